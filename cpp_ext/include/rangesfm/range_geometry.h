@@ -1,0 +1,81 @@
+// What the range costs share: where the tag is, how far from the anchor, and how both move with the parameters.
+
+#ifndef RANGESFM_RANGE_GEOMETRY_H_
+#define RANGESFM_RANGE_GEOMETRY_H_
+
+#include <Eigen/Core>
+#include <Eigen/Geometry>
+
+namespace rangesfm {
+
+using PoseGradient = Eigen::Matrix<double, 1, 7>;
+
+// Antenna of the tag in the world, seen from one of COLMAP's pose blocks, rig_from_world = [qx qy qz qw tx ty tz]:
+//
+//   tag_in_world = R^T d,  d = tag_in_cam - t
+//
+// ("cam" is the rig frame, that is, the rig's reference camera.) With q = (u, w) the rotation is the polynomial that
+// Eigen evaluates for `conjugate(q) * d`,
+//
+//   R^T d = d - 2 w (u x d) + 2 u x (u x d),
+//
+// which turns d only for a unit quaternion. Off the unit sphere its derivative is of no meaning in itself; projected
+// to the tangent space by the quaternion's manifold it is exact, as of any smooth function that agrees on the sphere.
+class TagPosition {
+ public:
+  TagPosition(const double* rig_from_world, const Eigen::Vector3d& tag_in_cam)
+      : cam_from_world_(rig_from_world),
+        tag_from_cam_(tag_in_cam - Eigen::Map<const Eigen::Vector3d>(rig_from_world + 4)),
+        in_world_(cam_from_world_.conjugate() * tag_from_cam_) {}
+
+  const Eigen::Vector3d& InWorld() const { return in_world_; }
+
+  // Derivative of direction . tag_in_world with respect to the seven numbers of the pose block.
+  PoseGradient Gradient(const Eigen::Vector3d& direction) const {
+    const auto u = cam_from_world_.vec();
+    const double w = cam_from_world_.w();
+    const Eigen::Vector3d& d = tag_from_cam_;
+    PoseGradient gradient;
+    gradient.head<3>() =
+        2.0 * (w * direction.cross(d) + u.dot(d) * direction + u.dot(direction) * d - 2.0 * direction.dot(d) * u);
+    gradient(3) = -2.0 * direction.dot(u.cross(d));
+    gradient.tail<3>() = -(cam_from_world_ * direction);
+    return gradient;
+  }
+
+ private:
+  Eigen::Map<const Eigen::Quaterniond> cam_from_world_;
+  Eigen::Vector3d tag_from_cam_;  // d: from the camera's centre to the tag, turned as the world is in the camera
+  Eigen::Vector3d in_world_;
+};
+
+// From the anchor to the tag: how far, and in which direction.
+class AnchorToTag {
+ public:
+  AnchorToTag(const Eigen::Vector3d& tag_in_world, const double* anchor_in_world)
+      : AnchorToTag(Eigen::Vector3d(tag_in_world - Eigen::Map<const Eigen::Vector3d>(anchor_in_world))) {}
+
+  double Distance() const { return distance_; }
+
+  // Derivative of the distance with respect to the tag; with respect to the anchor it is the negative.
+  const Eigen::Vector3d& Direction() const { return direction_; }
+
+ private:
+  // Where the two antennas meet the distance has no derivative. Closer than this the offset is rounding noise and its
+  // direction arbitrary; zero is the one subgradient that pushes nobody anywhere, so the answer stays finite and the
+  // other residuals decide.
+  static constexpr double kMinDistance = 1e-12;  // metres
+
+  explicit AnchorToTag(const Eigen::Vector3d& offset) : distance_(offset.norm()), direction_(Eigen::Vector3d::Zero()) {
+    if (distance_ > kMinDistance) {
+      direction_ = offset / distance_;
+    }
+  }
+
+  double distance_;
+  Eigen::Vector3d direction_;
+};
+
+}  // namespace rangesfm
+
+#endif  // RANGESFM_RANGE_GEOMETRY_H_
