@@ -1,0 +1,72 @@
+"""rangesfm: metric COLMAP models from photos and ultra-wideband ranges.
+
+The stages are plain functions, found here by name and imported when first asked for::
+
+    import rangesfm
+
+    log = rangesfm.read_ranges("uwb.csv")
+    trajectory = rangesfm.trajectory_from_reconstruction(reconstruction, image_times)
+    observations = rangesfm.associate(log, trajectory, tag_in_cam_m)
+    estimate = rangesfm.initialize_scale(observations, trajectory, anchors, anchor_frame="unknown")
+    metric = rangesfm.rescale(reconstruction, estimate.metric_from_sfm)
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import zlib as zlib  # before pycolmap: if its own copy is loaded first, Python's zlib aborts or hangs (4.2.1)
+from typing import Any
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Anchor": "rangesfm.ranging.anchors",
+    "GeometryError": "rangesfm.errors",
+    "InputError": "rangesfm.errors",
+    "RangeLog": "rangesfm.ranging.log",
+    "RangesfmError": "rangesfm.errors",
+    "ReconstructionError": "rangesfm.errors",
+    "Similarity": "rangesfm.geometry",
+    "SolverError": "rangesfm.errors",
+    "Survey": "rangesfm.config",
+    "Trajectory": "rangesfm.trajectory",
+    "associate": "rangesfm.ranging.association",
+    "compare": "rangesfm.comparison",
+    "compare_models": "rangesfm.comparison",
+    "estimate_time_offset": "rangesfm.ranging.clock",
+    "export_model": "rangesfm.export",
+    "export_result": "rangesfm.export",
+    "find_image_times": "rangesfm.vision.image_times",
+    "initialize_scale": "rangesfm.scale.initialize",
+    "read_anchors": "rangesfm.ranging.anchor_file",
+    "read_image_times_csv": "rangesfm.vision.image_times",
+    "read_ranges": "rangesfm.ranging.readers",
+    "read_reference": "rangesfm.reference",
+    "read_survey": "rangesfm.config",
+    "reconstruct": "rangesfm.vision.reconstruct",
+    "refine_with_ranges": "rangesfm.refine",
+    "rescale": "rangesfm.scale.rescale",
+    "run_survey": "rangesfm.pipeline",
+    "select_keyframes": "rangesfm.vision.keyframes",
+    "trajectory_from_reconstruction": "rangesfm.trajectory",
+    "two_candidate": "rangesfm.scale.two_candidate",
+    "write_report": "rangesfm.report",
+}
+
+__all__ = ["__version__", *sorted(_HOME)]
+
+logging.getLogger(__name__).addHandler(logging.NullHandler())
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name from its module when it is first used: pycolmap and scipy are slow to load."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

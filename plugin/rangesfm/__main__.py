@@ -1,0 +1,7 @@
+"""``python -m rangesfm``."""
+
+import sys
+
+from rangesfm.cli import main
+
+sys.exit(main())

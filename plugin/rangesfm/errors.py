@@ -1,0 +1,45 @@
+"""The errors a user can meet; everything else that escapes is a bug.
+
+Each class carries the exit status of the command line, so that a caller
+never has to look at the text of a message.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class RangesfmError(Exception):
+    """Root of all errors raised on purpose. Its text is one line for the user."""
+
+    exit_status = 4
+
+
+class InputError(RangesfmError):
+    """Bad usage or bad input: names the file, the line and what was expected."""
+
+    exit_status = 2
+
+    def __init__(self, message: str, path: str | Path | None = None, line: int | None = None):
+        self.path = None if path is None else Path(path)
+        self.line = line
+        where = "" if path is None else f"{path}: " if line is None else f"{path}:{line}: "
+        super().__init__(where + message)
+
+
+class GeometryError(RangesfmError):
+    """The geometry does not determine what was asked; the text says what and why."""
+
+    exit_status = 3
+
+
+class ReconstructionError(RangesfmError):
+    """The photos did not give a model."""
+
+    exit_status = 4
+
+
+class SolverError(RangesfmError):
+    """A solver failed, or the compiled part does not fit the installed packages."""
+
+    exit_status = 4

@@ -1,0 +1,67 @@
+"""Outputs appear whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rangesfm.errors import InputError
+
+
+def make_output_folder(path: Path) -> None:
+    """Make ``path`` and check that it can be written to; raise InputError if not."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise InputError(f"cannot write to this output folder ({error.strerror})", path) from error
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """Yield a temporary sibling to write to; on success it takes the place of ``path``."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def scratch_folder(path: Path) -> Iterator[Path]:
+    """Yield a temporary folder beside ``path``, named after it, that is gone afterwards.
+
+    Unlike tempfile's it also goes when Ctrl-C falls into its making or its removal.
+    """
+    folder = path.with_name(f".{path.name}.{os.getpid()}.part")  # the name first: nothing to lose track of
+    try:
+        try:
+            shutil.rmtree(folder, ignore_errors=True)  # of a process that was killed and had the same number
+            folder.mkdir(parents=True)
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+    finally:  # again: a Ctrl-C may have ended the first
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """Yield a temporary sibling folder; on success it takes the place of the folder ``path``."""
+    with scratch_folder(path) as temporary:
+        yield temporary
+        old = temporary.with_suffix(".old")
+        try:
+            if path.exists():
+                path.rename(old)
+            temporary.rename(path)
+        finally:
+            if old.exists() and not path.exists():  # interrupted halfway
+                old.rename(path)
+            shutil.rmtree(old, ignore_errors=True)

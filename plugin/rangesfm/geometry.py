@@ -1,0 +1,91 @@
+"""Similarities between point sets, and the shape of a path."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """``x_new = scale * rotation @ x_old + translation``; named new_from_old where it is used."""
+
+    scale: float
+    rotation: Array
+    translation: Array
+
+    def __matmul__(self, inner: Similarity) -> Similarity:
+        """``(a_from_b @ b_from_c)`` is ``a_from_c``."""
+        return Similarity(
+            self.scale * inner.scale,
+            self.rotation @ inner.rotation,
+            self.apply(inner.translation),
+        )
+
+    def apply(self, points: Array) -> Array:
+        """Map points of shape (..., 3)."""
+        mapped: Array = self.scale * points @ self.rotation.T + self.translation
+        return mapped
+
+    def inverse(self) -> Similarity:
+        rotation = self.rotation.T
+        return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
+
+
+IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
+
+
+def align_points(source: Array, target: Array, weights: Array | None = None, *, with_scale: bool = True) -> Similarity:
+    """The similarity (or rigid motion) target_from_source with least squared error.
+
+    Umeyama, "Least-squares estimation of transformation parameters between two point
+    patterns", PAMI 1991. A reflection is never returned.
+
+    Args:
+        source, target: (n, 3) corresponding points, n >= 3 for a unique answer.
+        weights: (n,) of the squared errors; None for equal ones.
+        with_scale: False keeps the scale at 1.
+    """
+    w = np.ones(len(source)) if weights is None else weights
+    w = w / w.sum()
+    mean_source, mean_target = w @ source, w @ target
+    centered_source, centered_target = source - mean_source, target - mean_target
+    u, singular_values, vt = np.linalg.svd((centered_target * w[:, None]).T @ centered_source)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = (u * signs) @ vt
+    variance = float(w @ np.sum(centered_source**2, axis=1))
+    scale = float(singular_values @ signs) / variance if with_scale and variance > 0 else 1.0
+    return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
+
+
+def rmse(differences: Array) -> float:
+    """Root of the mean squared length of (n, 3) differences; NaN for none."""
+    return float(np.sqrt(np.mean(np.sum(differences**2, axis=1)))) if len(differences) else float("nan")
+
+
+@dataclass(frozen=True)
+class PathShape:
+    """Principal extents of a set of points.
+
+    Attributes:
+        centroid: (3,).
+        axes: (3, 3), columns are the principal directions, longest first.
+        stddevs: (3,) along them, in the unit of the points.
+    """
+
+    centroid: Array
+    axes: Array
+    stddevs: Array
+
+
+def path_shape(points: Array) -> PathShape:
+    """Principal directions of (n, 3) points."""
+    centroid = points.mean(axis=0)
+    _, singular_values, vt = np.linalg.svd(points - centroid, full_matrices=len(points) < 3)
+    stddevs = np.zeros(3)
+    stddevs[: len(singular_values)] = singular_values / np.sqrt(len(points))
+    return PathShape(centroid, vt.T, stddevs)

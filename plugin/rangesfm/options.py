@@ -1,0 +1,135 @@
+"""Options of the stages: how each does its work. Plain values with defaults.
+
+A survey file's tables are these classes, key for key; what a key means is said here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+ANCHOR_FRAMES = ("site", "first_camera", "unknown")
+SCALE_METHODS = ("robust", "two-candidate")
+MATCHING_METHODS = ("sequential", "exhaustive", "auto")
+
+
+@dataclass(frozen=True)
+class KeyframeOptions:
+    """Which photos become keyframes (table ``[images]``). All that are given must hold.
+
+    Attributes:
+        every_nth: every n-th photo in time order.
+        min_interval_s: at least this long after the previous keyframe.
+        max_num_keyframes: evenly thinned to at most this many.
+    """
+
+    every_nth: int = 1
+    min_interval_s: float = 0.0
+    max_num_keyframes: int | None = None
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """One camera for all photos (table ``[camera]``).
+
+    Attributes:
+        model: COLMAP's camera model name; None lets COLMAP guess from EXIF.
+        params: the model's parameters in COLMAP's order; None if not known.
+        refine_intrinsics: whether mapping and refinement adjust them; None: mapping does if they
+            are not given, and the refinement keeps what it finds, so that it does the same to a
+            model just mapped and to one brought along.
+    """
+
+    model: str | None = None
+    params: tuple[float, ...] | None = None
+    refine_intrinsics: bool | None = None
+
+    @property
+    def mapping_refines_intrinsics(self) -> bool:
+        return self.params is None if self.refine_intrinsics is None else self.refine_intrinsics
+
+
+@dataclass(frozen=True)
+class MapperOptions:
+    """Photos to unscaled model (table ``[mapper]``).
+
+    Attributes:
+        matching: "sequential", "exhaustive" or "auto" (exhaustive up to 60 keyframes).
+        features, pairing, matcher, pipeline: passed through to pycolmap's
+            FeatureExtractionOptions, the pairing options of the chosen matching,
+            FeatureMatchingOptions and IncrementalPipelineOptions.
+        num_threads: -1 for all cores. Matching on the processor takes one thread all the same, as
+            pycolmap 4.2 loses matches with more; ``matcher.num_threads`` overrides that.
+    """
+
+    matching: str = "auto"
+    features: dict[str, Any] = field(default_factory=dict)
+    pairing: dict[str, Any] = field(default_factory=dict)
+    matcher: dict[str, Any] = field(default_factory=dict)
+    pipeline: dict[str, Any] = field(default_factory=dict)
+    num_threads: int = -1
+
+
+@dataclass(frozen=True)
+class AssociationOptions:
+    """Ranges to places on the path (part of table ``[ranges]``).
+
+    Attributes:
+        max_interpolation_gap_s: between keyframes further apart than this no pose is interpolated.
+        max_time_difference_s: a range this close to a keyframe counts as taken there in any case.
+        check_share: share of the ranges, chosen at random, that is held out of every estimate.
+    """
+
+    max_interpolation_gap_s: float = 2.0
+    max_time_difference_s: float = 0.02
+    check_share: float = 0.0
+
+
+@dataclass(frozen=True)
+class RangeModelOptions:
+    """What is assumed of the radio (part of table ``[ranges]``).
+
+    Attributes:
+        range_stddev_m: noise of a range; None: estimated from the residuals.
+        range_bias_stddev_m: prior of each anchor's own constant bias, mean 0. Small on purpose:
+            a freer bias soaks up errors that depend on direction, and shifts the map instead.
+        common_bias_stddev_m: prior of the bias that all anchors share (the tag's delay), mean 0.
+    """
+
+    range_stddev_m: float | None = None
+    range_bias_stddev_m: float = 0.01
+    common_bias_stddev_m: float = 0.1
+
+
+@dataclass(frozen=True)
+class ScaleOptions:
+    """Table ``[scale]``.
+
+    Attributes:
+        method: "robust" (default) or "two-candidate" (the paper's).
+        num_bootstrap: resamplings of the block bootstrap over time.
+        bootstrap_block_s: length of its blocks.
+        max_relative_stddev: a scale less certain than this is refused.
+    """
+
+    method: str = "robust"
+    num_bootstrap: int = 200
+    bootstrap_block_s: float = 10.0
+    max_relative_stddev: float = 0.1
+
+
+@dataclass(frozen=True)
+class RefineOptions:
+    """Table ``[refine]``.
+
+    Attributes:
+        enabled: False leaves the map as scaled.
+        max_num_iterations: of the solver.
+        range_loss_scale: residual in stddevs from which a range is down-weighted (Cauchy).
+        bundle_adjustment: passed through to pycolmap's BundleAdjustmentOptions.
+    """
+
+    enabled: bool = True
+    max_num_iterations: int = 200
+    range_loss_scale: float = 2.4
+    bundle_adjustment: dict[str, Any] = field(default_factory=dict)

@@ -1,0 +1,94 @@
+"""Trajectory: the camera's path through one model's world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses of the registered keyframes (COLMAP frames), sorted by time where times are known.
+
+    A rig's pose is that of its reference camera, so ``cam`` means the rig frame.
+
+    Attributes:
+        frame_ids: (n,) int, COLMAP's frame ids.
+        image_names: n names, the reference camera's photo of each frame.
+        timestamps_s: (n,) seconds on the camera's clock, strictly increasing; None if unknown.
+        centers: (n, 3) projection centres in the world, in the world's unit.
+        world_from_cam: (n, 3, 3) rotations.
+    """
+
+    frame_ids: npt.NDArray[np.int64]
+    image_names: tuple[str, ...]
+    timestamps_s: npt.NDArray[np.float64] | None
+    centers: npt.NDArray[np.float64]
+    world_from_cam: npt.NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.image_names)
+
+    def transformed(
+        self, scale: float, rotation: npt.NDArray[np.float64], translation: npt.NDArray[np.float64]
+    ) -> Trajectory:
+        """The same path in the world ``x_new = scale * rotation @ x + translation``."""
+        return Trajectory(
+            self.frame_ids,
+            self.image_names,
+            self.timestamps_s,
+            scale * self.centers @ rotation.T + translation,
+            rotation @ self.world_from_cam,
+        )
+
+
+def trajectory_from_reconstruction(
+    reconstruction: pycolmap.Reconstruction, timestamps_s: Mapping[str, float] | None = None
+) -> Trajectory:
+    """Read the path off a model.
+
+    Args:
+        reconstruction: a COLMAP model with registered frames.
+        timestamps_s: camera-clock time of each photo by name; frames whose photo has
+            no time are left out. None: the path has no times and is ordered by name.
+    """
+    rows = []
+    for frame_id in reconstruction.reg_frame_ids():
+        frame = reconstruction.frame(frame_id)
+        name = _reference_image_name(reconstruction, frame)
+        time = 0.0 if timestamps_s is None else timestamps_s.get(name)
+        if time is not None:
+            rig_from_world = pose_of(frame)
+            world_from_cam = rig_from_world.rotation.matrix().T
+            center = -world_from_cam @ rig_from_world.translation
+            rows.append((time, name, frame_id, center, world_from_cam))
+    rows.sort(key=lambda row: row[:2])
+    return Trajectory(
+        frame_ids=np.array([row[2] for row in rows], dtype=np.int64),
+        image_names=tuple(row[1] for row in rows),
+        timestamps_s=None if timestamps_s is None else np.array([row[0] for row in rows], dtype=np.float64),
+        centers=np.array([row[3] for row in rows], dtype=np.float64).reshape(-1, 3),
+        world_from_cam=np.array([row[4] for row in rows], dtype=np.float64).reshape(-1, 3, 3),
+    )
+
+
+def pose_of(frame: pycolmap.Frame) -> pycolmap.Rigid3d:
+    """rig_from_world of a registered frame: a view, so that what is written to its params moves the frame."""
+    pose = frame.rig_from_world
+    if pose is None:
+        raise ValueError(f"frame {frame.frame_id} has no pose")
+    return pose
+
+
+def _reference_image_name(reconstruction: pycolmap.Reconstruction, frame: pycolmap.Frame) -> str:
+    """The photo of the rig's reference camera; of a frame that lacks it, the first by name."""
+    images = [reconstruction.image(data_id.id) for data_id in frame.image_ids]
+    reference = [image for image in images if image.is_ref_in_frame()]
+    return str(min(image.name for image in reference or images))
