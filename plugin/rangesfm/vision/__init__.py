@@ -1,0 +1,1 @@
+"""Photos to an unscaled COLMAP model: image times, keyframes, features, matching, mapping."""

@@ -1,0 +1,61 @@
+"""Long calls into COLMAP that Ctrl-C can end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
+from typing import TypeVar
+
+import pycolmap
+
+from rangesfm.errors import ReconstructionError
+from rangesfm.progress import Progress
+
+Result = TypeVar("Result")
+
+_POLL_INTERVAL_S = 0.2
+
+
+def run_in_background(
+    work: Callable[[pycolmap.CancellationToken], Result],
+    progress: Progress,
+    count: Callable[[], int],
+    num_total: int | None,
+) -> Result:
+    """Run ``work`` in a thread, and meanwhile say how far it is.
+
+    Python hears Ctrl-C in the main thread only, and only between its own instructions: a call into
+    COLMAP there would put it off for minutes. Whatever interrupts the waiting cancels the work, and
+    goes on once the work has ended.
+
+    Args:
+        work: hands the token on to COLMAP (whose calls release Python's lock).
+        count: how many of ``num_total`` (None: unknown) items are done.
+
+    Raises:
+        ReconstructionError: COLMAP raised an error of its own.
+    """
+    token = pycolmap.CancellationToken()
+    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="colmap") as executor:
+        # A Ctrl-C that comes while the thread starts loses track of it: there must be nothing in it yet.
+        executor.submit(int).result()
+        try:
+            future = executor.submit(work, token)
+            while not wait([future], timeout=_POLL_INTERVAL_S).done:
+                _say(progress, count, num_total)
+        except BaseException as error:
+            token.cancel()
+            if isinstance(error, KeyboardInterrupt):
+                progress.message("interrupted: COLMAP finishes the photos at hand")
+            raise
+    try:
+        result = future.result()
+    except (RuntimeError, ValueError) as error:
+        raise ReconstructionError("COLMAP stopped: " + " ".join(str(error).split())) from error
+    _say(progress, count, num_total)
+    return result
+
+
+def _say(progress: Progress, count: Callable[[], int], num_total: int | None) -> None:
+    num_done = count()
+    progress.update(num_done if num_total is None else min(num_done, num_total), num_total)

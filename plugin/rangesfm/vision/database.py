@@ -1,0 +1,82 @@
+"""COLMAP's database of one survey: photos, features and matches.
+
+Always through pycolmap, also to look at it while COLMAP writes: Python's sqlite3 is another copy of
+SQLite, and when one copy closes a file, the system drops the locks that the other one in the same
+process holds on it. The database is broken within seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import pycolmap
+
+
+def create_database(path: Path, image_names: Sequence[str], camera: pycolmap.Camera) -> None:
+    """A new database with these photos of one camera, in the place of an old one.
+
+    COLMAP would enter photos as its threads come to them; entered here they have the same ids
+    1, 2, ... in every run, and the same seed gives the same model.
+    """
+    remove_database(path)
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        camera.camera_id = database.write_camera(camera)
+        rig = pycolmap.Rig()
+        rig.add_ref_sensor(camera.sensor_id)
+        rig.rig_id = database.write_rig(rig)
+        for name in image_names:
+            image = pycolmap.Image(name=name, camera_id=camera.camera_id)
+            image.image_id = database.write_image(image)
+            frame = pycolmap.Frame()
+            frame.rig_id = rig.rig_id
+            frame.add_data_id(image.data_id)
+            database.write_frame(frame)
+
+
+def remove_database(path: Path) -> None:
+    """Remove the file and those that SQLite keeps beside it."""
+    for suffix in ("", "-wal", "-shm"):
+        path.with_name(path.name + suffix).unlink(missing_ok=True)
+
+
+def clear_matches(path: Path) -> None:
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        database.clear_matches()
+        database.clear_two_view_geometries()
+
+
+@contextmanager
+def named_by_place(path: Path, image_names: Sequence[str]) -> Iterator[None]:
+    """Inside the block the photos are called by their place in ``image_names``, the order of their ids.
+
+    COLMAP's sequential matching takes the order of names for the order in time.
+    """
+    _rename(path, [f"{place:09d}" for place in range(len(image_names))])
+    try:
+        yield
+    finally:
+        _rename(path, image_names)
+
+
+def _rename(path: Path, image_names: Sequence[str]) -> None:
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        for image in database.read_all_images():
+            image.name = image_names[image.image_id - 1]
+            database.update_image(image)
+
+
+def num_photos_with_features(database: pycolmap.Database) -> int:
+    """How many photos COLMAP has been through, whether or not it found anything in them."""
+    return sum(database.exists_keypoints(image_id) for image_id in range(1, database.num_images() + 1))
+
+
+def num_compared_pairs(database: pycolmap.Database) -> int:
+    """How many pairs of photos COLMAP has been through, whether or not they match."""
+    return database.num_verified_image_pairs()
+
+
+def num_matching_pairs(database: pycolmap.Database) -> int:
+    """How many pairs of photos have matches that fit one geometry of two views."""
+    return len(database.read_two_view_geometry_num_inliers()[0])

@@ -1,0 +1,76 @@
+"""Step 1: photos into COLMAP's database, and features out of them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pycolmap
+
+from rangesfm.errors import ReconstructionError
+from rangesfm.options import MapperOptions
+from rangesfm.passthrough import apply_options
+from rangesfm.progress import Progress
+from rangesfm.vision.background import run_in_background
+from rangesfm.vision.database import num_photos_with_features
+from rangesfm.vision.photos import MIN_NUM_PHOTOS, Photos
+
+_MIN_NUM_FEATURES = 50  # COLMAP starts from pairs with 100 matches and adds photos that see 30 known points
+_PHOTOS_PER_THREAD = 2
+
+
+def feature_options(mapper: MapperOptions) -> pycolmap.FeatureExtractionOptions:
+    """Raises InputError for keys or values that are not COLMAP's."""
+    options = pycolmap.FeatureExtractionOptions(num_threads=mapper.num_threads)
+    apply_options(options, mapper.features, "mapper.features")
+    return options
+
+
+def extract_features(
+    database_path: Path, photos: Photos, options: pycolmap.FeatureExtractionOptions, progress: Progress
+) -> None:
+    """Find features in the photos of the database that have none yet.
+
+    Raises:
+        ReconstructionError: hardly any photo has features.
+    """
+    with pycolmap.Database.open(database_path) as database:
+        run_in_background(
+            lambda token: _call_colmap(database_path, photos, options, token),
+            progress,
+            lambda: num_photos_with_features(database),
+            len(photos.names),
+        )
+        ids = enumerate(photos.names, 1)
+        poor = [name for id_, name in ids if database.num_keypoints_for_image(id_) < _MIN_NUM_FEATURES]
+    num_rich = len(photos.names) - len(poor)
+    if num_rich < MIN_NUM_PHOTOS:
+        raise ReconstructionError(
+            f"{num_rich} of {len(photos.names)} photos have {_MIN_NUM_FEATURES} features or more, the first without"
+            f" is {poor[0]}: are they sharp, exposed well, and not of blank walls?"
+        )
+    if poor:
+        progress.message(
+            f"{len(poor)} of {len(photos.names)} photos have fewer than {_MIN_NUM_FEATURES} features, the first is"
+            f" {poor[0]}"
+        )
+
+
+def _call_colmap(
+    database_path: Path,
+    photos: Photos,
+    options: pycolmap.FeatureExtractionOptions,
+    token: pycolmap.CancellationToken,
+) -> None:
+    """A few photos at a time: COLMAP finishes all photos of a call before it heeds the token."""
+    num_threads = options.num_threads if options.num_threads > 0 else os.cpu_count() or 1
+    num_at_a_time = _PHOTOS_PER_THREAD * num_threads
+    for start in range(0, len(photos.names), num_at_a_time):
+        pycolmap.extract_features(
+            database_path,
+            photos.folder,
+            image_names=photos.names[start : start + num_at_a_time],
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            extraction_options=options,
+            cancellation_token=token,
+        )

@@ -1,0 +1,265 @@
+"""When each photo was taken: from a CSV file, from EXIF, or from file names that are times."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from rangesfm.errors import InputError
+from rangesfm.tables import Table, read_table
+
+IMAGE_EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+
+_FINEST_RESOLUTION_S = 1e-3
+_MAX_TIMESTAMP_S = 1e11  # the year 5138: larger numbers are in another unit
+_EXIF_IFD = 0x8769
+_DATE_TIME_ORIGINAL, _SUB_SEC_TIME_ORIGINAL, _OFFSET_TIME_ORIGINAL = 0x9003, 0x9291, 0x9011
+# 2001 to 2096 since 1970. The same in ms, us or ns is never taken for another unit, and neither a
+# frame number nor a date written as digits (20260131...) is taken for any of them.
+_EPOCH_S = (1e9, 4e9)
+_UNITS_PER_SECOND = (1, 10**3, 10**6, 10**9)
+_MIN_DECIMALS = 3  # with fewer, a number like scan_1.2 is more likely a version than seconds
+
+
+class _Stamp(NamedTuple):
+    time_s: float
+    resolution_s: float
+
+
+@dataclass(frozen=True)
+class ImageTimes:
+    """Photos in the order in which they were taken.
+
+    Attributes:
+        image_names: n names, relative to the folder of the photos, with forward slashes.
+        timestamps_s: (n,) seconds on the camera's clock, strictly increasing.
+        resolution_s: the finest step of that clock as written down, at least 0.001.
+        source: "csv", "exif" or "file_names".
+        num_left_out: photos that have no time, or the same as another.
+        notes: what a user should know about these times, a line each.
+    """
+
+    image_names: tuple[str, ...]
+    timestamps_s: npt.NDArray[np.float64]
+    resolution_s: float
+    source: str
+    num_left_out: int = 0
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.image_names)
+
+    def by_name(self) -> dict[str, float]:
+        """The time of each photo, seconds."""
+        return dict(zip(self.image_names, self.timestamps_s.tolist(), strict=True))
+
+
+def list_images(folder: str | Path) -> tuple[str, ...]:
+    """Names of all photos in a folder and its subfolders, sorted; hidden files are no photos.
+
+    Raises:
+        InputError: there is no such folder, or no photo in it.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError("is a file, expected a folder of photos" if folder.exists() else "no such folder", folder)
+    names = []
+    for parent, subfolders, files in os.walk(folder):
+        subfolders[:] = [name for name in subfolders if not name.startswith(".")]
+        photos = [name for name in files if name.lower().endswith(IMAGE_EXTENSIONS) and not name.startswith(".")]
+        names += [(Path(parent) / name).relative_to(folder).as_posix() for name in photos]
+    if not names:
+        raise InputError(f"no photos ({' '.join(e[1:] for e in IMAGE_EXTENSIONS)}) in this folder", folder)
+    return tuple(sorted(names))
+
+
+def find_image_times(folder: str | Path, names: Sequence[str], csv_path: str | Path | None = None) -> ImageTimes:
+    """Times of the photos ``names`` of ``folder``: the CSV file if given, else EXIF, else the names.
+
+    Raises:
+        InputError: none of them gives times, or the CSV file is not right.
+    """
+    if csv_path is not None:
+        return read_image_times_csv(csv_path, names)
+    with suppress(InputError):
+        return times_from_exif(folder, names)
+    with suppress(InputError):
+        return times_from_file_names(names)
+    raise InputError(
+        f"no time for {names[0]}: expected a CSV file image_name,timestamp_s, or EXIF DateTimeOriginal "
+        "in the photos, or file names that are times (like 1403715273262142976.png)",
+        folder,
+    )
+
+
+def read_image_times_csv(path: str | Path, names: Sequence[str] | None = None) -> ImageTimes:
+    """Read ``image_name,timestamp_s`` (the header may say ``filename`` and ``timestamp`` as well).
+
+    Args:
+        path: the CSV file; other columns are ignored.
+        names: the photos that there are; None: those of the file are not checked.
+
+    Raises:
+        InputError: with the line: a column missing, a cell that is no time in seconds, a photo
+            that does not exist, a photo or a time that stands there twice.
+    """
+    table = read_table(
+        path,
+        ["image_name", "timestamp_s"],
+        aliases={"filename": "image_name", "timestamp": "timestamp_s"},
+        separator=None,
+    )
+    if not len(table):
+        raise InputError("no rows below the header, expected one per photo", path)
+    image_names, times = table.text("image_name"), table.numbers("timestamp_s", expected="seconds")
+    for row in np.flatnonzero(np.abs(times) > _MAX_TIMESTAMP_S).tolist():
+        raise table.error(row, "timestamp_s", "seconds")
+    _refuse_repetitions(table, image_names, times.tolist())
+    if names is not None:
+        known = set(names)
+        for row, name in enumerate(image_names):
+            if name not in known:
+                raise table.error(row, "image_name", f"the name of a photo in the folder, like '{names[0]}'")
+    texts = table.text("timestamp_s")
+    stamps = {
+        name: _Stamp(time, _resolution(text))
+        for name, time, text in zip(image_names, times.tolist(), texts, strict=True)
+    }
+    return _in_time_order(stamps, names or image_names, "csv")
+
+
+def times_from_exif(folder: str | Path, names: Sequence[str]) -> ImageTimes:
+    """Times from EXIF DateTimeOriginal, its fraction SubSecTimeOriginal and its zone OffsetTimeOriginal.
+
+    Seconds since 1970 in UTC. Cameras that do not say their zone are taken to run on UTC, which
+    shifts all times alike.
+
+    Raises:
+        InputError: at most half of the photos have a time.
+    """
+    exifs = {name: _read_exif(Path(folder) / name) for name in names}
+    offsets = [_utc_offset(exif) for exif in exifs.values()]
+    offset = next((known for known in offsets if known is not None), timedelta(0))
+    stamps = {name: stamp for name, exif in exifs.items() if (stamp := _exif_stamp(exif, offset)) is not None}
+    _refuse_minority(stamps, names, "EXIF DateTimeOriginal", Path(folder))
+    return _in_time_order(stamps, names, "exif")
+
+
+def times_from_file_names(names: Sequence[str]) -> ImageTimes:
+    """Times from names that end in a time: ``1403715273262142976.png``, ``cam0/1305032180.405639.jpg``.
+
+    A whole number is a time if, in s, ms, us or ns since 1970, it lies between 2001 and 2096;
+    smaller ones are frame numbers, which say nothing about time. A number with three or more
+    decimals is in seconds, since whenever.
+
+    Raises:
+        InputError: at most half of the names are times.
+    """
+    stamps = {name: stamp for name in names if (stamp := _name_stamp(name)) is not None}
+    _refuse_minority(stamps, names, "time in its name", None)
+    return _in_time_order(stamps, names, "file_names")
+
+
+def _in_time_order(stamps: Mapping[str, _Stamp], names: Sequence[str], source: str) -> ImageTimes:
+    """Sort by time; of photos with the same time only the first by name can be kept."""
+    ordered = sorted(stamps, key=lambda name: (stamps[name].time_s, name))
+    kept = [n for i, n in enumerate(ordered) if i == 0 or stamps[n].time_s > stamps[ordered[i - 1]].time_s]
+    resolution_s = max(min(stamp.resolution_s for stamp in stamps.values()), _FINEST_RESOLUTION_S)
+    notes = []
+    if missing := [name for name in names if name not in stamps]:
+        notes.append(f"{len(missing)} of {len(names)} photos have no time and are left out, the first is {missing[0]}")
+    if repeated := sorted(set(ordered) - set(kept)):
+        notes.append(
+            f"{len(repeated)} of {len(names)} photos have the same time as another and are left out, "
+            f"the first is {repeated[0]}"
+        )
+    if resolution_s >= 1.0:
+        notes.append("image times are whole seconds: at walking pace that is up to half a metre of path")
+    return ImageTimes(
+        image_names=tuple(kept),
+        timestamps_s=np.array([stamps[name].time_s for name in kept], dtype=np.float64),
+        resolution_s=resolution_s,
+        source=source,
+        num_left_out=len(names) - len(kept),
+        notes=tuple(notes),
+    )
+
+
+def _refuse_repetitions(table: Table, image_names: Sequence[str], times: Sequence[float]) -> None:
+    row_of_name: dict[str, int] = {}
+    row_of_time: dict[float, int] = {}
+    for row, (name, time) in enumerate(zip(image_names, times, strict=True)):
+        if (first := row_of_name.setdefault(name, row)) != row:
+            message = f"{name} stands in line {table.line[first]} already, expected one row per photo"
+            raise InputError(message, table.path, int(table.line[row]))
+        if (first := row_of_time.setdefault(time, row)) != row:
+            message = f"{name} has the time of {image_names[first]} in line {table.line[first]}, expected another"
+            raise InputError(message, table.path, int(table.line[row]))
+
+
+def _refuse_minority(stamps: Mapping[str, _Stamp], names: Sequence[str], what: str, folder: Path | None) -> None:
+    if 2 * len(stamps) <= len(names):
+        first = next(name for name in names if name not in stamps)
+        raise InputError(
+            f"{len(names) - len(stamps)} of {len(names)} photos have no {what}, the first is {first}; "
+            "expected a CSV file image_name,timestamp_s then",
+            folder,
+        )
+
+
+def _resolution(text: str) -> float:
+    """The step of a decimal number as written."""
+    return float(10.0 ** -len(text.partition(".")[2]))
+
+
+def _read_exif(path: Path) -> dict[int, str]:
+    """Text tags of the EXIF block about the exposure; none if the file has none or is no image."""
+    try:
+        with Image.open(path) as image:
+            tags = image.getexif().get_ifd(_EXIF_IFD)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # what Pillow's readers raise
+        return {}
+    return {tag: value.strip("\0 ") for tag, value in tags.items() if isinstance(value, str)}
+
+
+def _exif_stamp(exif: Mapping[int, str], default_offset: timedelta) -> _Stamp | None:
+    try:
+        local = datetime.strptime(exif.get(_DATE_TIME_ORIGINAL, ""), "%Y:%m:%d %H:%M:%S")
+    except ValueError:  # also the zeros and blanks of a camera whose clock was never set
+        return None
+    offset = _utc_offset(exif)
+    seconds = (local.replace(tzinfo=timezone.utc) - (default_offset if offset is None else offset)).timestamp()
+    digits = exif.get(_SUB_SEC_TIME_ORIGINAL, "")
+    fraction = f"0.{digits}" if digits.isdecimal() and digits.isascii() else "0"
+    return _Stamp(seconds + float(fraction), _resolution(fraction))
+
+
+def _utc_offset(exif: Mapping[int, str]) -> timedelta | None:
+    found = re.fullmatch(r"([+-])(\d\d):(\d\d)", exif.get(_OFFSET_TIME_ORIGINAL, ""))
+    if found is None:
+        return None
+    offset = timedelta(hours=int(found[2]), minutes=int(found[3]))
+    return -offset if found[1] == "-" else offset
+
+
+def _name_stamp(name: str) -> _Stamp | None:
+    number = re.search(r"(\d+)(\.\d+)?$", os.path.splitext(name)[0])
+    if number is None:
+        return None
+    whole, decimals = int(number[1]), (number[2] or ".")[1:]
+    if len(decimals) >= _MIN_DECIMALS:
+        return _Stamp(float(number[0]), _resolution(number[0]))
+    for units_per_second in _UNITS_PER_SECOND:
+        if not decimals and _EPOCH_S[0] <= whole / units_per_second < _EPOCH_S[1]:
+            return _Stamp(whole / units_per_second, 1 / units_per_second)
+    return None

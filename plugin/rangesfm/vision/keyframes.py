@@ -1,0 +1,55 @@
+"""The choice of keyframes: enough photos for a model, few enough to wait for it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rangesfm.errors import InputError
+from rangesfm.options import KeyframeOptions
+from rangesfm.vision.image_times import ImageTimes
+
+MIN_NUM_KEYFRAMES = 3
+
+_ROUNDING_S = 1e-6  # of a difference of two times that are seconds since 1970
+
+
+def select_keyframes(image_times: ImageTimes, options: KeyframeOptions) -> tuple[str, ...]:
+    """Names of the keyframes in time order.
+
+    First every n-th photo, of those the ones far enough apart in time, and of those evenly as many
+    as are allowed; the first photo always is a keyframe.
+
+    Raises:
+        InputError: an option that makes no sense, or fewer than three keyframes left.
+    """
+    _check(options)
+    kept = np.arange(0, len(image_times), options.every_nth)
+    if options.min_interval_s > 0:
+        kept = kept[_far_enough_apart(image_times.timestamps_s[kept], options.min_interval_s)]
+    if options.max_num_keyframes is not None and len(kept) > options.max_num_keyframes:
+        kept = kept[np.linspace(0, len(kept) - 1, options.max_num_keyframes).round().astype(int)]
+    if len(kept) < MIN_NUM_KEYFRAMES:
+        raise InputError(
+            f"{len(kept)} of {len(image_times)} photos chosen as keyframes, expected at least {MIN_NUM_KEYFRAMES}"
+            f" (every_nth {options.every_nth}, min_interval_s {options.min_interval_s:g})"
+        )
+    return tuple(image_times.image_names[index] for index in kept)
+
+
+def _far_enough_apart(timestamps_s: np.typing.NDArray[np.float64], min_interval_s: float) -> list[int]:
+    kept = [0]
+    for index, time in enumerate(timestamps_s.tolist()):
+        if time - timestamps_s[kept[-1]] >= min_interval_s - _ROUNDING_S:
+            kept.append(index)
+    return kept
+
+
+def _check(options: KeyframeOptions) -> None:
+    if options.every_nth < 1:
+        raise InputError(f"every_nth is {options.every_nth}, expected 1 or more")
+    if not (math.isfinite(options.min_interval_s) and options.min_interval_s >= 0):
+        raise InputError(f"min_interval_s is {options.min_interval_s:g}, expected 0 or more seconds")
+    if options.max_num_keyframes is not None and options.max_num_keyframes < MIN_NUM_KEYFRAMES:
+        raise InputError(f"max_num_keyframes is {options.max_num_keyframes}, expected {MIN_NUM_KEYFRAMES} or more")

@@ -1,0 +1,93 @@
+"""Step 3: COLMAP's incremental mapper, and its models on disk."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pycolmap
+
+from rangesfm.errors import ReconstructionError
+from rangesfm.files import new_folder, scratch_folder
+from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.passthrough import apply_options
+from rangesfm.progress import Progress
+from rangesfm.vision.background import run_in_background
+from rangesfm.vision.database import num_matching_pairs
+from rangesfm.vision.photos import Photos
+
+
+def pipeline_options(camera: CameraOptions, mapper: MapperOptions, seed: int) -> pycolmap.IncrementalPipelineOptions:
+    """Raises InputError for keys or values that are not COLMAP's."""
+    options = pycolmap.IncrementalPipelineOptions(num_threads=mapper.num_threads, random_seed=seed)
+    options.mapper.random_seed = options.triangulation.random_seed = seed
+    if not camera.mapping_refines_intrinsics:
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    apply_options(options, mapper.pipeline, "mapper.pipeline")
+    return options
+
+
+def map_incrementally(
+    database_path: Path,
+    photos: Photos,
+    models_path: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+    progress: Progress,
+) -> None:
+    """Write all models to ``models_path``/0, /1, ..., the one with the most photos first.
+
+    Raises:
+        ReconstructionError: there is not a single one.
+    """
+    counter = _Counter()
+    # COLMAP writes models as it goes, in the order in which it began them.
+    with scratch_folder(models_path.with_name("mapping")) as folder:
+        models = run_in_background(
+            lambda token: pycolmap.incremental_mapping(
+                database_path,
+                photos.folder,
+                folder,
+                options=options,
+                initial_image_pair_callback=counter.add_pair,
+                next_image_callback=counter.add_one,
+                cancellation_token=token,
+            ),
+            progress,
+            lambda: counter.num_registered,
+            len(photos.names),
+        )
+    if not models:
+        with pycolmap.Database.open(database_path) as database:
+            num_matching = num_matching_pairs(database)
+        raise ReconstructionError(
+            f"no model from {len(photos.names)} photos, of which {num_matching} pairs match: photos from"
+            " more places sideways to the view, or known camera parameters, may help"
+        )
+    with new_folder(models_path) as temporary:
+        for index, model in enumerate(sorted(models.values(), key=lambda model: -model.num_reg_images())):
+            (temporary / str(index)).mkdir()
+            model.write_binary(temporary / str(index))
+
+
+def read_models(models_path: Path) -> tuple[pycolmap.Reconstruction, ...]:
+    """The models that ``map_incrementally`` wrote, in their order."""
+    folders = sorted(models_path.iterdir(), key=lambda folder: int(folder.name))
+    return tuple(pycolmap.Reconstruction(folder) for folder in folders)
+
+
+def remove_models(models_path: Path) -> None:
+    shutil.rmtree(models_path, ignore_errors=True)
+
+
+class _Counter:
+    """Photos registered so far; in more than one model they count more than once."""
+
+    def __init__(self) -> None:
+        self.num_registered = 0
+
+    def add_pair(self) -> None:
+        self.num_registered += 2
+
+    def add_one(self) -> None:
+        self.num_registered += 1

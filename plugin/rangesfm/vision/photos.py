@@ -1,0 +1,69 @@
+"""The photos that one camera can have taken: readable and all of one size."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image
+
+from rangesfm.errors import ReconstructionError
+
+MIN_NUM_PHOTOS = 2
+
+
+@dataclass(frozen=True)
+class Photos:
+    """Photos of one camera.
+
+    Attributes:
+        folder: of all of them.
+        names: n names, relative to the folder, in the order given.
+        width, height: of each, pixels.
+        left_out: photos that cannot be used, and why.
+    """
+
+    folder: Path
+    names: tuple[str, ...]
+    width: int
+    height: int
+    left_out: dict[str, str]
+
+    def states(self) -> list[tuple[str, int, int]]:
+        """Name, size and time of change of each file: what tells these photos from others."""
+        states = [(name, (self.folder / name).stat()) for name in self.names]
+        return [(name, state.st_size, state.st_mtime_ns) for name, state in states]
+
+
+def usable_photos(folder: Path, names: Sequence[str]) -> Photos:
+    """The photos of the most common size.
+
+    Raises:
+        ReconstructionError: fewer than two of them.
+    """
+    sizes = {name: _size(folder / name) for name in names}
+    common = Counter(size for size in sizes.values() if size is not None).most_common(1)
+    width, height = common[0][0] if common else (0, 0)
+    usable = tuple(name for name in names if sizes[name] == (width, height))
+    left_out = {name: _reason(size) for name, size in sizes.items() if size != (width, height)}
+    if len(usable) < MIN_NUM_PHOTOS:
+        why = "".join(f"; {name} {reason}" for name, reason in list(left_out.items())[:1])
+        raise ReconstructionError(
+            f"{folder}: {len(usable)} of {len(names)} photos can be used, expected at least {MIN_NUM_PHOTOS}"
+            f" readable ones of one size{why}"
+        )
+    return Photos(folder, usable, width, height, left_out)
+
+
+def _size(path: Path) -> tuple[int, int] | None:
+    try:
+        with Image.open(path) as image:
+            return int(image.width), int(image.height)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # what Pillow's readers raise
+        return None
+
+
+def _reason(size: tuple[int, int] | None) -> str:
+    return "cannot be read as an image" if size is None else f"has another size ({size[0]} x {size[1]} pixels)"

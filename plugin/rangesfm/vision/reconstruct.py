@@ -1,0 +1,149 @@
+"""Photos to an unscaled COLMAP model: features, matching, incremental mapping."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pycolmap
+
+from rangesfm.colmap_log import colmap_log
+from rangesfm.errors import ReconstructionError
+from rangesfm.files import make_output_folder
+from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.progress import Progress, SilentProgress
+from rangesfm.vision.camera import camera_of_photos, check_camera
+from rangesfm.vision.database import clear_matches, create_database
+from rangesfm.vision.features import extract_features, feature_options
+from rangesfm.vision.mapping import map_incrementally, pipeline_options, read_models, remove_models
+from rangesfm.vision.matching import match_features, matching_options
+from rangesfm.vision.photos import Photos, usable_photos
+from rangesfm.vision.steps import Steps, fingerprint
+
+
+@dataclass(frozen=True)
+class ReconstructionSummary:
+    """What became of the photos.
+
+    Attributes:
+        models: the separate models, the one with the most photos first.
+        num_keyframes: photos asked for.
+        num_registered: photos in the first model.
+        seconds: by step ("features", "matching", "mapping"); one that was taken over has none.
+        log_path: COLMAP's own log.
+    """
+
+    models: tuple[pycolmap.Reconstruction, ...]
+    num_keyframes: int
+    num_registered: int
+    seconds: dict[str, float]
+    log_path: Path
+
+
+def reconstruct(
+    image_path: str | Path,
+    image_names: Sequence[str],
+    output_path: str | Path,
+    *,
+    camera: CameraOptions,
+    mapper: MapperOptions,
+    seed: int = 0,
+    progress: Progress | None = None,
+    restart: bool = False,
+) -> ReconstructionSummary:
+    """Reconstruct photos of one camera.
+
+    Writes ``database.db``, the models ``sparse/0`` (the largest), ``sparse/1``, ..., ``mapper.log``
+    and ``reconstruct.json`` to ``output_path``. Steps that an earlier run into the same folder did
+    with the same photos and options are taken over, and so are the features and matches that an
+    interrupted one had found.
+
+    Args:
+        image_path: folder of the photos.
+        image_names: the keyframes, relative to it, in time order.
+        output_path: made if it does not exist.
+        camera: of all photos; photos of another size are left out.
+        seed: the same one gives the same models.
+        restart: take nothing over.
+
+    Raises:
+        InputError: options that COLMAP does not take, or a folder that cannot be written to.
+        ReconstructionError: the photos cannot be read, or do not give a model.
+        KeyboardInterrupt: as soon as COLMAP has stopped.
+    """
+    progress, output = progress or SilentProgress(), Path(output_path)
+    check_camera(camera)
+    for_features = feature_options(mapper)
+    for_matching = matching_options(mapper, len(image_names), seed)
+    for_mapping = pipeline_options(camera, mapper, seed)
+    photos = usable_photos(Path(image_path), image_names)
+    its_camera = camera_of_photos(camera, photos.folder / photos.names[0], photos.width, photos.height)
+    _say_left_out(photos, progress)
+    make_output_folder(output)
+
+    database, models, log = output / "database.db", output / "sparse", output / "mapper.log"
+    steps = Steps(output / "reconstruct.json", progress)
+    if restart:
+        steps.forget("features")
+
+    def prepare_features() -> None:
+        remove_models(models)
+        log.unlink(missing_ok=True)
+        create_database(database, photos.names, its_camera)
+
+    def prepare_matching() -> None:
+        remove_models(models)
+        clear_matches(database)
+
+    with colmap_log(log), _pointing_to(log):
+        inputs = fingerprint(pycolmap.__version__, photos.states(), camera.model, camera.params, mapper.features)
+        steps.run(
+            "features",
+            inputs,
+            database,
+            prepare_features,
+            lambda: extract_features(database, photos, for_features, progress),
+        )
+        inputs = fingerprint(inputs, for_matching.is_sequential, mapper.pairing, mapper.matcher, seed)
+        steps.run(
+            "matching",
+            inputs,
+            database,
+            prepare_matching,
+            lambda: match_features(database, photos, for_matching, progress),
+        )
+        inputs = fingerprint(inputs, mapper.pipeline, camera.mapping_refines_intrinsics)
+        steps.run(
+            "mapping",
+            inputs,
+            models / "0",
+            lambda: remove_models(models),
+            lambda: map_incrementally(database, photos, models, for_mapping, progress),
+        )
+    found = read_models(models)
+    _say_separate(found, progress)
+    return ReconstructionSummary(found, len(image_names), found[0].num_reg_images(), steps.seconds, log)
+
+
+@contextmanager
+def _pointing_to(log: Path) -> Iterator[None]:
+    """Say in a failure where COLMAP's own words are."""
+    try:
+        yield
+    except ReconstructionError as error:
+        raise ReconstructionError(f"{error} (COLMAP's log: {log})") from error
+
+
+def _say_left_out(photos: Photos, progress: Progress) -> None:
+    if photos.left_out:
+        name, reason = next(iter(photos.left_out.items()))
+        num = len(photos.left_out)
+        progress.message(f"{num} of {num + len(photos.names)} photos are left out; the first, {name}, {reason}")
+
+
+def _say_separate(models: tuple[pycolmap.Reconstruction, ...], progress: Progress) -> None:
+    if len(models) > 1:
+        sizes = ", ".join(str(model.num_reg_images()) for model in models)
+        progress.message(f"{len(models)} separate models of {sizes} photos; the largest, sparse/0, is used")

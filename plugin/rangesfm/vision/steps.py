@@ -1,0 +1,78 @@
+"""Steps that are done once: what an earlier run into the same folder did need not be done again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rangesfm.files import new_file
+from rangesfm.progress import Progress
+
+
+def fingerprint(*inputs: Any) -> str:
+    """The same text for the same inputs (plain values, in any nesting)."""
+    return hashlib.sha256(json.dumps(inputs, sort_keys=True, default=str).encode()).hexdigest()
+
+
+class Steps:
+    """A series of steps, each of which needs the one before; their state is kept in a JSON file.
+
+    Attributes:
+        seconds: how long each step took that was done here, by name.
+    """
+
+    def __init__(self, record_path: Path, progress: Progress):
+        self._path = record_path
+        self._progress = progress
+        self._record = _read(record_path)
+        self.seconds: dict[str, float] = {}
+
+    def run(self, name: str, inputs: str, output: Path, prepare: Callable[[], None], work: Callable[[], None]) -> None:
+        """Do a step, unless it was done with the same inputs and its output is still there.
+
+        Args:
+            inputs: fingerprint of all that the step depends on.
+            prepare: clears the ground; skipped where ``work`` was interrupted on the same inputs.
+            work: goes on from whatever it left when it was interrupted.
+        """
+        state = self._record.get(name, {})
+        is_begun = state.get("inputs") == inputs and output.exists()
+        if is_begun and state.get("done"):
+            self._progress.message(f"{name}: taken over from an earlier run")
+            return
+        self._progress.stage(name)
+        start = time.perf_counter()
+        if not is_begun:
+            self.forget(name)
+            prepare()
+        self._note(name, inputs, done=False)
+        work()
+        self._note(name, inputs, done=True)
+        self.seconds[name] = time.perf_counter() - start
+
+    def forget(self, first: str) -> None:
+        """Nothing is known any more of this step and of those after it."""
+        names = list(self._record)
+        for name in names[names.index(first) :] if first in names else ():
+            del self._record[name]
+        self._write()
+
+    def _note(self, name: str, inputs: str, *, done: bool) -> None:
+        self._record[name] = {"inputs": inputs, "done": done}
+        self._write()
+
+    def _write(self) -> None:
+        with new_file(self._path) as temporary:
+            temporary.write_text(json.dumps(self._record, indent=2) + "\n", encoding="utf-8")
+
+
+def _read(path: Path) -> dict[str, dict[str, Any]]:
+    try:
+        steps = json.loads(path.read_text(encoding="utf-8"))
+        return {str(name): dict(state) for name, state in steps.items()}
+    except (OSError, ValueError, AttributeError, TypeError):  # none yet, or not ours: nothing is known
+        return {}
