@@ -1,0 +1,1 @@
+"""From a radio's log to ranges at places on the camera's path."""

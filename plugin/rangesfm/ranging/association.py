@@ -1,0 +1,214 @@
+"""Puts every range at its place on the camera's path."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from rangesfm.errors import InputError
+from rangesfm.options import AssociationOptions
+from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.observations import RangeObservations, RangeStatus
+from rangesfm.trajectory import Trajectory
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+# A spline through every second keyframe misses the others by this many times what one
+# through all keyframes misses in between: 16 for a smooth path (the error grows with the
+# fourth power of the gap), 4 for a jerky one (second power).
+_HALVING_GAIN = 6.0
+# Median length of a Gaussian vector in space, in stddevs of its coordinates.
+_MEDIAN_LENGTH = 1.538
+# Early and late halves of a burst must agree to this many stddevs before the camera counts as still.
+_MAX_STILL_DRIFT_STDDEVS = 2.0
+
+
+def associate(
+    log: RangeLog,
+    trajectory: Trajectory,
+    tag_in_cam_m: npt.ArrayLike,
+    *,
+    time_offset_s: float = 0.0,
+    options: AssociationOptions | None = None,
+    anchor_ids: Collection[str] | None = None,
+) -> RangeObservations:
+    """Find the camera pose at which each range was taken.
+
+    Between keyframes that are close in time the centre follows a cubic spline and the
+    rotation the shortest turn. Between keyframes further apart than
+    ``options.max_interpolation_gap_s`` a range belongs to the nearest keyframe, and only
+    if it is within ``max_time_difference_s`` or the ranges themselves show that the camera
+    stood still around its photos.
+
+    Args:
+        log: n ranges.
+        trajectory: keyframes; with times, unless the log names photos.
+        tag_in_cam_m: (3,) antenna in the camera (rig) frame, metres.
+        time_offset_s: image time = range time + offset.
+        anchor_ids: ranges to other anchors are kept with status UNKNOWN_ANCHOR; None: all are wanted.
+
+    Returns:
+        all n ranges, each with a place or a status that says why it has none.
+
+    Raises:
+        InputError: the log needs image times and there are none.
+    """
+    options = options or AssociationOptions()
+    status = np.full(len(log), RangeStatus.USED, dtype=np.int8)
+    if log.image_name is not None:
+        before, after, weight = _places_by_name(log.image_name, trajectory, status)
+    elif trajectory.timestamps_s is not None:
+        times = log.timestamp_s + time_offset_s if log.timestamp_s is not None else np.empty(0)
+        before, after, weight = _places_by_time(log, times, trajectory.timestamps_s, options, status)
+    else:
+        raise InputError("the log has timestamps but the photos have none: give image times", log.source)
+    if anchor_ids is not None:
+        wanted = np.array([anchor_id in anchor_ids for anchor_id in log.anchor_ids], dtype=bool)
+        status[(status == RangeStatus.USED) & ~wanted[log.anchor_index]] = RangeStatus.UNKNOWN_ANCHOR
+    return _observe(log, trajectory, np.asarray(tag_in_cam_m, dtype=np.float64), status, before, after, weight, options)
+
+
+def _places_by_name(
+    image_names: tuple[str, ...], trajectory: Trajectory, status: npt.NDArray[np.int8]
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Array]:
+    index_of = {name: index for index, name in enumerate(trajectory.image_names)}
+    keyframe = np.array([index_of.get(name, -1) for name in image_names], dtype=np.int64)
+    status[keyframe < 0] = RangeStatus.UNKNOWN_IMAGE
+    return keyframe, keyframe, np.zeros(len(keyframe))
+
+
+def _places_by_time(
+    log: RangeLog, times: Array, keyframe_times: Array, options: AssociationOptions, status: npt.NDArray[np.int8]
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Array]:
+    """Keyframes around each time, and the weight of the later one. Sets ``status`` where there is no place."""
+    last = len(keyframe_times) - 1
+    after = np.clip(np.searchsorted(keyframe_times, times), min(1, last), last)
+    before = np.maximum(after - 1, 0)
+    gap = keyframe_times[after] - keyframe_times[before]
+    weight = np.clip((times - keyframe_times[before]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
+    nearest = np.where(weight < 0.5, before, after)
+    distance = np.abs(times - keyframe_times[nearest])
+    inside = (times >= keyframe_times[0]) & (times <= keyframe_times[last])
+
+    at_keyframe = distance <= options.max_time_difference_s
+    interpolated = inside & (gap <= options.max_interpolation_gap_s)
+    lonely = ~interpolated & _keyframe_is_isolated(keyframe_times, options)[nearest]
+    still = lonely & _camera_is_still(log, nearest, distance, times, lonely, keyframe_times)
+    snapped = at_keyframe | (still & ~interpolated)
+
+    before, after = np.where(snapped, nearest, before), np.where(snapped, nearest, after)
+    weight = np.where(snapped, 0.0, weight)
+    no_place = ~(snapped | interpolated)
+    status[no_place] = np.where(inside[no_place], RangeStatus.NO_KEYFRAME_NEAR, RangeStatus.OUTSIDE_PATH)
+    return before, after, weight
+
+
+def _keyframe_is_isolated(keyframe_times: Array, options: AssociationOptions) -> Mask:
+    """(n,) keyframes with a gap on both sides: only there can standing still matter."""
+    long_gap = np.concatenate([[True], np.diff(keyframe_times) > options.max_interpolation_gap_s, [True]])
+    return np.asarray(long_gap[:-1] & long_gap[1:])
+
+
+def _camera_is_still(
+    log: RangeLog,
+    nearest: npt.NDArray[np.int64],
+    distance: Array,
+    times: Array,
+    candidates: Mask,
+    keyframe_times: Array,
+) -> Mask:
+    """(n,) whether ranges this far from an isolated photo were taken where the photo was.
+
+    A stop-and-go survey leaves bursts of ranges around each photo that do not change within
+    the burst. The early and the late half of every burst are compared by their medians; the
+    differences must not exceed what the noise within the halves explains.
+    """
+    still = np.zeros(len(times), dtype=bool)
+    # Half the median gap keeps a burst on its own side of the way to the next photo.
+    reach = 0.5 * float(np.median(np.diff(keyframe_times))) if len(keyframe_times) > 1 else np.inf
+    near = np.flatnonzero(candidates & (distance <= reach))
+    if len(near) < 8:
+        return still
+    key = nearest[near] * len(log.anchor_ids) + log.anchor_index[near]
+    order = near[np.lexsort((times[near], key))]
+    starts = np.flatnonzero(np.diff(np.sort(key), prepend=-1))
+    drifts, noises = [], []
+    for burst in np.split(log.range_m[order], starts[1:]):
+        if len(burst) >= 6:
+            early, late = np.array_split(burst, 2)
+            noise = 1.4826 * float(
+                np.median(np.abs(np.concatenate([early - np.median(early), late - np.median(late)])))
+            )
+            drifts.append((np.median(late) - np.median(early)) * np.sqrt(len(burst) / 4))
+            noises.append(noise)
+    if not drifts:
+        return still
+    # 1.25 is the price of a median over a mean.
+    drift_stddev = 1.4826 * float(np.median(np.abs(drifts)))
+    noise_stddev = 1.25 * max(float(np.median(noises)), 1e-3)
+    still[near] = drift_stddev <= _MAX_STILL_DRIFT_STDDEVS * noise_stddev
+    return still
+
+
+def _observe(
+    log: RangeLog,
+    trajectory: Trajectory,
+    tag_in_cam_m: Array,
+    status: npt.NDArray[np.int8],
+    before: npt.NDArray[np.int64],
+    after: npt.NDArray[np.int64],
+    weight: Array,
+    options: AssociationOptions,
+) -> RangeObservations:
+    """Evaluate the path at the places found."""
+    n = len(log)
+    placed = np.isin(status, (RangeStatus.USED, RangeStatus.UNKNOWN_ANCHOR))
+    before, after = np.where(placed, before, -1), np.where(placed, after, -1)
+    weight = np.where(placed, weight, 0.0)
+    centers, lever = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
+    offsets, stddev = np.zeros((n, 3)), np.zeros(n)
+
+    b, a, w = before[placed], after[placed], weight[placed]
+    linear = (1 - w)[:, None] * trajectory.centers[b] + w[:, None] * trajectory.centers[a]
+    turn = Rotation.from_matrix(np.swapaxes(trajectory.world_from_cam[b], 1, 2) @ trajectory.world_from_cam[a])
+    tag_in_before = Rotation.from_rotvec(w[:, None] * turn.as_rotvec()).apply(tag_in_cam_m) if len(w) else linear
+    lever[placed] = np.einsum("nij,nj->ni", trajectory.world_from_cam[b], tag_in_before)
+    curved = np.flatnonzero(placed)[(w > 0) & (a != b)]
+    if len(curved) and trajectory.timestamps_s is not None:
+        offsets[curved], stddev[curved] = _curve_beyond_line(
+            trajectory.timestamps_s, trajectory.centers, before[curved], weight[curved], options
+        )
+    centers[placed] = linear + offsets[placed]
+    return RangeObservations(log, status, before, after, weight, centers, offsets, lever, stddev)
+
+
+def _curve_beyond_line(
+    times: Array, centers: Array, before: npt.NDArray[np.int64], weight: Array, options: AssociationOptions
+) -> tuple[Array, Array]:
+    """What a cubic spline has beyond the chord at each place, and how far the spline can be trusted."""
+    offsets, stddev = np.zeros((len(before), 3)), np.zeros(len(before))
+    breaks = np.flatnonzero(np.diff(times) > options.max_interpolation_gap_s) + 1
+    for segment in np.split(np.arange(len(times)), breaks):
+        here = (before >= segment[0]) & (before < segment[-1])
+        if len(segment) < 4 or not here.any():
+            continue
+        b, w = before[here], weight[here][:, None]
+        at = times[b] + weight[here] * (times[b + 1] - times[b])
+        offsets[here] = CubicSpline(times[segment], centers[segment])(at) - ((1 - w) * centers[b] + w * centers[b + 1])
+        # The error vanishes at the keyframes and is largest half-way.
+        stddev[here] = _spline_error(times[segment], centers[segment]) * (4 * weight[here] * (1 - weight[here]))
+    return offsets, stddev
+
+
+def _spline_error(times: Array, centers: Array) -> float:
+    """Stddev (each coordinate) half-way between keyframes, from how well every second one predicts the others."""
+    if len(times) < 8:
+        return 0.0
+    missed = CubicSpline(times[::2], centers[::2])(times[1:-1:2]) - centers[1:-1:2]
+    # Of lengths, so that it does not depend on how the world's axes lie.
+    return float(np.median(np.linalg.norm(missed, axis=1))) / (_MEDIAN_LENGTH * _HALVING_GAIN)

@@ -1,0 +1,97 @@
+"""RangeObservations: every range of a log with its place on the path, or the reason why it has none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import IntEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.ranging.log import RangeLog
+
+
+class RangeStatus(IntEnum):
+    """What became of a range. Everything but the first two is left out of every estimate."""
+
+    USED = 0
+    DOWN_WEIGHTED = 1
+    OUTLIER = 2
+    NO_KEYFRAME_NEAR = 3
+    OUTSIDE_PATH = 4
+    UNKNOWN_IMAGE = 5
+    UNKNOWN_ANCHOR = 6
+    CHECK = 7
+
+    @property
+    def label(self) -> str:
+        return self.name.lower().replace("_", "-")
+
+
+@dataclass(frozen=True)
+class RangeObservations:
+    """n ranges (all of the log, in its order) on the path of one model.
+
+    The antenna of range i is at ``centers[i] + tag_from_center[i]``, both turned with the
+    model's world; centers are in the world's unit, the lever arm is metric, so that a
+    similarity scales the first and never the second. Centers are interpolated between the
+    keyframes ``before`` and ``after``:
+    ``(1 - weight) * c_before + weight * c_after + center_offsets``; the offset is what a
+    curved path has beyond the straight line.
+
+    Attributes:
+        log: the ranges.
+        status: (n,) RangeStatus.
+        before, after: (n,) int, keyframes in the trajectory; -1 without a place.
+        weight: (n,) in [0, 1].
+        centers: (n, 3) camera centres, model units; NaN without a place.
+        center_offsets: (n, 3) model units.
+        tag_from_center: (n, 3) lever arm turned into the world, metres.
+        center_stddev: (n,) of the interpolated centre, each coordinate, model units; 0 at a keyframe.
+    """
+
+    log: RangeLog
+    status: npt.NDArray[np.int8]
+    before: npt.NDArray[np.int64]
+    after: npt.NDArray[np.int64]
+    weight: npt.NDArray[np.float64]
+    centers: npt.NDArray[np.float64]
+    center_offsets: npt.NDArray[np.float64]
+    tag_from_center: npt.NDArray[np.float64]
+    center_stddev: npt.NDArray[np.float64]
+
+    @property
+    def has_place(self) -> npt.NDArray[np.bool_]:
+        """(n,) ranges that estimates may use: on the path, of a wanted anchor, not held out."""
+        return np.asarray(self.status <= RangeStatus.OUTLIER)
+
+
+def hold_out(observations: RangeObservations, share: float, seed: int) -> RangeObservations:
+    """Set a random share of the usable ranges aside as checks."""
+    status = observations.status.copy()
+    usable = np.flatnonzero(observations.has_place)
+    status[np.random.default_rng(seed).permutation(usable)[: round(share * len(usable))]] = RangeStatus.CHECK
+    return replace(observations, status=status)
+
+
+# Robust weights below which a range counts as down-weighted, or has no say to speak of.
+DOWN_WEIGHTED_BELOW = 0.5
+OUTLIER_BELOW = 0.1
+
+
+# A Cauchy loss of this width (in stddevs) keeps 95 % efficiency under Gaussian noise.
+CAUCHY_WIDTH = 2.385
+
+
+def robust_weights(scaled_residuals: npt.NDArray[np.float64], width: float = CAUCHY_WIDTH) -> npt.NDArray[np.float64]:
+    """(n,) weights of a Cauchy loss in (0, 1], for residuals in stddevs."""
+    weights: npt.NDArray[np.float64] = 1 / (1 + (scaled_residuals / width) ** 2)
+    return weights
+
+
+def status_by_weight(weights: npt.NDArray[np.float64]) -> npt.NDArray[np.int8]:
+    """(n,) status of ranges that took part in an estimate, by their final robust weight in [0, 1]."""
+    status = np.full(len(weights), RangeStatus.USED, dtype=np.int8)
+    status[weights < DOWN_WEIGHTED_BELOW] = RangeStatus.DOWN_WEIGHTED
+    status[weights < OUTLIER_BELOW] = RangeStatus.OUTLIER
+    return status

@@ -1,0 +1,69 @@
+"""The canonical CSV: ``timestamp_s,anchor_id,range_m[,tag_id,range_stddev_m,los]``.
+
+``image_name`` may take the place of ``timestamp_s``; where both stand, the time counts.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from rangesfm.errors import InputError
+from rangesfm.files import new_file
+from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
+from rangesfm.ranging.readers.columns import Columns, read_columns
+from rangesfm.ranging.readers.reader import Reader, ReadOptions
+from rangesfm.tables import header_names, read_head
+
+_BY_TIME = Columns(
+    required={"timestamp": "timestamp_s", "anchor_id": "anchor_id", "range": "range_m"},
+    optional={"tag_id": "tag_id", "range_stddev": "range_stddev_m", "los": "los"},
+)
+_BY_IMAGE = replace(_BY_TIME, required={"image_name": "image_name", "anchor_id": "anchor_id", "range": "range_m"})
+
+
+def write_ranges_csv(log: RangeLog, path: str | Path) -> None:
+    """Write ``log`` as canonical CSV; optional columns only where the log says anything.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    columns: dict[str, Iterable[str]] = {}
+    if log.timestamp_s is not None:
+        columns["timestamp_s"] = map(repr, log.timestamp_s.tolist())
+    else:
+        columns["image_name"] = log.image_name or ()
+    columns["anchor_id"] = (log.anchor_ids[index] for index in log.anchor_index)
+    columns["range_m"] = map(repr, log.range_m.tolist())
+    if log.tag_ids != (DEFAULT_TAG_ID,):
+        columns["tag_id"] = (log.tag_ids[index] for index in log.tag_index)
+    if not np.all(np.isnan(log.range_stddev_m)):
+        columns["range_stddev_m"] = ("" if np.isnan(stddev) else repr(stddev) for stddev in log.range_stddev_m.tolist())
+    if np.any(log.los >= 0):
+        columns["los"] = ("" if los < 0 else str(los) for los in log.los)
+    try:
+        with new_file(Path(path)) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(columns)
+            writer.writerows(zip(*columns.values()))
+    except OSError as error:
+        raise InputError(f"cannot be written ({error.strerror})", path) from error
+
+
+def _recognizes(head: str) -> bool:
+    return not {"anchor_id", "range_m"}.isdisjoint(header_names(head))
+
+
+def _read(path: Path, options: ReadOptions) -> RangeLog:
+    if options.columns or options.timestamp_unit not in (None, "s") or options.range_unit not in (None, "m"):
+        raise InputError("the canonical CSV has fixed columns in seconds and metres; use format 'mapped'", path)
+    names = header_names(read_head(path), options.separator)
+    columns = _BY_IMAGE if "image_name" in names and "timestamp_s" not in names else _BY_TIME
+    return read_columns(path, replace(columns, separator=options.separator), READER.name, options.anchor_ids)
+
+
+READER = Reader("canonical", "CSV with the columns timestamp_s (or image_name), anchor_id, range_m", _recognizes, _read)

@@ -1,0 +1,53 @@
+"""What a reader of one log format is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.twr import StampOptions
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """What the user says about a log; None and empty: what the format says.
+
+    Attributes:
+        columns: name in the file of each quantity (``columns.QUANTITIES``).
+        timestamp_unit: s, ms, us, ns or iso.
+        range_unit: m, cm or mm.
+        separator: between cells; a blank means any run of blanks.
+        anchor_ids: known anchors, which tell tags from anchors where the log does not.
+        ranging_interval_s: time between two rounds, of radios that count them instead of telling times.
+        stamps: how time stamps of two-way ranging become ranges.
+    """
+
+    columns: Mapping[str, str] = field(default_factory=dict)
+    timestamp_unit: str | None = None
+    range_unit: str | None = None
+    separator: str | None = None
+    anchor_ids: frozenset[str] = frozenset()
+    ranging_interval_s: float | None = None
+    stamps: StampOptions = field(default_factory=StampOptions)
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One log format. What ``read`` and ``read_anchors`` find wrong is an InputError.
+
+    Attributes:
+        name: by which the user asks for it.
+        description: for the message that lists the formats.
+        recognizes: whether the beginning of a file looks like this format.
+        read: the whole file.
+        read_anchors: the anchors whose positions the log tells; None: this format tells none.
+    """
+
+    name: str
+    description: str
+    recognizes: Callable[[str], bool]
+    read: Callable[[Path, ReadOptions], RangeLog]
+    read_anchors: Callable[[Path], tuple[Anchor, ...]] | None = None

@@ -1,0 +1,96 @@
+"""ROS 1 and ROS 2 bags, through the optional package rosbags."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rangesfm.errors import InputError
+from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.readers.printed import check_only_time_is_described
+from rangesfm.ranging.readers.reader import Reader, ReadOptions
+from rangesfm.ranging.readers.records import Records
+from rangesfm.ranging.readers.roles import tag_and_anchor
+from rangesfm.ranging.readers.ros_messages import RANGES_IN, MessageRange
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+
+_BEGINS = ("#ROSBAG V", "SQLite format 3\0")
+_MCAP = "MCAP0"
+
+
+def is_bag_folder(path: Path) -> bool:
+    """Whether this is the folder of a ROS 2 bag."""
+    return (path / "metadata.yaml").is_file()
+
+
+def _recognizes(head: str) -> bool:
+    return head.startswith(_BEGINS) or head[1:6] == _MCAP
+
+
+def _read(path: Path, options: ReadOptions) -> RangeLog:
+    check_only_time_is_described(path, options)
+    if not path.exists():
+        raise InputError("no such file", path)
+    try:
+        from rosbags.highlevel import AnyReader
+    except ImportError:
+        raise InputError(
+            "reading a ROS bag needs the package rosbags: python -m pip install 'rangesfm[ros]'", path
+        ) from None
+    number, ranges = [], []
+    try:
+        with AnyReader([path]) as bag:
+            for message_number, found in _ranges(bag, path):
+                number.append(message_number)
+                ranges.append(found)
+    except InputError:
+        raise
+    except Exception as error:  # whatever a broken bag makes its parsers do
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"cannot be read as a ROS bag ({text})", path) from error
+    return _to_log(path, number, ranges, options.anchor_ids)
+
+
+def _ranges(bag: AnyReader, path: Path) -> Iterator[tuple[int, MessageRange]]:
+    """The ranges in all messages that hold any, each with the 1-based number of its message."""
+    connections = [connection for connection in bag.connections if _type_name(connection.msgtype) in RANGES_IN]
+    if not connections:
+        found = ", ".join(sorted({connection.msgtype for connection in bag.connections})) or "no messages"
+        raise InputError(f"no ranges in this bag; it has {found}, expected one of {', '.join(RANGES_IN)}", path)
+    for number, (connection, received_ns, data) in enumerate(bag.messages(connections), 1):
+        message = bag.deserialize(data, connection.msgtype)
+        try:
+            found_ranges = list(RANGES_IN[_type_name(connection.msgtype)](message))
+        except AttributeError as error:
+            raise InputError(f"a {connection.msgtype} has another definition than expected ({error})", path) from None
+        for found_range in found_ranges:
+            yield number, found_range._replace(time_s=found_range.time_s or received_ns * 1e-9)
+
+
+def _to_log(path: Path, number: list[int], ranges: list[MessageRange], known_anchor_ids: frozenset[str]) -> RangeLog:
+    tag_ids, anchor_ids = tag_and_anchor(
+        [found.tag_id for found in ranges], [found.anchor_id for found in ranges], known_anchor_ids
+    )
+    records = Records()
+    for message_number, found, tag_id, anchor_id in zip(number, ranges, tag_ids, anchor_ids):
+        records.add(
+            found.time_s or 0.0,
+            anchor_id,
+            float(found.range_m),
+            message_number,
+            tag_id=tag_id,
+            range_stddev_m=float(found.range_stddev_m or math.nan),
+            los=found.los,
+        )
+    return records.to_log(path, READER.name)
+
+
+def _type_name(message_type: str) -> str:
+    return message_type.rpartition("/")[2]
+
+
+READER = Reader("ros", f"ROS 1 or ROS 2 bag with {', '.join(RANGES_IN)}", _recognizes, _read)

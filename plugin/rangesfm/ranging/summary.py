@@ -1,0 +1,128 @@
+"""What is in a radio log, in a few numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.noise_of_log import estimate_noise_m
+from rangesfm.ranging.quantization import find_quantization_m, quantization_stddev_m
+
+
+@dataclass(frozen=True)
+class AnchorSummary:
+    """The ranges to one anchor; without times, or with too few ranges, the last two are None.
+
+    Attributes:
+        num: ranges.
+        min_m, median_m, max_m: of them.
+        largest_gap_s: longest time without any.
+        noise_stddev_m: estimated from the log itself, at least that of its rounding.
+    """
+
+    anchor_id: str
+    num: int
+    min_m: float
+    median_m: float
+    max_m: float
+    largest_gap_s: float | None
+    noise_stddev_m: float | None
+
+
+@dataclass(frozen=True)
+class RangeSummary:
+    """A log as a whole; times are None where it has image names instead.
+
+    Attributes:
+        num: ranges.
+        num_no_measurement: records that said that there was none.
+        num_duplicates: ranges that stand in the log already: same time, tag, anchor and range.
+        num_out_of_order: ranges that are earlier than the one before them.
+        num_between_anchors: ranges whose tag is an anchor of others.
+        quantization_m: suspected step of all ranges; None if there is none.
+        start_s, end_s: first and last time on the radio's clock.
+        rate_hz: ranges a second over the whole span.
+        largest_gap_s: longest time without a range to any anchor.
+        anchors: in the order of their first appearance.
+    """
+
+    format: str
+    num: int
+    num_no_measurement: int
+    num_duplicates: int
+    num_out_of_order: int
+    num_between_anchors: int
+    quantization_m: float | None
+    tag_ids: tuple[str, ...]
+    start_s: float | None
+    end_s: float | None
+    rate_hz: float | None
+    largest_gap_s: float | None
+    anchors: tuple[AnchorSummary, ...]
+
+
+def summarize_ranges(log: RangeLog) -> RangeSummary:
+    """Count and measure what a log holds."""
+    start = end = rate = None
+    if log.timestamp_s is not None and len(log):
+        start, end = float(log.timestamp_s.min()), float(log.timestamp_s.max())
+        rate = (len(log) - 1) / (end - start) if end > start else None
+    quantization = find_quantization_m(log.range_m)
+    return RangeSummary(
+        format=log.format,
+        num=len(log),
+        num_no_measurement=log.num_no_measurement,
+        num_duplicates=_num_duplicates(log),
+        num_out_of_order=0 if log.timestamp_s is None else int(np.count_nonzero(np.diff(log.timestamp_s) < 0)),
+        num_between_anchors=int(np.count_nonzero(np.isin(log.tag_ids, log.anchor_ids)[log.tag_index])),
+        quantization_m=quantization,
+        tag_ids=log.tag_ids,
+        start_s=start,
+        end_s=end,
+        rate_hz=rate,
+        largest_gap_s=_largest_gap(log.timestamp_s),
+        anchors=tuple(_summarize_anchor(log, index, quantization) for index in range(len(log.anchor_ids))),
+    )
+
+
+def _summarize_anchor(log: RangeLog, index: int, quantization_m: float | None) -> AnchorSummary:
+    mine = log.anchor_index == index
+    ranges = log.range_m[mine]
+    return AnchorSummary(
+        anchor_id=log.anchor_ids[index],
+        num=len(ranges),
+        min_m=float(ranges.min()),
+        median_m=float(np.median(ranges)),
+        max_m=float(ranges.max()),
+        largest_gap_s=_largest_gap(None if log.timestamp_s is None else log.timestamp_s[mine]),
+        noise_stddev_m=_noise(log, mine, quantization_m),
+    )
+
+
+def _noise(log: RangeLog, mine: npt.NDArray[np.bool_], quantization_m: float | None) -> float | None:
+    """Of the tag with the most ranges to this anchor: each tag moves by itself."""
+    if log.timestamp_s is None:
+        return None
+    mine = mine & (log.tag_index == np.argmax(np.bincount(log.tag_index[mine])))
+    noise = estimate_noise_m(log.timestamp_s[mine], log.range_m[mine])
+    if noise is None or quantization_m is None:
+        return noise
+    return max(noise, quantization_stddev_m(quantization_m))
+
+
+def _num_duplicates(log: RangeLog) -> int:
+    if log.timestamp_s is None:
+        return 0
+    columns = (log.timestamp_s, log.anchor_index, log.tag_index, log.range_m)
+    order = np.lexsort(columns)
+    same = np.logical_and.reduce([np.diff(column[order]) == 0 for column in columns])
+    return int(np.count_nonzero(same))
+
+
+def _largest_gap(timestamps_s: npt.NDArray[np.float64] | None) -> float | None:
+    if timestamps_s is None or len(timestamps_s) < 2:
+        return None
+    return float(np.diff(np.sort(timestamps_s)).max())

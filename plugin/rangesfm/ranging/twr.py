@@ -1,0 +1,132 @@
+"""Ranges from the time stamps of two-way ranging.
+
+An initiator A and a responder B each stamp what they send (tx) and receive (rx) by their own clocks,
+which run at slightly different rates and wrap around.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.errors import InputError
+
+VACUUM_M_PER_S = 299_792_458.0
+AIR_M_PER_S = 299_702_547.0  # refractive index 1.0003, as radio firmware assumes
+DW1000_TICK_S = 1 / (499.2e6 * 128)
+_MAX_RATE_DIFFERENCE = 1e-3  # fifty times what crystals of 20 ppm can do
+
+
+@dataclass(frozen=True)
+class StampOptions:
+    """How stamps become metres.
+
+    Attributes:
+        unit_s: seconds in one unit of the stamps.
+        wrap_s: where the counter starts anew. A divisor of it does as well if all intervals are shorter:
+            the 32-bit default also serves DW1000's 40 bits, up to 67 ms.
+        propagation_speed_m_per_s: of the signal.
+        t_off_s: what all delays of both devices together add to a round trip.
+    """
+
+    unit_s: float = 1e-9
+    wrap_s: float = 2**32 * DW1000_TICK_S
+    propagation_speed_m_per_s: float = AIR_M_PER_S
+    t_off_s: float = 0.0
+
+    def interval_s(self, later: npt.ArrayLike, earlier: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """Seconds from ``earlier`` to ``later`` on one clock, in [0, wrap_s)."""
+        wrap = self.wrap_s / self.unit_s
+        interval = np.mod(np.asarray(later, np.float64) - np.asarray(earlier, np.float64), wrap)
+        return np.asarray(interval * self.unit_s, np.float64)
+
+
+def range_from_round_trips(
+    round_trip_s: npt.ArrayLike, *, t_off_s: float = 0.0, propagation_speed_m_per_s: float = AIR_M_PER_S
+) -> npt.NDArray[np.float64]:
+    """Range from repeated round trips: d = c/2 (mean round-trip time - t_off), Lee et al. 2018.
+
+    Args:
+        round_trip_s: (..., k) times from sending to receiving the answer, without the responder's known
+            delay; NaN where a repetition failed.
+
+    Returns:
+        (...,) metres; NaN where all repetitions failed.
+    """
+    times = np.asarray(round_trip_s, np.float64)
+    valid = ~np.isnan(times)
+    num = valid.sum(axis=-1)
+    mean = np.where(num > 0, np.where(valid, times, 0).sum(axis=-1) / np.maximum(num, 1), np.nan)
+    return np.asarray(propagation_speed_m_per_s / 2 * (mean - t_off_s), np.float64)
+
+
+def single_sided_range(
+    tx1: npt.ArrayLike,
+    rx1: npt.ArrayLike,
+    tx2: npt.ArrayLike,
+    rx2: npt.ArrayLike,
+    options: StampOptions,
+    *,
+    rate_of_a: npt.ArrayLike = 1.0,
+) -> npt.NDArray[np.float64]:
+    """Range from A's poll (tx1, rx1) and B's answer (tx2, rx2), (n,) metres.
+
+    Args:
+        rate_of_a: how fast A's clock runs, in B's seconds; its error times B's delay goes into the range.
+    """
+    round_trip_s = options.interval_s(rx2, tx1) - np.asarray(rate_of_a) * options.interval_s(tx2, rx1)
+    return _range(round_trip_s, options)
+
+
+def double_sided_range(
+    tx1: npt.ArrayLike,
+    rx1: npt.ArrayLike,
+    tx2: npt.ArrayLike,
+    rx2: npt.ArrayLike,
+    tx3: npt.ArrayLike,
+    rx3: npt.ArrayLike,
+    options: StampOptions,
+) -> npt.NDArray[np.float64]:
+    """Range from A's poll, B's answer and a third message, free of the clocks' different rates, (n,) metres.
+
+    The third message tells the rates apart, whoever sent it; the stamps themselves show who that was.
+    From B it measures the rate of A's clock by B's: (rx3 - rx2) / (tx3 - tx2). From A it closes a second
+    round trip: time of flight = (Ra Rb - Da Db) / (Ra + Rb + Da + Db) (Neirynck, Luk and McLaughlin 2016).
+
+    Raises:
+        InputError: the stamps fit neither: their unit or wrap is another.
+    """
+    from_b_by_a, from_b_by_b = options.interval_s(rx3, rx2), options.interval_s(tx3, tx2)
+    delay_a, round_b = options.interval_s(tx3, rx2), options.interval_s(rx3, tx2)
+    if _same_duration(from_b_by_a, from_b_by_b):
+        rate_of_a = from_b_by_a / np.where(from_b_by_b > 0, from_b_by_b, np.nan)
+        return single_sided_range(tx1, rx1, tx2, rx2, options, rate_of_a=rate_of_a)
+    if _same_duration(delay_a, round_b):
+        round_a, delay_b = options.interval_s(rx2, tx1), options.interval_s(tx2, rx1)
+        total = round_a + round_b + delay_a + delay_b
+        round_trip_s = 2 * (round_a * round_b - delay_a * delay_b) / np.where(total > 0, total, np.nan)
+        return _range(round_trip_s, options)
+    raise InputError(
+        "the time stamps tx3, rx3 fit no third message: their unit or the wrap of the counter is another than "
+        f"{options.unit_s:g} s and {options.wrap_s:g} s"
+    )
+
+
+def _same_duration(one_s: npt.NDArray[np.float64], other_s: npt.NDArray[np.float64]) -> bool:
+    """Whether most intervals are the same on both clocks, as far as crystals agree."""
+    both = np.isfinite(one_s) & np.isfinite(other_s) & (other_s > 0)
+    if not np.any(both):
+        return False
+    return bool(np.median(np.abs(one_s[both] / other_s[both] - 1)) < _MAX_RATE_DIFFERENCE)
+
+
+def _range(round_trip_s: npt.NDArray[np.float64], options: StampOptions) -> npt.NDArray[np.float64]:
+    """A round trip is far shorter than the wrap: what seems almost a whole wrap is a little less than nothing."""
+    signed = np.mod(round_trip_s + options.wrap_s / 2, options.wrap_s) - options.wrap_s / 2
+    return range_from_round_trips(
+        signed[..., np.newaxis],
+        t_off_s=options.t_off_s,
+        propagation_speed_m_per_s=options.propagation_speed_m_per_s,
+    )
