@@ -1,0 +1,1 @@
+"""From ranges and an unscaled path to metres per SfM unit."""

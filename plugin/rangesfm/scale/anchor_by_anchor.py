@@ -1,0 +1,112 @@
+"""Each anchor on its own: where it is, and what scale it alone would give."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.geometry import IDENTITY, Similarity
+from rangesfm.ranging.anchors import AnchorEstimate
+from rangesfm.scale.problem import SurveyProblem
+from rangesfm.scale.range_equation import RangeProblem, RangeState, solve
+from rangesfm.scale.solution import MIN_COST_GAP, Solution
+from rangesfm.scale.starts import anchor_alone, choose_sides, mirrored, spread_subset
+
+Array = npt.NDArray[np.float64]
+
+_MIN_RANGES_ALONE = 8
+_MAX_RANGES_ALONE = 3000
+# An anchor that leaves the logarithm of the scale this open has no say of its own.
+_MAX_LOG_SCALE_STDDEV = 0.5
+
+
+def scale_per_anchor(solution: Solution, anchor_ids: tuple[str, ...]) -> dict[str, float]:
+    """Scale from the ranges of one anchor at a time, by id.
+
+    A known anchor stretches the path about its centre (about the first camera where that is
+    the frame's origin); an unknown one is estimated along with the scale.
+    """
+    scales = {}
+    for k, anchor_id in enumerate(anchor_ids):
+        problem, start = _one_anchor(solution, k)
+        if len(problem.range_m) < _MIN_RANGES_ALONE:
+            continue
+        fit = solve(problem, start)
+        if fit.log_scale_stddev * solution.inflation < _MAX_LOG_SCALE_STDDEV:
+            scales[anchor_id] = fit.state.metric_from_model.scale
+    return scales
+
+
+def _one_anchor(solution: Solution, k: int) -> tuple[RangeProblem, RangeState]:
+    problem, state = solution.problem, solution.fit.state
+    placed = state.metric_from_model
+    middle = problem.centers.mean(axis=0) if problem.frame_is_free else np.zeros(3)
+    part = problem.subset(np.flatnonzero(problem.anchor_index == k))
+    alone = replace(
+        part,
+        centers=part.centers - middle,
+        anchor_index=np.zeros(len(part.range_m), dtype=np.int64),
+        anchor_mean_m=problem.anchor_mean_m[k : k + 1],
+        anchor_stddev_m=problem.anchor_stddev_m[k : k + 1],
+        bias_mean_m=problem.bias_mean_m[k : k + 1],
+        bias_stddev_m=problem.bias_stddev_m[k : k + 1],
+        frame_is_free=False,
+    )
+    start = RangeState(
+        Similarity(placed.scale, placed.rotation, placed.apply(middle)),
+        state.anchors_m[k : k + 1],
+        state.bias_m[k : k + 1],
+    )
+    return spread_subset(alone, _MAX_RANGES_ALONE), start
+
+
+def anchor_estimates(
+    survey: SurveyProblem, solution: Solution, anchor_ids: tuple[str, ...]
+) -> tuple[AnchorEstimate, ...]:
+    """All anchors of the log, with stddev widened by the errors' correlation, and mirror places."""
+    problem, state = solution.problem, solution.fit.state
+    stddev = solution.fit.anchor_stddev_m() * solution.inflation
+    mirrors = _mirror_places(solution)
+    common_bias_m = _common_bias(problem, state)
+    estimates = []
+    for k, anchor_id in enumerate(anchor_ids):
+        known = bool(np.isfinite(problem.anchor_mean_m[k]).all())
+        heard = bool(np.any(problem.anchor_index == k))
+        estimates.append(
+            AnchorEstimate(
+                anchor_id=anchor_id,
+                position_m=state.anchors_m[k] if heard else problem.anchor_mean_m[k],
+                position_stddev_m=float(stddev[k]),
+                prior_position_m=problem.anchor_mean_m[k] if known else None,
+                prior_position_stddev_m=float(problem.anchor_stddev_m[k]),
+                range_bias_m=float(state.bias_m[k]),
+                prior_bias_m=float(problem.bias_mean_m[k]) + common_bias_m,
+                prior_bias_stddev_m=float(problem.bias_stddev_m[k] * solution.inflation),
+                mirror_position_m=mirrors.get(k),
+            )
+        )
+    return tuple(estimates)
+
+
+def _common_bias(problem: RangeProblem, state: RangeState) -> float:
+    """What the free biases share, beyond their prior means: its most likely value given them."""
+    free = problem.bias_stddev_m > 0
+    if not free.any() or problem.common_bias_stddev_m == 0:
+        return 0.0
+    weights = 1 / problem.bias_stddev_m[free] ** 2
+    off = (state.bias_m - problem.bias_mean_m)[free]
+    return float(weights @ off / (weights.sum() + 1 / problem.common_bias_stddev_m**2))
+
+
+def _mirror_places(solution: Solution) -> dict[int, Array]:
+    """Unknown anchors that the ranges allow on the other side of the path's plane as well."""
+    problem, state = solution.problem, solution.fit.state
+    _, rise = choose_sides(spread_subset(problem, _MAX_RANGES_ALONE), state)
+    places: dict[int, Array] = {}
+    for k in np.flatnonzero(rise / solution.inflation**2 < MIN_COST_GAP):
+        alone = anchor_alone(problem, int(k), state.metric_from_model)
+        start = RangeState(IDENTITY, mirrored(problem, state, int(k))[None], state.bias_m[k : k + 1])
+        places[int(k)] = solve(alone, start).state.anchors_m[0]
+    return places

@@ -1,0 +1,129 @@
+"""Scale initialisation: ranges and an unscaled path to metres per SfM unit, with its error."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.errors import GeometryError
+from rangesfm.geometry import Similarity
+from rangesfm.options import RangeModelOptions, ScaleOptions
+from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.observations import RangeObservations, RangeStatus, status_by_weight
+from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
+from rangesfm.scale.estimate import ScaleEstimate
+from rangesfm.scale.problem import survey_problem
+from rangesfm.scale.solution import Solution, solve_survey
+from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
+from rangesfm.scale.uncertainty import scale_uncertainty
+from rangesfm.scale.verdict import judge
+from rangesfm.trajectory import Trajectory
+
+Array = npt.NDArray[np.float64]
+
+
+def initialize_scale(
+    observations: RangeObservations,
+    trajectory: Trajectory,
+    anchors: Sequence[Anchor],
+    *,
+    anchor_frame: str,
+    options: ScaleOptions | None = None,
+    range_model: RangeModelOptions | None = None,
+    seed: int = 0,
+) -> ScaleEstimate:
+    """Estimate scale and frame of an unscaled path from ranges.
+
+    Args:
+        observations: ranges on ``trajectory``.
+        trajectory: the unscaled path.
+        anchors: every anchor of the log, with what is known of it.
+        anchor_frame: "site" (positions in a site frame: the map is carried there),
+            "first_camera" (positions in the first keyframe's camera frame, metres) or
+            "unknown" (positions are ignored; the map stays in the first camera's frame).
+
+    Raises:
+        InputError: the log has an anchor that is not given.
+        GeometryError: the scale, or the place in the site frame, is not determined.
+    """
+    options, range_model = options or ScaleOptions(), range_model or RangeModelOptions()
+    survey = survey_problem(observations, trajectory, anchors, anchor_frame, range_model)
+    blocks = _time_blocks(observations, survey.rows, options.bootstrap_block_s)
+    solution = solve_survey(
+        survey.ranges,
+        anchors_are_known=survey.anchors_are_known,
+        center_stddev=observations.center_stddev[survey.rows],
+        noise_stddev_m=_given_noise(observations, survey.rows, range_model),
+        groups=blocks * survey.ranges.num_anchors + survey.ranges.anchor_index,
+        seed=seed,
+    )
+    table = _paper_table(solution)
+    uncertainty = scale_uncertainty(
+        solution.problem, solution.fit, blocks, num_bootstrap=options.num_bootstrap, seed=seed
+    )
+    per_anchor = scale_per_anchor(solution, observations.log.anchor_ids)
+    found = anchor_estimates(survey, solution, observations.log.anchor_ids)
+    verdict, reasons = judge(survey, solution, uncertainty, per_anchor, found, options)
+    if options.method == "two-candidate":
+        robust = solution.fit.state.metric_from_model.scale
+        verdict = "doubtful"
+        reasons = (f"two-candidate, as asked for; the stddevs are of the robust scale, {robust:.6g}", *reasons)
+    status, stddev = observations.status.copy(), np.full(len(observations.log), np.nan)
+    status[observations.has_place] = RangeStatus.UNKNOWN_ANCHOR
+    status[survey.rows] = status_by_weight(solution.fit.weights)
+    stddev[survey.rows] = solution.problem.stddev_m
+    return ScaleEstimate(
+        metric_from_sfm=_by_method(options.method, solution, table) @ survey.first_camera_from_sfm,
+        frame=survey.frame,
+        method=options.method,
+        uncertainty=uncertainty,
+        verdict=verdict,
+        reasons=reasons,
+        per_anchor=per_anchor,
+        two_candidate=table,
+        anchors=found,
+        observations=replace(observations, status=status),
+        range_stddev_m=stddev,
+        correlation_inflation=solution.inflation,
+        noise_stddev_m=solution.noise_stddev_m,
+    )
+
+
+def _time_blocks(observations: RangeObservations, rows: npt.NDArray[np.int64], block_s: float) -> npt.NDArray[np.int64]:
+    """(k,) labels of stretches of time; photos, where ranges are tied to photos by name."""
+    times = observations.log.timestamp_s
+    if times is None:
+        return observations.before[rows]
+    since = times[rows] - times[rows].min()
+    # At least eight blocks, or there is nothing to resample in a short log.
+    length = max(min(block_s, float(since.max()) / 8), 1e-9)
+    blocks: npt.NDArray[np.int64] = np.floor(since / length).astype(np.int64)
+    return blocks
+
+
+def _given_noise(observations: RangeObservations, rows: npt.NDArray[np.int64], range_model: RangeModelOptions) -> Array:
+    """(k,) stddev from the log, else from the options, else NaN: to be estimated."""
+    given = observations.log.range_stddev_m[rows]
+    default = np.nan if range_model.range_stddev_m is None else range_model.range_stddev_m
+    return np.where(np.isfinite(given), given, default)
+
+
+def _paper_table(solution: Solution) -> TwoCandidate | None:
+    """The paper's duplets, with the anchors carried into the first camera's frame."""
+    state, problem = solution.fit.state, solution.problem
+    placed = state.metric_from_model
+    anchors = (state.anchors_m - placed.translation) @ placed.rotation
+    return two_candidate(problem.centers, problem.tag_from_center, anchors[problem.anchor_index], problem.range_m)
+
+
+def _by_method(method: str, solution: Solution, table: TwoCandidate | None) -> Similarity:
+    """metric_from_first_camera, its scale by the method asked for."""
+    robust = solution.fit.state.metric_from_model
+    if method == "robust":
+        return robust
+    if table is None or not table.scale > 0:
+        raise GeometryError("two-candidate found no positive scale: use the robust method")
+    return replace(robust, scale=table.scale)

@@ -1,0 +1,148 @@
+"""The range problem of a survey: observations and anchors in the first camera's frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.errors import GeometryError, InputError
+from rangesfm.geometry import Similarity, path_shape
+from rangesfm.options import RangeModelOptions
+from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.observations import RangeObservations
+from rangesfm.scale.noise import short_range_stddev
+from rangesfm.scale.range_equation import RangeProblem
+from rangesfm.trajectory import Trajectory
+
+Array = npt.NDArray[np.float64]
+
+_START_STDDEV_M = 0.1
+_MIN_RANGES = 8
+_MIN_KEYFRAMES = 4
+# A place of its own takes three numbers, and one range more to see that they fit.
+_MIN_RANGES_OF_UNKNOWN = 5
+# Anchors closer to a line than this share of their extent leave the turn about it open.
+_COLLINEAR = 0.02
+
+
+@dataclass(frozen=True)
+class SurveyProblem:
+    """A RangeProblem and how it hangs on the survey.
+
+    Attributes:
+        ranges: the problem; its model world is the first camera's frame, unscaled.
+        rows: (k,) which observations its ranges are.
+        first_camera_from_sfm: rigid motion from the world of the unscaled model.
+        frame: "site" or "first_camera": the metric world of the solution.
+        anchors_are_known: whether the scale can lean on given anchor positions.
+        notes: what was not possible, for the user.
+    """
+
+    ranges: RangeProblem
+    rows: npt.NDArray[np.int64]
+    first_camera_from_sfm: Similarity
+    frame: str
+    anchors_are_known: bool
+    notes: tuple[str, ...]
+
+
+def survey_problem(
+    observations: RangeObservations,
+    trajectory: Trajectory,
+    anchors: Sequence[Anchor],
+    anchor_frame: str,
+    range_model: RangeModelOptions,
+) -> SurveyProblem:
+    """Set up the estimation.
+
+    Raises:
+        InputError: an anchor of the log has no place in ``anchors``.
+        GeometryError: too few ranges have a place on the path.
+    """
+    log = observations.log
+    in_log = _anchors_of_log(log.anchor_ids, anchors)
+    given = np.array([a.position_m is not None for a in in_log], dtype=bool) & (anchor_frame != "unknown")
+    rows, heard = _usable_ranges(observations, given)
+    known, notes = _usable_positions(in_log, given & heard, anchor_frame)
+    left_out = [a.anchor_id for a, k in zip(in_log, heard, strict=True) if not k]
+    if left_out:
+        notes.append(f"too few ranges on the path to place anchor {', '.join(left_out)}: left out")
+    first_camera_from_sfm = _first_camera_from_sfm(trajectory)
+    noise = range_model.range_stddev_m or _START_STDDEV_M
+    stddev = np.where(np.isfinite(log.range_stddev_m), log.range_stddev_m, noise)
+    ranges = RangeProblem(
+        centers=first_camera_from_sfm.apply(observations.centers[rows]),
+        tag_from_center=observations.tag_from_center[rows] @ first_camera_from_sfm.rotation.T,
+        anchor_index=log.anchor_index[rows],
+        range_m=log.range_m[rows],
+        stddev_m=np.hypot(stddev, short_range_stddev(log.range_m))[rows],
+        anchor_mean_m=np.array([_position(a) if k else np.full(3, np.nan) for a, k in zip(in_log, known, strict=True)]),
+        anchor_stddev_m=np.where(heard, np.where(known, np.array([a.position_stddev_m for a in in_log]), np.inf), 0.0),
+        bias_mean_m=np.array([a.range_bias_m for a in in_log]),
+        bias_stddev_m=np.where(heard, np.array([_bias_stddev(a, range_model) for a in in_log]), 0.0),
+        common_bias_stddev_m=range_model.common_bias_stddev_m,
+        frame_is_free=anchor_frame == "site" and bool(known.any()),
+    )
+    frame = "site" if ranges.frame_is_free else "first_camera"
+    return SurveyProblem(ranges, rows, first_camera_from_sfm, frame, bool(known.any()), tuple(notes))
+
+
+def _anchors_of_log(anchor_ids: tuple[str, ...], anchors: Sequence[Anchor]) -> list[Anchor]:
+    by_id = {anchor.anchor_id: anchor for anchor in anchors}
+    missing = [anchor_id for anchor_id in anchor_ids if anchor_id not in by_id]
+    if missing:
+        raise InputError(f"anchor {missing[0]!r} of the log is not among the anchors ({', '.join(by_id)})")
+    return [by_id[anchor_id] for anchor_id in anchor_ids]
+
+
+def _position(anchor: Anchor) -> Array:
+    return np.full(3, np.nan) if anchor.position_m is None else anchor.position_m
+
+
+def _bias_stddev(anchor: Anchor, range_model: RangeModelOptions) -> float:
+    return range_model.range_bias_stddev_m if anchor.range_bias_stddev_m is None else anchor.range_bias_stddev_m
+
+
+def _usable_ranges(
+    observations: RangeObservations, given: npt.NDArray[np.bool_]
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+    """Rows that take part, and (m,) anchors that have enough of them."""
+    rows = np.flatnonzero(observations.has_place)
+    index = observations.log.anchor_index
+    counts = np.bincount(index[rows], minlength=len(given))
+    heard = counts >= np.where(given, 1, _MIN_RANGES_OF_UNKNOWN)
+    rows = rows[heard[index[rows]]]
+    _require_enough(observations, rows)
+    return rows, heard
+
+
+def _first_camera_from_sfm(trajectory: Trajectory) -> Similarity:
+    rotation = trajectory.world_from_cam[0].T
+    return Similarity(1.0, rotation, -rotation @ trajectory.centers[0])
+
+
+def _require_enough(observations: RangeObservations, rows: npt.NDArray[np.int64]) -> None:
+    keyframes = np.union1d(observations.before[rows], observations.after[rows])
+    if len(rows) < _MIN_RANGES or len(keyframes) < _MIN_KEYFRAMES:
+        raise GeometryError(
+            f"the scale is not determined: {len(rows)} of {len(observations.log)} ranges lie on the path, near "
+            f"{len(keyframes)} keyframes; {_MIN_RANGES} near {_MIN_KEYFRAMES} are needed (do the clocks agree?)"
+        )
+
+
+def _usable_positions(
+    anchors: Sequence[Anchor], given: npt.NDArray[np.bool_], anchor_frame: str
+) -> tuple[npt.NDArray[np.bool_], list[str]]:
+    """(m,) anchors whose given positions can be used in this frame, and why others cannot."""
+    if anchor_frame != "site" or not given.any():
+        return given, []
+    positions = np.array([_position(a) for a, k in zip(anchors, given, strict=True) if k])
+    spread = path_shape(positions).stddevs
+    if len(positions) >= 3 and spread[1] > _COLLINEAR * spread[0]:
+        return given, []
+    why = f"{len(positions)} surveyed anchor(s)" if len(positions) < 3 else "anchors on one line"
+    note = f"{why} cannot fix the map in the site frame, three not on a line can: scale only, first camera frame"
+    return np.zeros(len(anchors), dtype=bool), [note]

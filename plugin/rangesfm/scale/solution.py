@@ -1,0 +1,192 @@
+"""The best solution of a survey's range problem, and the proof that it is the only one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from rangesfm.errors import GeometryError
+from rangesfm.geometry import path_shape
+from rangesfm.scale.noise import correlation_inflation, robust_stddev, short_range_stddev
+from rangesfm.scale.range_equation import RangeFit, RangeProblem, solve
+from rangesfm.scale.starts import (
+    complete_unknown_anchors,
+    first_camera_starts,
+    site_starts,
+    sphere_swaps,
+    spread_subset,
+    unknown_anchor_starts,
+)
+
+Array = npt.NDArray[np.float64]
+
+_SUBSET_PER_ANCHOR = 300
+_NUM_NOISE_ROUNDS = 3
+_NUM_ALTERNATIVES = 4
+_MIN_ORDINARY = 0.3
+_SAME_LOG_SCALE = 0.03
+_SAME_ROTATION_DEG = 5.0
+# Of the path's middle, in extents of the path.
+_SAME_SHIFT = 0.05
+# Extent of a path across itself, in lengths.
+NEARLY_STRAIGHT = 0.03
+# Half of 3 stddevs squared: a rival this close in cost is not ruled out.
+MIN_COST_GAP = 4.5
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A fit whose noise level is its own.
+
+    Attributes:
+        problem: with the final stddevs; the bias priors weigh as against independent errors.
+        fit: the estimate.
+        inflation: of every formal stddev, by the errors' correlation.
+        noise_stddev_m: of a range without special cases.
+    """
+
+    problem: RangeProblem
+    fit: RangeFit
+    inflation: float
+    noise_stddev_m: float
+
+
+def solve_survey(
+    problem: RangeProblem,
+    *,
+    anchors_are_known: bool,
+    center_stddev: Array,
+    noise_stddev_m: Array,
+    groups: npt.NDArray[np.int64],
+    seed: int,
+) -> Solution:
+    """Solve from all starts, estimate the noise, and refuse where two answers fit alike.
+
+    Args:
+        problem: as set up.
+        anchors_are_known: whether starts may lean on given positions.
+        center_stddev: (n,) of interpolated centres, model units.
+        noise_stddev_m: (n,) NaN where it is to be estimated.
+        groups: (n,) labels of stretches of one anchor's ranges whose errors go together.
+
+    Raises:
+        GeometryError: nothing fits, or two different maps do.
+    """
+    rivals = _distinct_fits(problem, anchors_are_known, seed)
+    solution = _with_own_noise(problem, rivals[0], center_stddev, noise_stddev_m, groups)
+    _refuse_ambiguity(solution, rivals[1:])
+    return solution
+
+
+def _distinct_fits(problem: RangeProblem, anchors_are_known: bool, seed: int) -> list[RangeFit]:
+    """Local minima, best first, each different map once: found on a thinned problem, ranked on all ranges."""
+    small = spread_subset(problem, _SUBSET_PER_ANCHOR)
+    if not anchors_are_known:
+        starts = unknown_anchor_starts(problem)
+    else:
+        starts = site_starts(problem, seed) if problem.frame_is_free else first_camera_starts(_known_only(problem))
+    fits = [solve(_known_only(small) if anchors_are_known else small, start, tolerance=1e-8) for start in starts]
+    fits = [fit for fit in fits if np.isfinite(fit.cost)]
+    if not fits:
+        raise GeometryError("the scale is not determined: no scale explains the ranges")
+    distinct = _each_once(small, fits)
+    if anchors_are_known and np.isinf(problem.anchor_stddev_m).any():
+        distinct = [solve(small, complete_unknown_anchors(small, fit.state)) for fit in distinct]
+    if not anchors_are_known:
+        swapped = [solve(small, state, tolerance=1e-8) for state in sphere_swaps(small, distinct[0].state)]
+        distinct = _each_once(small, distinct + swapped)
+    return _each_once(problem, [solve(problem, fit.state, tolerance=1e-8) for fit in distinct])
+
+
+def _each_once(problem: RangeProblem, fits: list[RangeFit]) -> list[RangeFit]:
+    """The best fits, best first, of each map one."""
+    distinct: list[RangeFit] = []
+    for fit in sorted(fits, key=lambda f: f.cost):
+        if all(_differ(problem, fit, other) for other in distinct) and len(distinct) < _NUM_ALTERNATIVES:
+            distinct.append(fit)
+    return distinct
+
+
+def _known_only(problem: RangeProblem) -> RangeProblem:
+    """Ranges to anchors with a given position; the others rest where they are."""
+    known = np.isfinite(problem.anchor_stddev_m)
+    part = problem.subset(np.flatnonzero(known[problem.anchor_index]))
+    return replace(
+        part,
+        anchor_stddev_m=np.where(known, problem.anchor_stddev_m, 0.0),
+        bias_stddev_m=np.where(known, problem.bias_stddev_m, 0.0),
+    )
+
+
+def _differ(problem: RangeProblem, first: RangeFit, second: RangeFit) -> bool:
+    """Whether two fits are different maps, not the same one twice."""
+    a, b = first.state.metric_from_model, second.state.metric_from_model
+    scales_differ = bool(abs(np.log(a.scale / b.scale)) > _SAME_LOG_SCALE)
+    if scales_differ or not problem.frame_is_free:
+        return scales_differ
+    turn = np.rad2deg(Rotation.from_matrix(a.rotation.T @ b.rotation).magnitude())
+    shape = path_shape(problem.centers)
+    shift = np.linalg.norm(a.apply(shape.centroid) - b.apply(shape.centroid)) / np.linalg.norm(a.scale * shape.stddevs)
+    return bool(turn > _SAME_ROTATION_DEG or shift > _SAME_SHIFT)
+
+
+def _with_own_noise(
+    problem: RangeProblem, start: RangeFit, center_stddev: Array, noise_stddev_m: Array, groups: npt.NDArray[np.int64]
+) -> Solution:
+    """Alternate between the fit and the noise it shows."""
+    bias_stddev, common_bias_stddev = problem.bias_stddev_m, problem.common_bias_stddev_m
+    fit = solve(problem, start.state)
+    inflation, noise = 1.0, robust_stddev(fit.residuals_m)
+    for _ in range(_NUM_NOISE_ROUNDS):
+        base = np.where(np.isfinite(noise_stddev_m), noise_stddev_m, noise)
+        interpolation = fit.state.metric_from_model.scale * center_stddev
+        stddev = np.sqrt(base**2 + interpolation**2 + short_range_stddev(problem.range_m) ** 2)
+        # Correlated errors are worth fewer ranges; the ranges keep their nominal weight among
+        # themselves and the priors gain by as much instead.
+        problem = replace(
+            problem,
+            stddev_m=stddev,
+            bias_stddev_m=bias_stddev / inflation,
+            common_bias_stddev_m=common_bias_stddev / inflation,
+        )
+        fit = solve(problem, fit.state)
+        inflation = correlation_inflation(fit.residuals_m / stddev, fit.weights, groups)
+        ordinary = short_range_stddev(problem.range_m) < noise
+        noise = robust_stddev(fit.residuals_m[ordinary] if np.mean(ordinary) > _MIN_ORDINARY else fit.residuals_m)
+    return Solution(problem, fit, inflation, noise)
+
+
+def _refuse_ambiguity(solution: Solution, rivals: list[RangeFit]) -> None:
+    for rival in rivals:
+        other = solve(solution.problem, rival.state, tolerance=1e-8)
+        if not _differ(solution.problem, other, solution.fit):
+            continue
+        gap = (other.cost - solution.fit.cost) / solution.inflation**2
+        if gap < MIN_COST_GAP:
+            ours, theirs = solution.fit.state.metric_from_model.scale, other.state.metric_from_model.scale
+            extent = float(np.linalg.norm(path_shape(solution.problem.centers).stddevs))
+            if min(ours, theirs) * extent < solution.noise_stddev_m:
+                raise GeometryError("the scale is not determined: a camera that stands still fits the ranges as well")
+            if abs(np.log(ours / theirs)) <= _SAME_LOG_SCALE:
+                raise GeometryError(
+                    f"{_what_is_open(solution.problem)}; the scale alone needs no site frame "
+                    f"(anchor frame unknown; about {ours:.4g} here)"
+                )
+            raise GeometryError(
+                f"two scales fit the ranges equally well ({ours:.4g} and {theirs:.4g} m per unit): the path is too "
+                "straight or runs round the anchor; vary it, or add an anchor"
+            )
+
+
+def _what_is_open(problem: RangeProblem) -> str:
+    """Why two maps of the same scale fit in the site frame."""
+    stddevs = path_shape(problem.centers).stddevs
+    if stddevs[1] < NEARLY_STRAIGHT * stddevs[0]:
+        return "the map fits the ranges turned about the path, which is nearly straight: walk a bend"
+    return (
+        "the map and its mirror image in the anchors' plane fit the ranges equally well, as the path is flat too: "
+        "add an anchor at another height"
+    )

@@ -1,0 +1,291 @@
+"""Where the nonlinear range equation is started from, for each case of anchors.
+
+Squared and for a given scale, the range equation is linear in what places the anchors or the
+path, so a sweep over scales (and rotations) with a small robust linear solve at each finds
+every basin without a first guess.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from rangesfm.errors import GeometryError
+from rangesfm.geometry import IDENTITY, Similarity, path_shape
+from rangesfm.scale.consensus import consensus_scales
+from rangesfm.scale.range_equation import RangeProblem, RangeState, solve
+
+Array = npt.NDArray[np.float64]
+
+_NUM_SCALES = 80
+_SCALE_SPAN = 200.0
+_NUM_ROTATIONS = 400
+_MAX_RANGES_PER_ANCHOR = 200
+_MAX_RANGES_FOR_ROTATIONS = 240
+_NUM_STARTS = 12
+# Trials closer than this run into the same minimum.
+_BASIN_LOG_SCALE = 0.3
+_BASIN_ROTATION_RAD = 0.6
+
+
+def spread_subset(problem: RangeProblem, max_num_per_anchor: int) -> RangeProblem:
+    """Evenly spaced ranges of each anchor, at most so many."""
+    rows = []
+    for k in range(problem.num_anchors):
+        of_anchor = np.flatnonzero(problem.anchor_index == k)
+        count = min(len(of_anchor), max_num_per_anchor)
+        rows.append(of_anchor[np.linspace(0, len(of_anchor) - 1, count).astype(np.int64)] if count else of_anchor)
+    return problem.subset(np.sort(np.concatenate(rows)))
+
+
+def scale_candidates(problem: RangeProblem) -> Array:
+    """Scales to try, ascending. Raises GeometryError where no range changes along the path.
+
+    A range changes by no more than the antenna moves, so differences of ranges over
+    differences of centres bound the scale from below; the upper quartile forgives outliers.
+    """
+    small = spread_subset(problem, 60)
+    ratios = []
+    for k in range(small.num_anchors):
+        rows = small.anchor_index == k
+        centers, ranges = small.centers[rows], small.range_m[rows]
+        first, second = np.triu_indices(len(ranges), 1)
+        moved = np.linalg.norm(centers[first] - centers[second], axis=1)
+        far = moved > 0.5 * moved.max() if len(moved) and moved.max() > 0 else np.zeros(len(moved), dtype=bool)
+        ratios.append(np.abs(ranges[first] - ranges[second])[far] / moved[far])
+    ratio = np.concatenate(ratios) if ratios else np.empty(0)
+    lower = float(np.quantile(ratio, 0.75)) if len(ratio) else 0.0
+    if not lower > 0:
+        raise GeometryError("the scale is not determined: the camera hardly moved, or no range changed as it did")
+    return lower * 0.3 * np.geomspace(1.0, _SCALE_SPAN, _NUM_SCALES)
+
+
+def first_camera_starts(problem: RangeProblem) -> list[RangeState]:
+    """Starts where all anchors are known in the frame of the model: exact consensus over the scale."""
+    return [_at_scale(problem, scale) for scale in consensus_scales(problem)]
+
+
+def unknown_anchor_starts(problem: RangeProblem) -> list[RangeState]:
+    """Starts where nothing is known of the anchors: a sweep over the scale, each anchor solved linearly."""
+    small = spread_subset(problem, _MAX_RANGES_PER_ANCHOR)
+    scales = scale_candidates(problem)
+    costs, states = [], []
+    for scale in scales:
+        anchors, cost = _multilaterate_all(small, scale)
+        costs.append(cost)
+        states.append(RangeState(Similarity(scale, np.eye(3), np.zeros(3)), anchors, problem.bias_mean_m.copy()))
+    minima = [i for i in range(len(costs)) if costs[i] <= min(costs[max(i - 1, 0)], costs[min(i + 1, len(costs) - 1)])]
+    best = sorted(minima, key=lambda i: costs[i])[:4]
+    return [choose_sides(small, states[i])[0] for i in best]
+
+
+def site_starts(problem: RangeProblem, seed: int = 0) -> list[RangeState]:
+    """Starts where anchors are surveyed and the path's place among them is not known.
+
+    For a scale and a rotation the squared range equation is linear in the translation.
+    """
+    known = np.flatnonzero(np.isfinite(problem.anchor_stddev_m))
+    rows = np.flatnonzero(np.isin(problem.anchor_index, known))
+    per_anchor = max(_MAX_RANGES_FOR_ROTATIONS // max(len(known), 1), 8)
+    small = spread_subset(problem.subset(rows), per_anchor)
+    rotations = Rotation.random(_NUM_ROTATIONS, rng=np.random.default_rng(seed))
+    rotations = Rotation.concatenate([Rotation.identity(), rotations])
+    trials: list[tuple[float, Similarity]] = []
+    for scale in scale_candidates(problem)[::2]:
+        translations, costs = _translations(small, float(scale), rotations.as_matrix())
+        for i in np.argsort(costs)[:_NUM_STARTS]:
+            similarity = Similarity(float(scale), rotations[int(i)].as_matrix(), translations[i])
+            trials.append((float(costs[i]), similarity))
+    anchors = np.where(np.isfinite(problem.anchor_mean_m), problem.anchor_mean_m, 0.0)
+    return [RangeState(similarity, anchors.copy(), problem.bias_mean_m.copy()) for similarity in _apart(trials)]
+
+
+def _apart(trials: list[tuple[float, Similarity]]) -> list[Similarity]:
+    """The best trials, each basin about once."""
+    kept: list[Similarity] = []
+    for _, trial in sorted(trials, key=lambda trial: trial[0]):
+        if len(kept) < _NUM_STARTS and not any(
+            abs(np.log(trial.scale / other.scale)) < _BASIN_LOG_SCALE
+            and np.trace(trial.rotation.T @ other.rotation) > 1 + 2 * np.cos(_BASIN_ROTATION_RAD)
+            for other in kept
+        ):
+            kept.append(trial)
+    return kept
+
+
+def sphere_swaps(problem: RangeProblem, state: RangeState) -> list[RangeState]:
+    """Maps that fit as well if the path lies on a sphere (a flat circle does) and all anchors are unknown.
+
+    About the centre of a sphere rho^2 = scale^2 radius^2 + |a|^2 - 2 scale a.c: two terms that only
+    their sum tells apart, and one that depends on scale times a alone. So the radius of the path and
+    the distance of an anchor from its centre can change places.
+    """
+    shape = path_shape(problem.centers)
+    local = (problem.centers - shape.centroid) @ shape.axes
+    seen = shape.stddevs > 0.02 * shape.stddevs[0]
+    design = np.column_stack([2 * local[:, seen], np.ones(len(local))])
+    solution = np.linalg.lstsq(design, np.sum(local**2, axis=1), rcond=None)[0]
+    middle = shape.centroid + shape.axes[:, seen] @ solution[:-1]
+    radius = float(np.sqrt(solution[-1] + solution[:-1] @ solution[:-1]))
+    placed = state.metric_from_model
+    from_middle = state.anchors_m - placed.apply(middle)
+    swaps = []
+    for growth in np.linalg.norm(from_middle[np.unique(problem.anchor_index)], axis=1) / (placed.scale * radius):
+        if growth > 0:
+            grown = replace(placed, scale=float(placed.scale * growth))
+            swaps.append(RangeState(grown, grown.apply(middle) + from_middle / growth, state.bias_m))
+    return swaps
+
+
+def choose_sides(problem: RangeProblem, state: RangeState) -> tuple[RangeState, Array]:
+    """Put each unknown anchor on the better side of the path's plane, the scale kept.
+
+    Returns:
+        the state, and (m,) by how much the robust cost is higher on the other side; inf for
+        anchors that are known.
+    """
+    anchors, rise = state.anchors_m.copy(), np.full(problem.num_anchors, np.inf)
+    shape = path_shape(state.metric_from_model.apply(problem.centers))
+    normal = shape.axes[:, 2]
+    for k in np.flatnonzero(np.isinf(problem.anchor_stddev_m)):
+        alone = anchor_alone(problem, int(k), state.metric_from_model)
+        if not len(alone.range_m):
+            continue
+        height = float((anchors[k] - shape.centroid) @ normal)
+        # On the plane itself both sides start alike and could never part.
+        height = np.copysign(max(abs(height), 0.1 * float(np.median(alone.range_m))), height)
+        on_plane = anchors[k] - ((anchors[k] - shape.centroid) @ normal) * normal
+        fits = []
+        for side in (height, -height):
+            at = RangeState(IDENTITY, (on_plane + side * normal)[None], state.bias_m[k : k + 1])
+            fits.append(solve(alone, at, tolerance=1e-8))
+        fits.sort(key=lambda fit: fit.cost)
+        anchors[k] = fits[0].state.anchors_m[0]
+        rise[k] = fits[1].cost - fits[0].cost
+    return replace(state, anchors_m=anchors), rise
+
+
+def mirrored(problem: RangeProblem, state: RangeState, k: int) -> Array:
+    """(3,) anchor k on the other side of the path's plane."""
+    shape = path_shape(state.metric_from_model.apply(problem.centers))
+    normal = shape.axes[:, 2]
+    other: Array = state.anchors_m[k] - 2 * ((state.anchors_m[k] - shape.centroid) @ normal) * normal
+    return other
+
+
+def complete_unknown_anchors(problem: RangeProblem, state: RangeState) -> RangeState:
+    """Place the anchors of which nothing is known, the path being placed already."""
+    anchors = state.anchors_m.copy()
+    small = spread_subset(problem, _MAX_RANGES_PER_ANCHOR)
+    for k in np.flatnonzero(np.isinf(problem.anchor_stddev_m)):
+        alone = anchor_alone(small, int(k), state.metric_from_model)
+        if len(alone.range_m):
+            anchors[k], _ = multilaterate(alone.tag_from_center, alone.range_m - problem.bias_mean_m[k])
+    return choose_sides(small, replace(state, anchors_m=anchors))[0]
+
+
+def anchor_alone(problem: RangeProblem, k: int, metric_from_model: Similarity) -> RangeProblem:
+    """The problem of one anchor with the path given: centres already metric, scale practically fixed."""
+    rows = np.flatnonzero(problem.anchor_index == k)
+    part = problem.subset(rows)
+    tags = metric_from_model.apply(part.centers) + part.tag_from_center @ metric_from_model.rotation.T
+    return replace(
+        part,
+        centers=np.zeros_like(tags),
+        tag_from_center=tags,
+        anchor_index=np.zeros(len(rows), dtype=np.int64),
+        anchor_mean_m=problem.anchor_mean_m[k : k + 1],
+        anchor_stddev_m=problem.anchor_stddev_m[k : k + 1],
+        bias_mean_m=problem.bias_mean_m[k : k + 1],
+        bias_stddev_m=np.zeros(1),
+        common_bias_stddev_m=0.0,
+        frame_is_free=False,
+    )
+
+
+def _at_scale(problem: RangeProblem, scale: float) -> RangeState:
+    return RangeState(
+        Similarity(float(scale), np.eye(3), np.zeros(3)), problem.anchor_mean_m.copy(), problem.bias_mean_m.copy()
+    )
+
+
+def _multilaterate_all(problem: RangeProblem, scale: float) -> tuple[Array, float]:
+    """Each anchor from the tag's positions at a given scale; and the mean of the robust residuals."""
+    anchors, cost = np.zeros((problem.num_anchors, 3)), 0.0
+    tags = scale * problem.centers + problem.tag_from_center
+    for k in range(problem.num_anchors):
+        rows = problem.anchor_index == k
+        if rows.any():
+            ranges = problem.range_m[rows] - problem.bias_mean_m[k]
+            anchors[k], residuals = multilaterate(tags[rows], ranges)
+            cost += float(np.sum(np.log1p((residuals / _residual_unit(problem)) ** 2)))
+    return anchors, cost / len(tags)
+
+
+def _residual_unit(problem: RangeProblem) -> float:
+    return 3 * float(np.median(problem.stddev_m))
+
+
+def multilaterate(positions: Array, ranges: Array) -> tuple[Array, Array]:
+    """A point from its distances to known positions, robustly, without a start.
+
+    rho^2 = |p|^2 - 2 a.p + |a|^2 is linear in (a, |a|^2). Where the positions lie in a plane,
+    the height above it follows from |a|^2; its sign is arbitrary.
+
+    Returns:
+        the point (3,), and (n,) residuals in metres (of the linear model).
+    """
+    shape = path_shape(positions)
+    local = (positions - shape.centroid) @ shape.axes
+    # Noise of about a decimetre decides which directions the ranges see at all.
+    seen = shape.stddevs > max(0.02 * shape.stddevs[0], 1e-9)
+    design = np.column_stack([-2 * local[:, seen], np.ones(len(local))])
+    squared = ranges**2 - np.sum(local**2, axis=1)
+    weights = 1 / np.maximum(2 * ranges, 1e-3)
+    robust = np.ones(len(local))
+    for _ in range(12):
+        w = weights * np.sqrt(robust)
+        solution = np.linalg.lstsq(design * w[:, None], squared * w, rcond=1e-10)[0]
+        residuals = weights * (design @ solution - squared)
+        unit = 1.4826 * np.median(np.abs(residuals)) + 1e-12
+        robust = 1 / (1 + (residuals / (2 * unit)) ** 2)
+    point = np.zeros(3)
+    point[seen] = solution[:-1]
+    rest = solution[-1] - float(point @ point)
+    unseen = np.flatnonzero(~seen)
+    if len(unseen):
+        point[unseen[-1]] = np.sqrt(max(rest, 0.0))
+    anchor: Array = shape.centroid + shape.axes @ point
+    return anchor, residuals
+
+
+def _translations(problem: RangeProblem, scale: float, rotations: Array) -> tuple[Array, Array]:
+    """For each rotation the best translation and a robust cost.
+
+    With q = anchor - R (scale c + r): rho^2 = |t|^2 - 2 t.q + |q|^2 is linear in (t, |t|^2).
+    """
+    path = scale * problem.centers + problem.tag_from_center
+    anchors = problem.anchor_mean_m[problem.anchor_index]
+    ranges = problem.range_m - problem.bias_mean_m[problem.anchor_index]
+    q = anchors[None] - path @ np.swapaxes(rotations, 1, 2)
+    design = np.concatenate([-2 * q, np.ones((*q.shape[:2], 1))], axis=2)
+    squared = ranges**2 - np.sum(q**2, axis=2)
+    weights = 1 / np.maximum(2 * ranges, 1e-3) * np.ones_like(squared)
+    robust = np.ones_like(squared)
+    ridge = 1e-9 * np.eye(4)
+    for _ in range(4):
+        weighted = design * (weights**2 * robust)[..., None]
+        normal = np.swapaxes(weighted, 1, 2) @ design
+        right = (np.swapaxes(weighted, 1, 2) @ squared[..., None])[..., 0]
+        normal = normal + ridge * np.trace(normal, axis1=1, axis2=2)[:, None, None]
+        solution = np.linalg.solve(normal, right[..., None])[..., 0]
+        residuals = weights * ((design @ solution[..., None])[..., 0] - squared)
+        unit = 1.4826 * np.median(np.abs(residuals), axis=1, keepdims=True) + 1e-12
+        robust = 1 / (1 + (residuals / (2 * unit)) ** 2)
+    translation = solution[:, :3]
+    distance = np.linalg.norm(q - translation[:, None], axis=2)
+    off = np.abs(distance - ranges)
+    return translation, np.mean(np.minimum(off, 3 * np.median(off, axis=1, keepdims=True)), axis=1)

@@ -1,0 +1,79 @@
+"""The scale estimate of the paper: two candidates a range, the steadier branch wins.
+
+Lee, Zhu, Giorgi and Günther, "Fusion of Monocular Vision and Radio-based Ranging for Global
+Scale Estimation and Drift Mitigation", 2018. Kept exactly, for comparison: on real radios it
+is far off (the candidates explode near the origin, and the right root changes sides along a
+path that first approaches and then leaves the anchor).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Branch:
+    """One of the two roots over time."""
+
+    mean: float
+    std: float
+
+
+@dataclass(frozen=True)
+class TwoCandidate:
+    """The paper's table.
+
+    Attributes:
+        alpha0, alpha1: the branches, smaller root and larger root.
+        chosen: "alpha0" or "alpha1", the one with the smaller standard deviation.
+        scale: its mean, metres per SfM unit.
+        duplets: (k, 2) both candidates of each range that has them.
+        rows: (k,) which ranges those are.
+        num_without_root: ranges dropped for a negative discriminant or a camera at the origin.
+    """
+
+    alpha0: Branch
+    alpha1: Branch
+    chosen: str
+    scale: float
+    duplets: Array
+    rows: npt.NDArray[np.int64]
+    num_without_root: int
+
+
+def two_candidate(centers: Array, tag_from_center: Array, anchor_m: Array, range_m: Array) -> TwoCandidate | None:
+    """Both roots of the squared range equation for every range, and the paper's choice.
+
+    With A = |c|^2, B = c.(R^T l - a), C = |R^T l - a|^2 - rho^2, the candidates are
+    -B/A -+ sqrt((B/A)^2 - C/A).
+
+    Args:
+        centers: (n, 3) in the frame of the first camera, SfM units.
+        tag_from_center: (n, 3) lever arm turned into that frame, metres.
+        anchor_m: (3,) or (n, 3) anchor in that frame, metres.
+        range_m: (n,).
+
+    Returns:
+        None if fewer than two ranges have candidates, so that there is nothing to compare.
+    """
+    offset = tag_from_center - anchor_m
+    a = np.sum(centers**2, axis=1)
+    b = np.sum(centers * offset, axis=1)
+    c = np.sum(offset**2, axis=1) - range_m**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        center, discriminant = -b / a, (b / a) ** 2 - c / a
+    rows = np.flatnonzero((a > 0) & np.isfinite(discriminant) & (discriminant >= 0))
+    if len(rows) < 2:
+        return None
+    root = np.sqrt(discriminant[rows])
+    duplets = np.column_stack([center[rows] - root, center[rows] + root])
+    branches = [Branch(float(np.mean(branch)), float(np.std(branch, ddof=1))) for branch in duplets.T]
+    chosen = 0 if branches[0].std <= branches[1].std else 1
+    return TwoCandidate(
+        branches[0], branches[1], f"alpha{chosen}", branches[chosen].mean, duplets, rows, len(range_m) - len(rows)
+    )

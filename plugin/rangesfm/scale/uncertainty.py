@@ -1,0 +1,103 @@
+"""How wrong the scale may be: formal, by resampling, and by what the range model leaves out.
+
+All resamplings are single Newton steps from the estimate, which is exact to first order and costs
+one small solve each.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.scale.estimate import ScaleUncertainty
+from rangesfm.scale.range_equation import RangeFit, RangeProblem, predicted_ranges
+
+Array = npt.NDArray[np.float64]
+
+# Sizes of unmodelled errors that calibrated radios show: an offset common to all anchors, and a
+# short-range error that fades with distance. Every anchor has the latter alike, so no resampling sees it.
+_COMMON_OFFSET_M = 0.03
+_SHORT_RANGE_ERROR_M = 0.15
+_SHORT_RANGE_LENGTH_M = 2.0
+# Where most ranges are outliers, so that the curvature says nothing.
+_MIN_CURVATURE = 0.3
+
+
+def scale_uncertainty(
+    problem: RangeProblem, fit: RangeFit, blocks: npt.NDArray[np.int64], *, num_bootstrap: int, seed: int
+) -> ScaleUncertainty:
+    """Relative stddevs of the scale of ``fit``; ``blocks`` (n,) labels stretches of time."""
+    anchor_blocks = problem.anchor_index
+    present = np.unique(anchor_blocks)
+    return ScaleUncertainty(
+        formal=fit.log_scale_stddev,
+        bootstrap=_bootstrap(fit, blocks, num_bootstrap, np.random.default_rng(seed)),
+        jackknife=_jackknife(fit, anchor_blocks) if len(present) >= 3 else None,
+        range_model=_range_model_sensitivity(problem, fit),
+    )
+
+
+def scale_shift(fit: RangeFit, problem: RangeProblem, range_error_m: Array) -> float:
+    """Relative change of the scale if each range were longer by ``range_error_m`` (n,)."""
+    step = np.linalg.lstsq(fit.information, fit.gradients.T @ (range_error_m / problem.stddev_m), rcond=1e-12)[0]
+    return float(step[0])
+
+
+def _block_sums(fit: RangeFit, blocks: npt.NDArray[np.int64]) -> tuple[Array, Array]:
+    """(b, p, p) information and (b, p) gradient of each block; priors left out."""
+    labels, index = np.unique(blocks, return_inverse=True)
+    informations, gradients = [], []
+    curvature = _relative_curvature(fit.weights)
+    root_weights = np.sqrt(fit.weights)[:, None]
+    # gradients = weight * jacobian, so dividing by the root leaves what squares to the information.
+    rows = fit.gradients / np.maximum(root_weights, 1e-12)
+    for block in range(len(labels)):
+        inside = index == block
+        informations.append(curvature * rows[inside].T @ rows[inside])
+        gradients.append(fit.gradients[inside].T @ fit.scaled_residuals[inside])
+    return np.array(informations), np.array(gradients)
+
+
+def _relative_curvature(weights: Array) -> float:
+    """Mean second derivative of the Cauchy loss over the mean weight: 0.8 for Gaussian errors.
+
+    A weight w is the loss' slope over the residual; the second derivative is w (2 w - 1), less. With
+    w in its place the steps would be too short. The mean keeps all informations positive.
+    """
+    return max(float(np.mean(weights * (2 * weights - 1)) / np.mean(weights)), _MIN_CURVATURE)
+
+
+def _steps(fit: RangeFit, informations: Array, gradients: Array, counts: Array) -> Array:
+    """Change of the log scale for each row of ``counts`` (k, b): how often each block is taken."""
+    steps = np.empty(len(counts))
+    for i, count in enumerate(counts):
+        information = np.tensordot(count, informations, axes=1) + fit.prior_information
+        gradient = count @ gradients + fit.prior_gradient
+        steps[i] = -np.linalg.lstsq(information, gradient, rcond=1e-12)[0][0]
+    return steps
+
+
+def _bootstrap(fit: RangeFit, blocks: npt.NDArray[np.int64], num: int, rng: np.random.Generator) -> float:
+    informations, gradients = _block_sums(fit, blocks)
+    num_blocks = len(informations)
+    if num_blocks < 2 or num < 2:
+        return fit.log_scale_stddev
+    counts = rng.multinomial(num_blocks, np.full(num_blocks, 1 / num_blocks), size=num).astype(np.float64)
+    # Quartiles, so that a resample that happens to leave out a whole side does not decide alone.
+    low, high = np.quantile(_steps(fit, informations, gradients, counts), [0.16, 0.84])
+    # Blocks drawn from a few scatter less than blocks drawn anew.
+    return float(max(high - low, 0.0) / 2 * np.sqrt(num_blocks / (num_blocks - 1)))
+
+
+def _jackknife(fit: RangeFit, anchor_blocks: npt.NDArray[np.int64]) -> float:
+    informations, gradients = _block_sums(fit, anchor_blocks)
+    num = len(informations)
+    steps = _steps(fit, informations, gradients, 1.0 - np.eye(num))
+    return float(np.sqrt((num - 1) / num * np.sum((steps - steps.mean()) ** 2)))
+
+
+def _range_model_sensitivity(problem: RangeProblem, fit: RangeFit) -> float:
+    distance = predicted_ranges(problem, fit.state)
+    offset = scale_shift(fit, problem, np.full(len(distance), _COMMON_OFFSET_M))
+    short = scale_shift(fit, problem, _SHORT_RANGE_ERROR_M * np.exp(-distance / _SHORT_RANGE_LENGTH_M))
+    return float(np.hypot(offset, short))
