@@ -1,0 +1,32 @@
+"""``rangesfm doctor``: do the parts fit together."""
+
+from __future__ import annotations
+
+import argparse
+
+from rangesfm.cli.arguments import Commands, Outcome
+from rangesfm.errors import SolverError
+from rangesfm.progress import Progress
+
+
+def add_command(commands: Commands) -> None:
+    commands.add(
+        "doctor",
+        execute,
+        help="versions, and whether the compiled part fits them",
+        description="Check versions, threads, and that the compiled part shares its types with pycolmap and pyceres.",
+        example="rangesfm doctor",
+    )
+
+
+def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
+    from rangesfm.doctor import diagnose
+
+    checks = diagnose()
+    width = max(len(check.name) for check in checks)
+    lines = []
+    for check in checks:
+        lines.append(f"{'ok ' if check.ok else 'BAD'}  {check.name:{width}}  {check.found}")
+        if not check.ok:
+            lines.append(f"     {'':{width}}  expected {check.expected}; {check.remedy}")
+    return Outcome(lines, 0 if all(check.ok for check in checks) else SolverError.exit_status)

@@ -1,0 +1,160 @@
+"""Flags that stand for keys of a survey file, shared by the commands that run stages."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rangesfm.errors import InputError
+from rangesfm.options import ANCHOR_FRAMES, MATCHING_METHODS, SCALE_METHODS
+
+if TYPE_CHECKING:
+    from rangesfm.config import Survey
+
+
+@dataclass(frozen=True)
+class Flag:
+    """A flag that overrides one key of the survey file.
+
+    Attributes:
+        name: without the dashes.
+        key: dotted key of the survey file.
+        convert: from the text to the key's value.
+    """
+
+    name: str
+    key: str
+    help: str
+    convert: Callable[[str], Any] = str
+    choices: tuple[str, ...] | None = None
+    metavar: str | None = None
+
+
+def _numbers(text: str) -> list[float]:
+    try:
+        return [float(number) for number in text.replace(",", " ").split()]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a list of numbers, expected as 1.5,-2,0") from None
+
+
+def _names(text: str) -> list[str]:
+    return [name for name in (part.strip() for part in text.split(",")) if name]
+
+
+def _position(text: str) -> list[float]:
+    numbers = _numbers(text)
+    if len(numbers) != 3:
+        raise argparse.ArgumentTypeError(f"'{text}' has {len(numbers)} numbers, expected X,Y,Z in metres")
+    return numbers
+
+
+def _offset(text: str) -> str | float:
+    try:
+        return text if text == "auto" else float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is neither auto nor a number of seconds") from None
+
+
+IMAGE_FLAGS = (
+    Flag("image_times", "images.times", "CSV image_name,timestamp_s (default: EXIF, else file names)", metavar="CSV"),
+)
+RECONSTRUCTION_FLAGS = (
+    Flag("every_nth", "images.every_nth", "use every n-th photo", int, metavar="N"),
+    Flag("min_interval_s", "images.min_interval_s", "least time between keyframes", float, metavar="SECONDS"),
+    Flag("max_num_keyframes", "images.max_num_keyframes", "thin evenly to this many", int, metavar="N"),
+    Flag("camera_model", "camera.model", "COLMAP camera model, as OPENCV", metavar="MODEL"),
+    Flag("camera_params", "camera.params", "its parameters in COLMAP's order", _numbers, metavar="A,B,.."),
+    Flag("matching", "mapper.matching", "which photos are matched", choices=MATCHING_METHODS),
+)
+RANGE_FLAGS = (
+    Flag("ranges", "ranges.path", "the radio's log", metavar="LOG"),
+    Flag("ranges_format", "ranges.format", "its format (default: recognised by content)", metavar="FORMAT"),
+    Flag("ranges_time_offset", "ranges.time_offset", "image time minus range time", _offset, metavar="auto|SECONDS"),
+    Flag("range_stddev_m", "ranges.range_stddev_m", "noise of a range (default: estimated)", float, metavar="METRES"),
+    Flag("anchors", "anchors.path", "CSV anchor_id,x_m,y_m,z_m (default: all unknown)", metavar="CSV"),
+    Flag("anchor_frame", "anchors.frame", "what their coordinates refer to", choices=ANCHOR_FRAMES),
+    Flag("use_anchors", "anchors.use", "only these anchors' ranges are used", _names, metavar="ID,ID"),
+    Flag("tag_in_cam", "tag.tag_in_cam_m", "the tag's antenna in the camera frame, metres", _position, metavar="X,Y,Z"),
+    Flag("tag_id", "tag.tag_id", "the camera's tag, if the log has several", metavar="ID"),
+    Flag("scale_method", "scale.method", "how the scale is found", choices=SCALE_METHODS),
+    Flag("reference", "report.reference", "true positions, for comparison", metavar="FILE"),
+)
+REFINE_FLAGS = (
+    Flag("max_num_iterations", "refine.max_num_iterations", "of the refinement's solver", int, metavar="N"),
+)
+OUTPUT_FLAGS = (
+    Flag("output_path", "output.path", "folder of the results (default: out)", metavar="FOLDER"),
+    Flag("num_threads", "mapper.num_threads", "-1 for all cores", int, metavar="N"),
+    Flag("seed", "output.seed", "of everything random", int, metavar="N"),
+)
+
+
+def add_survey_arguments(parser: argparse.ArgumentParser, *groups: tuple[Flag, ...]) -> None:
+    """The survey file, the photos and the flags of some groups."""
+    parser.add_argument("survey", nargs="?", metavar="SURVEY.toml", help="survey file; flags override its keys")
+    parser.add_argument(
+        "--base_path", metavar="FOLDER", help="what the file's paths are relative to (default: its folder)"
+    )
+    parser.add_argument("--images", metavar="PATH", help="folder of the photos, or CSV of their times")
+    for flag in (flag for group in (IMAGE_FLAGS, *groups, OUTPUT_FLAGS) for flag in group):
+        parser.add_argument(
+            f"--{flag.name}",
+            dest=flag.key,
+            type=flag.convert,
+            choices=flag.choices,
+            help=flag.help,
+            metavar=flag.metavar,
+        )
+
+
+def add_model_argument(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--input_path", metavar="MODEL", help="existing COLMAP model, as sparse/0")
+
+
+def add_restart_argument(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--restart", action="store_true", help="do anew what an earlier run has done")
+
+
+def survey_from_arguments(args: argparse.Namespace) -> Survey:
+    """The survey file, if any, with the flags in place of its keys."""
+    from rangesfm.config import read_survey, survey_from_tables
+
+    overrides = {key: value for key, value in vars(args).items() if "." in key and value is not None}
+    if args.images is not None:
+        overrides["images.times" if _is_table(args.images) else "images.path"] = args.images
+    if args.survey is None:
+        survey = survey_from_tables({}, Path.cwd(), overrides)
+    else:
+        survey = read_survey(args.survey, overrides, args.base_path)
+    model = getattr(args, "input_path", None)
+    return survey if model is None else replace(survey, model_path=Path.cwd() / model)
+
+
+def require_images(survey: Survey) -> None:
+    """Raise InputError unless there is a folder of photos."""
+    if survey.images_path is None:
+        raise InputError("no photos: give [images] path in a survey file, or --images FOLDER")
+    if not os.path.isdir(survey.images_path):
+        raise InputError("no such folder of photos", survey.images_path)
+
+
+def require_model(survey: Survey) -> None:
+    """Raise InputError unless there is a folder of a COLMAP model."""
+    if survey.model_path is None:
+        raise InputError("no model: give --input_path MODEL, the folder of a COLMAP model such as sparse/0")
+    if not os.path.isdir(survey.model_path):
+        raise InputError("no such folder of a COLMAP model", survey.model_path)
+
+
+def require_ranges(survey: Survey) -> None:
+    """Raise InputError unless there is a radio log."""
+    if survey.ranges.path is None:
+        raise InputError("no ranges: give [ranges] path in a survey file, or --ranges LOG")
+
+
+def _is_table(path: str) -> bool:
+    return os.path.isfile(path) or path.endswith(".csv")

@@ -1,0 +1,288 @@
+"""Survey: everything a run needs to know, from a TOML file, from flags or from both."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from rangesfm.errors import InputError
+from rangesfm.options import (
+    ANCHOR_FRAMES,
+    MATCHING_METHODS,
+    SCALE_METHODS,
+    AssociationOptions,
+    CameraOptions,
+    KeyframeOptions,
+    MapperOptions,
+    RangeModelOptions,
+    RefineOptions,
+    ScaleOptions,
+)
+from rangesfm.strict_tables import Rule, Source, StrictTable, parse_toml
+
+TABLES = ("images", "camera", "ranges", "anchors", "tag", "mapper", "scale", "refine", "export", "report", "output")
+DEFAULT_FORMATS = ("tum", "ply")
+_LIKE_OURS = 0.85  # a [mapper] key this similar to one of ours is a slip; others are pycolmap's
+
+_MORE_THAN_0 = Rule("more than 0", lambda value: value > 0)
+_FROM_0 = Rule("0 or more", lambda value: value >= 0)
+_FROM_1 = Rule("1 or more", lambda value: value >= 1)
+
+
+def _one_of(choices: tuple[str, ...]) -> Rule:
+    return Rule("one of " + ", ".join(choices), lambda value: value in choices)
+
+
+_RULES = {
+    "every_nth": _FROM_1,
+    "min_interval_s": _FROM_0,
+    "max_num_keyframes": _FROM_1,
+    "max_interpolation_gap_s": _FROM_0,
+    "max_time_difference_s": _FROM_0,
+    "check_share": Rule("from 0 to 0.5", lambda value: 0 <= value <= 0.5),
+    "range_stddev_m": _MORE_THAN_0,
+    "range_bias_stddev_m": _FROM_0,
+    "common_bias_stddev_m": _FROM_0,
+    "max_relative_stddev": _MORE_THAN_0,
+    "separator": Rule("one character", lambda value: len(value) == 1),
+    "frame": _one_of(ANCHOR_FRAMES),
+    "matching": _one_of(MATCHING_METHODS),
+    "num_threads": Rule("1 or more, or -1 for all cores", lambda value: value == -1 or value >= 1),
+    "method": _one_of(SCALE_METHODS),
+    "num_bootstrap": _FROM_0,
+    "bootstrap_block_s": _MORE_THAN_0,
+    "max_num_iterations": _FROM_0,
+    "range_loss_scale": _MORE_THAN_0,
+    "seed": _FROM_0,
+}
+
+
+@dataclass(frozen=True)
+class RangesConfig:
+    """The radio's log and how to take it (table ``[ranges]``).
+
+    Attributes:
+        path: the log; None if not given.
+        format: name of a reader; None: recognised by content.
+        columns, timestamp_unit, range_unit, separator: as in ``read_ranges``.
+        time_offset_s: image time = range time + offset; None: searched for ("auto").
+        association: where ranges are put on the path.
+        model: what is assumed of the radio.
+    """
+
+    path: Path | None = None
+    format: str | None = None
+    columns: dict[str, str] = field(default_factory=dict)
+    timestamp_unit: str | None = None
+    range_unit: str | None = None
+    separator: str | None = None
+    time_offset_s: float | None = None
+    association: AssociationOptions = field(default_factory=AssociationOptions)
+    model: RangeModelOptions = field(default_factory=RangeModelOptions)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Inputs, options and output of one run. Paths are absolute.
+
+    Attributes:
+        images_path: folder of the photos.
+        model_path: an existing COLMAP model, for those who start from one; not a key of the file.
+        image_times_path: CSV of image times; None: EXIF, else file names.
+        anchors_path: None: the anchors in the log, all unknown.
+        anchor_frame: one of ANCHOR_FRAMES; None: "site" if the file knows any position, else "unknown".
+        use_anchors: ids of the anchors whose ranges are used; empty: all.
+        tag_in_cam_m: lever arm: the tag's antenna in the camera frame, metres.
+        tag_id: which tag of the log the camera carries; None: there is only one.
+        reference_path: true positions, for comparison.
+        formats: what to export beside the COLMAP models.
+        output_path: folder of the results.
+        seed: of everything random.
+    """
+
+    images_path: Path | None = None
+    model_path: Path | None = None
+    image_times_path: Path | None = None
+    keyframes: KeyframeOptions = field(default_factory=KeyframeOptions)
+    camera: CameraOptions = field(default_factory=CameraOptions)
+    ranges: RangesConfig = field(default_factory=RangesConfig)
+    anchors_path: Path | None = None
+    anchor_frame: str | None = None
+    use_anchors: tuple[str, ...] = ()
+    tag_in_cam_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tag_id: str | None = None
+    mapper: MapperOptions = field(default_factory=MapperOptions)
+    scale: ScaleOptions = field(default_factory=ScaleOptions)
+    refine: RefineOptions = field(default_factory=RefineOptions)
+    reference_path: Path | None = None
+    formats: tuple[str, ...] = DEFAULT_FORMATS
+    report_enabled: bool = True
+    output_path: Path = Path("out")
+    seed: int = 0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, fit for JSON."""
+        plain: dict[str, Any] = _plain(asdict(self))
+        return plain
+
+
+def read_survey(
+    path: str | Path, overrides: Mapping[str, object] | None = None, base_folder: str | Path | None = None
+) -> Survey:
+    """Read a survey file.
+
+    Args:
+        path: the TOML file.
+        base_folder: what relative paths in the file refer to; None: the file's own folder.
+        overrides: values by dotted key (``{"ranges.path": "uwb.csv"}``) that replace those of the file;
+            their paths are relative to the working directory.
+
+    Raises:
+        InputError: with the line where possible, for an unknown table or key, a value of the wrong
+            type or out of bounds, and a file that does not exist.
+    """
+    tables, source = parse_toml(Path(path))
+    folder = Path(path).absolute().parent if base_folder is None else Path(base_folder).absolute()
+    return _survey(tables, folder, overrides or {}, source)
+
+
+def survey_from_tables(
+    tables: Mapping[str, Any], base_folder: str | Path, overrides: Mapping[str, object] | None = None
+) -> Survey:
+    """The same from tables in memory, with paths relative to ``base_folder``."""
+    return _survey(tables, Path(base_folder).absolute(), overrides or {}, Source())
+
+
+def _survey(tables: Mapping[str, Any], folder: Path, overrides: Mapping[str, object], source: Source) -> Survey:
+    reader = _SurveyReader(tables, folder, overrides, source)
+    survey = Survey(
+        **reader.images(),
+        **reader.anchors(),
+        **reader.tag(),
+        **reader.report(),
+        **reader.output(),
+        camera=reader.table("camera").options(CameraOptions),
+        ranges=reader.ranges(),
+        mapper=reader.mapper(),
+        scale=reader.table("scale").options(ScaleOptions),
+        refine=reader.table("refine").options(RefineOptions),
+        formats=reader.table("export").value("formats", tuple[str, ...], DEFAULT_FORMATS),
+    )
+    reader.refuse_unknown()
+    return survey
+
+
+class _SurveyReader:
+    """The tables of a survey, each turned into its part of the Survey."""
+
+    def __init__(self, tables: Mapping[str, Any], folder: Path, overrides: Mapping[str, object], source: Source):
+        source = replace(source, overridden=frozenset(overrides))
+        self._root = StrictTable(_merged(tables, overrides), "", source)
+        self._source = source
+        self._folder = folder
+        self._tables = {name: StrictTable(self._root.value(name, Any, {}), name, source, _RULES) for name in TABLES}
+
+    def table(self, name: str) -> StrictTable:
+        return self._tables[name]
+
+    def refuse_unknown(self) -> None:
+        self._root.refuse_unknown()
+        for table in self._tables.values():
+            table.refuse_unknown()
+
+    def images(self) -> dict[str, Any]:
+        return {
+            "images_path": self._path("images", "path", must_exist=False),
+            "image_times_path": self._path("images", "times"),
+            "keyframes": self.table("images").options(KeyframeOptions),
+        }
+
+    def ranges(self) -> RangesConfig:
+        table = self.table("ranges")
+        return RangesConfig(
+            path=self._path("ranges", "path"),
+            format=table.value("format", str),
+            columns=table.value("columns", dict[str, str], {}),
+            timestamp_unit=table.value("timestamp_unit", str),
+            range_unit=table.value("range_unit", str),
+            separator=table.value("separator", str),
+            time_offset_s=_time_offset(table),
+            association=table.options(AssociationOptions),
+            model=table.options(RangeModelOptions),
+        )
+
+    def anchors(self) -> dict[str, Any]:
+        return {
+            "anchors_path": self._path("anchors", "path"),
+            "anchor_frame": self.table("anchors").value("frame", str),
+            "use_anchors": self.table("anchors").value("use", tuple[str, ...], ()),
+        }
+
+    def tag(self) -> dict[str, Any]:
+        table = self.table("tag")
+        return {
+            "tag_in_cam_m": table.value("tag_in_cam_m", tuple[float, float, float], (0.0, 0.0, 0.0)),
+            "tag_id": table.value("tag_id", str),
+        }
+
+    def mapper(self) -> MapperOptions:
+        """Keys that are not ours belong to pycolmap's pipeline options, which know best what they may be."""
+        table = self.table("mapper")
+        options = table.options(MapperOptions)
+        table.refuse_unknown(min_likeness=_LIKE_OURS)
+        return replace(options, pipeline={**table.rest(), **options.pipeline})
+
+    def report(self) -> dict[str, Any]:
+        return {
+            "reference_path": self._path("report", "reference"),
+            "report_enabled": self.table("report").value("enabled", bool, True),
+        }
+
+    def output(self) -> dict[str, Any]:
+        path = self._path("output", "path", must_exist=False) or self._folder / "out"
+        return {"output_path": path, "seed": self.table("output").value("seed", int, 0)}
+
+    def _path(self, table_name: str, key: str, *, must_exist: bool = True) -> Path | None:
+        table = self.table(table_name)
+        text: str | None = table.value(key, str)
+        if text is None:
+            return None
+        if not text:
+            raise table.error(key, "a path")
+        folder = Path.cwd() if f"{table_name}.{key}" in self._source.overridden else self._folder
+        path = folder / text
+        if must_exist and not os.path.isfile(path):
+            raise self._source.error(f"[{table_name}] {key}: there is no file {path}", table_name, key)
+        return path
+
+
+def _time_offset(table: StrictTable) -> float | None:
+    key = "time_offset"
+    offset = table.value(key, Any, "auto")
+    if offset == "auto":
+        return None
+    try:
+        return float(table.value(key, float))
+    except InputError:
+        raise table.error(key, '"auto" or seconds') from None
+
+
+def _merged(tables: Mapping[str, Any], overrides: Mapping[str, object]) -> dict[str, Any]:
+    merged = {name: dict(table) if isinstance(table, Mapping) else table for name, table in tables.items()}
+    for dotted_key, value in overrides.items():
+        table_name, _, key = dotted_key.partition(".")
+        table = merged.setdefault(table_name, {})
+        if isinstance(table, dict):
+            table[key] = str(value) if isinstance(value, Path) else value
+    return merged
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)

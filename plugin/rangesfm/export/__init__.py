@@ -1,0 +1,109 @@
+"""The metric map in other programs' formats: one file per format, one registry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rangesfm.errors import InputError
+from rangesfm.export.colmap import write_model
+from rangesfm.export.metric_map import MetricMap
+from rangesfm.export.model_aligner import write_positions
+from rangesfm.export.ply import write_anchors, write_cameras, write_points
+from rangesfm.export.transform import write_transform
+from rangesfm.export.tum import write_trajectory
+from rangesfm.files import make_output_folder
+from rangesfm.result_folder import read_result_folder
+
+if TYPE_CHECKING:
+    import pycolmap
+
+    from rangesfm.export.metric_map import Array
+    from rangesfm.geometry import Similarity
+
+__all__ = [
+    "EXPORTERS",
+    "MetricMap",
+    "export_model",
+    "export_result",
+    "write_anchors",
+    "write_cameras",
+    "write_model",
+    "write_points",
+    "write_positions",
+    "write_trajectory",
+    "write_transform",
+]
+
+Exporter = Callable[[MetricMap, Path], Path]
+
+EXPORTERS: dict[str, Exporter] = {
+    "colmap": lambda map_, folder: write_model(map_.reconstruction, folder / "colmap"),
+    "colmap_text": lambda map_, folder: write_model(map_.reconstruction, folder / "colmap_text", as_text=True),
+    "tum": lambda map_, folder: write_trajectory(map_.trajectory, folder / "trajectory.tum"),
+    "ply": lambda map_, folder: write_points(map_.reconstruction, folder / "points.ply"),
+    "ply_cameras": lambda map_, folder: write_cameras(map_.trajectory, folder / "cameras.ply"),
+    "ply_anchors": lambda map_, folder: write_anchors(map_.anchors_m, folder / "anchors.ply"),
+    "transform": lambda map_, folder: write_transform(map_.metric_from_sfm, folder / "transform.txt"),
+    "model_aligner": lambda map_, folder: write_positions(map_.reconstruction, folder / "positions.txt"),
+}
+"""Each writes one format of a map into a folder and returns the path written."""
+
+
+def export_model(
+    reconstruction: pycolmap.Reconstruction,
+    formats: Iterable[str],
+    output_path: Path,
+    *,
+    timestamps_s: Mapping[str, float] | None = None,
+    anchors_m: Mapping[str, Array] | None = None,
+    metric_from_sfm: Similarity | None = None,
+) -> tuple[Path, ...]:
+    """Write a metric model in each of the formats (names as in EXPORTERS) under ``output_path``.
+
+    Args:
+        timestamps_s: camera-clock time of each photo by name, for trajectories.
+        anchors_m: (3,) position by anchor id, in the model's world.
+        metric_from_sfm: from the unscaled model's world to this one's.
+
+    Returns:
+        The files or folders written, in the order of the formats.
+
+    Raises:
+        InputError: a format is not known or needs what is not given, or the folder cannot be written to.
+    """
+    chosen = list(dict.fromkeys(formats))
+    check_formats(chosen)
+    make_output_folder(output_path)
+    map_ = MetricMap(reconstruction, timestamps_s, dict(anchors_m or {}), metric_from_sfm)
+    return tuple(EXPORTERS[name](map_, output_path) for name in chosen)
+
+
+def check_formats(formats: Iterable[str]) -> None:
+    """Raise InputError for the first format that is not known."""
+    for name in formats:
+        if name not in EXPORTERS:
+            raise InputError(f"unknown export format {name!r}, expected one of: {', '.join(EXPORTERS)}")
+
+
+def export_result(output_path: Path, formats: Iterable[str], destination: Path) -> tuple[Path, ...]:
+    """Export the best metric model of a run's output folder: the refined one, else the scaled one.
+
+    Raises:
+        InputError: as ``export_model``, or the folder is not a result with a metric model.
+    """
+    chosen = list(formats)
+    check_formats(chosen)
+    result = read_result_folder(output_path)
+    reconstruction = result.read_model("sparse_metric") or result.read_model("sparse_scaled")
+    if reconstruction is None:
+        raise InputError("there is no metric model (sparse_metric/0 or sparse_scaled/0) to export", output_path)
+    return export_model(
+        reconstruction,
+        chosen,
+        destination,
+        timestamps_s=result.timestamps_s,
+        anchors_m=result.anchor_positions_m,
+        metric_from_sfm=result.metric_from_sfm,
+    )

@@ -1,0 +1,141 @@
+"""What a run reads before it works: the log, the anchors, the reference; checked against each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rangesfm.config import Survey
+from rangesfm.errors import InputError
+from rangesfm.ranging.anchor_file import default_anchor_frame, read_anchors
+from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.readers import read_anchors_in_log, read_ranges
+from rangesfm.reference import Reference, read_reference
+
+# Beyond these a unit is wrong, or the file: no camera carries its tag so far away, and no such radio reaches so far.
+_MAX_LEVER_ARM_M = 20.0
+_MAX_RANGE_M = 1e6
+
+
+@dataclass(frozen=True)
+class RangingInputs:
+    """The radio's side of a survey.
+
+    Attributes:
+        log: ranges of the wanted tag to the wanted anchors.
+        anchors: every anchor of the log.
+        anchor_frame: one of ANCHOR_FRAMES.
+        reference: true positions, if given.
+        notes: what the user should know.
+    """
+
+    log: RangeLog
+    anchors: tuple[Anchor, ...]
+    anchor_frame: str
+    reference: Reference | None
+    notes: tuple[str, ...]
+
+
+def read_ranging_inputs(survey: Survey) -> RangingInputs:
+    """Read and check all but the photos.
+
+    Raises:
+        InputError: a file is missing or wrong, or the log has an anchor or tags that nobody explained.
+    """
+    if survey.ranges.path is None:
+        raise InputError("no ranges: give [ranges] path in a survey file, or --ranges LOG")
+    _check_lever_arm(survey)
+    given = read_anchors(survey.anchors_path) if survey.anchors_path is not None else None
+    log = read_ranges(
+        survey.ranges.path,
+        format=survey.ranges.format,
+        columns=survey.ranges.columns or None,
+        timestamp_unit=survey.ranges.timestamp_unit,
+        range_unit=survey.ranges.range_unit,
+        separator=survey.ranges.separator,
+        anchor_ids=[anchor.anchor_id for anchor in given or ()],
+    )
+    _check_lengths(log)
+    log = _of_wanted_anchors(_of_wanted_tag(log, survey.tag_id), survey.use_anchors)
+    anchors = _anchors_of_log(log) if given is None else given
+    _check_anchors_known(log, anchors, survey)
+    frame = survey.anchor_frame or default_anchor_frame(anchors)
+    if frame != "unknown" and all(anchor.position_m is None for anchor in anchors):
+        raise InputError(
+            f"anchor frame {frame!r} needs anchor positions and there are none: give anchors.csv, or frame unknown",
+            survey.anchors_path,
+        )
+    reference = None if survey.reference_path is None else read_reference(survey.reference_path)
+    return RangingInputs(log, anchors, frame, reference, tuple(_notes(log, anchors, anchors_are_of_log=given is None)))
+
+
+def _check_lever_arm(survey: Survey) -> None:
+    if any(abs(coordinate) > _MAX_LEVER_ARM_M for coordinate in survey.tag_in_cam_m):
+        raise InputError(
+            f"tag_in_cam_m is {list(survey.tag_in_cam_m)}, expected metres from the camera to its tag, each at most "
+            f"{_MAX_LEVER_ARM_M:g}"
+        )
+
+
+def _check_lengths(log: RangeLog) -> None:
+    if np.any(too_long := log.range_m > _MAX_RANGE_M):
+        first = int(np.argmax(too_long))
+        message = f"a range of {log.range_m[first]:g} m, expected at most {_MAX_RANGE_M:g}: is its unit right?"
+        raise InputError(message, log.source, int(log.line[first]))
+
+
+def _anchors_of_log(log: RangeLog) -> tuple[Anchor, ...]:
+    """All unknown, but for those whose positions the log itself gives, as the radios were configured."""
+    in_log = read_anchors_in_log(log.source, format=log.format) if log.source is not None else ()
+    by_id = {anchor.anchor_id: anchor for anchor in in_log}
+    return tuple(by_id.get(anchor_id, Anchor(anchor_id)) for anchor_id in log.anchor_ids)
+
+
+def _of_wanted_tag(log: RangeLog, tag_id: str | None) -> RangeLog:
+    if tag_id is None:
+        if len(log.tag_ids) > 1:
+            raise InputError(
+                f"the log has several tags ({', '.join(log.tag_ids)}): say which is the camera's (--tag_id)",
+                log.source,
+            )
+        return log
+    if tag_id not in log.tag_ids:
+        raise InputError(f"tag {tag_id!r} is not in the log, which has {', '.join(log.tag_ids)}", log.source)
+    return log.subset(log.tag_index == log.tag_ids.index(tag_id))
+
+
+def _of_wanted_anchors(log: RangeLog, use_anchors: Sequence[str]) -> RangeLog:
+    if not use_anchors:
+        return log
+    for anchor_id in use_anchors:
+        if anchor_id not in log.anchor_ids:
+            raise InputError(
+                f"anchor {anchor_id!r} to be used is not in the log ({', '.join(log.anchor_ids)})", log.source
+            )
+    wanted = np.array([anchor_id in use_anchors for anchor_id in log.anchor_ids])
+    return log.subset(wanted[log.anchor_index])
+
+
+def _check_anchors_known(log: RangeLog, anchors: Sequence[Anchor], survey: Survey) -> None:
+    known = {anchor.anchor_id for anchor in anchors}
+    for k, anchor_id in enumerate(log.anchor_ids):
+        if anchor_id not in known:
+            first = int(np.argmax(log.anchor_index == k))
+            raise InputError(
+                f"anchor_id is {anchor_id!r}, expected one of {survey.anchors_path}: {', '.join(sorted(known))}",
+                log.source,
+                int(log.line[first]),
+            )
+
+
+def _notes(log: RangeLog, anchors: Sequence[Anchor], *, anchors_are_of_log: bool) -> list[str]:
+    silent = [anchor.anchor_id for anchor in anchors if anchor.anchor_id not in log.anchor_ids]
+    notes = [f"no ranges to anchor {', '.join(silent)}"] if silent else []
+    if anchors_are_of_log and any(anchor.position_m is not None for anchor in anchors):
+        notes.append("the anchor positions are those that the log gives")
+    if log.num_no_measurement:
+        notes.append(f"{log.num_no_measurement} records of the log say that there was no measurement")
+    return notes

@@ -1,0 +1,88 @@
+"""MetricSurvey: all that the stages after the reconstruction found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from rangesfm.geometry import align_points
+from rangesfm.ranging.anchors import AnchorEstimate
+from rangesfm.ranging.clock import TimeOffset
+from rangesfm.ranging.observations import RangeObservations
+from rangesfm.refine import RefineSummary
+from rangesfm.scale.estimate import ScaleEstimate
+from rangesfm.trajectory import Trajectory, trajectory_from_reconstruction
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MetricSurvey:
+    """A scaled and perhaps refined map with its ranges.
+
+    Attributes:
+        trajectory: keyframes of the unscaled model.
+        time_offset: as estimated; None where it was given or is not needed.
+        time_offset_s: as used; None where the log names photos.
+        estimate: of the scale.
+        scaled: the model after rescaling.
+        predicted_scaled_m: (n,) ranges by that model; NaN without a place.
+        scaled_weights: (n,) robust weights by it.
+        refined: the model after refinement; None without.
+        refinement: its summary; None without.
+    """
+
+    trajectory: Trajectory
+    time_offset: TimeOffset | None
+    time_offset_s: float | None
+    estimate: ScaleEstimate
+    scaled: pycolmap.Reconstruction
+    predicted_scaled_m: Array
+    scaled_weights: Array
+    refined: pycolmap.Reconstruction | None = None
+    refinement: RefineSummary | None = None
+
+    @property
+    def final(self) -> pycolmap.Reconstruction:
+        """The best metric model there is."""
+        return self.scaled if self.refined is None else self.refined
+
+    @property
+    def anchors(self) -> tuple[AnchorEstimate, ...]:
+        return self.estimate.anchors if self.refinement is None else self.refinement.anchors
+
+    @property
+    def observations(self) -> RangeObservations:
+        """With the final status of each range."""
+        return self.estimate.observations if self.refinement is None else self.refinement.observations
+
+    @property
+    def predicted_m(self) -> Array:
+        """(n,) ranges by the final model."""
+        return self.predicted_scaled_m if self.refinement is None else self.refinement.predicted_m
+
+    @property
+    def weights(self) -> Array:
+        """(n,) robust weights by the final model."""
+        return self.scaled_weights if self.refinement is None else self.refinement.weights
+
+    @property
+    def residuals_m(self) -> Array:
+        """(n,) predicted minus measured, by the final model."""
+        return self.predicted_m - self.observations.log.range_m
+
+    @property
+    def refined_scale(self) -> float | None:
+        """Metres per SfM unit after refinement, by the keyframe centres."""
+        if self.refined is None:
+            return None
+        return align_points(self.trajectory.centers, self.path_of(self.refined).centers).scale
+
+    def path_of(self, model: pycolmap.Reconstruction) -> Trajectory:
+        """The keyframes as another model has them."""
+        times = self.trajectory.timestamps_s
+        by_name = None if times is None else dict(zip(self.trajectory.image_names, times.tolist(), strict=True))
+        return trajectory_from_reconstruction(model, by_name)

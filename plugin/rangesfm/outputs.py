@@ -1,0 +1,168 @@
+"""The files of a result folder, and the summary for people."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.errors import InputError
+from rangesfm.export import export_model, write_model
+from rangesfm.files import new_file
+from rangesfm.metric_survey import MetricSurvey
+from rangesfm.ranging.observations import RangeStatus
+from rangesfm.results import USED
+
+Array = npt.NDArray[np.float64]
+
+# The first says that a result is whole: it is the last to be written and the first to go.
+_RESULT_FILES = ("result.json", "report.html", "ranges.csv", "images.csv", "reference.csv")
+_WRITTEN = (*_RESULT_FILES, "trajectory.tum", "points.ply", "sparse_scaled/0", "sparse_metric/0")
+
+
+def refuse_to_overwrite(inputs: Iterable[Path | None], folder: Path) -> None:
+    """Raise InputError for an input that stands where a result will be written."""
+    written = {(folder / name).resolve() for name in _WRITTEN}
+    for path in inputs:
+        if path is not None and path.resolve() in written:
+            raise InputError("the results would overwrite this input, expected another output path", path)
+
+
+def forget_result(folder: Path) -> None:
+    """Take away what an earlier run wrote about models that are about to change."""
+    if (folder / "result.json").is_file():
+        for name in _RESULT_FILES:
+            (folder / name).unlink(missing_ok=True)
+
+
+@contextmanager
+def forgetting_result_if_changed(model_path: Path, folder: Path) -> Iterator[None]:
+    """Forget the result if the block replaces or removes the model, even if it fails."""
+    before = _state(model_path)
+    try:
+        yield
+    finally:
+        if _state(model_path) != before:
+            forget_result(folder)
+
+
+def _state(path: Path) -> tuple[int, int] | None:
+    """The same only for a folder that nobody has replaced."""
+    try:
+        state = path.stat()
+    except OSError:
+        return None
+    return state.st_ino, state.st_mtime_ns
+
+
+def write_outputs(survey: MetricSurvey, formats: Sequence[str], folder: Path) -> None:
+    """Models, ranges.csv, images.csv and the formats asked for; each whole or not at all."""
+    write_model(survey.scaled, folder / "sparse_scaled" / "0")
+    if survey.refined is None:
+        # An earlier run's refined model would not belong to this result.
+        shutil.rmtree(folder / "sparse_metric", ignore_errors=True)
+    else:
+        write_model(survey.refined, folder / "sparse_metric" / "0")
+    _write_ranges(survey, folder / "ranges.csv")
+    times = survey.trajectory.timestamps_s
+    by_name = None
+    if times is not None:
+        by_name = dict(zip(survey.trajectory.image_names, times.tolist(), strict=True))
+        _write_csv(folder / "images.csv", ["image_name", "timestamp_s"], ((n, repr(t)) for n, t in by_name.items()))
+    export_model(
+        survey.final,
+        [name for name in formats if name != "ply" or survey.final.num_points3D()],
+        folder,
+        timestamps_s=by_name,
+        anchors_m={a.anchor_id: a.position_m for a in survey.anchors if np.isfinite(a.position_m).all()},
+        metric_from_sfm=survey.estimate.metric_from_sfm,
+    )
+
+
+def _write_ranges(survey: MetricSurvey, path: Path) -> None:
+    """ranges.csv as used: every range of the log, in its order."""
+    observations, log = survey.observations, survey.observations.log
+    refined = np.full(len(log), np.nan) if survey.refinement is None else survey.refinement.predicted_m
+    has_say = np.isin(observations.status, (*USED, RangeStatus.OUTLIER))
+    numbers = {
+        "weight": np.where(observations.before >= 0, observations.weight, np.nan),
+        "predicted_scaled_m": survey.predicted_scaled_m,
+        "predicted_refined_m": refined,
+        "residual_m": survey.residuals_m,
+        "robust_weight": np.where(has_say, survey.weights, np.nan),
+    }
+    labels = {int(status): status.label for status in RangeStatus}
+    names = (*survey.trajectory.image_names, "")
+    columns: dict[str, Iterable[str]] = {
+        "timestamp_s": [""] * len(log) if log.timestamp_s is None else [repr(t) for t in log.timestamp_s.tolist()],
+        "image_name": [""] * len(log) if log.image_name is None else log.image_name,
+        "anchor_id": [log.anchor_ids[k] for k in log.anchor_index],
+        "tag_id": [log.tag_ids[k] for k in log.tag_index],
+        "range_m": [repr(r) for r in log.range_m.tolist()],
+        "range_stddev_m": _texts(survey.estimate.range_stddev_m),
+        "keyframe_before": [names[i] for i in observations.before],
+        "keyframe_after": [names[i] for i in observations.after],
+        **{name: _texts(values) for name, values in numbers.items()},
+        "status": [labels[status] for status in observations.status.tolist()],
+    }
+    _write_csv(path, list(columns), zip(*columns.values(), strict=True))
+
+
+def _write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    with new_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows(rows)
+
+
+def _texts(values: Array) -> list[str]:
+    return [f"{value:.6g}" if math.isfinite(value) else "" for value in values.tolist()]
+
+
+def write_result(result: dict[str, Any], path: Path) -> None:
+    """result.json; numbers that are not finite become null, as JSON has no others."""
+    with new_file(path) as temporary:
+        text = json.dumps(_plain(result), indent=2, ensure_ascii=False, allow_nan=False)
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def summary_lines(survey: MetricSurvey, result: dict[str, Any], table: str | None, folder: Path) -> Iterator[str]:
+    """What a user wants to know at the end of a run."""
+    estimate, ranges = survey.estimate, result["ranges"]
+    relative = max(estimate.uncertainty.formal, estimate.uncertainty.empirical)
+    yield f"scale: {estimate.value:.6g} m per SfM unit +- {100 * relative:.2f} % (1 stddev)"
+    yield f"verdict: {estimate.verdict}: {'; '.join(estimate.reasons)}"
+    if survey.refinement is not None:
+        refined = survey.refined_scale
+        yield f"refined: {refined:.6g} m per SfM unit after {survey.refinement.num_iterations} iterations"
+    residuals = f", rms {ranges['rms_m']:.3f} m, median {ranges['median_abs_m']:.3f} m" if ranges["num_used"] else ""
+    yield f"ranges: {ranges['num_used']} of {ranges['num']} used{residuals}"
+    if survey.time_offset is not None:
+        offset = survey.time_offset
+        yield f"time offset: image time = range time {offset.value_s:+.3f} s, +- {offset.stddev_s:.3f} s"
+    yield f"map: {survey.final.num_reg_images()} photos, {survey.final.num_points3D()} points, frame {estimate.frame}"
+    if table is not None:
+        yield from ("", *table.splitlines(), "")
+    model = "sparse_scaled/0" if survey.refined is None else "sparse_metric/0"
+    yield f"metric model: {folder / model}"
+    yield f"all results: {folder / 'result.json'}"

@@ -1,0 +1,347 @@
+"""The method, stage by stage: photos, scale, rescaling, refinement, comparison, results.
+
+Lee, Zhu, Giorgi and Günther, "Fusion of Monocular Vision and Radio-based Ranging for Global
+Scale Estimation and Drift Mitigation", 2018, with other means where real radios ask for them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from rangesfm.comparison import format_table, papers_table, reference_in_frame
+from rangesfm.config import Survey
+from rangesfm.doctor import versions
+from rangesfm.errors import InputError
+from rangesfm.export import check_formats
+from rangesfm.files import make_output_folder
+from rangesfm.inputs import RangingInputs, read_ranging_inputs
+from rangesfm.journal import Journal
+from rangesfm.metric_survey import MetricSurvey
+from rangesfm.model_files import read_model
+from rangesfm.outputs import (
+    forget_result,
+    forgetting_result_if_changed,
+    refuse_to_overwrite,
+    summary_lines,
+    write_outputs,
+    write_result,
+)
+from rangesfm.passthrough import apply_options
+from rangesfm.progress import Progress
+from rangesfm.ranging.association import associate
+from rangesfm.ranging.clock import TimeOffset, estimate_time_offset
+from rangesfm.ranging.observations import RangeObservations, RangeStatus, hold_out, robust_weights
+from rangesfm.reference import write_reference
+from rangesfm.refine import predicted_ranges, refine_with_ranges
+from rangesfm.report import write_report
+from rangesfm.results import survey_result
+from rangesfm.scale.initialize import initialize_scale
+from rangesfm.scale.rescale import rescale
+from rangesfm.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images, read_image_times_csv
+from rangesfm.vision.keyframes import select_keyframes
+from rangesfm.vision.reconstruct import reconstruct
+
+TimesByName = Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run left.
+
+    Attributes:
+        output_path: its folder.
+        result: the content of ``result.json``; after a reconstruction alone, seconds and warnings.
+        lines: a summary for people.
+    """
+
+    output_path: Path
+    result: dict[str, Any]
+    lines: tuple[str, ...]
+
+    def summary_lines(self) -> list[str]:
+        return list(self.lines)
+
+
+def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> RunResult:
+    """Photos and ranges to a metric model. Steps of the reconstruction that are done are reused."""
+    journal = Journal(progress)
+    inputs = _read_inputs(survey, journal)
+    keyframes = _keyframes(survey, journal)
+    _check_times(survey, inputs, _path_without_places(keyframes))
+    sfm = _reconstruct(survey, keyframes, journal, restart)
+    return _to_metric(survey, inputs, sfm, keyframes, journal, refine=survey.refine.enabled)
+
+
+def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> RunResult:
+    """Photos to an unscaled model."""
+    journal = Journal(progress)
+    sfm = _reconstruct(survey, _keyframes(survey, journal), journal, restart)
+    path = survey.output_path / "sparse" / "0"
+    line = f"unscaled model: {sfm.num_reg_images()} photos, {sfm.num_points3D()} points, in {path}"
+    return RunResult(survey.output_path, {"seconds": journal.all_seconds(), "warnings": journal.warnings}, (line,))
+
+
+def refine_model(survey: Survey, *, progress: Progress) -> RunResult:
+    """An existing model and ranges to the refined metric model."""
+    return _from_model(survey, progress, refine=True)
+
+
+def scale_model(survey: Survey, *, progress: Progress) -> RunResult:
+    """An existing model, or only its trajectory, and ranges to the scaled model."""
+    return _from_model(survey, progress, refine=False)
+
+
+def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResult:
+    journal = Journal(progress)
+    inputs = _read_inputs(survey, journal)
+    if survey.model_path is None:
+        raise InputError("no model: give --input_path MODEL, a COLMAP model as sparse/0")
+    sfm = _read_registered(survey.model_path)
+    if refine and not sfm.num_points3D():
+        raise InputError("the model has no 3-D points to refine: a trajectory can only be scaled", survey.model_path)
+    times = None
+    if inputs.log.image_name is None:
+        times = _by_name(_times_of_model(survey, sfm, survey.model_path), journal)
+    make_output_folder(survey.output_path)
+    return _to_metric(survey, inputs, sfm, times, journal, refine=refine)
+
+
+def _to_metric(
+    survey: Survey,
+    inputs: RangingInputs,
+    sfm: pycolmap.Reconstruction,
+    times: TimesByName | None,
+    journal: Journal,
+    *,
+    refine: bool,
+) -> RunResult:
+    """From the unscaled model on: the same for photos just mapped and for a model brought along."""
+    trajectory = trajectory_from_reconstruction(sfm, times)
+    if not len(trajectory):
+        first = min(image.name for image in sfm.images.values())
+        raise InputError(f"none of the model's photos has a time, the first is {first}", survey.image_times_path)
+    if num_without_time := sfm.num_reg_frames() - len(trajectory):
+        journal.warn(f"{num_without_time} of {sfm.num_reg_frames()} photos of the model have no time and are left out")
+    _check_times(survey, inputs, trajectory)
+    # Clocks: where on the path each range was taken.
+    offset = _time_offset(survey, inputs, trajectory, journal)
+    # Scale, and the metric map that follows from it.
+    with journal.stage("scale"):
+        metric = _scale(survey, inputs, sfm, trajectory, offset)
+    for doubt in metric.estimate.reasons if metric.estimate.verdict != "good" else ():
+        journal.warn(doubt)
+    # Global refinement: photos and ranges together.
+    if refine:
+        with journal.stage("refinement"):
+            metric = _refine(survey, metric)
+        if metric.refinement is not None and not metric.refinement.converged:
+            journal.warn(f"the refinement stopped before it converged: {metric.refinement.message}")
+    # Comparison and results.
+    with journal.stage("results"):
+        result = survey_result(metric)
+        forget_result(survey.output_path)
+        table = _compare(survey, inputs, metric, result)
+        write_outputs(metric, survey.formats, survey.output_path)
+    result["versions"], result["settings"] = versions(), survey.to_dict()
+    result["seconds"], result["warnings"] = journal.all_seconds(), journal.warnings
+    write_result(result, survey.output_path / "result.json")
+    lines = [*summary_lines(metric, result, table, survey.output_path)]
+    if survey.report_enabled:
+        lines.append(f"report: {write_report(survey.output_path)}")
+    return RunResult(survey.output_path, result, tuple(lines))
+
+
+def _read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
+    """Everything that can be wrong is found before the long work begins."""
+    check_formats(survey.formats)
+    apply_options(pycolmap.BundleAdjustmentOptions(), survey.refine.bundle_adjustment, table="refine.bundle_adjustment")
+    refuse_to_overwrite(
+        (survey.ranges.path, survey.anchors_path, survey.image_times_path, survey.reference_path, survey.model_path),
+        survey.output_path,
+    )
+    inputs = read_ranging_inputs(survey)
+    for note in inputs.notes:
+        journal.warn(note)
+    return inputs
+
+
+def _keyframes(survey: Survey, journal: Journal) -> TimesByName:
+    """The photos to reconstruct, in time order."""
+    folder = _images_path(survey)
+    with journal.timed("keyframes"):
+        image_times = find_image_times(folder, list_images(folder), survey.image_times_path)
+        times = _by_name(image_times, journal)
+        return {name: times[name] for name in select_keyframes(image_times, survey.keyframes)}
+
+
+def _check_times(survey: Survey, inputs: RangingInputs, path: Trajectory) -> None:
+    """Refuse a reference and ranges that have nothing to do with these photos; where they were does not matter."""
+    reference, offset_s = inputs.reference, survey.ranges.time_offset_s
+    if reference is not None and not np.isfinite(reference.positions_at(path)[0]).any():
+        raise InputError(reference.why_nothing_is_known(path), survey.reference_path)
+    if inputs.log.image_name is not None or offset_s is not None:
+        _observations(survey, inputs, path, offset_s or 0.0)
+
+
+def _path_without_places(times: TimesByName) -> Trajectory:
+    n = len(times)
+    timestamps_s = np.array(list(times.values()), dtype=np.float64)
+    return Trajectory(np.arange(n), tuple(times), timestamps_s, np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))
+
+
+def _reconstruct(survey: Survey, keyframes: TimesByName, journal: Journal, restart: bool) -> pycolmap.Reconstruction:
+    """Map the keyframes into ``sparse``; returns ``sparse/0``."""
+    with forgetting_result_if_changed(survey.output_path / "sparse" / "0", survey.output_path):
+        summary = reconstruct(
+            _images_path(survey),
+            tuple(keyframes),
+            survey.output_path,
+            camera=survey.camera,
+            mapper=survey.mapper,
+            seed=survey.seed,
+            progress=journal.progress,
+            restart=restart,
+        )
+    journal.seconds.update(summary.seconds)
+    if summary.num_registered < summary.num_keyframes:
+        journal.warn(f"{summary.num_registered} of {summary.num_keyframes} keyframes are in the model")
+    return summary.models[0]
+
+
+def _images_path(survey: Survey) -> Path:
+    if survey.images_path is None:
+        raise InputError("no photos: give [images] path in a survey file, or --images FOLDER")
+    return survey.images_path
+
+
+def _times_of_model(survey: Survey, sfm: pycolmap.Reconstruction, model_path: Path) -> ImageTimes:
+    """Times of a model's photos; the table may list others, which did not become keyframes."""
+    if survey.image_times_path is not None:
+        return read_image_times_csv(survey.image_times_path)
+    names = tuple(sorted(image.name for image in sfm.images.values()))
+    return find_image_times(survey.images_path or model_path, names)
+
+
+def _by_name(image_times: ImageTimes, journal: Journal) -> TimesByName:
+    for note in image_times.notes:
+        journal.warn(note)
+    return image_times.by_name()
+
+
+def _read_registered(path: Path) -> pycolmap.Reconstruction:
+    model = read_model(path)
+    if not model.num_reg_images():
+        raise InputError("the model has no registered images", path)
+    return model
+
+
+def _time_offset(survey: Survey, inputs: RangingInputs, trajectory: Trajectory, journal: Journal) -> TimeOffset | None:
+    """Search for the offset of the clocks where it is wanted and not given."""
+    if inputs.log.image_name is not None or survey.ranges.time_offset_s is not None:
+        return None
+    with journal.stage("time offset"):
+        offset = estimate_time_offset(
+            inputs.log,
+            trajectory,
+            survey.tag_in_cam_m,
+            association=survey.ranges.association,
+            seed=survey.seed,
+            progress=journal.progress,
+        )
+    if offset.note:
+        journal.warn(offset.note)
+    return offset
+
+
+def _scale(
+    survey: Survey,
+    inputs: RangingInputs,
+    sfm: pycolmap.Reconstruction,
+    trajectory: Trajectory,
+    offset: TimeOffset | None,
+) -> MetricSurvey:
+    offset_s = offset.value_s if offset is not None else survey.ranges.time_offset_s
+    observations = _observations(survey, inputs, trajectory, offset_s or 0.0)
+    estimate = initialize_scale(
+        observations,
+        trajectory,
+        inputs.anchors,
+        anchor_frame=inputs.anchor_frame,
+        options=survey.scale,
+        range_model=survey.ranges.model,
+        seed=survey.seed,
+    )
+    scaled = rescale(sfm, estimate.metric_from_sfm)
+    predicted = predicted_ranges(
+        scaled,
+        trajectory,
+        estimate.observations,
+        estimate.metric_from_sfm,
+        survey.tag_in_cam_m,
+        [anchor.position_m for anchor in estimate.anchors],
+        [anchor.range_bias_m for anchor in estimate.anchors],
+    )
+    weights = robust_weights((predicted - inputs.log.range_m) / estimate.range_stddev_m)
+    return MetricSurvey(trajectory, offset, offset_s, estimate, scaled, predicted, weights)
+
+
+def _observations(survey: Survey, inputs: RangingInputs, trajectory: Trajectory, offset_s: float) -> RangeObservations:
+    """Ranges on the path; refused where the clocks cannot be right."""
+    association = survey.ranges.association
+    observations = associate(inputs.log, trajectory, survey.tag_in_cam_m, time_offset_s=offset_s, options=association)
+    if not observations.has_place.any():
+        raise InputError(_why_no_range_has_a_place(observations, trajectory, offset_s), survey.ranges.path)
+    return hold_out(observations, association.check_share, survey.seed)
+
+
+def _why_no_range_has_a_place(observations: RangeObservations, trajectory: Trajectory, offset_s: float) -> str:
+    times, photo_times = observations.log.timestamp_s, trajectory.timestamps_s
+    if times is None or photo_times is None:
+        return "none of the photos that the log names is in the model"
+    if np.all(observations.status == RangeStatus.OUTSIDE_PATH):
+        return (
+            f"the log's times ({times.min():.3f} to {times.max():.3f} s, plus an offset of {offset_s:g} s) do not "
+            f"overlap the photos' ({photo_times[0]:.3f} to {photo_times[-1]:.3f} s): give another time offset, or auto"
+        )
+    return "no range is near enough to a keyframe in time: use more photos, or a larger max_interpolation_gap_s"
+
+
+def _refine(survey: Survey, metric: MetricSurvey) -> MetricSurvey:
+    estimate = metric.estimate
+    refined, summary = refine_with_ranges(
+        metric.scaled,
+        metric.trajectory,
+        estimate.observations,
+        estimate.metric_from_sfm,
+        estimate.anchors,
+        tag_in_cam_m=survey.tag_in_cam_m,
+        range_stddev_m=estimate.range_stddev_m,
+        correlation_inflation=estimate.correlation_inflation,
+        first_pose_is_fixed=estimate.frame != "site",
+        camera=survey.camera,
+        options=survey.refine,
+        num_threads=survey.mapper.num_threads,
+    )
+    return replace(metric, refined=refined, refinement=summary)
+
+
+def _compare(survey: Survey, inputs: RangingInputs, metric: MetricSurvey, result: dict[str, Any]) -> str | None:
+    """Add the paper's table to the result where there is a reference; returns it as text."""
+    if inputs.reference is None:
+        return None
+    frame = metric.estimate.frame
+    scaled = metric.path_of(metric.scaled)
+    refined = None if metric.refined is None else metric.path_of(metric.refined)
+    rows = papers_table(scaled, refined, inputs.reference, frame=frame)
+    result["comparison"] = [asdict(row) for row in rows]
+    in_frame = reference_in_frame(refined or scaled, inputs.reference, frame=frame)
+    if in_frame is not None:
+        write_reference(in_frame, survey.output_path / "reference.csv")
+    return format_table(rows)

@@ -1,0 +1,117 @@
+"""The top of the report: the verdict with its reasons, the scale, and how large the survey was."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rangesfm.report.checks import larger_stddev
+from rangesfm.report.content import Content, Summary, as_number
+from rangesfm.report.markup import Child, Markup, element
+from rangesfm.report.text import count, decimals_for, duration, fixed, plain, signed
+from rangesfm.report.traffic_lights import traffic_light
+
+VERDICTS = {
+    "good": ("green", "Good", "The scale can be trusted within its interval."),
+    "doubtful": ("amber", "Doubtful", "Use the scale only with the reasons below in mind."),
+    "refused": ("red", "Refused", "The ranges do not determine the scale."),
+}
+NORMAL_QUANTILE_95 = 1.96
+
+
+def head(content: Content) -> Markup:
+    """What one needs to know if one reads no further."""
+    parts = [_verdict(content.summary), _scale(content.summary), _tiles(content)]
+    return element("section", parts, class_="head", id="verdict")
+
+
+def _verdict(summary: Summary) -> Markup:
+    verdict = plain(summary.get("scale", "verdict"))
+    unknown = ("off", verdict.capitalize(), "The run gave no verdict on the scale.")
+    light, word, meaning = VERDICTS.get(verdict, unknown)
+    text = element("div", element("h2", word), element("p", meaning))
+    reasons = [element("li", reason) for reason in summary.texts("scale", "reasons")]
+    warnings = [element("li", warning) for warning in summary.texts("warnings")]
+    return element(
+        "div",
+        element("div", traffic_light(light), text, class_=f"verdict {light}"),
+        element("ul", reasons, class_="reasons") if reasons else None,
+        element("div", element("h3", "Warnings"), element("ul", warnings), class_="warnings") if warnings else None,
+    )
+
+
+def _scale(summary: Summary) -> Markup:
+    value, stddev = summary.number("scale", "value"), larger_stddev(summary)
+    decimals = decimals_for(stddev, default=5)
+    plus_minus = None if stddev is None else element("span", f" ± {fixed(stddev, decimals)}", class_="plus-minus")
+    lines: list[Child] = [
+        element("p", "Metres per unit of the unscaled model", class_="name"),
+        element("p", fixed(value, decimals), plus_minus, class_="scale-value"),
+    ]
+    if value and stddev is not None:
+        low, high = (fixed(value + sign * NORMAL_QUANTILE_95 * stddev, decimals) for sign in (-1, 1))
+        lines.append(element("p", f"± {fixed(100.0 * stddev / value, 2, '%')} · 95 % interval {low} to {high}"))
+    stddevs = [(kind, summary.number("scale", f"stddev_{kind}")) for kind in ("formal", "empirical")]
+    known = [f"{kind} {fixed(number, decimals_for(number, default=5))}" for kind, number in stddevs if number]
+    if known:
+        text = f"The larger of the standard deviations found: {', '.join(known)}."
+        lines.append(element("p", text, class_="small"))
+    if summary.get("scale", "method") is not None:
+        lines.append(element("p", f"Method: {plain(summary.get('scale', 'method'))}", class_="small"))
+    return element("div", lines, class_="scale")
+
+
+def _tiles(content: Content) -> Markup:
+    summary, path = content.summary, content.final
+    num_points = None if content.points_m is None else len(content.points_m)
+    tiles = [
+        (
+            "Keyframes",
+            count(None if path is None else len(path)),
+            f"path of {fixed(_path_length_m(content), 2, 'm')}",
+        ),
+        (
+            "Ranges used",
+            count(summary.number("ranges", "num_used")),
+            f"of {count(summary.number('ranges', 'num'))} in the log",
+        ),
+        (
+            "Range RMS",
+            fixed(summary.number("ranges", "rms_m"), 3, "m"),
+            f"median {fixed(summary.number('ranges', 'median_abs_m'), 3, 'm')}",
+        ),
+        (
+            "Check range RMS",
+            fixed(summary.number("check_ranges", "rms_m"), 3, "m"),
+            f"{count(summary.number('check_ranges', 'num') or 0)} held out",
+        ),
+        (
+            "Reprojection RMS",
+            fixed(summary.number("refine", "reprojection_rms_px"), 2, "px"),
+            f"{count(num_points)} map points",
+        ),
+        (
+            "Clock offset",
+            signed(summary.number("time_offset", "value_s"), 3, "s"),
+            f"± {fixed(summary.number('time_offset', 'stddev_s'), 4, 's')}",
+        ),
+        ("Time taken", duration(_total_seconds(summary)), "all stages"),
+    ]
+    return element(
+        "dl",
+        [
+            element("div", element("dt", name), element("dd", value), element("dd", note, class_="small"))
+            for name, value, note in tiles
+        ],
+        class_="tiles",
+    )
+
+
+def _path_length_m(content: Content) -> float | None:
+    path = content.final
+    return None if path is None else float(np.linalg.norm(np.diff(path.centers, axis=0), axis=1).sum())
+
+
+def _total_seconds(summary: Summary) -> float | None:
+    seconds = summary.table("seconds")
+    known = [value for value in map(as_number, seconds.values()) if value is not None]
+    return as_number(seconds.get("total")) or (sum(known) if known else None)

@@ -1,0 +1,57 @@
+"""The page around the report's parts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rangesfm.report import sections
+from rangesfm.report.content import Content
+from rangesfm.report.head import head
+from rangesfm.report.markup import Markup, element
+
+# Nothing may be fetched, not even by mistake: the page holds all it shows.
+CONTENT_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+
+LOGO = element(
+    "svg",
+    element("circle", cx="6", cy="18", r="2.4", class_="logo-dot"),
+    [element("path", d=f"M6 {18 - r}a{r} {r} 0 0 1 {r} {r}", class_="logo-arc") for r in (6, 10.5, 15)],
+    viewBox="0 0 24 24",
+    class_="logo",
+    aria_hidden="true",
+)
+
+
+def render(content: Content) -> str:
+    """The whole page."""
+    parts = [
+        sections.checks(content),
+        sections.path(content),
+        sections.scale(content),
+        sections.ranges(content),
+        sections.anchors(content),
+        sections.run(content),
+    ]
+    title = f"{content.title} – rangesfm report"
+    return "<!DOCTYPE html>\n" + element(
+        "html",
+        element(
+            "head",
+            element("meta", charset="utf-8"),
+            element("meta", name="viewport", content="width=device-width, initial-scale=1"),
+            element("meta", name="color-scheme", content="light dark"),
+            element("meta", http_equiv="Content-Security-Policy", content=CONTENT_POLICY),
+            element("title", title),
+            element("style", Markup(Path(__file__).with_name("style.css").read_text(encoding="utf-8"))),
+        ),
+        element(
+            "body",
+            element(
+                "header",
+                element("p", LOGO, "rangesfm report", class_="wordmark"),
+                element("h1", content.title),
+            ),
+            element("main", head(content), parts),
+        ),
+        lang="en",
+    )

@@ -1,0 +1,185 @@
+"""The report's tables, each from Content; None where the run has nothing to show."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.report.content import Content, Summary, as_number, in_natural_order
+from rangesfm.report.markup import Child, Markup, element
+from rangesfm.report.text import count, duration, fixed, plain, signed
+
+Array = npt.NDArray[np.float64]
+
+
+def range_statuses(content: Content) -> Markup | None:
+    """What became of the log's ranges."""
+    if content.ranges is None:
+        return None
+    statuses = Counter(content.ranges.status)
+    rows = [[name, count(num), fixed(100.0 * num / statuses.total(), 1, "%")] for name, num in statuses.most_common()]
+    return _table("What became of the ranges", ["status", "ranges", "share"], rows)
+
+
+def ranges_per_anchor(content: Content) -> Markup | None:
+    """Numbers and residuals of each anchor's ranges, before and after the refinement."""
+    ranges = content.ranges
+    if ranges is None:
+        return None
+    anchors = np.array(ranges.anchor_id, dtype=str)
+    rows = []
+    for anchor_id in in_natural_order(ranges.anchor_id):
+        mine = anchors == anchor_id
+        used = mine & ranges.is_used
+        row = [anchor_id, count(int(mine.sum())), count(int(used.sum()))]
+        for residuals in (ranges.residual_scaled_m[used], ranges.residual_refined_m[used]):
+            known = residuals[np.isfinite(residuals)]
+            row += [_fixed_or_nothing(known**2, np.mean, root=True), _fixed_or_nothing(known, np.median)]
+        rows.append(row)
+    header = ["anchor", "ranges", "used", "scaled: RMS m", "median m", "refined: RMS m", "median m"]
+    return _table("Ranges of each anchor", header, rows)
+
+
+def comparison(content: Content) -> Markup | None:
+    """The paper's table."""
+    given = content.summary.get("comparison")
+    rows = [
+        [
+            plain(row.get("name")),
+            fixed(row.get("rmse_m"), 4),
+            fixed(row.get("rmse_se3_m"), 4),
+            fixed(row.get("rmse_sim3_m"), 4),
+            signed(row.get("scale_error_percent"), 3),
+        ]
+        for row in (given if isinstance(given, list) else [])
+        if isinstance(row, dict)
+    ]
+    return _table(
+        "Keyframe centres against the reference",
+        ["trajectory", "RMSE m", "after SE(3) m", "after Sim(3) m", "scale error %"],
+        rows,
+        "The first RMSE is without any alignment: a metric frame must speak for itself.",
+    )
+
+
+def two_candidates(content: Content) -> Markup | None:
+    """Mean and standard deviation of the paper's two branches."""
+    given = content.summary.table("scale", "two_candidate")
+    branches = [(name, given.get(name)) for name in ("alpha0", "alpha1")]
+    rows = [
+        [name, plain(branch.get("mean")), plain(branch.get("std")), "chosen" if given.get("chosen") == name else ""]
+        for name, branch in branches
+        if isinstance(branch, dict)
+    ]
+    return _table(
+        "The paper's two candidates",
+        ["branch", "mean", "stddev", ""],
+        rows,
+        "Each range has two possible scales; the paper takes the mean of the branch with the smaller standard "
+        "deviation. Shown for comparison: other methods do not use it.",
+    )
+
+
+def anchors(content: Content) -> Markup | None:
+    """Where the anchors are, with what is not certain about it."""
+    rows = [
+        [
+            anchor_id,
+            *_coordinates(anchor.get("position_m")),
+            " ".join(fixed(value, 3) for value in _as_list(anchor.get("stddev_m"))),
+            signed(anchor.get("range_bias_m"), 3),
+            " ".join(_coordinates(anchor["mirror_position_m"])) if anchor.get("mirror_position_m") else "none",
+        ]
+        for anchor_id, anchor in content.summary.table("anchors").items()
+        if isinstance(anchor, dict)
+    ]
+    header = ["anchor", "x m", "y m", "z m", "stddev m", "range bias m", "mirror image at m"]
+    return _table("Anchors in the map's frame", header, rows)
+
+
+def stages(content: Content) -> Markup | None:
+    """Where the time went."""
+    seconds = {name: as_number(value) for name, value in content.summary.table("seconds").items()}
+    known = {name: value for name, value in seconds.items() if value is not None and name != "total"}
+    longest = max(known.values(), default=0.0) or 1.0
+    rows = [
+        [
+            name.replace("_", " "),
+            duration(value),
+            element("i", class_="bar", style=f"width:{100.0 * value / longest:.1f}%"),
+        ]
+        for name, value in known.items()
+    ]
+    return _table("Time", ["stage", "time", ""], rows, class_="stages")
+
+
+def refinement(content: Content) -> Markup | None:
+    """What the solver did."""
+    rows = [[name.replace("_", " "), plain(value)] for name, value in content.summary.table("refine").items()]
+    return _table("Refinement", [], rows)
+
+
+def versions(content: Content) -> Markup | None:
+    """What the result was made with."""
+    return _table("Versions", [], _flattened(content.summary, "versions"))
+
+
+def settings(content: Content) -> Markup | None:
+    """What was asked for."""
+    return _table("Settings", [], _flattened(content.summary, "settings"), class_="settings")
+
+
+def _fixed_or_nothing(values: Array, measure: Any, *, root: bool = False) -> str:
+    if len(values) == 0:
+        return fixed(None, 3)
+    value = float(measure(values))
+    return fixed(value**0.5 if root else value, 3)
+
+
+def _coordinates(position: Any) -> list[str]:
+    values = position if isinstance(position, list) and len(position) == 3 else [None] * 3
+    return [fixed(value, 3) for value in values]
+
+
+def _as_list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]
+
+
+def _flattened(summary: Summary, *keys: str) -> list[list[str]]:
+    """Rows of key and value of a nested object, keys joined by dots."""
+    rows = []
+    for key in summary.table(*keys):
+        if summary.table(*keys, key):
+            rows += [[f"{key}.{inner}", value] for inner, value in _flattened(summary, *keys, key)]
+        else:
+            rows.append([key, plain(summary.get(*keys, key))])
+    return rows
+
+
+def _table(
+    caption: str,
+    header: Sequence[str],
+    rows: Sequence[Sequence[Child]],
+    note: str | None = None,
+    *,
+    class_: str | None = None,
+) -> Markup | None:
+    """A table that scrolls sideways on its own where the page is narrow; None without rows."""
+    if not rows:
+        return None
+    columns = element("thead", element("tr", [element("th", name, scope="col") for name in header])) if header else None
+    body = [
+        element("tr", element("th", first, scope="row"), [element("td", cell) for cell in cells])
+        for first, *cells in rows
+    ]
+    return element(
+        "div",
+        element("h3", caption),
+        element("div", element("table", columns, element("tbody", body), class_=class_), class_="scroll"),
+        element("p", note, class_="small") if note else None,
+        class_="table",
+    )

@@ -1,0 +1,60 @@
+"""Numbers as a reader likes them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from rangesfm.report.content import as_number
+
+NOTHING = "–"
+
+
+def fixed(value: Any, decimals: int, unit: str = "", *, nothing: str = NOTHING) -> str:
+    """With so many decimals and a unit; ``nothing`` for what is not a number."""
+    number = as_number(value)
+    return nothing if number is None else f"{number:.{decimals}f}".replace("-", "−") + (f"\u00a0{unit}" if unit else "")
+
+
+def signed(value: Any, decimals: int, unit: str = "") -> str:
+    """As ``fixed``, with a sign before positive numbers too."""
+    number = as_number(value)
+    return ("+" if number is not None and number > 0 else "") + fixed(value, decimals, unit)
+
+
+def count(value: Any) -> str:
+    """A whole number with thin spaces between thousands."""
+    number = as_number(value)
+    return NOTHING if number is None else f"{round(number):,}".replace(",", "\u202f")
+
+
+def decimals_for(stddev: float | None, *, default: int) -> int:
+    """Decimals that show two digits of the stddev."""
+    if stddev is None or stddev <= 0:
+        return default
+    return min(max(1 - math.floor(math.log10(stddev)), 0), 12)
+
+
+def duration(seconds: Any) -> str:
+    """As hours, minutes and seconds, no finer than needed."""
+    number = as_number(seconds)
+    if number is None:
+        return NOTHING
+    if number < 60:
+        return f"{number:.1f}\u00a0s"
+    minutes, rest = divmod(round(number), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}\u00a0h {minutes:02d}\u00a0min" if hours else f"{minutes}\u00a0min {rest:02d}\u00a0s"
+
+
+def plain(value: Any) -> str:
+    """Any JSON value on one line."""
+    if value is None:
+        return NOTHING
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list):
+        return ", ".join(map(plain, value)) or NOTHING
+    return str(value)

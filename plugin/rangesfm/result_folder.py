@@ -1,0 +1,166 @@
+"""What a run left in its output folder, read back for comparison, export and report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from rangesfm.errors import InputError
+from rangesfm.geometry import Similarity
+from rangesfm.ranging.observations import RangeStatus
+from rangesfm.tables import read_table
+
+if TYPE_CHECKING:
+    import pycolmap
+
+Array = npt.NDArray[np.float64]
+
+RANGES_COLUMNS = (
+    "timestamp_s",
+    "image_name",
+    "anchor_id",
+    "range_m",
+    "predicted_scaled_m",
+    "predicted_refined_m",
+    "status",
+)
+USED_STATUSES = (RangeStatus.USED.label, RangeStatus.DOWN_WEIGHTED.label)
+
+
+@dataclass(frozen=True)
+class RangesAsUsed:
+    """``ranges.csv`` of a result: n ranges with what became of them.
+
+    Attributes:
+        timestamp_s: (n,) on the radio's clock, NaN where the log gives photos instead.
+        image_name: n names, empty where the log gives times.
+        anchor_id: n ids.
+        range_m: (n,) measured.
+        residual_scaled_m, residual_refined_m: (n,) predicted minus measured with the
+            scaled and with the refined model; NaN where not applicable.
+        status: n labels of RangeStatus.
+    """
+
+    timestamp_s: Array
+    image_name: tuple[str, ...]
+    anchor_id: tuple[str, ...]
+    range_m: Array
+    residual_scaled_m: Array
+    residual_refined_m: Array
+    status: tuple[str, ...]
+
+    @property
+    def is_used(self) -> npt.NDArray[np.bool_]:
+        """(n,) ranges with a say in the final model, however small."""
+        return np.isin(np.array(self.status, dtype=str), USED_STATUSES)
+
+
+@dataclass(frozen=True)
+class ResultFolder:
+    """A run's output folder.
+
+    Attributes:
+        path: of the folder.
+        summary: ``result.json``.
+        timestamps_s: time of each photo by name; None where the photos have no times.
+    """
+
+    path: Path
+    summary: dict[str, Any]
+    timestamps_s: dict[str, float] | None
+
+    @property
+    def frame(self) -> str:
+        """The world of the metric models: "site" or "first_camera"."""
+        return str(self.summary.get("frame", "first_camera"))
+
+    @property
+    def anchor_positions_m(self) -> dict[str, Array]:
+        """(3,) position by anchor id, in the metric models' world; anchors without one are left out."""
+        with self._expecting("anchors"):
+            anchors = self.summary.get("anchors") or {}
+            return {
+                str(anchor_id): np.array(anchor["position_m"], dtype=np.float64).reshape(3)
+                for anchor_id, anchor in anchors.items()
+                if anchor.get("position_m") is not None
+            }
+
+    @property
+    def metric_from_sfm(self) -> Similarity | None:
+        """World of ``sparse/0`` to world of ``sparse_scaled/0``; None if not said."""
+        given = self.summary.get("metric_from_sfm")
+        if given is None:
+            return None
+        with self._expecting("metric_from_sfm"):
+            return Similarity(
+                float(given["scale"]),
+                Rotation.from_quat(given["rotation_xyzw"]).as_matrix(),
+                np.array(given["translation_m"], dtype=np.float64).reshape(3),
+            )
+
+    @contextmanager
+    def _expecting(self, key: str) -> Iterator[None]:
+        """Whatever goes wrong inside is the fault of the file."""
+        try:
+            yield
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise InputError(f"'{key}' is not what a run writes", self.path / "result.json") from error
+
+    def read_model(self, stage: str) -> pycolmap.Reconstruction | None:
+        """The model ``stage``/0 ("sparse", "sparse_scaled" or "sparse_metric"); None if not there."""
+        from rangesfm.model_files import read_model
+
+        path = self.path / stage / "0"
+        return read_model(path) if path.is_dir() else None
+
+    def read_ranges(self) -> RangesAsUsed | None:
+        """``ranges.csv``; None if not there."""
+        path = self.path / "ranges.csv"
+        if not path.is_file():
+            return None
+        table = read_table(path, RANGES_COLUMNS)
+        range_m = table.numbers("range_m")
+        return RangesAsUsed(
+            timestamp_s=table.numbers("timestamp_s", empty=np.nan),
+            image_name=tuple(table.text("image_name", empty="")),
+            anchor_id=tuple(table.text("anchor_id")),
+            range_m=range_m,
+            residual_scaled_m=table.numbers("predicted_scaled_m", empty=np.nan) - range_m,
+            residual_refined_m=table.numbers("predicted_refined_m", empty=np.nan) - range_m,
+            status=tuple(table.text("status")),
+        )
+
+
+def read_result_folder(path: Path) -> ResultFolder:
+    """Read what is small; models and ranges are read when asked for.
+
+    Raises:
+        InputError: the folder is missing, has no ``result.json``, or that is not what a run writes.
+    """
+    result_path = path / "result.json"
+    if not result_path.is_file():
+        raise InputError("not a result folder: it has no result.json (expected the output_path of a run)", path)
+    try:
+        summary = json.loads(result_path.read_text(encoding="utf-8"))
+    except json.JSONDecodeError as error:
+        raise InputError(f"not JSON: {error.msg}", result_path, error.lineno) from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError("cannot be read as text", result_path) from error
+    if not isinstance(summary, dict):
+        raise InputError("expected a JSON object", result_path, 1)
+    return ResultFolder(path, summary, _read_image_times(path / "images.csv"))
+
+
+def _read_image_times(path: Path) -> dict[str, float] | None:
+    if not path.is_file():
+        return None
+    table = read_table(path, ["image_name", "timestamp_s"])
+    return dict(zip(table.text("image_name"), table.numbers("timestamp_s").tolist())) or None

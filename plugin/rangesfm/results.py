@@ -1,0 +1,134 @@
+"""The content of result.json, in the contract's names."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from rangesfm.metric_survey import MetricSurvey
+from rangesfm.ranging.anchors import AnchorEstimate
+from rangesfm.ranging.observations import RangeStatus
+from rangesfm.scale.estimate import ScaleEstimate
+from rangesfm.scale.two_candidate import TwoCandidate
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+USED = (RangeStatus.USED, RangeStatus.DOWN_WEIGHTED)
+
+
+def survey_result(survey: MetricSurvey) -> dict[str, Any]:
+    """All entries that follow from the stages' results."""
+    similarity = survey.estimate.metric_from_sfm
+    return {
+        "scale": _scale(survey.estimate),
+        "metric_from_sfm": {
+            "scale": similarity.scale,
+            "rotation_xyzw": Rotation.from_matrix(similarity.rotation).as_quat(),
+            "translation_m": similarity.translation,
+        },
+        "frame": survey.estimate.frame,
+        "anchors": {anchor.anchor_id: _anchor(anchor) for anchor in survey.anchors},
+        "time_offset": _time_offset(survey),
+        "ranges": _ranges(survey),
+        "check_ranges": _check_ranges(survey),
+        "refine": _refine(survey),
+    }
+
+
+def _scale(estimate: ScaleEstimate) -> dict[str, Any]:
+    return {
+        "value": estimate.value,
+        "stddev_formal": estimate.stddev_formal,
+        "stddev_empirical": estimate.stddev_empirical,
+        "relative_stddev": asdict(estimate.uncertainty),
+        "method": estimate.method,
+        "verdict": estimate.verdict,
+        "reasons": estimate.reasons,
+        "per_anchor": estimate.per_anchor,
+        "range_noise_stddev_m": estimate.noise_stddev_m,
+        "correlation_inflation": estimate.correlation_inflation,
+        "two_candidate": _two_candidate(estimate.two_candidate),
+    }
+
+
+def _two_candidate(table: TwoCandidate | None) -> dict[str, Any] | None:
+    if table is None:
+        return None
+    return {
+        "alpha0": asdict(table.alpha0),
+        "alpha1": asdict(table.alpha1),
+        "chosen": table.chosen,
+        "num_without_root": table.num_without_root,
+    }
+
+
+def _anchor(anchor: AnchorEstimate) -> dict[str, Any]:
+    return {
+        "position_m": anchor.position_m if np.isfinite(anchor.position_m).all() else None,
+        "stddev_m": anchor.position_stddev_m,
+        "range_bias_m": anchor.range_bias_m,
+        "mirror_position_m": anchor.mirror_position_m,
+        "surveyed_position_m": anchor.prior_position_m,
+    }
+
+
+def _time_offset(survey: MetricSurvey) -> dict[str, Any]:
+    found = survey.time_offset
+    if found is not None:
+        return {"value_s": found.value_s, "stddev_s": found.stddev_s, "estimated": True, "note": found.note}
+    given = survey.time_offset_s
+    return {"value_s": given, "stddev_s": None if given is None else 0.0, "estimated": False, "note": None}
+
+
+def _ranges(survey: MetricSurvey) -> dict[str, Any]:
+    log = survey.observations.log
+    used = np.isin(survey.observations.status, USED)
+    return {
+        **_residual_summary(survey.residuals_m, used, np.ones(len(log), dtype=bool)),
+        "per_anchor": {
+            anchor_id: _residual_summary(survey.residuals_m, used, log.anchor_index == k)
+            for k, anchor_id in enumerate(log.anchor_ids)
+        },
+    }
+
+
+def _residual_summary(residuals_m: Array, used: Mask, of: Mask) -> dict[str, Any]:
+    chosen = residuals_m[used & of]
+    return {
+        "num": int(of.sum()),
+        "num_used": int((used & of).sum()),
+        "num_rejected": int((~used & of).sum()),
+        "rms_m": _rms(chosen),
+        "median_abs_m": float(np.median(np.abs(chosen))) if len(chosen) else None,
+    }
+
+
+def _check_ranges(survey: MetricSurvey) -> dict[str, Any]:
+    held_out = survey.observations.status == RangeStatus.CHECK
+    return {"num": int(held_out.sum()), "rms_m": _rms(survey.residuals_m[held_out])}
+
+
+def _rms(residuals_m: Array) -> float | None:
+    return float(np.sqrt(np.mean(residuals_m**2))) if len(residuals_m) else None
+
+
+def _refine(survey: MetricSurvey) -> dict[str, Any] | None:
+    summary = survey.refinement
+    if summary is None:
+        return None
+    return {
+        "iterations": summary.num_iterations,
+        "initial_cost": summary.initial_cost,
+        "final_cost": summary.final_cost,
+        "reprojection_rms_px": summary.reprojection_rms_px,
+        "pixel_stddev": summary.pixel_stddev,
+        "seconds": summary.seconds,
+        "converged": summary.converged,
+        "message": summary.message,
+        "scale_value": survey.refined_scale,
+    }

@@ -1,0 +1,147 @@
+"""CameraPath: a camera's smooth way through a scene, exact at every time.
+
+World z is up. Camera frame as in COLMAP: x right, y down, z forward.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Pose as a function of time on the camera's clock.
+
+    Attributes:
+        start_s, end_s: first and last time at which it is defined.
+        position: spline of the projection centre, metres.
+        rotation: spline of world_from_cam.
+    """
+
+    start_s: float
+    end_s: float
+    position: CubicSpline
+    rotation: RotationSpline
+
+    @classmethod
+    def through(cls, times_s: FloatArray, centers_m: FloatArray, world_from_cam: FloatArray) -> CameraPath:
+        """The smooth path through n poses.
+
+        Args:
+            times_s: (n,) strictly increasing, n >= 2.
+            centers_m: (n, 3).
+            world_from_cam: (n, 3, 3).
+        """
+        rotations = Rotation.from_matrix(world_from_cam)
+        return cls(
+            float(times_s[0]), float(times_s[-1]), CubicSpline(times_s, centers_m), RotationSpline(times_s, rotations)
+        )
+
+    def centers(self, times_s: FloatArray) -> FloatArray:
+        """(n, 3) projection centres in the world, metres."""
+        return np.asarray(self.position(times_s))
+
+    def world_from_cam(self, times_s: FloatArray) -> FloatArray:
+        """(n, 3, 3) rotations."""
+        return np.asarray(self.rotation(times_s).as_matrix())
+
+    def cam_from_world(self, times_s: FloatArray) -> FloatArray:
+        """(n, 3, 4) rotation and translation."""
+        cam_from_world = np.swapaxes(self.world_from_cam(times_s), 1, 2)
+        translation = -cam_from_world @ self.centers(times_s)[:, :, None]
+        return np.concatenate([cam_from_world, translation], axis=2)
+
+
+def look_at(centers_m: FloatArray, targets_m: FloatArray, roll_deg: FloatArray | float = 0.0) -> FloatArray:
+    """(n, 3, 3) world_from_cam of upright cameras that look from (n, 3) to (n, 3), then rolled clockwise."""
+    forward = targets_m - centers_m
+    forward = forward / np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    upright = np.stack([right, np.cross(forward, right), forward], axis=2)
+    roll = np.zeros((len(centers_m), 3))
+    roll[:, 2] = np.radians(roll_deg)
+    return np.asarray(upright @ Rotation.from_rotvec(roll).as_matrix())
+
+
+def loop_path(
+    duration_s: float,
+    *,
+    start_s: float = 0.0,
+    center_m: Sequence[float] = (0.0, 0.0, 1.6),
+    semi_axes_m: tuple[float, float] = (4.0, 3.0),
+    height_amplitude_m: float = 0.35,
+    num_turns: float = 1.15,
+    start_deg: float = 0.0,
+    unsteadiness_m: float = 0.05,
+    seed: int = 0,
+) -> CameraPath:
+    """A hand-held walk around ``center_m``, looking across it; more than one turn comes back to what was seen.
+
+    Args:
+        duration_s: of the walk.
+        start_s: when it starts.
+        center_m: middle of the loop, at the mean height of the camera.
+        semi_axes_m: of the ellipse, along x and y.
+        height_amplitude_m: how far the camera goes up and down, about 1.5 times a turn.
+        num_turns: of the walk, counter-clockwise.
+        start_deg: direction of the start from the centre, from x towards y.
+        unsteadiness_m: stddev of the slow sway; the gaze strays accordingly.
+        seed: of the sway.
+    """
+    rng = np.random.default_rng(seed)
+    times = np.linspace(0.0, duration_s, max(8, round(duration_s / 2.5)))
+    angle = np.radians(start_deg) + 2 * np.pi * num_turns * times / duration_s
+    wave = np.sin(1.5 * angle)
+    shape = np.stack(
+        [semi_axes_m[0] * np.cos(angle), semi_axes_m[1] * np.sin(angle), height_amplitude_m * wave], axis=1
+    )
+    centers = np.asarray(center_m) + shape + unsteadiness_m * rng.standard_normal(shape.shape)
+    # The gaze meets the plane beyond the middle, now a little left of it, now right, now lower.
+    across = np.asarray(center_m) - 0.25 * shape * [1, 1, 0]
+    stray = np.stack([0.25 * np.sin(2.1 * angle), 0.25 * np.cos(1.7 * angle), -0.09 + 0.05 * wave], axis=1)
+    targets = across + stray * np.linalg.norm(semi_axes_m)
+    targets += 2 * unsteadiness_m * rng.standard_normal(targets.shape)
+    rolls = 20 * unsteadiness_m * rng.standard_normal(len(times))
+    return CameraPath.through(start_s + times, centers, look_at(centers, targets, rolls))
+
+
+def orbit_path(duration_s: float, *, radius_m: float = 5.0, height_amplitude_m: float = 1.0) -> CameraPath:
+    """A steady circle around the origin, rising and falling, looking at the middle."""
+    return loop_path(
+        duration_s,
+        center_m=(0.0, 0.0, 0.0),
+        semi_axes_m=(radius_m, radius_m),
+        height_amplitude_m=height_amplitude_m,
+        num_turns=1.0,
+        unsteadiness_m=0.0,
+    )
+
+
+def sequence_path(
+    duration_s: float, *, speed_m_per_s: float = 1.0, turn_stddev_deg: float = 12.0, seed: int = 0
+) -> CameraPath:
+    """A way that never returns: ahead along x in bends, over low hills, looking ahead.
+
+    Args:
+        duration_s: from time 0.
+        speed_m_per_s: constant.
+        turn_stddev_deg: stddev of the heading, which wanders around the x axis.
+        seed: of the bends.
+    """
+    rng = np.random.default_rng(seed)
+    times = np.linspace(0.0, duration_s, max(8, round(duration_s / 4)))
+    heading = np.radians(turn_stddev_deg) * rng.standard_normal(len(times))
+    climb = 0.05 * rng.standard_normal(len(times))
+    direction = CubicSpline(times, np.stack([np.cos(heading), np.sin(heading), climb], axis=1))
+    position = direction.antiderivative()
+    centers = speed_m_per_s * position(times)
+    return CameraPath.through(times, centers, look_at(centers, centers + direction(times)))
