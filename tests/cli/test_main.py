@@ -1,0 +1,189 @@
+"""The command as users meet it: help, results, and one line for whatever goes wrong."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import rangesfm
+from rangesfm.cli import main
+from rangesfm.cli.arguments import COMMANDS
+from rangesfm.errors import GeometryError, SolverError
+
+LOG = "timestamp_s,anchor_id,range_m\n0,a,1\n0.5,b,0\n1,a,2\n"
+
+
+def rangesfm_command(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    package_folder = str(Path(rangesfm.__path__[-1]).parent)
+    path = os.pathsep.join([package_folder, os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+    return subprocess.run(
+        [sys.executable, "-m", "rangesfm", *arguments],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": path},
+        check=False,
+    )
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "uwb.csv").write_text(LOG)
+    (tmp_path / "model").mkdir()
+    (tmp_path / "photos").mkdir()
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def error_line(capsys: pytest.CaptureFixture[str]) -> str:
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("rangesfm: error: ")
+    assert captured.err.count("\n") == 1
+    return captured.err
+
+
+def raise_in_ranges(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("rangesfm.cli.ranges.execute", fail)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_of_each_command_shows_an_example(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, "--help"]) == 0
+    text = capsys.readouterr().out
+    assert f"example:\n  rangesfm {command}" in text
+
+
+def test_help_needs_none_of_the_heavy_packages() -> None:
+    code = (
+        "import sys; from rangesfm.cli import main; main(['refine', '--help']); "
+        "sys.exit(bool({'numpy', 'scipy', 'pycolmap'} & set(sys.modules)))"
+    )
+    env = {**os.environ, "PYTHONPATH": str(Path(rangesfm.__path__[-1]).parent)}
+    assert subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, check=False).returncode == 0
+
+
+def test_module_runs_as_a_command(folder: Path) -> None:
+    done = rangesfm_command("ranges", "uwb.csv", cwd=folder)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "format  canonical" in done.stdout
+    failed = rangesfm_command("ranges", "none.csv", cwd=folder)
+    assert (failed.returncode, failed.stdout) == (2, "")
+    assert failed.stderr == "rangesfm: error: none.csv: no such file\n"
+
+
+def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("rangesfm 0.")
+
+
+def test_ranges_prints_what_is_in_a_log(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["ranges", "uwb.csv"]) == 0
+    text = capsys.readouterr().out
+    assert "ranges  2, and 1 records without a measurement" in text
+    assert "0.000 to 1.000 s, 1.000 s long, 1.0 ranges a second, largest gap 1.000 s" in text
+    assert text.splitlines()[-1].split() == ["a", "2", "1.000", "1.500", "2.000", "1.000"]
+
+
+def test_ranges_writes_the_canonical_csv_from_mapped_columns(folder: Path) -> None:
+    (folder / "odd.tsv").write_text("node\tt\td\nA\t1500\t232\n")
+    columns = "timestamp=t,anchor_id=node,range=d"
+    argv = ["ranges", "odd.tsv", "--columns", columns, "--timestamp-unit", "ms", "--range_unit", "cm"]
+    assert main([*argv, "--output-path", "ranges.csv"]) == 0
+    assert (folder / "ranges.csv").read_text() == "timestamp_s,anchor_id,range_m\n1.5,A,2.32\n"
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["rum"], "rum"),
+        (["run"], "no photos"),
+        (["run", "--images", "none"], "no such folder of photos"),
+        (["run", "--images", "photos"], "no ranges"),
+        (["run", "--images", "photos", "--ranges", "none.csv"], "there is no file"),
+        (["run", "none.toml"], "none.toml: no such file"),
+        (["reconstruct", "--ranges", "uwb.csv"], "unknown option --ranges"),
+        (["scale", "--ranges", "uwb.csv"], "no model"),
+        (["refine", "--ranges", "uwb.csv", "--input_path", "none"], "no such folder of a COLMAP model"),
+        (["refine", "--input_path", "model"], "no ranges"),
+        (["ranges", "none.csv"], "none.csv: no such file"),
+        (["ranges", "uwb.csv", "--output_path", "none/ranges.csv"], "cannot be written"),
+        (["ranges", "photos"], "is a folder"),
+        (["report", "photos"], "photos"),
+        (["compare", "photos"], "photos"),
+        (["export", "photos"], "photos"),
+        (["export", "photos", "--formats", "tum,dxf"], "dxf"),
+        (["export", "a", "--input_path", "b"], "two result folders"),
+        (["demo", "--num_photos", "2"], "--num_photos is 2"),
+        (["demo", "--seed", "-2"], "--seed is -2"),
+    ],
+)
+@pytest.mark.usefixtures("folder")
+def test_bad_usage_and_bad_input_are_one_line_and_status_2(
+    argv: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(argv) == 2
+    assert said in error_line(capsys)
+
+
+def test_misspelt_survey_key_is_named_with_file_and_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "survey.toml").write_text('[ranges]\npth = "uwb.csv"\n')
+    assert main(["run", "survey.toml"]) == 2
+    assert "survey.toml:2: unknown key 'pth' in [ranges]; the nearest known one is 'path'" in error_line(capsys)
+
+
+def test_output_that_cannot_be_written_leaves_nothing_behind(folder: Path) -> None:
+    (folder / "taken").mkdir()
+    assert main(["ranges", "uwb.csv", "--output_path", "taken"]) == 2
+    assert sorted(path.name for path in folder.iterdir()) == ["model", "photos", "taken", "uwb.csv"]
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "said"),
+    [
+        (GeometryError("the path is straight"), 3, "the path is straight"),
+        (SolverError("diverged\nsomewhere"), 4, "diverged somewhere"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (OSError(28, "No space left on device", "out/x"), 4, "out/x: No space left on device"),
+        (PermissionError(13, "Permission denied", "out/x"), 2, "out/x: Permission denied"),
+        (MemoryError(), 4, "out of memory"),
+        (RuntimeError("odd"), 1, "internal error, please report it (RANGESFM_DEBUG=1 shows where): RuntimeError: odd"),
+    ],
+)
+@pytest.mark.usefixtures("folder")
+def test_every_error_ends_as_one_line(
+    error: BaseException,
+    status: int,
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    raise_in_ranges(monkeypatch, error)
+    monkeypatch.delenv("RANGESFM_DEBUG", raising=False)
+    assert main(["ranges", "uwb.csv"]) == status
+    assert said in error_line(capsys)
+
+
+@pytest.mark.usefixtures("folder")
+def test_traceback_is_shown_to_those_who_ask(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    raise_in_ranges(monkeypatch, RuntimeError("odd"))
+    monkeypatch.setenv("RANGESFM_DEBUG", "1")
+    assert main(["ranges", "uwb.csv"]) == 1
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_reader_that_goes_away_is_no_error(folder: Path) -> None:
+    script = f'"{sys.executable}" -m rangesfm ranges uwb.csv | true; echo "${{PIPESTATUS[0]}}"'
+    env = {**os.environ, "PYTHONPATH": str(Path(rangesfm.__path__[-1]).parent)}
+    done = subprocess.run(["bash", "-c", script], cwd=folder, env=env, capture_output=True, text=True, check=False)
+    assert done.stderr == ""
+    assert done.stdout.strip() in ("0", "141")

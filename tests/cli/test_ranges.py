@@ -1,0 +1,50 @@
+"""``rangesfm ranges`` says what is in a log, draws it and writes it in the canonical form."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rangesfm.cli import main
+from rangesfm.ranging.readers import read_ranges
+
+
+def test_faults_and_noise_of_a_log_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ranges = np.round(5 + np.random.default_rng(1).normal(0, 0.05, 200), 2).tolist()
+    rows = [f"{k / 10},a,{range_m}" for k, range_m in enumerate(ranges)]
+    rows += [rows[7]]
+    (tmp_path / "uwb.csv").write_text("\n".join(["timestamp_s,anchor_id,range_m", *rows]))
+    assert main(["ranges", str(tmp_path / "uwb.csv")]) == 0
+    text = capsys.readouterr().out
+    assert "1 ranges stand in the log twice" in text
+    assert "1 ranges are earlier than the one before them" in text
+    assert "all ranges are multiples of 0.01 m" in text
+    noise_m = float(text.splitlines()[-1].split()[5])
+    assert noise_m == pytest.approx(0.05, rel=0.2)
+
+
+def test_device_log_is_written_as_canonical_csv_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log, out, plot = tmp_path / "uwb.log", tmp_path / "out.csv", tmp_path / "out.png"
+    log.write_text("1.5 022E[7.94,8.03,0.00]=3.38 9280[7.95,0.00,0.00]=5.49\n")
+    assert main(["ranges", str(log), "--output-path", str(out), "--plot", str(plot)]) == 0
+    assert read_ranges(out).range_m.tolist() == [3.38, 5.49]
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    text = capsys.readouterr().out
+    assert "format  dwm1001_les" in text
+    assert "  022E  7.940  8.030  0.000" in text
+
+
+def test_time_stamps_are_converted_as_told(tmp_path: Path) -> None:
+    log, out = tmp_path / "uwb.csv", tmp_path / "out.csv"
+    told = ["--columns", "timestamp=t,anchor_id=node", "--stamp_unit", "us", "--t_off_s", "1e-7"]
+    log.write_text("t,node,tx1,rx1,tx2,rx2\n0,a,0,1000,2000,1000.5\n")
+    assert main(["ranges", str(log), *told, "--propagation_speed", "vacuum", "--output_path", str(out)]) == 0
+    assert read_ranges(out).range_m[0] == pytest.approx(299_792_458 / 2 * (0.5e-6 - 1e-7), abs=1e-4)
+
+
+@pytest.mark.parametrize("speed", ["fast", "5", "3e9"])
+def test_speed_that_is_not_lights_is_refused(speed: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["ranges", "uwb.csv", "--propagation_speed", speed]) == 2
+    assert "is no speed of light" in capsys.readouterr().err

@@ -1,0 +1,95 @@
+"""Progress is one moving line on a terminal, a few plain lines elsewhere, and nothing when quiet."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+
+from rangesfm.cli.terminal import TerminalProgress, terminal_progress
+
+
+class FakeTerminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_plain_lines_tell_start_and_end_of_stages() -> None:
+    stream, clock = io.StringIO(), Clock()
+    progress = TerminalProgress(stream, clock=clock)
+    progress.stage("features")
+    clock.now = 61.2
+    progress.stage("matching")
+    progress.message("two models")
+    clock.now = 63.7
+    progress.end_stage()
+    assert stream.getvalue().splitlines() == [
+        "features ...",
+        "features: 1 min 01 s",
+        "matching ...",
+        "two models",
+        "matching: 2.5 s",
+    ]
+
+
+def test_plain_updates_are_sparse() -> None:
+    stream, clock = io.StringIO(), Clock()
+    progress = TerminalProgress(stream, clock=clock)
+    progress.stage("mapping")
+    for num_done in range(101):
+        clock.now = float(num_done)
+        progress.update(num_done, 400)
+    lines = stream.getvalue().splitlines()
+    assert len(lines) == 1 + 10
+    assert lines[-1] == "mapping 100/400, 25 %, 5 min 00 s left"
+
+
+def test_terminal_has_one_line_that_is_written_anew() -> None:
+    stream, clock = FakeTerminal(), Clock()
+    progress = TerminalProgress(stream, clock=clock)
+    progress.stage("mapping")
+    clock.now = 2.0
+    progress.update(10, 40)
+    clock.now = 4.0
+    progress.update(40, 40)
+    assert "\n" not in stream.getvalue()
+    assert stream.getvalue().split("\r\033[K")[1:] == [
+        "mapping",
+        "mapping 10/40, 25 %, 6.0 s left",
+        "mapping 40/40, 100 %",
+    ]
+    progress.end_stage()
+    assert stream.getvalue().endswith("mapping: 4.0 s\n")
+
+
+def test_unknown_total_shows_the_count_alone() -> None:
+    stream, clock = io.StringIO(), Clock()
+    progress = TerminalProgress(stream, clock=clock)
+    progress.stage("refinement")
+    clock.now = 11.0
+    progress.update(7)
+    assert stream.getvalue().splitlines()[-1] == "refinement 7"
+
+
+def test_quiet_is_silent() -> None:
+    stream = io.StringIO()
+    with terminal_progress(stream, quiet=True) as progress:
+        progress.stage("features")
+        progress.update(1, 2)
+        progress.message("note")
+    assert stream.getvalue() == ""
+
+
+def test_stage_that_fails_is_not_said_to_be_done() -> None:
+    stream = io.StringIO()
+
+    with contextlib.suppress(KeyboardInterrupt), terminal_progress(stream) as progress:
+        progress.stage("mapping")
+        raise KeyboardInterrupt
+    assert stream.getvalue().splitlines()[-1].startswith("mapping: stopped after")

@@ -1,0 +1,143 @@
+"""What the tests of whole commands share: the command itself, and a survey without photos to try it on."""
+
+from __future__ import annotations
+
+import os
+
+# As the command line does; numpy reads it when it is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from rangesfm.geometry import Similarity
+from rangesfm.ranging.readers.canonical import write_ranges_csv
+from rangesfm.reference import Reference, write_reference
+from rangesfm.simulate.model import synthetic_model
+from rangesfm.simulate.path import loop_path
+from rangesfm.simulate.ranges import Radio, simulate_ranges
+from rangesfm.simulate.survey import TIME_OFFSET_S as DEMO_TIME_OFFSET_S
+from rangesfm.simulate.survey import DemoSurvey, make_demo_survey
+
+Array = npt.NDArray[np.float64]
+Command = Callable[..., "subprocess.CompletedProcess[str]"]
+
+TAG_IN_CAM_M = (0.03, -0.12, -0.05)
+TIME_OFFSET_S = 2.0
+ANCHORS_M = {"A1": (-6.0, -5.0, 0.5), "A2": (6.0, -5.0, 2.5), "A3": (6.0, 5.0, 0.7), "A4": (-6.0, 5.0, 2.2)}
+
+
+@dataclass(frozen=True)
+class WalkedSurvey:
+    """An unscaled model, a radio log and the truth, in one folder.
+
+    The folder holds the model ``sparse/0``, ``images.csv``, ``uwb.csv``, ``anchors.csv`` (site frame, exact),
+    ``anchors_first_camera.csv`` and ``reference.csv`` (site frame).
+
+    Attributes:
+        folder: of all of it.
+        site_from_sfm: the truth.
+        centers_m: (n, 3) in the site frame, by photo in time order.
+        image_names: n names.
+        flags: what a command needs to read it all but the anchors, from inside the folder.
+    """
+
+    folder: Path
+    site_from_sfm: Similarity
+    centers_m: Array
+    image_names: tuple[str, ...]
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        tag = ",".join(map(str, TAG_IN_CAM_M))
+        files = ("--input_path", "sparse/0", "--ranges", "uwb.csv", "--images", "images.csv")
+        return (*files, "--tag_in_cam", tag, "--ranges_time_offset", str(TIME_OFFSET_S))
+
+
+@pytest.fixture(scope="session")
+def rangesfm_command() -> Command:
+    """Run ``rangesfm`` with some arguments in a folder, as a process of its own."""
+
+    def run(*arguments: str | Path, cwd: Path, status: int | None = 0) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "rangesfm", *map(str, arguments)]
+        done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+        assert status in (None, done.returncode), f"exit status {done.returncode}\n{done.stdout}{done.stderr}"
+        return done
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def walked_survey(tmp_path_factory: pytest.TempPathFactory) -> WalkedSurvey:
+    """40 photos at one a second along a loop, and 20 ranges a second to four anchors. Not to be written to."""
+    folder = tmp_path_factory.mktemp("walked_survey")
+    path = loop_path(42.0, start_s=99.0, seed=3)
+    times: Array = np.arange(100, 140, dtype=np.float64)
+    made = synthetic_model(
+        times,
+        path.centers(times),
+        path.world_from_cam(times),
+        num_observations=60,
+        max_track_length=8,
+        pixel_stddev=0.5,
+        seed=1,
+    )
+    radio = Radio(rate_hz=5.0, range_stddev_m=0.05, time_offset_s=TIME_OFFSET_S)
+    (folder / "sparse" / "0").mkdir(parents=True)
+    made.reconstruction.write(folder / "sparse" / "0")
+    write_ranges_csv(simulate_ranges(path, ANCHORS_M, TAG_IN_CAM_M, radio, seed=5).log, folder / "uwb.csv")
+    _write_anchors(folder / "anchors.csv", np.array(list(ANCHORS_M.values())))
+    in_first_camera = (np.array(list(ANCHORS_M.values())) - made.centers_m[0]) @ made.world_from_cam[0]
+    _write_anchors(folder / "anchors_first_camera.csv", in_first_camera)
+    lines = [f"{name},{time!r}\n" for name, time in made.timestamps_s.items()]
+    (folder / "images.csv").write_text("image_name,timestamp_s\n" + "".join(lines))
+    names = tuple(made.timestamps_s)
+    write_reference(Reference(made.centers_m, image_names=names), folder / "reference.csv")
+    return WalkedSurvey(folder, made.metric_from_sfm, made.centers_m, names)
+
+
+@pytest.fixture
+def own_survey(walked_survey: WalkedSurvey, tmp_path: Path) -> WalkedSurvey:
+    """A copy of ``walked_survey`` that a test may spoil."""
+    folder = shutil.copytree(walked_survey.folder, tmp_path / "survey")
+    return WalkedSurvey(folder, walked_survey.site_from_sfm, walked_survey.centers_m, walked_survey.image_names)
+
+
+@dataclass(frozen=True)
+class PhotoRun:
+    """A small survey with photographs, and the first run on it.
+
+    Attributes:
+        survey: its folder is where the command ran.
+        flags: of that command, but for the output path.
+        output_path: what it left.
+        done: what it printed.
+    """
+
+    survey: DemoSurvey
+    flags: tuple[str, ...]
+    output_path: Path
+    done: subprocess.CompletedProcess[str]
+
+
+@pytest.fixture(scope="session")
+def photo_run(rangesfm_command: Command, tmp_path_factory: pytest.TempPathFactory) -> PhotoRun:
+    """14 small photos of the demo's yard, run once. Not to be written to."""
+    survey = make_demo_survey(tmp_path_factory.mktemp("yard") / "yard", num_photos=14, image_size=(360, 240))
+    # With more threads COLMAP starts from the first pair that will do, whichever thread comes first.
+    flags = ("survey.toml", "--ranges_time_offset", str(DEMO_TIME_OFFSET_S), "--num_threads", "1")
+    done = rangesfm_command("run", *flags, cwd=survey.folder)
+    return PhotoRun(survey, flags, survey.folder / "out", done)
+
+
+def _write_anchors(path: Path, positions_m: Array) -> None:
+    lines = [f"{name},{x!r},{y!r},{z!r}\n" for name, (x, y, z) in zip(ANCHORS_M, positions_m.tolist(), strict=True)]
+    path.write_text("anchor_id,x_m,y_m,z_m\n" + "".join(lines))

@@ -1,0 +1,242 @@
+"""Every range gets its place on the path, or a status that says why it has none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rangesfm.errors import InputError
+from rangesfm.options import AssociationOptions
+from rangesfm.ranging.association import associate
+from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.observations import RangeObservations, RangeStatus
+from rangesfm.trajectory import Trajectory
+
+Array = npt.NDArray[np.float64]
+TAG_IN_CAM_M = np.array([0.1, -0.2, 0.05])
+WITHOUT_SNAPPING = AssociationOptions(max_time_difference_s=0.0)
+
+
+def trajectory_of(times: Array | None, centers: Array, world_from_cam: Array | None = None) -> Trajectory:
+    n = len(centers)
+    rotations = np.tile(np.eye(3), (n, 1, 1)) if world_from_cam is None else world_from_cam
+    return Trajectory(np.arange(n), tuple(f"{i:03d}.jpg" for i in range(n)), times, centers, rotations)
+
+
+def log_at(times: npt.ArrayLike, range_m: npt.ArrayLike = 5.0, anchor_ids: Sequence[str] = ("A",)) -> RangeLog:
+    """One range to each of the anchors in turn at given times."""
+    times = np.asarray(times, dtype=np.float64)
+    ids = [anchor_ids[i % len(anchor_ids)] for i in range(len(times))]
+    return RangeLog.from_arrays(ids, np.broadcast_to(range_m, times.shape), timestamp_s=times)
+
+
+def statuses(observations: RangeObservations) -> list[str]:
+    return [RangeStatus(status).label for status in observations.status]
+
+
+def straight(times: Array) -> Array:
+    centers: Array = np.array([1.0, 2.0, 3.0]) + np.outer(times, [0.5, -1.0, 0.25])
+    return centers
+
+
+def curved(times: Array) -> Array:
+    """A walk in a circle of 2 m radius, at 1.2 m/s, bobbing."""
+    return np.stack([2 * np.cos(0.6 * times), 2 * np.sin(0.6 * times), 0.1 * np.sin(1.5 * times)], axis=1)
+
+
+class TestBetweenKeyframes:
+    def test_places_on_a_straight_line_are_exact(self) -> None:
+        keyframe_times = np.array([0.0, 0.4, 1.1, 1.5, 2.9, 3.2, 4.0])
+        range_times = np.linspace(0.0, 4.0, 57)
+        path = trajectory_of(keyframe_times, straight(keyframe_times))
+        found = associate(log_at(range_times), path, TAG_IN_CAM_M, options=WITHOUT_SNAPPING)
+        np.testing.assert_allclose(found.centers, straight(range_times), atol=1e-12)
+        np.testing.assert_allclose(found.tag_from_center, np.tile(TAG_IN_CAM_M, (57, 1)), atol=1e-12)
+        assert set(statuses(found)) == {"used"}
+
+    def test_places_on_a_curve_are_far_better_than_on_chords(self) -> None:
+        keyframe_times = np.arange(0.0, 20.0, 0.5)
+        range_times = np.arange(1.0, 19.0, 0.07)
+        path = trajectory_of(keyframe_times, curved(keyframe_times))
+        found = associate(log_at(range_times), path, np.zeros(3), options=WITHOUT_SNAPPING)
+        off = np.linalg.norm(found.centers - curved(range_times), axis=1)
+        off_chords = np.linalg.norm(found.centers - found.center_offsets - curved(range_times), axis=1)
+        assert off_chords.max() > 0.02
+        assert off.max() < 0.05 * off_chords.max()
+
+    def test_places_are_the_stated_mean_of_two_keyframes_plus_the_stated_offset(self) -> None:
+        keyframe_times = np.arange(0.0, 20.0, 0.5)
+        path = trajectory_of(keyframe_times, curved(keyframe_times))
+        found = associate(log_at(np.arange(0.0, 19.5, 0.07)), path, np.zeros(3))
+        weight = found.weight[:, None]
+        on_chords = (1 - weight) * path.centers[found.before] + weight * path.centers[found.after]
+        np.testing.assert_allclose(found.centers, on_chords + found.center_offsets, atol=1e-12)
+
+    def test_stated_stddev_is_about_the_error_of_a_jerky_path(self) -> None:
+        fine = np.arange(0.0, 120.0, 0.25)
+        # Acceleration changes at random, so that the keyframes do not determine the path between them.
+        jerk = 0.01 * np.random.default_rng(0).standard_normal((len(fine), 3))
+        walk = np.cumsum(np.cumsum(np.cumsum(jerk, axis=0), axis=0), axis=0)
+        found = associate(log_at(fine[2:-2]), trajectory_of(fine[::2], walk[::2]), np.zeros(3))
+        between = found.before != found.after
+        normalized = (found.centers - walk[2:-2])[between] / found.center_stddev[between, None]
+        assert 0.5 < np.sqrt(np.mean(normalized**2)) < 2.0
+        assert np.all(found.center_stddev[~between] == 0)
+
+    def test_the_lever_arm_turns_with_the_camera(self) -> None:
+        keyframe_times = np.arange(0.0, 5.0)
+        turned = Rotation.from_rotvec(np.outer(keyframe_times, [0.0, 0.0, 0.3]))
+        path = trajectory_of(keyframe_times, straight(keyframe_times), turned.as_matrix())
+        range_times = np.linspace(0.0, 4.0, 23)
+        found = associate(log_at(range_times), path, TAG_IN_CAM_M)
+        expected = Rotation.from_rotvec(np.outer(range_times, [0.0, 0.0, 0.3])).apply(TAG_IN_CAM_M)
+        np.testing.assert_allclose(found.tag_from_center, expected, atol=1e-12)
+
+    def test_offset_is_added_to_the_times_of_ranges(self) -> None:
+        keyframe_times = np.arange(0.0, 5.0)
+        path = trajectory_of(keyframe_times, straight(keyframe_times))
+        found = associate(log_at([-8.3]), path, TAG_IN_CAM_M, time_offset_s=10.0)
+        np.testing.assert_allclose(found.centers[0], straight(np.array([1.7]))[0], atol=1e-12)
+
+    def test_order_of_the_log_does_not_matter(self) -> None:
+        keyframe_times = np.arange(0.0, 20.0, 0.5)
+        path = trajectory_of(keyframe_times, curved(keyframe_times))
+        range_times = np.linspace(-1.0, 21.0, 101)
+        order = np.random.default_rng(0).permutation(101)
+        found, shuffled = (associate(log_at(times), path, TAG_IN_CAM_M) for times in (range_times, range_times[order]))
+        np.testing.assert_array_equal(shuffled.centers, found.centers[order])
+        np.testing.assert_array_equal(shuffled.status, found.status[order])
+
+    def test_a_model_in_another_unit_gives_the_same_places_in_that_unit(self) -> None:
+        keyframe_times = np.arange(0.0, 20.0, 0.5)
+        path = trajectory_of(keyframe_times, curved(keyframe_times))
+        rotation = Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix()
+        log = log_at(np.linspace(0.0, 19.0, 50))
+        found = associate(log, path, TAG_IN_CAM_M)
+        moved = associate(log, path.transformed(100.0, rotation, np.ones(3)), TAG_IN_CAM_M)
+        np.testing.assert_allclose(moved.centers, 100.0 * found.centers @ rotation.T + 1.0, atol=1e-9)
+        np.testing.assert_allclose(moved.tag_from_center, found.tag_from_center @ rotation.T, atol=1e-12)
+        np.testing.assert_allclose(moved.center_stddev, 100.0 * found.center_stddev, atol=1e-9)
+
+
+class TestNextToAKeyframe:
+    def test_a_range_counts_as_taken_there(self) -> None:
+        keyframe_times = np.array([0.0, 1.0, 2.0])
+        path = trajectory_of(keyframe_times, straight(keyframe_times))
+        found = associate(log_at([0.995, 1.0, 1.015]), path, TAG_IN_CAM_M)
+        assert found.before.tolist() == found.after.tolist() == [1, 1, 1]
+        assert found.weight.tolist() == [0.0, 0.0, 0.0]
+        np.testing.assert_array_equal(found.centers, np.tile(path.centers[1], (3, 1)))
+
+    def test_a_range_just_outside_the_path_has_its_place(self) -> None:
+        keyframe_times = np.array([0.0, 1.0, 2.0])
+        path = trajectory_of(keyframe_times, straight(keyframe_times))
+        found = associate(log_at([-0.01, 2.01, -0.03, 2.03]), path, TAG_IN_CAM_M)
+        assert statuses(found) == ["used", "used", "outside-path", "outside-path"]
+        assert found.before.tolist() == [0, 2, -1, -1]
+
+    def test_a_single_keyframe_is_enough(self) -> None:
+        path = trajectory_of(np.array([3.0]), np.array([[1.0, 2.0, 3.0]]))
+        found = associate(log_at([2.99, 3.5]), path, TAG_IN_CAM_M)
+        assert statuses(found) == ["used", "outside-path"]
+
+
+class TestLongGaps:
+    TIMES = np.concatenate([np.arange(0.0, 10.0, 0.5), np.arange(14.0, 24.0, 0.5)])
+
+    def test_nothing_is_interpolated_across(self) -> None:
+        path = trajectory_of(self.TIMES, curved(self.TIMES))
+        found = associate(log_at([9.2, 9.49, 10.0, 12.0, 13.9, 14.0, 14.2]), path, TAG_IN_CAM_M)
+        expected = ["used", "used", *["no-keyframe-near"] * 3, "used", "used"]
+        assert statuses(found) == expected
+        gone = found.status == RangeStatus.NO_KEYFRAME_NEAR
+        assert np.all(np.isnan(found.centers[gone]))
+        assert np.all(found.before[gone] == -1)
+        assert not found.has_place[gone].any()
+
+    def test_the_curve_on_one_side_knows_nothing_of_the_other(self) -> None:
+        range_times = np.arange(0.0, 9.5, 0.11)
+        whole = associate(log_at(range_times), trajectory_of(self.TIMES, curved(self.TIMES)), TAG_IN_CAM_M)
+        first = self.TIMES[self.TIMES < 12.0]
+        alone = associate(log_at(range_times), trajectory_of(first, curved(first)), TAG_IN_CAM_M)
+        np.testing.assert_allclose(whole.centers, alone.centers, atol=1e-12)
+
+    def test_the_limit_is_an_option(self) -> None:
+        path = trajectory_of(self.TIMES, straight(self.TIMES))
+        found = associate(log_at([12.0]), path, TAG_IN_CAM_M, options=AssociationOptions(max_interpolation_gap_s=5.0))
+        np.testing.assert_allclose(found.centers[0], straight(np.array([12.0]))[0], atol=1e-9)
+
+
+class TestStopAndGo:
+    """Photos every 8 s; ranges at 10 Hz for 2 s around each photo, or all the time."""
+
+    PHOTOS = np.linspace(0.0, 88.0, 12)
+    ANCHOR = np.array([6.0, 5.0, 2.0])
+
+    def log(self, position_at: Callable[[Array], Array], times: Array, stddev: float = 0.05) -> RangeLog:
+        ranges = np.linalg.norm(position_at(times) - self.ANCHOR, axis=1)
+        return log_at(times, ranges + stddev * np.random.default_rng(0).standard_normal(len(times)))
+
+    def test_bursts_around_photos_taken_standing_still_belong_to_the_photos(self) -> None:
+        times = (self.PHOTOS[:, None] + np.linspace(-1.0, 1.0, 20)).ravel()
+        log = self.log(lambda t: straight(8.0 * np.round(t / 8.0)), times)
+        found = associate(log, trajectory_of(self.PHOTOS, straight(self.PHOTOS)), TAG_IN_CAM_M)
+        assert set(statuses(found)) == {"used"}
+        np.testing.assert_array_equal(found.before, np.repeat(np.arange(12), 20))
+        np.testing.assert_array_equal(found.before, found.after)
+
+    def test_the_same_ranges_taken_walking_belong_to_none(self) -> None:
+        times = (self.PHOTOS[:, None] + np.linspace(-1.0, 1.0, 20)).ravel()
+        found = associate(self.log(straight, times), trajectory_of(self.PHOTOS, straight(self.PHOTOS)), TAG_IN_CAM_M)
+        assert not found.has_place.any()
+        assert "no-keyframe-near" in statuses(found)
+
+    def test_walking_all_the_time_leaves_the_ranges_at_the_photos_alone(self) -> None:
+        times = np.arange(0.0, 88.0, 0.1)
+        found = associate(self.log(straight, times), trajectory_of(self.PHOTOS, straight(self.PHOTOS)), TAG_IN_CAM_M)
+        np.testing.assert_allclose(times[found.has_place], self.PHOTOS[:-1], atol=0.02)
+
+
+class TestLogsThatNamePhotos:
+    def log(self, image_names: list[str]) -> RangeLog:
+        return RangeLog.from_arrays(["A"] * len(image_names), np.full(len(image_names), 5.0), image_name=image_names)
+
+    @pytest.mark.parametrize("times", [None, np.arange(4.0)], ids=["without times", "with times"])
+    def test_ranges_belong_to_the_photos_they_name(self, times: Array | None) -> None:
+        path = trajectory_of(times, straight(np.arange(4.0)))
+        found = associate(self.log(["002.jpg", "000.jpg", "002.jpg"]), path, TAG_IN_CAM_M)
+        assert found.before.tolist() == found.after.tolist() == [2, 0, 2]
+        np.testing.assert_array_equal(found.centers, path.centers[[2, 0, 2]])
+
+    def test_a_photo_that_is_not_in_the_model_is_told(self) -> None:
+        path = trajectory_of(None, straight(np.arange(4.0)))
+        found = associate(self.log(["001.jpg", "else.jpg"]), path, TAG_IN_CAM_M)
+        assert statuses(found) == ["used", "unknown-image"]
+        assert found.before.tolist() == [1, -1]
+        assert np.isnan(found.centers[1]).all()
+
+
+def test_ranges_to_anchors_that_nobody_wants_keep_their_place_and_are_told() -> None:
+    keyframe_times = np.arange(0.0, 5.0)
+    path = trajectory_of(keyframe_times, straight(keyframe_times))
+    log = log_at([0.5, 1.5, 2.5, 9.0], anchor_ids=("A", "B"))
+    found = associate(log, path, TAG_IN_CAM_M, anchor_ids=["B"])
+    assert statuses(found) == ["unknown-anchor", "used", "unknown-anchor", "outside-path"]
+    np.testing.assert_allclose(found.centers[0], straight(np.array([0.5]))[0], atol=1e-12)
+    assert found.has_place.tolist() == [False, True, False, False]
+
+
+def test_an_empty_log_gives_nothing() -> None:
+    keyframe_times = np.arange(0.0, 5.0)
+    found = associate(log_at([]), trajectory_of(keyframe_times, straight(keyframe_times)), TAG_IN_CAM_M)
+    assert len(found.status) == 0
+    assert found.centers.shape == (0, 3)
+
+
+def test_times_without_times_of_photos_are_refused() -> None:
+    with pytest.raises(InputError, match="image times"):
+        associate(log_at([1.0]), trajectory_of(None, straight(np.arange(4.0))), TAG_IN_CAM_M)

@@ -1,0 +1,46 @@
+"""Quality checks: which light comes on at which value."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rangesfm.report.checks import Check, quality_checks
+from rangesfm.report.content import Summary
+
+
+def light_of(name: str, summary: dict[str, Any]) -> str:
+    (check,) = (check for check in quality_checks(Summary(summary)) if check.name == name)
+    return check.light
+
+
+@pytest.mark.parametrize(("value", "light"), [(0.0, "green"), (1.0, "green"), (1.1, "amber"), (2.1, "red")])
+def test_smaller_is_better_up_to_and_with_each_limit(value: float, light: str) -> None:
+    assert Check("n", "m", value, "px", green_limit=1.0, amber_limit=2.0, decimals=1).light == light
+
+
+@pytest.mark.parametrize(("value", "light"), [(90.0, "green"), (70.0, "green"), (50.0, "amber"), (39.0, "red")])
+def test_larger_is_better_where_it_says_so(value: float, light: str) -> None:
+    check = Check("n", "m", value, "%", green_limit=70.0, amber_limit=40.0, decimals=1, larger_is_better=True)
+    assert check.light == light
+
+
+def test_the_larger_stddev_of_the_scale_counts() -> None:
+    assert light_of("Scale uncertainty", {"scale": {"value": 2.0, "stddev_formal": 0.001}}) == "green"
+    both = {"value": 2.0, "stddev_formal": 0.001, "stddev_empirical": 0.2}
+    assert light_of("Scale uncertainty", {"scale": both}) == "red"
+
+
+def test_one_anchor_cannot_agree_with_others() -> None:
+    assert light_of("Anchor agreement", {"scale": {"value": 1.0, "per_anchor": {"A": 1.0}}}) == "off"
+    assert light_of("Anchor agreement", {"scale": {"value": 1.0, "per_anchor": {"A": 1.0, "B": 0.9}}}) == "red"
+
+
+def test_no_check_ranges_is_no_good_check() -> None:
+    assert light_of("Check ranges", {"check_ranges": {"num": 0, "rms_m": 0.0}}) == "off"
+    assert light_of("Check ranges", {"check_ranges": {"num": 10, "rms_m": 0.1}}) == "green"
+
+
+def test_nothing_measured_means_no_light() -> None:
+    assert {check.light for check in quality_checks(Summary({}))} == {"off"}

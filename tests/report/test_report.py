@@ -1,0 +1,193 @@
+"""The report page: it says what the result says, needs nothing from elsewhere, and copes with what is missing."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rangesfm.errors import InputError
+from rangesfm.report import write_report
+
+MakeResult = Callable[..., Path]
+SECTIONS = ["verdict", "checks", "path", "scale", "ranges", "anchors", "run"]
+
+
+class Page(HTMLParser):
+    """Text, elements and ids of a page, in its order."""
+
+    def __init__(self, html: str):
+        super().__init__()
+        self.tags: list[str] = []
+        self.ids: list[str] = []
+        self.attributes: list[tuple[str, str | None]] = []
+        self.texts: list[str] = []
+        self.feed(html)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.attributes += attrs
+        self.ids += [value for name, value in attrs if name == "id" and value]
+
+    def handle_data(self, data: str) -> None:
+        if self.tags[-1:] != ["style"] and data.strip():
+            self.texts.append(data.strip().replace("\u00a0", " ").replace("\u202f", " "))
+
+
+def page_of(folder: Path) -> Page:
+    return Page(write_report(folder).read_text(encoding="utf-8"))
+
+
+def test_the_report_stands_beside_the_result_with_all_its_sections(make_result: MakeResult) -> None:
+    folder = make_result("my survey")
+    assert write_report(folder) == folder / "report.html"
+    page = page_of(folder)
+    assert page.ids == SECTIONS
+    assert "my survey" in page.texts
+    assert not list(folder.glob(".*"))
+
+
+def test_the_numbers_are_those_of_the_result(make_result: MakeResult) -> None:
+    folder = make_result()
+    summary = json.loads((folder / "result.json").read_text())
+    texts = page_of(folder).texts
+    expected = [
+        "0.7421",
+        "± 0.0041",
+        "Good",
+        "eight anchors agree within 1.5 %",
+        "12 ranges were taken before the first photo",
+        f"{summary['ranges']['rms_m']:.3f} m",
+        f"median {summary['ranges']['median_abs_m']:.3f} m",
+        f"{summary['check_ranges']['rms_m']:.3f} m",
+        f"{summary['check_ranges']['num']} held out",
+        "0.83 px",
+        "+0.012 s",
+        "2 min 10 s",
+        "1.9132",
+        "+1.094",
+        "−0.051",
+        "0.0214",
+        "refine.range_loss_scale",
+        "4.2.1",
+    ]
+    assert [text for text in expected if text not in texts] == []
+    assert any("95 % interval 0.7341 to 0.7502" in text for text in texts)
+
+
+def test_every_anchor_has_its_panel_and_its_row(make_result: MakeResult) -> None:
+    texts = page_of(make_result()).texts
+    assert [text for text in texts if text.startswith("Anchor ") and text[7:].isdigit()] == [
+        f"Anchor {i}" for i in range(1, 9)
+    ]
+    assert texts.count("−2.600") >= 4
+
+
+def test_the_page_asks_for_nothing_from_elsewhere(make_result: MakeResult) -> None:
+    html = write_report(make_result()).read_text(encoding="utf-8")
+    assert re.findall(r"https?:|//[a-z]|@import|url\(", html) == []
+    page = Page(html)
+    assert {"script", "link", "img", "iframe"}.isdisjoint(page.tags)
+    assert {"src", "href"}.isdisjoint(name for name, _ in page.attributes)
+    assert ("content", "default-src 'none'; style-src 'unsafe-inline'; img-src data:") in page.attributes
+
+
+def test_names_cannot_inject_markup(make_result: MakeResult) -> None:
+    evil = '<script>alert("1")</script>'
+    folder = make_result(
+        anchor_ids=(evil, "a&b", "'\"><svg onload=alert(1)>"),
+        changes={
+            "warnings": [evil],
+            "settings": {evil: evil},
+            "versions": {evil: evil},
+            "scale": {"value": 1.0, "verdict": evil, "reasons": [evil], "per_anchor": {evil: 1.0, "a&b": 1.1}},
+            "comparison": [{"name": evil}],
+            "seconds": {evil: 1.0},
+        },
+    )
+    page = page_of(folder)
+    assert "script" not in page.tags
+    assert not any(name.startswith("on") for name, _ in page.attributes)
+    assert page.texts.count(evil) >= 6
+    assert f"Anchor {evil}" in page.texts
+
+
+def test_the_same_result_gives_the_same_page(make_result: MakeResult) -> None:
+    folder = make_result()
+    assert write_report(folder).read_bytes() == write_report(folder).read_bytes()
+
+
+def test_a_scale_only_result_shows_what_it_has(make_result: MakeResult) -> None:
+    page = page_of(make_result(is_refined=False, has_reference=False))
+    assert page.ids == SECTIONS
+    assert "refined" not in page.texts
+    assert "reference" not in page.texts
+    assert "not measured" in page.texts
+    assert "Keyframe centres against the reference" not in page.texts
+
+
+def test_a_result_with_nothing_but_an_empty_summary_has_a_page(tmp_path: Path) -> None:
+    (tmp_path / "result.json").write_text("{}")
+    page = page_of(tmp_path)
+    assert page.ids == ["verdict", "checks"]
+    assert page.texts.count("not measured") == 7
+
+
+@pytest.mark.parametrize("odd", [None, 3, "text", [], [1], {"value": "x"}, float("nan"), True])
+def test_odd_parts_of_a_summary_are_left_out(make_result: MakeResult, odd: Any) -> None:
+    keys = ["scale", "ranges", "time_offset", "refine", "comparison", "seconds", "warnings", "settings", "versions"]
+    page_of(make_result(num_keyframes=5, num_ranges_per_anchor=5, changes=dict.fromkeys(keys, odd)))
+
+
+def test_a_result_without_ranges_or_models_has_a_page(make_result: MakeResult) -> None:
+    folder = make_result(num_keyframes=10, num_ranges_per_anchor=10)
+    (folder / "ranges.csv").unlink()
+    for stage in ("sparse_scaled", "sparse_metric"):
+        for file in (folder / stage / "0").iterdir():
+            file.unlink()
+        (folder / stage / "0").rmdir()
+    assert page_of(folder).ids == ["verdict", "checks", "path", "scale", "anchors", "run"]
+
+
+def test_a_log_by_photo_without_times_is_drawn_in_its_order(make_result: MakeResult) -> None:
+    folder = make_result(num_keyframes=20, num_ranges_per_anchor=20)
+    lines = (folder / "ranges.csv").read_text().splitlines()
+    by_photo = [lines[0], *(f",image00001.jpg,{line.split(',', 2)[2]}" for line in lines[1:])]
+    (folder / "ranges.csv").write_text("\n".join(by_photo))
+    (folder / "images.csv").unlink()
+    texts = page_of(folder).texts
+    assert texts.count("range number") == 8
+    assert "time s" not in texts
+
+
+def test_a_long_log_makes_no_long_page(make_result: MakeResult) -> None:
+    short = write_report(make_result("short", anchor_ids=("A",), num_ranges_per_anchor=500)).stat().st_size
+    long = write_report(make_result("long", anchor_ids=("A",), num_ranges_per_anchor=8000)).stat().st_size
+    assert long < 3 * short
+
+
+def test_anchors_that_coincide_in_a_view_share_their_label(make_result: MakeResult) -> None:
+    texts = page_of(make_result(num_keyframes=20, num_ranges_per_anchor=10)).texts
+    assert {"1, 2", "3, 4", "5, 6", "7, 8"} <= set(texts)
+
+
+def test_a_folder_that_is_not_a_result_is_refused_and_left_alone(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no result\.json"):
+        write_report(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_broken_table_is_named_with_its_line(make_result: MakeResult) -> None:
+    folder = make_result(num_keyframes=5, num_ranges_per_anchor=5)
+    lines = (folder / "ranges.csv").read_text().splitlines()
+    cells = lines[3].split(",")
+    cells[4] = "far"
+    (folder / "ranges.csv").write_text("\n".join([*lines[:3], ",".join(cells), *lines[4:]]))
+    with pytest.raises(InputError, match=r"ranges\.csv:4: range_m is 'far'"):
+        write_report(folder)
+    assert not (folder / "report.html").exists()

@@ -1,0 +1,144 @@
+"""Surveys without photos: a path in a unit of its own, anchors, ranges, and the truth about them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rangesfm.geometry import IDENTITY, Similarity
+from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.association import associate
+from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.observations import RangeObservations
+from rangesfm.scale.estimate import ScaleEstimate
+from rangesfm.scale.initialize import initialize_scale
+from rangesfm.simulate.path import loop_path
+from rangesfm.simulate.ranges import Radio, SimulatedRanges, simulate_ranges_at
+from rangesfm.trajectory import Trajectory
+
+Array = npt.NDArray[np.float64]
+
+FIVE_ANCHORS_M = {
+    "A": (6.0, 0.0, 2.5),
+    "B": (-6.0, 1.0, 0.4),
+    "C": (0.5, 6.0, 3.0),
+    "D": (1.0, -6.0, 0.2),
+    "E": (5.0, 5.0, 1.0),
+}
+
+
+@dataclass(frozen=True)
+class Survey:
+    """n keyframes, and ranges taken at each of them.
+
+    Attributes:
+        trajectory: as a mapper leaves it.
+        site_from_sfm: the truth that a scale stage is to find.
+        times, centers_m, world_from_cam: the true path in the site frame.
+        anchors_m: true positions in the site frame.
+        tag_in_cam_m: lever arm.
+        simulated: ranges and the truth about them.
+    """
+
+    trajectory: Trajectory
+    site_from_sfm: Similarity
+    times: Array
+    centers_m: Array
+    world_from_cam: Array
+    anchors_m: dict[str, Array]
+    tag_in_cam_m: Array
+    simulated: SimulatedRanges
+
+    def frame_from_site(self, frame: str) -> Similarity:
+        """``frame``: "site" or "first_camera"."""
+        first_camera = Similarity(1.0, self.world_from_cam[0], self.centers_m[0])
+        return IDENTITY if frame == "site" else first_camera.inverse()
+
+    def truth(self, frame: str) -> Similarity:
+        """What ``metric_from_sfm`` should be."""
+        return self.frame_from_site(frame) @ self.site_from_sfm
+
+    def anchors(self, frame: str, known: Collection[str]) -> list[Anchor]:
+        """All anchors; positions of the known ones in the frame they are given in."""
+        from_site = self.frame_from_site(frame)
+        return [Anchor(name, from_site.apply(at) if name in known else None) for name, at in self.anchors_m.items()]
+
+    def observations(self, log: RangeLog | None = None) -> RangeObservations:
+        return associate(log or self.simulated.log, self.trajectory, self.tag_in_cam_m)
+
+    def scale(
+        self, frame: str, known: Collection[str] = (), log: RangeLog | None = None, **options: Any
+    ) -> ScaleEstimate:
+        """The scale stage on this survey's ranges, or on another log."""
+        anchors = self.anchors(frame, known)
+        return initialize_scale(self.observations(log), self.trajectory, anchors, anchor_frame=frame, **options)
+
+    def log_with(self, range_m: Array) -> RangeLog:
+        """The same log with other ranges."""
+        return replace(self.simulated.log, range_m=range_m)
+
+    def relative_error(self, estimate: ScaleEstimate) -> float:
+        return estimate.value / self.site_from_sfm.scale - 1
+
+
+class MakeSurvey(Protocol):
+    def __call__(
+        self,
+        *,
+        scale: float = 2.0,
+        centers_m: Array | None = None,
+        num_keyframes: int = 40,
+        anchors_m: dict[str, tuple[float, float, float]] | None = None,
+        tag_in_cam_m: tuple[float, float, float] = ...,
+        radio: Radio = ...,
+        num_epochs: int = 1,
+        seed: int = 0,
+    ) -> Survey: ...
+
+
+@pytest.fixture(scope="session")
+def make_survey() -> MakeSurvey:
+    """A loop of 40 s, or another path by its centres; ``num_epochs`` ranges to each anchor at each keyframe."""
+    return _make_survey
+
+
+def _make_survey(
+    *,
+    scale: float = 2.0,
+    centers_m: Array | None = None,
+    num_keyframes: int = 40,
+    anchors_m: dict[str, tuple[float, float, float]] | None = None,
+    tag_in_cam_m: tuple[float, float, float] = (0.05, -0.12, -0.03),
+    radio: Radio = Radio(),  # noqa: B008 (frozen)
+    num_epochs: int = 1,
+    seed: int = 0,
+) -> Survey:
+    anchors_m = anchors_m or FIVE_ANCHORS_M
+    rng = np.random.default_rng(seed)
+    path = loop_path(40.0, unsteadiness_m=0.1, seed=3)
+    num_keyframes = num_keyframes if centers_m is None else len(centers_m)
+    times = np.linspace(0.0, 40.0, num_keyframes)
+    centers = path.centers(times) if centers_m is None else centers_m
+    world_from_cam = path.world_from_cam(times)
+    rotation = Rotation.from_quat(rng.normal(size=4)).as_matrix()
+    site_from_sfm = Similarity(scale, rotation, 10 * rng.normal(size=3))
+    inverse = site_from_sfm.inverse()
+    names = tuple(f"{number:04d}.jpg" for number in range(num_keyframes))
+    site_path = Trajectory(np.arange(1, num_keyframes + 1), names, times, centers, world_from_cam)
+    poses = np.repeat(np.arange(num_keyframes), num_epochs)
+    return Survey(
+        site_path.transformed(inverse.scale, inverse.rotation, inverse.translation),
+        site_from_sfm,
+        times,
+        centers,
+        world_from_cam,
+        {name: np.array(position) for name, position in anchors_m.items()},
+        np.array(tag_in_cam_m),
+        simulate_ranges_at(times[poses], centers[poses], world_from_cam[poses], anchors_m, tag_in_cam_m, radio, seed),
+    )

@@ -1,0 +1,113 @@
+"""The scale that most ranges agree on, exactly."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from rangesfm.errors import GeometryError
+from rangesfm.scale.consensus import agreeing_intervals, consensus_scales
+from rangesfm.scale.range_equation import RangeProblem
+from rangesfm.simulate.ranges import Radio
+
+if TYPE_CHECKING:
+    from tests.scale.conftest import MakeSurvey, Survey
+
+Array = npt.NDArray[np.float64]
+
+STDDEV_M = 0.1
+TOLERANCE_M = 2.5 * STDDEV_M
+
+
+def known_anchors(survey: Survey, range_m: Array | None = None) -> RangeProblem:
+    """The survey's ranges with all anchors known in the first camera's frame, and no biases."""
+    observations = survey.observations()
+    first_camera_from_sfm = survey.trajectory.world_from_cam[0].T
+    anchors = survey.frame_from_site("first_camera").apply(np.array(list(survey.anchors_m.values())))
+    return RangeProblem(
+        centers=(observations.centers - survey.trajectory.centers[0]) @ first_camera_from_sfm.T,
+        tag_from_center=observations.tag_from_center @ first_camera_from_sfm.T,
+        anchor_index=observations.log.anchor_index,
+        range_m=observations.log.range_m if range_m is None else range_m,
+        stddev_m=np.full(len(observations.log), STDDEV_M),
+        anchor_mean_m=anchors,
+        anchor_stddev_m=np.zeros(len(anchors)),
+        bias_mean_m=np.zeros(len(anchors)),
+        bias_stddev_m=np.zeros(len(anchors)),
+        common_bias_stddev_m=0.0,
+        frame_is_free=False,
+    )
+
+
+def num_agreeing(problem: RangeProblem, scales: Array) -> Array:
+    """By trying: how many ranges agree with each scale."""
+    offset = problem.tag_from_center - problem.anchor_mean_m[problem.anchor_index]
+    distances = np.linalg.norm(scales[:, None, None] * problem.centers + offset, axis=2)
+    agrees: Array = np.sum(np.abs(distances - problem.range_m) <= TOLERANCE_M, axis=1, dtype=np.float64)
+    return agrees
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_no_scale_of_a_fine_grid_has_more_ranges_agree(make_survey: MakeSurvey, seed: int) -> None:
+    radio = Radio(range_stddev_m=STDDEV_M, obstructed_share=0.5, obstructed_mean_m=2.0)
+    problem = known_anchors(make_survey(scale=0.5, radio=radio, num_keyframes=15, seed=seed))
+    best = consensus_scales(problem)[0]
+    grid = np.geomspace(1e-3, 1e2, 20_000)
+    assert num_agreeing(problem, np.array([best]))[0] >= num_agreeing(problem, grid).max()
+
+
+def test_intervals_hold_exactly_the_scales_that_agree() -> None:
+    rng = np.random.default_rng(0)
+    scales = np.linspace(0.0, 5.0, 4001)
+    num_double = 0
+    for _ in range(200):
+        center, offset = rng.normal(size=(1, 3)), 3 * rng.normal(size=(1, 3))
+        range_m, tolerance = rng.uniform(0.1, 6.0, 1), rng.uniform(0.05, 1.0, 1)
+        starts, ends = agreeing_intervals(center, offset, range_m, tolerance)
+        inside = np.any((scales[:, None] >= starts) & (scales[:, None] <= ends), axis=1)
+        distance = np.linalg.norm(scales[:, None] * center + offset, axis=1)
+        np.testing.assert_array_equal(inside, np.abs(distance - range_m) <= tolerance)
+        num_double += len(starts) == 2
+    assert num_double > 5
+
+
+def test_a_tolerance_larger_than_the_range_leaves_one_interval_about_the_anchor() -> None:
+    starts, ends = agreeing_intervals(
+        np.array([[1.0, 0.0, 0.0]]), np.array([[-2.0, 0.0, 0.0]]), np.array([0.5]), np.array([1.0])
+    )
+    assert (starts.tolist(), ends.tolist()) == ([0.5], [3.5])
+
+
+def test_scales_below_zero_are_none() -> None:
+    starts, _ = agreeing_intervals(
+        np.array([[1.0, 0.0, 0.0]]), np.array([[3.0, 0.0, 0.0]]), np.array([1.0]), np.array([0.2])
+    )
+    assert len(starts) == 0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_sixty_percent_of_wild_ranges_do_not_move_it(make_survey: MakeSurvey, seed: int) -> None:
+    survey = make_survey(scale=3.0, radio=Radio(range_stddev_m=STDDEV_M), seed=seed)
+    rng = np.random.default_rng(seed)
+    ranges = survey.simulated.log.range_m
+    wild = rng.random(len(ranges)) < 0.6
+    best = consensus_scales(known_anchors(survey, np.where(wild, rng.uniform(0.5, 20.0, len(ranges)), ranges)))[0]
+    assert best == pytest.approx(survey.site_from_sfm.scale, rel=0.03)
+
+
+def test_candidates_are_distinct_and_positive(make_survey: MakeSurvey) -> None:
+    radio = Radio(range_stddev_m=STDDEV_M, obstructed_share=0.6, obstructed_mean_m=4.0)
+    scales = consensus_scales(known_anchors(make_survey(radio=radio)))
+    assert len(scales) > 1
+    assert min(scales) > 0
+    ratios = np.exp(np.abs(np.subtract.outer(np.log(scales), np.log(scales))))
+    assert np.all(ratios[~np.eye(len(scales), dtype=bool)] > 1.01)
+
+
+def test_a_camera_that_stands_still_is_refused(make_survey: MakeSurvey) -> None:
+    survey = make_survey(centers_m=np.tile([[1.0, 2.0, 1.6]], (20, 1)))
+    with pytest.raises(GeometryError, match="no scale explains"):
+        consensus_scales(known_anchors(survey))

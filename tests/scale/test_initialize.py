@@ -1,0 +1,337 @@
+"""The scale stage: every case of anchors is recovered, and what the geometry leaves open is said."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from rangesfm.errors import GeometryError, InputError
+from rangesfm.options import RangeModelOptions, ScaleOptions
+from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.observations import RangeStatus, hold_out
+from rangesfm.scale.initialize import initialize_scale
+from rangesfm.simulate.path import orbit_path
+from rangesfm.simulate.ranges import Radio
+
+if TYPE_CHECKING:
+    from tests.scale.conftest import MakeSurvey, Survey
+
+Array = npt.NDArray[np.float64]
+
+NOISE = Radio(range_stddev_m=0.1)
+FLAT_ANCHORS_M = {"A": (6.0, 0.0, 1.0), "B": (-6.0, 1.0, 1.0), "C": (0.5, 6.0, 1.0), "D": (1.0, -6.0, 1.0)}
+THREE_ANCHORS_M = {"A": (6.0, 0.0, 2.5), "B": (-6.0, 1.0, 0.4), "D": (1.0, -6.0, 0.2)}
+ONE_ANCHOR_M = {"A": (6.0, 0.0, 2.5)}
+
+CASES = {
+    "first camera, one anchor": ("first_camera", ONE_ANCHOR_M, "A"),
+    "first camera, five anchors": ("first_camera", None, "ABCDE"),
+    "first camera, one of five known": ("first_camera", None, "A"),
+    "site, five anchors": ("site", None, "ABCDE"),
+    "site, three anchors": ("site", THREE_ANCHORS_M, "ABD"),
+    "site, four anchors in a plane": ("site", FLAT_ANCHORS_M, "ABCD"),
+    "site, four of five known": ("site", None, "ABCD"),
+    "one unknown anchor": ("unknown", ONE_ANCHOR_M, ""),
+    "five unknown anchors": ("unknown", None, ""),
+}
+
+
+def on_a_line() -> Array:
+    return np.stack([np.linspace(0.0, 10.0, 40), np.zeros(40), np.full(40, 1.6)], axis=1)
+
+
+def on_a_loop_at_one_height(make_survey: MakeSurvey) -> Array:
+    centers = make_survey().centers_m.copy()
+    centers[:, 2] = 1.6
+    return centers
+
+
+def on_a_sphere() -> Array:
+    centers = orbit_path(40.0, height_amplitude_m=1.5).centers(np.linspace(0.0, 40.0, 40))
+    on_sphere: Array = 4.0 * centers / np.linalg.norm(centers, axis=1, keepdims=True)
+    return on_sphere
+
+
+class TestWithoutNoise:
+    @pytest.mark.parametrize(
+        ("scale", "tag_in_cam_m"),
+        [(1e-3, (0.0, 0.0, 0.0)), (1e3, (0.05, -0.12, -0.03))],
+        ids=["no lever arm", "lever arm"],
+    )
+    @pytest.mark.parametrize("case", CASES)
+    def test_the_similarity_is_recovered(
+        self, make_survey: MakeSurvey, case: str, scale: float, tag_in_cam_m: tuple[float, float, float]
+    ) -> None:
+        frame, anchors_m, known = CASES[case]
+        survey = make_survey(scale=scale, anchors_m=anchors_m, tag_in_cam_m=tag_in_cam_m, seed=len(known))
+        estimate = survey.scale(frame, known)
+        truth = survey.truth(estimate.frame)
+        assert estimate.frame == ("site" if frame == "site" else "first_camera")
+        assert estimate.value == pytest.approx(truth.scale, rel=1e-6)
+        np.testing.assert_allclose(estimate.metric_from_sfm.rotation, truth.rotation, atol=1e-6)
+        centers = survey.trajectory.centers
+        np.testing.assert_allclose(estimate.metric_from_sfm.apply(centers), truth.apply(centers), atol=1e-6)
+        from_site = survey.frame_from_site(estimate.frame)
+        for anchor in estimate.anchors:
+            position = from_site.apply(survey.anchors_m[anchor.anchor_id])
+            places = [place for place in (anchor.position_m, anchor.mirror_position_m) if place is not None]
+            assert min(float(np.linalg.norm(place - position)) for place in places) < 1e-5
+
+    def test_each_anchor_alone_gives_the_same_scale(self, make_survey: MakeSurvey) -> None:
+        survey = make_survey()
+        estimate = survey.scale("first_camera", "ABCDE")
+        assert estimate.per_anchor.keys() == survey.anchors_m.keys()
+        np.testing.assert_allclose(list(estimate.per_anchor.values()), survey.site_from_sfm.scale, rtol=1e-6)
+
+    def test_the_papers_method_takes_its_own_scale(self, make_survey: MakeSurvey) -> None:
+        towards = np.stack([np.linspace(0.0, 4.0, 40), np.sin(np.linspace(0.0, 3.0, 40)), np.full(40, 1.6)], axis=1)
+        survey = make_survey(centers_m=towards, anchors_m={"A": (12.0, 1.0, 2.0)})
+        estimate = survey.scale("first_camera", "A", options=ScaleOptions(method="two-candidate"))
+        assert estimate.method == "two-candidate"
+        assert estimate.two_candidate is not None
+        assert estimate.value == estimate.two_candidate.scale
+        assert survey.relative_error(estimate) == pytest.approx(0.0, abs=1e-6)
+
+
+class TestWithOutliers:
+    @pytest.mark.parametrize(
+        ("frame", "known"), [("site", "ABCDE"), ("first_camera", "ABCDE"), ("unknown", "")], ids=lambda value: value
+    )
+    def test_thirty_percent_of_long_ranges_leave_the_scale_within_its_uncertainty(
+        self, make_survey: MakeSurvey, frame: str, known: str
+    ) -> None:
+        radio = Radio(range_stddev_m=0.1, obstructed_share=0.3, obstructed_mean_m=3.0)
+        survey = make_survey(radio=radio, num_epochs=3)
+        estimate = survey.scale(frame, known)
+        stddev = max(estimate.uncertainty.formal, estimate.uncertainty.empirical)
+        assert abs(survey.relative_error(estimate)) < 3 * stddev
+        assert stddev < 0.02
+
+    def test_they_are_marked(self, make_survey: MakeSurvey) -> None:
+        radio = Radio(range_stddev_m=0.1, obstructed_share=0.3, obstructed_mean_m=3.0)
+        survey = make_survey(radio=radio)
+        status = survey.scale("first_camera", "ABCDE").observations.status
+        too_long = survey.simulated.log.range_m - survey.simulated.distance_m
+        assert np.all(status[too_long > 2.0] == RangeStatus.OUTLIER)
+        assert np.mean(status[np.abs(too_long) < 0.1] == RangeStatus.USED) > 0.99
+
+    def test_many_of_them_are_a_reason_to_doubt(self, make_survey: MakeSurvey) -> None:
+        radio = Radio(range_stddev_m=0.05, obstructed_share=0.4, obstructed_mean_m=10.0)
+        estimate = make_survey(radio=radio).scale("first_camera", "ABCDE")
+        assert estimate.verdict == "doubtful"
+        assert any("do not fit" in reason for reason in estimate.reasons)
+
+
+class TestRefused:
+    """GeometryError: the text names what is wrong."""
+
+    def refuse(self, survey: Survey, frame: str, known: str, match: str, log: RangeLog | None = None) -> None:
+        with pytest.raises(GeometryError, match=match):
+            survey.scale(frame, known, log)
+
+    def test_too_few_ranges(self, make_survey: MakeSurvey) -> None:
+        survey = make_survey()
+        log = RangeLog.from_arrays(["A"] * 7, np.full(7, 5.0), timestamp_s=survey.times[:7])
+        self.refuse(survey, "first_camera", "A", r"7 of 7 ranges lie on the path.*8 near 4 are needed", log)
+
+    def test_ranges_near_too_few_keyframes(self, make_survey: MakeSurvey) -> None:
+        survey = make_survey()
+        log = RangeLog.from_arrays(["A"] * 30, np.full(30, 5.0), timestamp_s=np.repeat(survey.times[:3], 10))
+        self.refuse(survey, "first_camera", "A", "near 3 keyframes", log)
+
+    @pytest.mark.parametrize(
+        ("frame", "known", "match"),
+        [
+            ("site", "ABCDE", "hardly moved"),
+            ("unknown", "", "hardly moved"),
+            ("first_camera", "ABCDE", "no scale explains"),
+        ],
+        ids=["site", "unknown", "first camera"],
+    )
+    def test_a_camera_that_stands_still(self, make_survey: MakeSurvey, frame: str, known: str, match: str) -> None:
+        self.refuse(make_survey(centers_m=np.tile([[1.0, 2.0, 1.6]], (40, 1))), frame, known, match)
+
+    def test_a_camera_that_moves_less_than_the_noise(self, make_survey: MakeSurvey) -> None:
+        shaking = np.array([1.0, 2.0, 1.6]) + 0.002 * np.random.default_rng(0).standard_normal((40, 3))
+        self.refuse(make_survey(centers_m=shaking, radio=NOISE), "unknown", "", "only known to|stands still")
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_a_flat_circle_round_one_unknown_anchor(self, make_survey: MakeSurvey, seed: int) -> None:
+        circle = orbit_path(40.0, height_amplitude_m=0.0).centers(np.linspace(0.0, 40.0, 40))
+        survey = make_survey(centers_m=circle, anchors_m={"A": (1.0, 0.5, 0.3)}, radio=NOISE, seed=seed)
+        self.refuse(survey, "unknown", "", "only known to|two scales fit")
+
+    @pytest.mark.parametrize("anchor_m", [(1.0, 0.5, 0.3), (7.0, 0.5, 0.3)], ids=["inside", "outside"])
+    @pytest.mark.parametrize("seed", range(3))
+    def test_a_path_on_a_sphere_and_one_unknown_anchor(
+        self, make_survey: MakeSurvey, seed: int, anchor_m: tuple[float, float, float]
+    ) -> None:
+        """The radius of the path and the anchor's distance from its centre can change places."""
+        survey = make_survey(
+            centers_m=on_a_sphere(), anchors_m={"A": anchor_m}, tag_in_cam_m=(0, 0, 0), radio=NOISE, seed=seed
+        )
+        self.refuse(survey, "unknown", "", "two scales fit")
+
+    @pytest.mark.parametrize(("tilt", "seed"), [(0.0, 0), (0.0, 1), (0.3, 0)], ids=["parallel", "again", "tilted"])
+    def test_a_flat_path_among_anchors_in_a_plane(self, make_survey: MakeSurvey, tilt: float, seed: int) -> None:
+        """Its mirror image fits; parallel to the anchors' plane, that image is the same map higher or lower."""
+        centers = on_a_loop_at_one_height(make_survey)
+        centers[:, 2] += tilt * centers[:, 0]
+        survey = make_survey(centers_m=centers, anchors_m=FLAT_ANCHORS_M, radio=NOISE, seed=seed)
+        self.refuse(survey, "site", "ABCD", "mirror image")
+
+    def test_a_straight_path_in_the_site_frame(self, make_survey: MakeSurvey) -> None:
+        """The map can be turned about it."""
+        survey = make_survey(centers_m=on_a_line(), tag_in_cam_m=(0, 0, 0), radio=NOISE)
+        self.refuse(survey, "site", "ABCDE", "nearly straight")
+
+    def test_a_scale_less_certain_than_wanted(self, make_survey: MakeSurvey) -> None:
+        survey = make_survey(anchors_m=ONE_ANCHOR_M, radio=NOISE)
+        with pytest.raises(GeometryError, match=r"only known to .* more than the 0.1 % allowed"):
+            survey.scale("unknown", options=ScaleOptions(max_relative_stddev=0.001))
+
+    def test_the_papers_method_where_its_steadier_branch_is_negative(self, make_survey: MakeSurvey) -> None:
+        survey = make_survey()
+        robust = survey.scale("first_camera", "ABCDE")
+        assert robust.two_candidate is not None
+        assert robust.two_candidate.scale < 0
+        with pytest.raises(GeometryError, match="two-candidate found no positive scale"):
+            survey.scale("first_camera", "ABCDE", options=ScaleOptions(method="two-candidate"))
+
+
+def test_an_anchor_of_the_log_that_is_not_given_is_bad_input(make_survey: MakeSurvey) -> None:
+    survey = make_survey()
+    anchors = survey.anchors("first_camera", "ABCDE")[:-1]
+    with pytest.raises(InputError, match="'E' of the log is not among the anchors"):
+        initialize_scale(survey.observations(), survey.trajectory, anchors, anchor_frame="first_camera")
+
+
+class TestOpenButNotFatal:
+    @pytest.mark.parametrize(
+        ("anchors_m", "why"),
+        [
+            ({name: THREE_ANCHORS_M[name] for name in "AB"}, "2 surveyed anchor"),
+            ({"A": (6.0, 0.0, 2.0), "B": (-2.0, 0.1, 2.0), "C": (-7.0, 0.0, 2.0)}, "on one line"),
+        ],
+        ids=["two anchors", "anchors on a line"],
+    )
+    def test_too_few_site_anchors_give_the_scale_alone_and_say_so(
+        self, make_survey: MakeSurvey, anchors_m: dict[str, tuple[float, float, float]], why: str
+    ) -> None:
+        survey = make_survey(anchors_m=anchors_m)
+        estimate = survey.scale("site", anchors_m)
+        assert estimate.frame == "first_camera"
+        assert estimate.verdict == "doubtful"
+        assert any(why in reason and "scale only" in reason for reason in estimate.reasons)
+        assert survey.relative_error(estimate) == pytest.approx(0.0, abs=1e-6)
+
+    def test_a_straight_path_past_unknown_anchors_is_named(self, make_survey: MakeSurvey) -> None:
+        survey = make_survey(centers_m=on_a_line(), radio=NOISE, num_epochs=3)
+        estimate = survey.scale("unknown")
+        assert estimate.verdict == "doubtful"
+        assert any("straight" in reason for reason in estimate.reasons)
+        stddev = max(estimate.uncertainty.formal, estimate.uncertainty.empirical)
+        assert abs(survey.relative_error(estimate)) < 3 * stddev
+
+    def test_a_straight_path_is_no_harm_with_anchors_in_the_first_cameras_frame(self, make_survey: MakeSurvey) -> None:
+        estimate = make_survey(centers_m=on_a_line(), radio=NOISE).scale("first_camera", "ABCDE")
+        assert not any("straight" in reason for reason in estimate.reasons)
+
+    def test_above_and_below_a_flat_path_an_unknown_anchor_has_two_places(self, make_survey: MakeSurvey) -> None:
+        survey = make_survey(
+            centers_m=on_a_loop_at_one_height(make_survey), anchors_m=ONE_ANCHOR_M, radio=NOISE, num_epochs=3
+        )
+        estimate = survey.scale("unknown")
+        (anchor,) = estimate.anchors
+        assert anchor.mirror_position_m is not None
+        assert any("flat" in reason for reason in estimate.reasons)
+        truth = survey.frame_from_site("first_camera").apply(survey.anchors_m["A"])
+        places = np.array([anchor.position_m, anchor.mirror_position_m])
+        assert np.linalg.norm(places - truth, axis=1).min() < 0.5
+        # The path lies half-way between the two.
+        in_frame = estimate.metric_from_sfm.apply(survey.trajectory.centers)
+        normal = np.linalg.svd(in_frame - in_frame.mean(axis=0))[2][2]
+        heights = (places - in_frame.mean(axis=0)) @ normal
+        assert heights[0] == pytest.approx(-heights[1], abs=0.3)
+
+    def test_an_unknown_anchor_with_hardly_any_ranges_is_left_out_and_named(self, make_survey: MakeSurvey) -> None:
+        survey = make_survey()
+        log = survey.simulated.log
+        of_e = np.flatnonzero(log.anchor_index == log.anchor_ids.index("E"))
+        keep = np.setdiff1d(np.arange(len(log)), of_e[3:])
+        ids = [log.anchor_ids[k] for k in log.anchor_index[keep]]
+        assert log.timestamp_s is not None
+        thinned = RangeLog.from_arrays(ids, log.range_m[keep], timestamp_s=log.timestamp_s[keep])
+        estimate = survey.scale("first_camera", "ABCD", thinned)
+        assert any("anchor E" in reason for reason in estimate.reasons)
+        assert survey.relative_error(estimate) == pytest.approx(0.0, abs=1e-6)
+        assert set(estimate.observations.status[np.array(ids) == "E"]) == {RangeStatus.UNKNOWN_ANCHOR}
+
+
+class TestBias:
+    def test_a_delay_common_to_all_anchors_is_found(self, make_survey: MakeSurvey) -> None:
+        biases = dict.fromkeys("ABCDE", 0.15)
+        survey = make_survey(radio=Radio(range_stddev_m=0.02, range_bias_m=biases), num_epochs=3)
+        estimate = survey.scale("first_camera", "ABCDE")
+        assert [anchor.range_bias_m for anchor in estimate.anchors] == pytest.approx([0.15] * 5, abs=0.03)
+        assert survey.relative_error(estimate) == pytest.approx(0.0, abs=0.005)
+
+    def test_with_a_prior_of_zero_it_is_held_at_zero(self, make_survey: MakeSurvey) -> None:
+        survey = make_survey(radio=NOISE)
+        held = RangeModelOptions(range_bias_stddev_m=0.0, common_bias_stddev_m=0.0)
+        estimate = survey.scale("first_camera", "ABCDE", range_model=held)
+        assert [anchor.range_bias_m for anchor in estimate.anchors] == [0.0] * 5
+
+
+def test_order_of_the_ranges_does_not_matter(make_survey: MakeSurvey) -> None:
+    survey = make_survey(radio=Radio(range_stddev_m=0.1, obstructed_share=0.2), num_epochs=2)
+    log = survey.simulated.log
+    order = np.random.default_rng(0).permutation(len(log))
+    assert log.timestamp_s is not None
+    shuffled = RangeLog.from_arrays(
+        [log.anchor_ids[k] for k in log.anchor_index[order]], log.range_m[order], timestamp_s=log.timestamp_s[order]
+    )
+    first, second = survey.scale("first_camera", "ABCDE"), survey.scale("first_camera", "ABCDE", shuffled)
+    assert second.value == pytest.approx(first.value, rel=1e-9)
+    assert second.uncertainty.formal == pytest.approx(first.uncertainty.formal, rel=1e-6)
+    assert second.uncertainty.bootstrap == pytest.approx(first.uncertainty.bootstrap, rel=1e-6)
+    np.testing.assert_array_equal(second.observations.status, first.observations.status[order])
+
+
+def test_ranges_set_aside_as_checks_have_no_say(make_survey: MakeSurvey) -> None:
+    survey = make_survey(radio=NOISE, num_epochs=2)
+    held_out = hold_out(survey.observations(), 0.2, seed=0)
+    is_check = held_out.status == RangeStatus.CHECK
+    spoilt = survey.observations(survey.log_with(np.where(is_check, 1.0, survey.simulated.log.range_m)))
+    spoilt.status[is_check] = RangeStatus.CHECK
+    anchors = survey.anchors("first_camera", "ABCDE")
+    first, second = (
+        initialize_scale(observations, survey.trajectory, anchors, anchor_frame="first_camera")
+        for observations in (held_out, spoilt)
+    )
+    assert first.value == second.value
+    assert np.all(second.observations.status[is_check] == RangeStatus.CHECK)
+    assert np.all(np.isnan(second.range_stddev_m[is_check]))
+
+
+def test_the_noise_is_found_from_the_ranges_themselves(make_survey: MakeSurvey) -> None:
+    radio = Radio(range_stddev_m=0.07, obstructed_share=0.1, obstructed_mean_m=3.0)
+    estimate = make_survey(radio=radio, num_epochs=4).scale("first_camera", "ABCDE")
+    assert estimate.noise_stddev_m == pytest.approx(0.07, rel=0.2)
+
+
+def test_noise_that_the_log_states_is_believed(make_survey: MakeSurvey) -> None:
+    survey = make_survey(radio=NOISE)
+    log = survey.simulated.log
+    stated = RangeLog.from_arrays(
+        [log.anchor_ids[k] for k in log.anchor_index],
+        log.range_m,
+        timestamp_s=log.timestamp_s,
+        range_stddev_m=np.full(len(log), 0.3),
+    )
+    far = log.range_m > 5.0
+    stddev = survey.scale("first_camera", "ABCDE", stated).range_stddev_m
+    np.testing.assert_allclose(stddev[far], 0.3, rtol=0.01)

@@ -1,0 +1,159 @@
+"""The range equation, its derivatives and its solver."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rangesfm.geometry import IDENTITY, Similarity
+from rangesfm.scale import range_equation
+from rangesfm.scale.range_equation import RangeProblem, RangeState, predicted_ranges, solve
+
+Array = npt.NDArray[np.float64]
+
+NUM_RANGES, NUM_ANCHORS = 40, 3
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+def random_state(rng: np.random.Generator) -> RangeState:
+    rotation = Rotation.from_quat(rng.normal(size=4)).as_matrix()
+    return RangeState(
+        Similarity(1.7, rotation, rng.normal(size=3)), 4 * rng.normal(size=(NUM_ANCHORS, 3)), rng.normal(size=3)
+    )
+
+
+def random_problem(rng: np.random.Generator, state: RangeState) -> RangeProblem:
+    """Everything is estimated: the frame, all anchors (one unknown), all biases. Ranges fit ``state`` exactly."""
+    problem = RangeProblem(
+        centers=3 * rng.normal(size=(NUM_RANGES, 3)),
+        tag_from_center=0.3 * rng.normal(size=(NUM_RANGES, 3)),
+        anchor_index=rng.integers(NUM_ANCHORS, size=NUM_RANGES),
+        range_m=np.zeros(NUM_RANGES),
+        stddev_m=rng.uniform(0.05, 0.3, NUM_RANGES),
+        anchor_mean_m=np.vstack([rng.normal(size=(2, 3)), np.full((1, 3), np.nan)]),
+        anchor_stddev_m=np.array([0.1, 0.4, np.inf]),
+        bias_mean_m=rng.normal(size=3),
+        bias_stddev_m=np.array([0.02, 0.1, 0.3]),
+        common_bias_stddev_m=0.2,
+        frame_is_free=True,
+    )
+    return replace(problem, range_m=predicted_ranges(problem, state))
+
+
+def finite_differences(function: Callable[[Array], Array], at: Array, step: float = 1e-6) -> Array:
+    steps = step * np.eye(len(at))
+    return np.stack([(function(at + s) - function(at - s)) / (2 * step) for s in steps], axis=1)
+
+
+def test_prediction_is_the_hand_computed_one() -> None:
+    # Scaled by 2 and turned by 90 degrees about z, the centre (1, 0, 0) is at (0, 2, 0), shifted to (1, 2, 0); the
+    # lever arm (0, 1, 0) turns to (-1, 0, 0) and is not scaled: tag at (0, 2, 0), 5 m from (0, 6, 3), bias 0.25 m.
+    quarter_turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    problem = RangeProblem(
+        centers=np.array([[1.0, 0.0, 0.0]]),
+        tag_from_center=np.array([[0.0, 1.0, 0.0]]),
+        anchor_index=np.zeros(1, dtype=np.int64),
+        range_m=np.array([5.0]),
+        stddev_m=np.array([0.1]),
+        anchor_mean_m=np.array([[0.0, 6.0, 3.0]]),
+        anchor_stddev_m=np.zeros(1),
+        bias_mean_m=np.zeros(1),
+        bias_stddev_m=np.zeros(1),
+        common_bias_stddev_m=0.0,
+        frame_is_free=False,
+    )
+    state = RangeState(
+        Similarity(2.0, quarter_turn, np.array([1.0, 0.0, 0.0])), problem.anchor_mean_m, np.array([0.25])
+    )
+    assert predicted_ranges(problem, state) == pytest.approx([5.25], abs=1e-12)
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 1e-5, 0.5, 2.5])
+def test_jacobians_are_finite_differences_in_every_column(rng: np.random.Generator, turn_rad: float) -> None:
+    start = random_state(rng)
+    problem = random_problem(rng, random_state(rng))
+    columns = range_equation._columns(problem)
+    assert columns.num == 1 + 6 + 3 * NUM_ANCHORS + NUM_ANCHORS
+    at = 0.2 * rng.normal(size=columns.num)
+    at[1:4] *= turn_rad / np.linalg.norm(at[1:4])
+
+    def residuals(x: Array) -> Array:
+        state = range_equation._state(problem, columns, start, x)
+        return (predicted_ranges(problem, state) - problem.range_m) / problem.stddev_m
+
+    def prior_residuals(x: Array) -> Array:
+        return range_equation._prior_residuals(problem, columns, range_equation._state(problem, columns, start, x))
+
+    state = range_equation._state(problem, columns, start, at)
+    jacobian = range_equation._range_jacobian(problem, columns, start, state)
+    np.testing.assert_allclose(jacobian, finite_differences(residuals, at), rtol=1e-6, atol=1e-6)
+    prior_jacobian = range_equation._prior_jacobian(problem, columns)
+    np.testing.assert_allclose(prior_jacobian, finite_differences(prior_residuals, at), rtol=1e-6, atol=1e-6)
+
+
+def test_with_the_tag_on_the_anchor_all_numbers_are_finite(rng: np.random.Generator) -> None:
+    start = random_state(rng)
+    problem = random_problem(rng, start)
+    tag = range_equation.tag_positions(problem, start.metric_from_model)[0]
+    anchors = start.anchors_m.copy()
+    anchors[problem.anchor_index[0]] = tag
+    state = replace(start, anchors_m=anchors)
+    jacobian = range_equation._range_jacobian(problem, range_equation._columns(problem), state, state)
+    assert np.all(np.isfinite(jacobian))
+    assert np.isfinite(solve(problem, state).cost)
+
+
+def test_solver_comes_back_from_nearby(rng: np.random.Generator) -> None:
+    truth = random_state(rng)
+    problem = replace(
+        random_problem(rng, truth),
+        anchor_mean_m=truth.anchors_m,
+        anchor_stddev_m=np.array([0.0, 0.1, 0.1]),
+        bias_mean_m=truth.bias_m,
+    )
+    placed = truth.metric_from_model
+    turned = Rotation.from_rotvec([0.1, -0.2, 0.1]).as_matrix() @ placed.rotation
+    start = RangeState(
+        Similarity(1.2 * placed.scale, turned, placed.translation + 0.3),
+        truth.anchors_m + np.array([[0.0], [0.1], [0.5]]),
+        truth.bias_m,
+    )
+    fit = solve(problem, start)
+    assert fit.state.metric_from_model.scale == pytest.approx(placed.scale, rel=1e-9)
+    np.testing.assert_allclose(fit.state.metric_from_model.rotation, placed.rotation, atol=1e-9)
+    np.testing.assert_allclose(fit.state.anchors_m, truth.anchors_m, atol=1e-8)
+    np.testing.assert_array_equal(fit.state.anchors_m[0], truth.anchors_m[0])
+    np.testing.assert_allclose(fit.residuals_m, 0.0, atol=1e-9)
+    assert np.all(fit.weights > 1 - 1e-9)
+
+
+def test_formal_stddev_is_the_scatter_of_estimates(rng: np.random.Generator) -> None:
+    truth = random_state(rng)
+    problem = replace(random_problem(rng, truth), anchor_mean_m=truth.anchors_m, anchor_stddev_m=np.zeros(NUM_ANCHORS))
+    covariance = np.diag(problem.bias_stddev_m**2) + problem.common_bias_stddev_m**2
+    logs, stddevs = [], []
+    for _ in range(150):
+        biases = rng.multivariate_normal(problem.bias_mean_m, covariance)
+        ranges = predicted_ranges(problem, replace(truth, bias_m=biases)) + problem.stddev_m * rng.normal(
+            size=NUM_RANGES
+        )
+        fit = solve(replace(problem, range_m=ranges), truth, tolerance=1e-8)
+        logs.append(np.log(fit.state.metric_from_model.scale / truth.metric_from_model.scale))
+        stddevs.append(fit.log_scale_stddev)
+    assert np.std(logs) / np.median(stddevs) == pytest.approx(1.0, abs=0.25)
+
+
+def test_what_nothing_determines_is_not_certain(rng: np.random.Generator) -> None:
+    """Without motion the scale is open: the formal stddev says so rather than nothing."""
+    truth = replace(random_state(rng), metric_from_model=IDENTITY)
+    problem = replace(random_problem(rng, truth), centers=np.zeros((NUM_RANGES, 3)), frame_is_free=False)
+    assert solve(problem, truth).log_scale_stddev > 1e3

@@ -1,0 +1,140 @@
+"""The demo's survey is complete, says when its photos were taken, and comes with the truth."""
+
+from __future__ import annotations
+
+from datetime import datetime, timezone
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+from PIL.ExifTags import IFD, Base
+
+from rangesfm.config import read_survey
+from rangesfm.errors import InputError
+from rangesfm.ranging.anchor_file import read_anchors
+from rangesfm.ranging.readers import read_ranges
+from rangesfm.reference import read_reference
+from rangesfm.simulate import survey as survey_module
+from rangesfm.simulate.courtyard import ANCHOR_POSITIONS_M
+from rangesfm.simulate.photos import PhotoCamera
+from rangesfm.simulate.survey import ANCHOR_STDDEV_M, DemoSurvey, make_demo_survey, photo_exif
+
+NUM_PHOTOS = 4
+IMAGE_SIZE = (120, 80)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> DemoSurvey:
+    return _make(tmp_path_factory.mktemp("demo") / "survey")
+
+
+def _make(folder: Path) -> DemoSurvey:
+    return make_demo_survey(folder, num_photos=NUM_PHOTOS, seed=5, image_size=IMAGE_SIZE)
+
+
+def _files(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_folder_holds_the_survey_and_nothing_half_written(made: DemoSurvey) -> None:
+    photos = {f"images/{name}" for name in made.image_names}
+    assert _files(made.folder).keys() == photos | {"survey.toml", "uwb.csv", "anchors.csv", "reference.csv"}
+    with Image.open(made.folder / "images" / made.image_names[0]) as photo:
+        assert photo.size == IMAGE_SIZE
+        assert np.asarray(photo).std() > 20
+
+
+def test_survey_file_is_valid_and_names_the_camera_that_took_the_photos(made: DemoSurvey) -> None:
+    survey = read_survey(made.survey_path, {})
+    assert survey.camera.model == "SIMPLE_RADIAL"
+    assert survey.camera.params == pytest.approx(made.camera.params)
+    assert survey.anchor_frame == "site"
+    assert survey.ranges.time_offset_s is None
+    assert survey.reference_path == made.folder / "reference.csv"
+
+
+def test_exif_tells_the_time_of_each_photo_to_the_millisecond(made: DemoSurvey) -> None:
+    for name, timestamp_s in zip(made.image_names, made.timestamps_s, strict=True):
+        with Image.open(made.folder / "images" / name) as photo:
+            exif = photo.getexif().get_ifd(IFD.Exif)
+        text = f"{exif[Base.DateTimeOriginal]}.{exif[Base.SubsecTimeOriginal]}{exif[Base.OffsetTimeOriginal]}"
+        taken = datetime.strptime(text, "%Y:%m:%d %H:%M:%S.%f%z")
+        assert taken.timestamp() == pytest.approx(timestamp_s, abs=1e-6)
+
+
+def test_time_just_before_a_full_second_keeps_its_second() -> None:
+    exif = photo_exif(PhotoCamera(960, 640, 750.0), 1_000_000_000.9996, timezone.utc).get_ifd(IFD.Exif)
+    assert exif[Base.DateTimeOriginal] == "2001:09:09 01:46:41"
+    assert exif[Base.SubsecTimeOriginal] == "000"
+
+
+def test_colmap_guesses_the_focal_length_from_exif_within_two_percent(made: DemoSurvey) -> None:
+    guess = pycolmap.infer_camera_from_image(made.folder / "images" / made.image_names[0])
+    assert guess.has_prior_focal_length
+    assert guess.focal_length == pytest.approx(made.camera.focal_px, rel=0.02)
+
+
+def test_log_is_on_the_radios_clock_and_covers_all_photos(made: DemoSurvey) -> None:
+    log = read_ranges(made.folder / "uwb.csv")
+    assert set(log.anchor_ids) == set(ANCHOR_POSITIONS_M)
+    np.testing.assert_array_equal(log.range_m, made.ranges.log.range_m)
+    times = np.asarray(log.timestamp_s) + made.time_offset_s
+    assert times.min() < made.timestamps_s[0] - 1
+    assert times.max() > made.timestamps_s[-1] + 1
+    assert abs(made.time_offset_s) > 1
+
+
+def test_surveyed_anchors_are_near_the_true_ones_and_not_in_one_plane(made: DemoSurvey) -> None:
+    anchors = read_anchors(made.folder / "anchors.csv")
+    assert len(anchors) >= 4
+    surveyed = np.array([anchor.position_m for anchor in anchors])
+    true = np.array([made.anchors_m[anchor.anchor_id] for anchor in anchors])
+    assert 0 < np.abs(surveyed - true).max() < 4 * ANCHOR_STDDEV_M
+    assert all(anchor.position_stddev_m == ANCHOR_STDDEV_M for anchor in anchors)
+    assert np.linalg.svd(surveyed - surveyed.mean(axis=0))[1][2] > 0.5
+
+
+def test_reference_is_the_true_path(made: DemoSurvey) -> None:
+    reference = read_reference(made.folder / "reference.csv")
+    assert reference.image_names == made.image_names
+    np.testing.assert_allclose(reference.positions_m, made.centers_m, atol=1e-6)
+
+
+def test_same_seed_makes_the_same_files(made: DemoSurvey, tmp_path: Path) -> None:
+    assert _files(_make(tmp_path / "again").folder) == _files(made.folder)
+
+
+@pytest.fixture
+def no_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Taking a photo fails."""
+
+    def fail(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(survey_module, "courtyard", lambda **_: None)
+    monkeypatch.setattr(survey_module, "_take_photo", fail)
+
+
+@pytest.mark.usefixtures("no_camera")
+def test_survey_that_is_there_already_is_not_made_again(made: DemoSurvey) -> None:
+    before = _files(made.folder)
+    again = _make(made.folder)
+    np.testing.assert_array_equal(again.centers_m, made.centers_m)
+    assert _files(made.folder) == before
+
+
+@pytest.mark.usefixtures("no_camera")
+def test_folder_with_other_things_is_refused_and_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "holiday.txt").write_text("mine")
+    with pytest.raises(InputError, match="empty folder"):
+        _make(tmp_path)
+    assert _files(tmp_path) == {"holiday.txt": b"mine"}
+
+
+@pytest.mark.usefixtures("no_camera")
+def test_interrupted_survey_leaves_no_photos(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        _make(tmp_path / "demo")
+    assert _files(tmp_path) == {}

@@ -1,0 +1,507 @@
+"""Whatever is wrong with the input ends as one line that names it, the right exit status, and nothing half-written."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from rangesfm.cli import main
+
+if TYPE_CHECKING:
+    from tests.conftest import Command, PhotoRun, WalkedSurvey
+
+Spoil = Callable[[Path], object]
+MODEL_FILES = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
+
+
+def write(name: str, text: str) -> Spoil:
+    return lambda folder: (folder / name).write_text(text)
+
+
+def remove(name: str) -> Spoil:
+    return lambda folder: (folder / name).unlink()
+
+
+def set_line(name: str, number: int, text: str) -> Spoil:
+    """Put a text in the place of one line."""
+
+    def spoil(folder: Path) -> None:
+        lines = (folder / name).read_text().splitlines()
+        lines[number - 1] = text
+        (folder / name).write_text("\n".join(lines) + "\n")
+
+    return spoil
+
+
+def keep_lines(name: str, numbers: slice) -> Spoil:
+    """Keep the header row and some of the lines below it."""
+
+    def spoil(folder: Path) -> None:
+        header, *lines = (folder / name).read_text().splitlines()
+        (folder / name).write_text("\n".join([header, *lines[numbers]]) + "\n")
+
+    return spoil
+
+
+def add_tags(folder: Path) -> None:
+    header, *lines = (folder / "uwb.csv").read_text().splitlines()
+    tagged = [f"{line},T{number % 2}" for number, line in enumerate(lines)]
+    (folder / "uwb.csv").write_text("\n".join([f"{header},tag_id", *tagged]) + "\n")
+
+
+def change_model(change: Callable[[pycolmap.Reconstruction], object]) -> Spoil:
+    def spoil(folder: Path) -> None:
+        model = pycolmap.Reconstruction(folder / "sparse" / "0")
+        change(model)
+        model.write(folder / "sparse" / "0")
+
+    return spoil
+
+
+def stand_still(model: pycolmap.Reconstruction) -> None:
+    for frame_id in model.reg_frame_ids():
+        model.frame(frame_id).rig_from_world = pycolmap.Rigid3d()
+
+
+def lose_a_pose(model: pycolmap.Reconstruction) -> None:
+    model.frame(3).rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.full(3, np.nan))
+
+
+def remove_points(model: pycolmap.Reconstruction) -> None:
+    for point_id in list(model.points3D):
+        model.delete_point3D(point_id)
+
+
+def nothing(folder: Path) -> None:
+    pass
+
+
+class Refusal:
+    """Runs commands in one folder that must fail, and looks at what they say and leave."""
+
+    def __init__(self, folder: Path, capfd: pytest.CaptureFixture[str]):
+        self._folder = folder
+        self._capfd = capfd
+
+    def __call__(self, *argv: str, status: int = 2) -> str:
+        """What the command says behind ``rangesfm: error:``; its output is one line, and no file is new or gone."""
+        before = self._files()
+        assert main([*argv, "--quiet"]) == status
+        out, err = self._capfd.readouterr()
+        assert out == ""
+        assert err.count("\n") == 1, err
+        assert err.startswith("rangesfm: error: ")
+        assert self._files() == before
+        return err.removeprefix("rangesfm: error: ").rstrip("\n")
+
+    def _files(self) -> dict[str, int]:
+        return {str(path): path.stat().st_mtime_ns for path in self._folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def refusal(own_survey: WalkedSurvey, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Refusal:
+    monkeypatch.chdir(own_survey.folder)
+    return Refusal(own_survey.folder, capfd)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (remove("uwb.csv"), r"\[ranges\] path: there is no file .*/uwb.csv"),
+        (write("uwb.csv", ""), r"/uwb.csv: the file is empty, expected a log of ranges"),
+        (write("uwb.csv", "timestamp_s,anchor_id,range_m\n"), r"/uwb.csv: no usable range: no records"),
+        (write("uwb.csv", "t,d\n1,2\n"), r"/uwb.csv: .*canonical"),
+        (set_line("uwb.csv", 7, "103.0,A9,3.0"), r"/uwb.csv:7: anchor_id is 'A9', expected one of .*anchors.csv: A1, "),
+        (set_line("uwb.csv", 7, "103.0,A1,nan"), r"/uwb.csv:7: range_m is nan, expected a positive number of metres"),
+        (set_line("uwb.csv", 8, "103.0,A1,-3"), r"/uwb.csv:8: range_m is -3, expected a positive number of metres"),
+        (set_line("uwb.csv", 9, "103.0,A1,x"), r"/uwb.csv:9: range_m is 'x', expected a positive number of metres"),
+        (set_line("uwb.csv", 9, "103.0,A1,1e300"), r"/uwb.csv:9: a range of 1e\+300 m, expected at most 1e\+06"),
+        (set_line("uwb.csv", 9, "now,A1,3"), r"/uwb.csv:9: timestamp_s is 'now', expected a time in s"),
+        (write("anchors.csv", ""), r"/anchors.csv: "),
+        (set_line("anchors.csv", 3, "A2,far,2,3"), r"/anchors.csv:3: x_m is 'far', expected a number of metres"),
+        (
+            set_line("anchors.csv", 3, "A2,1,,3"),
+            r"/anchors.csv:3: y_m is empty, expected all three coordinates or none",
+        ),
+        (set_line("anchors.csv", 3, "A1,1,2,3"), r"/anchors.csv:3: anchor A1 stands in line 2 already"),
+        (set_line("images.csv", 4, "frame_00001.jpg,7"), r"/images.csv:4: frame_00001.jpg stands in line 2 already"),
+        (set_line("images.csv", 4, "frame_00003.jpg,x"), r"/images.csv:4: timestamp_s is 'x', expected seconds"),
+        (
+            write("images.csv", "image_name,timestamp_s\nother.jpg,1\n"),
+            r"/images.csv: none of the model's photos has a time, the first is frame_00001.jpg",
+        ),
+        (set_line("reference.csv", 5, "frame_00004.jpg,1,b,2"), r"/reference.csv:5: y_m is 'b', expected a number"),
+        (
+            write("reference.csv", "image_name,x_m,y_m,z_m\nother.jpg,1,2,3\n"),
+            r"/reference.csv: the reference knows none of the keyframes: its first photo is 'other.jpg'",
+        ),
+        (
+            write("reference.csv", "timestamp_s,x_m,y_m,z_m\n1,1,2,3\n2,1,2,3\n"),
+            r"/reference.csv: the reference knows none of the keyframes: its times are 1.000 to 2.000 s",
+        ),
+        (add_tags, r"/uwb.csv: the log has several tags \(T0, T1\): say which is the camera's \(--tag_id\)"),
+        (change_model(lose_a_pose), r"/sparse/0: the pose of frame_00003.jpg is not finite"),
+        (change_model(remove_points), r"/sparse/0: the model has no 3-D points to refine"),
+    ],
+)
+def test_spoilt_file_is_named_with_its_line(
+    spoil: Spoil, said: str, own_survey: WalkedSurvey, refusal: Refusal
+) -> None:
+    spoil(own_survey.folder)
+    flags = ("--anchors", "anchors.csv", "--reference", "reference.csv", "--output_path", "out")
+    assert re.search(said, refusal("refine", *own_survey.flags, *flags))
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--ranges_time_offset", "5000"], r"/uwb.csv: the log's times \(97.000 to .* do not overlap the photos'"),
+        (["--tag_id", "T9"], r"/uwb.csv: tag 'T9' is not in the log"),
+        (["--use_anchors", "A1,A7"], r"/uwb.csv: anchor 'A7' to be used is not in the log \(A1, A2, A3, A4\)"),
+        (["--anchor_frame", "first_camera"], r"anchor frame 'first_camera' needs anchor positions and there are none"),
+        (["--tag_in_cam", "-1.2,-90,-66.3"], r"tag_in_cam_m is \[-1.2, -90.0, -66.3\], expected metres"),
+        (["--tag_in_cam", "nan,0,0"], r"tag_in_cam_m is \[nan, 0.0, 0.0\], expected a list of numbers"),
+        (["--input_path", "."], r"not a COLMAP model, expected cameras, images and points3D files"),
+        (["--input_path", "sparse"], r"/sparse: not a COLMAP model, .*; is it .*/sparse/0\?"),
+        (["--input_path", "none"], r"/none: no such folder of a COLMAP model"),
+        (["--output_path", "uwb.csv"], r"/uwb.csv: cannot write to this output folder"),
+        (["--output_path", "uwb.csv/out"], r"/uwb.csv/out: cannot write to this output folder \(Not a directory\)"),
+        (["--output_path", "."], r"/images.csv: the results would overwrite this input, expected another output path"),
+        (["--images", "sparse"], r"/sparse: no time for frame_00001.jpg: expected a CSV file"),
+    ],
+)
+def test_wrong_flag_is_explained(flags: list[str], said: str, own_survey: WalkedSurvey, refusal: Refusal) -> None:
+    output = () if "--output_path" in flags else ("--output_path", "out")
+    assert re.search(said, refusal("scale", *own_survey.flags, *flags, *output))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            '[ranges]\npath = "uwb.csv"\nrange_stdev_m = 1\n',
+            "s.toml:3: unknown key 'range_stdev_m' in [ranges]; the near",
+        ),
+        ('[range]\npath = "uwb.csv"\n', "s.toml:1: unknown table [range]; the nearest known one is 'ranges'"),
+        ("[ranges]\npath = uwb.csv\n", "s.toml:2: not a TOML file"),
+        (
+            '[anchors]\nframe = "sight"\n',
+            "s.toml:2: [anchors] frame is 'sight', expected one of site, first_camera, unk",
+        ),
+        ('[export]\nformats = ["tum", "dxf"]\n', "unknown export format 'dxf', expected one of: colmap, "),
+        (
+            "[refine.bundle_adjustment]\nrefine_focal_lenght = true\n",
+            "unknown key 'refine_focal_lenght' in [refine.bundle_adjustment]; the nearest known one is "
+            "'refine_focal_length'",
+        ),
+        (
+            '[refine.bundle_adjustment]\nrefine_focal_length = "yes"\n',
+            "[refine.bundle_adjustment] refine_focal_length is 'yes', expected true or false",
+        ),
+    ],
+)
+def test_slip_in_the_survey_file_is_found_before_the_work(
+    text: str, said: str, own_survey: WalkedSurvey, refusal: Refusal
+) -> None:
+    (own_survey.folder / "s.toml").write_text(text)
+    assert said in refusal("refine", "s.toml", *own_survey.flags, "--output_path", "out")
+    assert not (own_survey.folder / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "flags", "said"),
+    [
+        (change_model(stand_still), (), "the scale is not determined: the camera hardly moved"),
+        (keep_lines("uwb.csv", slice(400, 405)), (), "the scale is not determined: 5 of 5 ranges lie on the path"),
+        (keep_lines("images.csv", slice(3)), (), "the scale is not determined: .* near 3 keyframes"),
+    ],
+    ids=["still camera", "few ranges", "few photos"],
+)
+def test_geometry_that_determines_nothing_is_status_3(
+    spoil: Spoil, flags: tuple[str, ...], said: str, own_survey: WalkedSurvey, refusal: Refusal
+) -> None:
+    spoil(own_survey.folder)
+    given = (*own_survey.flags, "--anchors", "anchors.csv", *flags, "--output_path", "out")
+    assert re.search(said, refusal("refine", *given, status=3))
+
+
+@pytest.mark.parametrize("name", MODEL_FILES)
+@pytest.mark.parametrize("damage", ["cut", "noise", "gone"])
+def test_damaged_model_is_refused_at_once(
+    name: str, damage: str, own_survey: WalkedSurvey, rangesfm_command: Command
+) -> None:
+    path = own_survey.folder / "sparse" / "0" / name
+    data = path.read_bytes()
+    if damage == "gone":
+        path.unlink()
+    else:
+        path.write_bytes(data[: 2 * len(data) // 3] if damage == "cut" else b"\xff" * len(data))
+    # A process of its own: what COLMAP does with such files may take all memory, or never end.
+    flags = ("--output_path", "out", "--quiet")
+    done = rangesfm_command("scale", *own_survey.flags, *flags, cwd=own_survey.folder, status=2)
+    assert re.fullmatch(rf"rangesfm: error: {own_survey.folder}/sparse/0(/{name})?: .*\n", done.stderr)
+    assert not (own_survey.folder / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (keep_lines("anchors.csv", slice(1)), "1 surveyed anchor"),
+        (
+            write("anchors.csv", "anchor_id,x_m,y_m,z_m\nA1,0,0,1\nA2,2,0,1\nA3,4,0,1\nA4,9,0,1\n"),
+            "anchors on one line",
+        ),
+    ],
+    ids=["one anchor", "a line of anchors"],
+)
+def test_anchors_that_cannot_hold_the_site_frame_still_give_the_scale_with_a_warning(
+    spoil: Spoil,
+    said: str,
+    own_survey: WalkedSurvey,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    spoil(own_survey.folder)
+    anchors = (own_survey.folder / "anchors.csv").read_text().splitlines()[1:]
+    ids = ",".join(line.split(",")[0] for line in anchors)
+    monkeypatch.chdir(own_survey.folder)
+    flags = ("--anchors", "anchors.csv", "--use_anchors", ids, "--anchor_frame", "site", "--output_path", "out")
+    assert main(["scale", *own_survey.flags, *flags]) == 0
+    warning = next(line for line in capfd.readouterr().err.splitlines() if said in line)
+    assert "cannot fix the map in the site frame" in warning
+    result = json.loads((own_survey.folder / "out" / "result.json").read_text())
+    assert result["frame"] == "first_camera"
+    assert warning in result["warnings"]
+    assert result["scale"]["value"] == pytest.approx(own_survey.site_from_sfm.scale, rel=0.02)
+
+
+def test_model_photos_without_a_time_are_counted(
+    own_survey: WalkedSurvey, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    set_line("images.csv", 4, "not_there.jpg,102")(own_survey.folder)
+    monkeypatch.chdir(own_survey.folder)
+    assert main(["scale", *own_survey.flags, "--anchors", "anchors.csv", "--output_path", "out"]) == 0
+    assert "1 of 40 photos of the model have no time and are left out\n" in capfd.readouterr().err
+
+
+def test_failure_leaves_an_earlier_result_as_it_was(
+    own_survey: WalkedSurvey, refusal: Refusal, rangesfm_command: Command
+) -> None:
+    flags = (*own_survey.flags, "--output_path", "out")
+    rangesfm_command("scale", *flags, "--anchors", "anchors.csv", cwd=own_survey.folder)
+    assert "tag 'T9'" in refusal("refine", *flags, "--tag_id", "T9")
+    keep_lines("uwb.csv", slice(400, 405))(own_survey.folder)
+    assert "not determined" in refusal("refine", *flags, status=3)
+    assert (own_survey.folder / "out" / "result.json").is_file()
+
+
+@pytest.mark.parametrize("command", ["compare", "export", "report"])
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (write("result.json", '{"frame":\n'), "out/result.json:2: not JSON"),
+        (write("result.json", "[]\n"), "out/result.json:1: expected a JSON object"),
+        (write("sparse_scaled/0/images.bin", "x" * 99), "out/sparse_scaled/0/images.bin: is damaged or cut off"),
+    ],
+    ids=["cut", "list", "model"],
+)
+def test_damaged_result_is_named(
+    command: str, spoil: Spoil, said: str, own_survey: WalkedSurvey, refusal: Refusal
+) -> None:
+    out = own_survey.folder / "out"
+    shutil.copytree(own_survey.folder / "sparse", out / "sparse_scaled")
+    (out / "result.json").write_text('{"frame": "site"}\n')
+    spoil(out)
+    reference = ("--reference", "reference.csv") if command == "compare" else ()
+    assert said in refusal(command, "out", *reference)
+
+
+class TestPhotos:
+    """Folders of photos from which nothing can come."""
+
+    @pytest.fixture
+    def photos(self, own_survey: WalkedSurvey) -> Path:
+        """Five pictures of different rugs, a second apart, in the folder of the survey."""
+        folder = own_survey.folder / "photos"
+        folder.mkdir()
+        rng = np.random.default_rng(0)
+        for number in range(5):
+            cells = Image.fromarray(rng.integers(0, 255, (48, 64), dtype=np.uint8))
+            cells.resize((320, 240), Image.Resampling.BICUBIC).save(folder / f"{number}.png")
+        times = "".join(f"{number}.png,{110 + number}\n" for number in range(5))
+        (own_survey.folder / "photos.csv").write_text("image_name,timestamp_s\n" + times)
+        return folder
+
+    flags = ("--images", "photos", "--image_times", "photos.csv", "--ranges", "uwb.csv", "--output_path", "out")
+
+    def test_that_are_not_there(self, refusal: Refusal, own_survey: WalkedSurvey) -> None:
+        flags = ("--ranges", "uwb.csv", "--output_path", "out")
+        assert "/photos: no such folder of photos" in refusal("run", "--images", "photos", *flags)
+        (own_survey.folder / "photos").mkdir()
+        assert "/photos: no photos (jpg " in refusal("run", "--images", "photos", *flags)
+
+    @pytest.mark.usefixtures("photos")
+    @pytest.mark.parametrize(
+        ("line", "text", "said"),
+        [
+            (3, "0.png,111", r"/photos.csv:3: 0.png stands in line 2 already, expected one row per photo"),
+            (3, "1.jpg,111", r"/photos.csv:3: image_name is '1.jpg', expected the name of a photo in the folder"),
+            (3, "1.png,110", r"/photos.csv:3: 1.png has the time of 0.png in line 2, expected another"),
+        ],
+    )
+    def test_whose_times_are_wrong(
+        self, line: int, text: str, said: str, own_survey: WalkedSurvey, refusal: Refusal
+    ) -> None:
+        set_line("photos.csv", line, text)(own_survey.folder)
+        assert re.search(said, refusal("run", *self.flags))
+
+    @pytest.mark.usefixtures("photos")
+    @pytest.mark.parametrize(
+        ("flags", "said"),
+        [
+            (("--ranges_time_offset", "999"), r"/uwb.csv: the log's times .* do not overlap the photos'"),
+            (("--reference", "reference.csv"), r"/reference.csv: the reference knows none of the keyframes"),
+            (("--camera_model", "PINHOL"), r"\[camera\] model is 'PINHOL', expected .* the nearest is 'PINHOLE'"),
+            (
+                ("--camera_model", "PINHOLE", "--camera_params", "300,160,120"),
+                r"\[camera\] params has 3 numbers, expected 4 for PINHOLE \(fx, fy, cx, cy\)",
+            ),
+            (("--camera_params", "300,160,120"), r"\[camera\] has params but no model"),
+            (("--max_num_keyframes", "2"), r"max_num_keyframes is 2, expected 3 or more"),
+            (("--output_path", "uwb.csv/out"), r"/uwb.csv/out: cannot write to this output folder"),
+        ],
+    )
+    def test_whose_flags_are_wrong_are_not_even_looked_at(
+        self, flags: tuple[str, ...], said: str, own_survey: WalkedSurvey, refusal: Refusal
+    ) -> None:
+        assert re.search(said, refusal("run", *self.flags, *flags))
+        assert not (own_survey.folder / "out").exists()
+
+    @pytest.mark.usefixtures("photos")
+    def test_whose_mapper_key_does_not_exist(self, own_survey: WalkedSurvey, refusal: Refusal) -> None:
+        (own_survey.folder / "s.toml").write_text("[mapper.pipeline]\nmin_num_maches = 9\n")
+        said = refusal("run", "s.toml", *self.flags)
+        assert said == "unknown key 'min_num_maches' in [mapper.pipeline]; the nearest known one is 'min_num_matches'"
+        assert not (own_survey.folder / "out").exists()
+
+    @pytest.mark.parametrize("kind", ["unrelated", "black", "no pictures"])
+    def test_that_do_not_reconstruct_are_status_4(
+        self,
+        kind: str,
+        photos: Path,
+        own_survey: WalkedSurvey,
+        monkeypatch: pytest.MonkeyPatch,
+        capfd: pytest.CaptureFixture[str],
+    ) -> None:
+        for path in photos.iterdir():
+            if kind == "black":
+                Image.new("L", (320, 240)).save(path)
+            elif kind == "no pictures":
+                path.write_text("not a photo")
+        monkeypatch.chdir(own_survey.folder)
+        assert main(["run", *self.flags, "--quiet"]) == 4
+        out, err = capfd.readouterr()
+        assert out == ""
+        said = {
+            "unrelated": "no two of 5 photos match: .*/mapper.log.*",
+            "black": "0 of 5 photos have 50 features or more, .*",
+            "no pictures": ".*: 0 of 5 photos can be used, expected .*",
+        }
+        assert re.fullmatch(f"rangesfm: error: {said[kind]}\n", err)
+        assert_nothing_half_written(own_survey.folder / "out")
+        assert not (own_survey.folder / "out" / "sparse").exists()
+
+
+def assert_nothing_half_written(folder: Path) -> None:
+    """Nothing here can be taken for a result, or for a part of one."""
+    names = [path.name for path in folder.rglob("*")]
+    assert "result.json" not in names
+    assert not [name for name in names if name.endswith((".part", ".old")) or name.startswith(".")]
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Start a command, as from a terminal, where Ctrl-C is not ignored."""
+    started = []
+
+    def start_command(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "rangesfm", *arguments],
+            cwd=cwd,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )
+        started.append(process)
+        return process
+
+    yield start_command
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+def interrupt_when(happened: Callable[[], bool], process: subprocess.Popen[str]) -> list[str]:
+    """Send Ctrl-C as soon as something has happened; what the process said."""
+    deadline = time.monotonic() + 60
+    while not happened():
+        assert process.poll() is None, "the process ended before"
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert out == ""
+    assert "Traceback" not in err
+    return err.splitlines()
+
+
+class TestCtrlC:
+    def test_in_mapping_keeps_the_matches_and_the_next_run_goes_on_from_them(
+        self,
+        photo_run: PhotoRun,
+        start: Callable[..., subprocess.Popen[str]],
+        rangesfm_command: Command,
+        tmp_path: Path,
+    ) -> None:
+        out = shutil.copytree(photo_run.output_path, tmp_path / "out")
+        survey = photo_run.survey.folder / "other_mapping.toml"
+        survey.write_text(
+            (photo_run.survey.folder / "survey.toml").read_text() + "[mapper.pipeline]\nmin_model_size = 4\n"
+        )
+        flags = (str(survey), *photo_run.flags[1:], "--output_path", str(out))
+        lines = interrupt_when(lambda: not (out / "sparse").exists(), start("run", *flags, cwd=tmp_path))
+        assert lines[-1] == "rangesfm: error: interrupted; stages that were done are kept"
+        assert sum(line.startswith("rangesfm:") for line in lines) == 1
+        assert lines[-2].startswith("mapping: stopped after ")
+        assert_nothing_half_written(out)
+        assert not (out / "sparse").exists()
+        with pycolmap.Database.open(out / "database.db") as database:
+            assert database.num_verified_image_pairs() > 13
+
+        done = rangesfm_command("run", *flags, cwd=tmp_path)
+        assert "matching: taken over from an earlier run\nmapping ...\n" in done.stderr
+        found = json.loads((out / "result.json").read_text())["scale"]["value"]
+        before = json.loads((photo_run.output_path / "result.json").read_text())["scale"]["value"]
+        assert found == pytest.approx(before, rel=1e-9)
+
+    def test_while_the_demo_is_rendered_leaves_no_photos(
+        self, start: Callable[..., subprocess.Popen[str]], tmp_path: Path
+    ) -> None:
+        lines = interrupt_when(lambda: any(tmp_path.glob("yard/.images.*")), start("demo", "yard", cwd=tmp_path))
+        assert lines[-1] == "rangesfm: error: interrupted; stages that were done are kept"
+        assert [path for path in tmp_path.rglob("*") if path.is_file()] == []

@@ -1,0 +1,526 @@
+"""Whole commands, run as users run them: what they leave, and that it is right."""
+
+from __future__ import annotations
+
+import copy
+import csv
+import json
+import math
+import os
+import shutil
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rangesfm.geometry import Similarity
+from rangesfm.ranging.readers import read_ranges
+
+if TYPE_CHECKING:
+    from tests.conftest import Command, PhotoRun, WalkedSurvey
+
+Array = npt.NDArray[np.float64]
+
+NUMBER, TEXT, LIST, TABLE, BOOL = (float, int), str, list, dict, bool
+OR_NULL = type(None)
+RANGE_SUMMARY = {"num": int, "num_used": int, "num_rejected": int, "rms_m": NUMBER, "median_abs_m": NUMBER}
+# What result.json has at least, whatever else there is; "*" stands for each of the keys.
+RESULT = {
+    "scale": {
+        "value": NUMBER,
+        "stddev_formal": NUMBER,
+        "stddev_empirical": NUMBER,
+        "method": TEXT,
+        "verdict": TEXT,
+        "reasons": LIST,
+        "per_anchor": {"*": NUMBER},
+        "two_candidate": {
+            "alpha0": {"mean": NUMBER, "std": NUMBER},
+            "alpha1": {"mean": NUMBER, "std": NUMBER},
+            "chosen": TEXT,
+        },
+    },
+    "metric_from_sfm": {"scale": NUMBER, "rotation_xyzw": LIST, "translation_m": LIST},
+    "frame": TEXT,
+    "anchors": {
+        "*": {
+            "position_m": LIST,
+            "stddev_m": NUMBER,
+            "range_bias_m": NUMBER,
+            "mirror_position_m": (list, OR_NULL),
+        }
+    },
+    "time_offset": {"value_s": (float, OR_NULL), "stddev_s": (float, OR_NULL)},
+    "ranges": {**RANGE_SUMMARY, "per_anchor": {"*": RANGE_SUMMARY}},
+    "check_ranges": {"num": int, "rms_m": (float, OR_NULL)},
+    "versions": {"rangesfm": TEXT, "pycolmap": TEXT, "pyceres": TEXT},
+    "settings": TABLE,
+    "seconds": {"*": NUMBER},
+    "warnings": LIST,
+}
+REFINE = {
+    "iterations": int,
+    "initial_cost": NUMBER,
+    "final_cost": NUMBER,
+    "reprojection_rms_px": NUMBER,
+    "pixel_stddev": NUMBER,
+    "seconds": NUMBER,
+}
+COMPARISON = {
+    "name": TEXT,
+    "rmse_m": (float, OR_NULL),
+    "rmse_se3_m": NUMBER,
+    "rmse_sim3_m": NUMBER,
+    "scale_error_percent": NUMBER,
+}
+MODEL_FILES = {"cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin"}
+
+
+@dataclass(frozen=True)
+class Left:
+    """An output folder and what the command printed."""
+
+    folder: Path
+    stdout: str
+    stderr: str
+
+    @cached_property
+    def result(self) -> dict[str, Any]:
+        loaded = json.loads((self.folder / "result.json").read_text(encoding="utf-8"))
+        assert isinstance(loaded, dict)
+        return loaded
+
+    @property
+    def without_seconds(self) -> dict[str, Any]:
+        """A copy of result.json but for how long things took and where it lies."""
+        result = copy.deepcopy(self.result)
+        del result["seconds"], result["settings"]["output_path"]
+        if result["refine"] is not None:
+            del result["refine"]["seconds"]
+        return result
+
+    @property
+    def files(self) -> set[str]:
+        """Everything in the folder but the models' own files."""
+        paths = {path.relative_to(self.folder).as_posix() for path in self.folder.rglob("*") if path.is_file()}
+        models = {path for path in paths if path.startswith("sparse") and os.path.basename(path) in MODEL_FILES}
+        return (paths - models) | {os.path.dirname(path) for path in models}
+
+    @property
+    def metric_from_sfm(self) -> Similarity:
+        given = self.result["metric_from_sfm"]
+        rotation = Rotation.from_quat(given["rotation_xyzw"]).as_matrix()
+        return Similarity(given["scale"], rotation, np.array(given["translation_m"]))
+
+    @property
+    def relative_stddev(self) -> float:
+        scale = self.result["scale"]
+        return float(max(scale["stddev_formal"], scale["stddev_empirical"]) / scale["value"])
+
+    def centers(self, model: str) -> Array:
+        return centers_of(self.folder / model / "0")
+
+    def rows(self, name: str) -> list[dict[str, str]]:
+        with (self.folder / name).open(encoding="utf-8", newline="") as file:
+            return list(csv.DictReader(file))
+
+
+def centers_of(model: Path) -> Array:
+    """(n, 3) projection centres by name."""
+    images = sorted(pycolmap.Reconstruction(model).images.values(), key=lambda image: image.name)
+    return np.array([image.projection_center() for image in images if image.has_pose])
+
+
+def assert_has(found: Any, expected: Any, where: str = "") -> None:
+    """``found`` has every key of ``expected``, with a value of its type; what is a number is finite."""
+    if not isinstance(expected, dict):
+        is_right = isinstance(found, expected) and (not isinstance(found, bool) or expected is BOOL)
+        assert is_right, f"{where} is {found!r}"
+        assert not isinstance(found, float) or math.isfinite(found), f"{where} is {found!r}"
+        return
+    assert isinstance(found, dict), f"{where} is {found!r}"
+    for key, inner in expected.items():
+        for name in found if key == "*" else [key]:
+            assert name in found, f"{where} has no {name}"
+            assert_has(found[name], inner, f"{where}.{name}")
+    assert found, f"{where} is empty"
+
+
+def run_on(
+    command: Command, survey: WalkedSurvey, folder: Path, stage: str, *flags: str, drop: tuple[str, ...] = ()
+) -> Left:
+    """A stage on the walked survey, with the results in ``folder``."""
+    pairs = zip(survey.flags[::2], survey.flags[1::2], strict=True)
+    given = [item for pair in pairs if pair[0] not in drop for item in pair]
+    done = command(stage, *given, *flags, "--output_path", str(folder), cwd=survey.folder)
+    return Left(folder, done.stdout, done.stderr)
+
+
+@pytest.fixture(scope="module")
+def refined(walked_survey: WalkedSurvey, rangesfm_command: Command, tmp_path_factory: pytest.TempPathFactory) -> Left:
+    """The walked survey refined in its site frame, compared with the truth; not to be written to."""
+    folder = tmp_path_factory.mktemp("refined") / "out"
+    flags = ("--anchors", "anchors.csv", "--anchor_frame", "site", "--reference", "reference.csv")
+    return run_on(rangesfm_command, walked_survey, folder, "refine", *flags)
+
+
+class TestRefineInASiteFrame:
+    def test_leaves_every_file_and_nothing_half_written(self, refined: Left) -> None:
+        assert refined.files == {
+            "sparse_scaled/0",
+            "sparse_metric/0",
+            "result.json",
+            "ranges.csv",
+            "images.csv",
+            "reference.csv",
+            "report.html",
+            "trajectory.tum",
+            "points.ply",
+        }
+
+    def test_result_has_every_key(self, refined: Left) -> None:
+        assert_has(refined.result, {**RESULT, "refine": REFINE})
+        assert refined.result["frame"] == "site"
+        assert refined.result["scale"]["verdict"] == "good"
+        assert refined.result["warnings"] == []
+        assert set(refined.result["anchors"]) == {"A1", "A2", "A3", "A4"}
+        assert refined.result["time_offset"]["value_s"] == 2.0
+        assert [row["name"] for row in refined.result["comparison"]] == ["true scale", "estimated scale", "refined"]
+        for row in refined.result["comparison"]:
+            assert_has(row, COMPARISON)
+
+    def test_metric_from_sfm_carries_the_model_onto_the_scaled_one(
+        self, refined: Left, walked_survey: WalkedSurvey
+    ) -> None:
+        sfm = centers_of(walked_survey.folder / "sparse" / "0")
+        carried = refined.metric_from_sfm.apply(sfm)
+        assert np.abs(carried - refined.centers("sparse_scaled")).max() < 1e-9
+
+    def test_scale_is_right_within_its_stated_error(self, refined: Left, walked_survey: WalkedSurvey) -> None:
+        error = refined.result["scale"]["value"] / walked_survey.site_from_sfm.scale - 1
+        assert abs(error) < 3 * refined.relative_stddev < 0.02
+
+    def test_map_is_in_the_site_frame_without_alignment(self, refined: Left, walked_survey: WalkedSurvey) -> None:
+        for model, tolerance_m in (("sparse_scaled", 0.05), ("sparse_metric", 0.04)):
+            errors = np.linalg.norm(refined.centers(model) - walked_survey.centers_m, axis=1)
+            assert np.sqrt(np.mean(errors**2)) < tolerance_m
+
+    def test_comparison_says_how_far_the_models_are_from_the_reference(
+        self, refined: Left, walked_survey: WalkedSurvey
+    ) -> None:
+        by_name = {row["name"]: row for row in refined.result["comparison"]}
+        for name, model in (("estimated scale", "sparse_scaled"), ("refined", "sparse_metric")):
+            errors = np.linalg.norm(refined.centers(model) - walked_survey.centers_m, axis=1)
+            assert by_name[name]["rmse_m"] == pytest.approx(np.sqrt(np.mean(errors**2)), rel=1e-6)
+        assert by_name["true scale"]["scale_error_percent"] == pytest.approx(0, abs=1e-9)
+        assert "RMSE m" in refined.stdout
+
+    def test_every_range_is_listed_with_what_became_of_it(self, refined: Left, walked_survey: WalkedSurvey) -> None:
+        log = read_ranges(walked_survey.folder / "uwb.csv")
+        rows = refined.rows("ranges.csv")
+        assert [float(row["range_m"]) for row in rows] == log.range_m.tolist()
+        assert [row["anchor_id"] for row in rows] == [log.anchor_ids[k] for k in log.anchor_index]
+        used = [row for row in rows if row["status"] in ("used", "down-weighted")]
+        assert len(used) == refined.result["ranges"]["num_used"] > 0.9 * len(rows)
+        for row in used:
+            predicted, residual = float(row["predicted_refined_m"]), float(row["residual_m"])
+            assert residual == pytest.approx(predicted - float(row["range_m"]), abs=1e-4)
+        residuals = [float(row["residual_m"]) for row in used]
+        assert refined.result["ranges"]["rms_m"] == pytest.approx(np.sqrt(np.mean(np.square(residuals))), rel=1e-3)
+        outside = [row for row in rows if row["status"] == "outside-path"]
+        assert outside
+        assert all(row["keyframe_before"] == row["residual_m"] == "" for row in outside)
+
+    def test_trajectory_and_points_are_those_of_the_metric_model(self, refined: Left) -> None:
+        lines = (refined.folder / "trajectory.tum").read_text().splitlines()
+        poses = np.array([line.split() for line in lines if not line.startswith("#")], dtype=np.float64)
+        np.testing.assert_allclose(poses[:, 0], 100.0 + np.arange(40))
+        np.testing.assert_allclose(poses[:, 1:4], refined.centers("sparse_metric"), atol=1e-6)
+        num_points = pycolmap.Reconstruction(refined.folder / "sparse_metric" / "0").num_points3D()
+        assert f"element vertex {num_points}\n".encode() in (refined.folder / "points.ply").read_bytes()
+
+    def test_progress_goes_to_stderr_line_by_line_and_the_summary_to_stdout(self, refined: Left) -> None:
+        stages = [line.removesuffix(" ...") for line in refined.stderr.splitlines() if line.endswith(" ...")]
+        assert stages == ["scale", "refinement", "results"]
+        assert "\r" not in refined.stderr
+        assert "\033" not in refined.stderr
+        assert refined.stdout.startswith(f"scale: {refined.result['scale']['value']:.6g} m per SfM unit")
+        assert f"\nall results: {refined.folder / 'result.json'}\n" in refined.stdout
+        assert refined.stdout.endswith(f"\nreport: {refined.folder / 'report.html'}\n")
+
+    def test_survey_file_and_dashes_for_underscores_give_the_same_result(
+        self, refined: Left, own_survey: WalkedSurvey, rangesfm_command: Command
+    ) -> None:
+        (own_survey.folder / "survey.toml").write_text(
+            '[images]\ntimes = "images.csv"\n[ranges]\npath = "uwb.csv"\ntime_offset = 7\n'
+            '[anchors]\npath = "anchors.csv"\n[report]\nreference = "reference.csv"\n'
+        )
+        flags = ["--input-path", "sparse/0", "--ranges-time-offset", "2", "--tag-in-cam", "0.03,-0.12,-0.05"]
+        flags += ["--anchor-frame", "site", "--output-path", "new/out", "--quiet"]
+        done = rangesfm_command("refine", "survey.toml", *flags, cwd=own_survey.folder)
+        again = Left(own_survey.folder / "new" / "out", done.stdout, done.stderr)
+        assert again.stderr == ""
+        first, second = refined.without_seconds, again.without_seconds
+        del first["settings"], second["settings"]  # they hold absolute paths
+        assert second == first
+        assert again.files == refined.files
+
+
+class TestModelWithoutSurveyedAnchors:
+    @pytest.mark.parametrize(
+        ("stage", "flags"),
+        [
+            ("scale", ("--anchors", "anchors_first_camera.csv", "--anchor_frame", "first_camera")),
+            ("refine", ("--anchors", "anchors_first_camera.csv", "--anchor_frame", "first_camera")),
+            ("refine", ()),
+        ],
+        ids=["first camera, scale", "first camera, refine", "unknown, refine"],
+    )
+    def test_is_metric_in_the_first_cameras_frame(
+        self,
+        stage: str,
+        flags: tuple[str, ...],
+        walked_survey: WalkedSurvey,
+        rangesfm_command: Command,
+        tmp_path: Path,
+    ) -> None:
+        left = run_on(rangesfm_command, walked_survey, tmp_path / "out", stage, *flags)
+        refine = REFINE if stage == "refine" else OR_NULL
+        assert_has(left.result, {**RESULT, "refine": refine})
+        assert left.result["frame"] == "first_camera"
+        error = left.result["scale"]["value"] / walked_survey.site_from_sfm.scale - 1
+        assert abs(error) < 3 * left.relative_stddev < 0.05
+        models = ["sparse_scaled"] + ["sparse_metric"] * (stage == "refine")
+        assert {file for file in left.files if file.startswith("sparse")} == {f"{model}/0" for model in models}
+        for model in models:
+            first = pycolmap.Reconstruction(left.folder / model / "0").image(1).cam_from_world()
+            np.testing.assert_allclose(first.matrix(), np.eye(3, 4), atol=1e-9)
+            steps = np.linalg.norm(np.diff(left.centers(model), axis=0), axis=1)
+            true_steps = np.linalg.norm(np.diff(walked_survey.centers_m, axis=0), axis=1)
+            assert steps.sum() == pytest.approx(true_steps.sum(), rel=3 * left.relative_stddev)
+        sfm = centers_of(walked_survey.folder / "sparse" / "0")
+        assert np.abs(left.metric_from_sfm.apply(sfm) - left.centers("sparse_scaled")).max() < 1e-9
+
+        with (walked_survey.folder / "anchors_first_camera.csv").open(newline="") as file:
+            for row in csv.DictReader(file):
+                true = np.array([float(row[key]) for key in ("x_m", "y_m", "z_m")])
+                found = left.result["anchors"][row["anchor_id"]]
+                error_m = np.linalg.norm(np.array(found["position_m"]) - true)
+                assert error_m <= 3 * np.sqrt(3) * found["stddev_m"] < 0.6
+
+    def test_may_be_a_path_without_points(
+        self, own_survey: WalkedSurvey, rangesfm_command: Command, refined: Left, tmp_path: Path
+    ) -> None:
+        path = own_survey.folder / "sparse" / "0"
+        model = pycolmap.Reconstruction(path)
+        for point_id in list(model.points3D):
+            model.delete_point3D(point_id)
+        model.write(path)
+        left = run_on(rangesfm_command, own_survey, tmp_path / "out", "scale", "--anchors", "anchors.csv")
+        assert left.result["scale"]["value"] == pytest.approx(refined.result["scale"]["value"], rel=1e-9)
+        assert left.result["refine"] is None
+        assert left.files == {
+            "sparse_scaled/0",
+            "result.json",
+            "ranges.csv",
+            "images.csv",
+            "report.html",
+            "trajectory.tum",
+        }
+
+
+def test_scale_uses_the_anchors_and_the_tag_asked_for(
+    own_survey: WalkedSurvey, rangesfm_command: Command, tmp_path: Path
+) -> None:
+    log = own_survey.folder / "uwb.csv"
+    header, *rows = log.read_text().splitlines()
+    nonsense = [",".join([*row.split(",")[:2], "1.5"]) for row in rows]
+    tagged = [f"{row},mine\n" for row in rows] + [f"{row},other\n" for row in nonsense]
+    log.write_text(f"{header},tag_id\n" + "".join(tagged))
+    flags = ("--use_anchors", "A2,A4", "--tag_id", "mine", "--anchors", "anchors.csv", "--anchor_frame", "unknown")
+    left = run_on(rangesfm_command, own_survey, tmp_path / "out", "scale", *flags)
+    assert set(left.result["anchors"]) == set(left.result["ranges"]["per_anchor"]) == {"A2", "A4"}
+    assert left.result["ranges"]["num"] == len(rows) / 2
+    assert {row["tag_id"] for row in left.rows("ranges.csv")} == {"mine"}
+    error = left.result["scale"]["value"] / own_survey.site_from_sfm.scale - 1
+    assert abs(error) < 3 * left.relative_stddev
+
+
+def test_log_may_name_photos_instead_of_times(
+    own_survey: WalkedSurvey, rangesfm_command: Command, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(0)
+    anchors = {"near": np.array([2.0, 1.0, 3.0]), "far": np.array([-6.0, 5.0, 0.2]), "third": np.array([6.0, 4.0, 1.0])}
+    lines = ["image_name,anchor_id,range_m"]
+    for name, center in zip(own_survey.image_names, own_survey.centers_m, strict=True):
+        for anchor_id, position in anchors.items():
+            range_m = np.linalg.norm(position - center) + 0.02 * rng.standard_normal()
+            lines += [f"{name},{anchor_id},{range_m}"]
+    (own_survey.folder / "uwb.csv").write_text("\n".join(lines) + "\n")
+    drop = ("--images", "--tag_in_cam", "--ranges_time_offset")
+    left = run_on(rangesfm_command, own_survey, tmp_path / "out", "refine", drop=drop)
+    assert left.result["time_offset"]["value_s"] is None
+    assert left.result["ranges"]["num_used"] > 100
+    error = left.result["scale"]["value"] / own_survey.site_from_sfm.scale - 1
+    assert abs(error) < 3 * left.relative_stddev < 0.05
+
+
+def test_offset_of_the_clocks_is_found(walked_survey: WalkedSurvey, rangesfm_command: Command, tmp_path: Path) -> None:
+    flags = ("--anchors", "anchors.csv", "--ranges_time_offset", "auto")
+    left = run_on(rangesfm_command, walked_survey, tmp_path / "out", "scale", *flags)
+    offset = left.result["time_offset"]
+    assert abs(offset["value_s"] - 2.0) < 3 * offset["stddev_s"] < 0.3
+
+
+class TestResultFolder:
+    """What the other commands make of the folder that a run left."""
+
+    @pytest.fixture
+    def out(self, refined: Left, tmp_path: Path) -> Path:
+        return shutil.copytree(refined.folder, tmp_path / "out")
+
+    def test_is_compared_with_and_without_a_reference(
+        self, out: Path, refined: Left, walked_survey: WalkedSurvey, rangesfm_command: Command
+    ) -> None:
+        reference = walked_survey.folder / "reference.csv"
+        text = rangesfm_command("compare", out, "--reference", reference, cwd=out.parent).stdout
+        rmse_m = {row["name"]: row["rmse_m"] for row in refined.result["comparison"]}
+        for name in ("true scale", "estimated scale", "refined"):
+            (line,) = (line for line in text.splitlines() if line.startswith(name))
+            assert f" {rmse_m[name]:.4f} " in line
+        text = rangesfm_command("compare", cwd=out.parent).stdout  # "out" is the default
+        assert "RMSE m" not in text
+        (line,) = (line for line in text.splitlines() if line.startswith("range residual RMS m"))
+        assert float(line.split()[-1]) == pytest.approx(refined.result["ranges"]["rms_m"], abs=2e-3)
+
+    def test_is_exported_to_other_formats(self, out: Path, rangesfm_command: Command) -> None:
+        flags = ("--formats", "colmap_text,ply_cameras,ply_anchors,transform,model_aligner", "--output_path", "more")
+        done = rangesfm_command("export", out, *flags, cwd=out.parent)
+        written = [out.parent / line for line in done.stdout.splitlines()]
+        assert len(written) == 5
+        assert all(path.exists() for path in written)
+        assert pycolmap.Reconstruction(out.parent / "more" / "colmap_text").num_reg_images() == 40
+
+    def test_gets_its_report_anew(self, out: Path, rangesfm_command: Command) -> None:
+        before = (out / "report.html").read_bytes()
+        (out / "report.html").unlink()
+        assert rangesfm_command("report", out, cwd=out.parent).stdout == f"{out / 'report.html'}\n"
+        assert (out / "report.html").read_bytes() == before
+
+    def test_ranges_as_used_are_a_log_again(self, out: Path, refined: Left, rangesfm_command: Command) -> None:
+        done = rangesfm_command("ranges", out / "ranges.csv", "--output_path", "log.csv", cwd=out.parent)
+        assert f"ranges  {refined.result['ranges']['num']}" in done.stdout
+        assert len(read_ranges(out.parent / "log.csv")) == refined.result["ranges"]["num"]
+
+
+def test_doctor_finds_nothing_wrong(rangesfm_command: Command, tmp_path: Path) -> None:
+    lines = rangesfm_command("doctor", cwd=tmp_path).stdout.splitlines()
+    assert all(line.startswith("ok ") for line in lines)
+    assert any("shares its types" in line or "pybind11" in line for line in lines)
+
+
+@pytest.fixture(scope="module")
+def first_run(photo_run: PhotoRun) -> Left:
+    return Left(photo_run.output_path, photo_run.done.stdout, photo_run.done.stderr)
+
+
+class TestRunOnPhotos:
+    def test_leaves_every_file(self, first_run: Left) -> None:
+        assert first_run.files == {
+            "database.db",
+            "reconstruct.json",
+            "mapper.log",
+            "sparse/0",
+            "sparse_scaled/0",
+            "sparse_metric/0",
+            "result.json",
+            "ranges.csv",
+            "images.csv",
+            "reference.csv",
+            "report.html",
+            "trajectory.tum",
+            "points.ply",
+        }
+
+    def test_tells_of_each_stage(self, first_run: Left) -> None:
+        lines = first_run.stderr.splitlines()
+        stages = [line.removesuffix(" ...") for line in lines if line.endswith(" ...")]
+        assert stages == ["features", "matching", "mapping", "scale", "refinement", "results"]
+        for stage in stages:
+            assert any(line.startswith(f"{stage}: ") and line.endswith(" s") for line in lines)
+
+    def test_result_has_every_key(self, first_run: Left) -> None:
+        result = copy.deepcopy(first_run.result)
+        assert_has(result, {**RESULT, "refine": REFINE})
+        total_s = result["seconds"].pop("total")
+        stages = {"keyframes", "features", "matching", "mapping", "scale", "refinement", "results"}
+        assert result["seconds"].keys() == stages
+        assert 0 < sum(result["seconds"].values()) <= total_s
+
+    def test_map_is_true_to_scale_and_to_the_site_frame(self, photo_run: PhotoRun, first_run: Left) -> None:
+        true = photo_run.survey.centers_m
+        errors = np.linalg.norm(first_run.centers("sparse_metric") - true, axis=1)
+        assert len(errors) == 14
+        assert np.sqrt(np.mean(errors**2)) < 0.15
+        (refined,) = (row for row in first_run.result["comparison"] if row["name"] == "refined")
+        assert abs(refined["scale_error_percent"]) < 1.0
+        sfm = first_run.centers("sparse")
+        assert np.abs(first_run.metric_from_sfm.apply(sfm) - first_run.centers("sparse_scaled")).max() < 1e-9
+
+    def test_again_and_quietly_takes_the_model_over_and_gives_the_same_result(
+        self, photo_run: PhotoRun, first_run: Left, rangesfm_command: Command, tmp_path: Path
+    ) -> None:
+        out = shutil.copytree(photo_run.output_path, tmp_path / "out")
+        done = rangesfm_command(
+            "run", *photo_run.flags, "--output_path", str(out), "--quiet", cwd=photo_run.survey.folder
+        )
+        again = Left(out, done.stdout, done.stderr)
+        assert again.stderr == ""
+        assert not {"features", "matching", "mapping"} & again.result["seconds"].keys()
+        assert again.without_seconds == first_run.without_seconds
+        assert again.files == first_run.files
+        for model in ("sparse", "sparse_metric"):
+            np.testing.assert_array_equal(again.centers(model), first_run.centers(model))
+
+    def test_anew_elsewhere_gives_the_same_scale_for_the_same_seed(
+        self, photo_run: PhotoRun, first_run: Left, rangesfm_command: Command, tmp_path: Path
+    ) -> None:
+        out = shutil.copytree(photo_run.output_path, tmp_path / "out")
+        flags = (*photo_run.flags, "--restart", "--output_path", str(out))
+        done = rangesfm_command("run", *flags, cwd=photo_run.survey.folder)
+        again = Left(out, done.stdout, done.stderr)
+        assert {"features", "matching", "mapping"} <= again.result["seconds"].keys()
+        assert "taken over" not in again.stderr
+        assert again.result["scale"]["value"] == pytest.approx(first_run.result["scale"]["value"], rel=1e-9)
+        np.testing.assert_allclose(
+            again.centers("sparse_metric"), first_run.centers("sparse_metric"), rtol=0, atol=1e-9
+        )
+
+    def test_refine_of_the_unscaled_model_gives_the_runs_answer(
+        self, photo_run: PhotoRun, first_run: Left, rangesfm_command: Command, tmp_path: Path
+    ) -> None:
+        flags = ["--input_path", str(photo_run.output_path / "sparse" / "0"), "--output_path", str(tmp_path / "out")]
+        done = rangesfm_command("refine", *photo_run.flags, *flags, cwd=photo_run.survey.folder)
+        again = Left(tmp_path / "out", done.stdout, done.stderr)
+        first, second = first_run.without_seconds, again.without_seconds
+        del first["settings"], second["settings"]
+        assert second == first
+        np.testing.assert_allclose(
+            again.centers("sparse_metric"), first_run.centers("sparse_metric"), rtol=0, atol=1e-9
+        )
+
+    def test_of_other_photos_forgets_the_result_even_where_it_fails(
+        self, photo_run: PhotoRun, rangesfm_command: Command, tmp_path: Path
+    ) -> None:
+        out = shutil.copytree(photo_run.output_path, tmp_path / "out")
+        flags = (*photo_run.flags, "--output_path", str(out), "--every_nth", "5")
+        done = rangesfm_command("run", *flags, cwd=photo_run.survey.folder, status=None)
+        assert done.returncode in (3, 4)  # three photos a few metres apart
+        assert not (out / "result.json").exists()
+        assert not (out / "report.html").exists()

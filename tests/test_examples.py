@@ -1,0 +1,96 @@
+"""The examples run, and the survey files among them are surveys."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pycolmap
+import pytest
+
+from rangesfm.config import read_survey
+from rangesfm.strict_tables import parse_toml
+
+if TYPE_CHECKING:
+    from tests.conftest import WalkedSurvey
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+
+
+def run_example(name: str, *arguments: str, cwd: Path) -> str:
+    command = [sys.executable, str(EXAMPLES / name), *arguments]
+    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    return done.stdout
+
+
+def test_every_program_is_tested_here() -> None:
+    assert {path.name for path in EXAMPLES.glob("*.py")} == {"own_problem.py", "scale_existing_model.py"}
+
+
+def test_own_problem_converges_on_a_model_that_fits_its_ranges(walked_survey: WalkedSurvey) -> None:
+    printed = run_example("own_problem.py", "sparse/0", cwd=walked_survey.folder)
+    assert "CONVERGENCE" in printed
+    initial, final = (float(re.search(rf"{name} cost: ([\d.e+-]+)", printed)[1]) for name in ("Initial", "Final"))  # type: ignore[index]
+    assert 0 < final <= initial
+
+
+def test_scale_existing_model_takes_it_to_metres(walked_survey: WalkedSurvey, tmp_path: Path) -> None:
+    # The example takes a log on the camera's clock.
+    lines = (walked_survey.folder / "uwb.csv").read_text().splitlines()
+    shifted = [f"{float(line.split(',')[0]) + 2.0},{line.split(',', 1)[1]}" for line in lines[1:]]
+    (tmp_path / "uwb.csv").write_text("\n".join([lines[0], *shifted]) + "\n")
+    arguments = ("sparse/0", "images.csv", str(tmp_path / "uwb.csv"), str(tmp_path / "metric" / "0"))
+    printed = run_example("scale_existing_model.py", *arguments, cwd=walked_survey.folder)
+    scale = float(printed.split()[0])
+    assert scale == pytest.approx(walked_survey.site_from_sfm.scale, rel=0.02)
+    images = sorted(pycolmap.Reconstruction(tmp_path / "metric" / "0").images.values(), key=lambda image: image.name)
+    centers = np.array([image.projection_center() for image in images])
+    length_m, true_m = (
+        np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in (centers, walked_survey.centers_m)
+    )
+    assert length_m == pytest.approx(true_m, rel=0.02)
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda path: path.name)
+def test_survey_file_is_one_for_a_folder_with_its_files(path: Path, tmp_path: Path) -> None:
+    tables, _ = parse_toml(path)
+    given = {
+        f"{table}.{key}": name
+        for table, keys in FILES_OF.items()
+        for key in keys
+        if (name := tables.get(table, {}).get(key))
+    }
+    for name in given.values():
+        (tmp_path / name).touch()
+    survey = read_survey(path, base_folder=tmp_path)
+    assert survey.images_path == tmp_path / tables["images"]["path"]
+    assert survey.ranges.path == tmp_path / tables["ranges"]["path"]
+    assert survey.output_path == tmp_path / tables.get("output", {}).get("path", "out")
+
+
+FILES_OF = {"images": ["times"], "ranges": ["path"], "anchors": ["path"], "report": ["reference"]}
+
+
+def test_survey_of_the_readme_is_one(tmp_path: Path) -> None:
+    (text,) = re.findall(r"```toml\n(.*?)```", README, re.DOTALL)
+    (tmp_path / "survey.toml").write_text(text, encoding="utf-8")
+    for name in ("images.csv", "uwb.csv", "anchors.csv"):
+        (tmp_path / name).touch()
+    survey = read_survey(tmp_path / "survey.toml")
+    assert survey.keyframes.every_nth == 3
+    assert survey.camera.model == "OPENCV"
+    assert survey.ranges.time_offset_s is None
+    assert survey.tag_in_cam_m == (-0.0012, -0.09, -0.0663)
+
+
+def test_readme_shows_every_command() -> None:
+    from rangesfm.cli.arguments import COMMANDS
+
+    assert [command for command in COMMANDS if f"`rangesfm {command}`" not in README] == []

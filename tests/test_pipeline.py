@@ -1,0 +1,193 @@
+"""The pipeline from Python: what it returns, what it keeps of earlier runs, and what it never overwrites."""
+
+from __future__ import annotations
+
+import csv
+import json
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from rangesfm.config import RangesConfig, Survey
+from rangesfm.errors import GeometryError, InputError
+from rangesfm.journal import Journal
+from rangesfm.options import AssociationOptions, ScaleOptions
+from rangesfm.outputs import forget_result, forgetting_result_if_changed, refuse_to_overwrite, write_result
+from rangesfm.pipeline import refine_model, scale_model
+from rangesfm.progress import SilentProgress
+
+if TYPE_CHECKING:
+    from tests.conftest import WalkedSurvey
+
+
+class Listener(SilentProgress):
+    def __init__(self) -> None:
+        self.stages: list[str] = []
+        self.messages: list[str] = []
+
+    def stage(self, name: str) -> None:
+        self.stages.append(name)
+
+    def message(self, text: str) -> None:
+        self.messages.append(text)
+
+
+@pytest.fixture
+def survey(walked_survey: WalkedSurvey, tmp_path: Path) -> Survey:
+    """The walked survey with anchors in the site frame, the clocks' offset known."""
+    folder = walked_survey.folder
+    return Survey(
+        model_path=folder / "sparse" / "0",
+        image_times_path=folder / "images.csv",
+        ranges=RangesConfig(path=folder / "uwb.csv", time_offset_s=2.0),
+        anchors_path=folder / "anchors.csv",
+        tag_in_cam_m=(0.03, -0.12, -0.05),
+        scale=ScaleOptions(num_bootstrap=20),
+        output_path=tmp_path / "out",
+    )
+
+
+def files_of(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def test_result_and_summary_are_returned_as_written(survey: Survey) -> None:
+    listener = Listener()
+    done = refine_model(survey, progress=listener)
+    assert listener.stages == ["scale", "refinement", "results"]
+    assert done.output_path == survey.output_path
+    written = json.loads((survey.output_path / "result.json").read_text())
+    assert written["scale"]["value"] == done.result["scale"]["value"]
+    assert written["settings"] == done.result["settings"]
+    assert done.summary_lines()[0].startswith(f"scale: {done.result['scale']['value']:.6g} m per SfM unit")
+    assert "comparison" not in written
+
+
+def test_a_run_in_the_same_folder_leaves_nothing_of_the_one_before(survey: Survey, walked_survey: WalkedSurvey) -> None:
+    first = replace(survey, reference_path=walked_survey.folder / "reference.csv")
+    refine_model(first, progress=SilentProgress())
+    assert {"sparse_metric", "reference.csv", "report.html"} <= files_of(survey.output_path)
+    second = replace(survey, formats=(), report_enabled=False)
+    scale_model(second, progress=SilentProgress())
+    left = files_of(survey.output_path) - {"trajectory.tum", "points.ply"}  # exported by request, not part of a result
+    assert left == {"sparse_scaled", "result.json", "ranges.csv", "images.csv"}
+
+
+def test_refused_run_leaves_the_result_before_it(survey: Survey) -> None:
+    scale_model(survey, progress=SilentProgress())
+    before = {path: path.stat().st_mtime_ns for path in survey.output_path.rglob("*")}
+    strict = replace(survey, scale=ScaleOptions(num_bootstrap=20, max_relative_stddev=1e-6))
+    with pytest.raises(GeometryError, match="the scale is only known to"):
+        refine_model(strict, progress=SilentProgress())
+    assert {path: path.stat().st_mtime_ns for path in survey.output_path.rglob("*")} == before
+
+
+def test_ranges_held_out_check_the_result(survey: Survey) -> None:
+    ranges = replace(survey.ranges, association=AssociationOptions(check_share=0.25))
+    result = refine_model(replace(survey, ranges=ranges), progress=SilentProgress()).result
+    with (survey.output_path / "ranges.csv").open(newline="") as file:
+        statuses = Counter(row["status"] for row in csv.DictReader(file))
+    num_on_path = sum(statuses[name] for name in ("used", "down-weighted", "outlier", "check"))
+    assert result["check_ranges"]["num"] == statuses["check"] == round(0.25 * num_on_path)
+    assert result["check_ranges"]["rms_m"] == pytest.approx(0.05, rel=0.3)
+    assert result["ranges"]["num_used"] == statuses["used"] + statuses["down-weighted"]
+
+
+def test_doubts_are_warnings_in_the_result_and_for_the_user(survey: Survey) -> None:
+    listener = Listener()
+    method = ScaleOptions(method="two-candidate", num_bootstrap=20)
+    result = scale_model(replace(survey, scale=method), progress=listener).result
+    assert result["scale"]["method"] == "two-candidate"
+    assert result["scale"]["verdict"] == "doubtful"
+    assert result["warnings"] == listener.messages != []
+
+
+@pytest.mark.parametrize(
+    "name", ["ranges.csv", "images.csv", "reference.csv", "trajectory.tum", "sparse_scaled/0", "sparse_metric/0"]
+)
+def test_input_is_never_overwritten(name: str, tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "out", target_is_directory=True)
+    for path in (tmp_path / "out" / name, tmp_path / "out" / "." / name, tmp_path / "link" / name):
+        with pytest.raises(InputError, match="the results would overwrite this input") as caught:
+            refuse_to_overwrite([None, path], tmp_path / "out")
+        assert caught.value.path == path
+    refuse_to_overwrite([None, tmp_path / name, tmp_path / "out" / "sparse" / "0"], tmp_path / "out")
+
+
+class TestForgetting:
+    @pytest.fixture
+    def folder(self, tmp_path: Path) -> Path:
+        (tmp_path / "sparse" / "0").mkdir(parents=True)
+        for name in ("result.json", "report.html", "ranges.csv", "mine.txt"):
+            (tmp_path / name).touch()
+        return tmp_path
+
+    def test_takes_away_what_was_said_of_the_model_and_nothing_else(self, folder: Path) -> None:
+        forget_result(folder)
+        assert files_of(folder) == {"sparse", "mine.txt"}
+
+    def test_leaves_files_alone_that_belong_to_no_result(self, folder: Path) -> None:
+        (folder / "result.json").unlink()
+        forget_result(folder)
+        assert files_of(folder) == {"sparse", "report.html", "ranges.csv", "mine.txt"}
+
+    def test_happens_when_the_model_is_removed_even_by_something_that_fails(self, folder: Path) -> None:
+        def remove_and_fail() -> None:
+            with forgetting_result_if_changed(folder / "sparse" / "0", folder):
+                (folder / "sparse" / "0").rmdir()
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            remove_and_fail()
+        assert not (folder / "result.json").exists()
+
+    def test_happens_when_the_model_is_replaced(self, folder: Path) -> None:
+        with forgetting_result_if_changed(folder / "sparse" / "0", folder):
+            (folder / "sparse").rename(folder / "old")
+            (folder / "sparse" / "0").mkdir(parents=True)
+        assert not (folder / "result.json").exists()
+
+    def test_does_not_happen_when_the_model_stays(self, folder: Path) -> None:
+        with forgetting_result_if_changed(folder / "sparse" / "0", folder):
+            pass
+        assert (folder / "result.json").exists()
+
+
+def test_result_file_is_plain_json_whatever_the_numbers(tmp_path: Path) -> None:
+    result: dict[Any, Any] = {
+        "array": np.array([1.0, np.nan]),
+        "number": np.float64(np.inf),
+        "count": np.int64(3),
+        "reasons": ("über", True, None),
+        1: {"inner": -np.inf},
+    }
+    write_result(result, tmp_path / "result.json")
+    text = (tmp_path / "result.json").read_text(encoding="utf-8")
+    assert json.loads(text, parse_constant=pytest.fail) == {
+        "array": [1.0, None],
+        "number": None,
+        "count": 3,
+        "reasons": ["über", True, None],
+        "1": {"inner": None},
+    }
+    assert files_of(tmp_path) == {"result.json"}
+
+
+def test_journal_times_stages_and_all_of_it() -> None:
+    listener = Listener()
+    journal = Journal(listener)
+    with journal.stage("scale"):
+        time.sleep(0.01)
+    with journal.timed("quick"):
+        pass
+    journal.warn("careful")
+    assert listener.stages == ["scale"]
+    assert listener.messages == journal.warnings == ["careful"]
+    seconds = journal.all_seconds()
+    assert seconds.keys() == {"scale", "quick", "total"}
+    assert 0.01 <= seconds["scale"] <= seconds["total"]

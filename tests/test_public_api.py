@@ -1,0 +1,82 @@
+"""The package as a library: every public name is there, explained, and costs nothing until it is used."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import subprocess
+import sys
+
+import pytest
+
+import rangesfm
+
+# Slow to load, and of no use to somebody who only wants to know what there is.
+HEAVY = {"numpy", "scipy", "pycolmap", "pyceres", "PIL", "matplotlib"}
+
+
+def modules_after(code: str) -> set[str]:
+    """Top-level modules that a fresh interpreter has loaded after running ``code``."""
+    code += "\nimport json, sys; print(json.dumps(sorted({name.partition('.')[0] for name in sys.modules})))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(json.loads(done.stdout))
+
+
+def test_import_loads_nothing_heavy() -> None:
+    assert not HEAVY & modules_after("import rangesfm")
+
+
+def test_errors_and_the_command_line_need_nothing_heavy() -> None:
+    assert not HEAVY & modules_after("import rangesfm.cli; rangesfm.InputError, rangesfm.GeometryError")
+
+
+def test_surveys_and_logs_are_read_without_pycolmap() -> None:
+    names = ("read_survey", "read_ranges", "read_anchors", "RangeLog")
+    loaded = modules_after("import rangesfm; " + ", ".join(f"rangesfm.{name}" for name in names))
+    assert "numpy" in loaded
+    assert not {"pycolmap", "pyceres"} & loaded
+
+
+def test_stages_are_not_hidden_by_modules_of_their_name() -> None:
+    code = "import rangesfm.pipeline, rangesfm.cli.arguments as a; a.parse(['doctor'])\n"
+    code += "assert all(callable(getattr(rangesfm, name)) for name in rangesfm.__all__[1:])"
+    modules_after(code)
+
+
+@pytest.mark.parametrize("name", [name for name in rangesfm.__all__ if name != "__version__"])
+def test_public_name_is_there_and_explained(name: str) -> None:
+    found = getattr(rangesfm, name)
+    assert callable(found)
+    assert found.__name__ == name
+    assert found.__module__.partition(".")[0] == "rangesfm"
+    text = inspect.getdoc(found)
+    assert text is not None
+    assert not text.startswith(f"{name}(")  # what a dataclass says of itself where nobody does
+    assert len(text) > 20
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["select_keyframes", "reconstruct", "read_ranges", "initialize_scale", "rescale", "refine_with_ranges", "compare"],
+)
+def test_each_stage_is_a_plain_function(name: str) -> None:
+    assert inspect.isfunction(getattr(rangesfm, name))
+
+
+def test_names_are_sorted_listed_and_no_others() -> None:
+    assert list(rangesfm.__all__) == ["__version__", *sorted(rangesfm.__all__[1:])]
+    assert dir(rangesfm) == sorted(rangesfm.__all__)
+    with pytest.raises(AttributeError, match="has no attribute 'rescale_everything'"):
+        rangesfm.rescale_everything  # noqa: B018
+
+
+def test_import_is_silent_and_leaves_logging_alone() -> None:
+    code = "import logging, rangesfm, rangesfm.pipeline\nassert not logging.getLogger().handlers"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("", "")
+
+
+def test_version_is_that_of_the_package() -> None:
+    from importlib.metadata import version
+
+    assert rangesfm.__version__ == version("rangesfm")

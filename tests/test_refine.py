@@ -1,0 +1,457 @@
+"""Bundle adjustment with ranges: it finds the scale, keeps what is known, and bends drift back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+import pytest
+
+from rangesfm import _ceres
+from rangesfm.errors import InputError
+from rangesfm.geometry import IDENTITY, Similarity, align_points, rmse
+from rangesfm.options import CameraOptions, RefineOptions
+from rangesfm.ranging.anchors import AnchorEstimate
+from rangesfm.ranging.association import associate
+from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.observations import RangeObservations, RangeStatus
+from rangesfm.refine import RefineSummary, predicted_ranges, refine_with_ranges
+from rangesfm.scale.rescale import rescale
+from rangesfm.simulate.model import synthetic_model
+from rangesfm.simulate.path import CameraPath, loop_path, sequence_path
+from rangesfm.simulate.ranges import Radio, simulate_ranges, simulate_ranges_at
+from rangesfm.trajectory import Trajectory, pose_of, trajectory_from_reconstruction
+
+Array = npt.NDArray[np.float64]
+
+TAG_IN_CAM_M = np.array([0.05, -0.12, -0.03])
+ANCHORS_M = {"A": (6.0, 0.0, 2.5), "B": (-6.0, 1.0, 0.4), "C": (0.5, 6.0, 3.0), "D": (1.0, -6.0, 0.2)}
+RANGE_STDDEV_M = 0.1
+
+
+@dataclass(frozen=True)
+class Survey:
+    """An unscaled model, ranges on its path, and the truth in a metric frame.
+
+    Attributes:
+        sfm: the model; timestamps_s: of its photos.
+        frame: "site" or "first_camera": the metric frame.
+        metric_from_sfm, centers_m, anchors_m: the truth in that frame.
+    """
+
+    sfm: pycolmap.Reconstruction
+    timestamps_s: dict[str, float]
+    trajectory: Trajectory
+    observations: RangeObservations
+    frame: str
+    metric_from_sfm: Similarity
+    centers_m: Array
+    anchors_m: dict[str, Array]
+
+    def anchors(self, stddev_m: float, bias_stddev_m: float = 0.0) -> list[AnchorEstimate]:
+        """At their true places, where a prior of this stddev puts them; inf: nothing was known."""
+        return [
+            AnchorEstimate(
+                anchor_id=name,
+                position_m=self.anchors_m[name],
+                position_stddev_m=stddev_m,
+                prior_position_m=self.anchors_m[name] if np.isfinite(stddev_m) else None,
+                prior_position_stddev_m=stddev_m,
+                range_bias_m=0.0,
+                prior_bias_m=0.0,
+                prior_bias_stddev_m=bias_stddev_m,
+            )
+            for name in self.observations.log.anchor_ids
+        ]
+
+    def refine(
+        self, anchors: Sequence[AnchorEstimate], scale_error: float = 1.0, **changes: Any
+    ) -> tuple[pycolmap.Reconstruction, RefineSummary]:
+        """From the true similarity, its scale off by a factor."""
+        start = Similarity(scale_error, np.eye(3), np.zeros(3)) @ self.metric_from_sfm
+        observations = changes.pop("observations", self.observations)
+        arguments: dict[str, Any] = {
+            "tag_in_cam_m": TAG_IN_CAM_M,
+            "range_stddev_m": np.full(len(observations.log), RANGE_STDDEV_M),
+            "first_pose_is_fixed": self.frame != "site",
+            "camera": CameraOptions(refine_intrinsics=False),
+            "num_threads": 1,
+        }
+        return refine_with_ranges(
+            rescale(self.sfm, start), self.trajectory, observations, start, anchors, **(arguments | changes)
+        )
+
+    def centers(self, model: pycolmap.Reconstruction) -> Array:
+        return trajectory_from_reconstruction(model, self.timestamps_s).centers
+
+    def scale_error(self, model: pycolmap.Reconstruction) -> float:
+        return align_points(self.centers_m, self.centers(model)).scale - 1
+
+
+def make_survey(
+    frame: str = "site",
+    *,
+    path: CameraPath | None = None,
+    num_keyframes: int = 20,
+    pixel_stddev: float = 0.0,
+    radio: Radio | None = None,
+    at_keyframes: bool = True,
+    num_epochs: int = 1,
+    anchors_m: dict[str, tuple[float, float, float]] = ANCHORS_M,
+    seed: int = 0,
+    **model_options: Any,
+) -> Survey:
+    """A loop of 20 s; ranges at the keyframes, or all the time at the radio's rate."""
+    path = path or loop_path(20.0, unsteadiness_m=0.1, seed=3)
+    times = np.linspace(path.start_s, path.end_s, num_keyframes)
+    model_options = {"num_observations": 60, **model_options}
+    model = synthetic_model(
+        times, path.centers(times), path.world_from_cam(times), pixel_stddev=pixel_stddev, seed=seed, **model_options
+    )
+    if pixel_stddev > 0:
+        adjust_by_colmap(model.reconstruction)
+    radio = radio or Radio()
+    if at_keyframes:
+        each = np.repeat(np.arange(num_keyframes), num_epochs)
+        centers, rotations = model.centers_m[each], model.world_from_cam[each]
+        simulated = simulate_ranges_at(times[each], centers, rotations, anchors_m, TAG_IN_CAM_M, radio, seed)
+    else:
+        simulated = simulate_ranges(path, anchors_m, TAG_IN_CAM_M, radio, seed)
+    trajectory = trajectory_from_reconstruction(model.reconstruction, model.timestamps_s)
+    first_camera = Similarity(1.0, model.world_from_cam[0], model.centers_m[0])
+    from_world = IDENTITY if frame == "site" else first_camera.inverse()
+    return Survey(
+        model.reconstruction,
+        model.timestamps_s,
+        trajectory,
+        associate(simulated.log, trajectory, TAG_IN_CAM_M),
+        frame,
+        from_world @ model.metric_from_sfm,
+        from_world.apply(model.centers_m),
+        {name: from_world.apply(np.array(position)) for name, position in anchors_m.items()},
+    )
+
+
+def adjust_by_colmap(sfm: pycolmap.Reconstruction) -> None:
+    """Bring a model with noise to where a mapper would leave it."""
+    config = pycolmap.BundleAdjustmentConfig()
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    for image_id in sfm.reg_image_ids():
+        config.add_image(image_id)
+    options = pycolmap.BundleAdjustmentOptions(
+        print_summary=False, refine_focal_length=False, refine_extra_params=False
+    )
+    options.ceres.solver_options.num_threads = 1
+    pycolmap.create_default_ceres_bundle_adjuster(options, config, sfm).solve()
+
+
+@pytest.fixture
+def adjusters(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[pycolmap.CeresBundleAdjuster]]:
+    """The bundle adjusters that the refinement makes, to look into their problems."""
+    _ceres.check_compatibility()
+    make, made = pycolmap.create_default_ceres_bundle_adjuster, []
+
+    def make_and_keep(*arguments: Any) -> pycolmap.CeresBundleAdjuster:
+        made.append(make(*arguments))
+        return made[-1]
+
+    monkeypatch.setattr(pycolmap, "create_default_ceres_bundle_adjuster", make_and_keep)
+    yield made
+    made.clear()
+
+
+class TestWithoutNoise:
+    @pytest.mark.parametrize("scale_error", [1.05, 0.95])
+    @pytest.mark.parametrize(
+        ("frame", "stddev_m"),
+        [("site", 0.0), ("first_camera", 0.0), ("first_camera", np.inf)],
+        ids=["site", "first camera", "unknown"],
+    )
+    def test_a_wrong_scale_is_put_right(self, frame: str, stddev_m: float, scale_error: float) -> None:
+        survey = make_survey(frame)
+        refined, summary = survey.refine(survey.anchors(stddev_m), scale_error)
+        assert summary.converged
+        np.testing.assert_allclose(survey.centers(refined), survey.centers_m, atol=1e-6)
+        for anchor in summary.anchors:
+            np.testing.assert_allclose(anchor.position_m, survey.anchors_m[anchor.anchor_id], atol=1e-5)
+        assert summary.final_cost < 1e-9
+        assert summary.reprojection_rms_px < 1e-4
+        np.testing.assert_allclose(summary.predicted_m, survey.observations.log.range_m, atol=1e-6)
+
+    def test_a_bias_within_its_prior_is_found(self) -> None:
+        survey = make_survey(radio=Radio(range_bias_m={"A": 0.2, "C": -0.1}), num_epochs=4)
+        refined, summary = survey.refine(survey.anchors(0.0, bias_stddev_m=1.0))
+        biases = {anchor.anchor_id: anchor.range_bias_m for anchor in summary.anchors}
+        assert biases == pytest.approx({"A": 0.2, "B": 0.0, "C": -0.1, "D": 0.0}, abs=0.005)
+        assert rmse(survey.centers(refined) - survey.centers_m) < 0.02
+
+    def test_points_and_poses_scale_together(self) -> None:
+        survey = make_survey()
+        refined, _ = survey.refine(survey.anchors(0.0), 1.05)
+        for point_id, point in survey.sfm.points3D.items():
+            expected = survey.metric_from_sfm.apply(np.array(point.xyz))
+            np.testing.assert_allclose(refined.point3D(point_id).xyz, expected, atol=1e-5)
+
+    def test_ranges_between_keyframes_count_as_well(self) -> None:
+        survey = make_survey(num_keyframes=41, radio=Radio(rate_hz=5.0), at_keyframes=False)
+        between = survey.observations.before != survey.observations.after
+        assert np.mean(between) > 0.5
+        only_between = replace(
+            survey.observations,
+            status=np.where(between, survey.observations.status, RangeStatus.UNKNOWN_ANCHOR).astype(np.int8),
+        )
+        refined, _ = survey.refine(survey.anchors(0.0), 1.05, observations=only_between)
+        assert rmse(survey.centers(refined) - survey.centers_m) < 0.002
+
+    def test_the_model_given_stays_as_it_was(self) -> None:
+        survey = make_survey()
+        metric = rescale(survey.sfm, survey.metric_from_sfm)
+        before = survey.centers(metric)
+        refine_with_ranges(
+            metric,
+            survey.trajectory,
+            survey.observations,
+            survey.metric_from_sfm,
+            anchors := survey.anchors(np.inf),
+            tag_in_cam_m=TAG_IN_CAM_M + 0.1,
+            range_stddev_m=np.full(len(survey.observations.log), RANGE_STDDEV_M),
+            first_pose_is_fixed=False,
+        )
+        np.testing.assert_array_equal(survey.centers(metric), before)
+        for anchor in anchors:
+            np.testing.assert_array_equal(anchor.position_m, survey.anchors_m[anchor.anchor_id])
+
+    def test_a_rig_carries_the_tag_in_its_own_frame(self) -> None:
+        pycolmap.set_random_seed(0)
+        sfm = pycolmap.synthesize_dataset(
+            pycolmap.SyntheticDatasetOptions(
+                num_rigs=1, num_cameras_per_rig=2, num_frames_per_rig=12, num_points3D=80, track_length=6
+            )
+        )
+        trajectory = trajectory_from_reconstruction(sfm)
+        tags = trajectory.centers + trajectory.world_from_cam @ TAG_IN_CAM_M
+        names, frames = list(ANCHORS_M), np.repeat(np.arange(12), len(ANCHORS_M))
+        log = RangeLog.from_arrays(
+            names * 12,
+            np.linalg.norm(tags[frames] - np.array(list(ANCHORS_M.values()) * 12), axis=1),
+            image_name=[trajectory.image_names[frame] for frame in frames],
+        )
+        truth = {name: np.array(position) for name, position in ANCHORS_M.items()}
+        observations = associate(log, trajectory, TAG_IN_CAM_M)
+        survey = Survey(sfm, {}, trajectory, observations, "site", IDENTITY, trajectory.centers, truth)
+        refined, summary = survey.refine(survey.anchors(0.0), 1.05)
+        assert summary.converged
+        np.testing.assert_allclose(trajectory_from_reconstruction(refined).centers, trajectory.centers, atol=1e-5)
+
+
+class TestWhatIsKnownStays:
+    @pytest.mark.parametrize("stddev_m", [0.0, np.inf], ids=["known", "unknown"])
+    def test_the_first_pose_in_its_own_frame(self, stddev_m: float) -> None:
+        radio = Radio(range_stddev_m=RANGE_STDDEV_M)
+        survey = make_survey("first_camera", pixel_stddev=0.5, radio=radio, num_epochs=3)
+        refined, _ = survey.refine(survey.anchors(stddev_m), 1.05)
+        start = rescale(survey.sfm, Similarity(1.05, np.eye(3), np.zeros(3)) @ survey.metric_from_sfm)
+        first, last = survey.trajectory.frame_ids[[0, -1]]
+        np.testing.assert_array_equal(pose_of(refined.frame(first)).params, pose_of(start.frame(first)).params)
+        assert np.abs(pose_of(refined.frame(last)).params - pose_of(start.frame(last)).params).max() > 1e-3
+
+    def test_a_first_keyframe_without_ranges(self) -> None:
+        survey = make_survey("first_camera", pixel_stddev=0.5)
+        far = survey.observations.before > 3
+        status = np.where(far, survey.observations.status, RangeStatus.NO_KEYFRAME_NEAR).astype(np.int8)
+        refined, summary = survey.refine(
+            survey.anchors(0.0), 1.05, observations=replace(survey.observations, status=status)
+        )
+        assert summary.converged
+        assert survey.scale_error(refined) == pytest.approx(0.0, abs=2e-3)
+        first = int(survey.trajectory.frame_ids[0])
+        start = rescale(survey.sfm, Similarity(1.05, np.eye(3), np.zeros(3)) @ survey.metric_from_sfm)
+        np.testing.assert_array_equal(pose_of(refined.frame(first)).params, pose_of(start.frame(first)).params)
+
+    def test_anchors_without_uncertainty(self) -> None:
+        survey = make_survey(pixel_stddev=0.5, radio=Radio(range_stddev_m=RANGE_STDDEV_M))
+        _, summary = survey.refine(survey.anchors(0.0), 1.05)
+        for anchor in summary.anchors:
+            np.testing.assert_array_equal(anchor.position_m, survey.anchors_m[anchor.anchor_id])
+
+    def test_surveyed_anchors_move_by_no_more_than_they_may(self) -> None:
+        """One of four was written down 0.2 m off: the ranges tell, as far as its stddev lets them."""
+        survey = make_survey(pixel_stddev=0.5, num_epochs=5)
+        wrong = survey.anchors_m["A"] + [0.0, 0.0, 0.2]
+        moved = {}
+        for stddev_m in (0.001, 1.0):
+            first, *others = survey.anchors(0.001)
+            first = replace(
+                first,
+                position_m=wrong,
+                prior_position_m=wrong,
+                position_stddev_m=stddev_m,
+                prior_position_stddev_m=stddev_m,
+            )
+            _, summary = survey.refine([first, *others])
+            moved[stddev_m] = float(np.linalg.norm(summary.anchors[0].position_m - wrong))
+            for anchor in summary.anchors[1:]:
+                assert np.linalg.norm(anchor.position_m - survey.anchors_m[anchor.anchor_id]) < 0.003
+        assert moved[0.001] < 0.003
+        assert moved[1.0] == pytest.approx(0.2, abs=0.02)
+
+    def test_known_intrinsics_unless_they_are_to_be_refined(self) -> None:
+        survey = make_survey(pixel_stddev=0.5)
+        held, _ = survey.refine(survey.anchors(0.0))
+        np.testing.assert_array_equal(held.camera(1).params, survey.sfm.camera(1).params)
+        freed, _ = survey.refine(survey.anchors(0.0), camera=CameraOptions(refine_intrinsics=True))
+        assert np.abs(freed.camera(1).params - survey.sfm.camera(1).params).max() > 1e-3
+
+
+class TestWithNoise:
+    def test_order_of_the_ranges_does_not_matter(self) -> None:
+        survey = make_survey("first_camera", pixel_stddev=0.5, radio=Radio(range_stddev_m=RANGE_STDDEV_M))
+        log = survey.observations.log
+        assert log.timestamp_s is not None
+        order = np.random.default_rng(0).permutation(len(log))
+        ids = [log.anchor_ids[k] for k in log.anchor_index[order]]
+        shuffled = associate(
+            RangeLog.from_arrays(ids, log.range_m[order], timestamp_s=log.timestamp_s[order]),
+            survey.trajectory,
+            TAG_IN_CAM_M,
+        )
+        first, first_summary = survey.refine(survey.anchors(0.0))
+        other = replace(survey, observations=shuffled)
+        second, second_summary = other.refine(other.anchors(0.0))
+        np.testing.assert_allclose(survey.centers(second), survey.centers(first), atol=1e-6)
+        np.testing.assert_allclose(second_summary.predicted_m, first_summary.predicted_m[order], atol=1e-6)
+
+    def test_the_unit_of_the_unscaled_model_does_not_matter(self) -> None:
+        radio = Radio(range_stddev_m=RANGE_STDDEV_M)
+        survey = make_survey(pixel_stddev=0.5, radio=radio, num_keyframes=41, at_keyframes=False)
+        small = Similarity(1e-3, np.eye(3), np.ones(3))
+        sfm = rescale(survey.sfm, small)
+        trajectory = trajectory_from_reconstruction(sfm, survey.timestamps_s)
+        other = replace(
+            survey,
+            sfm=sfm,
+            trajectory=trajectory,
+            observations=associate(survey.observations.log, trajectory, TAG_IN_CAM_M),
+            metric_from_sfm=survey.metric_from_sfm @ small.inverse(),
+        )
+        first, _ = survey.refine(survey.anchors(0.0))
+        second, _ = other.refine(other.anchors(0.0))
+        np.testing.assert_allclose(survey.centers(second), survey.centers(first), atol=1e-5)
+
+    def test_the_pixel_stddev_is_found(self) -> None:
+        survey = make_survey(pixel_stddev=0.7, num_keyframes=30, num_observations=150)
+        _, summary = survey.refine(survey.anchors(0.0))
+        assert summary.pixel_stddev == pytest.approx(0.7, rel=0.05)
+
+    def test_outliers_are_marked_and_do_not_bend_the_map(self) -> None:
+        radio = Radio(range_stddev_m=0.03, obstructed_share=0.2, obstructed_mean_m=5.0)
+        survey = make_survey(pixel_stddev=0.5, radio=radio, num_epochs=3)
+        stddev = np.full(len(survey.observations.log), 0.03)
+        refined, summary = survey.refine(survey.anchors(0.0), range_stddev_m=stddev)
+        assert rmse(survey.centers(refined) - survey.centers_m) < 0.03
+        off = np.abs(summary.predicted_m - survey.observations.log.range_m)
+        assert np.all(summary.observations.status[off > 0.5] == RangeStatus.OUTLIER)
+        assert np.all(summary.observations.status[off < 0.05] == RangeStatus.USED)
+        assert np.mean(off > 0.5) > 0.1
+
+    def test_drift_is_bent_back(self) -> None:
+        """No similarity can do it: the refined centres are nearer to the truth than after the best one."""
+        path = sequence_path(59.0, seed=2)
+        anchors = {"A": (10.0, 12.0, 3.0), "B": (25.0, -10.0, 5.0), "C": (40.0, 11.0, 0.0), "D": (55.0, -9.0, 2.0)}
+        survey = make_survey(
+            path=path,
+            num_keyframes=60,
+            pixel_stddev=1.0,
+            radio=Radio(range_stddev_m=RANGE_STDDEV_M),
+            num_epochs=5,
+            anchors_m=anchors,
+            num_observations=40,
+            max_track_length=3,
+        )
+        best = align_points(survey.trajectory.centers, survey.centers_m)
+        drift = rmse(best.apply(survey.trajectory.centers) - survey.centers_m)
+        assert drift > 0.2
+        refined, _ = replace(survey, metric_from_sfm=best).refine(survey.anchors(0.0))
+        assert rmse(survey.centers(refined) - survey.centers_m) < 0.3 * drift
+
+
+class TestProblem:
+    def test_predicted_ranges_are_those_of_the_residuals(self, adjusters: list[pycolmap.CeresBundleAdjuster]) -> None:
+        radio = Radio(rate_hz=3.0, range_stddev_m=RANGE_STDDEV_M)
+        survey = make_survey(pixel_stddev=0.5, num_keyframes=41, radio=radio, at_keyframes=False)
+        between = survey.observations.before != survey.observations.after
+        assert 0.2 < np.mean(between) < 0.95
+        # Without a robust loss, whose square root the problem's residuals would hold.
+        _, summary = survey.refine(
+            survey.anchors(0.0),
+            correlation_inflation=3.0,
+            options=RefineOptions(range_loss_scale=1e9),
+        )
+        placed = survey.observations.has_place
+        residuals = np.asarray(adjusters[-1].problem.evaluate_residuals())[-np.count_nonzero(placed) :]
+        unit = 3.0 * RANGE_STDDEV_M / summary.pixel_stddev
+        expected = (summary.predicted_m - survey.observations.log.range_m)[placed]
+        np.testing.assert_allclose(unit * residuals, expected, atol=1e-6)
+
+    def test_predictions_by_the_true_model_are_the_true_ranges(self) -> None:
+        survey = make_survey(num_keyframes=41, radio=Radio(rate_hz=3.0), at_keyframes=False)
+        predicted = predicted_ranges(
+            rescale(survey.sfm, survey.metric_from_sfm),
+            survey.trajectory,
+            survey.observations,
+            survey.metric_from_sfm,
+            TAG_IN_CAM_M,
+            [survey.anchors_m[name] for name in survey.observations.log.anchor_ids],
+            [0.0] * 4,
+        )
+        placed = survey.observations.has_place
+        # Up to what interpolation misses.
+        np.testing.assert_allclose(predicted[placed], survey.observations.log.range_m[placed], atol=0.02)
+        assert np.all(np.isnan(predicted[~placed]))
+
+    def test_correlated_ranges_weigh_less(self) -> None:
+        radio = Radio(range_stddev_m=RANGE_STDDEV_M)
+        survey = make_survey(pixel_stddev=2.0, radio=radio, num_epochs=5)
+        reprojection = [
+            survey.refine(survey.anchors(0.0), correlation_inflation=inflation)[1].reprojection_rms_px
+            for inflation in (1.0, 10.0)
+        ]
+        assert reprojection[1] < reprojection[0]
+
+    @pytest.mark.parametrize(
+        ("num_keyframes", "num_anchors"), [(20, 1), (20, 4), (12, 20), (60, 5)], ids=lambda value: str(value)
+    )
+    def test_free_anchors_and_biases_leave_the_points_to_be_eliminated_alone(
+        self, adjusters: list[pycolmap.CeresBundleAdjuster], num_keyframes: int, num_anchors: int
+    ) -> None:
+        """What keeps Ceres' specialised kernels: blocks of 3 in rows of 2; "d" would be any size."""
+        positions = np.random.default_rng(0).normal(size=(num_anchors, 3)) * [6.0, 6.0, 2.0]
+        survey = make_survey(
+            "first_camera",
+            num_keyframes=num_keyframes,
+            pixel_stddev=0.5,
+            anchors_m={f"N{k}": (x, y, z) for k, (x, y, z) in enumerate(positions.tolist())},
+        )
+        survey.refine(survey.anchors(np.inf, bias_stddev_m=0.05))
+        summary = adjusters[-1].solve()
+        assert isinstance(summary, pycolmap.CeresBundleAdjustmentSummary)
+        assert summary.ceres_summary.schur_structure_used.startswith("2,3,")
+
+    def test_options_pass_through_and_unknown_ones_are_named(self) -> None:
+        survey = make_survey(pixel_stddev=0.5)
+        anchors = survey.anchors(0.0)
+        options = RefineOptions(bundle_adjustment={"refine_focal_length": True})
+        refined, _ = survey.refine(anchors, options=options)
+        assert refined.camera(1).params[0] != survey.sfm.camera(1).params[0]
+        with pytest.raises(InputError, match=r"refine_focal_lenght.*refine\.bundle_adjustment.*refine_focal_length"):
+            survey.refine(anchors, options=RefineOptions(bundle_adjustment={"refine_focal_lenght": True}))
+
+    def test_too_few_iterations_are_told(self) -> None:
+        survey = make_survey(pixel_stddev=0.5)
+        _, summary = survey.refine(survey.anchors(0.0), 1.05, options=RefineOptions(max_num_iterations=1))
+        assert not summary.converged
+        assert summary.message

@@ -1,0 +1,80 @@
+"""One formatter, one set of rules and one type checker over everything, and the C++ part's own tests."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+CPP_SOURCES = sorted(path for path in (ROOT / "cpp_ext").rglob("*") if path.suffix in (".cc", ".h"))
+PYTHON_FOLDERS = [name for name in ("plugin", "tests", "examples") if any((ROOT / name).rglob("*.py"))]
+
+
+def tool(name: str) -> str:
+    """Path of a tool: that of this interpreter's environment (its version is pinned), else the system's."""
+    path = shutil.which(name, path=sysconfig.get_path("scripts")) or shutil.which(name)
+    if path is None:
+        pytest.fail(f"{name} is missing; run: python -m pip install '.[test]', and for cmake: apt-get install cmake")
+    return path
+
+
+def run(*command: str | Path) -> str:
+    """Output of a command run at the repository's root; fails the test with all of it if the command does."""
+    done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    if done.returncode != 0:
+        pytest.fail(f"{' '.join(map(str, command))}\n{done.stdout}", pytrace=False)
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def cpp_build(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A configured build folder of the C++ part and its tests, with the compile commands clang-tidy asks for."""
+    folder = tmp_path_factory.mktemp("cpp_build")
+    run(
+        *(tool("cmake"), "-S", ROOT / "cpp_ext", "-B", folder),
+        "-DCMAKE_BUILD_TYPE=Debug",
+        "-DCMAKE_EXPORT_COMPILE_COMMANDS=ON",
+        "-DRANGESFM_BUILD_TESTS=ON",
+        f"-DPython_EXECUTABLE={sys.executable}",
+        f"-Dpybind11_DIR={run(sys.executable, '-m', 'pybind11', '--cmakedir').strip()}",
+    )
+    return folder
+
+
+def test_python_is_formatted() -> None:
+    run(tool("ruff"), "format", "--check", *PYTHON_FOLDERS)
+
+
+def test_python_keeps_the_rules() -> None:
+    run(tool("ruff"), "check", *PYTHON_FOLDERS)
+
+
+def test_python_types_are_right() -> None:
+    run(tool("mypy"), *PYTHON_FOLDERS)
+
+
+def test_cpp_is_formatted() -> None:
+    run(tool("clang-format"), "--dry-run", "-Werror", *CPP_SOURCES)
+
+
+def test_cpp_keeps_the_rules(cpp_build: Path) -> None:
+    def check(source: Path) -> None:
+        run(tool("clang-tidy"), "--quiet", "-p", cpp_build, source)
+
+    # Headers are checked where they are included.
+    with ThreadPoolExecutor(os.cpu_count()) as executor:
+        list(executor.map(check, [path for path in CPP_SOURCES if path.suffix == ".cc"]))
+
+
+def test_cpp_tests_pass(cpp_build: Path) -> None:
+    run(tool("cmake"), "--build", cpp_build, "--parallel", str(os.cpu_count()))
+    report = run(tool("ctest"), "--test-dir", cpp_build, "--output-on-failure")
+    assert "100% tests passed" in report
+    assert "No tests were found" not in report

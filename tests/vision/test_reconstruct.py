@@ -1,0 +1,255 @@
+from __future__ import annotations
+
+import os
+import shutil
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+import pytest
+from PIL import Image
+
+from rangesfm.errors import InputError, ReconstructionError
+from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.vision.reconstruct import ReconstructionSummary, reconstruct
+
+if TYPE_CHECKING:
+    from tests.vision.conftest import Listener, Room
+
+FEATURES = {"sift": {"max_num_features": 250}}  # enough for these photos, and quick
+MAPPER = MapperOptions(features=FEATURES)
+
+
+@pytest.fixture(scope="module")
+def done(room: Room, tmp_path_factory: pytest.TempPathFactory) -> ReconstructionSummary:
+    """The room, reconstructed once for all tests that only look at the result."""
+    output = tmp_path_factory.mktemp("done") / "new" / "out"
+    return reconstruct(room.folder, room.names, output, camera=room.camera, mapper=MAPPER)
+
+
+@pytest.fixture
+def output(done: ReconstructionSummary, tmp_path: Path) -> Path:
+    """A copy of the output folder of ``done``."""
+    return shutil.copytree(done.log_path.parent, tmp_path / "out")
+
+
+def centers_by_name(model: pycolmap.Reconstruction) -> dict[str, npt.NDArray[np.float64]]:
+    return {image.name: image.projection_center() for image in model.images.values() if image.has_pose}
+
+
+class TestOneModel:
+    def test_holds_every_photo_at_its_place_up_to_a_similarity(self, room: Room, done: ReconstructionSummary) -> None:
+        assert (len(done.models), done.num_registered, done.num_keyframes) == (1, 6, 6)
+        centers = centers_by_name(done.models[0])
+        sfm = np.array([centers[name] for name in room.names])
+        world_from_sfm = pycolmap.estimate_sim3d(sfm, room.centers)
+        assert world_from_sfm is not None
+        errors = np.linalg.norm([world_from_sfm * center for center in sfm] - room.centers, axis=1)
+        assert errors.max() < 0.02 * np.linalg.norm(np.ptp(room.centers, axis=0))
+
+    def test_is_on_disk_beside_the_database_and_the_log_and_nothing_else(self, done: ReconstructionSummary) -> None:
+        folder = done.log_path.parent
+        assert sorted(os.listdir(folder)) == ["database.db", "mapper.log", "reconstruct.json", "sparse"]
+        assert os.listdir(folder / "sparse") == ["0"]
+        assert pycolmap.Reconstruction(folder / "sparse" / "0").num_reg_images() == 6
+        log = done.log_path.read_text()
+        assert "Feature extraction" in log
+        assert "Registering image" in log
+        assert set(done.seconds) == {"features", "matching", "mapping"}
+
+    def test_keeps_known_intrinsics_to_the_last_digit(self, room: Room, done: ReconstructionSummary) -> None:
+        assert [tuple(camera.params) for camera in done.models[0].cameras.values()] == [room.camera.params]
+
+    def test_has_a_database_with_options_as_given(self, output: Path) -> None:
+        with pycolmap.Database.open(output / "database.db") as database:
+            assert all(50 < database.num_keypoints_for_image(image_id) < 1000 for image_id in range(1, 7))
+
+    def test_comes_again_with_the_same_seed_progress_to_the_end_and_a_clean_terminal(
+        self,
+        room: Room,
+        done: ReconstructionSummary,
+        tmp_path: Path,
+        listener: Listener,
+        capfd: pytest.CaptureFixture[str],
+    ) -> None:
+        again = reconstruct(room.folder, room.names, tmp_path, camera=room.camera, mapper=MAPPER, progress=listener)
+        centers, others = centers_by_name(done.models[0]), centers_by_name(again.models[0])
+        assert max(np.abs(centers[name] - others[name]).max() for name in room.names) < 1e-9
+        assert listener.stages == ["features", "matching", "mapping"]
+        assert {step: updates[-1] for step, updates in listener.updates.items()} == {
+            "features": (6, 6),
+            "matching": (15, 15),
+            "mapping": (6, 6),
+        }
+        assert listener.messages == []
+        assert capfd.readouterr() == ("", "")
+
+
+class TestCamera:
+    def test_is_refined_from_colmaps_guess_when_only_its_model_is_known(self, room: Room, tmp_path: Path) -> None:
+        camera = CameraOptions("SIMPLE_PINHOLE")
+        summary = reconstruct(room.folder, room.names, tmp_path, camera=camera, mapper=MAPPER)
+        (refined,) = summary.models[0].cameras.values()
+        assert summary.num_registered == 6
+        assert refined.model == pycolmap.CameraModelId.SIMPLE_PINHOLE
+        assert refined.focal_length == pytest.approx(240, rel=0.03)  # the guess is 307
+
+    def test_is_refined_from_its_parameters_on_demand(self, room: Room, tmp_path: Path) -> None:
+        camera = CameraOptions("SIMPLE_PINHOLE", (250.0, 128.0, 96.0), refine_intrinsics=True)
+        summary = reconstruct(room.folder, room.names, tmp_path, camera=camera, mapper=MAPPER)
+        assert next(iter(summary.models[0].cameras.values())).focal_length == pytest.approx(240, rel=0.03)
+
+    @pytest.mark.parametrize(
+        ("camera", "message"),
+        [
+            (CameraOptions("PINHOL", (1.0,)), "model is 'PINHOL', expected one of COLMAP's, the nearest is 'PINHOLE'"),
+            (CameraOptions("PINHOLE", (300.0, 160.0, 120.0)), "3 numbers, expected 4 for PINHOLE .fx, fy, cx, cy."),
+            (CameraOptions(None, (300.0, 160.0, 120.0)), "has params but no model"),
+            (CameraOptions("SIMPLE_PINHOLE", (-3.0, 128.0, 96.0)), "expected f, cx, cy with f above 0"),
+            (CameraOptions("SIMPLE_PINHOLE", (1500.0, 800.0, 600.0)), "inside the photos of 256 x 192 pixels"),
+        ],
+    )
+    def test_that_cannot_be_is_refused_before_anything_is_written(
+        self, room: Room, tmp_path: Path, camera: CameraOptions, message: str
+    ) -> None:
+        with pytest.raises(InputError, match=message):
+            reconstruct(room.folder, room.names, tmp_path / "out", camera=camera, mapper=MAPPER)
+        assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("mapper", "message"),
+    [
+        (MapperOptions(features={"max_image": 9}), r"'max_image' in \[mapper.features\]; .* 'max_image_size'"),
+        (MapperOptions(matcher={"sift": {"max_ratio": "x"}}), r"\[mapper.matcher.sift\] max_ratio is 'x'"),
+        (MapperOptions(pairing={"overlap": 3}), r"'overlap' in \[mapper.pairing\]; .* known one is"),
+        (MapperOptions(pipeline={"min_num_matches": 0}), r"refuses a value, expected min_num_matches > 0"),
+        (MapperOptions(matching="sequental"), r"matching is 'sequental', expected sequential, exhaustive, auto"),
+    ],
+)
+def test_options_that_colmap_does_not_have_are_refused_before_anything_is_written(
+    room: Room, tmp_path: Path, mapper: MapperOptions, message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        reconstruct(room.folder, room.names, tmp_path / "out", camera=room.camera, mapper=mapper)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_output_folder_that_cannot_be_made_is_named(room: Room, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="file/out: cannot write to this output folder"):
+        reconstruct(room.folder, room.names, tmp_path / "file" / "out", camera=room.camera, mapper=MAPPER)
+
+
+def test_sequential_matching_pairs_neighbours_in_time_whatever_their_names(
+    room: Room, tmp_path: Path, listener: Listener
+) -> None:
+    names = tuple(f"left {9 - index}/my photo.png" for index in range(len(room.names)))
+    for old, new in zip(room.names, names, strict=True):
+        (tmp_path / new).parent.mkdir()
+        shutil.copy(room.folder / old, tmp_path / new)
+    mapper = MapperOptions("sequential", FEATURES, pairing={"overlap": 2, "quadratic_overlap": False})
+    summary = reconstruct(tmp_path, names, tmp_path / "out", camera=room.camera, mapper=mapper, progress=listener)
+    assert set(centers_by_name(summary.models[0])) == set(names)
+    with pycolmap.Database.open(tmp_path / "out" / "database.db") as database:
+        place = {image.image_id: names.index(image.name) for image in database.read_all_images()}
+        pairs = [pycolmap.pair_id_to_image_pair(pair_id) for pair_id in database.read_num_matches()[0]]
+    assert Counter(abs(place[a] - place[b]) for a, b in pairs) == {1: 5, 2: 4}
+    assert listener.updates["matching"][-1] == (9, 9)
+
+
+def test_two_rooms_give_two_models_the_larger_first(
+    render_room: Callable[..., Room], tmp_path: Path, listener: Listener
+) -> None:
+    small = render_room(tmp_path, 4, seed=1, prefix="a")
+    large = render_room(tmp_path, 5, seed=2, prefix="b")
+    mapper = MapperOptions(features=FEATURES, pipeline={"min_model_size": 3})
+    names = small.names + large.names
+    summary = reconstruct(tmp_path, names, tmp_path / "out", camera=small.camera, mapper=mapper, progress=listener)
+    assert [set(centers_by_name(model)) for model in summary.models] == [set(large.names), set(small.names)]
+    assert sorted(os.listdir(tmp_path / "out" / "sparse")) == ["0", "1"]
+    assert pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "1").num_reg_images() == 4
+    assert summary.num_registered == 5
+    assert listener.messages == ["2 separate models of 5, 4 photos; the largest, sparse/0, is used"]
+
+
+class TestEarlierRun:
+    def test_is_taken_over_whatever_the_number_of_threads(self, room: Room, output: Path, listener: Listener) -> None:
+        mapper = MapperOptions(features=FEATURES, num_threads=1)
+        summary = reconstruct(room.folder, room.names, output, camera=room.camera, mapper=mapper, progress=listener)
+        assert (summary.num_registered, summary.seconds, listener.stages) == (6, {}, [])
+        assert listener.messages == [
+            f"{step}: taken over from an earlier run" for step in ("features", "matching", "mapping")
+        ]
+
+    @pytest.mark.parametrize(
+        ("change", "steps"),
+        [
+            ({"mapper": MapperOptions(features=FEATURES, pipeline={"extract_colors": False})}, ["mapping"]),
+            ({"seed": 1}, ["matching", "mapping"]),
+            ({"restart": True}, ["features", "matching", "mapping"]),
+        ],
+        ids=["mapper option", "seed", "restart"],
+    )
+    def test_is_taken_over_up_to_the_first_change(
+        self, room: Room, output: Path, change: dict[str, Any], steps: list[str]
+    ) -> None:
+        arguments = {"camera": room.camera, "mapper": MAPPER, **change}
+        summary = reconstruct(room.folder, room.names, output, **arguments)
+        assert list(summary.seconds) == steps
+        assert summary.num_registered == 6
+
+    def test_on_other_photos_leaves_nothing_behind_when_these_do_not_reconstruct(
+        self, room: Room, output: Path
+    ) -> None:
+        with pytest.raises(ReconstructionError, match="no model from 2 photos"):
+            reconstruct(room.folder, [room.names[0], room.names[-1]], output, camera=room.camera, mapper=MAPPER)
+        assert not (output / "sparse").exists()
+
+
+class TestBadPhotos:
+    def test_among_good_ones_are_left_out_and_said_so(self, room: Room, tmp_path: Path, listener: Listener) -> None:
+        shutil.copytree(room.folder, tmp_path, dirs_exist_ok=True)
+        (tmp_path / "broken.png").write_bytes(b"not a photo")
+        Image.new("L", (100, 50)).save(tmp_path / "small.png")
+        Image.new("L", (256, 192), 128).save(tmp_path / "blank.png")
+        names = ("broken.png", "small.png", "blank.png", *room.names)
+        summary = reconstruct(tmp_path, names, tmp_path / "out", camera=room.camera, mapper=MAPPER, progress=listener)
+        assert set(centers_by_name(summary.models[0])) == set(room.names)
+        assert listener.messages == [
+            "2 of 9 photos are left out; the first, broken.png, cannot be read as an image",
+            "1 of 7 photos have fewer than 50 features, the first is blank.png",
+        ]
+
+    @pytest.mark.parametrize(
+        ("draw", "message"),
+        [
+            (lambda index: None, "0 of 3 photos can be used, expected at least 2 .*; 0.png cannot be read as an image"),
+            (lambda index: Image.new("L", (50 + index, 50)), "1 of 3 photos can be used.*; 1.png has another size"),
+            (lambda index: Image.new("L", (256, 192), 128), "0 of 3 photos have 50 features or more.*0.png"),
+            (lambda index: rug(index), "no two of 3 photos match: .*COLMAP's log: .*mapper.log"),
+            (lambda index: rug(0), "no model from 3 photos, of which 3 pairs match: .*sideways"),
+        ],
+        ids=["unreadable", "sizes", "blank", "unrelated", "from one place"],
+    )
+    def test_that_give_no_model_are_told_apart(
+        self, tmp_path: Path, draw: Callable[[int], Image.Image | None], message: str
+    ) -> None:
+        names = [f"{index}.png" for index in range(3)]
+        for index, name in enumerate(names):
+            photo = draw(index)
+            if photo is not None:
+                photo.save(tmp_path / name)
+        with pytest.raises(ReconstructionError, match=message):
+            reconstruct(tmp_path, names, tmp_path / "out", camera=CameraOptions("SIMPLE_PINHOLE"), mapper=MAPPER)
+        assert not (tmp_path / "out" / "sparse").exists()
+
+
+def rug(seed: int) -> Image.Image:
+    """A photo rich in features, and each its own."""
+    cells = np.random.default_rng(seed).integers(0, 255, (30 + 7 * seed, 41 + 9 * seed), dtype=np.uint8)
+    return Image.fromarray(cells).resize((256, 192), Image.Resampling.BICUBIC)
