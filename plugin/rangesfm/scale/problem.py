@@ -12,8 +12,8 @@ from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry import Similarity, path_shape
 from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.noise import short_range_stddev
 from rangesfm.ranging.observations import RangeObservations
-from rangesfm.scale.noise import short_range_stddev
 from rangesfm.scale.range_equation import RangeProblem
 from rangesfm.trajectory import Trajectory
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import GeometryError
 from rangesfm.geometry import path_shape
-from rangesfm.scale.noise import correlation_inflation, robust_stddev, short_range_stddev
+from rangesfm.ranging.noise import correlation_inflation, robust_stddev, short_range_stddev
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, solve
 from rangesfm.scale.starts import (
     complete_unknown_anchors,
