@@ -230,6 +230,25 @@ def test_ranges_to_anchors_that_nobody_wants_keep_their_place_and_are_told() -> 
     assert found.has_place.tolist() == [False, True, False, False]
 
 
+def test_each_tag_has_its_own_lever_arm() -> None:
+    keyframe_times = np.arange(0.0, 5.0)
+    turned = Rotation.from_rotvec(np.outer(keyframe_times, [0.0, 0.0, 0.3]))
+    path = trajectory_of(keyframe_times, straight(keyframe_times), turned.as_matrix())
+    range_times, tags = np.array([0.5, 1.25, 3.75]), np.array([[0.1, 0.0, 0.0], [0.0, -0.3, 0.2]])
+    log = RangeLog.from_arrays(["A"] * 3, np.full(3, 5.0), timestamp_s=range_times, tag_id=["left", "right", "left"])
+    found = associate(log, path, tags)
+    expected = Rotation.from_rotvec(np.outer(range_times, [0.0, 0.0, 0.3])).apply(tags[[0, 1, 0]])
+    np.testing.assert_allclose(found.tag_from_center, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("lever_arms", [np.zeros(2), np.zeros((2, 3)), np.zeros((3, 1))])
+def test_lever_arms_that_do_not_suit_the_tags_of_the_log_are_refused(lever_arms: Array) -> None:
+    keyframe_times = np.arange(0.0, 5.0)
+    path = trajectory_of(keyframe_times, straight(keyframe_times))
+    with pytest.raises(InputError, match=r"a log of 1 tag\(s\), expected \(3,\) or \(1, 3\)"):
+        associate(log_at([1.5]), path, lever_arms)
+
+
 def test_an_empty_log_gives_nothing() -> None:
     keyframe_times = np.arange(0.0, 5.0)
     found = associate(log_at([]), trajectory_of(keyframe_times, straight(keyframe_times)), TAG_IN_CAM_M)

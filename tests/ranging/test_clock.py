@@ -140,6 +140,39 @@ def test_lever_arm_of_half_a_metre_does_not_shift_the_offset() -> None:
     assert known.stddev_s < 0.7 * ignored.stddev_s
 
 
+def both_tags(first: RangeLog, second: RangeLog) -> RangeLog:
+    """One log of two tags."""
+    ids = [log.anchor_ids[k] for log in (first, second) for k in log.anchor_index]
+    return RangeLog.from_arrays(
+        ids,
+        np.concatenate([first.range_m, second.range_m]),
+        timestamp_s=np.concatenate([times_of(first), times_of(second)]),
+        tag_id=["left"] * len(first) + ["right"] * len(second),
+    )
+
+
+def test_two_tags_with_their_own_lever_arms_find_one_offset() -> None:
+    walk, left, right = handheld(60), (0.4, -0.4, 0.1), (-0.4, 0.3, -0.2)
+    photos = walk.photos(photo_times(60))
+    first = walk.log(range_times(0, 60), 2.0, tag_in_cam_m=left)
+    second = walk.log(range_times(0, 60, seed=1), 2.0, seed=1, tag_in_cam_m=right)
+    log = both_tags(first, second)
+    known = estimate_time_offset(log, photos, [left, right])
+    swapped = estimate_time_offset(log, photos, [right, left])
+    assert known.value_s == pytest.approx(2.0, abs=0.02)
+    assert known.stddev_s < 0.7 * swapped.stddev_s
+
+
+def test_bursts_of_two_tags_are_centred_on_their_photos() -> None:
+    left, right = (0.8, 0.0, 0.1), (-0.8, 0.2, 0.0)
+    first = stop_and_go(20, 0.83, tag_in_cam_m=left)
+    second = stop_and_go(20, 0.83, tag_in_cam_m=right)
+    found = estimate_time_offset(both_tags(first.log, second.log), first.photos, [left, right])
+    assert found.value_s == pytest.approx(0.83, abs=0.05)
+    assert not found.offset_matters
+    assert found.num_ranges_on_path == 2 * 80 * 20
+
+
 def test_curve_is_highest_at_the_offset() -> None:
     walk = handheld(40)
     found = estimate(walk.log(range_times(0, 40), 5.0), walk.photos(photo_times(40)))
@@ -215,7 +248,12 @@ class StopAndGo:
 
 
 def stop_and_go(
-    num_stops: int, offset_s: float, seed: int = 0, first_photo: int = 0, speed_m_s: float = 0
+    num_stops: int,
+    offset_s: float,
+    seed: int = 0,
+    first_photo: int = 0,
+    speed_m_s: float = 0,
+    tag_in_cam_m: tuple[float, float, float] = TAG_IN_CAM_M,
 ) -> StopAndGo:
     rng = np.random.default_rng([seed, 4])
     stop_times = np.linspace(1000, 1000 + 6 * (num_stops - 1), num_stops)
@@ -232,9 +270,8 @@ def stop_and_go(
 
     walk = Walk(center, lambda times: turns[stop_at(times)])
     burst_times = (stop_times[:, None] + np.linspace(-1, 1, 80)).ravel()
-    return StopAndGo(
-        walk.log(burst_times, offset_s, seed=seed), walk.photos(stop_times[first_photo:], center_stddev_m=0.003)
-    )
+    log = walk.log(burst_times, offset_s, seed=seed, tag_in_cam_m=tag_in_cam_m)
+    return StopAndGo(log, walk.photos(stop_times[first_photo:], center_stddev_m=0.003))
 
 
 @pytest.mark.parametrize(("num_stops", "first_photo"), [(11, 0), (20, 0), (20, 4)])

@@ -48,7 +48,8 @@ def associate(
     Args:
         log: n ranges.
         trajectory: keyframes; with times, unless the log names photos.
-        tag_in_cam_m: (3,) antenna in the camera (rig) frame, metres.
+        tag_in_cam_m: (3,) antenna in the camera (rig) frame, metres; (num_tags, 3) where the tags of
+            ``log.tag_ids`` have their own.
         time_offset_s: image time = range time + offset.
         anchor_ids: ranges to other anchors are kept with status UNKNOWN_ANCHOR; None: all are wanted.
 
@@ -56,7 +57,7 @@ def associate(
         all n ranges, each with a place or a status that says why it has none.
 
     Raises:
-        InputError: the log needs image times and there are none.
+        InputError: the log needs image times and there are none, or the log has more tags than lever arms.
     """
     options = options or AssociationOptions()
     status = np.full(len(log), RangeStatus.USED, dtype=np.int8)
@@ -70,7 +71,24 @@ def associate(
     if anchor_ids is not None:
         wanted = np.array([anchor_id in anchor_ids for anchor_id in log.anchor_ids], dtype=bool)
         status[(status == RangeStatus.USED) & ~wanted[log.anchor_index]] = RangeStatus.UNKNOWN_ANCHOR
-    return _observe(log, trajectory, np.asarray(tag_in_cam_m, dtype=np.float64), status, before, after, weight, options)
+    tags = lever_arms(log, tag_in_cam_m)[log.tag_index]
+    return _observe(log, trajectory, tags, status, before, after, weight, options)
+
+
+def lever_arms(log: RangeLog, tag_in_cam_m: npt.ArrayLike) -> Array:
+    """(num_tags, 3) in the order of ``log.tag_ids``, from one lever arm for all or one for each.
+
+    Raises:
+        InputError: it is neither.
+    """
+    given = np.asarray(tag_in_cam_m, dtype=np.float64)
+    num_tags = len(log.tag_ids)
+    if given.shape not in ((3,), (num_tags, 3)):
+        raise InputError(
+            f"lever arms of shape {given.shape} for a log of {num_tags} tag(s), expected (3,) or ({num_tags}, 3)",
+            log.source,
+        )
+    return np.broadcast_to(given, (num_tags, 3))
 
 
 def _places_by_name(
@@ -158,14 +176,14 @@ def _camera_is_still(
 def _observe(
     log: RangeLog,
     trajectory: Trajectory,
-    tag_in_cam_m: Array,
+    tags_in_cam_m: Array,
     status: npt.NDArray[np.int8],
     before: npt.NDArray[np.int64],
     after: npt.NDArray[np.int64],
     weight: Array,
     options: AssociationOptions,
 ) -> RangeObservations:
-    """Evaluate the path at the places found."""
+    """Evaluate the path at the places found; ``tags_in_cam_m``: (n, 3)."""
     n = len(log)
     placed = np.isin(status, (RangeStatus.USED, RangeStatus.UNKNOWN_ANCHOR))
     before, after = np.where(placed, before, -1), np.where(placed, after, -1)
@@ -176,7 +194,9 @@ def _observe(
     b, a, w = before[placed], after[placed], weight[placed]
     linear = (1 - w)[:, None] * trajectory.centers[b] + w[:, None] * trajectory.centers[a]
     turn = Rotation.from_matrix(np.swapaxes(trajectory.world_from_cam[b], 1, 2) @ trajectory.world_from_cam[a])
-    tag_in_before = Rotation.from_rotvec(w[:, None] * turn.as_rotvec()).apply(tag_in_cam_m) if len(w) else linear
+    tag_in_before = (
+        Rotation.from_rotvec(w[:, None] * turn.as_rotvec()).apply(tags_in_cam_m[placed]) if len(w) else linear
+    )
     lever[placed] = np.einsum("nij,nj->ni", trajectory.world_from_cam[b], tag_in_before)
     curved = np.flatnonzero(placed)[(w > 0) & (a != b)]
     if len(curved) and trajectory.timestamps_s is not None:

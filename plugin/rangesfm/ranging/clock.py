@@ -10,7 +10,7 @@ import numpy.typing as npt
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.options import AssociationOptions
 from rangesfm.progress import Progress, SilentProgress
-from rangesfm.ranging.association import associate
+from rangesfm.ranging.association import associate, lever_arms
 from rangesfm.ranging.clock_bursts import Bursts, curve_of, find_bursts, offsets_that_keep, pair_bursts
 from rangesfm.ranging.clock_fit import OffsetFit, Timing, refine_offset
 from rangesfm.ranging.clock_path import PathSamples, moving_path
@@ -85,13 +85,13 @@ def estimate_time_offset(
     Args:
         log: ranges with timestamps, to one anchor or more.
         trajectory: keyframes with times, in any unit.
-        tag_in_cam_m: (3,) antenna in the camera (rig) frame, metres.
+        tag_in_cam_m: (3,) antenna in the camera (rig) frame, metres; or (num_tags, 3), as ``log.tag_ids``.
         association: how ranges will be put on the path.
         seed: of the choice of ranges where there are more than needed.
         progress: told of the offsets looked into.
 
     Raises:
-        InputError: log or photos have no times.
+        InputError: log or photos have no times, or the log has more tags than lever arms.
         GeometryError: the motion does not determine the offset.
     """
     if log.timestamp_s is None:
@@ -103,29 +103,29 @@ def estimate_time_offset(
             f"{len(trajectory)} photos and {len(log)} ranges are too few to find the time offset by: {_REMEDY}"
         )
     association = association or AssociationOptions()
-    tag = np.asarray(tag_in_cam_m, dtype=np.float64)
-    ranges = TimedRanges(log.timestamp_s, log.range_m, log.anchor_index, len(log.anchor_ids))
+    tags = lever_arms(log, tag_in_cam_m)
+    ranges = TimedRanges(log.timestamp_s, log.range_m, log.anchor_index, log.tag_index)
     gap_s = float(np.median(np.diff(trajectory.timestamps_s)))
     if gap_s > association.max_interpolation_gap_s:
         bursts = find_bursts(ranges, trajectory.timestamps_s)
         if bursts is not None:
-            found = _offset_of_bursts(bursts, log, trajectory, tag, association)
+            found = _offset_of_bursts(bursts, log, trajectory, tags, association)
             if found is not None:
                 return found
         association = replace(association, max_interpolation_gap_s=_MAX_GAPS * gap_s)
-    return _offset_of_motion(ranges, trajectory, tag, association, seed, progress or SilentProgress())
+    return _offset_of_motion(ranges, trajectory, tags, association, seed, progress or SilentProgress())
 
 
 def _offset_of_motion(
     ranges: TimedRanges,
     trajectory: Trajectory,
-    tag_in_cam_m: Array,
+    tags_in_cam_m: Array,
     association: AssociationOptions,
     seed: int,
     progress: Progress,
 ) -> TimeOffset:
     """Scan all offsets, descend from the best few, and make sure that one stands out."""
-    path = moving_path(trajectory, tag_in_cam_m, association)
+    path = moving_path(trajectory, tags_in_cam_m, association)
     if np.count_nonzero(path.is_known) < 2:
         raise GeometryError(f"no part of the path and the log can be compared to find the time offset: {_REMEDY}")
     curve = scan_offsets(ranges, path)
@@ -213,10 +213,10 @@ def _drift_note(timing: Timing, span_s: float) -> str | None:
 
 
 def _offset_of_bursts(
-    bursts: Bursts, log: RangeLog, trajectory: Trajectory, tag_in_cam_m: Array, association: AssociationOptions
+    bursts: Bursts, log: RangeLog, trajectory: Trajectory, tags_in_cam_m: Array, association: AssociationOptions
 ) -> TimeOffset | None:
     """The offset that centres each burst on its photo; None if the camera did not stand still meanwhile."""
-    pairings = pair_bursts(bursts, trajectory, tag_in_cam_m)
+    pairings = pair_bursts(bursts, trajectory, tags_in_cam_m)
     best = pairings[0]
     if not (best.is_testable and best.explains()):
         raise GeometryError(

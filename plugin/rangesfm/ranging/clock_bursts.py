@@ -37,13 +37,16 @@ class Bursts(NamedTuple):
     Attributes:
         start_s, end_s: (B,) first and last range, radio's clock.
         num_ranges: (B,)
-        range_m: (B, A) median range to each anchor; NaN where there is none.
+        range_m: (B, L) median range of each link (an anchor and a tag); NaN where there is none.
+        anchor, tag: (L,) of each link.
     """
 
     start_s: Array
     end_s: Array
     num_ranges: Rows
     range_m: Array
+    anchor: Rows
+    tag: Rows
 
     @property
     def middle_s(self) -> Array:
@@ -97,16 +100,23 @@ def find_bursts(ranges: TimedRanges, photo_times_s: Array) -> Bursts | None:
     if kept.sum() < _MIN_BURST_SHARE * len(photo_times_s):
         return None
     starts, ends = starts[kept], ends[kept]
-    medians = np.full((len(starts), ranges.num_anchors), np.nan)
+    (anchor, tag), link = np.unique(np.stack([ranges.anchor, ranges.tag]), axis=1, return_inverse=True)
+    link = link.ravel()
+    medians = np.full((len(starts), len(anchor)), np.nan)
     for burst, (start, end) in enumerate(zip(starts, ends)):
-        anchor, range_m = ranges.anchor[start:end], ranges.range_m[start:end]
-        for number in np.unique(anchor):
-            medians[burst, number] = np.median(range_m[anchor == number])
-    return Bursts(ranges.times_s[starts], ranges.times_s[ends - 1], ends - starts, medians)
+        range_m, links = ranges.range_m[start:end], link[start:end]
+        for number in np.unique(links):
+            medians[burst, number] = np.median(range_m[links == number])
+    return Bursts(ranges.times_s[starts], ranges.times_s[ends - 1], ends - starts, medians, anchor, tag)
 
 
-def pair_bursts(bursts: Bursts, trajectory: Trajectory, tag_in_cam_m: Array) -> list[Pairing]:
-    """Every way to lay the bursts on the photos that pairs most of them; the best first."""
+def pair_bursts(bursts: Bursts, trajectory: Trajectory, tags_in_cam_m: Array) -> list[Pairing]:
+    """Every way to lay the bursts on the photos that pairs most of them; the best first.
+
+    Args:
+        bursts, trajectory: of the same survey.
+        tags_in_cam_m: (num_tags, 3) lever arms, metres.
+    """
     photo_times = trajectory.timestamps_s
     assert photo_times is not None, "a path in time needs times"
     reach_s = _REACH_SHARE * float(np.median(np.diff(photo_times)))
@@ -115,7 +125,7 @@ def pair_bursts(bursts: Bursts, trajectory: Trajectory, tag_in_cam_m: Array) -> 
         times = bursts.middle_s + offset_s
         nearest = np.searchsorted(0.5 * (photo_times[1:] + photo_times[:-1]), times)
         burst = np.flatnonzero(np.abs(times - photo_times[nearest]) <= reach_s)
-        pairings.append(_fit(bursts, trajectory, tag_in_cam_m, burst, nearest[burst]))
+        pairings.append(_fit(bursts, trajectory, tags_in_cam_m, burst, nearest[burst]))
     return sorted(pairings, key=lambda pairing: (not pairing.is_testable, pairing.variance))
 
 
@@ -156,12 +166,14 @@ def _offsets(burst_times: Array, photo_times: Array, reach_s: float) -> list[flo
     return offsets
 
 
-def _fit(bursts: Bursts, trajectory: Trajectory, tag_in_cam_m: Array, burst: Rows, photo: Rows) -> Pairing:
+def _fit(bursts: Bursts, trajectory: Trajectory, tags_in_cam_m: Array, burst: Rows, photo: Rows) -> Pairing:
     assert trajectory.timestamps_s is not None
-    pair, anchor = np.nonzero(np.isfinite(bursts.range_m[burst]))
-    range_m = bursts.range_m[burst[pair], anchor]
+    pair, link = np.nonzero(np.isfinite(bursts.range_m[burst]))
+    anchor = bursts.anchor[link]
+    range_m = bursts.range_m[burst[pair], link]
     centers = trajectory.centers[photo[pair]]
-    tag_from_center = (trajectory.world_from_cam @ tag_in_cam_m)[photo[pair]]
+    lever_arms = tags_in_cam_m[bursts.tag[link]]
+    tag_from_center = np.einsum("nij,nj->ni", trajectory.world_from_cam[photo[pair]], lever_arms)
     without_lever = fit_squares(centers, range_m, anchor, _LOSS_SCALE)
     squares = fit_squares(centers + tag_from_center / without_lever.scale, range_m, anchor, _LOSS_SCALE)
     num_spare = float(squares.weights.sum()) - squares.num_unknowns

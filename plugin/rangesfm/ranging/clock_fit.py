@@ -167,7 +167,7 @@ def fit_at_offset(
         scale: metres per model unit, for the lever arm; infinite to leave it out.
     """
     ranges = ranges.take(path.knows(ranges.times_s + offset_s))
-    points, velocities = path.tag(ranges.times_s + offset_s, scale)
+    points, velocities = path.tag(ranges.times_s + offset_s, ranges.tag, scale)
     squares = fit_squares(points, ranges.range_m, ranges.anchor)
     deviations = ranges.range_m.copy()
     for rows in rows_by_anchor(ranges.anchor):

@@ -28,7 +28,7 @@ class PathSamples:
 
     Attributes:
         centers: (m, 3) camera centres, model units; 0 where unknown.
-        tag_from_center: (m, 3) lever arm turned into the world, metres.
+        tag_from_center: (num_tags, m, 3) lever arms turned into the world, metres.
         is_known: (m,) whether the camera's pose is known then.
     """
 
@@ -48,11 +48,12 @@ class PathSamples:
         before = np.where(inside, place, 0).astype(np.int64)
         return np.asarray(inside & self.is_known[before] & self.is_known[np.minimum(before + 1, len(self) - 1)])
 
-    def tag(self, times_s: Array, scale: float) -> tuple[Array, Array]:
-        """Where the antenna is at known times, and how it moves.
+    def tag(self, times_s: Array, tag: npt.NDArray[np.int64], scale: float) -> tuple[Array, Array]:
+        """Where the antenna of a tag is at known times, and how it moves.
 
         Args:
             times_s: (n,)
+            tag: (n,) which one.
             scale: metres per model unit; infinite to leave the lever arm out.
 
         Returns:
@@ -61,12 +62,13 @@ class PathSamples:
         place = (times_s - self.start_s) / self.step_s
         before = np.clip(place, 0, len(self) - 2).astype(np.int64)
         points = self.centers + self.tag_from_center / scale
-        step = points[before + 1] - points[before]
-        return points[before] + (place - before)[:, None] * step, step / self.step_s
+        here = points[tag, before]
+        step = points[tag, before + 1] - here
+        return here + (place - before)[:, None] * step, step / self.step_s
 
 
-def moving_path(trajectory: Trajectory, tag_in_cam_m: Array, options: AssociationOptions) -> PathSamples:
-    """The path where ranges would be interpolated between keyframes."""
+def moving_path(trajectory: Trajectory, tags_in_cam_m: Array, options: AssociationOptions) -> PathSamples:
+    """The path where ranges would be interpolated between keyframes; ``tags_in_cam_m``: (num_tags, 3)."""
     assert trajectory.timestamps_s is not None, "a path in time needs times"
     start_s = float(trajectory.timestamps_s[0])
     span_s = float(trajectory.timestamps_s[-1]) - start_s
@@ -74,8 +76,10 @@ def moving_path(trajectory: Trajectory, tag_in_cam_m: Array, options: Associatio
     times = start_s + step_s * np.arange(int(span_s / step_s) + 1)
     probe = RangeLog.from_arrays(["probe"] * len(times), np.ones(len(times)), timestamp_s=times)
     # A negative tolerance: a sample next to a keyframe is interpolated like all others.
-    places = associate(probe, trajectory, tag_in_cam_m, options=replace(options, max_time_difference_s=-1.0))
+    options = replace(options, max_time_difference_s=-1.0)
+    by_tag = [associate(probe, trajectory, tag_in_cam_m, options=options) for tag_in_cam_m in tags_in_cam_m]
+    places = by_tag[0]
     is_known = (places.status == RangeStatus.USED) & (places.before != places.after)
     known = is_known[:, None]
-    centers, tag_from_center = np.where(known, places.centers, 0.0), np.where(known, places.tag_from_center, 0.0)
-    return PathSamples(start_s, step_s, centers, tag_from_center, is_known)
+    tag_from_center = np.stack([np.where(known, places_of_tag.tag_from_center, 0.0) for places_of_tag in by_tag])
+    return PathSamples(start_s, step_s, np.where(known, places.centers, 0.0), tag_from_center, is_known)

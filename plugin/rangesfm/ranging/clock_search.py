@@ -31,15 +31,15 @@ _PAIRS = [(i, j) for i in range(_NUM_COLUMNS) for j in range(i, _NUM_COLUMNS)]
 
 
 class TimedRanges(NamedTuple):
-    """n ranges: radio's clock, metres, and the number of each one's anchor."""
+    """n ranges: radio's clock, metres, and the numbers of each one's anchor and tag."""
 
     times_s: Array
     range_m: Array
     anchor: npt.NDArray[np.int64]
-    num_anchors: int
+    tag: npt.NDArray[np.int64]
 
     def take(self, rows: npt.NDArray[np.int64] | npt.NDArray[np.bool_]) -> TimedRanges:
-        return TimedRanges(self.times_s[rows], self.range_m[rows], self.anchor[rows], self.num_anchors)
+        return TimedRanges(self.times_s[rows], self.range_m[rows], self.anchor[rows], self.tag[rows])
 
 
 @dataclass(frozen=True)
