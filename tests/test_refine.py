@@ -207,6 +207,31 @@ class TestWithoutNoise:
         refined, _ = survey.refine(survey.anchors(0.0), 1.05, observations=only_between)
         assert rmse(survey.centers(refined) - survey.centers_m) < 0.002
 
+    @pytest.mark.parametrize("at_keyframes", [True, False], ids=["at keyframes", "between"])
+    def test_each_range_belongs_to_the_tag_that_took_it(self, at_keyframes: bool) -> None:
+        survey = make_survey(num_keyframes=41, at_keyframes=at_keyframes)
+        tags = np.array([TAG_IN_CAM_M, [-0.4, 0.3, 0.5]])
+        metric = rescale(survey.sfm, survey.metric_from_sfm)
+        log, similarity = survey.observations.log, survey.metric_from_sfm
+        positions = [survey.anchors_m[name] for name in log.anchor_ids]
+        places = [associate(log, survey.trajectory, tag) for tag in tags]
+        each = [
+            predicted_ranges(metric, survey.trajectory, places[k], similarity, tags[k], positions, [0.0] * 4)
+            for k in range(2)
+        ]
+        assert np.nanmedian(np.abs(each[1] - each[0])) > 0.1
+        index = np.arange(len(log)) % 2
+        range_m = np.where(places[0].has_place, np.where(index, each[1], each[0]), log.range_m)
+        log = replace(log, tag_ids=("left", "right"), tag_index=index, range_m=range_m)
+        lever = np.where(index[:, None], places[1].tag_from_center, places[0].tag_from_center)
+        observations = replace(places[0], log=log, tag_from_center=lever)
+        refined, summary = survey.refine(survey.anchors(0.0), 1.05, observations=observations, tag_in_cam_m=tags)
+        np.testing.assert_allclose(survey.centers(refined), survey.centers_m, atol=1e-2)
+        placed = observations.has_place
+        np.testing.assert_allclose(summary.predicted_m[placed], log.range_m[placed], atol=1e-2)
+        with pytest.raises(ValueError, match=r"expected \(3,\) or \(2, 3\)"):
+            survey.refine(survey.anchors(0.0), observations=observations, tag_in_cam_m=np.zeros((3, 3)))
+
     def test_the_model_given_stays_as_it_was(self) -> None:
         survey = make_survey()
         metric = rescale(survey.sfm, survey.metric_from_sfm)

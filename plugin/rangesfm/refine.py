@@ -19,6 +19,7 @@ from rangesfm.geometry import Similarity
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.passthrough import apply_options
 from rangesfm.ranging.anchors import AnchorEstimate
+from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeObservations, robust_weights, status_by_weight
 from rangesfm.trajectory import Trajectory, pose_of, trajectory_from_reconstruction
 
@@ -95,7 +96,7 @@ def refine_with_ranges(
         metric_from_sfm: from the world of ``observations`` to that of ``reconstruction``.
         anchors: in the order of the log, in the metric world. One with a prior stddev of 0 is
             held, one with a finite prior is drawn to it, others are free.
-        tag_in_cam_m: (3,) antenna in the camera (rig) frame.
+        tag_in_cam_m: (3,) antenna in the camera (rig) frame; or (num_tags, 3), in the order of the log's tags.
         range_stddev_m: (n,) of each range.
         correlation_inflation: how much the ranges' correlation in time reduces their say.
         first_pose_is_fixed: the gauge: True in the first camera's frame, False where
@@ -124,7 +125,7 @@ def refine_with_ranges(
         trajectory,
         observations,
         metric_from_sfm,
-        np.asarray(tag_in_cam_m, dtype=np.float64),
+        tags_in_cam_of_ranges(observations.log, tag_in_cam_m),
         range_stddev_m * range_unit,
         _ceres.cauchy_loss(options.range_loss_scale / range_unit),
         blocks,
@@ -214,24 +215,24 @@ def _add_ranges(
     trajectory: Trajectory,
     observations: RangeObservations,
     metric_from_sfm: Similarity,
-    tag_in_cam_m: Array,
+    tags_in_cam_m: Array,
     stddev_m: Array,
     loss: _ceres.LossFunction,
     blocks: _Blocks,
 ) -> None:
     log = observations.log
     poses = [pose_of(metric.frame(int(frame_id))).params for frame_id in trajectory.frame_ids]
-    offsets = _offsets_beyond_line(trajectory, observations, metric_from_sfm, tag_in_cam_m)
+    offsets = _offsets_beyond_line(trajectory, observations, metric_from_sfm, tags_in_cam_m)
     for i in np.flatnonzero(observations.has_place):
         k, before, after = log.anchor_index[i], observations.before[i], observations.after[i]
         end_blocks = [blocks.anchors[k], blocks.biases[k]]
         if before == after:
-            cost = _ceres.range_cost(range_m=log.range_m[i], tag_in_cam_m=tag_in_cam_m, stddev_m=stddev_m[i])
+            cost = _ceres.range_cost(range_m=log.range_m[i], tag_in_cam_m=tags_in_cam_m[i], stddev_m=stddev_m[i])
             _ceres.add_residual_block(adjuster, cost, loss, [poses[before], *end_blocks])
         else:
             cost = _ceres.interpolated_range_cost(
                 range_m=log.range_m[i],
-                tag_in_cam_m=tag_in_cam_m,
+                tag_in_cam_m=tags_in_cam_m[i],
                 weight=observations.weight[i],
                 offset_in_world_m=offsets[i],
                 stddev_m=stddev_m[i],
@@ -239,13 +240,29 @@ def _add_ranges(
             _ceres.add_residual_block(adjuster, cost, loss, [poses[before], poses[after], *end_blocks])
 
 
+def tags_in_cam_of_ranges(log: RangeLog, tag_in_cam_m: npt.ArrayLike) -> Array:
+    """(n, 3) antenna that took each range, in the camera frame: of one tag (3,), or of each of the log's (num_tags, 3).
+
+    Raises:
+        ValueError: of another shape.
+    """
+    tags = np.asarray(tag_in_cam_m, dtype=np.float64)
+    if tags.shape == (3,):
+        return np.broadcast_to(tags, (len(log), 3))
+    if tags.shape != (len(log.tag_ids), 3):
+        raise ValueError(f"tag_in_cam_m is {tags.shape}, expected (3,) or ({len(log.tag_ids)}, 3): one for each tag")
+    return tags[log.tag_index]
+
+
 def _offsets_beyond_line(
-    trajectory: Trajectory, observations: RangeObservations, metric_from_sfm: Similarity, tag_in_cam_m: Array
+    trajectory: Trajectory, observations: RangeObservations, metric_from_sfm: Similarity, tags_in_cam_m: Array
 ) -> Array:
     """(n, 3) what the antenna's curved path has beyond the straight line between two keyframes, metric world."""
-    levers = trajectory.world_from_cam @ tag_in_cam_m
-    weight = observations.weight[:, None]
-    on_line = (1 - weight) * levers[observations.before] + weight * levers[observations.after]
+    turns, weight = trajectory.world_from_cam, observations.weight[:, None]
+    before, after = (
+        np.einsum("nij,nj->ni", turns[ends], tags_in_cam_m) for ends in (observations.before, observations.after)
+    )
+    on_line = (1 - weight) * before + weight * after
     beyond = metric_from_sfm.scale * observations.center_offsets + observations.tag_from_center - on_line
     turned: Array = beyond @ metric_from_sfm.rotation.T
     return turned
@@ -294,18 +311,24 @@ def predicted_ranges(
     anchors: Sequence[Array],
     biases: Sequence[float],
 ) -> Array:
-    """(n,) ranges that a metric model predicts, interpolated as the residuals are; NaN without a place."""
-    tag = np.asarray(tag_in_cam_m, dtype=np.float64)
+    """(n,) ranges that a metric model predicts, interpolated as the residuals are; NaN without a place.
+
+    Arguments as for ``refine_with_ranges``.
+    """
+    tags_in_cam = tags_in_cam_of_ranges(observations.log, tag_in_cam_m)
     times = (
         None
         if trajectory.timestamps_s is None
         else dict(zip(trajectory.image_names, trajectory.timestamps_s, strict=True))
     )
     now = trajectory_from_reconstruction(metric, times)
-    tags = now.centers + now.world_from_cam @ tag
     weight = observations.weight[:, None]
-    at = (1 - weight) * tags[observations.before] + weight * tags[observations.after]
-    at = at + _offsets_beyond_line(trajectory, observations, metric_from_sfm, tag)
+    before, after = (
+        now.centers[ends] + np.einsum("nij,nj->ni", now.world_from_cam[ends], tags_in_cam)
+        for ends in (observations.before, observations.after)
+    )
+    at = (1 - weight) * before + weight * after
+    at = at + _offsets_beyond_line(trajectory, observations, metric_from_sfm, tags_in_cam)
     index = observations.log.anchor_index
     predicted = np.linalg.norm(at - np.array(anchors)[index], axis=1) + np.array(biases)[index]
     return np.where(observations.before >= 0, predicted, np.nan)
