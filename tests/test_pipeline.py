@@ -16,10 +16,11 @@ import pytest
 from rangesfm.config import RangesConfig, Survey
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.journal import Journal
-from rangesfm.options import AssociationOptions, ScaleOptions
+from rangesfm.options import CheckOptions, ScaleOptions
 from rangesfm.outputs import forget_result, forgetting_result_if_changed, refuse_to_overwrite, write_result
 from rangesfm.pipeline import refine_model, scale_model
 from rangesfm.progress import SilentProgress
+from rangesfm.ranging.readers import read_ranges
 
 if TYPE_CHECKING:
     from tests.conftest import WalkedSurvey
@@ -88,7 +89,7 @@ def test_refused_run_leaves_the_result_before_it(survey: Survey) -> None:
 
 
 def test_ranges_held_out_check_the_result(survey: Survey) -> None:
-    ranges = replace(survey.ranges, association=AssociationOptions(check_share=0.25))
+    ranges = replace(survey.ranges, checks=CheckOptions(check_share=0.25))
     result = refine_model(replace(survey, ranges=ranges), progress=SilentProgress()).result
     with (survey.output_path / "ranges.csv").open(newline="") as file:
         statuses = Counter(row["status"] for row in csv.DictReader(file))
@@ -96,6 +97,39 @@ def test_ranges_held_out_check_the_result(survey: Survey) -> None:
     assert result["check_ranges"]["num"] == statuses["check"] == round(0.25 * num_on_path)
     assert result["check_ranges"]["rms_m"] == pytest.approx(0.05, rel=0.3)
     assert result["ranges"]["num_used"] == statuses["used"] + statuses["down-weighted"]
+
+
+def test_an_anchor_and_a_stretch_of_time_can_be_held_out(survey: Survey) -> None:
+    log = read_ranges(survey.ranges.path or "")
+    assert log.timestamp_s is not None
+    anchor_id, times = log.anchor_ids[0], tuple(np.quantile(log.timestamp_s, [0.4, 0.5]).tolist())
+    checks = CheckOptions(check_anchors=(anchor_id,), check_times_s=times)
+    ranges = replace(survey.ranges, checks=checks)
+    result = refine_model(replace(survey, ranges=ranges), progress=SilentProgress()).result
+    with (survey.output_path / "ranges.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["predicted_refined_m"]]
+    held_out = {True: Counter[bool](), False: Counter[bool]()}
+    for row in rows:
+        wanted = row["anchor_id"] == anchor_id or times[0] <= float(row["timestamp_s"]) <= times[1]
+        held_out[wanted][row["status"] == "check"] += 1
+    assert held_out[True] == {True: result["check_ranges"]["num"]}
+    assert not held_out[False][True]
+    assert result["ranges"]["per_anchor"][anchor_id]["num_used"] == 0
+    assert result["check_ranges"]["per_anchor"][anchor_id]["rms_m"] == pytest.approx(0.05, rel=0.4)
+
+
+@pytest.mark.parametrize(
+    ("checks", "frame", "said"),
+    [
+        (CheckOptions(check_anchors=("nobody",)), "site", "the position of anchor 'nobody' is not known, .*"),
+        (CheckOptions(check_anchors=("A1",)), "unknown", "the position of anchor 'A1' is not known, .* none"),
+        (CheckOptions(check_times_s=(-20.0, -10.0)), "site", "no range from -20 to -10 s, expected within .*"),
+    ],
+)
+def test_what_cannot_be_held_out_is_refused(checks: CheckOptions, frame: str, said: str, survey: Survey) -> None:
+    wrong = replace(survey, ranges=replace(survey.ranges, checks=checks), anchor_frame=frame)
+    with pytest.raises(InputError, match=said):
+        scale_model(wrong, progress=SilentProgress())
 
 
 def test_doubts_are_warnings_in_the_result_and_for_the_user(survey: Survey) -> None:

@@ -15,6 +15,7 @@ from rangesfm.options import (
     SCALE_METHODS,
     AssociationOptions,
     CameraOptions,
+    CheckOptions,
     KeyframeOptions,
     MapperOptions,
     RangeModelOptions,
@@ -43,6 +44,7 @@ _RULES = {
     "max_interpolation_gap_s": _FROM_0,
     "max_time_difference_s": _FROM_0,
     "check_share": Rule("from 0 to 0.5", lambda value: 0 <= value <= 0.5),
+    "check_times_s": Rule("two times, the later one last", lambda value: len(value) == 2 and value[0] < value[1]),
     "range_stddev_m": _MORE_THAN_0,
     "range_bias_stddev_m": _FROM_0,
     "common_bias_stddev_m": _FROM_0,
@@ -70,6 +72,7 @@ class RangesConfig:
         columns, timestamp_unit, range_unit, separator: as in ``read_ranges``.
         time_offset_s: image time = range time + offset; None: searched for ("auto").
         association: where ranges are put on the path.
+        checks: which ranges are held out.
         model: what is assumed of the radio.
     """
 
@@ -81,6 +84,7 @@ class RangesConfig:
     separator: str | None = None
     time_offset_s: float | None = None
     association: AssociationOptions = field(default_factory=AssociationOptions)
+    checks: CheckOptions = field(default_factory=CheckOptions)
     model: RangeModelOptions = field(default_factory=RangeModelOptions)
 
 
@@ -211,6 +215,7 @@ class _SurveyReader:
             separator=table.value("separator", str),
             time_offset_s=_time_offset(table),
             association=table.options(AssociationOptions),
+            checks=table.options(CheckOptions),
             model=table.options(RangeModelOptions),
         )
 

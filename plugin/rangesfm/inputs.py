@@ -68,8 +68,20 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
             f"anchor frame {frame!r} needs anchor positions and there are none: give anchors.csv, or frame unknown",
             survey.anchors_path,
         )
+    _check_held_out(survey, anchors, frame)
     reference = None if survey.reference_path is None else read_reference(survey.reference_path)
     return RangingInputs(log, anchors, frame, reference, tuple(_notes(log, anchors, anchors_are_of_log=given is None)))
+
+
+def _check_held_out(survey: Survey, anchors: Sequence[Anchor], frame: str) -> None:
+    surveyed = [anchor.anchor_id for anchor in anchors if anchor.position_m is not None and frame != "unknown"]
+    for anchor_id in survey.ranges.checks.check_anchors:
+        if anchor_id not in surveyed:
+            raise InputError(
+                f"check_anchors: the position of anchor {anchor_id!r} is not known, so that its ranges can check "
+                f"nothing; expected of: {', '.join(surveyed) or 'none'}",
+                survey.anchors_path,
+            )
 
 
 def _check_lever_arm(survey: Survey) -> None:

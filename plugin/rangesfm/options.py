@@ -77,12 +77,26 @@ class AssociationOptions:
     Attributes:
         max_interpolation_gap_s: between keyframes further apart than this no pose is interpolated.
         max_time_difference_s: a range this close to a keyframe counts as taken there in any case.
-        check_share: share of the ranges, chosen at random, that is held out of every estimate.
     """
 
     max_interpolation_gap_s: float = 2.0
     max_time_difference_s: float = 0.02
+
+
+@dataclass(frozen=True)
+class CheckOptions:
+    """Ranges held out of every estimate, to be compared with the result (part of table ``[ranges]``).
+
+    Attributes:
+        check_share: share of the ranges, chosen at random. Neighbours in time err alike, so that
+            this is the mildest check.
+        check_anchors: ids of anchors; each must have a surveyed position, or nothing could be said of its ranges.
+        check_times_s: (from, to) on the radio's clock; empty for none.
+    """
+
     check_share: float = 0.0
+    check_anchors: tuple[str, ...] = ()
+    check_times_s: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)

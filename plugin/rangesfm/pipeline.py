@@ -298,7 +298,7 @@ def _observations(survey: Survey, inputs: RangingInputs, trajectory: Trajectory,
     observations = associate(inputs.log, trajectory, survey.tag_in_cam_m, time_offset_s=offset_s, options=association)
     if not observations.has_place.any():
         raise InputError(_why_no_range_has_a_place(observations, trajectory, offset_s), survey.ranges.path)
-    return hold_out(observations, association.check_share, survey.seed)
+    return hold_out(observations, survey.ranges.checks, survey.seed)
 
 
 def _why_no_range_has_a_place(observations: RangeObservations, trajectory: Trajectory, offset_s: float) -> str:

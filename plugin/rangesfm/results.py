@@ -109,8 +109,21 @@ def _residual_summary(residuals_m: Array, used: Mask, of: Mask) -> dict[str, Any
 
 
 def _check_ranges(survey: MetricSurvey) -> dict[str, Any]:
-    held_out = survey.observations.status == RangeStatus.CHECK
-    return {"num": int(held_out.sum()), "rms_m": _rms(survey.residuals_m[held_out])}
+    log, held_out = survey.observations.log, survey.observations.status == RangeStatus.CHECK
+    anchors = {anchor_id: held_out & (log.anchor_index == k) for k, anchor_id in enumerate(log.anchor_ids)}
+    return {
+        **_check_summary(survey.residuals_m[held_out]),
+        "per_anchor": {i: _check_summary(survey.residuals_m[of]) for i, of in anchors.items() if of.any()},
+    }
+
+
+def _check_summary(residuals_m: Array) -> dict[str, Any]:
+    residuals_m = residuals_m[np.isfinite(residuals_m)]
+    return {
+        "num": len(residuals_m),
+        "rms_m": _rms(residuals_m),
+        "median_m": float(np.median(residuals_m)) if len(residuals_m) else None,
+    }
 
 
 def _rms(residuals_m: Array) -> float | None:

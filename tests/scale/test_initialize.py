@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from rangesfm.errors import GeometryError, InputError
-from rangesfm.options import RangeModelOptions, ScaleOptions
+from rangesfm.options import CheckOptions, RangeModelOptions, ScaleOptions
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeStatus, hold_out
 from rangesfm.scale.initialize import initialize_scale
@@ -303,7 +303,7 @@ def test_order_of_the_ranges_does_not_matter(make_survey: MakeSurvey) -> None:
 
 def test_ranges_set_aside_as_checks_have_no_say(make_survey: MakeSurvey) -> None:
     survey = make_survey(radio=NOISE, num_epochs=2)
-    held_out = hold_out(survey.observations(), 0.2, seed=0)
+    held_out = hold_out(survey.observations(), CheckOptions(check_share=0.2), seed=0)
     is_check = held_out.status == RangeStatus.CHECK
     spoilt = survey.observations(survey.log_with(np.where(is_check, 1.0, survey.simulated.log.range_m)))
     spoilt.status[is_check] = RangeStatus.CHECK

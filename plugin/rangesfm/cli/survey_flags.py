@@ -80,6 +80,9 @@ RANGE_FLAGS = (
     Flag("use_anchors", "anchors.use", "only these anchors' ranges are used", _names, metavar="ID,ID"),
     Flag("tag_in_cam", "tag.tag_in_cam_m", "the tag's antenna in the camera frame, metres", _position, metavar="X,Y,Z"),
     Flag("tag_id", "tag.tag_id", "the camera's tag, if the log has several", metavar="ID"),
+    Flag("check_share", "ranges.check_share", "share of the ranges held out as checks", float, metavar="SHARE"),
+    Flag("check_anchors", "ranges.check_anchors", "anchors whose ranges are all held out", _names, metavar="ID,ID"),
+    Flag("check_times_s", "ranges.check_times_s", "times between which ranges are held out", _numbers, metavar="A,B"),
     Flag("scale_method", "scale.method", "how the scale is found", choices=SCALE_METHODS),
     Flag("reference", "report.reference", "true positions, for comparison", metavar="FILE"),
 )

@@ -8,6 +8,8 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.errors import InputError
+from rangesfm.options import CheckOptions
 from rangesfm.ranging.log import RangeLog
 
 
@@ -66,12 +68,36 @@ class RangeObservations:
         return np.asarray(self.status <= RangeStatus.OUTLIER)
 
 
-def hold_out(observations: RangeObservations, share: float, seed: int) -> RangeObservations:
-    """Set a random share of the usable ranges aside as checks."""
-    status = observations.status.copy()
-    usable = np.flatnonzero(observations.has_place)
-    status[np.random.default_rng(seed).permutation(usable)[: round(share * len(usable))]] = RangeStatus.CHECK
+def hold_out(observations: RangeObservations, checks: CheckOptions, seed: int) -> RangeObservations:
+    """Set usable ranges aside as checks: of some anchors, of a stretch of time, and a random share of the rest.
+
+    Raises:
+        InputError: an anchor to be held out is not in the log, or a stretch of time holds no range.
+    """
+    log, status = observations.log, observations.status.copy()
+    chosen = np.zeros(len(log), dtype=bool)
+    for anchor_id in checks.check_anchors:
+        if anchor_id not in log.anchor_ids:
+            raise InputError(f"anchor {anchor_id!r} to be held out is not in the log ({', '.join(log.anchor_ids)})")
+        chosen |= log.anchor_index == log.anchor_ids.index(anchor_id)
+    if checks.check_times_s:
+        chosen |= _in_time(log, checks.check_times_s)
+    status[chosen & observations.has_place] = RangeStatus.CHECK
+    usable = np.flatnonzero(status <= RangeStatus.OUTLIER)
+    share = round(checks.check_share * len(usable))
+    status[np.random.default_rng(seed).permutation(usable)[:share]] = RangeStatus.CHECK
     return replace(observations, status=status)
+
+
+def _in_time(log: RangeLog, times_s: tuple[float, ...]) -> npt.NDArray[np.bool_]:
+    if log.timestamp_s is None:
+        raise InputError("check_times_s needs a log with times, this one names photos", log.source)
+    first, last = times_s
+    inside: npt.NDArray[np.bool_] = (log.timestamp_s >= first) & (log.timestamp_s <= last)
+    if not inside.any():
+        start, end = log.timestamp_s.min(), log.timestamp_s.max()
+        raise InputError(f"no range from {first:g} to {last:g} s, expected within {start:g} to {end:g} s", log.source)
+    return inside
 
 
 # Robust weights below which a range counts as down-weighted, or has no say to speak of.

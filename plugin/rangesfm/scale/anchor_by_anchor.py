@@ -81,7 +81,7 @@ def anchor_estimates(
                 position_stddev_m=float(stddev[k]),
                 prior_position_m=problem.anchor_mean_m[k] if known else None,
                 prior_position_stddev_m=float(problem.anchor_stddev_m[k]),
-                range_bias_m=float(state.bias_m[k]),
+                range_bias_m=float(state.bias_m[k] if heard else problem.bias_mean_m[k] + common_bias_m),
                 prior_bias_m=float(problem.bias_mean_m[k]) + common_bias_m,
                 prior_bias_stddev_m=float(problem.bias_stddev_m[k] * solution.inflation),
                 mirror_position_m=mirrors.get(k),

@@ -67,7 +67,9 @@ def survey_problem(
     given = np.array([a.position_m is not None for a in in_log], dtype=bool) & (anchor_frame != "unknown")
     rows, heard = _usable_ranges(observations, given)
     known, notes = _usable_positions(in_log, given & heard, anchor_frame)
-    left_out = [a.anchor_id for a, k in zip(in_log, heard, strict=True) if not k]
+    # A surveyed anchor whose ranges are all held out keeps its place, to check them against.
+    placed = known | (given & known.any())
+    left_out = [a.anchor_id for a, k in zip(in_log, heard | placed, strict=True) if not k]
     if left_out:
         notes.append(f"too few ranges on the path to place anchor {', '.join(left_out)}: left out")
     first_camera_from_sfm = _first_camera_from_sfm(trajectory)
@@ -79,7 +81,7 @@ def survey_problem(
         anchor_index=log.anchor_index[rows],
         range_m=log.range_m[rows],
         stddev_m=np.hypot(stddev, short_range_stddev(log.range_m))[rows],
-        anchor_mean_m=np.array([_position(a) if k else np.full(3, np.nan) for a, k in zip(in_log, known, strict=True)]),
+        anchor_mean_m=np.array([_position(a) if k else np.full(3, np.nan) for a, k in zip(in_log, placed, strict=True)]),
         anchor_stddev_m=np.where(heard, np.where(known, np.array([a.position_stddev_m for a in in_log]), np.inf), 0.0),
         bias_mean_m=np.array([a.range_bias_m for a in in_log]),
         bias_stddev_m=np.where(heard, np.array([_bias_stddev(a, range_model) for a in in_log]), 0.0),
