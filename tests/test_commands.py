@@ -352,6 +352,30 @@ def test_scale_uses_the_anchors_and_the_tag_asked_for(
     assert abs(error) < 3 * left.relative_stddev
 
 
+def test_taped_distances_hold_the_scale_and_check_it(
+    own_survey: WalkedSurvey, rangesfm_command: Command, tmp_path: Path
+) -> None:
+    ends = [(0, 20, "control"), (5, 30, "check"), (10, 25, "check")]
+    truth = [float(np.linalg.norm(own_survey.centers_m[i] - own_survey.centers_m[j])) for i, j, _ in ends]
+    lengths = [truth[0], truth[1], truth[2] + 0.5]
+    lines = [
+        f"{own_survey.image_names[i]},{own_survey.image_names[j]},{length},0.005,{kind}\n"
+        for (i, j, kind), length in zip(ends, lengths, strict=True)
+    ]
+    (own_survey.folder / "taped.csv").write_text("from,to,distance_m,stddev_m,kind\n" + "".join(lines))
+    flags = ("--distances", "taped.csv", "--anchors", "anchors.csv", "--anchor_frame", "unknown")
+    left = run_on(rangesfm_command, own_survey, tmp_path / "out", "scale", *flags)
+    rows = left.result["distances"]
+    assert [row["kind"] for row in rows] == ["control", "check", "check"]
+    assert [row["measured_m"] for row in rows] == pytest.approx(lengths)
+    assert rows[0]["residual_m"] == pytest.approx(0, abs=0.015)
+    assert rows[1]["residual_m"] == pytest.approx(0, abs=0.03)
+    assert rows[2]["residual_m"] == pytest.approx(-0.5, abs=0.03)
+    assert len([text for text in left.result["warnings"] if text.startswith("check distance")]) == 1
+    error = left.result["scale"]["value"] / own_survey.site_from_sfm.scale - 1
+    assert abs(error) < 0.003
+
+
 def test_log_may_name_photos_instead_of_times(
     own_survey: WalkedSurvey, rangesfm_command: Command, tmp_path: Path
 ) -> None:

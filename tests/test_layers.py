@@ -23,6 +23,7 @@ LAYER_OF = {
     "colmap_log": DATA,
     "config": DATA,
     "costs": DATA,
+    "distances": DATA,
     "geometry": DATA,
     "model_files": DATA,
     "options": DATA,

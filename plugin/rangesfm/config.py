@@ -101,6 +101,7 @@ class Survey:
         use_anchors: ids of the anchors whose ranges are used; empty: all.
         tag_in_cam_m: lever arm: the tag's antenna in the camera frame, metres.
         tag_id: which tag of the log the camera carries; None: there is only one.
+        distances_path, markers_path: taped distances, and the marks in photos between which they were taken.
         reference_path: true positions, for comparison.
         formats: what to export beside the COLMAP models.
         output_path: folder of the results.
@@ -121,6 +122,8 @@ class Survey:
     mapper: MapperOptions = field(default_factory=MapperOptions)
     scale: ScaleOptions = field(default_factory=ScaleOptions)
     refine: RefineOptions = field(default_factory=RefineOptions)
+    distances_path: Path | None = None
+    markers_path: Path | None = None
     reference_path: Path | None = None
     formats: tuple[str, ...] = DEFAULT_FORMATS
     report_enabled: bool = True
@@ -166,6 +169,7 @@ def _survey(tables: Mapping[str, Any], folder: Path, overrides: Mapping[str, obj
         **reader.images(),
         **reader.anchors(),
         **reader.tag(),
+        **reader.tape(),
         **reader.report(),
         **reader.output(),
         camera=reader.table("camera").options(CameraOptions),
@@ -231,6 +235,12 @@ class _SurveyReader:
         return {
             "tag_in_cam_m": table.value("tag_in_cam_m", tuple[float, float, float], (0.0, 0.0, 0.0)),
             "tag_id": table.value("tag_id", str),
+        }
+
+    def tape(self) -> dict[str, Any]:
+        return {
+            "distances_path": self._path("scale", "distances"),
+            "markers_path": self._path("scale", "markers"),
         }
 
     def mapper(self) -> MapperOptions:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesfm.config import Survey
+from rangesfm.distances.tape import Tape, read_tape
 from rangesfm.errors import InputError
 from rangesfm.ranging.anchor_file import default_anchor_frame, read_anchors
 from rangesfm.ranging.anchors import Anchor
@@ -28,6 +29,7 @@ class RangingInputs:
         log: ranges of the wanted tag to the wanted anchors.
         anchors: every anchor of the log.
         anchor_frame: one of ANCHOR_FRAMES.
+        tape: taped distances, if given.
         reference: true positions, if given.
         notes: what the user should know.
     """
@@ -35,6 +37,7 @@ class RangingInputs:
     log: RangeLog
     anchors: tuple[Anchor, ...]
     anchor_frame: str
+    tape: Tape | None
     reference: Reference | None
     notes: tuple[str, ...]
 
@@ -69,8 +72,11 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
             survey.anchors_path,
         )
     _check_held_out(survey, anchors, frame)
+    tape = None if survey.distances_path is None else read_tape(survey.distances_path, survey.markers_path)
     reference = None if survey.reference_path is None else read_reference(survey.reference_path)
-    return RangingInputs(log, anchors, frame, reference, tuple(_notes(log, anchors, anchors_are_of_log=given is None)))
+    return RangingInputs(
+        log, anchors, frame, tape, reference, tuple(_notes(log, anchors, anchors_are_of_log=given is None))
+    )
 
 
 def _check_held_out(survey: Survey, anchors: Sequence[Anchor], frame: str) -> None:

@@ -16,6 +16,8 @@ import pycolmap
 
 from rangesfm.comparison import format_table, papers_table, reference_in_frame
 from rangesfm.config import Survey
+from rangesfm.distances.ends import locate_distances
+from rangesfm.distances.rows import disagreements, distance_rows
 from rangesfm.doctor import versions
 from rangesfm.errors import InputError
 from rangesfm.export import check_formats
@@ -147,6 +149,7 @@ def _to_metric(
     with journal.stage("results"):
         result = survey_result(metric)
         forget_result(survey.output_path)
+        result["distances"] = _distances(inputs, metric, journal)
         table = _compare(survey, inputs, metric, result)
         write_outputs(metric, survey.formats, survey.output_path)
     result["versions"], result["settings"] = versions(), survey.to_dict()
@@ -269,6 +272,9 @@ def _scale(
 ) -> MetricSurvey:
     offset_s = offset.value_s if offset is not None else survey.ranges.time_offset_s
     observations = _observations(survey, inputs, trajectory, offset_s or 0.0)
+    distances = None
+    if inputs.tape is not None:
+        distances = locate_distances(inputs.tape, sfm, observations.log.anchor_ids)
     estimate = initialize_scale(
         observations,
         trajectory,
@@ -276,6 +282,7 @@ def _scale(
         anchor_frame=inputs.anchor_frame,
         options=survey.scale,
         range_model=survey.ranges.model,
+        distances=distances,
         seed=survey.seed,
     )
     scaled = rescale(sfm, estimate.metric_from_sfm)
@@ -330,6 +337,18 @@ def _refine(survey: Survey, metric: MetricSurvey) -> MetricSurvey:
         num_threads=survey.mapper.num_threads,
     )
     return replace(metric, refined=refined, refinement=summary)
+
+
+def _distances(inputs: RangingInputs, metric: MetricSurvey, journal: Journal) -> list[dict[str, Any]]:
+    """The table of control and check distances in the final map; those that disagree are named."""
+    if inputs.tape is None:
+        return []
+    located = locate_distances(inputs.tape, metric.final, [anchor.anchor_id for anchor in metric.anchors])
+    anchors_m = np.array([anchor.position_m for anchor in metric.anchors]).reshape(-1, 3)
+    rows = distance_rows(inputs.tape, located.lengths_m(1.0, anchors_m))
+    for note in disagreements(rows, metric.estimate.uncertainty.empirical):
+        journal.warn(note)
+    return rows
 
 
 def _compare(survey: Survey, inputs: RangingInputs, metric: MetricSurvey, result: dict[str, Any]) -> str | None:

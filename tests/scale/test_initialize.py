@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.spatial.distance import pdist
 
+from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.options import CheckOptions, RangeModelOptions, ScaleOptions
 from rangesfm.ranging.log import RangeLog
@@ -18,6 +21,8 @@ from rangesfm.simulate.ranges import Radio
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey
+
+    from rangesfm.scale.estimate import ScaleEstimate
 
 Array = npt.NDArray[np.float64]
 
@@ -315,6 +320,58 @@ def test_ranges_set_aside_as_checks_have_no_say(make_survey: MakeSurvey) -> None
     assert first.value == second.value
     assert np.all(second.observations.status[is_check] == RangeStatus.CHECK)
     assert np.all(np.isnan(second.range_stddev_m[is_check]))
+
+
+def between_cameras(survey: Survey, *, factor: float = 1.0, stddev_m: float = 0.005) -> LocatedDistances:
+    """Two taped distances between cameras, longer than true by a factor."""
+    pairs = np.array([[0, len(survey.times) // 2], [len(survey.times) // 4, -1]])
+    model = np.linalg.norm(np.diff(survey.trajectory.centers[pairs], axis=1)[:, 0], axis=1)
+    metric = factor * np.linalg.norm(np.diff(survey.centers_m[pairs], axis=1)[:, 0], axis=1)
+    nobody = np.full((2, 2), -1)
+    return LocatedDistances(model, nobody, metric, np.full(2, stddev_m), np.zeros(2, dtype=bool))
+
+
+def between_anchors(survey: Survey, stddev_m: float = 0.005) -> LocatedDistances:
+    """Every anchor's distance to the first, true."""
+    places = np.array(list(survey.anchors_m.values()))
+    pairs = np.array([[0, k] for k in range(1, len(places))])
+    lengths = np.linalg.norm(places[1:] - places[0], axis=1)
+    k = len(lengths)
+    return LocatedDistances(np.full(k, np.nan), pairs, lengths, np.full(k, stddev_m), np.zeros(k, dtype=bool))
+
+
+def test_control_distances_between_cameras_hold_a_scale_that_long_ranges_would_spoil(make_survey: MakeSurvey) -> None:
+    survey = make_survey(radio=NOISE, num_epochs=2)
+    long = survey.log_with(survey.simulated.log.range_m * 1.04)
+    truth = survey.truth("first_camera").scale
+    alone = survey.scale("unknown", log=long)
+    held = survey.scale("unknown", log=long, distances=between_cameras(survey))
+    assert abs(alone.value / truth - 1) > 0.02
+    assert held.value == pytest.approx(truth, rel=0.005)
+    assert held.uncertainty.formal < 0.5 * alone.uncertainty.formal
+
+
+def test_control_distances_between_anchors_put_unknown_anchors_in_their_places(make_survey: MakeSurvey) -> None:
+    survey = make_survey(radio=NOISE)
+    log = survey.log_with(survey.simulated.log.range_m + 0.3)
+    truth = survey.frame_from_site("first_camera").apply(np.array(list(survey.anchors_m.values())))
+
+    def spread_m(estimate: ScaleEstimate) -> float:
+        """How far distances between anchors are from the truth."""
+        found = np.array([anchor.position_m for anchor in estimate.anchors])
+        return float(np.abs(pdist(found) - pdist(truth)).max())
+
+    alone, held = survey.scale("unknown", log=log), survey.scale("unknown", log=log, distances=between_anchors(survey))
+    assert spread_m(alone) > 0.2
+    assert spread_m(held) < 0.5 * spread_m(alone)
+    assert abs(held.value / survey.truth("first_camera").scale - 1) < 0.02
+
+
+def test_check_distances_have_no_say(make_survey: MakeSurvey) -> None:
+    survey = make_survey(radio=NOISE)
+    wrong = between_cameras(survey, factor=2.0)
+    checks = replace(wrong, is_check=np.ones(2, dtype=bool))
+    assert survey.scale("unknown", distances=checks).value == survey.scale("unknown").value
 
 
 def test_the_noise_is_found_from_the_ranges_themselves(make_survey: MakeSurvey) -> None:

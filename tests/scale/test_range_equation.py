@@ -10,6 +10,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rangesfm.distances.ends import LocatedDistances
 from rangesfm.geometry import IDENTITY, Similarity
 from rangesfm.scale import range_equation
 from rangesfm.scale.range_equation import RangeProblem, RangeState, predicted_ranges, solve
@@ -80,7 +81,14 @@ def test_prediction_is_the_hand_computed_one() -> None:
 @pytest.mark.parametrize("turn_rad", [0.0, 1e-5, 0.5, 2.5])
 def test_jacobians_are_finite_differences_in_every_column(rng: np.random.Generator, turn_rad: float) -> None:
     start = random_state(rng)
-    problem = random_problem(rng, random_state(rng))
+    taped = LocatedDistances(
+        model_length=np.array([2.0, np.nan, np.nan]),
+        anchor_pair=np.array([[-1, -1], [0, 1], [2, 1]]),
+        distance_m=np.array([3.0, 5.0, 4.0]),
+        stddev_m=np.array([0.1, 0.2, 0.5]),
+        is_check=np.zeros(3, dtype=bool),
+    )
+    problem = replace(random_problem(rng, random_state(rng)), distances=taped)
     columns = range_equation._columns(problem)
     assert columns.num == 1 + 6 + 3 * NUM_ANCHORS + NUM_ANCHORS
     at = 0.2 * rng.normal(size=columns.num)
@@ -96,7 +104,7 @@ def test_jacobians_are_finite_differences_in_every_column(rng: np.random.Generat
     state = range_equation._state(problem, columns, start, at)
     jacobian = range_equation._range_jacobian(problem, columns, start, state)
     np.testing.assert_allclose(jacobian, finite_differences(residuals, at), rtol=1e-6, atol=1e-6)
-    prior_jacobian = range_equation._prior_jacobian(problem, columns)
+    prior_jacobian = range_equation._prior_jacobian(problem, columns, state)
     np.testing.assert_allclose(prior_jacobian, finite_differences(prior_residuals, at), rtol=1e-6, atol=1e-6)
 
 

@@ -84,6 +84,8 @@ RANGE_FLAGS = (
     Flag("check_anchors", "ranges.check_anchors", "anchors whose ranges are all held out", _names, metavar="ID,ID"),
     Flag("check_times_s", "ranges.check_times_s", "times between which ranges are held out", _numbers, metavar="A,B"),
     Flag("scale_method", "scale.method", "how the scale is found", choices=SCALE_METHODS),
+    Flag("distances", "scale.distances", "CSV from,to,distance_m[,stddev_m,kind]: taped distances", metavar="CSV"),
+    Flag("markers", "scale.markers", "CSV marker,image_name,x_px,y_px: marks that they refer to", metavar="CSV"),
     Flag("reference", "report.reference", "true positions, for comparison", metavar="FILE"),
 )
 REFINE_FLAGS = (

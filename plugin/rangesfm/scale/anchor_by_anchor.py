@@ -53,6 +53,7 @@ def _one_anchor(solution: Solution, k: int) -> tuple[RangeProblem, RangeState]:
         bias_mean_m=problem.bias_mean_m[k : k + 1],
         bias_stddev_m=problem.bias_stddev_m[k : k + 1],
         frame_is_free=False,
+        distances=None,
     )
     start = RangeState(
         Similarity(placed.scale, placed.rotation, placed.apply(middle)),

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry import Similarity
 from rangesfm.options import RangeModelOptions, ScaleOptions
@@ -33,6 +34,7 @@ def initialize_scale(
     anchor_frame: str,
     options: ScaleOptions | None = None,
     range_model: RangeModelOptions | None = None,
+    distances: LocatedDistances | None = None,
     seed: int = 0,
 ) -> ScaleEstimate:
     """Estimate scale and frame of an unscaled path from ranges.
@@ -44,13 +46,14 @@ def initialize_scale(
         anchor_frame: "site" (positions in a site frame: the map is carried there),
             "first_camera" (positions in the first keyframe's camera frame, metres) or
             "unknown" (positions are ignored; the map stays in the first camera's frame).
+        distances: taped ones in the model of ``trajectory``; its checks have no say.
 
     Raises:
         InputError: the log has an anchor that is not given.
         GeometryError: the scale, or the place in the site frame, is not determined.
     """
     options, range_model = options or ScaleOptions(), range_model or RangeModelOptions()
-    survey = survey_problem(observations, trajectory, anchors, anchor_frame, range_model)
+    survey = survey_problem(observations, trajectory, anchors, anchor_frame, range_model, distances)
     blocks = _time_blocks(observations, survey.rows, options.bootstrap_block_s)
     solution = solve_survey(
         survey.ranges,

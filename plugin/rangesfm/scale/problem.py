@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry import Similarity, path_shape
 from rangesfm.options import RangeModelOptions
@@ -55,8 +56,12 @@ def survey_problem(
     anchors: Sequence[Anchor],
     anchor_frame: str,
     range_model: RangeModelOptions,
+    distances: LocatedDistances | None = None,
 ) -> SurveyProblem:
     """Set up the estimation.
+
+    Args:
+        distances: taped ones, with the anchors of the log in its order.
 
     Raises:
         InputError: an anchor of the log has no place in ``anchors``.
@@ -81,15 +86,26 @@ def survey_problem(
         anchor_index=log.anchor_index[rows],
         range_m=log.range_m[rows],
         stddev_m=np.hypot(stddev, short_range_stddev(log.range_m))[rows],
-        anchor_mean_m=np.array([_position(a) if k else np.full(3, np.nan) for a, k in zip(in_log, placed, strict=True)]),
+        anchor_mean_m=np.array(
+            [_position(a) if k else np.full(3, np.nan) for a, k in zip(in_log, placed, strict=True)]
+        ),
         anchor_stddev_m=np.where(heard, np.where(known, np.array([a.position_stddev_m for a in in_log]), np.inf), 0.0),
         bias_mean_m=np.array([a.range_bias_m for a in in_log]),
         bias_stddev_m=np.where(heard, np.array([_bias_stddev(a, range_model) for a in in_log]), 0.0),
         common_bias_stddev_m=range_model.common_bias_stddev_m,
         frame_is_free=anchor_frame == "site" and bool(known.any()),
+        distances=_control(distances, heard | placed),
     )
     frame = "site" if ranges.frame_is_free else "first_camera"
     return SurveyProblem(ranges, rows, first_camera_from_sfm, frame, bool(known.any()), tuple(notes))
+
+
+def _control(distances: LocatedDistances | None, has_place: npt.NDArray[np.bool_]) -> LocatedDistances | None:
+    """Those that are to be kept to, between points or anchors that take part."""
+    if distances is None:
+        return None
+    takes_part = np.append(has_place, True)[distances.anchor_pair].all(axis=1)
+    return distances.subset(takes_part & ~distances.is_check)
 
 
 def _anchors_of_log(anchor_ids: tuple[str, ...], anchors: Sequence[Anchor]) -> list[Anchor]:

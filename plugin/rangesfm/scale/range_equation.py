@@ -17,8 +17,10 @@ import numpy.typing as npt
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from rangesfm.distances.ends import LocatedDistances
 from rangesfm.geometry import Similarity
 from rangesfm.ranging.observations import CAUCHY_WIDTH, robust_weights
+from rangesfm.scale.distance_equation import distance_jacobian, distance_residuals
 
 Array = npt.NDArray[np.float64]
 
@@ -40,6 +42,7 @@ class RangeProblem:
         bias_mean_m, bias_stddev_m: (m,) prior of each bias; stddev 0 fixes it.
         common_bias_stddev_m: prior of what all (free) biases share, the tag's own delay.
         frame_is_free: whether rotation and translation are estimated, or stay as started.
+        distances: taped ones that are to be kept to; their anchors are indices as ``anchor_index``.
     """
 
     centers: Array
@@ -53,6 +56,7 @@ class RangeProblem:
     bias_stddev_m: Array
     common_bias_stddev_m: float
     frame_is_free: bool
+    distances: LocatedDistances | None = None
 
     @property
     def num_anchors(self) -> int:
@@ -190,7 +194,9 @@ def solve(
 
     def jacobian(x: Array) -> Array:
         state = _state(problem, columns, start, x)
-        return np.concatenate([_range_jacobian(problem, columns, start, state), _prior_jacobian(problem, columns)])
+        return np.concatenate(
+            [_range_jacobian(problem, columns, start, state), _prior_jacobian(problem, columns, state)]
+        )
 
     result = least_squares(
         residuals,
@@ -212,7 +218,7 @@ def _fit(problem: RangeProblem, columns: _Columns, start: RangeState, state: Ran
     scaled = residuals_m / problem.stddev_m
     weights = robust_weights(scaled)
     jacobian = _range_jacobian(problem, columns, start, state)
-    prior_jacobian = _prior_jacobian(problem, columns)
+    prior_jacobian = _prior_jacobian(problem, columns, state)
     prior_information = prior_jacobian.T @ prior_jacobian
     return RangeFit(
         state=state,
@@ -295,17 +301,24 @@ def _prior_residuals(problem: RangeProblem, columns: _Columns, state: RangeState
     anchors, biases = _prior_rows(problem, columns)
     off_anchor = (state.anchors_m - problem.anchor_mean_m)[anchors] / problem.anchor_stddev_m[anchors, None]
     off_bias = _bias_whitening(problem, biases) @ (state.bias_m - problem.bias_mean_m)[biases]
-    return np.concatenate([off_anchor.ravel(), off_bias])
+    priors = [off_anchor.ravel(), off_bias]
+    if problem.distances is not None:
+        priors.append(distance_residuals(problem.distances, state.metric_from_model.scale, state.anchors_m))
+    return np.concatenate(priors)
 
 
-def _prior_jacobian(problem: RangeProblem, columns: _Columns) -> Array:
+def _prior_jacobian(problem: RangeProblem, columns: _Columns, state: RangeState) -> Array:
     anchors, biases = _prior_rows(problem, columns)
     jacobian = np.zeros((3 * len(anchors) + len(biases), columns.num))
     for row, k in enumerate(anchors):
         for axis in range(3):
             jacobian[3 * row + axis, columns.anchor[k] + axis] = 1 / problem.anchor_stddev_m[k]
     jacobian[3 * len(anchors) :, columns.bias[biases]] = _bias_whitening(problem, biases)
-    return jacobian
+    if problem.distances is None:
+        return jacobian
+    scale = state.metric_from_model.scale
+    taped = distance_jacobian(problem.distances, scale, state.anchors_m, columns.anchor, columns.num)
+    return np.concatenate([jacobian, taped])
 
 
 def _bias_whitening(problem: RangeProblem, biases: npt.NDArray[np.int64]) -> Array:

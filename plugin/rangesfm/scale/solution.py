@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry import path_shape
 from rangesfm.ranging.noise import correlation_inflation, robust_stddev, short_range_stddev
@@ -118,7 +119,12 @@ def _known_only(problem: RangeProblem) -> RangeProblem:
         part,
         anchor_stddev_m=np.where(known, problem.anchor_stddev_m, 0.0),
         bias_stddev_m=np.where(known, problem.bias_stddev_m, 0.0),
+        distances=_between_points(problem.distances),
     )
+
+
+def _between_points(distances: LocatedDistances | None) -> LocatedDistances | None:
+    return None if distances is None else distances.subset(distances.anchor_pair[:, 0] < 0)
 
 
 def _differ(problem: RangeProblem, first: RangeFit, second: RangeFit) -> bool:
@@ -137,7 +143,11 @@ def _with_own_noise(
     problem: RangeProblem, start: RangeFit, center_stddev: Array, noise_stddev_m: Array, groups: npt.NDArray[np.int64]
 ) -> Solution:
     """Alternate between the fit and the noise it shows."""
-    bias_stddev, common_bias_stddev = problem.bias_stddev_m, problem.common_bias_stddev_m
+    bias_stddev, common_bias_stddev, distances = (
+        problem.bias_stddev_m,
+        problem.common_bias_stddev_m,
+        problem.distances,
+    )
     fit = solve(problem, start.state)
     inflation, noise = 1.0, robust_stddev(fit.residuals_m)
     for _ in range(_NUM_NOISE_ROUNDS):
@@ -151,6 +161,7 @@ def _with_own_noise(
             stddev_m=stddev,
             bias_stddev_m=bias_stddev / inflation,
             common_bias_stddev_m=common_bias_stddev / inflation,
+            distances=None if distances is None else replace(distances, stddev_m=distances.stddev_m / inflation),
         )
         fit = solve(problem, fit.state)
         inflation = correlation_inflation(fit.residuals_m / stddev, fit.weights, groups)

@@ -204,6 +204,7 @@ def anchor_alone(problem: RangeProblem, k: int, metric_from_model: Similarity) -
         bias_stddev_m=np.zeros(1),
         common_bias_stddev_m=0.0,
         frame_is_free=False,
+        distances=None,
     )
 
 

@@ -1,0 +1,138 @@
+"""Where the ends of taped distances are in a model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from rangesfm.distances.tape import CHECK, Marker, Tape, TapedDistance
+from rangesfm.errors import InputError
+
+Array = npt.NDArray[np.float64]
+
+# Marks of one point further from it than this share of the photo's size are of different points.
+_MAX_REPROJECTION = 0.02
+_MIN_TRIANGULATION_ANGLE_DEG = 0.5
+
+
+@dataclass(frozen=True)
+class LocatedDistances:
+    """k taped distances, their ends found in one model: two of its points, or two anchors.
+
+    Attributes:
+        model_length: (k,) between points, in the model's unit; NaN between anchors.
+        anchor_pair: (k, 2) int, the two anchors; -1 between points.
+        distance_m, stddev_m: (k,) as measured.
+        is_check: (k,) bool, those that have no say.
+    """
+
+    model_length: Array
+    anchor_pair: npt.NDArray[np.int64]
+    distance_m: Array
+    stddev_m: Array
+    is_check: npt.NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.distance_m)
+
+    def subset(self, rows: npt.NDArray[np.bool_]) -> LocatedDistances:
+        """Some of them."""
+        return LocatedDistances(
+            self.model_length[rows],
+            self.anchor_pair[rows],
+            self.distance_m[rows],
+            self.stddev_m[rows],
+            self.is_check[rows],
+        )
+
+    def lengths_m(self, scale: float, anchors_m: Array) -> Array:
+        """(k,) as a map has them, with the model's scale and the anchors (m, 3); NaN where an anchor has no place."""
+        lengths = scale * self.model_length
+        between_anchors = self.anchor_pair[:, 0] >= 0
+        first, second = anchors_m[self.anchor_pair[between_anchors].T]
+        lengths[between_anchors] = np.linalg.norm(first - second, axis=1)
+        return lengths
+
+
+def locate_distances(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Sequence[str]) -> LocatedDistances:
+    """Find each end: a photo of that name (its projection centre), else a marker, else an anchor.
+
+    Raises:
+        InputError: with the line, for an end that is none of these, a photo that is not in the model, a
+            distance from an anchor to what is none, and marks that are too few, seen from one direction only, or not
+            of one point.
+    """
+    images = {image.name: image for image in model.images.values() if image.has_pose}
+    markers = {name: _triangulate(name, marker, images, tape) for name, marker in _wanted_markers(tape).items()}
+    points = {name: image.projection_center() for name, image in images.items()} | markers
+    lengths = np.full(len(tape.distances), np.nan)
+    pairs = np.full((len(tape.distances), 2), -1, dtype=np.int64)
+    for row, taped in enumerate(tape.distances):
+        start, end = taped.ends
+        if start in points and end in points:
+            lengths[row] = np.linalg.norm(points[start] - points[end])
+        elif start in anchor_ids and end in anchor_ids:
+            pairs[row] = anchor_ids.index(start), anchor_ids.index(end)
+        else:
+            raise InputError(_what_is_wrong(taped, points, anchor_ids), tape.distances_path, taped.line)
+    return LocatedDistances(
+        lengths,
+        pairs,
+        np.array([taped.distance_m for taped in tape.distances], dtype=np.float64),
+        np.array([taped.stddev_m for taped in tape.distances], dtype=np.float64),
+        np.array([taped.kind == CHECK for taped in tape.distances], dtype=bool),
+    )
+
+
+def _what_is_wrong(taped: TapedDistance, points: dict[str, Array], anchor_ids: Sequence[str]) -> str:
+    for name in taped.ends:
+        if name not in points and name not in anchor_ids:
+            return f"an end is {name!r}, expected a photo that is in the model, a marker or an anchor of the log"
+    return f"from {taped.ends[0]!r} to {taped.ends[1]!r}: expected two anchors, or two ends of which none is an anchor"
+
+
+def _wanted_markers(tape: Tape) -> dict[str, Marker]:
+    ends = {name for taped in tape.distances for name in taped.ends}
+    return {name: marker for name, marker in (tape.markers or {}).items() if name in ends}
+
+
+def _triangulate(name: str, marker: Marker, images: dict[str, pycolmap.Image], tape: Tape) -> Array:
+    """The marker's place, from the photos that are in the model."""
+    seen = [k for k, image_name in enumerate(marker.image_names) if image_name in images]
+    if len(seen) < 2:
+        message = f"marker {name!r} is marked in {len(seen)} photos of the model, expected two or more"
+        raise InputError(message, tape.markers_path, marker.lines[0])
+    views = [images[marker.image_names[k]] for k in seen]
+    in_cam = [_camera(view).cam_from_img(marker.pixels[k]) for k, view in zip(seen, views, strict=True)]
+    if any(at is None for at in in_cam):
+        raise InputError(f"marker {name!r} has a mark outside its photo", tape.markers_path, marker.lines[0])
+    rays = np.array([[*np.ravel(at), 1.0] for at in in_cam if at is not None])
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    point = pycolmap.triangulate_multi_view_point([view.cam_from_world().matrix() for view in views], rays)
+    if point is None or _widest_angle_deg(point, views) < _MIN_TRIANGULATION_ANGLE_DEG:
+        message = f"marker {name!r} is seen from one direction only, expected photos from different places"
+        raise InputError(message, tape.markers_path, marker.lines[0])
+    for k, view in zip(seen, views, strict=True):
+        camera, seen_at = _camera(view), view.project_point(point)
+        off_px = np.inf if seen_at is None else float(np.linalg.norm(seen_at - marker.pixels[k]))
+        if off_px > _MAX_REPROJECTION * max(camera.width, camera.height):
+            message = f"marker {name!r} is {off_px:.0f} px from where the other photos put it: is it the same point?"
+            raise InputError(message, tape.markers_path, marker.lines[k])
+    return np.asarray(point, dtype=np.float64).reshape(3)
+
+
+def _camera(image: pycolmap.Image) -> pycolmap.Camera:
+    camera = image.camera
+    if camera is None:
+        raise ValueError(f"image {image.name} has no camera")
+    return camera
+
+
+def _widest_angle_deg(point: Array, views: Sequence[pycolmap.Image]) -> float:
+    rays = np.array([view.projection_center() for view in views]) - point
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    return float(np.rad2deg(np.arccos(np.clip(rays @ rays.T, -1, 1)).max()))

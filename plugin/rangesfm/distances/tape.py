@@ -1,0 +1,125 @@
+"""The files of taped distances and of the marks in photos between which they were taken."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.errors import InputError
+from rangesfm.tables import Table, read_table
+
+CONTROL, CHECK = "control", "check"
+# What a steel tape and a steady hand are good for.
+DEFAULT_STDDEV_M = 0.01
+
+
+@dataclass(frozen=True)
+class TapedDistance:
+    """A measured length between two ends, each a photo (its camera), a marker or an anchor.
+
+    Attributes:
+        ends: names of the two ends.
+        distance_m: measured.
+        stddev_m: of the measurement.
+        kind: "control" (it holds the scale) or "check" (it is compared with the result).
+        line: in the file.
+    """
+
+    ends: tuple[str, str]
+    distance_m: float
+    stddev_m: float
+    kind: str
+    line: int
+
+
+@dataclass(frozen=True)
+class Marker:
+    """A point of the scene, marked by hand in k photos.
+
+    Attributes:
+        image_names: k names.
+        pixels: (k, 2) x and y in COLMAP's convention: the centre of the first pixel is (0.5, 0.5).
+        lines: (k,) in the file.
+    """
+
+    image_names: tuple[str, ...]
+    pixels: npt.NDArray[np.float64]
+    lines: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Tape:
+    """All that was taped.
+
+    Attributes:
+        distances: in the order of the file.
+        markers: by name.
+        distances_path, markers_path: where they were read from, for messages.
+    """
+
+    distances: tuple[TapedDistance, ...] = ()
+    markers: dict[str, Marker] | None = None
+    distances_path: Path | None = None
+    markers_path: Path | None = None
+
+
+def read_tape(distances_path: str | Path, markers_path: str | Path | None = None) -> Tape:
+    """Read ``from,to,distance_m[,stddev_m,kind]`` and ``marker,image_name,x_px,y_px``.
+
+    Without a kind a distance is control, without a stddev it is good to a centimetre.
+
+    Raises:
+        InputError: with the line, for what is not as described.
+    """
+    distances = _distances(read_table(distances_path, ["from", "to", "distance_m"], ["stddev_m", "kind"]))
+    markers = None if markers_path is None else _markers(read_table(markers_path, ["marker", "image_name", *_PIXELS]))
+    return Tape(distances, markers, Path(distances_path), None if markers_path is None else Path(markers_path))
+
+
+_PIXELS = ("x_px", "y_px")
+
+
+def _distances(table: Table) -> tuple[TapedDistance, ...]:
+    if not len(table):
+        raise InputError("holds no distance, expected one a line", table.path)
+    starts, ends = table.text("from"), table.text("to")
+    kinds = table.text("kind", empty=CONTROL) if "kind" in table else [CONTROL] * len(table)
+    for row, (start, end, kind) in enumerate(zip(starts, ends, kinds, strict=True)):
+        if start == end:
+            raise table.error(row, "to", "another end than 'from'")
+        if kind not in (CONTROL, CHECK):
+            raise table.error(row, "kind", f"{CONTROL} or {CHECK}")
+    lengths = _positive(table, "distance_m", "a number of metres greater than 0", empty=None)
+    stddevs = np.full(len(table), DEFAULT_STDDEV_M)
+    if "stddev_m" in table:
+        stddevs = _positive(table, "stddev_m", "a number of metres greater than 0, or nothing", empty=DEFAULT_STDDEV_M)
+    rows = zip(starts, ends, lengths.tolist(), stddevs.tolist(), kinds, table.line.tolist(), strict=True)
+    return tuple(TapedDistance((a, b), length, stddev, kind, line) for a, b, length, stddev, kind, line in rows)
+
+
+def _positive(table: Table, column: str, expected: str, *, empty: float | None) -> npt.NDArray[np.float64]:
+    values = table.numbers(column, empty=empty, expected=expected)
+    if np.any(values <= 0):
+        raise table.error(int(np.argmax(values <= 0)), column, expected)
+    return values
+
+
+def _markers(table: Table) -> dict[str, Marker]:
+    names, image_names = table.text("marker"), table.text("image_name")
+    pixels = np.column_stack([table.numbers(column, expected="a number of pixels") for column in _PIXELS])
+    rows_of: dict[str, list[int]] = {}
+    for row, name in enumerate(names):
+        rows_of.setdefault(name, []).append(row)
+    return {name: _marker(table, image_names, pixels, rows) for name, rows in rows_of.items()}
+
+
+def _marker(table: Table, image_names: Sequence[str], pixels: npt.NDArray[np.float64], rows: list[int]) -> Marker:
+    seen_in = [image_names[row] for row in rows]
+    for k, row in enumerate(rows):
+        if seen_in[k] in seen_in[:k]:
+            raise table.error(row, "image_name", "a photo in which this marker has no place yet")
+    return Marker(tuple(seen_in), pixels[rows], tuple(table.line[rows].tolist()))
