@@ -41,6 +41,8 @@ LAYER_OF = {
     "ranging.association": STAGE,
     "ranging.clock": STAGE,
     "ranging.clock_bursts": STAGE,
+    "ranging.clock_curve": STAGE,
+    "ranging.clock_drift": STAGE,
     "ranging.clock_fit": STAGE,
     "ranging.clock_path": STAGE,
     "ranging.clock_search": STAGE,

@@ -24,7 +24,7 @@ from rangesfm.results import USED
 Array = npt.NDArray[np.float64]
 
 # The first says that a result is whole: it is the last to be written and the first to go.
-_RESULT_FILES = ("result.json", "report.html", "ranges.csv", "images.csv", "reference.csv")
+_RESULT_FILES = ("result.json", "report.html", "ranges.csv", "images.csv", "reference.csv", "time_offset_curve.csv")
 _WRITTEN = (*_RESULT_FILES, "trajectory.tum", "points.ply", "sparse_scaled/0", "sparse_metric/0")
 
 
@@ -72,6 +72,7 @@ def write_outputs(survey: MetricSurvey, formats: Sequence[str], folder: Path) ->
     else:
         write_model(survey.refined, folder / "sparse_metric" / "0")
     _write_ranges(survey, folder / "ranges.csv")
+    _write_time_offset_curve(survey, folder / "time_offset_curve.csv")
     times = survey.trajectory.timestamps_s
     by_name = None
     if times is not None:
@@ -114,6 +115,17 @@ def _write_ranges(survey: MetricSurvey, path: Path) -> None:
         "status": [labels[status] for status in observations.status.tolist()],
     }
     _write_csv(path, list(columns), zip(*columns.values(), strict=True))
+
+
+def _write_time_offset_curve(survey: MetricSurvey, path: Path) -> None:
+    """What offsets of the clocks cost, metres, where the offset was searched for; see ``CostCurve``."""
+    if survey.time_offset is None:
+        # An earlier run's curve would not belong to this result.
+        path.unlink(missing_ok=True)
+        return
+    curve = survey.time_offset.curve
+    offsets = [repr(offset_s) for offset_s in curve.offsets_s.tolist()]
+    _write_csv(path, ["time_offset_s", "cost"], zip(offsets, _texts(curve.costs_m), strict=True))
 
 
 def _write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

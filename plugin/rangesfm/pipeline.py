@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pycolmap
 
 from rangesfm.comparison import format_table, papers_table, reference_in_frame
@@ -271,7 +272,9 @@ def _scale(
     offset: TimeOffset | None,
 ) -> MetricSurvey:
     offset_s = offset.value_s if offset is not None else survey.ranges.time_offset_s
-    observations = _observations(survey, inputs, trajectory, offset_s or 0.0)
+    radio_times_s = inputs.log.timestamp_s
+    offsets_s = (offset_s or 0.0) if offset is None or radio_times_s is None else offset.at(radio_times_s)
+    observations = _observations(survey, inputs, trajectory, offsets_s)
     distances = None
     if inputs.tape is not None:
         distances = locate_distances(inputs.tape, sfm, observations.log.anchor_ids)
@@ -299,12 +302,16 @@ def _scale(
     return MetricSurvey(trajectory, offset, offset_s, estimate, scaled, predicted, weights)
 
 
-def _observations(survey: Survey, inputs: RangingInputs, trajectory: Trajectory, offset_s: float) -> RangeObservations:
+def _observations(
+    survey: Survey, inputs: RangingInputs, trajectory: Trajectory, offset_s: float | npt.NDArray[np.float64]
+) -> RangeObservations:
     """Ranges on the path; refused where the clocks cannot be right."""
     association = survey.ranges.association
     observations = associate(inputs.log, trajectory, survey.tag_in_cam_m, time_offset_s=offset_s, options=association)
     if not observations.has_place.any():
-        raise InputError(_why_no_range_has_a_place(observations, trajectory, offset_s), survey.ranges.path)
+        raise InputError(
+            _why_no_range_has_a_place(observations, trajectory, float(np.mean(offset_s))), survey.ranges.path
+        )
     return hold_out(observations, survey.ranges.checks, survey.seed)
 
 

@@ -80,7 +80,15 @@ def _anchor(anchor: AnchorEstimate) -> dict[str, Any]:
 def _time_offset(survey: MetricSurvey) -> dict[str, Any]:
     found = survey.time_offset
     if found is not None:
-        return {"value_s": found.value_s, "stddev_s": found.stddev_s, "estimated": True, "note": found.note}
+        return {
+            "value_s": found.value_s,
+            "stddev_s": found.stddev_s,
+            "estimated": True,
+            "drift_ppm": 1e6 * found.drift,
+            "drift_stddev_ppm": 1e6 * found.drift_stddev,
+            "drift_is_followed": found.drift_is_followed,
+            "note": found.note,
+        }
     given = survey.time_offset_s
     return {"value_s": given, "stddev_s": None if given is None else 0.0, "estimated": False, "note": None}
 

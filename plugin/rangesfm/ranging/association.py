@@ -33,7 +33,7 @@ def associate(
     trajectory: Trajectory,
     tag_in_cam_m: npt.ArrayLike,
     *,
-    time_offset_s: float = 0.0,
+    time_offset_s: float | Array = 0.0,
     options: AssociationOptions | None = None,
     anchor_ids: Collection[str] | None = None,
 ) -> RangeObservations:
@@ -50,7 +50,7 @@ def associate(
         trajectory: keyframes; with times, unless the log names photos.
         tag_in_cam_m: (3,) antenna in the camera (rig) frame, metres; (num_tags, 3) where the tags of
             ``log.tag_ids`` have their own.
-        time_offset_s: image time = range time + offset.
+        time_offset_s: image time = range time + offset; (n,) where the clocks drift.
         anchor_ids: ranges to other anchors are kept with status UNKNOWN_ANCHOR; None: all are wanted.
 
     Returns:

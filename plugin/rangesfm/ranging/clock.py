@@ -12,9 +12,11 @@ from rangesfm.options import AssociationOptions
 from rangesfm.progress import Progress, SilentProgress
 from rangesfm.ranging.association import associate, lever_arms
 from rangesfm.ranging.clock_bursts import Bursts, curve_of, find_bursts, offsets_that_keep, pair_bursts
-from rangesfm.ranging.clock_fit import OffsetFit, Timing, refine_offset
+from rangesfm.ranging.clock_curve import CostCurve, cost_curve
+from rangesfm.ranging.clock_drift import drift_note, fit_clocks, without_drift
+from rangesfm.ranging.clock_fit import OffsetFit, refine_offset
 from rangesfm.ranging.clock_path import PathSamples, moving_path
-from rangesfm.ranging.clock_search import OffsetCurve, TimedRanges, scan_offsets
+from rangesfm.ranging.clock_search import TimedRanges, ranges_on_path, scan_offsets
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.trajectory import Trajectory
@@ -35,7 +37,6 @@ _SAME_OFFSET_S = 0.25
 _SAME_OFFSET_STDDEVS = 5.0
 # An offset that puts fewer ranges on the path than this share of the best one's leaves much alone.
 _COVERING_SHARE = 0.7
-_MIN_DRIFT_STDDEVS = 3.0
 # So many of the ranges in bursts must stay at their photos for the offset not to matter.
 _MIN_SAME_SHARE = 0.95
 # Photos too far apart for ranges to be interpolated still show the motion: up to this many times their usual gap.
@@ -47,24 +48,33 @@ class TimeOffset:
     """The clocks' offset: image time = range time + ``value_s``.
 
     Attributes:
-        value_s: half-way through the ranges used, where the clocks drift.
+        value_s: where the clocks drift, at ``reference_s``.
         stddev_s: of the value, with allowance for correlated residuals.
-        curve: how well all offsets explain the ranges, for the report.
+        curve: what all offsets cost, for the report.
         num_ranges_on_path: ranges that the offset puts where the path is known.
         offset_matters: False where any offset near the value puts the ranges at the same photos.
         drift: what camera time gains on radio time, seconds a second.
         drift_stddev: of the drift; infinite where it was not looked for.
+        drift_is_followed: whether the drift is beyond doubt, so that ``at`` follows it.
+        reference_s: radio's time at which the clocks differ by ``value_s``.
         note: what the user should know; None if nothing.
     """
 
     value_s: float
     stddev_s: float
-    curve: OffsetCurve
+    curve: CostCurve
     num_ranges_on_path: int
     offset_matters: bool
     drift: float
     drift_stddev: float
+    drift_is_followed: bool
+    reference_s: float
     note: str | None
+
+    def at(self, radio_times_s: Array) -> Array:
+        """(n,) offsets at times of the radio's clock."""
+        drift = self.drift if self.drift_is_followed else 0.0
+        return self.value_s + drift * (radio_times_s - self.reference_s)
 
 
 def estimate_time_offset(
@@ -128,42 +138,38 @@ def _offset_of_motion(
     path = moving_path(trajectory, tags_in_cam_m, association)
     if np.count_nonzero(path.is_known) < 2:
         raise GeometryError(f"no part of the path and the log can be compared to find the time offset: {_REMEDY}")
-    curve = scan_offsets(ranges, path)
-    candidates = curve.peaks(_CANDIDATE_SEPARATION_S, _MAX_NUM_CANDIDATES)
+    scanned = scan_offsets(ranges, path)
+    candidates = scanned.peaks(_CANDIDATE_SEPARATION_S, _MAX_NUM_CANDIDATES)
     fits = []
     for num_done, offset_s in enumerate(candidates):
         progress.update(num_done, len(candidates))
-        near = _thinned(ranges, path, offset_s, _NUM_RANGES_PER_CANDIDATE, seed)
+        near = ranges_on_path(ranges, path, offset_s, _NUM_RANGES_PER_CANDIDATE, seed)
         if len(near.range_m):
             fits.append(refine_offset(near, path, offset_s, _CELL_S))
     progress.update(len(candidates), len(candidates))
     best = _the_one_that_stands_out(fits, [_num_on_path(ranges, path, fit.offset_s) for fit in fits])
-    near = _thinned(ranges, path, best.offset_s, _NUM_RANGES_OF_FINAL, seed)
-    final = refine_offset(near, path, best.offset_s, _CELL_S)
-    timing = final.timing()
+    near = ranges_on_path(ranges, path, best.offset_s, _NUM_RANGES_OF_FINAL, seed)
+    clocks = fit_clocks(near, path, best.offset_s, _CELL_S)
+    final, timing = clocks.fit, clocks.timing
     if not timing.stddev_s * timing.range_rate < final.residual_stddev_m:
         raise GeometryError(
             f"the motion is too even to tell the time offset (about {final.offset_s:+.2f} s, "
             f"stddev {timing.stddev_s:.2g} s): {_REMEDY}"
         )
+    drifts = clocks.followed_drift != 0
+    ranges = without_drift(ranges, clocks.followed_drift, clocks.reference_s)
     return TimeOffset(
         value_s=final.offset_s,
         stddev_s=timing.stddev_s,
-        curve=curve,
+        curve=cost_curve(ranges, path, scanned, final, timing.stddev_s, _CELL_S),
         num_ranges_on_path=_num_on_path(ranges, path, final.offset_s),
         offset_matters=True,
-        drift=timing.drift,
+        drift=clocks.drift,
         drift_stddev=timing.drift_stddev,
-        note=_drift_note(timing, float(np.ptp(final.ranges.times_s))),
+        drift_is_followed=drifts,
+        reference_s=clocks.reference_s,
+        note=drift_note(clocks.drift, timing.drift_stddev, near.times_s) if drifts else None,
     )
-
-
-def _thinned(ranges: TimedRanges, path: PathSamples, offset_s: float, max_num: int, seed: int) -> TimedRanges:
-    """At most so many of the ranges that an offset puts on the path, at random."""
-    rows = np.flatnonzero(path.knows(ranges.times_s + offset_s))
-    if len(rows) > max_num:
-        rows = np.sort(np.random.default_rng(seed).permutation(rows)[:max_num])
-    return ranges.take(rows)
 
 
 def _num_on_path(ranges: TimedRanges, path: PathSamples, offset_s: float) -> int:
@@ -202,16 +208,6 @@ def _ambiguity(offset_s: float, stddev_m: float, other_offset_s: float, other_st
     )
 
 
-def _drift_note(timing: Timing, span_s: float) -> str | None:
-    if abs(timing.drift) < _MIN_DRIFT_STDDEVS * timing.drift_stddev:
-        return None
-    return (
-        f"the clocks drift: the camera's gains {1e6 * timing.drift:+.0f} ppm on the radio's "
-        f"(stddev {1e6 * timing.drift_stddev:.0f} ppm); the time offset is {abs(timing.drift) * span_s / 2:.3f} s off "
-        "at both ends of the path"
-    )
-
-
 def _offset_of_bursts(
     bursts: Bursts, log: RangeLog, trajectory: Trajectory, tags_in_cam_m: Array, association: AssociationOptions
 ) -> TimeOffset | None:
@@ -237,11 +233,13 @@ def _offset_of_bursts(
     return TimeOffset(
         value_s=value_s,
         stddev_s=(latest_s - earliest_s) / np.sqrt(12),
-        curve=curve_of(pairings, bursts),
+        curve=curve_of(pairings, bursts, trajectory),
         num_ranges_on_path=num_in_bursts,
         offset_matters=False,
         drift=0.0,
         drift_stddev=np.inf,
+        drift_is_followed=False,
+        reference_s=float(np.mean(bursts.middle_s)),
         note=f"the camera stands still at every photo: any time offset from {earliest_s:+.2f} s to {latest_s:+.2f} s "
         f"gives the same result; {value_s:+.2f} s centres the ranges on the photos",
     )

@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import f as f_distribution
 
-from rangesfm.ranging.clock_search import OffsetCurve, TimedRanges
+from rangesfm.ranging.clock_curve import CostCurve
+from rangesfm.ranging.clock_search import TimedRanges
 from rangesfm.ranging.clock_squares import MIN_RESIDUAL_M, fit_squares
 from rangesfm.trajectory import Trajectory
 
@@ -142,14 +143,16 @@ def offsets_that_keep(pairing: Pairing, bursts: Bursts, trajectory: Trajectory) 
     )
 
 
-def curve_of(pairings: list[Pairing], bursts: Bursts) -> OffsetCurve:
-    """The scores of all pairings."""
-    ordered = sorted(pairings, key=lambda pairing: pairing.offset_s)
-    return OffsetCurve(
-        np.array([pairing.offset_s for pairing in ordered]),
-        np.array([0.5 * np.log(pairing.variation / pairing.variance) for pairing in ordered]),
-        np.array([float(bursts.num_ranges[pairing.burst].sum()) for pairing in ordered]),
-    )
+def curve_of(pairings: list[Pairing], bursts: Bursts, trajectory: Trajectory) -> CostCurve:
+    """What all pairings cost: each the same wherever its bursts stay nearest to their photos."""
+    offsets, costs = [], []
+    for pairing in sorted(pairings, key=lambda pairing: pairing.offset_s):
+        earliest_s, latest_s = offsets_that_keep(pairing, bursts, trajectory)
+        plateau = {earliest_s, pairing.offset_s, latest_s} if earliest_s < latest_s else {pairing.offset_s}
+        offsets += sorted(plateau)
+        costs += [float(np.sqrt(pairing.variance))] * len(plateau)
+    order = np.argsort(offsets, kind="stable")
+    return CostCurve(np.array(offsets)[order], np.array(costs)[order])
 
 
 def _offsets(burst_times: Array, photo_times: Array, reach_s: float) -> list[float]:

@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.stats import norm
+from scipy.stats import t as student
 
 from rangesfm.ranging.clock_path import PathSamples
 from rangesfm.ranging.clock_search import TimedRanges
@@ -24,6 +26,12 @@ _MIN_OWN_RATE = 1e-3
 # Residuals of real radios stay correlated for seconds: blocks this long count as independent.
 _BLOCK_S = 10.0
 _MIN_NUM_BLOCKS = 12
+# How long they stay so is not known: the stddev is that of the mean variance with so many blocks of time.
+_JACKKNIFE_NUM_BLOCKS = (6, 12, 24)
+# In longer logs than this there are more of them, of 40, 20 and 10 s.
+_LONG_LOG_S = 240.0
+# Without one block the others must still determine everything: of columns of length one.
+_MIN_LEFT_CURVATURE = 1e-6
 # The tag's delay makes all ranges read too long or too short by about this.
 _RANGE_BIAS_STDDEV_M = 0.05
 # A rival's mean log residual must exceed the best one's by this and by this many stddevs.
@@ -128,9 +136,21 @@ class OffsetFit:
         range_rate = float(np.sqrt(np.mean(self.rates**2)))
         if not _is_determined(own[:, 0], self.rates):
             return Timing(np.inf, 0.0, np.inf, range_rate)
-        alone, both = _covariance(own[:, :1], self.squares, times), _covariance(own, self.squares, times)
-        drift = np.linalg.lstsq(own, self.squares.weighted_residuals, rcond=None)[0][1]
-        return Timing(float(np.sqrt(alone[0, 0])), float(drift), float(np.sqrt(both[1, 1])), range_rate)
+        residuals = self.squares.weighted_residuals
+        change = np.linalg.lstsq(own, residuals, rcond=None)[0]
+        alone = self._variances(own[:, :1], residuals, times)
+        both = self._variances(own, residuals - own @ change, times)
+        return Timing(float(np.sqrt(alone[0])), float(change[1]), float(np.sqrt(both[1])), range_rate)
+
+    def _variances(self, own: Array, residuals: Array, times: Array) -> Array:
+        """(k,) of the unknowns with columns ``own``, from chance and from a constant bias of all ranges."""
+        span_s = float(np.ptp(times))
+        by_chance = [
+            _jackknife_variances(own, residuals, self.squares, times, max(num, round(num * span_s / _LONG_LOG_S)))
+            for num in _JACKKNIFE_NUM_BLOCKS
+        ]
+        by_bias = np.linalg.lstsq(own, _RANGE_BIAS_STDDEV_M * np.sqrt(self.squares.weights), rcond=None)[0]
+        return np.asarray(np.mean(by_chance, axis=0) + by_bias**2)
 
 
 def refine_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, cell_s: float) -> OffsetFit:
@@ -194,17 +214,35 @@ def _blocks(times: Array) -> npt.NDArray[np.int64]:
     return np.unique(np.floor((times - times.min()) / block_s), return_inverse=True)[1]
 
 
-def _covariance(own: Array, squares: SquaresFit, times: Array) -> Array:
-    """(k, k) covariance of an M-estimate whose residuals are correlated within blocks of time.
+def _jackknife_variances(own: Array, residuals: Array, squares: SquaresFit, times: Array, num_blocks: int) -> Array:
+    """(k,) variances of an M-estimate whose residuals are correlated within blocks of time.
 
-    The sandwich H^-1 (sum of g g^T) H^-1 with H the curvature of the robust loss and g each
-    block's gradient (Liang and Zeger, Biometrika 1986), and what a constant bias of all ranges does.
+    The delete-one-block jackknife, each time by one Newton step with everything that the fit adjusts
+    (Bell and McCaffrey, Survey Methodology 2002). Sums of residuals over blocks, without the step, are
+    too small where a block's own ranges pull the fit: on short logs by half. With Student's quantile in
+    place of the Gaussian one, as there are few blocks.
+
+    Args:
+        own: (n, k) columns of the unknowns in question, which nothing else explains.
+        residuals: (n,) weighted, metres.
+        squares: the fit.
+        times: (n,)
+        num_blocks: of equal length.
     """
-    block = _blocks(times)
-    curvature = own.T @ (own * (2 * squares.weights - 1)[:, None])
-    scores = own * squares.weighted_residuals[:, None]
-    gradients = np.stack([np.bincount(block, column) for column in scores.T], axis=1)
-    inverse = np.linalg.pinv(curvature)
-    sandwich = inverse @ (gradients.T @ gradients) @ inverse * len(gradients) / max(len(gradients) - 1, 1)
-    shift = np.linalg.lstsq(own, _RANGE_BIAS_STDDEV_M * np.sqrt(squares.weights), rcond=None)[0]
-    return np.asarray(sandwich + np.outer(shift, shift))
+    columns = np.column_stack([squares.basis, own / np.linalg.norm(own, axis=0)])
+    curved = columns * (2 * squares.weights - 1)[:, None]
+    gradients = columns * residuals[:, None]
+    curvature = columns.T @ curved
+    length_s = max(float(np.ptp(times)) / num_blocks, 1e-9)
+    block = np.unique(np.minimum((times - times.min()) // length_s, num_blocks - 1), return_inverse=True)[1]
+    num = int(block.max()) + 1
+    changes = np.zeros((num, own.shape[1]))
+    for number in range(num):
+        rows = np.flatnonzero(block == number)
+        left = curvature - columns[rows].T @ curved[rows]
+        if np.linalg.eigvalsh(left)[0] < _MIN_LEFT_CURVATURE:
+            return np.full(own.shape[1], np.inf)
+        changes[number] = np.linalg.solve(left, gradients[rows].sum(axis=0))[-own.shape[1] :]
+    quantile = float(student.ppf(0.975, num - 1) / norm.ppf(0.975)) if num > 1 else np.inf
+    variances = (num - 1) / num * np.sum((changes / np.linalg.norm(own, axis=0)) ** 2, axis=0)
+    return np.asarray(quantile**2 * variances)

@@ -42,6 +42,14 @@ class TimedRanges(NamedTuple):
         return TimedRanges(self.times_s[rows], self.range_m[rows], self.anchor[rows], self.tag[rows])
 
 
+def ranges_on_path(ranges: TimedRanges, path: PathSamples, offset_s: float, max_num: int, seed: int) -> TimedRanges:
+    """At most so many of the ranges that an offset puts on the path, at random."""
+    rows = np.flatnonzero(path.knows(ranges.times_s + offset_s))
+    if len(rows) > max_num:
+        rows = np.sort(np.random.default_rng(seed).permutation(rows)[:max_num])
+    return ranges.take(rows)
+
+
 @dataclass(frozen=True)
 class OffsetCurve:
     """How well each of m offsets explains the ranges.

@@ -53,6 +53,13 @@ class SquaresFit:
         """(n,) metres."""
         return np.asarray(np.sqrt(self.weights) * self.residuals_m)
 
+    @property
+    def basis(self) -> Array:
+        """(n, p) orthonormal weighted columns of all that the fit adjusts."""
+        curvature = self._columns.curvature
+        norm = max(float(np.linalg.norm(curvature)), 1e-300)
+        return np.column_stack([self._columns.anchors_basis(), curvature / norm])
+
     def unexplained(self, values: Array) -> Array:
         """(n, k) weighted columns of small changes of the ranges, less what anchors and scale could explain."""
         left = self._columns.without_anchors(np.sqrt(self.weights)[:, None] * values)
@@ -115,6 +122,14 @@ class _LinearColumns:
         for rows, basis, _ in self._factors:
             left_over[rows] -= basis @ (basis.T @ values[rows])
         return left_over
+
+    def anchors_basis(self) -> Array:
+        """(n, <= 4 num_anchors) the anchors' own columns; each is zero for ranges to the others."""
+        padded = []
+        for rows, basis, _ in self._factors:
+            padded.append(np.zeros((len(self._row_weights), basis.shape[1])))
+            padded[-1][rows] = basis
+        return np.column_stack(padded)
 
     def solve(self, squared_ranges: Array) -> tuple[float, Array, Array]:
         """alpha^2 (not negative), (n, 3) the vector b of each range's anchor, (n,) weighted residuals."""
