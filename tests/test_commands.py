@@ -400,6 +400,13 @@ def test_offset_of_the_clocks_is_found(walked_survey: WalkedSurvey, rangesfm_com
     left = run_on(rangesfm_command, walked_survey, tmp_path / "out", "scale", *flags)
     offset = left.result["time_offset"]
     assert abs(offset["value_s"] - 2.0) < 3 * offset["stddev_s"] < 0.3
+    assert abs(offset["drift_ppm"]) < 4 * offset["drift_stddev_ppm"]
+    assert not offset["drift_is_followed"]
+    header, *rows = (left.folder / "time_offset_curve.csv").read_text().splitlines()
+    assert header == "time_offset_s,cost"
+    offsets, costs = np.array([row.split(",") for row in rows], dtype=float).T
+    assert np.all(np.diff(offsets) > 0)
+    assert abs(offsets[np.argmin(costs)] - 2.0) < 0.3
 
 
 class TestResultFolder:

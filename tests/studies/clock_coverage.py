@@ -77,8 +77,8 @@ def exponentially_correlated(times: Array, rng: np.random.Generator) -> Array:
     return values
 
 
-def row(duration_s: float, num_anchors: int, correlation_s: float, num_seeds: int) -> str:
-    """One line of the table."""
+def estimates(duration_s: float, num_anchors: int, correlation_s: float, num_seeds: int) -> tuple[Array, Array]:
+    """(k,) errors and (k,) stated stddevs of the estimates that were not refused, seconds."""
     errors, stddevs = [], []
     for seed in range(num_seeds):
         path = walk(duration_s, seed)
@@ -89,11 +89,17 @@ def row(duration_s: float, num_anchors: int, correlation_s: float, num_seeds: in
             continue
         errors.append(found.value_s - OFFSET_S)
         stddevs.append(found.stddev_s)
+    return np.array(errors), np.array(stddevs)
+
+
+def row(duration_s: float, num_anchors: int, correlation_s: float, num_seeds: int) -> str:
+    """One line of the table."""
+    errors, stddevs = estimates(duration_s, num_anchors, correlation_s, num_seeds)
     head = f"{duration_s:10.0f} {num_anchors:7d} {num_seeds - len(errors):7d}/{num_seeds:<4d}"
-    if not errors:
+    if not len(errors):
         return head
-    scaled = np.array(errors) / stddevs
-    rms_s, stddev_s = np.sqrt(np.mean(np.square(errors))), np.median(stddevs)
+    scaled = errors / stddevs
+    rms_s, stddev_s = np.sqrt(np.mean(errors**2)), np.median(stddevs)
     return (
         f"{head} {rms_s:9.4f} {stddev_s:9.4f} {100 * np.mean(np.abs(scaled) < 1.96):9.0f} "
         f"{np.sqrt(np.mean(scaled**2)):8.2f} {np.abs(scaled).max():7.1f}"
