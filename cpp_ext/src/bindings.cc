@@ -1,4 +1,4 @@
-// Factories of the cost functions for Python, checked at the gate: what passes here never fails in the solver.
+// Factories of the cost functions for Python, checked at the gate.
 //
 // No class is bound. The factories return ceres::CostFunction, a type that pyceres registers, and give the object
 // away: pyceres wraps it in the holder it chose itself, owns it and deletes it.
@@ -7,15 +7,22 @@
 #include <ceres/version.h>
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
 
 #include <Eigen/Core>
-#include <cmath>
+#include <limits>
+#include <memory>
+#include <optional>
 #include <string>
+#include <utility>
 
-#include "rangesfm/fixed_pose_range_cost.h"
-#include "rangesfm/interpolated_range_cost.h"
+#include "gate.h"
+#include "rangesfm/distance_cost.h"
 #include "rangesfm/normal_prior_cost.h"
 #include "rangesfm/range_cost.h"
+#include "rangesfm/range_error_curve.h"
+#include "rangesfm/tag_place.h"
+#include "rangesfm/two_sided_cauchy.h"
 #include "rangesfm/zero_tie_cost.h"
 
 namespace py = pybind11;
@@ -23,71 +30,107 @@ namespace py = pybind11;
 namespace rangesfm {
 namespace {
 
-using Array = py::array_t<double, py::array::c_style | py::array::forcecast>;
+using OptionalArray = std::optional<Array>;
 
-double Finite(const std::string& name, double value) {
-  if (!std::isfinite(value)) {
-    throw py::value_error(name + " is " + std::to_string(value) + ", expected a finite number");
+MeasuredRanges Measured(const Array& range_m, const Array& stddev_m) {
+  if (range_m.ndim() > 1 || range_m.size() == 0) {
+    FailOnShape("range_m", range_m, "one number, or one dimension and one number or more");
   }
-  return value;
+  const Eigen::Index num_ranges = range_m.size();
+  return {ForEachRange("range_m", range_m, num_ranges, Positive),
+          ForEachRange("stddev_m", stddev_m, num_ranges, Positive)};
 }
 
-double Positive(const std::string& name, double value) {
-  if (Finite(name, value) <= 0.0) {
-    throw py::value_error(name + " is " + std::to_string(value) + ", expected more than 0");
+// Distance and error in the two columns.
+std::shared_ptr<const RangeErrorCurve> Tabulated(const Array& error_curve_m) {
+  if (error_curve_m.ndim() != 2 || error_curve_m.shape(0) < 2 || error_curve_m.shape(1) != 2) {
+    FailOnShape("error_curve_m", error_curve_m, "two columns and two rows or more");
   }
-  return value;
-}
-
-double Weight(const std::string& name, double value) {
-  if (Finite(name, value) < 0.0 || value > 1.0) {
-    throw py::value_error(name + " is " + std::to_string(value) + ", expected a number from 0 to 1");
+  const Eigen::Map<const Eigen::Matrix2Xd> columns(error_curve_m.data(), 2, error_curve_m.shape(0));
+  CheckEach("error_curve_m", columns.reshaped(), Finite);
+  const Eigen::VectorXd distance = columns.row(0);
+  const Eigen::Index num_steps = distance.size() - 1;
+  if ((distance.tail(num_steps).array() <= distance.head(num_steps).array()).any()) {
+    throw py::value_error("error_curve_m: expected distances that increase from row to row");
   }
-  return value;
+  return std::make_shared<TabulatedCurve>(distance, columns.row(1));
 }
 
-int BlockSize(const std::string& name, int value) {
-  if (value <= 0) {
-    throw py::value_error(name + " is " + std::to_string(value) + ", expected 1 or more");
+// What the three range costs have in common.
+RangeModel Model(bool has_common_bias, std::optional<double> short_range_length_m, const OptionalArray& error_curve_m,
+                 double loss_scale_too_long, double loss_scale_too_short) {
+  RangeModel model;
+  model.has_common_bias = has_common_bias;
+  if (short_range_length_m && error_curve_m) {
+    throw py::value_error("short_range_length_m and error_curve_m are both given, expected one of them");
   }
-  return value;
-}
-
-Eigen::VectorXd FiniteVector(const std::string& name, const Array& array) {
-  if (array.ndim() != 1 || array.size() == 0) {
-    throw py::value_error(name + " has " + std::to_string(array.ndim()) + " dimensions and " +
-                          std::to_string(array.size()) + " numbers, expected one dimension and one number or more");
+  if (short_range_length_m) {
+    model.error_curve = std::make_shared<ExponentialCurve>(Positive("short_range_length_m", *short_range_length_m));
+  } else if (error_curve_m) {
+    model.error_curve = Tabulated(*error_curve_m);
   }
-  const Eigen::Map<const Eigen::VectorXd> vector(array.data(), array.size());
-  for (const double value : vector) {
-    Finite(name, value);
+  model.loss = TwoSidedCauchy(PositiveOrInfinite("loss_scale_too_long", loss_scale_too_long),
+                              PositiveOrInfinite("loss_scale_too_short", loss_scale_too_short));
+  return model;
+}
+
+std::optional<Eigen::Vector3d> LeverArm(const OptionalArray& tag_in_cam_m) {
+  if (!tag_in_cam_m) {
+    return std::nullopt;
   }
-  return vector;
+  return FiniteVector3("tag_in_cam_m", *tag_in_cam_m);
 }
 
-Eigen::Vector3d FiniteVector3(const std::string& name, const Array& array) {
-  if (array.ndim() != 1 || array.size() != 3) {
-    throw py::value_error(name + " has " + std::to_string(array.ndim()) + " dimensions and " +
-                          std::to_string(array.size()) + " numbers, expected one dimension and 3 numbers");
+ceres::CostFunction* MakeFixedPoseRangeCost(MeasuredRanges measured, RangeModel model, const Array& tag_in_world_m) {
+  const KnownPlace place(FiniteVector3("tag_in_world_m", tag_in_world_m));
+  return new RangeCost<KnownPlace>(place, std::move(measured), std::move(model));
+}
+
+ceres::CostFunction* MakeRangeCost(MeasuredRanges measured, RangeModel model, const OptionalArray& tag_in_cam_m) {
+  model.tag_in_cam = LeverArm(tag_in_cam_m);
+  return new RangeCost<KeyframePlace>(KeyframePlace(), std::move(measured), std::move(model));
+}
+
+ceres::CostFunction* MakeInterpolatedRangeCost(MeasuredRanges measured, RangeModel model,
+                                               const OptionalArray& tag_in_cam_m, const Array& weight,
+                                               const Array& offset_in_world_m, std::optional<double> interval_s,
+                                               const OptionalArray& offset_velocity_in_world_m_per_s) {
+  const Eigen::Index num_ranges = measured.range.size();
+  model.tag_in_cam = LeverArm(tag_in_cam_m);
+  model.has_time_shift = interval_s.has_value();
+  Eigen::Matrix3Xd offset_velocity = Eigen::Matrix3Xd::Zero(3, num_ranges);
+  if (offset_velocity_in_world_m_per_s) {
+    offset_velocity =
+        Vector3ForEachRange("offset_velocity_in_world_m_per_s", *offset_velocity_in_world_m_per_s, num_ranges);
   }
-  return FiniteVector(name, array);
+  InterpolatedPlace place(ForEachRange("weight", weight, num_ranges, Weight),
+                          Vector3ForEachRange("offset_in_world_m", offset_in_world_m, num_ranges),
+                          Positive("interval_s", interval_s.value_or(1.0)), std::move(offset_velocity));
+  return new RangeCost<InterpolatedPlace>(std::move(place), std::move(measured), std::move(model));
 }
 
-ceres::CostFunction* MakeRangeCost(double range_m, const Array& tag_in_cam_m, double stddev_m) {
-  return new RangeCost(Positive("range_m", range_m), FiniteVector3("tag_in_cam_m", tag_in_cam_m),
-                       Positive("stddev_m", stddev_m));
+template <typename EndA, typename EndB>
+ceres::CostFunction* MakeDistanceCostBetween(double distance_m, const EndA& a, const EndB& b, double stddev_m,
+                                             bool has_bias) {
+  return new DistanceCost<EndA, EndB>(Positive("distance_m", distance_m), a, b, Positive("stddev_m", stddev_m),
+                                      has_bias);
 }
 
-ceres::CostFunction* MakeFixedPoseRangeCost(double range_m, const Array& tag_in_world_m, double stddev_m) {
-  return new FixedPoseRangeCost(Positive("range_m", range_m), FiniteVector3("tag_in_world_m", tag_in_world_m),
-                                Positive("stddev_m", stddev_m));
-}
-
-ceres::CostFunction* MakeInterpolatedRangeCost(double range_m, const Array& tag_in_cam_m, double weight,
-                                               const Array& offset_in_world_m, double stddev_m) {
-  return new InterpolatedRangeCost(Positive("range_m", range_m), FiniteVector3("tag_in_cam_m", tag_in_cam_m),
-                                   Weight("weight", weight), FiniteVector3("offset_in_world_m", offset_in_world_m),
-                                   Positive("stddev_m", stddev_m));
+ceres::CostFunction* MakeDistanceCost(double distance_m, double stddev_m, const OptionalArray& a_in_cam_m,
+                                      const OptionalArray& b_in_cam_m, bool has_bias) {
+  if (a_in_cam_m && b_in_cam_m) {
+    return MakeDistanceCostBetween(distance_m, CamEnd(FiniteVector3("a_in_cam_m", *a_in_cam_m)),
+                                   CamEnd(FiniteVector3("b_in_cam_m", *b_in_cam_m)), stddev_m, has_bias);
+  }
+  if (a_in_cam_m) {
+    return MakeDistanceCostBetween(distance_m, CamEnd(FiniteVector3("a_in_cam_m", *a_in_cam_m)), PointEnd(), stddev_m,
+                                   has_bias);
+  }
+  if (b_in_cam_m) {
+    return MakeDistanceCostBetween(distance_m, PointEnd(), CamEnd(FiniteVector3("b_in_cam_m", *b_in_cam_m)), stddev_m,
+                                   has_bias);
+  }
+  return MakeDistanceCostBetween(distance_m, PointEnd(), PointEnd(), stddev_m, has_bias);
 }
 
 ceres::CostFunction* MakeNormalPriorCost(const Array& mean, const Array& stddev) {
@@ -97,14 +140,37 @@ ceres::CostFunction* MakeNormalPriorCost(const Array& mean, const Array& stddev)
     throw py::value_error("mean has " + std::to_string(means.size()) + " numbers and stddev " +
                           std::to_string(stddevs.size()) + ", expected as many");
   }
-  for (const double value : stddevs) {
-    Positive("stddev", value);
-  }
+  CheckEach("stddev", stddevs, Positive);
   return new NormalPriorCost(means, stddevs);
 }
 
 ceres::CostFunction* MakeZeroTieCost(int size_a, int size_b) {
   return new ZeroTieCost(BlockSize("size_a", size_a), BlockSize("size_b", size_b));
+}
+
+constexpr double kLeastSquares = std::numeric_limits<double>::infinity();
+constexpr auto kOwn = py::return_value_policy::take_ownership;
+
+// A factory of range costs at one kind of place: the ranges, what is particular to the place, and the model that all
+// have in common.
+template <typename... OfPlace, typename... PlaceArguments>
+void DefineRangeCost(py::module_& m, const char* name,
+                     ceres::CostFunction* (*make)(MeasuredRanges, RangeModel, OfPlace...),
+                     const PlaceArguments&... place_arguments) {
+  m.def(
+      name,
+      [make](const Array& range_m, const Array& stddev_m, OfPlace... of_place, bool has_common_bias,
+             std::optional<double> short_range_length_m, const OptionalArray& error_curve_m, double loss_scale_too_long,
+             double loss_scale_too_short) {
+        return make(
+            Measured(range_m, stddev_m),
+            Model(has_common_bias, short_range_length_m, error_curve_m, loss_scale_too_long, loss_scale_too_short),
+            of_place...);
+      },
+      kOwn, py::kw_only(), py::arg("range_m"), py::arg("stddev_m"), place_arguments...,
+      py::arg("has_common_bias") = false, py::arg("short_range_length_m") = py::none(),
+      py::arg("error_curve_m") = py::none(), py::arg("loss_scale_too_long") = kLeastSquares,
+      py::arg("loss_scale_too_short") = kLeastSquares);
 }
 
 }  // namespace
@@ -118,13 +184,15 @@ PYBIND11_MODULE(_cpp, m) {
       PYBIND11_VERSION_MINOR) "." PYBIND11_TOSTRING(PYBIND11_VERSION_PATCH);
   m.attr("pybind11_internals_version") = PYBIND11_INTERNALS_VERSION;
 
-  constexpr auto kOwn = py::return_value_policy::take_ownership;
-  m.def("range_cost", &rangesfm::MakeRangeCost, kOwn, py::kw_only(), py::arg("range_m"), py::arg("tag_in_cam_m"),
-        py::arg("stddev_m"));
-  m.def("fixed_pose_range_cost", &rangesfm::MakeFixedPoseRangeCost, kOwn, py::kw_only(), py::arg("range_m"),
-        py::arg("tag_in_world_m"), py::arg("stddev_m"));
-  m.def("interpolated_range_cost", &rangesfm::MakeInterpolatedRangeCost, kOwn, py::kw_only(), py::arg("range_m"),
-        py::arg("tag_in_cam_m"), py::arg("weight"), py::arg("offset_in_world_m"), py::arg("stddev_m"));
-  m.def("normal_prior_cost", &rangesfm::MakeNormalPriorCost, kOwn, py::kw_only(), py::arg("mean"), py::arg("stddev"));
-  m.def("zero_tie_cost", &rangesfm::MakeZeroTieCost, kOwn, py::kw_only(), py::arg("size_a"), py::arg("size_b"));
+  rangesfm::DefineRangeCost(m, "fixed_pose_range_cost", &rangesfm::MakeFixedPoseRangeCost, py::arg("tag_in_world_m"));
+  rangesfm::DefineRangeCost(m, "range_cost", &rangesfm::MakeRangeCost, py::arg("tag_in_cam_m"));
+  rangesfm::DefineRangeCost(m, "interpolated_range_cost", &rangesfm::MakeInterpolatedRangeCost, py::arg("tag_in_cam_m"),
+                            py::arg("weight"), py::arg("offset_in_world_m"), py::arg("interval_s") = py::none(),
+                            py::arg("offset_velocity_in_world_m_per_s") = py::none());
+  m.def("distance_cost", &rangesfm::MakeDistanceCost, rangesfm::kOwn, py::kw_only(), py::arg("distance_m"),
+        py::arg("stddev_m"), py::arg("a_in_cam_m"), py::arg("b_in_cam_m"), py::arg("has_bias"));
+  m.def("normal_prior_cost", &rangesfm::MakeNormalPriorCost, rangesfm::kOwn, py::kw_only(), py::arg("mean"),
+        py::arg("stddev"));
+  m.def("zero_tie_cost", &rangesfm::MakeZeroTieCost, rangesfm::kOwn, py::kw_only(), py::arg("size_a"),
+        py::arg("size_b"));
 }

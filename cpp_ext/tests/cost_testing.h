@@ -81,20 +81,26 @@ inline Evaluation Evaluate(const ceres::CostFunction& cost, const std::vector<Bl
   return evaluation;
 }
 
-// Expects the analytic Jacobians to be what Ridders' method makes of the residuals, in the tangent spaces.
+// Expects the analytic Jacobians to be what Ridders' method makes of the residuals, in the tangent spaces. Which first
+// step leads it to the last digits depends on how curved the residuals are: a wrong Jacobian fails for any.
 inline void ExpectGradientsAreRight(const ceres::CostFunction& cost, const std::vector<Block>& blocks,
-                                    double initial_step = 1e-3, double tolerance = 1e-8) {
+                                    double tolerance = 1e-8) {
   const PoseManifold pose_manifold;
   std::vector<const ceres::Manifold*> manifolds;
   manifolds.reserve(blocks.size());
   for (const Block& block : blocks) {
     manifolds.push_back(block.size() == 7 ? &pose_manifold : nullptr);
   }
-  ceres::NumericDiffOptions options;
-  options.ridders_relative_initial_step_size = initial_step;
-  ceres::GradientChecker checker(&cost, &manifolds, options);
   ceres::GradientChecker::ProbeResults results;
-  EXPECT_TRUE(checker.Probe(Pointers(blocks).data(), tolerance, &results)) << results.error_log;
+  for (const double first_step : {1e-3, 1e-2, 1e-4, 1e-5}) {
+    ceres::NumericDiffOptions options;
+    options.ridders_relative_initial_step_size = first_step;
+    ceres::GradientChecker checker(&cost, &manifolds, options);
+    if (checker.Probe(Pointers(blocks).data(), tolerance, &results)) {
+      return;
+    }
+  }
+  ADD_FAILURE() << results.error_log;
 }
 
 // Ceres asks for residuals alone in line searches and leaves out the Jacobians of constant blocks.

@@ -1,15 +1,13 @@
-#include "rangesfm/fixed_pose_range_cost.h"
-
 #include <gtest/gtest.h>
 
 #include "cost_testing.h"
-#include "rangesfm/range_cost.h"
+#include "range_costs.h"
 
 namespace rangesfm {
 namespace {
 
 TEST(FixedPoseRangeCost, ResidualIsTheHandComputedOne) {
-  const FixedPoseRangeCost cost(5.0, Eigen::Vector3d(1.0, 2.0, 0.0), 0.1);
+  const auto cost = AtKnownPlace(5.0, Eigen::Vector3d(1.0, 2.0, 0.0), 0.1);
   EXPECT_NEAR(Evaluate(cost, {{4.0, 6.0, 0.0}, {0.25}}).residuals[0], 2.5, 1e-13);
 }
 
@@ -19,8 +17,8 @@ TEST(FixedPoseRangeCost, IsTheRangeCostWithoutItsPose) {
   const Eigen::Vector3d cam_in_world = random.Vector(5.0);
   const Eigen::Vector3d tag_in_cam = random.Vector(0.1);
   const Block anchor = ToBlock(random.Vector(5.0));
-  const RangeCost free_cost(3.0, tag_in_cam, 0.05);
-  const FixedPoseRangeCost fixed_cost(3.0, cam_in_world + cam_from_world.conjugate() * tag_in_cam, 0.05);
+  const auto free_cost = AtKeyframe(3.0, tag_in_cam, 0.05);
+  const auto fixed_cost = AtKnownPlace(3.0, cam_in_world + cam_from_world.conjugate() * tag_in_cam, 0.05);
   const Evaluation free = Evaluate(free_cost, {PoseBlock(cam_from_world, cam_in_world), anchor, {0.2}});
   const Evaluation fixed = Evaluate(fixed_cost, {anchor, {0.2}});
   EXPECT_NEAR(fixed.residuals[0], free.residuals[0], 1e-11);
@@ -33,20 +31,20 @@ TEST(FixedPoseRangeCost, IsTheRangeCostWithoutItsPose) {
 TEST(FixedPoseRangeCost, GradientsAreRightAtRandomPoints) {
   Random random(2);
   for (int i = 0; i < 100; ++i) {
-    const FixedPoseRangeCost cost(random.Uniform(0.1, 20.0), random.Vector(10.0), random.Uniform(0.01, 1.0));
+    const auto cost = AtKnownPlace(random.Uniform(0.1, 20.0), random.Vector(10.0), random.Uniform(0.01, 1.0));
     ExpectGradientsAreRight(cost, {ToBlock(random.Vector(10.0)), {random.Uniform(-1.0, 1.0)}});
   }
 }
 
 TEST(FixedPoseRangeCost, GradientsAreRightFarAwayAndForATinyStddev) {
   Random random(3);
-  const FixedPoseRangeCost cost(1e6, random.Vector(1e6), 1e-9);
+  const auto cost = AtKnownPlace(1e6, random.Vector(1e6), 1e-9);
   ExpectGradientsAreRight(cost, {ToBlock(random.Vector(1e6)), {0.0}});
 }
 
 TEST(FixedPoseRangeCost, AnswerIsFiniteWithTheTagOnTheAnchor) {
   const Eigen::Vector3d tag_in_world(1.0, 2.0, 3.0);
-  const Evaluation evaluation = Evaluate(FixedPoseRangeCost(0.5, tag_in_world, 0.1), {ToBlock(tag_in_world), {0.0}});
+  const Evaluation evaluation = Evaluate(AtKnownPlace(0.5, tag_in_world, 0.1), {ToBlock(tag_in_world), {0.0}});
   ExpectAllFinite(evaluation);
   EXPECT_DOUBLE_EQ(evaluation.residuals[0], -5.0);
   EXPECT_EQ(evaluation.jacobians[0], std::vector<double>(3, 0.0));
@@ -54,7 +52,7 @@ TEST(FixedPoseRangeCost, AnswerIsFiniteWithTheTagOnTheAnchor) {
 
 TEST(FixedPoseRangeCost, AnyJacobianMayBeLeftOut) {
   Random random(4);
-  ExpectAnyJacobianMayBeLeftOut(FixedPoseRangeCost(3.0, random.Vector(5.0), 0.1), {ToBlock(random.Vector(5.0)), {0.1}});
+  ExpectAnyJacobianMayBeLeftOut(AtKnownPlace(3.0, random.Vector(5.0), 0.1), {ToBlock(random.Vector(5.0)), {0.1}});
 }
 
 }  // namespace

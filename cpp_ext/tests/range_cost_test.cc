@@ -1,5 +1,3 @@
-#include "rangesfm/range_cost.h"
-
 #include <gtest/gtest.h>
 
 #include <algorithm>
@@ -7,6 +5,7 @@
 #include <functional>
 
 #include "cost_testing.h"
+#include "range_costs.h"
 
 namespace rangesfm {
 namespace {
@@ -16,7 +15,7 @@ Eigen::Vector3d TagInCam() { return {-0.0012, -0.0900, -0.0663}; }
 TEST(RangeCost, ResidualIsTheHandComputedOne) {
   // The camera at (1, 2.5, 0), turned by 90 degrees about z: its x axis is the world's -y. The tag, half a metre along
   // that axis, is at (1, 2, 0), 5 m from the anchor. Predicted 5.25 m, measured 5 m, in stddevs of 0.1 m: 2.5.
-  const RangeCost cost(5.0, Eigen::Vector3d(0.5, 0.0, 0.0), 0.1);
+  const auto cost = AtKeyframe(5.0, Eigen::Vector3d(0.5, 0.0, 0.0), 0.1);
   const Block pose = {0.0, 0.0, std::sqrt(0.5), std::sqrt(0.5), 2.5, -1.0, 0.0};
   const Evaluation evaluation = Evaluate(cost, {pose, {4.0, 6.0, 0.0}, {0.25}});
   EXPECT_NEAR(evaluation.residuals[0], 2.5, 1e-13);
@@ -28,8 +27,8 @@ TEST(RangeCost, MovingTheCameraOntoTheTagGivesTheSameResidual) {
   const Eigen::Vector3d cam_in_world = random.Vector(5.0);
   const Eigen::Vector3d tag_in_world = cam_in_world + cam_from_world.conjugate() * TagInCam();
   const Block anchor = ToBlock(random.Vector(5.0));
-  const RangeCost with_lever_arm(4.0, TagInCam(), 0.1);
-  const RangeCost without(4.0, Eigen::Vector3d::Zero(), 0.1);
+  const auto with_lever_arm = AtKeyframe(4.0, TagInCam(), 0.1);
+  const auto without = AtKeyframe(4.0, Eigen::Vector3d::Zero(), 0.1);
   EXPECT_NEAR(Evaluate(with_lever_arm, {PoseBlock(cam_from_world, cam_in_world), anchor, {0.0}}).residuals[0],
               Evaluate(without, {PoseBlock(cam_from_world, tag_in_world), anchor, {0.0}}).residuals[0], 1e-12);
 }
@@ -37,7 +36,7 @@ TEST(RangeCost, MovingTheCameraOntoTheTagGivesTheSameResidual) {
 TEST(RangeCost, GradientsAreRightAtRandomPoints) {
   Random random(2);
   for (int i = 0; i < 100; ++i) {
-    const RangeCost cost(random.Uniform(0.1, 20.0), random.Vector(1.0), random.Uniform(0.01, 1.0));
+    const auto cost = AtKeyframe(random.Uniform(0.1, 20.0), random.Vector(1.0), random.Uniform(0.01, 1.0));
     ExpectGradientsAreRight(
         cost,
         {PoseBlock(random.Rotation(), random.Vector(10.0)), ToBlock(random.Vector(10.0)), {random.Uniform(-1.0, 1.0)}});
@@ -46,7 +45,7 @@ TEST(RangeCost, GradientsAreRightAtRandomPoints) {
 
 TEST(RangeCost, GradientsAreRightForEitherSignOfTheQuaternion) {
   Random random(3);
-  const RangeCost cost(3.0, TagInCam(), 0.1);
+  const auto cost = AtKeyframe(3.0, TagInCam(), 0.1);
   const Block anchor = ToBlock(random.Vector(5.0));
   Block pose = PoseBlock(random.Rotation(), random.Vector(5.0));
   const double residual = Evaluate(cost, {pose, anchor, {0.0}}).residuals[0];
@@ -57,13 +56,13 @@ TEST(RangeCost, GradientsAreRightForEitherSignOfTheQuaternion) {
 
 TEST(RangeCost, GradientsAreRightFarAway) {
   Random random(4);
-  const RangeCost cost(1e6, TagInCam(), 0.1);
+  const auto cost = AtKeyframe(1e6, TagInCam(), 0.1);
   ExpectGradientsAreRight(cost, {PoseBlock(random.Rotation(), random.Vector(1e6)), ToBlock(random.Vector(1e6)), {0.0}});
 }
 
 TEST(RangeCost, GradientsAreRightForATinyStddev) {
   Random random(5);
-  const RangeCost cost(3.0, TagInCam(), 1e-9);
+  const auto cost = AtKeyframe(3.0, TagInCam(), 1e-9);
   ExpectGradientsAreRight(cost, {PoseBlock(random.Rotation(), random.Vector(5.0)), ToBlock(random.Vector(5.0)), {0.1}});
 }
 
@@ -72,14 +71,14 @@ TEST(RangeCost, GradientsAreRightWithTheTagAlmostOnTheAnchor) {
   const Eigen::Quaterniond cam_from_world = random.Rotation();
   const Eigen::Vector3d cam_in_world = random.Vector(1.0);
   const Eigen::Vector3d tag_in_world = cam_in_world + cam_from_world.conjugate() * TagInCam();
-  const RangeCost cost(0.1, TagInCam(), 0.05);
+  const auto cost = AtKeyframe(0.1, TagInCam(), 0.05);
   const Eigen::Vector3d anchor = tag_in_world + Eigen::Vector3d(1e-3, -2e-3, 1e-3);
   // Steps that stay well on this side of the anchor; what they cost in digits, the tolerance gives.
-  ExpectGradientsAreRight(cost, {PoseBlock(cam_from_world, cam_in_world), ToBlock(anchor), {0.0}}, 1e-5, 1e-6);
+  ExpectGradientsAreRight(cost, {PoseBlock(cam_from_world, cam_in_world), ToBlock(anchor), {0.0}}, 1e-6);
 }
 
 TEST(RangeCost, AnswerIsFiniteWithTheTagOnTheAnchor) {
-  const RangeCost cost(0.5, TagInCam(), 0.1);
+  const auto cost = AtKeyframe(0.5, TagInCam(), 0.1);
   const Block pose = {0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0};
   const Evaluation evaluation = Evaluate(cost, {pose, ToBlock(TagInCam()), {0.0}});
   ExpectAllFinite(evaluation);
@@ -92,7 +91,7 @@ TEST(RangeCost, AnswerIsFiniteWithTheTagOnTheAnchor) {
 TEST(RangeCost, PullsWithFullStrengthAnyDistanceFromTheAnchor) {
   // The derivative with respect to the anchor is a unit vector over the stddev, however near or far.
   const Block pose = {0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0};
-  const RangeCost cost(1.0, Eigen::Vector3d::Zero(), 0.1);
+  const auto cost = AtKeyframe(1.0, Eigen::Vector3d::Zero(), 0.1);
   for (const double distance : {1e-11, 1e-6, 1.0, 1e6}) {
     const Evaluation evaluation = Evaluate(cost, {pose, {0.0, distance, 0.0}, {0.0}});
     EXPECT_DOUBLE_EQ(evaluation.jacobians[1][1], 10.0) << distance;
@@ -101,7 +100,7 @@ TEST(RangeCost, PullsWithFullStrengthAnyDistanceFromTheAnchor) {
 
 TEST(RangeCost, AnyJacobianMayBeLeftOut) {
   Random random(7);
-  const RangeCost cost(3.0, TagInCam(), 0.1);
+  const auto cost = AtKeyframe(3.0, TagInCam(), 0.1);
   ExpectAnyJacobianMayBeLeftOut(cost,
                                 {PoseBlock(random.Rotation(), random.Vector(5.0)), ToBlock(random.Vector(5.0)), {0.1}});
 }

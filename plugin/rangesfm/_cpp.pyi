@@ -2,17 +2,57 @@
 
 import numpy.typing as npt
 
-from rangesfm._ceres import CostFunction
+from rangesfm._ceres.types import CostFunction
 
 version: str
 ceres_version: str
 pybind11_version: str
 pybind11_internals_version: int
 
-def range_cost(*, range_m: float, tag_in_cam_m: npt.ArrayLike, stddev_m: float) -> CostFunction: ...
-def fixed_pose_range_cost(*, range_m: float, tag_in_world_m: npt.ArrayLike, stddev_m: float) -> CostFunction: ...
+def range_cost(
+    *,
+    range_m: npt.ArrayLike,
+    stddev_m: npt.ArrayLike,
+    tag_in_cam_m: npt.ArrayLike | None,
+    has_common_bias: bool = ...,
+    short_range_length_m: float | None = ...,
+    error_curve_m: npt.ArrayLike | None = ...,
+    loss_scale_too_long: float = ...,
+    loss_scale_too_short: float = ...,
+) -> CostFunction: ...
+def fixed_pose_range_cost(
+    *,
+    range_m: npt.ArrayLike,
+    stddev_m: npt.ArrayLike,
+    tag_in_world_m: npt.ArrayLike,
+    has_common_bias: bool = ...,
+    short_range_length_m: float | None = ...,
+    error_curve_m: npt.ArrayLike | None = ...,
+    loss_scale_too_long: float = ...,
+    loss_scale_too_short: float = ...,
+) -> CostFunction: ...
 def interpolated_range_cost(
-    *, range_m: float, tag_in_cam_m: npt.ArrayLike, weight: float, offset_in_world_m: npt.ArrayLike, stddev_m: float
+    *,
+    range_m: npt.ArrayLike,
+    stddev_m: npt.ArrayLike,
+    tag_in_cam_m: npt.ArrayLike | None,
+    weight: npt.ArrayLike,
+    offset_in_world_m: npt.ArrayLike,
+    interval_s: float | None = ...,
+    offset_velocity_in_world_m_per_s: npt.ArrayLike | None = ...,
+    has_common_bias: bool = ...,
+    short_range_length_m: float | None = ...,
+    error_curve_m: npt.ArrayLike | None = ...,
+    loss_scale_too_long: float = ...,
+    loss_scale_too_short: float = ...,
+) -> CostFunction: ...
+def distance_cost(
+    *,
+    distance_m: float,
+    stddev_m: float,
+    a_in_cam_m: npt.ArrayLike | None,
+    b_in_cam_m: npt.ArrayLike | None,
+    has_bias: bool,
 ) -> CostFunction: ...
 def normal_prior_cost(*, mean: npt.ArrayLike, stddev: npt.ArrayLike) -> CostFunction: ...
 def zero_tie_cost(*, size_a: int, size_b: int) -> CostFunction: ...

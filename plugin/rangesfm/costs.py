@@ -1,13 +1,20 @@
-"""The range residuals alone, for bundle adjustment programs of one's own.
+"""The range and distance residuals alone, for bundle adjustment programs of one's own.
 
 See ``examples/own_problem.py``. Blocks, units and errors are described with each function.
 """
 
 from rangesfm._ceres import (
+    AddedRanges,
     CostFunction,
     LossFunction,
+    PlacedRanges,
+    RangeBlocks,
+    RangeErrorModel,
+    add_ranges,
     add_residual_block,
     cauchy_loss,
+    combine_ranges,
+    distance_cost,
     fixed_pose_range_cost,
     interpolated_range_cost,
     normal_prior_cost,
@@ -16,10 +23,17 @@ from rangesfm._ceres import (
 )
 
 __all__ = [
+    "AddedRanges",
     "CostFunction",
     "LossFunction",
+    "PlacedRanges",
+    "RangeBlocks",
+    "RangeErrorModel",
+    "add_ranges",
     "add_residual_block",
     "cauchy_loss",
+    "combine_ranges",
+    "distance_cost",
     "fixed_pose_range_cost",
     "interpolated_range_cost",
     "normal_prior_cost",

@@ -1,50 +1,151 @@
 #ifndef RANGESFM_RANGE_COST_H_
 #define RANGESFM_RANGE_COST_H_
 
-#include <ceres/sized_cost_function.h>
+#include <ceres/cost_function.h>
 
 #include <Eigen/Core>
+#include <memory>
+#include <optional>
+#include <utility>
 
+#include "rangesfm/range_error_curve.h"
 #include "rangesfm/range_geometry.h"
+#include "rangesfm/tag_place.h"
+#include "rangesfm/two_sided_cauchy.h"
 
 namespace rangesfm {
 
-// 1-DoF error of a range measured at a keyframe, in stddevs:
+// Ranges as measured, n of them.
+struct MeasuredRanges {
+  Eigen::VectorXd range;
+  Eigen::VectorXd stddev;
+};
+
+// How a range follows from the two antennas, and what of that is estimated along with the map.
+struct RangeModel {
+  std::optional<Eigen::Vector3d> tag_in_cam = Eigen::Vector3d::Zero();  // nothing: a parameter block
+  bool has_time_shift = false;                                          // a block; of InterpolatedPlace
+  bool has_common_bias = false;                                         // a block
+  std::shared_ptr<const RangeErrorCurve> error_curve;                   // if there is one, its amplitude is a block
+  TwoSidedCauchy loss;
+};
+
+// n-DoF error of the ranges between the tag at one place and one anchor, in stddevs; for each of them
 //
-//   (|| R^T (tag_in_cam - t) - anchor_in_world || + bias - range) / stddev
+//   (d + bias + common_bias + amplitude error_curve(d) - range) / stddev,  d = || tag_in_world - anchor_in_world ||,
 //
-// Blocks: rig_from_world (7: qx qy qz qw tx ty tz), anchor_in_world (3), range bias (1: what the radio reads too
-// long). Metres throughout. Needs the model to be metric already, or close to it.
-class RangeCost final : public ceres::SizedCostFunction<1, 7, 3, 1> {
+// made robust one by one. Metres and seconds throughout. Needs the model to be metric already, or close to it.
+//
+// Blocks: those of the place's poses (7 each: qx qy qz qw tx ty tz), anchor_in_world (3), range bias (1: what the radio
+// reads too long), and, as far as the model has them, in this order: tag_in_cam (3), time shift (1), common bias (1),
+// amplitude (1).
+template <typename Place>
+class RangeCost final : public ceres::CostFunction {
  public:
-  RangeCost(double range, const Eigen::Vector3d& tag_in_cam, double stddev)
-      : range_(range), tag_in_cam_(tag_in_cam), inv_stddev_(1.0 / stddev) {}
+  RangeCost(Place place, MeasuredRanges measured, RangeModel model)
+      : place_(std::move(place)),
+        range_(std::move(measured.range)),
+        inv_stddev_(measured.stddev.cwiseInverse()),
+        model_(std::move(model)) {
+    set_num_residuals(static_cast<int>(range_.size()));
+    for (int pose = 0; pose < Place::kNumPoses; ++pose) {
+      AddBlock(true, kPoseSize);
+    }
+    anchor_ = AddBlock(true, 3);
+    bias_ = AddBlock(true, 1);
+    lever_arm_ = AddBlock(!model_.tag_in_cam.has_value(), 3);
+    time_shift_ = AddBlock(model_.has_time_shift, 1);
+    common_bias_ = AddBlock(model_.has_common_bias, 1);
+    amplitude_ = AddBlock(model_.error_curve != nullptr, 1);
+  }
 
   bool Evaluate(double const* const* parameters, double* residuals, double** jacobians) const override {
-    const TagPosition tag(parameters[0], tag_in_cam_);
-    const AnchorToTag anchor_to_tag(tag.InWorld(), parameters[1]);
-    const double bias = *parameters[2];
-    residuals[0] = (anchor_to_tag.Distance() + bias - range_) * inv_stddev_;
-    if (jacobians == nullptr) {
-      return true;
-    }
-    const Eigen::Vector3d direction = anchor_to_tag.Direction() * inv_stddev_;
-    if (jacobians[0] != nullptr) {
-      Eigen::Map<PoseGradient>{jacobians[0]} = tag.Gradient(direction);
-    }
-    if (jacobians[1] != nullptr) {
-      Eigen::Map<Eigen::Vector3d>{jacobians[1]} = -direction;
-    }
-    if (jacobians[2] != nullptr) {
-      jacobians[2][0] = inv_stddev_;
+    const typename Place::Now place(place_, parameters, Motion(parameters));
+    const double bias = *parameters[bias_] + Number(parameters, common_bias_);
+    for (int i = 0; i < num_residuals(); ++i) {
+      const AnchorToTag anchor_to_tag(place.TagInWorld(i), parameters[anchor_]);
+      const RangeErrorCurve::Point curve = Curve(anchor_to_tag.Distance());
+      const double amplitude = Number(parameters, amplitude_);
+      const double predicted = anchor_to_tag.Distance() + bias + amplitude * curve.value;
+      const TwoSidedCauchy::Robust robust = model_.loss((predicted - range_[i]) * inv_stddev_[i]);
+      residuals[i] = robust.value;
+      if (jacobians != nullptr) {
+        const double of_range = robust.slope * inv_stddev_[i];
+        const double of_distance = of_range * (1.0 + amplitude * curve.slope);
+        WriteGeometry(i, place, of_distance * anchor_to_tag.Direction(), jacobians);
+        WriteNumber(i, bias_, of_range, jacobians);
+        WriteNumber(i, common_bias_, of_range, jacobians);
+        WriteNumber(i, amplitude_, of_range * curve.value, jacobians);
+      }
     }
     return true;
   }
 
  private:
-  const double range_;
-  const Eigen::Vector3d tag_in_cam_;
-  const double inv_stddev_;
+  static constexpr int kPoseSize = 7;
+  static constexpr int kNone = -1;
+
+  int AddBlock(bool is_there, int size) {
+    if (!is_there) {
+      return kNone;
+    }
+    mutable_parameter_block_sizes()->push_back(size);
+    return static_cast<int>(parameter_block_sizes().size()) - 1;
+  }
+
+  static double Number(double const* const* parameters, int block) { return block == kNone ? 0.0 : *parameters[block]; }
+
+  TagMotion Motion(double const* const* parameters) const {
+    return {model_.tag_in_cam ? *model_.tag_in_cam : Eigen::Vector3d(parameters[lever_arm_]),
+            Number(parameters, time_shift_)};
+  }
+
+  RangeErrorCurve::Point Curve(double distance) const {
+    return model_.error_curve == nullptr ? RangeErrorCurve::Point{0.0, 0.0} : model_.error_curve->At(distance);
+  }
+
+  // Where the derivatives of one range with respect to a block go; null if nobody asks for them.
+  double* Row(int range, int block, double** jacobians) const {
+    if (block == kNone || jacobians[block] == nullptr) {
+      return nullptr;
+    }
+    return jacobians[block] + range * parameter_block_sizes()[block];
+  }
+
+  void WriteGeometry(int range, const typename Place::Now& place, const Eigen::Vector3d& direction,
+                     double** jacobians) const {
+    for (int pose = 0; pose < Place::kNumPoses; ++pose) {
+      if (double* const row = Row(range, pose, jacobians)) {
+        Eigen::Map<PoseGradient>{row} = place.OfPose(pose, range, direction);
+      }
+    }
+    if (double* const row = Row(range, anchor_, jacobians)) {
+      Eigen::Map<Eigen::Vector3d>{row} = -direction;
+    }
+    if (double* const row = Row(range, lever_arm_, jacobians)) {
+      Eigen::Map<Eigen::Vector3d>{row} = place.OfLeverArm(range, direction);
+    }
+    if (double* const row = Row(range, time_shift_, jacobians)) {
+      *row = place.OfTimeShift(range, direction);
+    }
+  }
+
+  void WriteNumber(int range, int block, double value, double** jacobians) const {
+    if (double* const row = Row(range, block, jacobians)) {
+      *row = value;
+    }
+  }
+
+  const Place place_;
+  const Eigen::VectorXd range_;
+  const Eigen::VectorXd inv_stddev_;
+  const RangeModel model_;
+  int anchor_ = kNone;
+  int bias_ = kNone;
+  int lever_arm_ = kNone;
+  int time_shift_ = kNone;
+  int common_bias_ = kNone;
+  int amplitude_ = kNone;
 };
 
 }  // namespace rangesfm

@@ -1,4 +1,5 @@
-// What the range costs share: where the tag is, how far from the anchor, and how both move with the parameters.
+// What ranges and distances share: where a point of a camera is, how far from another, and how both move with the
+// parameters.
 
 #ifndef RANGESFM_RANGE_GEOMETRY_H_
 #define RANGESFM_RANGE_GEOMETRY_H_
@@ -39,9 +40,12 @@ class TagPosition {
     gradient.head<3>() =
         2.0 * (w * direction.cross(d) + u.dot(d) * direction + u.dot(direction) * d - 2.0 * direction.dot(d) * u);
     gradient(3) = -2.0 * direction.dot(u.cross(d));
-    gradient.tail<3>() = -(cam_from_world_ * direction);
+    gradient.tail<3>() = -LeverArmGradient(direction);
     return gradient;
   }
+
+  // The same with respect to tag_in_cam.
+  Eigen::Vector3d LeverArmGradient(const Eigen::Vector3d& direction) const { return cam_from_world_ * direction; }
 
  private:
   Eigen::Map<const Eigen::Quaterniond> cam_from_world_;

@@ -1,0 +1,102 @@
+#ifndef RANGESFM_DISTANCE_COST_H_
+#define RANGESFM_DISTANCE_COST_H_
+
+#include <ceres/cost_function.h>
+
+#include <Eigen/Core>
+
+#include "rangesfm/range_geometry.h"
+
+namespace rangesfm {
+
+// An end of a distance that is a parameter block itself: a 3-D point, an anchor.
+class PointEnd {
+ public:
+  static constexpr int kBlockSize = 3;
+
+  class Now {
+   public:
+    Now(const PointEnd& /*end*/, const double* block) : in_world_(block) {}
+
+    Eigen::Vector3d InWorld() const { return in_world_; }
+    static Eigen::RowVector3d Gradient(const Eigen::Vector3d& direction) { return direction.transpose(); }
+
+   private:
+    Eigen::Map<const Eigen::Vector3d> in_world_;
+  };
+};
+
+// An end that is fixed to a camera (to its rig frame), whose pose is the block.
+class CamEnd {
+ public:
+  static constexpr int kBlockSize = 7;
+
+  explicit CamEnd(const Eigen::Vector3d& end_in_cam) : end_in_cam_(end_in_cam) {}
+
+  class Now {
+   public:
+    Now(const CamEnd& end, const double* block) : position_(block, end.end_in_cam_) {}
+
+    const Eigen::Vector3d& InWorld() const { return position_.InWorld(); }
+    PoseGradient Gradient(const Eigen::Vector3d& direction) const { return position_.Gradient(direction); }
+
+   private:
+    TagPosition position_;
+  };
+
+ private:
+  Eigen::Vector3d end_in_cam_;
+};
+
+// 1-DoF error of a distance that was measured, by tape or by radio, in stddevs:
+//
+//   (|| a - b || + bias - distance) / stddev
+//
+// Blocks: those of the two ends (rig_from_world, 7: qx qy qz qw tx ty tz; or a point in the world, 3), and the bias (1:
+// what is read too long) if it has one. Metres throughout.
+template <typename EndA, typename EndB>
+class DistanceCost final : public ceres::CostFunction {
+ public:
+  DistanceCost(double distance, const EndA& a, const EndB& b, double stddev, bool has_bias)
+      : distance_(distance), a_(a), b_(b), inv_stddev_(1.0 / stddev), has_bias_(has_bias) {
+    set_num_residuals(1);
+    *mutable_parameter_block_sizes() = {EndA::kBlockSize, EndB::kBlockSize};
+    if (has_bias_) {
+      mutable_parameter_block_sizes()->push_back(1);
+    }
+  }
+
+  bool Evaluate(double const* const* parameters, double* residuals, double** jacobians) const override {
+    const typename EndA::Now a(a_, parameters[0]);
+    const typename EndB::Now b(b_, parameters[1]);
+    const Eigen::Vector3d& b_in_world = b.InWorld();
+    const AnchorToTag b_to_a(a.InWorld(), b_in_world.data());
+    const double bias = has_bias_ ? *parameters[2] : 0.0;
+    residuals[0] = (b_to_a.Distance() + bias - distance_) * inv_stddev_;
+    if (jacobians == nullptr) {
+      return true;
+    }
+    const Eigen::Vector3d direction = b_to_a.Direction() * inv_stddev_;
+    if (jacobians[0] != nullptr) {
+      Eigen::Map<Eigen::Matrix<double, 1, EndA::kBlockSize>>{jacobians[0]} = a.Gradient(direction);
+    }
+    if (jacobians[1] != nullptr) {
+      Eigen::Map<Eigen::Matrix<double, 1, EndB::kBlockSize>>{jacobians[1]} = b.Gradient(-direction);
+    }
+    if (has_bias_ && jacobians[2] != nullptr) {
+      jacobians[2][0] = inv_stddev_;
+    }
+    return true;
+  }
+
+ private:
+  const double distance_;
+  const EndA a_;
+  const EndB b_;
+  const double inv_stddev_;
+  const bool has_bias_;
+};
+
+}  // namespace rangesfm
+
+#endif  // RANGESFM_DISTANCE_COST_H_

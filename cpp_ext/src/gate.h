@@ -1,0 +1,110 @@
+// What Python hands over, checked and turned into Eigen's types. What passes here never fails in the solver.
+
+#ifndef RANGESFM_SRC_GATE_H_
+#define RANGESFM_SRC_GATE_H_
+
+#include <pybind11/numpy.h>
+#include <pybind11/pybind11.h>
+
+#include <Eigen/Core>
+#include <cmath>
+#include <string>
+
+namespace rangesfm {
+
+using Array = pybind11::array_t<double, pybind11::array::c_style | pybind11::array::forcecast>;
+
+inline double Finite(const std::string& name, double value) {
+  if (!std::isfinite(value)) {
+    throw pybind11::value_error(name + " is " + std::to_string(value) + ", expected a finite number");
+  }
+  return value;
+}
+
+inline double Positive(const std::string& name, double value) {
+  if (Finite(name, value) <= 0.0) {
+    throw pybind11::value_error(name + " is " + std::to_string(value) + ", expected more than 0");
+  }
+  return value;
+}
+
+// A loss scale: infinity stands for least squares.
+inline double PositiveOrInfinite(const std::string& name, double value) {
+  return std::isinf(value) && value > 0.0 ? value : Positive(name, value);
+}
+
+inline double Weight(const std::string& name, double value) {
+  if (Finite(name, value) < 0.0 || value > 1.0) {
+    throw pybind11::value_error(name + " is " + std::to_string(value) + ", expected a number from 0 to 1");
+  }
+  return value;
+}
+
+inline int BlockSize(const std::string& name, int value) {
+  if (value <= 0) {
+    throw pybind11::value_error(name + " is " + std::to_string(value) + ", expected 1 or more");
+  }
+  return value;
+}
+
+[[noreturn]] inline void FailOnShape(const std::string& name, const Array& array, const std::string& expected) {
+  throw pybind11::value_error(name + " has " + std::to_string(array.ndim()) + " dimensions and " +
+                              std::to_string(array.size()) + " numbers, expected " + expected);
+}
+
+// Each number as `check` lets it through.
+template <typename Check>
+void CheckEach(const std::string& name, const Eigen::VectorXd& values, const Check& check) {
+  for (const double value : values) {
+    check(name, value);
+  }
+}
+
+inline Eigen::VectorXd FiniteVector(const std::string& name, const Array& array) {
+  if (array.ndim() != 1 || array.size() == 0) {
+    FailOnShape(name, array, "one dimension and one number or more");
+  }
+  Eigen::VectorXd vector = Eigen::Map<const Eigen::VectorXd>(array.data(), array.size());
+  CheckEach(name, vector, Finite);
+  return vector;
+}
+
+inline Eigen::Vector3d FiniteVector3(const std::string& name, const Array& array) {
+  if (array.ndim() != 1 || array.size() != 3) {
+    FailOnShape(name, array, "one dimension and 3 numbers");
+  }
+  return FiniteVector(name, array);
+}
+
+// (n,): one number for each of n ranges, or one for all.
+template <typename Check>
+Eigen::VectorXd ForEachRange(const std::string& name, const Array& array, Eigen::Index num_ranges, const Check& check) {
+  Eigen::VectorXd vector;
+  if (array.ndim() == 0) {
+    vector = Eigen::VectorXd::Constant(num_ranges, *array.data());
+  } else if (array.ndim() == 1 && array.size() == num_ranges) {
+    vector = Eigen::Map<const Eigen::VectorXd>(array.data(), num_ranges);
+  } else {
+    FailOnShape(name, array, "one number, or one for each of " + std::to_string(num_ranges) + " ranges");
+  }
+  CheckEach(name, vector, check);
+  return vector;
+}
+
+// (n, 3), a vector for each of n ranges, or (3,), one for all; as columns.
+inline Eigen::Matrix3Xd Vector3ForEachRange(const std::string& name, const Array& array, Eigen::Index num_ranges) {
+  Eigen::Matrix3Xd columns;
+  if (array.ndim() == 1 && array.size() == 3) {
+    columns = Eigen::Map<const Eigen::Vector3d>(array.data()).replicate(1, num_ranges);
+  } else if (array.ndim() == 2 && array.shape(0) == num_ranges && array.shape(1) == 3) {
+    columns = Eigen::Map<const Eigen::Matrix3Xd>(array.data(), 3, num_ranges);
+  } else {
+    FailOnShape(name, array, "3 numbers, or 3 for each of " + std::to_string(num_ranges) + " ranges");
+  }
+  CheckEach(name, columns.reshaped(), Finite);
+  return columns;
+}
+
+}  // namespace rangesfm
+
+#endif  // RANGESFM_SRC_GATE_H_

@@ -1,0 +1,40 @@
+// Range costs of one range and of many, made as the tests want them.
+
+#ifndef RANGESFM_TESTS_RANGE_COSTS_H_
+#define RANGESFM_TESTS_RANGE_COSTS_H_
+
+#include <Eigen/Core>
+#include <utility>
+
+#include "rangesfm/range_cost.h"
+#include "rangesfm/tag_place.h"
+
+namespace rangesfm {
+
+inline MeasuredRanges OneRange(double range, double stddev) {
+  return {Eigen::VectorXd::Constant(1, range), Eigen::VectorXd::Constant(1, stddev)};
+}
+
+inline RangeModel WithLeverArm(const Eigen::Vector3d& tag_in_cam) {
+  RangeModel model;
+  model.tag_in_cam = tag_in_cam;
+  return model;
+}
+
+inline RangeCost<KnownPlace> AtKnownPlace(double range, const Eigen::Vector3d& tag_in_world, double stddev) {
+  return {KnownPlace(tag_in_world), OneRange(range, stddev), RangeModel()};
+}
+
+inline RangeCost<KeyframePlace> AtKeyframe(double range, const Eigen::Vector3d& tag_in_cam, double stddev) {
+  return {KeyframePlace(), OneRange(range, stddev), WithLeverArm(tag_in_cam)};
+}
+
+inline RangeCost<InterpolatedPlace> BetweenKeyframes(double range, const Eigen::Vector3d& tag_in_cam, double weight,
+                                                     const Eigen::Vector3d& offset_in_world, double stddev) {
+  InterpolatedPlace place(Eigen::VectorXd::Constant(1, weight), offset_in_world, 1.0, Eigen::Vector3d::Zero());
+  return {std::move(place), OneRange(range, stddev), WithLeverArm(tag_in_cam)};
+}
+
+}  // namespace rangesfm
+
+#endif  // RANGESFM_TESTS_RANGE_COSTS_H_

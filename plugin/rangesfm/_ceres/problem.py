@@ -1,0 +1,80 @@
+"""Residuals into a bundle adjuster's problem, and robust losses for them."""
+
+from __future__ import annotations
+
+import math
+import weakref
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm._ceres.types import CostFunction, LossFunction
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_NUM_POSE_PARAMS = 7
+
+
+def cauchy_loss(scale: float) -> LossFunction:
+    """Cauchy's robust loss ``scale^2 log(1 + r^2 / scale^2)``; scale in stddevs, positive."""
+    if not (math.isfinite(scale) and scale > 0):
+        raise ValueError(f"loss scale is {scale}, expected a finite number greater than 0")
+    import pyceres
+
+    loss: LossFunction = pyceres.CauchyLoss(scale)
+    return loss
+
+
+def add_residual_block(
+    adjuster: pycolmap.CeresBundleAdjuster,
+    cost: CostFunction,
+    loss: LossFunction | None,
+    blocks: Sequence[npt.NDArray[np.float64]],
+) -> None:
+    """Add a residual to a bundle adjuster's problem, so that nothing it needs can go missing or astray.
+
+    ``adjuster.problem.add_residual_block`` does the same for those who know its two traps. There, cost, loss
+    and blocks live only as long as the Python object ``problem``, and to solve without it reads freed memory;
+    here they live as long as the adjuster. And a pose that the adjuster holds constant is part of its
+    reprojection costs, not of the problem: there, a range makes it a new free block without a manifold, which
+    then wanders off alone; here it is held, as is the pose of a frame without observations.
+
+    Args:
+        adjuster: from ``pycolmap.create_default_ceres_bundle_adjuster``.
+        cost: of which the blocks must have the sizes, in its order.
+        loss: None for least squares.
+        blocks: the arrays that the solver works on, in place: float64, contiguous, writeable.
+
+    Raises:
+        ValueError: a block is no such array, or given twice, or not of the cost's size.
+    """
+    ResidualAdder(adjuster).add(cost, loss, blocks)
+
+
+class ResidualAdder:
+    """What ``add_residual_block`` does, for one residual after the other into the same problem."""
+
+    def __init__(self, adjuster: pycolmap.CeresBundleAdjuster) -> None:
+        self._problem = adjuster.problem
+        self._used = _used_by_adjuster.setdefault(adjuster, [])
+
+    def add(self, cost: CostFunction, loss: LossFunction | None, blocks: Sequence[npt.NDArray[np.float64]]) -> None:
+        """See ``add_residual_block``."""
+        for block in blocks:
+            if block.dtype != np.float64 or not block.flags.carray:
+                raise ValueError("the solver works in place: a block must be a contiguous, writeable float64 array")
+        if len({block.__array_interface__["data"][0] for block in blocks}) < len(blocks):
+            raise ValueError("a block is given twice: the blocks of one residual must be different ones")
+        problem = self._problem
+        held = [b for b in blocks if b.size == _NUM_POSE_PARAMS and not problem.has_parameter_block(b)]
+        problem.add_residual_block(cost, loss, list(blocks))
+        for pose in held:
+            problem.set_parameter_block_constant(pose)
+        self._used.append((cost, loss, blocks))
+
+
+# What residuals refer to. The problem refers to its adjuster, so only a weak key lets the two go in the end.
+_used_by_adjuster: weakref.WeakKeyDictionary[pycolmap.CeresBundleAdjuster, list[Any]] = weakref.WeakKeyDictionary()

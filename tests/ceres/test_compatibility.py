@@ -1,0 +1,97 @@
+"""Whether what is installed fits together."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import re
+import subprocess
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from rangesfm import _cpp
+from rangesfm._ceres import (
+    CostFunction,
+    check_compatibility,
+    compatibility,
+    range_cost,
+)
+from rangesfm.errors import SolverError
+
+Array = npt.NDArray[np.float64]
+
+TAG_IN_CAM_M = np.array([-0.0012, -0.0900, -0.0663])
+
+
+def test_the_gate_opens_for_what_is_installed() -> None:
+    check_compatibility()
+
+
+@pytest.fixture
+def unchecked() -> Iterator[None]:
+    """Nothing has been checked yet in this process, and will not have been."""
+    check_compatibility.cache_clear()
+    yield
+    check_compatibility.cache_clear()
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(("package", "version"), [("pycolmap", "4.3.0"), ("pyceres", "2.5"), ("pyceres", None)])
+def test_the_gate_names_what_is_installed_what_is_needed_and_what_to_run(
+    monkeypatch: pytest.MonkeyPatch, package: str, version: str | None
+) -> None:
+    installed_version = compatibility.installed_version
+    monkeypatch.setattr(
+        compatibility, "installed_version", lambda name: version if name == package else installed_version(name)
+    )
+    with pytest.raises(SolverError) as caught:
+        range_cost(range_m=4.0, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=0.1)
+    message = str(caught.value)
+    assert f"{package} {version or 'not'}" in message
+    assert f"needs {package} {compatibility.NEEDED_VERSIONS[package]}" in message
+    assert "pip install 'pycolmap>=4.2,<4.3' 'pyceres>=2.6,<2.7'" in message
+    assert "\n" not in message
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_the_gate_stays_shut_where_types_are_not_shared(monkeypatch: pytest.MonkeyPatch) -> None:
+    # What pybind11 does with a type that its internals do not know.
+    def unknown_type(**_: object) -> CostFunction:
+        raise TypeError("Unable to convert function return value to a Python type! The signature was\n\t...")
+
+    monkeypatch.setattr(_cpp, "range_cost", unknown_type)
+    with pytest.raises(SolverError, match="pyceres does not know its cost functions"):
+        check_compatibility()
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_the_gate_stays_shut_where_a_known_cost_comes_out_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    right = _cpp.range_cost
+    monkeypatch.setattr(
+        _cpp,
+        "range_cost",
+        lambda *, range_m, tag_in_cam_m, stddev_m: right(
+            range_m=range_m, tag_in_cam_m=tag_in_cam_m, stddev_m=2 * stddev_m
+        ),
+    )
+    with pytest.raises(SolverError, match=r"a residual of cost 2\.0 costs 0\.5 in pyceres' problem"):
+        check_compatibility()
+
+
+def test_the_compiled_part_needs_no_library_that_pycolmap_does_not_need_too() -> None:
+    """Ceres is linked in, and never the system's: else two of them would meet."""
+    readelf = subprocess.run(["readelf", "-dW", _cpp.__file__], capture_output=True, text=True, check=True)
+    needed = set(re.findall(r"NEEDED.*\[(.+?)\.so", readelf.stdout))
+    assert needed <= {"libstdc++", "libm", "libgcc_s", "libc", "ld-linux-x86-64", "ld-linux-aarch64"}
+
+
+def test_the_pins_checked_are_the_pins_of_the_package() -> None:
+    requirements = importlib.metadata.requires("rangesfm")
+    assert requirements is not None
+    for package, needed in compatibility.NEEDED_VERSIONS.items():
+        major, minor = map(int, needed.split("."))
+        (requirement,) = (r for r in requirements if re.match(rf"{package}\b", r))
+        assert set(re.findall(r"[<>=]+[\d.]+", requirement)) == {f">={needed}", f"<{major}.{minor + 1}"}
+        assert f"'{package}>={needed},<{major}.{minor + 1}'" in compatibility.INSTALL_COMMAND

@@ -1,0 +1,236 @@
+"""A whole log of ranges in a bundle adjustment: the same as one by one, in fewer blocks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+import pytest
+
+from rangesfm._ceres import (
+    PlacedRanges,
+    RangeBlocks,
+    RangeErrorModel,
+    add_ranges,
+    add_residual_block,
+    cauchy_loss,
+    combine_ranges,
+    interpolated_range_cost,
+    range_cost,
+)
+
+if TYPE_CHECKING:
+    from tests.ceres.conftest import AdjusterOf, PoseBlock
+
+Array = npt.NDArray[np.float64]
+
+NUM_RANGES, NUM_ANCHORS, NUM_TAGS, NUM_POSES = 200, 3, 2, 6
+CAUCHY = RangeErrorModel(loss_scale_too_long=2.0, loss_scale_too_short=2.0)
+
+
+@pytest.fixture
+def ranges() -> PlacedRanges:
+    """At and between the keyframes, in no order."""
+    rng = np.random.default_rng(0)
+    before = rng.integers(NUM_POSES - 1, size=NUM_RANGES)
+    after = before + rng.integers(2, size=NUM_RANGES)
+    between = before != after
+    return PlacedRanges(
+        range_m=rng.uniform(1.0, 10.0, NUM_RANGES),
+        stddev_m=rng.uniform(0.5, 2.0, NUM_RANGES),
+        before=before,
+        after=after,
+        weight=np.where(between, rng.uniform(size=NUM_RANGES), 0.0),
+        offset_in_world_m=np.where(between[:, None], rng.normal(0, 0.1, (NUM_RANGES, 3)), 0.0),
+        anchor_index=rng.integers(NUM_ANCHORS, size=NUM_RANGES),
+        tag_index=rng.integers(NUM_TAGS, size=NUM_RANGES),
+        interval_s=np.full(NUM_RANGES, 0.5),
+    )
+
+
+def blocks_of(reconstruction: pycolmap.Reconstruction, pose_block: PoseBlock) -> RangeBlocks:
+    rng = np.random.default_rng(1)
+    return RangeBlocks(
+        poses=[pose_block(reconstruction, i) for i in sorted(reconstruction.reg_frame_ids())],
+        anchors=list(rng.normal(0, 5, (NUM_ANCHORS, 3))),
+        biases=list(rng.normal(0, 0.1, (NUM_ANCHORS, 1))),
+        tags_in_cam=list(rng.normal(0, 0.1, (NUM_TAGS, 3))),
+    )
+
+
+def add_one_by_one(adjuster: pycolmap.CeresBundleAdjuster, ranges: PlacedRanges, blocks: RangeBlocks) -> None:
+    for i in range(NUM_RANGES):
+        ends = [blocks.anchors[ranges.anchor_index[i]], blocks.biases[ranges.anchor_index[i]]]
+        tag = blocks.tags_in_cam[ranges.tag_index[i]]
+        before, after = blocks.poses[ranges.before[i]], blocks.poses[ranges.after[i]]
+        if before is after:
+            cost = range_cost(range_m=ranges.range_m[i], tag_in_cam_m=tag, stddev_m=ranges.stddev_m[i])
+            add_residual_block(adjuster, cost, cauchy_loss(2.0), [before, *ends])
+        else:
+            cost = interpolated_range_cost(
+                range_m=ranges.range_m[i],
+                tag_in_cam_m=tag,
+                weight=ranges.weight[i],
+                offset_in_world_m=ranges.offset_in_world_m[i],
+                stddev_m=ranges.stddev_m[i],
+            )
+            add_residual_block(adjuster, cost, cauchy_loss(2.0), [before, after, *ends])
+
+
+def cost_of(adjuster: pycolmap.CeresBundleAdjuster) -> float:
+    return 0.5 * float(np.sum(np.square(adjuster.problem.evaluate_residuals())))
+
+
+def initial_cost(adjuster: pycolmap.CeresBundleAdjuster) -> float:
+    """As the solver finds it."""
+    adjuster.options.ceres.solver_options.max_num_iterations = 0
+    summary = adjuster.solve()
+    assert isinstance(summary, pycolmap.CeresBundleAdjustmentSummary)
+    return float(summary.ceres_summary.initial_cost)
+
+
+def gradient_norm(adjuster: pycolmap.CeresBundleAdjuster) -> float:
+    """Of the whole problem, so that it depends on every residual and Jacobian."""
+    jacobian = adjuster.problem.evaluate_jacobian()
+    rows = np.repeat(np.arange(jacobian.num_rows), np.diff(jacobian.rows))
+    residuals = np.asarray(adjuster.problem.evaluate_residuals())
+    gradient = np.bincount(jacobian.cols, residuals[rows] * np.asarray(jacobian.values), jacobian.num_cols)
+    return float(np.linalg.norm(gradient))
+
+
+def test_cost_and_gradient_are_those_of_the_ranges_one_by_one(
+    reconstruction: pycolmap.Reconstruction, ranges: PlacedRanges, adjuster_of: AdjusterOf, pose_block: PoseBlock
+) -> None:
+    blocks = blocks_of(reconstruction, pose_block)
+    one_by_one, together = adjuster_of(reconstruction), adjuster_of(reconstruction)
+    before = together.problem.num_residual_blocks()
+    add_one_by_one(one_by_one, ranges, blocks)
+    added = add_ranges(together, ranges, blocks, CAUCHY)
+    assert gradient_norm(together) == pytest.approx(gradient_norm(one_by_one), rel=1e-9)
+    # With one of Ceres' losses, half the squares of what the problem calls residuals are not the cost.
+    assert cost_of(together) == pytest.approx(initial_cost(one_by_one), rel=1e-9)
+    assert added.num_residuals == NUM_RANGES
+    assert added.constant_cost == 0.0
+    assert added.num_residual_blocks == together.problem.num_residual_blocks() - before < NUM_RANGES / 2
+
+
+def test_ranges_at_one_keyframe_become_one_by_least_squares(
+    reconstruction: pycolmap.Reconstruction, ranges: PlacedRanges, adjuster_of: AdjusterOf, pose_block: PoseBlock
+) -> None:
+    blocks = blocks_of(reconstruction, pose_block)
+    combined, separate = adjuster_of(reconstruction), adjuster_of(reconstruction)
+    added = add_ranges(combined, ranges, blocks)
+    # A loss scale so large that it is least squares keeps the ranges apart.
+    add_ranges(separate, ranges, blocks, RangeErrorModel(loss_scale_too_long=1e9, loss_scale_too_short=1e9))
+    assert added.num_residuals < NUM_RANGES
+    assert cost_of(combined) + added.constant_cost == pytest.approx(cost_of(separate), rel=1e-9)
+    assert gradient_norm(combined) == pytest.approx(gradient_norm(separate), rel=1e-9)
+
+
+def test_everything_that_can_be_estimated_reaches_its_block(
+    reconstruction: pycolmap.Reconstruction, ranges: PlacedRanges, adjuster_of: AdjusterOf, pose_block: PoseBlock
+) -> None:
+    fixed = blocks_of(reconstruction, pose_block)
+    blocks = replace(
+        fixed,
+        lever_arms_are_free=True,
+        common_biases=[np.zeros(1) for _ in range(NUM_TAGS)],
+        time_shift=np.zeros(1),
+        amplitude=np.zeros(1),
+    )
+    model = replace(CAUCHY, short_range_length_m=1.0)
+    adjuster, same = adjuster_of(reconstruction), adjuster_of(reconstruction)
+    add_ranges(adjuster, ranges, blocks, model)
+    add_ranges(same, ranges, fixed, CAUCHY)
+    assert cost_of(adjuster) == pytest.approx(cost_of(same), rel=1e-12)
+    assert blocks.common_biases is not None
+    assert blocks.time_shift is not None
+    assert blocks.amplitude is not None
+    for block in (*blocks.tags_in_cam, *blocks.common_biases, blocks.time_shift, blocks.amplitude):
+        assert adjuster.problem.has_parameter_block(block)
+        before = cost_of(adjuster)
+        block += 0.1
+        assert cost_of(adjuster) != pytest.approx(before, rel=1e-6)
+    assert not any(same.problem.has_parameter_block(tag) for tag in fixed.tags_in_cam)
+
+
+def test_a_curve_needs_its_amplitude_and_a_time_shift_its_intervals(
+    reconstruction: pycolmap.Reconstruction, ranges: PlacedRanges, adjuster_of: AdjusterOf, pose_block: PoseBlock
+) -> None:
+    adjuster, blocks = adjuster_of(reconstruction), blocks_of(reconstruction, pose_block)
+    with pytest.raises(ValueError, match="amplitude"):
+        add_ranges(adjuster, ranges, blocks, RangeErrorModel(short_range_length_m=1.0))
+    with pytest.raises(ValueError, match="amplitude"):
+        add_ranges(adjuster, ranges, replace(blocks, amplitude=np.zeros(1)))
+    with pytest.raises(ValueError, match="interval_s"):
+        add_ranges(adjuster, replace(ranges, interval_s=None), replace(blocks, time_shift=np.zeros(1)))
+
+
+def test_no_ranges_are_no_blocks(
+    reconstruction: pycolmap.Reconstruction, ranges: PlacedRanges, adjuster_of: AdjusterOf, pose_block: PoseBlock
+) -> None:
+    none = PlacedRanges(**{name: value[:0] for name, value in vars(ranges).items() if value is not None})
+    added = add_ranges(adjuster_of(reconstruction), none, blocks_of(reconstruction, pose_block))
+    assert added.num_residual_blocks == added.num_residuals == 0
+
+
+def test_combined_range_has_the_same_cost_at_any_distance_but_for_a_constant() -> None:
+    rng = np.random.default_rng(2)
+    range_m, stddev_m = rng.uniform(1, 10, 7), rng.uniform(0.1, 1, 7)
+    mean, stddev, constant = combine_ranges(range_m, stddev_m)
+    for distance in (0.5, 4.0, 20.0):
+        expected = 0.5 * np.sum(((distance - range_m) / stddev_m) ** 2)
+        assert 0.5 * ((distance - mean[0]) / stddev[0]) ** 2 + constant == pytest.approx(expected)
+    alone = combine_ranges(np.array([3.0]), np.array([0.1]))
+    assert np.concatenate([alone[0], alone[1], [alone[2]]]) == pytest.approx([3.0, 0.1, 0.0])
+
+
+def test_the_tag_hangs_on_the_rig_frame_whichever_cameras_the_rig_has(
+    adjuster_of: AdjusterOf, pose_block: PoseBlock
+) -> None:
+    """Three cameras in a rig, and the scale 4 % off: ranges from the rig frame put it right."""
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_cameras_per_rig=3, num_frames_per_rig=8, num_points3D=80, track_length=8
+    )
+    reconstruction = pycolmap.synthesize_dataset(options)
+    tag_in_cam, anchors = np.array([0.3, -0.2, 0.1]), list(np.random.default_rng(3).uniform(-8, 8, (4, 3)))
+    frames = sorted(reconstruction.reg_frame_ids())
+
+    def tags() -> Array:
+        poses = [reconstruction.frame(i).rig_from_world for i in frames]
+        return np.array([pose.inverse() * tag_in_cam for pose in poses if pose is not None])
+
+    truth, baselines = tags(), [pose.translation.copy() for pose in sensor_poses(reconstruction)]
+    assert len(baselines) == 2
+    frame, anchor = (index.ravel() for index in np.meshgrid(np.arange(len(frames)), np.arange(4)))
+    ranges = PlacedRanges(
+        range_m=np.linalg.norm(truth[frame] - np.array(anchors)[anchor], axis=1),
+        stddev_m=np.full(len(frame), 1e-3),
+        before=frame,
+        after=frame,
+        weight=np.zeros(len(frame)),
+        offset_in_world_m=np.zeros((len(frame), 3)),
+        anchor_index=anchor,
+        tag_index=np.zeros(len(frame), dtype=np.int64),
+    )
+    reconstruction.transform(pycolmap.Sim3d(1.04, pycolmap.Rotation3d(), np.zeros(3)))
+    adjuster = adjuster_of(reconstruction)
+    biases = [np.zeros(1) for _ in anchors]
+    poses = [pose_block(reconstruction, i) for i in frames]
+    add_ranges(adjuster, ranges, RangeBlocks(poses, anchors, biases, [tag_in_cam]))
+    for block in (*anchors, *biases):
+        adjuster.problem.set_parameter_block_constant(block)
+    assert adjuster.solve().is_solution_usable()
+    assert tags() == pytest.approx(truth, abs=1e-5)
+    for pose, baseline in zip(sensor_poses(reconstruction), baselines, strict=True):
+        assert pose.translation == pytest.approx(baseline, abs=1e-5)
+
+
+def sensor_poses(reconstruction: pycolmap.Reconstruction) -> list[pycolmap.Rigid3d]:
+    """Of the cameras in their rig, but for the reference camera, which is the rig frame."""
+    (rig,) = reconstruction.rigs.values()
+    return [rig.sensor_from_rig(sensor) for sensor in rig.non_ref_sensors]
