@@ -97,7 +97,7 @@ def test_whole_survey_is_read(folder: Path) -> None:
     assert survey.scale.method == "two-candidate"
     assert not survey.refine.enabled
     assert survey.refine.bundle_adjustment == {"refine_extra_params": False}
-    assert (survey.formats, survey.report_enabled) == (("tum",), False)
+    assert (survey.export.formats, survey.report_enabled) == (("tum",), False)
     assert (survey.reference_path, survey.output_path, survey.seed) == (folder / "truth.csv", folder / "result", 7)
 
 

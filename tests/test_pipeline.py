@@ -16,7 +16,7 @@ import pytest
 from rangesfm.config import RangesConfig, Survey
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.journal import Journal
-from rangesfm.options import CheckOptions, ScaleOptions
+from rangesfm.options import CheckOptions, ExportOptions, ScaleOptions
 from rangesfm.outputs import forget_result, forgetting_result_if_changed, refuse_to_overwrite, write_result
 from rangesfm.pipeline import refine_model, scale_model
 from rangesfm.progress import SilentProgress
@@ -73,7 +73,7 @@ def test_a_run_in_the_same_folder_leaves_nothing_of_the_one_before(survey: Surve
     first = replace(survey, reference_path=walked_survey.folder / "reference.csv")
     refine_model(first, progress=SilentProgress())
     assert {"sparse_metric", "reference.csv", "report.html"} <= files_of(survey.output_path)
-    second = replace(survey, formats=(), report_enabled=False)
+    second = replace(survey, export=ExportOptions(formats=()), report_enabled=False)
     scale_model(second, progress=SilentProgress())
     left = files_of(survey.output_path) - {"trajectory.tum", "points.ply"}  # exported by request, not part of a result
     assert left == {"sparse_scaled", "result.json", "ranges.csv", "images.csv"}

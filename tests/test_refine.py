@@ -14,13 +14,13 @@ import pytest
 from rangesfm import _ceres
 from rangesfm.errors import InputError
 from rangesfm.geometry import IDENTITY, Similarity, align_points, rmse
+from rangesfm.model_transform import rescale
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.anchors import AnchorEstimate
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
 from rangesfm.refine import RefineSummary, predicted_ranges, refine_with_ranges
-from rangesfm.scale.rescale import rescale
 from rangesfm.simulate.model import synthetic_model
 from rangesfm.simulate.path import CameraPath, loop_path, sequence_path
 from rangesfm.simulate.ranges import Radio, simulate_ranges, simulate_ranges_at

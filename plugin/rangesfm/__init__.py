@@ -46,7 +46,7 @@ _HOME = {
     "read_survey": "rangesfm.config",
     "reconstruct": "rangesfm.vision.reconstruct",
     "refine_with_ranges": "rangesfm.refine",
-    "rescale": "rangesfm.scale.rescale",
+    "rescale": "rangesfm.model_transform",
     "run_survey": "rangesfm.pipeline",
     "select_keyframes": "rangesfm.vision.keyframes",
     "trajectory_from_reconstruction": "rangesfm.trajectory",

@@ -11,11 +11,13 @@ from typing import Any
 from rangesfm.errors import InputError
 from rangesfm.options import (
     ANCHOR_FRAMES,
+    EXPORT_FRAMES,
     MATCHING_METHODS,
     SCALE_METHODS,
     AssociationOptions,
     CameraOptions,
     CheckOptions,
+    ExportOptions,
     KeyframeOptions,
     MapperOptions,
     RangeModelOptions,
@@ -25,7 +27,6 @@ from rangesfm.options import (
 from rangesfm.strict_tables import Rule, Source, StrictTable, parse_toml
 
 TABLES = ("images", "camera", "ranges", "anchors", "tag", "mapper", "scale", "refine", "export", "report", "output")
-DEFAULT_FORMATS = ("tum", "ply")
 _LIKE_OURS = 0.85  # a [mapper] key this similar to one of ours is a slip; others are pycolmap's
 
 _MORE_THAN_0 = Rule("more than 0", lambda value: value > 0)
@@ -50,7 +51,6 @@ _RULES = {
     "common_bias_stddev_m": _FROM_0,
     "max_relative_stddev": _MORE_THAN_0,
     "separator": Rule("one character", lambda value: len(value) == 1),
-    "frame": _one_of(ANCHOR_FRAMES),
     "matching": _one_of(MATCHING_METHODS),
     "num_threads": Rule("1 or more, or -1 for all cores", lambda value: value == -1 or value >= 1),
     "method": _one_of(SCALE_METHODS),
@@ -60,6 +60,8 @@ _RULES = {
     "range_loss_scale": _MORE_THAN_0,
     "seed": _FROM_0,
 }
+# Where one name means different things.
+_RULES_OF = {"anchors": {"frame": _one_of(ANCHOR_FRAMES)}, "export": {"frame": _one_of(EXPORT_FRAMES)}}
 
 
 @dataclass(frozen=True)
@@ -98,12 +100,13 @@ class Survey:
         image_times_path: CSV of image times; None: EXIF, else file names.
         anchors_path: None: the anchors in the log, all unknown.
         anchor_frame: one of ANCHOR_FRAMES; None: "site" if the file knows any position, else "unknown".
+        anchor_crs: coordinate system of their positions, as "EPSG:2056"; None: metres of a frame of their own.
         use_anchors: ids of the anchors whose ranges are used; empty: all.
         tag_in_cam_m: lever arm: the tag's antenna in the camera frame, metres.
         tag_id: which tag of the log the camera carries; None: there is only one.
         distances_path, markers_path: taped distances, and the marks in photos between which they were taken.
         reference_path: true positions, for comparison.
-        formats: what to export beside the COLMAP models.
+        export: what to write beside the COLMAP models, and in which frame.
         output_path: folder of the results.
         seed: of everything random.
     """
@@ -116,6 +119,7 @@ class Survey:
     ranges: RangesConfig = field(default_factory=RangesConfig)
     anchors_path: Path | None = None
     anchor_frame: str | None = None
+    anchor_crs: str | None = None
     use_anchors: tuple[str, ...] = ()
     tag_in_cam_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tag_id: str | None = None
@@ -125,7 +129,7 @@ class Survey:
     distances_path: Path | None = None
     markers_path: Path | None = None
     reference_path: Path | None = None
-    formats: tuple[str, ...] = DEFAULT_FORMATS
+    export: ExportOptions = field(default_factory=ExportOptions)
     report_enabled: bool = True
     output_path: Path = Path("out")
     seed: int = 0
@@ -177,7 +181,7 @@ def _survey(tables: Mapping[str, Any], folder: Path, overrides: Mapping[str, obj
         mapper=reader.mapper(),
         scale=reader.table("scale").options(ScaleOptions),
         refine=reader.table("refine").options(RefineOptions),
-        formats=reader.table("export").value("formats", tuple[str, ...], DEFAULT_FORMATS),
+        export=reader.table("export").options(ExportOptions),
     )
     reader.refuse_unknown()
     return survey
@@ -191,7 +195,10 @@ class _SurveyReader:
         self._root = StrictTable(_merged(tables, overrides), "", source)
         self._source = source
         self._folder = folder
-        self._tables = {name: StrictTable(self._root.value(name, Any, {}), name, source, _RULES) for name in TABLES}
+        self._tables = {
+            name: StrictTable(self._root.value(name, Any, {}), name, source, {**_RULES, **_RULES_OF.get(name, {})})
+            for name in TABLES
+        }
 
     def table(self, name: str) -> StrictTable:
         return self._tables[name]
@@ -227,6 +234,7 @@ class _SurveyReader:
         return {
             "anchors_path": self._path("anchors", "path"),
             "anchor_frame": self.table("anchors").value("frame", str),
+            "anchor_crs": self.table("anchors").value("crs", str),
             "use_anchors": self.table("anchors").value("use", tuple[str, ...], ()),
         }
 

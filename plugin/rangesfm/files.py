@@ -25,7 +25,8 @@ def make_output_folder(path: Path) -> None:
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
     """Yield a temporary sibling to write to; on success it takes the place of ``path``."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    # With the same ending, by which libraries tell the format.
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
         yield temporary
         os.replace(temporary, path)

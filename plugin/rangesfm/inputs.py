@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rangesfm.config import Survey
 from rangesfm.distances.tape import Tape, read_tape
 from rangesfm.errors import InputError
+from rangesfm.georeference import Georeference, georeference_at
 from rangesfm.ranging.anchor_file import default_anchor_frame, read_anchors
 from rangesfm.ranging.anchors import Anchor
 from rangesfm.ranging.log import RangeLog
@@ -29,6 +30,7 @@ class RangingInputs:
         log: ranges of the wanted tag to the wanted anchors.
         anchors: every anchor of the log.
         anchor_frame: one of ANCHOR_FRAMES.
+        georeference: of the anchors' frame; None if their coordinates are in a frame of their own.
         tape: taped distances, if given.
         reference: true positions, if given.
         notes: what the user should know.
@@ -37,6 +39,7 @@ class RangingInputs:
     log: RangeLog
     anchors: tuple[Anchor, ...]
     anchor_frame: str
+    georeference: Georeference | None
     tape: Tape | None
     reference: Reference | None
     notes: tuple[str, ...]
@@ -65,6 +68,7 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     log = _of_wanted_anchors(_of_wanted_tag(log, survey.tag_id), survey.use_anchors)
     anchors = _anchors_of_log(log) if given is None else given
     _check_anchors_known(log, anchors, survey)
+    georeference, anchors = _on_the_earth(anchors, survey)
     frame = survey.anchor_frame or default_anchor_frame(anchors)
     if frame != "unknown" and all(anchor.position_m is None for anchor in anchors):
         raise InputError(
@@ -74,9 +78,29 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     _check_held_out(survey, anchors, frame)
     tape = None if survey.distances_path is None else read_tape(survey.distances_path, survey.markers_path)
     reference = None if survey.reference_path is None else read_reference(survey.reference_path)
-    return RangingInputs(
-        log, anchors, frame, tape, reference, tuple(_notes(log, anchors, anchors_are_of_log=given is None))
+    notes = tuple(_notes(log, anchors, anchors_are_of_log=given is None))
+    return RangingInputs(log, anchors, frame, georeference, tape, reference, notes)
+
+
+def _on_the_earth(anchors: tuple[Anchor, ...], survey: Survey) -> tuple[Georeference | None, tuple[Anchor, ...]]:
+    """Anchors given in a coordinate system, in the local frame of metres around them."""
+    crs = survey.anchor_crs
+    if crs is None:
+        return None, anchors
+    if survey.anchor_frame not in (None, "site"):
+        raise InputError(f"[anchors] crs {crs} needs the frame 'site', not {survey.anchor_frame!r}")
+    given = np.array([np.full(3, np.nan) if a.position_m is None else a.position_m for a in anchors]).reshape(-1, 3)
+    if np.isnan(given).all():
+        raise InputError(f"[anchors] crs is {crs}, but no anchor has a position", survey.anchors_path)
+    try:
+        georeference, local = georeference_at(given, crs)
+    except InputError as error:
+        raise InputError(str(error), survey.anchors_path) from None
+    moved = tuple(
+        anchor if anchor.position_m is None else replace(anchor, position_m=position)
+        for anchor, position in zip(anchors, local, strict=True)
     )
+    return georeference, moved
 
 
 def _check_held_out(survey: Survey, anchors: Sequence[Anchor], frame: str) -> None:

@@ -10,6 +10,8 @@ from typing import Any
 
 ANCHOR_FRAMES = ("site", "first_camera", "unknown")
 SCALE_METHODS = ("robust", "two-candidate")
+EXPORT_FRAMES = ("result", "level", "enu")
+DEFAULT_FORMATS = ("tum", "ply")
 MATCHING_METHODS = ("sequential", "exhaustive", "auto")
 
 
@@ -147,3 +149,29 @@ class RefineOptions:
     max_num_iterations: int = 200
     range_loss_scale: float = 2.4
     bundle_adjustment: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """Table ``[export]``: the metric model in other formats, and in which frame.
+
+    Attributes:
+        formats: names of exporters.
+        frame: "result" (the site's or the first camera's, as the result has it), "level" (z up, y as the first camera
+            looks, origin as it is) or "enu" (x east, y north, z up; for that the map must be georeferenced).
+        up: what is up, where the map itself does not know: "cameras" (the mean of what is up in the photos), "path"
+            (across the plane of the path) or three numbers, a direction in the result's frame.
+        crs: coordinate system of what is written for maps (LAZ, GeoPackage), as "EPSG:2056"; None: that of the
+            anchors, else longitude and latitude.
+        origin_anchor: id of an anchor whose place on the Earth is known.
+        origin_lat_lon_height: that place, degrees and metres above the ellipsoid (WGS 84).
+        heading_deg: azimuth in which the first camera looks, from north through east.
+    """
+
+    formats: tuple[str, ...] = DEFAULT_FORMATS
+    frame: str = "result"
+    up: str = "cameras"
+    crs: str | None = None
+    origin_anchor: str | None = None
+    origin_lat_lon_height: tuple[float, float, float] | None = None
+    heading_deg: float | None = None

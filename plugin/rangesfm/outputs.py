@@ -8,6 +8,7 @@ import math
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import InputError
-from rangesfm.export import export_model, write_model
+from rangesfm.export import MetricMap, export_map, write_model
 from rangesfm.files import new_file
+from rangesfm.georeference import Georeference
 from rangesfm.metric_survey import MetricSurvey
+from rangesfm.options import ExportOptions
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.results import USED
 
@@ -63,7 +66,14 @@ def _state(path: Path) -> tuple[int, int] | None:
     return state.st_ino, state.st_mtime_ns
 
 
-def write_outputs(survey: MetricSurvey, formats: Sequence[str], folder: Path) -> None:
+def write_outputs(
+    survey: MetricSurvey,
+    export: ExportOptions,
+    folder: Path,
+    *,
+    images_path: Path | None = None,
+    georeference: Georeference | None = None,
+) -> None:
     """Models, ranges.csv, images.csv and the formats asked for; each whole or not at all."""
     write_model(survey.scaled, folder / "sparse_scaled" / "0")
     if survey.refined is None:
@@ -78,14 +88,17 @@ def write_outputs(survey: MetricSurvey, formats: Sequence[str], folder: Path) ->
     if times is not None:
         by_name = dict(zip(survey.trajectory.image_names, times.tolist(), strict=True))
         _write_csv(folder / "images.csv", ["image_name", "timestamp_s"], ((n, repr(t)) for n, t in by_name.items()))
-    export_model(
+    map_ = MetricMap(
         survey.final,
-        [name for name in formats if name != "ply" or survey.final.num_points3D()],
-        folder,
         timestamps_s=by_name,
         anchors_m={a.anchor_id: a.position_m for a in survey.anchors if np.isfinite(a.position_m).all()},
         metric_from_sfm=survey.estimate.metric_from_sfm,
+        relative_scale_stddev=survey.estimate.uncertainty.empirical,
+        images_path=images_path,
+        georeference=georeference,
     )
+    formats = tuple(name for name in export.formats if name != "ply" or survey.final.num_points3D())
+    export_map(map_, folder, replace(export, formats=formats))
 
 
 def _write_ranges(survey: MetricSurvey, path: Path) -> None:

@@ -23,10 +23,12 @@ from rangesfm.doctor import versions
 from rangesfm.errors import InputError
 from rangesfm.export import check_formats
 from rangesfm.files import make_output_folder
+from rangesfm.georeference import Georeference
 from rangesfm.inputs import RangingInputs, read_ranging_inputs
 from rangesfm.journal import Journal
 from rangesfm.metric_survey import MetricSurvey
 from rangesfm.model_files import read_model
+from rangesfm.model_transform import rescale
 from rangesfm.outputs import (
     forget_result,
     forgetting_result_if_changed,
@@ -45,7 +47,6 @@ from rangesfm.refine import predicted_ranges, refine_with_ranges
 from rangesfm.report import write_report
 from rangesfm.results import survey_result
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.scale.rescale import rescale
 from rangesfm.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images, read_image_times_csv
 from rangesfm.vision.keyframes import select_keyframes
@@ -152,7 +153,11 @@ def _to_metric(
         forget_result(survey.output_path)
         result["distances"] = _distances(inputs, metric, journal)
         table = _compare(survey, inputs, metric, result)
-        write_outputs(metric, survey.formats, survey.output_path)
+        georeference = _georeference(inputs, metric)
+        result["georeference"] = georeference and georeference.to_dict()
+        write_outputs(
+            metric, survey.export, survey.output_path, images_path=survey.images_path, georeference=georeference
+        )
     result["versions"], result["settings"] = versions(), survey.to_dict()
     result["seconds"], result["warnings"] = journal.all_seconds(), journal.warnings
     write_result(result, survey.output_path / "result.json")
@@ -164,7 +169,7 @@ def _to_metric(
 
 def _read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
     """Everything that can be wrong is found before the long work begins."""
-    check_formats(survey.formats)
+    check_formats(survey.export.formats)
     apply_options(pycolmap.BundleAdjustmentOptions(), survey.refine.bundle_adjustment, table="refine.bundle_adjustment")
     refuse_to_overwrite(
         (survey.ranges.path, survey.anchors_path, survey.image_times_path, survey.reference_path, survey.model_path),
@@ -344,6 +349,11 @@ def _refine(survey: Survey, metric: MetricSurvey) -> MetricSurvey:
         num_threads=survey.mapper.num_threads,
     )
     return replace(metric, refined=refined, refinement=summary)
+
+
+def _georeference(inputs: RangingInputs, metric: MetricSurvey) -> Georeference | None:
+    """Of the final map: that of the anchors, if the map could be carried to them."""
+    return inputs.georeference if metric.estimate.frame == "site" else None
 
 
 def _distances(inputs: RangingInputs, metric: MetricSurvey, journal: Journal) -> list[dict[str, Any]]:

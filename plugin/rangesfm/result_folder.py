@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
 from rangesfm.geometry import Similarity
+from rangesfm.georeference import Georeference
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.tables import read_table
 
@@ -105,6 +106,32 @@ class ResultFolder:
                 Rotation.from_quat(given["rotation_xyzw"]).as_matrix(),
                 np.array(given["translation_m"], dtype=np.float64).reshape(3),
             )
+
+    @property
+    def relative_scale_stddev(self) -> float | None:
+        """Of every length in the metric models, by the scale alone; None if not said."""
+        scale = self.summary.get("scale")
+        if scale is None:
+            return None
+        with self._expecting("scale"):
+            return float(scale["stddev_empirical"]) / float(scale["value"])
+
+    @property
+    def images_path(self) -> Path | None:
+        """Folder of the photos, as the run was told; None if it had none."""
+        with self._expecting("settings"):
+            path = (self.summary.get("settings") or {}).get("images_path")
+            return None if path is None else Path(path)
+
+    @property
+    def georeference(self) -> Georeference | None:
+        """Where the metric models' world lies on the Earth; None if the anchors did not say."""
+        given = self.summary.get("georeference")
+        if given is None:
+            return None
+        with self._expecting("georeference"):
+            lat_deg, lon_deg, height_m = (float(given[key]) for key in ("lat_deg", "lon_deg", "height_m"))
+            return Georeference(lat_deg, lon_deg, height_m, str(given["crs"]))
 
     @contextmanager
     def _expecting(self, key: str) -> Iterator[None]:

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
@@ -202,10 +203,18 @@ def test_distances_between_cameras_agree_between_the_formats(tmp_path: Path, mod
 def test_an_unknown_format_is_named_with_the_known_ones_before_anything_is_written(
     tmp_path: Path, model: pycolmap.Reconstruction
 ) -> None:
-    with pytest.raises(InputError, match=r"'laz'.*colmap.*tum.*ply.*transform") as error:
-        export_model(model, ["tum", "laz"], tmp_path / "out")
+    with pytest.raises(InputError, match=r"'las'.*colmap.*tum.*ply.*transform") as error:
+        export_model(model, ["tum", "las"], tmp_path / "out")
     assert error.value.exit_status == 2
     assert not (tmp_path / "out").exists()
+
+
+def write_photos(folder: Path, model: pycolmap.Reconstruction) -> Path:
+    folder.mkdir()
+    for image in model.images.values():
+        camera = model.cameras[image.camera_id]
+        Image.new("RGB", (camera.width, camera.height), (90, 120, 30)).save(folder / image.name)
+    return folder
 
 
 def write_result(folder: Path, model: pycolmap.Reconstruction, *, is_refined: bool) -> None:
@@ -218,6 +227,8 @@ def write_result(folder: Path, model: pycolmap.Reconstruction, *, is_refined: bo
     rows = [f"{name},{time}" for name, time in times_of(model).items()]
     (folder / "images.csv").write_text("\n".join(["image_name,timestamp_s", *rows]))
     summary = {
+        "scale": {"value": 2.0, "stddev_empirical": 0.02},
+        "georeference": {"lat_deg": 47.4, "lon_deg": 8.5, "height_m": 400.0, "crs": "EPSG:2056"},
         "anchors": {"A1": {"position_m": [1, 2, 3]}, "A2": {"position_m": None}},
         "metric_from_sfm": {"scale": 2.0, "rotation_xyzw": [0, 0, 1, 0], "translation_m": [1, 2, 3]},
     }
@@ -229,7 +240,9 @@ def test_a_result_is_exported_in_its_best_form_in_every_format(
     tmp_path: Path, model: pycolmap.Reconstruction, is_refined: bool
 ) -> None:
     write_result(tmp_path / "out", model, is_refined=is_refined)
-    paths = dict(zip(EXPORTERS, export_result(tmp_path / "out", EXPORTERS, tmp_path / "exports")))
+    photos = write_photos(tmp_path / "photos", model)
+    exported = export_result(tmp_path / "out", EXPORTERS, tmp_path / "exports", images_path=photos)
+    paths = dict(zip(EXPORTERS, exported))
     assert all(path.exists() and path.parent == tmp_path / "exports" for path in paths.values())
     expected = np.mean(list(centers_of(model).values()), axis=0) + ([0, 0, 0] if is_refined else [1000, 0, 0])
     rows = np.loadtxt(paths["tum"])

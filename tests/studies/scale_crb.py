@@ -27,12 +27,12 @@ import numpy.typing as npt
 import pycolmap
 
 from rangesfm.geometry import Similarity, align_points
+from rangesfm.model_transform import rescale
 from rangesfm.options import CameraOptions, RangeModelOptions
 from rangesfm.ranging.anchors import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.refine import refine_with_ranges
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.scale.rescale import rescale
 from rangesfm.simulate.model import SyntheticModel, synthetic_model
 from rangesfm.simulate.path import loop_path
 from rangesfm.simulate.ranges import Radio, simulate_ranges_at

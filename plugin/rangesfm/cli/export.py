@@ -1,4 +1,4 @@
-"""``rangesfm export``: the metric model in other formats."""
+"""``rangesfm export``: the metric model in other formats and frames."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from pathlib import Path
 
 from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.cli.result_argument import add_result_argument, result_path
+from rangesfm.cli.survey_flags import position
+from rangesfm.options import DEFAULT_FORMATS, EXPORT_FRAMES
 from rangesfm.progress import Progress
 
 
@@ -16,17 +18,37 @@ def add_command(commands: Commands) -> None:
         execute,
         help="metric model to other formats",
         description="Write the metric model of a result folder in other formats; an unknown one lists them all.",
-        example="rangesfm export out --formats tum,ply,ply_cameras --output_path exported",
+        example="rangesfm export out --formats tum,ply,nerfstudio --frame level --output_path exported",
     )
     add_result_argument(parser)
     parser.add_argument("--formats", metavar="A,B,..", help="what to write (default: what a run exports)")
+    parser.add_argument("--frame", choices=EXPORT_FRAMES, default="result", help="its frame (default: the result's)")
+    parser.add_argument("--up", metavar="UP", default="cameras", help="cameras, path or a direction X,Y,Z")
+    parser.add_argument("--crs", metavar="CRS", help="coordinate system for maps, as EPSG:2056 (default: the anchors')")
+    parser.add_argument("--origin_anchor", metavar="ID", help="an anchor whose place on the Earth is known")
+    parser.add_argument(
+        "--origin_lat_lon_height", metavar="LAT,LON,H", type=position, help="its place: degrees and metres, WGS 84"
+    )
+    parser.add_argument("--heading_deg", metavar="DEG", type=float, help="azimuth in which the first camera looks")
+    parser.add_argument("--images", metavar="FOLDER", help="the photos (default: where the run found them)")
     parser.add_argument("--output_path", metavar="FOLDER", help="where to (default: the result folder)")
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
-    from rangesfm.config import DEFAULT_FORMATS
     from rangesfm.export import export_result
+    from rangesfm.options import ExportOptions
 
     source = result_path(args)
     formats = DEFAULT_FORMATS if args.formats is None else args.formats.replace(",", " ").split()
-    return Outcome([str(path) for path in export_result(source, formats, Path(args.output_path or source))])
+    place = args.origin_lat_lon_height
+    options = ExportOptions(
+        frame=args.frame,
+        up=args.up,
+        crs=args.crs,
+        origin_anchor=args.origin_anchor,
+        origin_lat_lon_height=None if place is None else (place[0], place[1], place[2]),
+        heading_deg=args.heading_deg,
+    )
+    images_path = None if args.images is None else Path(args.images)
+    written = export_result(source, formats, Path(args.output_path or source), options=options, images_path=images_path)
+    return Outcome([str(path) for path in written])

@@ -45,7 +45,7 @@ def _names(text: str) -> list[str]:
     return [name for name in (part.strip() for part in text.split(",")) if name]
 
 
-def _position(text: str) -> list[float]:
+def position(text: str) -> list[float]:
     numbers = _numbers(text)
     if len(numbers) != 3:
         raise argparse.ArgumentTypeError(f"'{text}' has {len(numbers)} numbers, expected X,Y,Z in metres")
@@ -77,8 +77,9 @@ RANGE_FLAGS = (
     Flag("range_stddev_m", "ranges.range_stddev_m", "noise of a range (default: estimated)", float, metavar="METRES"),
     Flag("anchors", "anchors.path", "CSV anchor_id,x_m,y_m,z_m (default: all unknown)", metavar="CSV"),
     Flag("anchor_frame", "anchors.frame", "what their coordinates refer to", choices=ANCHOR_FRAMES),
+    Flag("anchor_crs", "anchors.crs", "coordinate system of their positions, as EPSG:2056", metavar="CRS"),
     Flag("use_anchors", "anchors.use", "only these anchors' ranges are used", _names, metavar="ID,ID"),
-    Flag("tag_in_cam", "tag.tag_in_cam_m", "the tag's antenna in the camera frame, metres", _position, metavar="X,Y,Z"),
+    Flag("tag_in_cam", "tag.tag_in_cam_m", "the tag's antenna in the camera frame, metres", position, metavar="X,Y,Z"),
     Flag("tag_id", "tag.tag_id", "the camera's tag, if the log has several", metavar="ID"),
     Flag("check_share", "ranges.check_share", "share of the ranges held out as checks", float, metavar="SHARE"),
     Flag("check_anchors", "ranges.check_anchors", "anchors whose ranges are all held out", _names, metavar="ID,ID"),

@@ -112,7 +112,10 @@ def _triangulate(name: str, marker: Marker, images: dict[str, pycolmap.Image], t
         raise InputError(f"marker {name!r} has a mark outside its photo", tape.markers_path, marker.lines[0])
     rays = np.array([[*np.ravel(at), 1.0] for at in in_cam if at is not None])
     rays /= np.linalg.norm(rays, axis=1)[:, None]
-    point = pycolmap.triangulate_multi_view_point([view.cam_from_world().matrix() for view in views], rays)
+    # From the first camera: far from its origin a linear triangulation loses half its digits.
+    origin = views[0].projection_center()
+    relative = pycolmap.triangulate_multi_view_point([_cam_from_world_at(origin, view) for view in views], rays)
+    point = None if relative is None else np.ravel(relative) + origin
     if point is None or _widest_angle_deg(point, views) < _MIN_TRIANGULATION_ANGLE_DEG:
         message = f"marker {name!r} is seen from one direction only, expected photos from different places"
         raise InputError(message, tape.markers_path, marker.lines[0])
@@ -122,7 +125,14 @@ def _triangulate(name: str, marker: Marker, images: dict[str, pycolmap.Image], t
         if off_px > _MAX_REPROJECTION * max(camera.width, camera.height):
             message = f"marker {name!r} is {off_px:.0f} px from where the other photos put it: is it the same point?"
             raise InputError(message, tape.markers_path, marker.lines[k])
-    return np.asarray(point, dtype=np.float64).reshape(3)
+    return point
+
+
+def _cam_from_world_at(origin: Array, image: pycolmap.Image) -> Array:
+    """(3, 4) for a world whose origin is at ``origin``."""
+    pose = image.cam_from_world().matrix()
+    pose[:, 3] += pose[:, :3] @ origin
+    return pose
 
 
 def _camera(image: pycolmap.Image) -> pycolmap.Camera:

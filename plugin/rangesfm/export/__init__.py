@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rangesfm.errors import InputError
 from rangesfm.export.colmap import write_model
+from rangesfm.export.features import write_features
+from rangesfm.export.frames import in_frame
+from rangesfm.export.kitti import write_kitti
+from rangesfm.export.las import write_laz
 from rangesfm.export.metric_map import MetricMap
 from rangesfm.export.model_aligner import write_positions
+from rangesfm.export.nerfstudio import write_nerfstudio
+from rangesfm.export.opensfm import write_opensfm
+from rangesfm.export.opf import write_opf
 from rangesfm.export.ply import write_anchors, write_cameras, write_points
 from rangesfm.export.transform import write_transform
 from rangesfm.export.tum import write_trajectory
+from rangesfm.export.undistorted import write_undistorted
 from rangesfm.files import make_output_folder
+from rangesfm.options import ExportOptions
 from rangesfm.result_folder import read_result_folder
 
 if TYPE_CHECKING:
@@ -25,15 +35,23 @@ if TYPE_CHECKING:
 __all__ = [
     "EXPORTERS",
     "MetricMap",
+    "export_map",
     "export_model",
     "export_result",
     "write_anchors",
     "write_cameras",
+    "write_features",
+    "write_kitti",
+    "write_laz",
     "write_model",
+    "write_nerfstudio",
+    "write_opensfm",
+    "write_opf",
     "write_points",
     "write_positions",
     "write_trajectory",
     "write_transform",
+    "write_undistorted",
 ]
 
 Exporter = Callable[[MetricMap, Path], Path]
@@ -41,12 +59,21 @@ Exporter = Callable[[MetricMap, Path], Path]
 EXPORTERS: dict[str, Exporter] = {
     "colmap": lambda map_, folder: write_model(map_.reconstruction, folder / "colmap"),
     "colmap_text": lambda map_, folder: write_model(map_.reconstruction, folder / "colmap_text", as_text=True),
+    "undistorted": lambda map_, folder: write_undistorted(map_, folder / "undistorted"),
     "tum": lambda map_, folder: write_trajectory(map_.trajectory, folder / "trajectory.tum"),
+    "kitti": lambda map_, folder: write_kitti(map_.trajectory, folder / "trajectory.kitti"),
     "ply": lambda map_, folder: write_points(map_.reconstruction, folder / "points.ply"),
     "ply_cameras": lambda map_, folder: write_cameras(map_.trajectory, folder / "cameras.ply"),
-    "ply_anchors": lambda map_, folder: write_anchors(map_.anchors_m, folder / "anchors.ply"),
+    "ply_anchors": lambda map_, folder: write_anchors(map_.anchors_m or {}, folder / "anchors.ply"),
+    "laz": lambda map_, folder: write_laz(map_, folder / "points.laz"),
+    "gpkg": lambda map_, folder: write_features(map_, folder / "survey.gpkg", "GPKG"),
+    "geojson": lambda map_, folder: write_features(map_, folder / "survey.geojson", "GeoJSON"),
+    "kml": lambda map_, folder: write_features(map_, folder / "survey.kml", "KML"),
     "transform": lambda map_, folder: write_transform(map_.metric_from_sfm, folder / "transform.txt"),
     "model_aligner": lambda map_, folder: write_positions(map_.reconstruction, folder / "positions.txt"),
+    "nerfstudio": lambda map_, folder: write_nerfstudio(map_, folder),
+    "opensfm": lambda map_, folder: write_opensfm(map_, folder / "reconstruction.json"),
+    "opf": lambda map_, folder: write_opf(map_, folder / "opf"),
 }
 """Each writes one format of a map into a folder and returns the path written."""
 
@@ -73,10 +100,16 @@ def export_model(
     Raises:
         InputError: a format is not known or needs what is not given, or the folder cannot be written to.
     """
-    chosen = list(dict.fromkeys(formats))
+    map_ = MetricMap(reconstruction, timestamps_s, anchors_m, metric_from_sfm)
+    return export_map(map_, output_path, ExportOptions(formats=tuple(formats)))
+
+
+def export_map(map_: MetricMap, output_path: Path, options: ExportOptions) -> tuple[Path, ...]:
+    """The same of a map with all that is known of it, in the frame that the options ask for."""
+    chosen = list(dict.fromkeys(options.formats))
     check_formats(chosen)
+    map_ = in_frame(map_, options)
     make_output_folder(output_path)
-    map_ = MetricMap(reconstruction, timestamps_s, dict(anchors_m or {}), metric_from_sfm)
     return tuple(EXPORTERS[name](map_, output_path) for name in chosen)
 
 
@@ -87,23 +120,36 @@ def check_formats(formats: Iterable[str]) -> None:
             raise InputError(f"unknown export format {name!r}, expected one of: {', '.join(EXPORTERS)}")
 
 
-def export_result(output_path: Path, formats: Iterable[str], destination: Path) -> tuple[Path, ...]:
+def export_result(
+    output_path: Path,
+    formats: Iterable[str],
+    destination: Path,
+    *,
+    options: ExportOptions | None = None,
+    images_path: Path | None = None,
+) -> tuple[Path, ...]:
     """Export the best metric model of a run's output folder: the refined one, else the scaled one.
+
+    Args:
+        options: all but the formats.
+        images_path: folder of the photos; None: where the run found them.
 
     Raises:
         InputError: as ``export_model``, or the folder is not a result with a metric model.
     """
-    chosen = list(formats)
-    check_formats(chosen)
+    options = replace(options or ExportOptions(), formats=tuple(formats))
+    check_formats(options.formats)
     result = read_result_folder(output_path)
     reconstruction = result.read_model("sparse_metric") or result.read_model("sparse_scaled")
     if reconstruction is None:
         raise InputError("there is no metric model (sparse_metric/0 or sparse_scaled/0) to export", output_path)
-    return export_model(
+    map_ = MetricMap(
         reconstruction,
-        chosen,
-        destination,
         timestamps_s=result.timestamps_s,
         anchors_m=result.anchor_positions_m,
         metric_from_sfm=result.metric_from_sfm,
+        relative_scale_stddev=result.relative_scale_stddev,
+        images_path=images_path or result.images_path,
+        georeference=result.georeference,
     )
+    return export_map(map_, destination, options)

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import pycolmap
 
 from rangesfm.geometry import Similarity
+from rangesfm.georeference import Georeference
 from rangesfm.trajectory import Trajectory, trajectory_from_reconstruction
 
 Array = npt.NDArray[np.float64]
@@ -25,12 +27,18 @@ class MetricMap:
         timestamps_s: camera-clock time of each photo by name; None if unknown.
         anchors_m: (3,) position by anchor id, in the model's world.
         metric_from_sfm: from the unscaled model's world to this one's; None if unknown.
+        relative_scale_stddev: of every length in the map, by the scale alone; None if unknown.
+        images_path: folder of the photos; None if unknown.
+        georeference: where the model's world lies on the Earth; None if unknown.
     """
 
     reconstruction: pycolmap.Reconstruction
-    timestamps_s: Mapping[str, float] | None
-    anchors_m: Mapping[str, Array]
-    metric_from_sfm: Similarity | None
+    timestamps_s: Mapping[str, float] | None = None
+    anchors_m: Mapping[str, Array] | None = None
+    metric_from_sfm: Similarity | None = None
+    relative_scale_stddev: float | None = None
+    images_path: Path | None = None
+    georeference: Georeference | None = None
 
     @cached_property
     def trajectory(self) -> Trajectory:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rangesfm.scale.rescale import rescale
+from rangesfm.model_transform import rescale
 from rangesfm.simulate.model import SyntheticModel, synthetic_model
 from rangesfm.simulate.path import orbit_path
 from rangesfm.trajectory import trajectory_from_reconstruction

@@ -1,0 +1,66 @@
+"""Cameras and anchors as points on the map, for GIS programs: GeoPackage, GeoJSON and KML, through GDAL."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from rangesfm.errors import InputError
+from rangesfm.export.metric_map import Array, MetricMap
+from rangesfm.files import new_file
+from rangesfm.georeference import GEOGRAPHIC
+
+_WKB_POINT_Z = 1001
+
+
+def write_features(map_: MetricMap, path: Path, driver: str) -> Path:
+    """Write one point for each photo and each anchor, with ``kind``, ``name`` and the photo's ``timestamp_s``.
+
+    A GeoPackage is in the map's coordinate system, the other two have longitude and latitude by their definition.
+
+    Raises:
+        InputError: the map is not georeferenced, or pyogrio is not installed.
+    """
+    if map_.georeference is None:
+        raise InputError(
+            f"the format {path.suffix[1:]!r} needs a georeferenced map: anchors with [anchors] crs, or origin_anchor, "
+            "origin_lat_lon_height and heading_deg"
+        )
+    try:
+        import pyogrio.raw
+    except ImportError:
+        raise InputError(f"the format {path.suffix[1:]!r} needs pyogrio: pip install 'rangesfm[geo]'") from None
+    anchors = map_.anchors_m or {}
+    trajectory = map_.trajectory
+    places = np.concatenate([trajectory.centers, np.array(list(anchors.values())).reshape(-1, 3)])
+    is_projected = driver == "GPKG"
+    georeference = map_.georeference
+    coordinates = georeference.projected(places) if is_projected else georeference.geographic(places)
+    times = np.full(len(trajectory), np.nan) if trajectory.timestamps_s is None else trajectory.timestamps_s
+    names = np.array([*trajectory.image_names, *anchors], dtype=object)
+    kinds = np.array(["camera"] * len(trajectory) + ["anchor"] * len(anchors), dtype=object)
+    with new_file(path) as temporary:
+        pyogrio.raw.write(
+            temporary,
+            geometry=_wkb(coordinates),
+            field_data=[kinds, names, np.concatenate([times, np.full(len(anchors), np.nan)])],
+            fields=np.array(["kind", "name", "timestamp_s"]),
+            layer="survey",
+            driver=driver,
+            geometry_type="Point Z",
+            crs=georeference.crs if is_projected else GEOGRAPHIC,
+            **_OPTIONS.get(driver, {}),
+        )
+    return path
+
+
+# Nine decimals of a degree are a tenth of a millimetre.
+_OPTIONS = {"GeoJSON": {"COORDINATE_PRECISION": "9"}}
+
+
+def _wkb(coordinates: Array) -> np.ndarray[tuple[int], np.dtype[np.object_]]:
+    """(n,) well-known binary of points."""
+    points = [struct.pack("<BI3d", 1, _WKB_POINT_Z, *row) for row in coordinates.tolist()]
+    return np.array(points, dtype=object)

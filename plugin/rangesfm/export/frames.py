@@ -1,0 +1,125 @@
+"""The frame in which a map leaves: as it is, level, or east-north-up."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rangesfm.errors import InputError
+from rangesfm.export.metric_map import Array, MetricMap
+from rangesfm.geometry import Similarity, path_shape
+from rangesfm.georeference import check_crs, georeference_of_anchor
+from rangesfm.model_transform import rescale
+from rangesfm.options import ExportOptions
+from rangesfm.trajectory import Trajectory
+
+# Extent of a path across its plane, in its second extent: above this there is no plane to speak of.
+_MAX_ROUGHNESS = 0.3
+# Mean of the photos' up directions: of photos that agree it has length 1.
+_MIN_AGREEMENT = 0.3
+_NEARLY_VERTICAL = 0.1
+
+
+def in_frame(map_: MetricMap, options: ExportOptions) -> MetricMap:
+    """The map in the frame that the options ask for, georeferenced as far as they and the map say.
+
+    Raises:
+        InputError: the frame is not determined, with what is missing.
+    """
+    map_ = _georeferenced(map_, options)
+    if options.frame == "result":
+        return map_
+    if options.frame == "level":
+        return moved(map_, Similarity(1.0, _level_from_world(map_, options.up), np.zeros(3)))
+    if map_.georeference is None:
+        raise InputError(
+            "the frame 'enu' needs a georeference: anchors with [anchors] crs, or origin_anchor, "
+            "origin_lat_lon_height and heading_deg"
+        )
+    return moved(map_, map_.georeference.enu_from_world)
+
+
+def moved(map_: MetricMap, new_from_old: Similarity) -> MetricMap:
+    """The same map in another world."""
+    georeference = map_.georeference
+    if georeference is not None:
+        georeference = replace(georeference, enu_from_world=georeference.enu_from_world @ new_from_old.inverse())
+    known = map_.metric_from_sfm
+    return replace(
+        map_,
+        reconstruction=rescale(map_.reconstruction, new_from_old),
+        anchors_m={name: new_from_old.apply(at) for name, at in (map_.anchors_m or {}).items()},
+        metric_from_sfm=None if known is None else new_from_old @ known,
+        georeference=georeference,
+    )
+
+
+def _georeferenced(map_: MetricMap, options: ExportOptions) -> MetricMap:
+    georeference = map_.georeference
+    if options.origin_anchor is not None:
+        anchor = (map_.anchors_m or {}).get(options.origin_anchor)
+        if anchor is None:
+            known = ", ".join(map_.anchors_m or {}) or "none"
+            raise InputError(f"origin_anchor is {options.origin_anchor!r}, expected one with a position: {known}")
+        if options.origin_lat_lon_height is None or options.heading_deg is None:
+            raise InputError("origin_anchor needs origin_lat_lon_height and heading_deg as well")
+        georeference = georeference_of_anchor(
+            anchor,
+            options.origin_lat_lon_height,
+            up_in_world=up_in_world(map_.trajectory, options.up),
+            forward_in_world=map_.trajectory.world_from_cam[0][:, 2],
+            heading_deg=options.heading_deg,
+        )
+    if georeference is not None and options.crs is not None:
+        check_crs(options.crs)
+        georeference = replace(georeference, crs=options.crs)
+    return replace(map_, georeference=georeference)
+
+
+def up_in_world(trajectory: Trajectory, up: str) -> Array:
+    """(3,) unit vector against gravity, by the rule ``up`` of ExportOptions.
+
+    Raises:
+        InputError: the photos disagree about it, the path is not flat, or it is no direction.
+    """
+    photos_up = -trajectory.world_from_cam[:, :, 1].mean(axis=0)
+    if up == "cameras":
+        if np.linalg.norm(photos_up) < _MIN_AGREEMENT:
+            raise InputError("the photos do not agree what is up: say it (--up path, or --up X,Y,Z)")
+        return _unit(photos_up)
+    if up == "path":
+        shape = path_shape(trajectory.centers)
+        if shape.stddevs[2] > _MAX_ROUGHNESS * shape.stddevs[1]:
+            raise InputError("the path does not lie in a plane: say what is up (--up cameras, or --up X,Y,Z)")
+        normal = shape.axes[:, 2]
+        return _unit(normal if normal @ photos_up >= 0 else -normal)
+    return _unit(np.array(direction(up)))
+
+
+def direction(text: str) -> tuple[float, float, float]:
+    """Three numbers that are not all 0; InputError for anything else."""
+    try:
+        numbers = tuple(float(part) for part in text.replace(",", " ").split())
+    except ValueError:
+        numbers = ()
+    if len(numbers) != 3 or not 0 < np.linalg.norm(numbers) < np.inf:
+        raise InputError(f"up is {text!r}, expected cameras, path or a direction X,Y,Z")
+    return numbers
+
+
+def _unit(vector: Array) -> Array:
+    unit: Array = vector / np.linalg.norm(vector)
+    return unit
+
+
+def _level_from_world(map_: MetricMap, up: str) -> Array:
+    """(3, 3) rotation: z up, y as the first camera looks (its upper edge, where it looks down)."""
+    vertical = up_in_world(map_.trajectory, up)
+    first = map_.trajectory.world_from_cam[0]
+    for ahead in (first[:, 2], -first[:, 1]):
+        level = ahead - (ahead @ vertical) * vertical
+        if np.linalg.norm(level) > _NEARLY_VERTICAL:
+            break
+    y = _unit(level)
+    return np.stack([np.cross(y, vertical), y, vertical])

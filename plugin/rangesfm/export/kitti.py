@@ -1,0 +1,18 @@
+"""Trajectories as the KITTI odometry benchmark has them: the first three rows of world_from_cam, 12 numbers a line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from rangesfm.files import new_file
+from rangesfm.trajectory import Trajectory
+
+
+def write_kitti(trajectory: Trajectory, path: Path) -> Path:
+    """Write one pose a line (metres), in the order of time; the format has no place for times and names."""
+    poses = np.concatenate([trajectory.world_from_cam, trajectory.centers[:, :, None]], axis=2).reshape(-1, 12)
+    with new_file(path) as temporary:
+        np.savetxt(temporary, poses, fmt="%.17g")
+    return path

@@ -1,0 +1,44 @@
+"""Undistorted photos with a metric ``sparse/0``: what dense reconstruction, Gaussian splatting and MVS tools read."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+import pycolmap
+
+from rangesfm.errors import InputError
+from rangesfm.export.metric_map import MetricMap
+from rangesfm.files import new_folder
+
+
+def write_undistorted(map_: MetricMap, folder: Path) -> Path:
+    """Write ``images/`` (pinhole) and ``sparse/0`` into ``folder``.
+
+    Raises:
+        InputError: the photos are not where the map says, or nobody said where they are.
+    """
+    images_path = map_.images_path
+    if images_path is None:
+        raise InputError("the format 'undistorted' needs the photos: give their folder (--images)")
+    for image in map_.reconstruction.images.values():
+        if image.has_pose and not os.path.isfile(images_path / image.name):
+            raise InputError(f"there is no photo {image.name}, which the map needs, in this folder", images_path)
+    with new_folder(folder) as temporary, tempfile.TemporaryDirectory() as model_path:
+        map_.reconstruction.write(model_path)
+        pycolmap.undistort_images(temporary, model_path, images_path)
+        _into_sparse_0(temporary)
+    return folder
+
+
+def _into_sparse_0(folder: Path) -> None:
+    """COLMAP writes the model to sparse/; everybody else looks for it in sparse/0. Its scripts for MVS stay out."""
+    files = list((folder / "sparse").iterdir())
+    (folder / "sparse" / "0").mkdir()
+    for path in files:
+        path.rename(folder / "sparse" / "0" / path.name)
+    for path in folder.iterdir():
+        if path.name not in ("images", "sparse"):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
