@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from rangesfm.errors import GeometryError
-from rangesfm.scale.consensus import agreeing_intervals, consensus_scales
+from rangesfm.scale.consensus import agreeing_intervals, consensus_scales, local_maxima
 from rangesfm.scale.range_equation import RangeProblem
 from rangesfm.simulate.ranges import Radio
 
@@ -50,13 +51,34 @@ def num_agreeing(problem: RangeProblem, scales: Array) -> Array:
     return agrees
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_no_scale_of_a_fine_grid_has_more_ranges_agree(make_survey: MakeSurvey, seed: int) -> None:
-    radio = Radio(range_stddev_m=STDDEV_M, obstructed_share=0.5, obstructed_mean_m=2.0)
+@pytest.mark.parametrize("obstructed_share", [0.0, 0.5, 0.8])
+@pytest.mark.parametrize("seed", range(4))
+def test_no_scale_at_all_has_more_ranges_agree(make_survey: MakeSurvey, seed: int, obstructed_share: float) -> None:
+    """The count changes at ends of intervals only, so trying every place between two of them tries every scale."""
+    radio = Radio(range_stddev_m=STDDEV_M, obstructed_share=obstructed_share, obstructed_mean_m=2.0)
     problem = known_anchors(make_survey(scale=0.5, radio=radio, num_keyframes=15, seed=seed))
     best = consensus_scales(problem)[0]
-    grid = np.geomspace(1e-3, 1e2, 20_000)
-    assert num_agreeing(problem, np.array([best]))[0] >= num_agreeing(problem, grid).max()
+    offset = problem.tag_from_center - problem.anchor_mean_m[problem.anchor_index]
+    places = np.unique(agreeing_intervals(problem.centers, offset, problem.range_m, np.full(75, TOLERANCE_M)))
+    everywhere = np.concatenate([0.5 * (places[:-1] + places[1:]), np.geomspace(1e-3, 1e2, 5000)])
+    assert num_agreeing(problem, np.array([best]))[0] == num_agreeing(problem, everywhere).max()
+
+
+def test_local_maxima_are_those_found_by_counting_at_every_place() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        # Whole numbers, so that many ends meet.
+        starts = rng.integers(0, 30, 12).astype(np.float64)
+        ends = starts + rng.integers(1, 8, 12)
+        places = np.arange(-0.5, 40.0, 0.25)
+        covered = np.sum((starts[:, None] <= places) & (places <= ends[:, None]), axis=0)
+        middles, counts = local_maxima(starts, ends)
+        expected = []
+        changes = np.flatnonzero(np.diff(covered))
+        for begin, end in zip(changes[:-1] + 1, changes[1:], strict=True):
+            if covered[begin] > covered[begin - 1] and covered[end] > covered[end + 1]:
+                expected.append((0.5 * (places[begin] + places[end]), covered[begin]))
+        assert list(zip(middles, counts, strict=True)) == expected
 
 
 def test_intervals_hold_exactly_the_scales_that_agree() -> None:
@@ -98,10 +120,19 @@ def test_sixty_percent_of_wild_ranges_do_not_move_it(make_survey: MakeSurvey, se
     assert best == pytest.approx(survey.site_from_sfm.scale, rel=0.03)
 
 
+def test_a_lower_hill_of_agreement_is_a_candidate_too(make_survey: MakeSurvey) -> None:
+    """Sixty ranges fit one scale, fifty a second one."""
+    survey = make_survey(radio=Radio(range_stddev_m=0.02), anchors_m={"A": (12.0, 1.0, 2.0)}, num_keyframes=110)
+    problem = known_anchors(survey)
+    distance = np.linalg.norm(5.0 * problem.centers + problem.tag_from_center - problem.anchor_mean_m[0], axis=1)
+    scales = consensus_scales(replace(problem, range_m=np.where(np.arange(110) % 11 < 6, problem.range_m, distance)))
+    assert scales[0] == pytest.approx(survey.site_from_sfm.scale, rel=0.03)
+    assert min(abs(scale / 5.0 - 1) for scale in scales[1:]) < 0.03
+
+
 def test_candidates_are_distinct_and_positive(make_survey: MakeSurvey) -> None:
     radio = Radio(range_stddev_m=STDDEV_M, obstructed_share=0.6, obstructed_mean_m=4.0)
     scales = consensus_scales(known_anchors(make_survey(radio=radio)))
-    assert len(scales) > 1
     assert min(scales) > 0
     ratios = np.exp(np.abs(np.subtract.outer(np.log(scales), np.log(scales))))
     assert np.all(ratios[~np.eye(len(scales), dtype=bool)] > 1.01)

@@ -12,12 +12,16 @@ Array = npt.NDArray[np.float64]
 
 # A range agrees with a scale if it fits to this many stddevs of noise and bias together.
 _TOLERANCE_STDDEVS = 2.5
-_MAX_CANDIDATES = 5
-_SAME_CANDIDATE = 1.02
+# Hills of agreement are told apart on a logarithmic grid of the scale; only those at least so high beside the best.
+_LOG_CELL = 0.02
+_MIN_SHARE_OF_BEST = 0.5
+_MAX_CANDIDATES = 12
 
 
 def consensus_scales(problem: RangeProblem) -> list[float]:
     """Scales that most ranges agree on, best first; the first is the exact maximum.
+
+    The others are the tops of lower hills: local maxima of the number of ranges that agree.
 
     Raises:
         GeometryError: no positive scale explains any range.
@@ -29,14 +33,24 @@ def consensus_scales(problem: RangeProblem) -> list[float]:
     starts, ends = agreeing_intervals(problem.centers, offset, ranges, tolerance)
     if not len(starts):
         raise GeometryError("no scale explains any range: are the anchors given in the first camera's frame?")
-    middles, counts = _stab(starts, ends)
-    found: list[float] = []
-    for i in np.argsort(-counts, kind="stable"):
-        if all(max(middles[i] / s, s / middles[i]) > _SAME_CANDIDATE for s in found):
-            found.append(float(middles[i]))
-        if len(found) == _MAX_CANDIDATES:
-            break
-    return found
+    return _hilltops(*local_maxima(starts, ends))
+
+
+def _hilltops(scales: Array, counts: npt.NDArray[np.int64]) -> list[float]:
+    """Best first: scales with no better one in their cell of the grid or in the two beside it."""
+    cells = np.floor(np.log(scales) / _LOG_CELL).astype(np.int64)
+    first = np.flatnonzero(np.diff(cells, prepend=cells[0] - 1))
+    best = np.maximum.reduceat(counts, first)
+    if len(first) == 1:
+        return [float(scales[np.argmax(counts)])]
+    beside = np.diff(cells[first]) == 1
+    lower = np.concatenate([[0], np.where(beside, best[:-1], 0)])
+    higher = np.concatenate([np.where(beside, best[1:], 0), [0]])
+    # Of equal neighbours the first is the top.
+    tops = np.flatnonzero((best > lower) & (best >= higher) & (best >= _MIN_SHARE_OF_BEST * best.max()))
+    tops = tops[np.argsort(-best[tops], kind="stable")][:_MAX_CANDIDATES]
+    ends = np.append(first[1:], len(scales))
+    return [float(scales[first[top] + np.argmax(counts[first[top] : ends[top]])]) for top in tops]
 
 
 def agreeing_intervals(centers: Array, offset: Array, ranges: Array, tolerance: Array) -> tuple[Array, Array]:
@@ -73,12 +87,21 @@ def _roots(a: Array, b: Array, c: Array) -> tuple[Array, Array, npt.NDArray[np.b
     return (-b - root) / safe, (-b + root) / safe, real
 
 
-def _stab(starts: Array, ends: Array) -> tuple[Array, npt.NDArray[np.int64]]:
-    """Middle of every stretch between interval ends, and how many intervals cover it. O(n log n)."""
-    places = np.concatenate([starts, ends])
-    steps = np.concatenate([np.ones(len(starts), dtype=np.int64), -np.ones(len(ends), dtype=np.int64)])
-    order = np.argsort(places, kind="stable")
-    places, counts = places[order], np.cumsum(steps[order])
-    middles = 0.5 * (places[:-1] + places[1:])
-    wide = places[1:] > places[:-1]
-    return middles[wide], counts[:-1][wide]
+def local_maxima(starts: Array, ends: Array) -> tuple[Array, npt.NDArray[np.int64]]:
+    """Where more of the closed intervals overlap than just before and just after: the stretches' middles, and counts.
+
+    Such a stretch lies between a start and the next end, without another start between them. O(n log n); starts and
+    ends are sorted apart, as sorting numbers is many times faster than sorting an index to them.
+
+    Args:
+        starts, ends: (n,) n > 0.
+
+    Returns:
+        (k,) ascending middles, and how many intervals hold each.
+    """
+    starts, ends = np.sort(starts), np.sort(ends)
+    num_ended = np.searchsorted(ends, starts, side="left")
+    next_start = np.append(starts[1:], np.inf)
+    tops = np.flatnonzero(ends[num_ended] < next_start)
+    counts = tops + 1 - num_ended[tops]
+    return 0.5 * (starts[tops] + ends[num_ended[tops]]), counts
