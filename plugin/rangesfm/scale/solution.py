@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry import path_shape
-from rangesfm.ranging.noise import correlation_inflation, robust_stddev, short_range_stddev
+from rangesfm.ranging.noise import correlation_inflation, short_range_stddev
+from rangesfm.scale.inlier_noise import inlier_stddev
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, solve
 from rangesfm.scale.starts import (
     complete_unknown_anchors,
@@ -149,7 +150,7 @@ def _with_own_noise(
         problem.distances,
     )
     fit = solve(problem, start.state)
-    inflation, noise = 1.0, robust_stddev(fit.residuals_m)
+    inflation, noise = 1.0, inlier_stddev(fit.residuals_m)
     for _ in range(_NUM_NOISE_ROUNDS):
         base = np.where(np.isfinite(noise_stddev_m), noise_stddev_m, noise)
         interpolation = fit.state.metric_from_model.scale * center_stddev
@@ -166,7 +167,7 @@ def _with_own_noise(
         fit = solve(problem, fit.state)
         inflation = correlation_inflation(fit.residuals_m / stddev, fit.weights, groups)
         ordinary = short_range_stddev(problem.range_m) < noise
-        noise = robust_stddev(fit.residuals_m[ordinary] if np.mean(ordinary) > _MIN_ORDINARY else fit.residuals_m)
+        noise = inlier_stddev(fit.residuals_m[ordinary] if np.mean(ordinary) > _MIN_ORDINARY else fit.residuals_m)
     return Solution(problem, fit, inflation, noise)
 
 
