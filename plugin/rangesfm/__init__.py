@@ -49,7 +49,10 @@ _HOME = {
     "rescale": "rangesfm.model_transform",
     "run_survey": "rangesfm.pipeline",
     "select_keyframes": "rangesfm.vision.keyframes",
+    "tag_positions": "rangesfm.ranging.tag_positions",
     "trajectory_from_reconstruction": "rangesfm.trajectory",
+    "trilaterate": "rangesfm.ranging.trilateration",
+    "trilaterate_anchors": "rangesfm.ranging.anchor_survey",
     "two_candidate": "rangesfm.scale.two_candidate",
     "write_report": "rangesfm.report",
 }

@@ -65,7 +65,7 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
         anchor_ids=[anchor.anchor_id for anchor in given or ()],
     )
     _check_lengths(log)
-    log = _of_wanted_anchors(_of_wanted_tag(log, survey.tag_id), survey.use_anchors)
+    log = _of_wanted_anchors(of_wanted_tag(log, survey.tag_id), survey.use_anchors)
     anchors = _anchors_of_log(log) if given is None else given
     _check_anchors_known(log, anchors, survey)
     georeference, anchors = _on_the_earth(anchors, survey)
@@ -136,7 +136,8 @@ def _anchors_of_log(log: RangeLog) -> tuple[Anchor, ...]:
     return tuple(by_id.get(anchor_id, Anchor(anchor_id)) for anchor_id in log.anchor_ids)
 
 
-def _of_wanted_tag(log: RangeLog, tag_id: str | None) -> RangeLog:
+def of_wanted_tag(log: RangeLog, tag_id: str | None) -> RangeLog:
+    """The ranges of one tag; InputError if it is not there, or if there are several and none is named."""
     if tag_id is None:
         if len(log.tag_ids) > 1:
             raise InputError(

@@ -64,11 +64,38 @@ class Reference:
             InputError: the reference is by time and the trajectory has no times.
         """
         if self.image_names is not None:
-            return self._at_names(self.image_names, trajectory.image_names)
+            return self.poses_of(trajectory.image_names)
         if trajectory.timestamps_s is None:
             raise InputError("the reference is by time, but the photos have no times (images.csv)")
+        return self.poses_at(trajectory.timestamps_s, max_gap_s)
+
+    def poses_of(self, image_names: Sequence[str]) -> tuple[Array, Array | None]:
+        """Poses of n photos, NaN where unknown, as ``positions_at`` returns them; only of a reference by photo."""
+        assert self.image_names is not None
+        index_of = {name: i for i, name in enumerate(self.image_names)}
+        return self._at_index(np.array([index_of.get(name, -1) for name in image_names], dtype=np.int64))
+
+    def poses_at(self, times: Array, max_gap_s: float) -> tuple[Array, Array | None]:
+        """Poses at (n,) times, as ``positions_at`` finds them; only of a reference by time."""
         assert self.timestamps_s is not None
-        return self._at_times(self.timestamps_s, trajectory.timestamps_s, max_gap_s)
+        known = self.timestamps_s
+        after = np.clip(np.searchsorted(known, times, side="right"), 1, max(len(known) - 1, 1))
+        after = np.minimum(after, len(known) - 1)
+        before = np.maximum(after - 1, 0)
+        nearest = np.where(times - known[before] <= known[after] - times, before, after)
+        nearest[np.abs(times - known[nearest]) > MAX_TIME_DIFFERENCE_S] = -1
+        positions, rotations = self._at_index(nearest)
+
+        gap = known[after] - known[before]
+        between = (gap > 0) & (gap <= max_gap_s) & (times >= known[before]) & (times <= known[after])
+        weight = ((times - known[before])[between] / gap[between])[:, None]
+        positions[between] = (1 - weight) * self.positions_m[before[between]] + weight * self.positions_m[
+            after[between]
+        ]
+        if rotations is not None and between.any():
+            assert self.world_from_cam is not None
+            rotations[between] = Slerp(known, Rotation.from_matrix(self.world_from_cam))(times[between]).as_matrix()
+        return positions, rotations
 
     def why_nothing_is_known(self, trajectory: Trajectory, max_gap_s: float = 0.05) -> str:
         """One line for the user whose reference knows no keyframe of the trajectory."""
@@ -89,32 +116,9 @@ class Reference:
             + (f", its samples are {np.median(spacing):.3f} s apart" if len(spacing) else "")
         )
 
-    def _at_names(self, known: tuple[str, ...], names: tuple[str, ...]) -> tuple[Array, Array | None]:
-        index_of = {name: i for i, name in enumerate(known)}
-        return self._at_index(np.array([index_of.get(name, -1) for name in names], dtype=np.int64))
-
     def _at_index(self, index: npt.NDArray[np.int64]) -> tuple[Array, Array | None]:
         rotations = None if self.world_from_cam is None else _rows(self.world_from_cam, index)
         return _rows(self.positions_m, index), rotations
-
-    def _at_times(self, known: Array, times: Array, max_gap_s: float) -> tuple[Array, Array | None]:
-        after = np.clip(np.searchsorted(known, times, side="right"), 1, max(len(known) - 1, 1))
-        after = np.minimum(after, len(known) - 1)
-        before = np.maximum(after - 1, 0)
-        nearest = np.where(times - known[before] <= known[after] - times, before, after)
-        nearest[np.abs(times - known[nearest]) > MAX_TIME_DIFFERENCE_S] = -1
-        positions, rotations = self._at_index(nearest)
-
-        gap = known[after] - known[before]
-        between = (gap > 0) & (gap <= max_gap_s) & (times >= known[before]) & (times <= known[after])
-        weight = ((times - known[before])[between] / gap[between])[:, None]
-        positions[between] = (1 - weight) * self.positions_m[before[between]] + weight * self.positions_m[
-            after[between]
-        ]
-        if rotations is not None and between.any():
-            assert self.world_from_cam is not None
-            rotations[between] = Slerp(known, Rotation.from_matrix(self.world_from_cam))(times[between]).as_matrix()
-        return positions, rotations
 
 
 def read_reference(path: str | Path) -> Reference:

@@ -11,7 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rangesfm.errors import InputError
-from rangesfm.ranging.anchor_file import default_anchor_frame, read_anchors
+from rangesfm.ranging.anchor_file import default_anchor_frame, read_anchors, write_anchors
+from rangesfm.ranging.anchors import Anchor
 
 HEADER = "anchor_id,x_m,y_m,z_m"
 FULL_HEADER = HEADER + ",position_stddev_m,range_bias_m,range_bias_stddev_m"
@@ -92,3 +93,20 @@ def test_missing_coordinate_column_is_named(tmp_path: Path) -> None:
 def test_any_bytes_are_anchors_or_an_input_error(tmp_path: Path, header: bytes, content: bytes) -> None:
     with contextlib.suppress(InputError):
         assert read_anchors(write(tmp_path, header + content))
+
+
+def test_written_anchors_are_read_back(tmp_path: Path) -> None:
+    anchors = (
+        Anchor("A1", np.array([1.5, -2.25, 0.125]), 0.05, 0.02, 0.01),
+        Anchor("A2", np.array([0.0, 7.0, 1.0])),
+        Anchor("A3", None, 0.0, -0.1, 0.03),
+        Anchor("A4"),
+    )
+    write_anchors(anchors, tmp_path / "anchors.csv")
+    for written, read in zip(anchors, read_anchors(tmp_path / "anchors.csv"), strict=True):
+        assert str(read) == str(written)
+
+
+def test_anchors_that_cannot_be_written_are_an_input_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be written"):
+        write_anchors([Anchor("A1")], tmp_path / "none" / "anchors.csv")

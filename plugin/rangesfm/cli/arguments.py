@@ -13,7 +13,19 @@ from typing import NoReturn
 from rangesfm.errors import InputError
 from rangesfm.progress import Progress
 
-COMMANDS = ("run", "demo", "reconstruct", "scale", "refine", "export", "compare", "report", "ranges", "doctor")
+COMMANDS = (
+    "run",
+    "demo",
+    "reconstruct",
+    "scale",
+    "refine",
+    "export",
+    "compare",
+    "report",
+    "ranges",
+    "trilaterate",
+    "doctor",
+)
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,7 @@ def _names(text: str) -> list[str]:
 
 
 def position(text: str) -> list[float]:
+    """Three numbers X,Y,Z; to be a type of argparse."""
     numbers = _numbers(text)
     if len(numbers) != 3:
         raise argparse.ArgumentTypeError(f"'{text}' has {len(numbers)} numbers, expected X,Y,Z in metres")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import InputError
+from rangesfm.files import new_file
 from rangesfm.ranging.anchors import Anchor
 from rangesfm.tables import Table, read_table
 
@@ -45,6 +47,35 @@ def read_anchors(path: str | Path) -> tuple[Anchor, ...]:
         )
         for row, anchor_id in enumerate(anchor_ids)
     )
+
+
+def write_anchors(anchors: Sequence[Anchor], path: str | Path) -> None:
+    """Write anchors so that ``read_anchors`` reads them: empty coordinates where the position is unknown.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    try:
+        with new_file(Path(path)) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(["anchor_id", *_COORDINATES, *_OPTIONAL])
+            writer.writerows(map(_row, anchors))
+    except OSError as error:
+        raise InputError(f"cannot be written ({error.strerror})", path) from error
+
+
+def _row(anchor: Anchor) -> list[str]:
+    bias = ["", ""]
+    if anchor.range_bias_stddev_m is not None:
+        bias = [f"{anchor.range_bias_m:.4f}", f"{anchor.range_bias_stddev_m:.4f}"]
+    if anchor.position_m is None:
+        return [anchor.anchor_id, "", "", "", "", *bias]
+    return [
+        anchor.anchor_id,
+        *(f"{coordinate:.4f}" for coordinate in anchor.position_m),
+        f"{anchor.position_stddev_m:.4f}",
+        *bias,
+    ]
 
 
 def default_anchor_frame(anchors: Sequence[Anchor]) -> str:

@@ -1,0 +1,194 @@
+"""``rangesfm trilaterate``: where anchors stand, from ranges taken at known positions of the tag."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from rangesfm.cli.arguments import Commands, Outcome
+from rangesfm.cli.log_arguments import add_log_arguments, read_log
+from rangesfm.cli.survey_flags import position
+from rangesfm.progress import Progress
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rangesfm.ranging.anchor_survey import AnchorPlacement
+    from rangesfm.ranging.log import RangeLog
+
+_TOWARD = {
+    "above": (0.0, 0.0, 1.0),
+    "below": (0.0, 0.0, -1.0),
+    "x+": (1.0, 0.0, 0.0),
+    "x-": (-1.0, 0.0, 0.0),
+    "y+": (0.0, 1.0, 0.0),
+    "y-": (0.0, -1.0, 0.0),
+    "z+": (0.0, 0.0, 1.0),
+    "z-": (0.0, 0.0, -1.0),
+}
+
+
+def add_command(commands: Commands) -> None:
+    parser = commands.add(
+        "trilaterate",
+        execute,
+        help="anchor positions from ranges at known tag positions",
+        description=(
+            "Find where anchors stand from ranges that were taken at known positions of the tag, robustly. If these "
+            "lie in a plane, an anchor has two possible places, one on each side: --side says which."
+        ),
+        example=(
+            "rangesfm trilaterate uwb.csv --positions total_station.csv --side above --output_path anchors.csv\n"
+            "  rangesfm run survey.toml --anchors anchors.csv --anchor_frame site"
+        ),
+    )
+    add_log_arguments(parser)
+    parser.add_argument(
+        "--positions",
+        required=True,
+        metavar="FILE",
+        help="of the tag: CSV timestamp_s,x_m,y_m,z_m (or image_name,.. with ranges by name), or a TUM trajectory",
+    )
+    parser.add_argument(
+        "--tag_in_cam",
+        type=position,
+        default=(0.0, 0.0, 0.0),
+        metavar="X,Y,Z",
+        help="the tag in the frame whose poses (with qx,qy,qz,qw) the file holds, metres (default: 0,0,0)",
+    )
+    parser.add_argument("--tag_id", metavar="ID", help="the tag whose positions these are, if the log has several")
+    parser.add_argument(
+        "--time_offset", type=float, default=0.0, metavar="SECONDS", help="time of positions minus time of ranges"
+    )
+    parser.add_argument(
+        "--max_interpolation_gap_s",
+        type=float,
+        default=0.5,
+        metavar="S",
+        help="between known positions further apart none is interpolated (default: 0.5)",
+    )
+    parser.add_argument(
+        "--side",
+        type=_side,
+        default={},
+        metavar="WORD|ID=WORD,..",
+        help=f"of two possible places the one that lies {', '.join(_TOWARD)}; for all anchors or for each",
+    )
+    _add_estimate_options(parser)
+    parser.add_argument("--output_path", metavar="CSV", help="write the anchors there, for --anchors of other commands")
+
+
+def _add_estimate_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("estimate")
+    group.add_argument("--range_stddev_m", type=_positive, metavar="M", help="noise of a range (default: estimated)")
+    group.add_argument("--range_bias_m", type=float, default=0.0, metavar="M", help="what ranges read too long")
+    group.add_argument(
+        "--range_bias_stddev_m",
+        type=_not_negative,
+        default=0.1,
+        metavar="M",
+        help="how uncertain that is; 0 fixes it (default: 0.1)",
+    )
+    group.add_argument(
+        "--max_position_stddev_m",
+        type=_positive,
+        default=1.0,
+        metavar="M",
+        help="an anchor less certain than this in any direction is refused (default: 1)",
+    )
+
+
+def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
+    from rangesfm.errors import GeometryError
+    from rangesfm.inputs import of_wanted_tag
+    from rangesfm.ranging.anchor_file import write_anchors
+    from rangesfm.ranging.anchor_survey import trilaterate_anchors
+    from rangesfm.ranging.tag_positions import tag_positions
+    from rangesfm.ranging.trilateration import TrilaterationOptions
+    from rangesfm.reference import read_reference
+
+    log = of_wanted_tag(read_log(args), args.tag_id)
+    positions = tag_positions(
+        log,
+        read_reference(args.positions),
+        args.tag_in_cam,
+        time_offset_s=args.time_offset,
+        max_gap_s=args.max_interpolation_gap_s,
+    )
+    options = TrilaterationOptions(
+        range_stddev_m=args.range_stddev_m,
+        range_bias_m=args.range_bias_m,
+        range_bias_stddev_m=args.range_bias_stddev_m,
+        max_position_stddev_m=args.max_position_stddev_m,
+    )
+    placements = trilaterate_anchors(log, positions, toward=_toward(args.side, log), options=options)
+    if all(placement.found is None for placement in placements):
+        raise GeometryError(f"anchor {placements[0].anchor_id}: {placements[0].why_not}")
+    lines = _lines(log, placements)
+    if args.output_path is not None:
+        write_anchors([placement.anchor for placement in placements], args.output_path)
+        lines += ["", f"written to {args.output_path}"]
+    return Outcome(lines)
+
+
+def _toward(side: dict[str, str], log: RangeLog) -> dict[str, Sequence[float]]:
+    from rangesfm.errors import InputError
+
+    for anchor_id in side:
+        if anchor_id and anchor_id not in log.anchor_ids:
+            raise InputError(f"--side: anchor '{anchor_id}' is not in the log ({', '.join(log.anchor_ids)})")
+    words = {anchor_id: side.get(anchor_id, side.get("")) for anchor_id in log.anchor_ids}
+    return {anchor_id: _TOWARD[word] for anchor_id, word in words.items() if word is not None}
+
+
+def _side(text: str) -> dict[str, str]:
+    """Words by anchor; by the empty id the word for all others."""
+    pairs = [part.strip().rpartition("=") for part in text.split(",")]
+    for _, _, word in pairs:
+        if word not in _TOWARD:
+            raise argparse.ArgumentTypeError(f"'{word}' is no side, expected one of {', '.join(_TOWARD)}")
+    return {anchor_id: word for anchor_id, _, word in pairs}
+
+
+def _positive(text: str) -> float:
+    if not (value := _not_negative(text)) > 0:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a length in metres, expected more than 0")
+    return value
+
+
+def _not_negative(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a length in metres, expected 0 or more")
+    return value
+
+
+def _lines(log: RangeLog, placements: Sequence[AnchorPlacement]) -> list[str]:
+    width = max(len("anchor"), *(len(placement.anchor_id) for placement in placements))
+    num_known = sum(placement.num_ranges for placement in placements)
+    head = f"{'anchor':{width}}  {'ranges':>7}  {'fit':>5}  {'x m':>9}  {'y m':>9}  {'z m':>9}  {'stddev m':>8}"
+    return [
+        f"{num_known} of {len(log)} ranges are at known positions of the tag",
+        "",
+        f"{head}  {'bias m':>7}  {'noise m':>7}",
+        *(line for placement in placements for line in _rows(placement, width)),
+    ]
+
+
+def _rows(placement: AnchorPlacement, width: int) -> list[str]:
+    found, name = placement.found, f"{placement.anchor_id:{width}}  {placement.num_ranges:7}"
+    if found is None:
+        return [f"{name}  {placement.why_not}"]
+    share = 100 * float((found.weights > 0.5).mean())
+    coordinates = "  ".join(f"{value:9.3f}" for value in found.position_m)
+    row = f"{name}  {share:3.0f} %  {coordinates}  {found.position_stddev_m:8.3f}"
+    rows = [f"{row}  {found.range_bias_m:7.3f}  {found.noise_stddev_m:7.3f}"]
+    if found.mirror_position_m is not None:
+        other = "  ".join(f"{value:9.3f}" for value in found.mirror_position_m)
+        rows.append(
+            f"{'':{width}}  {'':7}  {'or':>5}  {other}  (the tag's positions lie in a plane: say which by --side)"
+        )
+    return rows
