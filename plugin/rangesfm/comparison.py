@@ -94,20 +94,14 @@ def papers_table(
 def with_true_scale(
     path: Trajectory, reference: Reference, *, frame: str = "site", max_gap_s: float = 0.05
 ) -> Trajectory:
-    """The path with the scale that fits the reference best, otherwise placed as it is.
+    """The path with the scale that fits the reference best, otherwise placed as it is (see Trajectory.resized).
 
-    What stays in place while the scale changes: in the first camera's frame the first
-    keyframe, which defines it (the paper); in a site frame the middle of the path, which is
-    what ranges to surveyed anchors hold on to whatever the scale. A path whose scale the
-    reference does not tell comes back unchanged.
+    A path whose scale the reference does not tell comes back unchanged.
     """
     positions, _ = reference.positions_at(path, max_gap_s)
     known = np.isfinite(positions).all(axis=1)
     scale = _scale_to(path.centers[known], positions[known])
-    if scale is None:
-        return path
-    fixed_point = path.centers[0] if frame == "first_camera" else path.centers.mean(axis=0)
-    return path.transformed(scale, np.eye(3), (1.0 - scale) * fixed_point)
+    return path if scale is None else path.resized(scale, frame)
 
 
 def reference_in_frame(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +33,7 @@ RANGES_COLUMNS = (
     "predicted_refined_m",
     "status",
 )
+PLACE_COLUMNS = ("keyframe_before", "keyframe_after", "weight")
 USED_STATUSES = (RangeStatus.USED.label, RangeStatus.DOWN_WEIGHTED.label)
 
 
@@ -48,6 +49,8 @@ class RangesAsUsed:
         residual_scaled_m, residual_refined_m: (n,) predicted minus measured with the
             scaled and with the refined model; NaN where not applicable.
         status: n labels of RangeStatus.
+        keyframe_before, keyframe_after: n photos between which each range was taken; empty without a place.
+        weight: (n,) of the later one, in [0, 1]; NaN without a place.
     """
 
     timestamp_s: Array
@@ -57,6 +60,9 @@ class RangesAsUsed:
     residual_scaled_m: Array
     residual_refined_m: Array
     status: tuple[str, ...]
+    keyframe_before: tuple[str, ...]
+    keyframe_after: tuple[str, ...]
+    weight: Array
 
     @property
     def is_used(self) -> npt.NDArray[np.bool_]:
@@ -153,8 +159,10 @@ class ResultFolder:
         path = self.path / "ranges.csv"
         if not path.is_file():
             return None
-        table = read_table(path, RANGES_COLUMNS)
+        table = read_table(path, RANGES_COLUMNS, PLACE_COLUMNS)
         range_m = table.numbers("range_m")
+        nowhere = [""] * len(table)
+        before, after = (table.text(name, empty="") if name in table else nowhere for name in PLACE_COLUMNS[:2])
         return RangesAsUsed(
             timestamp_s=table.numbers("timestamp_s", empty=np.nan),
             image_name=tuple(table.text("image_name", empty="")),
@@ -163,7 +171,18 @@ class ResultFolder:
             residual_scaled_m=table.numbers("predicted_scaled_m", empty=np.nan) - range_m,
             residual_refined_m=table.numbers("predicted_refined_m", empty=np.nan) - range_m,
             status=tuple(table.text("status")),
+            keyframe_before=tuple(before),
+            keyframe_after=tuple(after),
+            weight=table.numbers("weight", empty=np.nan) if "weight" in table else np.full(len(table), np.nan),
         )
+
+    def read_numbers(self, name: str, columns: Sequence[str]) -> dict[str, Array] | None:
+        """Columns of numbers of ``name``.csv, NaN where a cell is empty; None if not there."""
+        path = self.path / f"{name}.csv"
+        if not path.is_file():
+            return None
+        table = read_table(path, columns)
+        return {column: table.numbers(column, empty=np.nan) for column in columns}
 
 
 def read_result_folder(path: Path) -> ResultFolder:

@@ -48,6 +48,16 @@ class Trajectory:
             rotation @ self.world_from_cam,
         )
 
+    def resized(self, factor: float, frame: str) -> Trajectory:
+        """The path with another scale, otherwise placed as it is.
+
+        What stays in place: in the first camera's frame the first keyframe, which defines it
+        (the paper); in a site frame the middle of the path, which is what ranges to surveyed
+        anchors hold on to whatever the scale.
+        """
+        fixed_point = self.centers[0] if frame == "first_camera" else self.centers.mean(axis=0)
+        return self.transformed(factor, np.eye(3), (1.0 - factor) * fixed_point)
+
 
 def trajectory_from_reconstruction(
     reconstruction: pycolmap.Reconstruction, timestamps_s: Mapping[str, float] | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,18 @@ from rangesfm.reference import read_reference
 from rangesfm.result_folder import RangesAsUsed, ResultFolder
 from rangesfm.trajectory import Trajectory, trajectory_from_reconstruction
 
+if TYPE_CHECKING:
+    import pycolmap
+
 Array = npt.NDArray[np.float64]
+
+TABLES = {
+    "scale_candidates": ("timestamp_s", "alpha0", "alpha1"),
+    "scale_consensus": ("scale", "num_agreeing"),
+    "scale_bootstrap": ("scale",),
+    "time_offset_curve": ("time_offset_s", "cost"),
+}
+"""Columns of numbers of the files of these names, which a run leaves for the figures."""
 
 
 class Summary:
@@ -46,6 +57,25 @@ class Summary:
 
 
 @dataclass(frozen=True)
+class CameraIntrinsics:
+    """One camera of the models.
+
+    Attributes:
+        camera_id: COLMAP's.
+        model: COLMAP's name of the camera model.
+        size_px: width and height of its photos.
+        parameters: name, value before the refinement, value after it (NaN without).
+        half_angles: half width and half height of its picture at unit distance.
+    """
+
+    camera_id: int
+    model: str
+    size_px: tuple[int, int]
+    parameters: tuple[tuple[str, float, float], ...]
+    half_angles: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class Content:
     """All that a report shows.
 
@@ -57,7 +87,11 @@ class Content:
         scaled, refined: the path before and after the refinement.
         reference_m: (k, 3) positions in the map's frame.
         anchors_m: (3,) by id.
-        points_m: (m, 3) of the final map.
+        points_m, points_rgb: (m, 3) of the final map; None without a model.
+        cameras: intrinsics in the scaled and in the final model.
+        true_scale: the path before the refinement with the reference's scale; None if that is not known.
+        reference_by_photo: (3,) by name, in the map's frame.
+        tables: columns of the small tables beside the result (see TABLES), by name; those there are.
     """
 
     title: str
@@ -69,6 +103,17 @@ class Content:
     reference_m: Array | None
     anchors_m: dict[str, Array]
     points_m: Array | None
+    points_rgb: npt.NDArray[np.uint8] | None
+    cameras: tuple[CameraIntrinsics, ...]
+    true_scale: Trajectory | None
+    reference_by_photo: dict[str, Array]
+    tables: dict[str, dict[str, Array]]
+
+    @property
+    def tag_in_cam_m(self) -> Array:
+        """(3,) the radio's antenna in the camera's frame, zero where the settings do not say."""
+        given = self.summary.get("settings", "tag_in_cam_m")
+        return np.array(given if is_position(given) else [0.0, 0.0, 0.0], dtype=np.float64)
 
     @property
     def final(self) -> Trajectory | None:
@@ -89,20 +134,75 @@ def gather(result: ResultFolder) -> Content:
     ranges = result.read_ranges()
     scaled, refined = result.read_model("sparse_scaled"), result.read_model("sparse_metric")
     final = refined or scaled
+    path_scaled = None if scaled is None else trajectory_from_reconstruction(scaled, result.timestamps_s)
+    points_m, points_rgb = (None, None) if final is None else points_of(final)
     reference_path = result.path / "reference.csv"
+    reference = read_reference(reference_path) if reference_path.is_file() else None
+    summary = Summary(result.summary)
     return Content(
         title=result.path.resolve().name,
-        summary=Summary(result.summary),
+        summary=summary,
         ranges=ranges,
         range_times_s=None if ranges is None else _range_times(ranges, result.timestamps_s or {}),
-        scaled=None if scaled is None else trajectory_from_reconstruction(scaled, result.timestamps_s),
+        scaled=path_scaled,
         refined=None if refined is None else trajectory_from_reconstruction(refined, result.timestamps_s),
-        reference_m=read_reference(reference_path).positions_m if reference_path.is_file() else None,
+        reference_m=None if reference is None else reference.positions_m,
         anchors_m=result.anchor_positions_m,
-        points_m=None
-        if final is None
-        else np.array([point.xyz for point in final.points3D.values()], dtype=np.float64).reshape(-1, 3),
+        points_m=points_m,
+        points_rgb=points_rgb,
+        cameras=() if final is None else _cameras(scaled, refined, final),
+        true_scale=None if path_scaled is None else _with_true_scale(path_scaled, summary),
+        reference_by_photo={} if reference is None else dict(zip(reference.image_names or (), reference.positions_m)),
+        tables={name: table for name, columns in TABLES.items() if (table := result.read_numbers(name, columns))},
     )
+
+
+def _with_true_scale(path: Trajectory, summary: Summary) -> Trajectory | None:
+    """By the error that the comparison found: the reference itself may know no more than a few photos."""
+    rows = summary.get("comparison")
+    for row in rows if isinstance(rows, list) else []:
+        percent = as_number(row.get("scale_error_percent")) if isinstance(row, dict) else None
+        if percent is not None and row.get("name") == "estimated scale":
+            return path.resized(1.0 / (1.0 + percent / 100.0), str(summary.get("frame")))
+    return None
+
+
+def points_of(model: pycolmap.Reconstruction) -> tuple[Array, npt.NDArray[np.uint8]]:
+    """(m, 3) positions and (m, 3) colours of a model's points."""
+    points = list(model.points3D.values())
+    positions = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
+    return positions, np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
+
+
+def _cameras(
+    scaled: pycolmap.Reconstruction | None, refined: pycolmap.Reconstruction | None, final: pycolmap.Reconstruction
+) -> tuple[CameraIntrinsics, ...]:
+    before, after = ({} if model is None else dict(model.cameras.items()) for model in (scaled, refined))
+    return tuple(
+        _intrinsics(camera_id, camera, before.get(camera_id), after.get(camera_id))
+        for camera_id, camera in sorted(final.cameras.items())
+    )
+
+
+def _intrinsics(
+    camera_id: int, camera: pycolmap.Camera, before: pycolmap.Camera | None, after: pycolmap.Camera | None
+) -> CameraIntrinsics:
+    names = [name.strip() for name in camera.params_info.split(",")]
+    unknown = [math.nan] * len(names)
+    columns = [unknown if one is None else [float(value) for value in one.params] for one in (before, after)]
+    focal = camera.mean_focal_length()
+    return CameraIntrinsics(
+        camera_id=camera_id,
+        model=camera.model.name,
+        size_px=(camera.width, camera.height),
+        parameters=tuple(zip(names, *columns)),
+        half_angles=(camera.width / (2 * focal), camera.height / (2 * focal)),
+    )
+
+
+def is_position(value: Any) -> bool:
+    """Whether a value is a list of three numbers."""
+    return isinstance(value, list) and len(value) == 3 and all(as_number(item) is not None for item in value)
 
 
 def as_number(value: Any) -> float | None:

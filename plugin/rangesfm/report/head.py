@@ -47,8 +47,9 @@ def _scale(summary: Summary) -> Markup:
         element("p", "Metres per unit of the unscaled model", class_="name"),
         element("p", fixed(value, decimals), plus_minus, class_="scale-value"),
     ]
-    if value and stddev is not None:
-        low, high = (fixed(value + sign * NORMAL_QUANTILE_95 * stddev, decimals) for sign in (-1, 1))
+    interval = scale_interval(summary)
+    if value and stddev is not None and interval is not None:
+        low, high = (fixed(end, decimals) for end in interval)
         lines.append(element("p", f"± {fixed(100.0 * stddev / value, 2, '%')} · 95 % interval {low} to {high}"))
     stddevs = [(kind, summary.number("scale", f"stddev_{kind}")) for kind in ("formal", "empirical")]
     known = [f"{kind} {fixed(number, decimals_for(number, default=5))}" for kind, number in stddevs if number]
@@ -58,6 +59,18 @@ def _scale(summary: Summary) -> Markup:
     if summary.get("scale", "method") is not None:
         lines.append(element("p", f"Method: {plain(summary.get('scale', 'method'))}", class_="small"))
     return element("div", lines, class_="scale")
+
+
+def scale_interval(summary: Summary) -> tuple[float, float] | None:
+    """The scale's 95 % interval: the result's own, else that of a normal distribution of the larger stddev."""
+    given = summary.get("scale", "interval_95")
+    ends = [as_number(end) for end in given] if isinstance(given, list) else []
+    if len(ends) == 2 and ends[0] is not None and ends[1] is not None:
+        return ends[0], ends[1]
+    value, stddev = summary.number("scale", "value"), larger_stddev(summary)
+    if value is None or stddev is None:
+        return None
+    return value - NORMAL_QUANTILE_95 * stddev, value + NORMAL_QUANTILE_95 * stddev
 
 
 def _tiles(content: Content) -> Markup:

@@ -6,7 +6,7 @@ import html
 from collections.abc import Iterable
 from typing import TypeAlias
 
-VOID_TAGS = {"meta", "br"}
+VOID_TAGS = {"meta", "br", "img", "input"}
 
 
 class Markup(str):

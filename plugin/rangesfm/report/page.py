@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from rangesfm.report import sections
 from rangesfm.report.content import Content
 from rangesfm.report.head import head
-from rangesfm.report.markup import Markup, element
+from rangesfm.report.markup import Child, Markup, element
+from rangesfm.report.script import ASSETS, policy_source, view_script
 
-# Nothing may be fetched, not even by mistake: the page holds all it shows.
-CONTENT_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+# Nothing may be fetched, not even by mistake: the page holds all it shows. One script may run, this package's.
+CONTENT_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; script-src {script}"
+
+STYLES = ("page.css", "view.css")
 
 LOGO = element(
     "svg",
@@ -26,13 +27,19 @@ def render(content: Content) -> str:
     """The whole page."""
     parts = [
         sections.checks(content),
+        sections.view(content),
         sections.path(content),
         sections.scale(content),
         sections.ranges(content),
         sections.anchors(content),
         sections.run(content),
     ]
-    title = f"{content.title} – rangesfm report"
+    return document(f"{content.title} – rangesfm report", content.title, head(content), parts)
+
+
+def document(title: str, heading: str, *parts: Child) -> str:
+    """A whole self-contained page."""
+    script = view_script()
     return "<!DOCTYPE html>\n" + element(
         "html",
         element(
@@ -40,18 +47,23 @@ def render(content: Content) -> str:
             element("meta", charset="utf-8"),
             element("meta", name="viewport", content="width=device-width, initial-scale=1"),
             element("meta", name="color-scheme", content="light dark"),
-            element("meta", http_equiv="Content-Security-Policy", content=CONTENT_POLICY),
+            element(
+                "meta",
+                http_equiv="Content-Security-Policy",
+                content=CONTENT_POLICY.format(script=policy_source(script)),
+            ),
             element("title", title),
-            element("style", Markup(Path(__file__).with_name("style.css").read_text(encoding="utf-8"))),
+            [element("style", Markup((ASSETS / name).read_text(encoding="utf-8"))) for name in STYLES],
         ),
         element(
             "body",
             element(
                 "header",
                 element("p", LOGO, "rangesfm report", class_="wordmark"),
-                element("h1", content.title),
+                element("h1", heading),
             ),
-            element("main", head(content), parts),
+            element("main", parts),
+            element("script", Markup(script)),
         ),
         lang="en",
     )

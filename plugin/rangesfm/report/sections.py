@@ -5,8 +5,14 @@ from __future__ import annotations
 from rangesfm.report import figures, tables
 from rangesfm.report.checks import quality_checks
 from rangesfm.report.content import Content
-from rangesfm.report.markup import Markup, element
+from rangesfm.report.drawing import draw
+from rangesfm.report.markup import Child, Markup, element
+from rangesfm.report.result_scene import scene_of
 from rangesfm.report.traffic_lights import card
+from rangesfm.report.view import view as scene_view
+
+WIDE = 600
+"""Figures at least so wide stand on their own."""
 
 
 def checks(content: Content) -> Markup | None:
@@ -15,14 +21,20 @@ def checks(content: Content) -> Markup | None:
     return _section("checks", "Quality checks", element("div", cards, class_="checks"))
 
 
+def view(content: Content) -> Markup | None:
+    """The map in 3-D."""
+    scene = scene_of(content)
+    return None if scene is None else _section("view-section", "Map in 3-D", scene_view(scene))
+
+
 def path(content: Content) -> Markup | None:
     """The path in plan and elevation, and the paper's table."""
-    return _section("path", "Path", figures.trajectory_views(content), tables.comparison(content))
+    return _section("path", "Path", _figures(content, "path"), tables.comparison(content))
 
 
 def scale(content: Content) -> Markup | None:
-    """The scale from each anchor, and the paper's two candidates."""
-    return _section("scale", "Scale", _columns(figures.scale_per_anchor(content), tables.two_candidates(content)))
+    """The scale from each anchor, how it was found, and the paper's two candidates."""
+    return _section("scale", "Scale", _figures(content, "scale"), tables.two_candidates(content))
 
 
 def ranges(content: Content) -> Markup | None:
@@ -30,8 +42,8 @@ def ranges(content: Content) -> Markup | None:
     return _section(
         "ranges",
         "Ranges",
-        figures.residuals_over_time(content),
-        _columns(figures.residual_histogram(content), tables.range_statuses(content)),
+        _figures(content, "ranges"),
+        tables.range_statuses(content),
         tables.ranges_per_anchor(content),
     )
 
@@ -47,12 +59,26 @@ def run(content: Content) -> Markup | None:
     return _section("run", "Run", columns, tables.settings(content))
 
 
+def _figures(content: Content, section: str) -> list[Markup]:
+    """Small figures side by side, wide ones and those of many panels on their own."""
+    parts: list[Markup] = []
+    small: list[Markup] = []
+    for figure in figures.figures_of(content, section):
+        if figure.layout == "single" and figure.panels[0].size[0] < WIDE:
+            small.append(draw(figure))
+        else:
+            parts += [columns] if (columns := _columns(*small)) else []
+            parts.append(draw(figure))
+            small = []
+    return parts + ([columns] if (columns := _columns(*small)) else [])
+
+
 def _columns(*parts: Markup | None) -> Markup | None:
     """Parts side by side where there is room."""
     known = [part for part in parts if part is not None]
     return element("div", known, class_="columns") if known else None
 
 
-def _section(id_: str, title: str, *parts: Markup | None) -> Markup | None:
-    known = [part for part in parts if part is not None]
+def _section(id_: str, title: str, *parts: Child) -> Markup | None:
+    known = [part for part in parts if part]
     return element("section", element("h2", title), known, id=id_, class_="card") if known else None

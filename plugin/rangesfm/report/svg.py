@@ -45,7 +45,7 @@ class Chart:
         low, high = self.y_range
         return self.bottom - (np.asarray(values, dtype=np.float64) - low) / (high - low) * (self.bottom - self.top)
 
-    def pixels_between(self, first: Array, second: Array) -> float:
+    def pixels_between(self, first: tuple[float, float], second: tuple[float, float]) -> float:
         """Distance of two data points on the page."""
         return math.dist((self.x(first[0]), self.y(first[1])), (self.x(second[0]), self.y(second[1])))
 

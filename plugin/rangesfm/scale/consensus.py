@@ -11,7 +11,7 @@ from rangesfm.scale.range_equation import RangeProblem
 Array = npt.NDArray[np.float64]
 
 # A range agrees with a scale if it fits to this many stddevs of noise and bias together.
-_TOLERANCE_STDDEVS = 2.5
+TOLERANCE_STDDEVS = 2.5
 # Hills of agreement are told apart on a logarithmic grid of the scale; only those at least so high beside the best.
 _LOG_CELL = 0.02
 _MIN_SHARE_OF_BEST = 0.5
@@ -27,7 +27,7 @@ def consensus_scales(problem: RangeProblem) -> list[float]:
         GeometryError: no positive scale explains any range.
     """
     bias_stddev = np.where(np.isfinite(problem.bias_stddev_m), problem.bias_stddev_m, 0.0)[problem.anchor_index]
-    tolerance = _TOLERANCE_STDDEVS * np.hypot(problem.stddev_m, bias_stddev)
+    tolerance = TOLERANCE_STDDEVS * np.hypot(problem.stddev_m, bias_stddev)
     ranges = problem.range_m - problem.bias_mean_m[problem.anchor_index]
     offset = problem.tag_from_center - problem.anchor_mean_m[problem.anchor_index]
     starts, ends = agreeing_intervals(problem.centers, offset, ranges, tolerance)

@@ -55,6 +55,7 @@ class ScaleEstimate:
         range_stddev_m: (n,) noise of each range as weighted; NaN without a place.
         correlation_inflation: by how much the errors' correlation in time widens the formal stddev.
         noise_stddev_m: stddev of a range away from all special cases.
+        resampled_scales: (k,) the robust scale from blocks of time drawn anew, metres per SfM unit.
     """
 
     metric_from_sfm: Similarity
@@ -70,6 +71,7 @@ class ScaleEstimate:
     range_stddev_m: Array
     correlation_inflation: float
     noise_stddev_m: float
+    resampled_scales: Array
 
     @property
     def value(self) -> float:

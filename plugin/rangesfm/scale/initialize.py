@@ -19,7 +19,7 @@ from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.problem import survey_problem
 from rangesfm.scale.solution import Solution, solve_survey
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
-from rangesfm.scale.uncertainty import scale_uncertainty
+from rangesfm.scale.uncertainty import resampled_log_scales, scale_uncertainty
 from rangesfm.scale.verdict import judge
 from rangesfm.trajectory import Trajectory
 
@@ -92,7 +92,13 @@ def initialize_scale(
         range_stddev_m=stddev,
         correlation_inflation=solution.inflation,
         noise_stddev_m=solution.noise_stddev_m,
+        resampled_scales=_resampled_scales(solution, blocks, options.num_bootstrap, seed),
     )
+
+
+def _resampled_scales(solution: Solution, blocks: npt.NDArray[np.int64], num: int, seed: int) -> Array:
+    steps = resampled_log_scales(solution.fit, blocks, num=num, seed=seed)
+    return np.asarray(solution.fit.state.metric_from_model.scale * np.exp(steps))
 
 
 def _time_blocks(observations: RangeObservations, rows: npt.NDArray[np.int64], block_s: float) -> npt.NDArray[np.int64]:

@@ -31,7 +31,7 @@ def scale_uncertainty(
     present = np.unique(anchor_blocks)
     return ScaleUncertainty(
         formal=fit.log_scale_stddev,
-        bootstrap=_bootstrap(fit, blocks, num_bootstrap, np.random.default_rng(seed)),
+        bootstrap=_bootstrap(fit, blocks, num_bootstrap, seed),
         jackknife=_jackknife(fit, anchor_blocks) if len(present) >= 3 else None,
         range_model=_range_model_sensitivity(problem, fit),
     )
@@ -77,14 +77,23 @@ def _steps(fit: RangeFit, informations: Array, gradients: Array, counts: Array) 
     return steps
 
 
-def _bootstrap(fit: RangeFit, blocks: npt.NDArray[np.int64], num: int, rng: np.random.Generator) -> float:
+def resampled_log_scales(fit: RangeFit, blocks: npt.NDArray[np.int64], *, num: int, seed: int) -> Array:
+    """(num,) changes of the log scale when blocks of time are drawn anew; none from a single block."""
     informations, gradients = _block_sums(fit, blocks)
     num_blocks = len(informations)
-    if num_blocks < 2 or num < 2:
-        return fit.log_scale_stddev
+    if num_blocks < 2:
+        return np.zeros(0)
+    rng = np.random.default_rng(seed)
     counts = rng.multinomial(num_blocks, np.full(num_blocks, 1 / num_blocks), size=num).astype(np.float64)
+    return _steps(fit, informations, gradients, counts)
+
+
+def _bootstrap(fit: RangeFit, blocks: npt.NDArray[np.int64], num: int, seed: int) -> float:
+    steps, num_blocks = resampled_log_scales(fit, blocks, num=num, seed=seed), len(np.unique(blocks))
+    if len(steps) < 2:
+        return fit.log_scale_stddev
     # Quartiles, so that a resample that happens to leave out a whole side does not decide alone.
-    low, high = np.quantile(_steps(fit, informations, gradients, counts), [0.16, 0.84])
+    low, high = np.quantile(steps, [0.16, 0.84])
     # Blocks drawn from a few scatter less than blocks drawn anew.
     return float(max(high - low, 0.0) / 2 * np.sqrt(num_blocks / (num_blocks - 1)))
 

@@ -1,0 +1,49 @@
+// A grid in metres on the ground, and the scale bar over the view.
+
+const NUM_GRID_CELLS = 12;
+
+/** The round length (1, 2 or 5 times a power of ten) nearest below. */
+function roundLength(length) {
+  const power = 10 ** Math.floor(Math.log10(length));
+  return [5, 2, 1].map((factor) => factor * power).find((round) => round <= length * 1.0001);
+}
+
+function lengthText(length) {
+  return length < 0.01 ? `${+(1000 * length).toPrecision(2)} mm` : length < 1 ? `${+(100 * length).toPrecision(2)} cm` : `${+length.toPrecision(6)} m`;
+}
+
+/** Returns the grid and the width of its cells. */
+function makeGrid(box, up) {
+  const cell = roundLength((2.4 * box.radius) / NUM_GRID_CELLS);
+  const vertical = up.findIndex((value) => value !== 0);
+  const [first, second] = [0, 1, 2].filter((axis) => axis !== vertical);
+  const half = cell * Math.ceil((1.2 * box.radius) / cell);
+  const middle = box.center.map((value) => cell * Math.round(value / cell));
+  const lines = [];
+  for (let offset = -half; offset <= half + cell / 2; offset += cell) {
+    for (const [along, across] of [[first, second], [second, first]]) {
+      for (const end of [-half, half]) {
+        const corner = [0, 0, 0];
+        corner[vertical] = box.ground;
+        corner[along] = middle[along] + end;
+        corner[across] = middle[across] + offset;
+        lines.push(corner);
+      }
+    }
+  }
+  const material = new THREE.LineBasicMaterial();
+  onTheme(() => material.color.set(themeColor("stage-grid")));
+  const grid = new THREE.LineSegments(lineGeometry(lines), material);
+  grid.frustumCulled = false;
+  return { grid, cell };
+}
+
+/** Keeps a bar of round length up to date. */
+function attachScaleBar(stage, bar) {
+  stage.on("frame", () => {
+    const perPixel = stage.metresPerPixel();
+    const length = roundLength(130 * perPixel);
+    bar.style.width = `${(length / perPixel).toFixed(1)}px`;
+    bar.textContent = lengthText(length);
+  });
+}

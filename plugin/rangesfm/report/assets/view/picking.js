@@ -1,0 +1,55 @@
+// What is under the reader's finger.
+
+const REACH_PX = 14;
+const SAME_SPOT_PX = 5;
+const MAX_DRAG_PX = 5;
+
+/** Calls back with the pixel of each click or tap that was no drag. */
+function onClick(canvas, callback) {
+  let start = null;
+  canvas.addEventListener("pointerdown", (event) => {
+    start = event.isPrimary ? [event.clientX, event.clientY] : null;
+  });
+  canvas.addEventListener("pointerup", (event) => {
+    if (start === null || Math.hypot(event.clientX - start[0], event.clientY - start[1]) > MAX_DRAG_PX) return;
+    const box = canvas.getBoundingClientRect();
+    callback([event.clientX - box.left, event.clientY - box.top]);
+  });
+}
+
+/**
+ * The nearest of many positions to a pixel; of several on the same spot, the one in front.
+ * positionAt(i, out) writes the i-th into out. Returns {index, position, pixels, depth} or null.
+ */
+function nearestTo(stage, pixel, num, positionAt) {
+  const matrix = stage.camera.projectionMatrix.clone().multiply(stage.camera.matrixWorldInverse).elements;
+  const [width, height] = [stage.canvas.clientWidth, stage.canvas.clientHeight];
+  const p = [0, 0, 0];
+  let best = null;
+  for (let i = 0; i < num; i++) {
+    positionAt(i, p);
+    const w = matrix[3] * p[0] + matrix[7] * p[1] + matrix[11] * p[2] + matrix[15];
+    if (w <= 0) continue;
+    const x = ((matrix[0] * p[0] + matrix[4] * p[1] + matrix[8] * p[2] + matrix[12]) / w + 1) * 0.5 * width;
+    const y = (1 - (matrix[1] * p[0] + matrix[5] * p[1] + matrix[9] * p[2] + matrix[13]) / w) * 0.5 * height;
+    const pixels = Math.hypot(x - pixel[0], y - pixel[1]);
+    if (pixels > REACH_PX) continue;
+    const isCloser = best === null || pixels < best.pixels - SAME_SPOT_PX;
+    const isInFront = best !== null && pixels < best.pixels + SAME_SPOT_PX && w < best.depth;
+    if (isCloser || isInFront) best = { index: i, position: [...p], pixels, depth: w };
+  }
+  return best;
+}
+
+function nearestOfPath(stage, pixel, path) {
+  return nearestTo(stage, pixel, path.names.length, (i, out) => {
+    for (let axis = 0; axis < 3; axis++) out[axis] = path.centers[3 * i + axis];
+  });
+}
+
+function nearestPoint(stage, pixel, data) {
+  const step = data.extent / 65535;
+  return nearestTo(stage, pixel, data.num, (i, out) => {
+    for (let axis = 0; axis < 3; axis++) out[axis] = data.origin[axis] + step * data.steps[3 * i + axis];
+  });
+}

@@ -1,0 +1,75 @@
+"""The 3-D scene of a result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.report.content import Content, as_number, is_position
+from rangesfm.report.head import scale_interval
+from rangesfm.report.scene import Scene, SceneAnchor, ScenePath
+from rangesfm.trajectory import Trajectory
+
+Array = npt.NDArray[np.float64]
+
+
+def scene_of(content: Content) -> Scene | None:
+    """What the view shows of a result; None without a model."""
+    paths = _paths(content)
+    if content.final is None or len(content.final) == 0:
+        return None
+    interval, value = scale_interval(content.summary), content.summary.number("scale", "value")
+    images = content.summary.get("settings", "images_path")
+    return Scene(
+        frame=content.frame,
+        paths=paths,
+        points_m=_or_empty(content.points_m, np.float64),
+        points_rgb=_or_empty(content.points_rgb, np.uint8),
+        anchors=_anchors(content),
+        ranges=content.ranges,
+        range_times_s=content.range_times_s,
+        tag_in_cam_m=content.tag_in_cam_m,
+        frustum_shape=content.cameras[0].half_angles if content.cameras else (0.6, 0.4),
+        images_path=Path(images) if isinstance(images, str) else None,
+        scale_interval=None if interval is None or not value else (interval[0] / value, interval[1] / value),
+    )
+
+
+def _paths(content: Content) -> tuple[ScenePath, ...]:
+    paths = []
+    if content.reference_m is not None:
+        paths.append(ScenePath("reference", "reference", "reference", _of_positions(content.reference_m), False))
+    if content.scaled is not None and len(content.scaled):
+        paths.append(ScenePath("scaled", "cameras, scaled only", "before", content.scaled))
+    if content.refined is not None and len(content.refined):
+        paths.append(ScenePath("refined", "cameras, refined", "after", content.refined))
+    return tuple(paths)
+
+
+def _of_positions(positions_m: Array) -> Trajectory:
+    n = len(positions_m)
+    nowhere = np.tile(np.eye(3), (n, 1, 1))
+    return Trajectory(np.arange(n), tuple(map(str, range(n))), None, positions_m, nowhere)
+
+
+def _anchors(content: Content) -> tuple[SceneAnchor, ...]:
+    found = []
+    for anchor_id, position_m in content.anchors_m.items():
+        stddev = content.summary.get("anchors", anchor_id, "stddev_m")
+        mirror = content.summary.get("anchors", anchor_id, "mirror_position_m")
+        stddev_m = np.array(stddev if is_position(stddev) else [_number_or_nan(stddev)] * 3, dtype=np.float64)
+        mirror_m = np.array(mirror, dtype=np.float64) if is_position(mirror) else None
+        found.append(SceneAnchor(anchor_id, position_m, stddev_m, mirror_m))
+    return tuple(found)
+
+
+def _number_or_nan(value: Any) -> float:
+    number = as_number(value)
+    return float("nan") if number is None else number
+
+
+def _or_empty(values: Any, kind: Any) -> Any:
+    return np.zeros((0, 3), dtype=kind) if values is None else values

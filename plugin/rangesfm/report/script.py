@@ -1,0 +1,40 @@
+"""The page's script: its files one after another, and the hash by which the page's policy allows it."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from pathlib import Path
+
+ASSETS = Path(__file__).with_name("assets")
+
+_VIEW_FILES = (
+    "data.js",
+    "theme.js",
+    "stage.js",
+    "points.js",
+    "cameras.js",
+    "anchors.js",
+    "ranges.js",
+    "grid.js",
+    "labels.js",
+    "picking.js",
+    "measuring.js",
+    "photo_panel.js",
+    "print.js",
+    "csv.js",
+    "main.js",
+)
+
+
+def view_script() -> str:
+    """three.js, then the view's files in one scope of their own."""
+    library = (ASSETS / "vendor" / "three.min.js").read_text(encoding="utf-8")
+    files = [(ASSETS / "view" / name).read_text(encoding="utf-8") for name in _VIEW_FILES]
+    return f'{library}\n(() => {{\n"use strict";\n{"".join(files)}}})();\n'
+
+
+def policy_source(script: str) -> str:
+    """What Content-Security-Policy calls an inline script by."""
+    digest = hashlib.sha256(script.encode("utf-8")).digest()
+    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
