@@ -23,11 +23,14 @@ from rangesfm.metric_survey import MetricSurvey
 from rangesfm.options import ExportOptions
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.results import USED
+from rangesfm.scale.diagnostics import scale_diagnostics
 
 Array = npt.NDArray[np.float64]
 
 # The first says that a result is whole: it is the last to be written and the first to go.
-_RESULT_FILES = ("result.json", "report.html", "ranges.csv", "images.csv", "reference.csv", "time_offset_curve.csv")
+_SCALE_TABLES = ("scale_candidates.csv", "scale_consensus.csv", "scale_bootstrap.csv")
+_CURVES = (*_SCALE_TABLES, "time_offset_curve.csv")
+_RESULT_FILES = ("result.json", "report.html", "ranges.csv", "images.csv", "reference.csv", *_CURVES)
 _WRITTEN = (*_RESULT_FILES, "trajectory.tum", "points.ply", "sparse_scaled/0", "sparse_metric/0")
 
 
@@ -99,6 +102,20 @@ def write_outputs(
     )
     formats = tuple(name for name in export.formats if name != "ply" or survey.final.num_points3D())
     export_map(map_, folder, replace(export, formats=formats))
+
+
+def write_scale_tables(survey: MetricSurvey, folder: Path) -> None:
+    """The paper's candidates, the consensus curve and the resampled scales, each as a small CSV."""
+    found, log = scale_diagnostics(survey.estimate, survey.trajectory), survey.observations.log
+    candidates, consensus, bootstrap = (folder / name for name in _SCALE_TABLES)
+    rows = found.candidate_rows.tolist()
+    times = [""] * len(rows) if log.timestamp_s is None else [repr(log.timestamp_s[row].item()) for row in rows]
+    ids = [log.anchor_ids[log.anchor_index[row]] for row in rows]
+    columns = [times, ids, *(_texts(values) for values in found.candidates.T)]
+    _write_csv(candidates, ["timestamp_s", "anchor_id", "alpha0", "alpha1"], zip(*columns, strict=True))
+    counts = map(str, found.num_agreeing.tolist())
+    _write_csv(consensus, ["scale", "num_agreeing"], zip(_texts(found.curve_scales), counts, strict=True))
+    _write_csv(bootstrap, ["scale"], zip(_texts(found.resampled_scales)))
 
 
 def _write_ranges(survey: MetricSurvey, path: Path) -> None:

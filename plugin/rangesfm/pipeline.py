@@ -24,6 +24,7 @@ from rangesfm.errors import InputError
 from rangesfm.export import check_formats
 from rangesfm.files import make_output_folder
 from rangesfm.georeference import Georeference
+from rangesfm.input_hashes import input_hashes
 from rangesfm.inputs import RangingInputs, read_ranging_inputs
 from rangesfm.journal import Journal
 from rangesfm.metric_survey import MetricSurvey
@@ -36,6 +37,7 @@ from rangesfm.outputs import (
     summary_lines,
     write_outputs,
     write_result,
+    write_scale_tables,
 )
 from rangesfm.passthrough import apply_options
 from rangesfm.progress import Progress
@@ -158,7 +160,9 @@ def _to_metric(
         write_outputs(
             metric, survey.export, survey.output_path, images_path=survey.images_path, georeference=georeference
         )
+        write_scale_tables(metric, survey.output_path)
     result["versions"], result["settings"] = versions(), survey.to_dict()
+    result["inputs"] = input_hashes(survey)
     result["seconds"], result["warnings"] = journal.all_seconds(), journal.warnings
     write_result(result, survey.output_path / "result.json")
     lines = [*summary_lines(metric, result, table, survey.output_path)]

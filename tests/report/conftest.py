@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
+from PIL import Image
 
 Array = npt.NDArray[np.float64]
 MakeResult = Callable[..., Path]
@@ -33,6 +34,12 @@ def make_result(tmp_path: Path) -> MakeResult:
     return make
 
 
+@pytest.fixture(scope="session")
+def make_shared_result() -> MakeResult:
+    """As ``make_result``, at a path of its own, for results that several tests look at."""
+    return write_result
+
+
 def write_result(
     folder: Path,
     *,
@@ -41,6 +48,8 @@ def write_result(
     anchor_ids: tuple[str, ...] = ("1", "2", "3", "4", "5", "6", "7", "8"),
     is_refined: bool = True,
     has_reference: bool = True,
+    has_photos: bool = False,
+    num_points: int = 9000,
     changes: dict[str, Any] | None = None,
 ) -> Path:
     """A whole result folder; ``changes`` replace keys of result.json (None removes one)."""
@@ -50,7 +59,7 @@ def write_result(
     refined = truth + 0.012 * _wander(rng, num_keyframes)
     scaled = 1.011 * (truth - truth[0]) + truth[0] + 0.07 * _wander(rng, num_keyframes)
     folder.mkdir(parents=True)
-    points = _room(rng)
+    points = _room(rng, num_points)
     _write_model(folder / "sparse_scaled" / "0", scaled, points)
     if is_refined:
         _write_model(folder / "sparse_metric" / "0", refined, points)
@@ -60,10 +69,36 @@ def write_result(
         _write_csv(folder / "reference.csv", ["image_name", "x_m", "y_m", "z_m"], rows)
     rows = _ranges(rng, times, truth, scaled, refined if is_refined else None, anchor_ids, num_ranges_per_anchor)
     _write_csv(folder / "ranges.csv", RANGES_HEADER.split(), rows)
+    _write_scale_tables(folder, rows)
     summary = _summary(rows, anchor_ids, is_refined, has_reference)
+    if has_photos:
+        summary["settings"]["images_path"] = str(_write_photos(folder / "photos", num_keyframes))
     for key, value in (changes or {}).items():
         summary[key] = value
     (folder / "result.json").write_text(json.dumps({k: v for k, v in summary.items() if v is not None}))
+    return folder
+
+
+def _write_scale_tables(folder: Path, rows: list[list[Any]]) -> None:
+    """The tables of how the scale and the offset came about, of plausible shape."""
+    rng = np.random.default_rng(5)
+    times = [float(row[0]) for row in rows]
+    noise = rng.normal(0, 0.02, len(rows))
+    duplets = [[t, row[2], 0.4 - 0.5 * np.sin(t / 9), 0.742 + e] for t, row, e in zip(times, rows, noise)]
+    _write_csv(folder / "scale_candidates.csv", ["timestamp_s", "anchor_id", "alpha0", "alpha1"], duplets)
+    scales = np.geomspace(0.25, 2.2, 101)
+    counts = np.round(2500 * np.exp(-(((scales - 0.742) / 0.1) ** 2))).astype(int)
+    _write_csv(folder / "scale_consensus.csv", ["scale", "num_agreeing"], zip(scales, counts))
+    _write_csv(folder / "scale_bootstrap.csv", ["scale"], [[s] for s in rng.normal(0.742, 0.004, 200)])
+    offsets = np.linspace(-2.0, 2.0, 81)
+    _write_csv(folder / "time_offset_curve.csv", ["time_offset_s", "cost"], zip(offsets, (offsets - 0.012) ** 2))
+
+
+def _write_photos(folder: Path, num: int) -> Path:
+    """One plain picture for each photo, no two of one colour."""
+    folder.mkdir()
+    for i, name in enumerate(_names(num)):
+        Image.new("RGB", (320, 240), (i * 255 // num, 80, 255 - i * 255 // num)).save(folder / name)
     return folder
 
 
@@ -105,7 +140,7 @@ def _write_model(path: Path, centers: Array, points: Array) -> None:
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ center)
         reconstruction.add_image_with_trivial_frame(image, pose)
     for point in points:
-        reconstruction.add_point3D(point, pycolmap.Track(), np.array([120, 120, 120], dtype=np.uint8))
+        reconstruction.add_point3D(point, pycolmap.Track(), (40 + 70 * np.abs(point) / 3).astype(np.uint8))
     path.mkdir(parents=True)
     reconstruction.write_binary(path)
 
@@ -123,6 +158,7 @@ def _ranges(
         position = np.array([np.interp(when, times, column) for column in path.T])
         return float(np.linalg.norm(position - anchor))
 
+    names = _names(len(times))
     rows: list[list[Any]] = []
     for when in np.sort(rng.uniform(-3.0, times[-1] + 2.0, num_per_anchor * len(anchor_ids))):
         index = int(rng.integers(len(anchor_ids)))
@@ -143,8 +179,11 @@ def _ranges(
             status = "down-weighted"
         elif rng.random() < 0.05:
             status = "check"
-        keyframe = "" if is_outside else int(np.searchsorted(times, when))
-        place = [keyframe, keyframe, 0.5]
+        place: list[Any] = ["", "", ""]
+        if not is_outside:
+            later = max(int(np.searchsorted(times, when)), 1)
+            share = (when - times[later - 1]) / (times[later] - times[later - 1])
+            place = [names[later - 1], names[later], share]
         rows.append(
             [f"{when:.6f}", "", anchor_ids[index], "tag", measured, "", *place, before, after, residual, 1.0, status]
         )
@@ -179,6 +218,7 @@ def _summary(
                 "stddev_m": 0.02,
                 "range_bias_m": 0.02 * (i % 4),
                 "mirror_position_m": None,
+                "surveyed_position_m": (ANCHORS[i % len(ANCHORS)] + 0.004).tolist(),
             }
             for i, id_ in enumerate(anchor_ids)
         },
@@ -222,12 +262,24 @@ def _summary(
                 "scale_error_percent": -0.051,
             },
         ],
+        "inputs": [{"path": "uwb.csv", "sha256": "0" * 64, "bytes": 12345, "hashed": "content"}],
+        "distances": [
+            {
+                "from": "image00003.jpg",
+                "to": "marker 2",
+                "kind": "check",
+                "measured_m": 2.5,
+                "stddev_m": 0.003,
+                "estimated_m": 2.5127,
+                "residual_m": 0.0127,
+            }
+        ],
         "versions": {"rangesfm": "0.1.0", "pycolmap": "4.2.1", "pyceres": "2.6", "numpy": "2.3.1"},
         "settings": {
             "images": {"path": "images", "every_nth": 3},
             "anchors": {"path": "anchors.csv", "frame": "site"},
             "ranges": {"path": "uwb.csv", "time_offset": "auto"},
-            "tag": {"tag_in_cam_m": [-0.0012, -0.09, -0.0663]},
+            "tag_in_cam_m": [-0.0012, -0.09, -0.0663],
             "refine": {"enabled": is_refined, "max_num_iterations": 200, "range_loss_scale": 2.4},
         },
         "seconds": {"features": 31.2, "matching": 18.4, "mapping": 64.0, "scale": 3.1, "refine": 12.3, "output": 1.2},

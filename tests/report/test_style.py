@@ -9,7 +9,7 @@ import pytest
 
 import rangesfm.report
 
-STYLE = Path(rangesfm.report.__file__).with_name("style.css").read_text(encoding="utf-8")
+STYLE = (Path(rangesfm.report.__file__).with_name("assets") / "page.css").read_text(encoding="utf-8")
 
 
 def colors_of(theme: str) -> dict[str, str]:
@@ -48,5 +48,7 @@ def test_texts_are_readable(theme: str) -> None:
 @pytest.mark.parametrize("theme", ["light", "dark"])
 def test_lines_and_marks_stand_out_from_the_card(theme: str) -> None:
     colors = colors_of(theme)
-    marks = ("before", "after", "reference", "anchor", "rejected", "green", "amber", "red")
+    marks = ("before", "after", "true-scale", "reference", "anchor", "rejected", "green", "amber", "red")
     assert [mark for mark in marks if contrast(colors[mark], colors["card"]) < 3.0] == []
+    in_view = ("before", "after", "third", "fourth", "reference", "anchor", "chosen", "residual-negative")
+    assert [mark for mark in in_view if contrast(colors[mark], colors["stage"]) < 3.0] == []

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rangesfm.report.markup import Markup, element, join
-from rangesfm.report.svg import Chart, equal_chart, running_median, ticks
+from rangesfm.report.svg import DOT_GRID_PX, Chart, equal_chart, running_median, ticks
 
 
 def moves(markup: Markup, pen: str) -> list[tuple[float, float]]:
@@ -29,7 +29,10 @@ def test_y_grows_upwards() -> None:
 def test_dots_outside_lie_on_the_edge_and_those_that_coincide_are_drawn_once() -> None:
     chart = make_chart()
     chart.dots(np.array([[5.0, 0.5], [5.001, 0.5], [5.0, 99.0], [np.nan, 0.5]]), "after")
-    assert moves(chart.render("dots"), "M") == [(60.0, 10.0), (60.0, 60.0)]
+    svg = chart.render("dots")
+    steps = np.cumsum([(float(x), float(y)) for x, y in re.findall(r"m(-?\d+) (-?\d+)h0", svg)], axis=0)
+    np.testing.assert_allclose(DOT_GRID_PX * steps, [(60.0, 10.0), (60.0, 60.0)])
+    assert f'transform="scale({DOT_GRID_PX:g})"' in svg
 
 
 def test_a_line_is_broken_where_a_point_is_missing() -> None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
 
 from rangesfm.reference import read_reference
+from rangesfm.report.true_ranges import true_ranges_m
 from rangesfm.result_folder import RangesAsUsed, ResultFolder
 from rangesfm.trajectory import Trajectory, trajectory_from_reconstruction
 
@@ -115,6 +117,14 @@ class Content:
         given = self.summary.get("settings", "tag_in_cam_m")
         return np.array(given if is_position(given) else [0.0, 0.0, 0.0], dtype=np.float64)
 
+    @cached_property
+    def true_ranges_m(self) -> Array | None:
+        """(n,) by the reference, NaN where it says nothing; None where it says nothing at all."""
+        if self.ranges is None or self.final is None or not self.reference_by_photo:
+            return None
+        distances = true_ranges_m(self.ranges, self.final, self.reference_by_photo, self.anchors_m, self.tag_in_cam_m)
+        return distances if np.isfinite(distances).any() else None
+
     @property
     def final(self) -> Trajectory | None:
         """The best path there is."""
@@ -200,7 +210,7 @@ def _intrinsics(
     )
 
 
-def is_position(value: Any) -> bool:
+def is_position(value: Any) -> TypeGuard[list[float]]:
     """Whether a value is a list of three numbers."""
     return isinstance(value, list) and len(value) == 3 and all(as_number(item) is not None for item in value)
 

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import base64
 import io
+from urllib.parse import quote
 
+import numpy as np
 from PIL import Image
 
 from rangesfm.report.markup import Markup, element
-from rangesfm.report.plot import Figure, Mark, Panel, Picture, csv_text
+from rangesfm.report.plot import Figure, Mark, Panel, Picture, Series, csv_text
 from rangesfm.report.svg import Chart, equal_chart, legend
 
 MIN_LABEL_DISTANCE_PX = 12.0
-_LEFT_OF_ROWS, _RIGHT_OF_ROWS = 64, 74
+_LEFT, _LEFT_OF_ROWS, _RIGHT_OF_ROWS = 58, 64, 74
 _NUM_COLORS = 128
+_SAFE_IN_DATA = "-._~,;:+*/()'"
 
 
 def draw(figure: Figure) -> Markup:
@@ -30,8 +33,7 @@ def _download(figure: Figure) -> Markup:
     if figure.table is not None:
         attributes = {"data_csv": figure.table, "data_file": file}
         return element("button", "CSV", type="button", class_="csv", aria_label=label, **attributes)
-    data = base64.b64encode(csv_text(figure).encode("utf-8")).decode("ascii")
-    href = f"data:text/csv;base64,{data}"
+    href = "data:text/csv;charset=utf-8," + quote(csv_text(figure), safe=_SAFE_IN_DATA)
     return element("a", "CSV", href=href, download=file, class_="button csv", aria_label=label)
 
 
@@ -53,16 +55,23 @@ def draw_panel(panel: Panel) -> Markup:
     for x, style in panel.verticals:
         chart.vertical(x, style)
     for series in panel.series:
-        if series.kind == "dots":
-            chart.dots(series.points, series.style)
-        else:
-            chart.line(series.points, f"{series.style} filled" if series.kind == "filled" else series.style)
+        _draw_series(chart, series)
     for y, left, right in panel.rows:
         chart.label(chart.x_range[0], y, left, dx=-8, dy=4, anchor="end")
         chart.label(chart.x_range[1], y, right, dx=8, dy=4)
     for mark in joined(panel.marks, chart):
         _draw_mark(chart, mark)
     return chart.render(panel.description)
+
+
+def _draw_series(chart: Chart, series: Series) -> None:
+    if series.kind == "dots":
+        chart.dots(series.points, series.style)
+    elif series.kind == "line":
+        chart.line(series.points, series.style)
+    else:
+        ends = series.points[[0, -1]] * (1.0, 0.0)
+        chart.line(np.concatenate([ends[:1], series.points, ends[1:]]), f"{series.style} filled")
 
 
 def _chart(panel: Panel) -> Chart:
@@ -72,7 +81,7 @@ def _chart(panel: Panel) -> Chart:
     x_range, y_range = panel.limits
     if panel.rows:
         return Chart(width, height, x_range, y_range, left=_LEFT_OF_ROWS, right=_RIGHT_OF_ROWS)
-    return Chart(width, height, x_range, y_range, left=52)
+    return Chart(width, height, x_range, y_range, left=_LEFT)
 
 
 def _num_ticks(panel: Panel) -> int:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from rangesfm.geometry import align_points
 from rangesfm.report.content import Content
-from rangesfm.report.plot import Figure, Mark, Panel, Picture, Series
+from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Panel, Picture, Series
 from rangesfm.report.svg import equal_chart
 from rangesfm.report.text import count
 from rangesfm.trajectory import Trajectory
@@ -61,7 +61,7 @@ def local_scale(content: Content) -> Figure | None:
         return None
     label = "photo" if content.scaled.timestamps_s is None else "time s"
     panel = Panel(
-        "", "Local scale along the path", label, "local scale %", known_series, zero_line=True, size=(700, 240)
+        "", "Local scale along the path", label, "local scale %", known_series, zero_line=True, size=WIDE_SIZE
     )
     caption = (
         f"Scale of stretches of {2 * _window(content.scaled) + 1} photos, relative to that of the scaled map. A level "

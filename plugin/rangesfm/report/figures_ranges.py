@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.report.content import Content, in_natural_order
-from rangesfm.report.plot import Figure, Panel, Series
+from rangesfm.report.plot import WIDE_SIZE, Figure, Panel, Series
 from rangesfm.report.svg import running_median
 from rangesfm.result_folder import RangesAsUsed
 
@@ -15,9 +15,6 @@ Array = npt.NDArray[np.float64]
 
 NUM_HISTOGRAM_BINS = 60
 NUM_MEDIAN_BINS = 48
-MAX_KEYFRAME_SHARE = 0.1
-"""A range counts as taken at a photo if it is no farther from it, in parts of the way to the next."""
-
 PANEL_SIZE = (360, 172)
 
 
@@ -69,10 +66,10 @@ def outline(edges: Array, heights: Array) -> Array:
 
 def absolute_errors(content: Content) -> Figure | None:
     """True errors of the ranges: measured, and as both maps have them, by the reference's camera positions."""
-    ranges, path = content.ranges, content.final
-    if ranges is None or path is None or not content.reference_by_photo:
+    ranges, true_m = content.ranges, content.true_ranges_m
+    if ranges is None or true_m is None:
         return None
-    rows, true_m = _true_ranges(content, ranges)
+    rows = np.flatnonzero(np.isfinite(true_m))
     if len(rows) == 0:
         return None
     times, time_label = _times(content, ranges)
@@ -81,7 +78,7 @@ def absolute_errors(content: Content) -> Figure | None:
     x_range = (float(times[rows].min()), float(times[rows].max()))
     dots, lines = [], []
     for name, style, values in errors:
-        points = np.column_stack([times[rows], np.abs(values[rows] - true_m)])
+        points = np.column_stack([times[rows], np.abs(values - true_m)[rows]])
         if np.isfinite(points[:, 1]).any():
             dots.append(Series(name, style, points))
             lines.append(Series(name, style, running_median(points, x_range, NUM_MEDIAN_BINS), "line", is_data=False))
@@ -94,31 +91,13 @@ def absolute_errors(content: Content) -> Figure | None:
         (*dots, *lines),
         x_range=x_range,
         y_range=(0.0, 1.1 * max(float(np.nanquantile(sizes, 0.98)), 1e-3)),
-        size=(700, 250),
+        size=WIDE_SIZE,
     )
     caption = (
         "How far ranges are from those of the reference: as measured, by the scaled map, and by the refined one, with "
         "their running medians. Ranges taken at a photo, to anchors where this map has them."
     )
-    return Figure("absolute_range_errors", caption, (panel,))
-
-
-def _true_ranges(content: Content, ranges: RangesAsUsed) -> tuple[npt.NDArray[np.int64], Array]:
-    """Ranges taken at a photo that the reference knows, and the distance that it has there."""
-    path = content.final
-    assert path is not None
-    index_of = {name: i for i, name in enumerate(path.image_names)}
-    rows, distances = [], []
-    for row in np.flatnonzero(np.isfinite(ranges.weight) & ranges.is_used):
-        weight = float(ranges.weight[row])
-        name = (ranges.keyframe_before if weight < 0.5 else ranges.keyframe_after)[row]
-        position, anchor = content.reference_by_photo.get(name), content.anchors_m.get(ranges.anchor_id[row])
-        if min(weight, 1 - weight) > MAX_KEYFRAME_SHARE or position is None or anchor is None or name not in index_of:
-            continue
-        tag = position + path.world_from_cam[index_of[name]] @ content.tag_in_cam_m
-        rows.append(int(row))
-        distances.append(float(np.linalg.norm(tag - anchor)))
-    return np.array(rows, dtype=np.int64), np.array(distances)
+    return Figure("absolute_range_errors", caption, (panel,), table="range_errors")
 
 
 def _residual_panel(content: Content, ranges: RangesAsUsed, anchor_id: str) -> Panel:

@@ -9,12 +9,13 @@ from rangesfm.report.checks import larger_stddev
 from rangesfm.report.content import Content, as_number, in_natural_order
 from rangesfm.report.figures_ranges import outline
 from rangesfm.report.head import scale_interval
-from rangesfm.report.plot import Figure, Mark, Panel, Series
+from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Panel, Series
 from rangesfm.report.text import signed
 
 Array = npt.NDArray[np.float64]
 
 NUM_BOOTSTRAP_BINS = 40
+MAX_NUM_CANDIDATES = 3000
 CANDIDATE_AXIS = (-1.0, 4.0)
 """Ends of the axis of candidates, in units of the scale: they have no bounds of their own."""
 
@@ -63,6 +64,8 @@ def candidates(content: Content) -> Figure | None:
     table, scale = content.tables.get("scale_candidates"), content.summary.number("scale", "value")
     if table is None or scale is None or len(table["alpha0"]) == 0:
         return None
+    stride = -(-len(table["alpha0"]) // MAX_NUM_CANDIDATES)
+    table = {name: values[::stride] for name, values in table.items()}
     times = table["timestamp_s"] - np.min(table["timestamp_s"], initial=np.inf, where=np.isfinite(table["timestamp_s"]))
     label = "time s"
     if not np.isfinite(times).all():
@@ -81,12 +84,14 @@ def candidates(content: Content) -> Figure | None:
         "candidate m per unit",
         tuple(both),
         y_range=(CANDIDATE_AXIS[0] * scale, CANDIDATE_AXIS[1] * scale),
-        size=(700, 260),
+        size=WIDE_SIZE,
     )
     caption = (
         "Each range has two possible scales. The true one is constant over time, the other is not; where the path "
         "turns towards or away from an anchor they change places. What lies beyond the axis is drawn at its edge."
     )
+    if stride > 1:
+        caption += f" One range in {stride}; scale_candidates.csv holds all."
     return Figure("scale_candidates", caption, (panel,))
 
 

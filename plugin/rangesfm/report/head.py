@@ -30,13 +30,21 @@ def _verdict(summary: Summary) -> Markup:
     light, word, meaning = VERDICTS.get(verdict, unknown)
     text = element("div", element("h2", word), element("p", meaning))
     reasons = [element("li", reason) for reason in summary.texts("scale", "reasons")]
+    advice = _advice(summary)
     warnings = [element("li", warning) for warning in summary.texts("warnings")]
     return element(
         "div",
         element("div", traffic_light(light), text, class_=f"verdict {light}"),
         element("ul", reasons, class_="reasons") if reasons else None,
+        element("div", element("h3", "What would help"), element("ul", advice), class_="advice") if advice else None,
         element("div", element("h3", "Warnings"), element("ul", warnings), class_="warnings") if warnings else None,
     )
+
+
+def _advice(summary: Summary) -> list[Markup]:
+    given = summary.get("scale", "advice")
+    texts = [given] if isinstance(given, str) else summary.texts("scale", "advice")
+    return [element("li", text) for text in texts if text]
 
 
 def _scale(summary: Summary) -> Markup:

@@ -9,6 +9,11 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
+WIDE_SIZE = (1060.0, 300.0)
+"""Of a panel as wide as the page."""
+
+_ROOM_AROUND = 0.06
+
 
 @dataclass(frozen=True)
 class Series:
@@ -18,7 +23,7 @@ class Series:
         name: as the legend and the CSV file have it.
         style: name of its colour: "before", "after", "reference", ...
         points: (n, 2); NaN breaks a line.
-        kind: "dots", "line", or "filled" (a line with the area under it).
+        kind: "dots", "line", or "filled" (a line with the area from there to zero).
         is_data: whether the CSV file holds it; not a mere summary of another series.
     """
 
@@ -94,10 +99,10 @@ class Panel:
 
     @property
     def limits(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Ranges of both axes, around the data where none are given."""
+        """Ranges of both axes, where none are given those of the data, with room above and below."""
         points = self.all_points
-        found = [_limits(points[:, axis]) for axis in (0, 1)]
-        return self.x_range or found[0], self.y_range or found[1]
+        x_range = self.x_range or _limits(points[:, 0])
+        return x_range, self.y_range or _with_room(_limits(points[:, 1]))
 
     @property
     def all_points(self) -> Array:
@@ -163,3 +168,8 @@ def _cell(text: str) -> str:
 def _limits(values: Array) -> tuple[float, float]:
     known = values[np.isfinite(values)]
     return (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
+
+
+def _with_room(limits: tuple[float, float]) -> tuple[float, float]:
+    margin = _ROOM_AROUND * (limits[1] - limits[0])
+    return limits[0] - margin, limits[1] + margin

@@ -31,6 +31,7 @@ def scene_of(content: Content) -> Scene | None:
         anchors=_anchors(content),
         ranges=content.ranges,
         range_times_s=content.range_times_s,
+        true_ranges_m=content.true_ranges_m,
         tag_in_cam_m=content.tag_in_cam_m,
         frustum_shape=content.cameras[0].half_angles if content.cameras else (0.6, 0.4),
         images_path=Path(images) if isinstance(images, str) else None,

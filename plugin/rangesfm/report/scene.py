@@ -70,6 +70,7 @@ class Scene:
         tag_in_cam_m: where they begin.
         frustum_shape: half width and half height of a camera's picture at unit distance.
         images_path: folder of the photos; None where it is not known.
+        true_ranges_m: (n,) by a reference, NaN where unknown; or None.
         scale_interval: the scale's 95 % interval relative to the scale; None if not known.
     """
 
@@ -80,6 +81,7 @@ class Scene:
     anchors: tuple[SceneAnchor, ...] = ()
     ranges: RangesAsUsed | None = None
     range_times_s: Array | None = None
+    true_ranges_m: Array | None = None
     tag_in_cam_m: Array = field(default_factory=lambda: np.zeros(3))
     frustum_shape: tuple[float, float] = (0.6, 0.4)
     images_path: Path | None = None
@@ -224,6 +226,7 @@ def _ranges(scene: Scene) -> dict[str, Any] | None:
         "residual_refined": pack(ranges.residual_refined_m[rows], "float32"),
         "final": "residual_refined" if is_refined else "residual_scaled",
         "residual_limit_m": _residual_limit(final[ranges.is_used]),
+        "true": None if scene.true_ranges_m is None else pack(scene.true_ranges_m[rows], "float32"),
         "has_place": pack(has_place, "uint8"),
         "before": pack(np.maximum(before, 0), "int32"),
         "after": pack(np.maximum(after, 0), "int32"),

@@ -34,7 +34,9 @@ def path(content: Content) -> Markup | None:
 
 def scale(content: Content) -> Markup | None:
     """The scale from each anchor, how it was found, and the paper's two candidates."""
-    return _section("scale", "Scale", _figures(content, "scale"), tables.two_candidates(content))
+    return _section(
+        "scale", "Scale", _figures(content, "scale"), tables.two_candidates(content), tables.sensitivity(content)
+    )
 
 
 def ranges(content: Content) -> Markup | None:
@@ -49,14 +51,15 @@ def ranges(content: Content) -> Markup | None:
 
 
 def anchors(content: Content) -> Markup | None:
-    """Where the anchors are."""
-    return _section("anchors", "Anchors", tables.anchors(content))
+    """Where the anchors are, and what a tape says."""
+    return _section("anchors", "Anchors", tables.anchors(content), tables.distances(content))
 
 
 def run(content: Content) -> Markup | None:
     """How the result came about."""
     columns = _columns(tables.stages(content), tables.refinement(content), tables.versions(content))
-    return _section("run", "Run", columns, tables.settings(content))
+    parts = (tables.intrinsics(content), tables.inputs(content), tables.settings(content))
+    return _section("run", "Run", columns, *parts)
 
 
 def _figures(content: Content, section: str) -> list[Markup]:

@@ -70,9 +70,11 @@ class Chart:
         pixels = self._pixels(points)
         pixels = np.clip(pixels[np.isfinite(pixels).all(axis=1)], (self.left, self.top), (self.right, self.bottom))
         steps = np.unique(np.round(pixels / DOT_GRID_PX).astype(np.int64), axis=0)
-        data = "".join(f"M{x:g} {y:g}h0" for x, y in (steps * DOT_GRID_PX).tolist())
-        if data:
-            self.add(element("path", d=data, class_=f"dots {class_}"))
+        if len(steps):
+            # From dot to dot, in whole steps: a third of the text that places in pixels would take.
+            moves = np.diff(steps, axis=0, prepend=0).tolist()
+            data = "".join(f"m{x} {y}h0" for x, y in moves)
+            self.add(element("path", d=data, class_=f"dots {class_}", transform=f"scale({DOT_GRID_PX:g})"))
 
     def line(self, points: Array, class_: str) -> None:
         """A line through (n, 2) points in turn, broken where one is not finite."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.report.content import Content, Summary, as_number, in_natural_order
+from rangesfm.report.content import Content, Summary, as_number, in_natural_order, is_position
 from rangesfm.report.markup import Child, Markup, element
 from rangesfm.report.text import count, duration, fixed, plain, signed
 
@@ -91,14 +91,76 @@ def anchors(content: Content) -> Markup | None:
             anchor_id,
             *_coordinates(anchor.get("position_m")),
             " ".join(fixed(value, 3) for value in _as_list(anchor.get("stddev_m"))),
+            *(signed(value, 3) for value in _difference(anchor)),
             signed(anchor.get("range_bias_m"), 3),
             " ".join(_coordinates(anchor["mirror_position_m"])) if anchor.get("mirror_position_m") else "none",
         ]
         for anchor_id, anchor in content.summary.table("anchors").items()
         if isinstance(anchor, dict)
     ]
-    header = ["anchor", "x m", "y m", "z m", "stddev m", "range bias m", "mirror image at m"]
-    return _table("Anchors in the map's frame", header, rows)
+    header = ["anchor", "x m", "y m", "z m", "stddev m", "Δx m", "Δy m", "Δz m", "range bias m", "mirror image at m"]
+    note = "Δ: estimated minus surveyed position, where it was surveyed."
+    return _table("Anchors in the map's frame", header, rows, note)
+
+
+def _difference(anchor: dict[str, Any]) -> list[float | None]:
+    """Estimated minus surveyed position."""
+    estimated, surveyed = anchor.get("position_m"), anchor.get("surveyed_position_m")
+    if is_position(estimated) and is_position(surveyed):
+        return [a - b for a, b in zip(estimated, surveyed)]
+    return [None] * 3
+
+
+def distances(content: Content) -> Markup | None:
+    """Taped distances, those that held the scale and those that check it."""
+    given = content.summary.get("distances")
+    rows = [
+        [
+            f"{plain(row.get('from'))} to {plain(row.get('to'))}",
+            plain(row.get("kind")),
+            fixed(row.get("measured_m"), 4),
+            fixed(row.get("stddev_m"), 4),
+            fixed(row.get("estimated_m"), 4),
+            signed(row.get("residual_m"), 4),
+        ]
+        for row in (given if isinstance(given, list) else [])
+        if isinstance(row, dict)
+    ]
+    header = ["distance", "kind", "by tape m", "stddev m", "in the map m", "difference m"]
+    return _table("Control and check distances", header, rows)
+
+
+def intrinsics(content: Content) -> Markup | None:
+    """The cameras before and, if there was one, after the refinement."""
+    header = ["camera", "parameter", "scaled", "refined", "change"]
+    num_columns = 3 if content.refined is None else 5
+    rows = [
+        [
+            f"{camera.camera_id} {camera.model} {camera.size_px[0]} × {camera.size_px[1]}",
+            name,
+            *(fixed(before, 6), fixed(after, 6), signed(after - before, 6))[: num_columns - 2],
+        ]
+        for camera in content.cameras
+        for name, before, after in camera.parameters
+    ]
+    return _table("Cameras", header[:num_columns], rows)
+
+
+def sensitivity(content: Content) -> Markup | None:
+    """How the scale answers to what was assumed, where the run tells."""
+    rows = _flattened(content.summary, "scale", "cutoff_test") + _flattened(content.summary, "scale", "sensitivity")
+    return _table("How the scale answers to what was assumed", [], rows)
+
+
+def inputs(content: Content) -> Markup | None:
+    """The files that the result was made from."""
+    given = content.summary.get("inputs")
+    rows = [
+        [plain(row.get("path")), count(row.get("bytes")), plain(row.get("sha256")), plain(row.get("hashed"))]
+        for row in (given if isinstance(given, list) else [])
+        if isinstance(row, dict)
+    ]
+    return _table("Inputs", ["file", "bytes", "SHA-256", "of"], rows, class_="settings")
 
 
 def stages(content: Content) -> Markup | None:

@@ -29,6 +29,18 @@ const CSV_TABLES = {
         ranges.statuses[ranges.status[i]],
       ],
     ),
+  range_errors: ({ ranges }) =>
+    csvText(["time_s", "anchor_id", "range_m", "range_by_reference_m", "error_scaled_m", "error_refined_m"], ranges.num, (i) => {
+      const fromReference = ranges.measured[i] - ranges.true[i];
+      return [
+        rounded(ranges.time[i], 3),
+        ranges.anchor_ids[ranges.anchor[i]],
+        rounded(ranges.measured[i], 4),
+        rounded(ranges.true[i], 4),
+        rounded(ranges.residual_scaled[i] + fromReference, 4),
+        rounded(ranges.residual_refined[i] + fromReference, 4),
+      ];
+    }),
   points: ({ points }) =>
     csvText(["x_m", "y_m", "z_m", "red", "green", "blue"], points.num, (i) => [
       ...pointPosition(points, i).map((value) => rounded(value, 4)),

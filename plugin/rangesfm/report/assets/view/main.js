@@ -61,6 +61,11 @@ class View {
     this.stage.lookFrom(directions[name]);
   }
 
+  /** Position of the i-th point of the map, metres. */
+  pointAt(i) {
+    return pointPosition(this.scene.points, i);
+  }
+
   #candidates(pixel, camera) {
     const { points, anchors } = this.scene;
     const anchor = nearestTo(this.stage, pixel, anchors.length, (i, out) => {

@@ -1,0 +1,173 @@
+"""The report's 3-D view: what it draws, and what it answers to."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from rangesfm.report import write_report
+
+if TYPE_CHECKING:
+    from tests.report.in_browser.conftest import Browser, Pixels
+
+MakeResult = Callable[..., Path]
+WIDTHS_PX = (390, 1280)
+REFINED, SCALED = (29, 95, 209), (194, 87, 12)
+NUM_KEYFRAMES = 40
+CENTER = "Array.from(rangesfmView.path.centers.subarray(3 * ({0}), 3 * ({0}) + 3))"
+CENTER = "Array.from(rangesfmView.path.centers.subarray(3 * ({0}), 3 * ({0}) + 3))"
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory, make_shared_result: MakeResult) -> Path:
+    folder = tmp_path_factory.mktemp("view") / "survey"
+    return write_report(
+        make_shared_result(folder, num_keyframes=NUM_KEYFRAMES, num_ranges_per_anchor=120, has_photos=True)
+    )
+
+
+@pytest.fixture(params=WIDTHS_PX)
+def opened(request: pytest.FixtureRequest, browser: Browser, page: Path) -> Browser:
+    """The page, on a telephone and on a desk, scrolled to the view."""
+    browser.open(page, width=request.param)
+    browser.run("document.querySelector('.stage').scrollIntoView({block: 'center'})")
+    browser.wait_for("window.rangesfmView && rangesfmView.stage")
+    return browser
+
+
+def num_pixels(picture: Pixels, color: tuple[int, int, int]) -> int:
+    return int((np.abs(picture - color).max(axis=2) < 12).sum())
+
+
+def toggle(browser: Browser, name: str, value: str) -> None:
+    browser.run(f"document.querySelector('#view [name={name}][value=\"{value}\"]').click()")
+
+
+def place_of(browser: Browser, position: str) -> tuple[float, float]:
+    """Where in the window a position of the scene is."""
+    x, y = browser.run(
+        "const box = document.querySelector('.stage canvas').getBoundingClientRect();"
+        f"const [x, y] = rangesfmView.stage.pixelOf({position}); return [x + box.x, y + box.y]"
+    )
+    return float(x), float(y)
+
+
+def text_of(browser: Browser, selector: str) -> str:
+    return str(browser.run("return document.querySelector(arguments[0]).textContent", selector))
+
+
+def test_points_cameras_and_anchors_are_drawn_and_layers_take_them_away(opened: Browser) -> None:
+    full = opened.picture(".stage canvas")
+    assert np.std(full) > 5
+    assert num_pixels(full, REFINED) > 30
+    assert num_pixels(full, SCALED) > 30
+    for layer in ("points", "refined", "scaled"):
+        before = opened.picture(".stage canvas")
+        toggle(opened, "layer", layer)
+        assert np.any(opened.picture(".stage canvas") != before)
+    assert num_pixels(opened.picture(".stage canvas"), SCALED) < 5
+    toggle(opened, "layer", "anchors")
+    opened.picture(".stage canvas")
+    assert opened.run("return [...document.querySelectorAll('.label.anchor')].every(label => label.hidden)")
+    assert opened.console() == []
+
+
+def test_the_grid_and_the_scale_bar_are_round_lengths(opened: Browser) -> None:
+    assert re.fullmatch(r"grid [125]0* c?m", text_of(opened, ".grid-cell"))
+    bar = text_of(opened, ".scale-bar")
+    assert re.fullmatch(r"[125]0* c?m", bar)
+    length = float(bar.split()[0]) / (100 if bar.endswith("cm") else 1)
+    drawn = opened.run("return parseFloat(document.querySelector('.scale-bar').style.width)")
+    assert drawn * opened.run("return rangesfmView.stage.metresPerPixel()") == pytest.approx(length, rel=0.01)
+
+
+def test_ranges_are_filtered_by_status_and_photo(opened: Browser) -> None:
+    def num_drawn() -> int:
+        return int(text_of(opened, ".num-lines").split()[0])
+
+    of_one = num_drawn()
+    toggle(opened, "all-photos", "all")
+    of_all = num_drawn()
+    assert of_all > 5 * of_one > 0
+    statuses = opened.run("return rangesfmView.scene.ranges.statuses")
+    for status in ("used", "down-weighted"):
+        toggle(opened, "status", str(statuses.index(status)))
+    assert num_drawn() == 0
+    toggle(opened, "status", str(statuses.index("outlier")))
+    outliers = opened.run(
+        "const {ranges} = rangesfmView.scene; const outlier = ranges.statuses.indexOf('outlier');"
+        "return ranges.status.filter((status, i) => status === outlier && ranges.has_place[i]).length"
+    )
+    assert num_drawn() == outliers > 0
+
+
+def test_a_click_on_a_camera_shows_its_photo_and_its_ranges(opened: Browser) -> None:
+    wanted = 11
+    opened.run("rangesfmView.look('plan')")
+    opened.picture(".stage canvas")
+    opened.click_at(*place_of(opened, CENTER.format(wanted)))
+    chosen = opened.run("return rangesfmView.chosen")
+    centers = [opened.run(f"return {CENTER.format(index)}") for index in (wanted, chosen)]
+    near = np.linalg.norm(np.subtract(*centers)[:2])  # in plan one may hide another
+    assert near < 0.3
+    assert text_of(opened, ".photo h3") == f"image{chosen:05d}.jpg"
+    assert opened.run("return document.querySelector('[name=photo]').value") == str(chosen)
+    opened.wait_for("document.querySelector('.photo img').naturalWidth > 0")
+    listed = opened.run("return document.querySelectorAll('.photo tbody tr').length")
+    assert 0 < listed == int(text_of(opened, ".num-ranges").split()[0])
+
+
+def test_the_slider_walks_along_the_path(opened: Browser) -> None:
+    before = opened.picture(".stage canvas")
+    opened.run(
+        "const slider = document.querySelector('[name=photo]'); slider.value = arguments[0];"
+        "slider.dispatchEvent(new Event('input'))",
+        str(NUM_KEYFRAMES - 1),
+    )
+    assert text_of(opened, ".photo h3") == f"image{NUM_KEYFRAMES - 1:05d}.jpg"
+    assert f"Photo {NUM_KEYFRAMES} of {NUM_KEYFRAMES}" in text_of(opened, ".photo .place")
+    assert np.any(opened.picture(".stage canvas") != before)
+
+
+def test_two_clicks_measure_a_distance_with_its_interval(opened: Browser) -> None:
+    anchors = opened.run("return rangesfmView.scene.anchors.map(anchor => anchor.position)")
+    toggle(opened, "layer", "points")
+    toggle(opened, "measure", "on")
+    opened.picture(".stage canvas")
+    for i in (0, 5):
+        opened.click_at(*place_of(opened, f"rangesfmView.scene.anchors[{i}].position"))
+    distance = float(np.linalg.norm(np.subtract(anchors[0], anchors[5])))
+    said = re.fullmatch(
+        r"anchor 1 to anchor 6: ([\d.]+) m \(95 % by the scale alone: ([\d.]+) to ([\d.]+) m\)",
+        text_of(opened, ".measured"),
+    )
+    assert said is not None
+    half = 1.96 * 0.00412 / 0.74213
+    expected = [distance, distance * (1 - half), distance * (1 + half)]
+    assert [float(value) for value in said.groups()] == pytest.approx(expected, abs=6e-4)
+    assert text_of(opened, ".label.distance") == f"{distance:.3f} m"
+
+
+def test_a_drag_turns_the_view_and_chooses_nothing(opened: Browser) -> None:
+    before, chosen = opened.picture(".stage canvas"), opened.run("return rangesfmView.chosen")
+    x, y = place_of(opened, "rangesfmView.scene.box.center")
+    opened.drag((x, y), (x + 60, y + 20))
+    assert np.any(opened.picture(".stage canvas") != before)
+    assert opened.run("return rangesfmView.chosen") == chosen
+
+
+def test_points_stand_where_the_map_has_them(opened: Browser) -> None:
+    """To the step that their packing leaves, a fraction of a millimetre."""
+    low, high = opened.run(
+        "const num = rangesfmView.scene.points.num;"
+        "const all = Array.from({length: num}, (_, i) => rangesfmView.pointAt(i));"
+        "return [Math.min, Math.max].map(f => [0, 1, 2].map(axis => all.reduce((m, p) => f(m, p[axis]), all[0][axis])))"
+    )
+    # The room of the made-up result: walls at these places, with noise.
+    assert np.subtract(low, (-2.4, -2.9, 0.0)) == pytest.approx(np.zeros(3), abs=0.1)
+    assert np.subtract(high, (2.4, 2.9, 2.3)) == pytest.approx(np.zeros(3), abs=0.1)
