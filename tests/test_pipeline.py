@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import time
 from collections import Counter
@@ -21,6 +22,7 @@ from rangesfm.outputs import forget_result, forgetting_result_if_changed, refuse
 from rangesfm.pipeline import refine_model, scale_model
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.readers import read_ranges
+from rangesfm.tables import read_table
 
 if TYPE_CHECKING:
     from tests.conftest import WalkedSurvey
@@ -76,7 +78,41 @@ def test_a_run_in_the_same_folder_leaves_nothing_of_the_one_before(survey: Surve
     second = replace(survey, export=ExportOptions(formats=()), report_enabled=False)
     scale_model(second, progress=SilentProgress())
     left = files_of(survey.output_path) - {"trajectory.tum", "points.ply"}  # exported by request, not part of a result
-    assert left == {"sparse_scaled", "result.json", "ranges.csv", "images.csv"}
+    scale_tables = {"scale_candidates.csv", "scale_consensus.csv", "scale_bootstrap.csv"}
+    assert left == {"sparse_scaled", "result.json", "ranges.csv", "images.csv", *scale_tables}
+
+
+def test_tables_beside_the_result_tell_how_the_scale_came_about(survey: Survey) -> None:
+    scale = scale_model(survey, progress=SilentProgress()).result["scale"]
+    tables = {
+        name: read_table(survey.output_path / f"scale_{name}.csv", columns)
+        for name, columns in (
+            ("candidates", ("alpha0", "alpha1")),
+            ("consensus", ("scale", "num_agreeing")),
+            ("bootstrap", ("scale",)),
+        )
+    }
+    for branch in ("alpha0", "alpha1"):
+        paper = scale["two_candidate"][branch]
+        values = tables["candidates"].numbers(branch)
+        assert values.mean() == pytest.approx(paper["mean"], rel=1e-4)
+        assert values.std(ddof=1) == pytest.approx(paper["std"], rel=1e-4)
+    agreeing = tables["consensus"].numbers("num_agreeing")
+    assert tables["consensus"].numbers("scale")[np.argmax(agreeing)] == pytest.approx(scale["value"], rel=0.02)
+    assert agreeing.max() > 0.95 * len(tables["candidates"])
+    resampled = tables["bootstrap"].numbers("scale")
+    spread = np.diff(np.quantile(resampled, [0.16, 0.84]))[0] / 2 / scale["value"]
+    assert spread == pytest.approx(scale["relative_stddev"]["bootstrap"], rel=0.25)
+
+
+def test_the_result_names_its_inputs_by_their_hashes(survey: Survey) -> None:
+    inputs = scale_model(survey, progress=SilentProgress()).result["inputs"]
+    by_path = {entry["path"]: entry for entry in inputs}
+    assert survey.ranges.path is not None
+    data = survey.ranges.path.read_bytes()
+    expected = {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data), "hashed": "content"}
+    assert by_path[str(survey.ranges.path)] == {"path": str(survey.ranges.path), **expected}
+    assert {Path(path).name for path in by_path} >= {"cameras.bin", "images.bin", "points3D.bin", "uwb.csv"}
 
 
 def test_refused_run_leaves_the_result_before_it(survey: Survey) -> None:

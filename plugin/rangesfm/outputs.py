@@ -27,9 +27,9 @@ from rangesfm.scale.diagnostics import scale_diagnostics
 
 Array = npt.NDArray[np.float64]
 
-# The first says that a result is whole: it is the last to be written and the first to go.
 _SCALE_TABLES = ("scale_candidates.csv", "scale_consensus.csv", "scale_bootstrap.csv")
 _CURVES = (*_SCALE_TABLES, "time_offset_curve.csv")
+# The first says that a result is whole: it is the last to be written and the first to go.
 _RESULT_FILES = ("result.json", "report.html", "ranges.csv", "images.csv", "reference.csv", *_CURVES)
 _WRITTEN = (*_RESULT_FILES, "trajectory.tum", "points.ply", "sparse_scaled/0", "sparse_metric/0")
 
