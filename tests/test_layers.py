@@ -23,6 +23,7 @@ LAYER_OF = {
     "colmap_log": DATA,
     "config": DATA,
     "costs": DATA,
+    "covariance": DATA,
     "distances": DATA,
     "geometry": DATA,
     "georeference": DATA,

@@ -33,6 +33,7 @@ from rangesfm._ceres.costs import (
     range_cost,
     zero_tie_cost,
 )
+from rangesfm._ceres.jacobian import tangent_jacobian
 from rangesfm._ceres.many_ranges import AddedRanges, PlacedRanges, RangeBlocks, add_ranges, combine_ranges
 from rangesfm._ceres.problem import add_residual_block, cauchy_loss
 from rangesfm._ceres.types import CostFunction, LossFunction
@@ -59,5 +60,6 @@ __all__ = [
     "normal_prior_cost",
     "pyceres_ceres_version",
     "range_cost",
+    "tangent_jacobian",
     "zero_tie_cost",
 ]
