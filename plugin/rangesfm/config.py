@@ -72,6 +72,7 @@ class RangesConfig:
         path: the log; None if not given.
         format: name of a reader; None: recognised by content.
         columns, timestamp_unit, range_unit, separator: as in ``read_ranges``.
+        error_curve_path: the radio's error by distance, as ``rangesfm ranges calibrate`` writes it; None: not known.
         time_offset_s: image time = range time + offset; None: searched for ("auto").
         association: where ranges are put on the path.
         checks: which ranges are held out.
@@ -84,6 +85,7 @@ class RangesConfig:
     timestamp_unit: str | None = None
     range_unit: str | None = None
     separator: str | None = None
+    error_curve_path: Path | None = None
     time_offset_s: float | None = None
     association: AssociationOptions = field(default_factory=AssociationOptions)
     checks: CheckOptions = field(default_factory=CheckOptions)
@@ -224,6 +226,7 @@ class _SurveyReader:
             timestamp_unit=table.value("timestamp_unit", str),
             range_unit=table.value("range_unit", str),
             separator=table.value("separator", str),
+            error_curve_path=self._path("ranges", "error_curve"),
             time_offset_s=_time_offset(table),
             association=table.options(AssociationOptions),
             checks=table.options(CheckOptions),

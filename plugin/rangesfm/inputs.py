@@ -13,6 +13,7 @@ from rangesfm.errors import InputError
 from rangesfm.georeference import Georeference, georeference_at
 from rangesfm.ranging.anchor_file import default_anchor_frame, read_anchors
 from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.error_curve import correct_ranges, read_error_curve
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges
 from rangesfm.reference import Reference, read_reference
@@ -76,9 +77,10 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
             survey.anchors_path,
         )
     _check_held_out(survey, anchors, frame)
+    log, curve_notes = _without_known_errors(log, survey)
     tape = None if survey.distances_path is None else read_tape(survey.distances_path, survey.markers_path)
     reference = None if survey.reference_path is None else read_reference(survey.reference_path)
-    notes = tuple(_notes(log, anchors, anchors_are_of_log=given is None))
+    notes = (*_notes(log, anchors, anchors_are_of_log=given is None), *curve_notes)
     return RangingInputs(log, anchors, frame, georeference, tape, reference, notes)
 
 
@@ -112,6 +114,11 @@ def _check_held_out(survey: Survey, anchors: Sequence[Anchor], frame: str) -> No
                 f"nothing; expected of: {', '.join(surveyed) or 'none'}",
                 survey.anchors_path,
             )
+
+
+def _without_known_errors(log: RangeLog, survey: Survey) -> tuple[RangeLog, list[str]]:
+    curve_path = survey.ranges.error_curve_path
+    return (log, []) if curve_path is None else correct_ranges(log, read_error_curve(curve_path))
 
 
 def _check_lever_arm(survey: Survey) -> None:

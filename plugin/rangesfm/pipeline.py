@@ -176,7 +176,14 @@ def _read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
     check_formats(survey.export.formats)
     apply_options(pycolmap.BundleAdjustmentOptions(), survey.refine.bundle_adjustment, table="refine.bundle_adjustment")
     refuse_to_overwrite(
-        (survey.ranges.path, survey.anchors_path, survey.image_times_path, survey.reference_path, survey.model_path),
+        (
+            survey.ranges.path,
+            survey.ranges.error_curve_path,
+            survey.anchors_path,
+            survey.image_times_path,
+            survey.reference_path,
+            survey.model_path,
+        ),
         survey.output_path,
     )
     inputs = read_ranging_inputs(survey)

@@ -56,7 +56,7 @@ def raise_in_ranges(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> No
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_of_each_command_shows_an_example(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([command, "--help"]) == 0
+    assert main([*command.split(), "--help"]) == 0
     text = capsys.readouterr().out
     assert f"example:\n  rangesfm {command}" in text
 

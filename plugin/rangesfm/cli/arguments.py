@@ -23,6 +23,7 @@ COMMANDS = (
     "compare",
     "report",
     "ranges",
+    "ranges calibrate",
     "trilaterate",
     "doctor",
 )
@@ -109,13 +110,19 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--version", action=_PrintVersion)
     commands = Commands(parser)
     for name in COMMANDS:
-        import_module(f"rangesfm.cli.{name}").add_command(commands)
-    args, unknown = parser.parse_known_args(argv)
+        import_module(f"rangesfm.cli.{name.replace(' ', '_')}").add_command(commands)
+    args, unknown = parser.parse_known_args(_two_words_in_one(argv))
     if not hasattr(args, "command"):
         parser.error("a command is missing, expected one of " + ", ".join(COMMANDS))
     if unknown:
         commands.by_name[args.command].error(_unknown(unknown[0], commands.by_name[args.command]))
     return args
+
+
+def _two_words_in_one(argv: Sequence[str]) -> list[str]:
+    """A command of two words as argparse knows it: as one."""
+    two = " ".join(argv[:2])
+    return [two, *argv[2:]] if two in COMMANDS and len(argv) > 1 else list(argv)
 
 
 def _unknown(argument: str, parser: Parser) -> str:

@@ -76,6 +76,7 @@ RANGE_FLAGS = (
     Flag("ranges_format", "ranges.format", "its format (default: recognised by content)", metavar="FORMAT"),
     Flag("ranges_time_offset", "ranges.time_offset", "image time minus range time", _offset, metavar="auto|SECONDS"),
     Flag("range_stddev_m", "ranges.range_stddev_m", "noise of a range (default: estimated)", float, metavar="METRES"),
+    Flag("error_curve", "ranges.error_curve", "the radio's, by rangesfm ranges calibrate", metavar="CSV"),
     Flag("anchors", "anchors.path", "CSV anchor_id,x_m,y_m,z_m (default: all unknown)", metavar="CSV"),
     Flag("anchor_frame", "anchors.frame", "what their coordinates refer to", choices=ANCHOR_FRAMES),
     Flag("anchor_crs", "anchors.crs", "coordinate system of their positions, as EPSG:2056", metavar="CRS"),

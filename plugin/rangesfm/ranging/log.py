@@ -31,6 +31,8 @@ class RangeLog:
         source: the file it came from, for messages; None if made in memory.
         format: name of the reader, for the record.
         num_no_measurement: how many records said that there was no measurement.
+        shared_stddev_m: (n,) stddev of what all ranges of about this length are off together, once the radio's
+            error curve has been taken off them; None: it has not.
     """
 
     anchor_ids: tuple[str, ...]
@@ -46,6 +48,7 @@ class RangeLog:
     source: Path | None = None
     format: str = "memory"
     num_no_measurement: int = 0
+    shared_stddev_m: npt.NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         n = len(self.range_m)
@@ -77,6 +80,7 @@ class RangeLog:
             source=self.source,
             format=self.format,
             num_no_measurement=self.num_no_measurement,
+            shared_stddev_m=None if self.shared_stddev_m is None else self.shared_stddev_m[rows],
         )
 
     @classmethod
@@ -94,6 +98,7 @@ class RangeLog:
         source: Path | None = None,
         format: str = "memory",
         num_no_measurement: int = 0,
+        shared_stddev_m: npt.ArrayLike | None = None,
     ) -> RangeLog:
         """Build a log from one value (or one string) per range; optional columns may be left out."""
         ranges = np.asarray(range_m, dtype=np.float64)
@@ -116,6 +121,7 @@ class RangeLog:
             source=source,
             format=format,
             num_no_measurement=num_no_measurement,
+            shared_stddev_m=None if shared_stddev_m is None else np.asarray(shared_stddev_m, dtype=np.float64),
         )
 
 

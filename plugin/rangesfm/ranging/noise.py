@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.ranging.log import RangeLog
+
 Array = npt.NDArray[np.float64]
 
 # Radios read up to 0.15 m short below about 2 m, every anchor alike, by an amount that depends
@@ -25,6 +27,11 @@ def short_range_stddev(range_m: Array) -> Array:
     """(n,) how far a range of this length may be off for being short, metres."""
     stddev: Array = _SHORT_RANGE_STDDEV_M * np.exp(-range_m / _SHORT_RANGE_LENGTH_M)
     return stddev
+
+
+def shared_stddev(log: RangeLog) -> Array:
+    """(n,) what all ranges of about this length may be off together: as the error curve says, else for being short."""
+    return short_range_stddev(log.range_m) if log.shared_stddev_m is None else log.shared_stddev_m
 
 
 def correlation_inflation(scaled_residuals: Array, weights: Array, groups: npt.NDArray[np.int64]) -> float:

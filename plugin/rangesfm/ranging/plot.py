@@ -1,4 +1,4 @@
-"""Ranges over time as a figure, through the optional package matplotlib."""
+"""Ranges over time, and a radio's error curve, as figures, through the optional package matplotlib."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from rangesfm.errors import InputError
 from rangesfm.files import new_file
+from rangesfm.ranging.calibration import Calibration
 from rangesfm.ranging.log import RangeLog
 
 if TYPE_CHECKING:
@@ -21,12 +22,9 @@ def plot_ranges(log: RangeLog) -> Figure:
     Raises:
         InputError: matplotlib is not installed.
     """
-    try:
-        from matplotlib import colormaps
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise InputError("a plot needs the package matplotlib: python -m pip install 'rangesfm[plot]'") from None
-    figure = Figure(figsize=(12, 6), layout="constrained")
+    figure = _new_figure()
+    from matplotlib import colormaps
+
     axes = figure.add_subplot()
     time = np.arange(len(log)) if log.timestamp_s is None else log.timestamp_s - log.timestamp_s.min()
     colors = colormaps["tab20"].colors  # type: ignore[attr-defined]
@@ -39,6 +37,35 @@ def plot_ranges(log: RangeLog) -> Figure:
     axes.grid(alpha=0.3)
     figure.legend(loc="outside right upper", title="anchor", markerscale=4)
     return figure
+
+
+def plot_error_curve(calibration: Calibration) -> Figure:
+    """Draw a radio's error curve with two stddevs on either side, over the errors that it was learnt from.
+
+    Raises:
+        InputError: matplotlib is not installed.
+    """
+    figure = _new_figure()
+    axes = figure.add_subplot()
+    curve = calibration.curve
+    axes.plot(calibration.distance_m, calibration.error_m, ".", markersize=2, alpha=0.3, color="0.6")
+    band = 2 * curve.stddev_m
+    axes.fill_between(curve.distance_m, curve.error_m - band, curve.error_m + band, alpha=0.3)
+    axes.plot(curve.distance_m, curve.error_m, "o-", markersize=3)
+    shown = 5 * calibration.noise_stddev_m
+    axes.set_ylim(float(np.min(curve.error_m)) - shown, float(np.max(curve.error_m)) + shown)
+    axes.set_xlabel("distance, m")
+    axes.set_ylabel("measured minus true, m")
+    axes.grid(alpha=0.3)
+    return figure
+
+
+def _new_figure() -> Figure:
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise InputError("a plot needs the package matplotlib: python -m pip install 'rangesfm[plot]'") from None
+    return Figure(figsize=(12, 6), layout="constrained")
 
 
 def write_figure(figure: Figure, path: str | Path) -> None:

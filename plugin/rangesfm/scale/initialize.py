@@ -13,6 +13,7 @@ from rangesfm.errors import GeometryError
 from rangesfm.geometry import Similarity
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.noise import shared_stddev
 from rangesfm.ranging.observations import RangeObservations, RangeStatus, status_by_weight
 from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
 from rangesfm.scale.estimate import ScaleEstimate
@@ -60,6 +61,7 @@ def initialize_scale(
         anchors_are_known=survey.anchors_are_known,
         center_stddev=observations.center_stddev[survey.rows],
         noise_stddev_m=_given_noise(observations, survey.rows, range_model),
+        shared_stddev_m=shared_stddev(observations.log)[survey.rows],
         groups=blocks * survey.ranges.num_anchors + survey.ranges.anchor_index,
         seed=seed,
     )

@@ -13,7 +13,7 @@ from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry import Similarity, path_shape
 from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.anchors import Anchor
-from rangesfm.ranging.noise import short_range_stddev
+from rangesfm.ranging.noise import shared_stddev
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.range_equation import RangeProblem
 from rangesfm.trajectory import Trajectory
@@ -85,7 +85,7 @@ def survey_problem(
         tag_from_center=observations.tag_from_center[rows] @ first_camera_from_sfm.rotation.T,
         anchor_index=log.anchor_index[rows],
         range_m=log.range_m[rows],
-        stddev_m=np.hypot(stddev, short_range_stddev(log.range_m))[rows],
+        stddev_m=np.hypot(stddev, shared_stddev(log))[rows],
         anchor_mean_m=np.array(
             [_position(a) if k else np.full(3, np.nan) for a, k in zip(in_log, placed, strict=True)]
         ),

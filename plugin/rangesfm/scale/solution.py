@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry import path_shape
-from rangesfm.ranging.noise import correlation_inflation, short_range_stddev
+from rangesfm.ranging.noise import correlation_inflation
 from rangesfm.scale.inlier_noise import inlier_stddev
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, solve
 from rangesfm.scale.starts import (
@@ -62,6 +62,7 @@ def solve_survey(
     anchors_are_known: bool,
     center_stddev: Array,
     noise_stddev_m: Array,
+    shared_stddev_m: Array,
     groups: npt.NDArray[np.int64],
     seed: int,
 ) -> Solution:
@@ -72,13 +73,14 @@ def solve_survey(
         anchors_are_known: whether starts may lean on given positions.
         center_stddev: (n,) of interpolated centres, model units.
         noise_stddev_m: (n,) NaN where it is to be estimated.
+        shared_stddev_m: (n,) what ranges of about this length may be off together.
         groups: (n,) labels of stretches of one anchor's ranges whose errors go together.
 
     Raises:
         GeometryError: nothing fits, or two different maps do.
     """
     rivals = _distinct_fits(problem, anchors_are_known, seed)
-    solution = _with_own_noise(problem, rivals[0], center_stddev, noise_stddev_m, groups)
+    solution = _with_own_noise(problem, rivals[0], center_stddev, noise_stddev_m, shared_stddev_m, groups)
     _refuse_ambiguity(solution, rivals[1:])
     return solution
 
@@ -141,7 +143,12 @@ def _differ(problem: RangeProblem, first: RangeFit, second: RangeFit) -> bool:
 
 
 def _with_own_noise(
-    problem: RangeProblem, start: RangeFit, center_stddev: Array, noise_stddev_m: Array, groups: npt.NDArray[np.int64]
+    problem: RangeProblem,
+    start: RangeFit,
+    center_stddev: Array,
+    noise_stddev_m: Array,
+    shared_stddev_m: Array,
+    groups: npt.NDArray[np.int64],
 ) -> Solution:
     """Alternate between the fit and the noise it shows."""
     bias_stddev, common_bias_stddev, distances = (
@@ -154,7 +161,7 @@ def _with_own_noise(
     for _ in range(_NUM_NOISE_ROUNDS):
         base = np.where(np.isfinite(noise_stddev_m), noise_stddev_m, noise)
         interpolation = fit.state.metric_from_model.scale * center_stddev
-        stddev = np.sqrt(base**2 + interpolation**2 + short_range_stddev(problem.range_m) ** 2)
+        stddev = np.sqrt(base**2 + interpolation**2 + shared_stddev_m**2)
         # Correlated errors are worth fewer ranges; the ranges keep their nominal weight among
         # themselves and the priors gain by as much instead.
         problem = replace(
@@ -166,7 +173,7 @@ def _with_own_noise(
         )
         fit = solve(problem, fit.state)
         inflation = correlation_inflation(fit.residuals_m / stddev, fit.weights, groups)
-        ordinary = short_range_stddev(problem.range_m) < noise
+        ordinary = shared_stddev_m < noise
         noise = inlier_stddev(fit.residuals_m[ordinary] if np.mean(ordinary) > _MIN_ORDINARY else fit.residuals_m)
     return Solution(problem, fit, inflation, noise)
 

@@ -1,0 +1,106 @@
+"""``rangesfm ranges calibrate``: the error curve of a radio, from ranges whose true lengths are known."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rangesfm.cli.arguments import Commands, Outcome
+from rangesfm.cli.log_arguments import add_log_arguments, read_log
+from rangesfm.cli.survey_flags import position
+from rangesfm.progress import Progress
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rangesfm.ranging.calibration import Calibration
+
+
+def add_command(commands: Commands) -> None:
+    parser = commands.add(
+        "ranges calibrate",
+        execute,
+        help="the error curve of a radio, from a log with known tag positions",
+        description=(
+            "Learn by how much a radio reads long or short at each distance, from a log whose tag positions are "
+            "known (a total station, motion capture) and surveyed anchors. Every command takes the file that this "
+            "writes as --error_curve, or as error_curve in [ranges]."
+        ),
+        example=(
+            "rangesfm ranges calibrate log.csv --anchors anchors.csv --positions truth.csv \\\n"
+            "    --output_path curve.csv"
+        ),
+    )
+    add_log_arguments(parser)
+    parser.add_argument("--anchors", required=True, metavar="CSV", help="anchor_id,x_m,y_m,z_m: surveyed")
+    parser.add_argument(
+        "--positions",
+        required=True,
+        metavar="FILE",
+        help="CSV timestamp_s (or image_name),x_m,y_m,z_m[,qx,qy,qz,qw], or a TUM file, in the anchors' frame",
+    )
+    parser.add_argument(
+        "--tag_in_cam",
+        type=position,
+        default=[0.0, 0.0, 0.0],
+        metavar="X,Y,Z",
+        help="the antenna in the frame whose poses are given (default: they are the antenna's)",
+    )
+    parser.add_argument(
+        "--time_offset", type=float, default=0.0, metavar="SECONDS", help="time of positions minus time of ranges"
+    )
+    parser.add_argument("--tag_id", metavar="ID", help="the tag whose positions these are, if the log has several")
+    parser.add_argument(
+        "--max_interpolation_gap_s",
+        type=float,
+        default=0.2,
+        metavar="S",
+        help="between known positions further apart none is interpolated (default: 0.2)",
+    )
+    parser.add_argument("--output_path", required=True, metavar="CSV", help="write the curve there")
+    parser.add_argument("--plot", metavar="PNG", help="draw the curve and the ranges' errors there")
+
+
+def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
+    from rangesfm.inputs import of_wanted_tag
+    from rangesfm.ranging.anchor_file import read_anchors
+    from rangesfm.ranging.calibration import calibrate_ranges
+    from rangesfm.ranging.error_curve import write_error_curve
+    from rangesfm.ranging.tag_positions import tag_positions
+    from rangesfm.reference import read_reference
+
+    anchors = read_anchors(args.anchors)
+    log = of_wanted_tag(read_log(args), args.tag_id)
+    tags = tag_positions(
+        log,
+        read_reference(args.positions),
+        args.tag_in_cam,
+        time_offset_s=args.time_offset,
+        max_gap_s=args.max_interpolation_gap_s,
+    )
+    calibration = calibrate_ranges(log, tags, anchors)
+    lines = [*_lines(calibration, len(log)), "", f"written to {args.output_path}"]
+    if args.plot is not None:
+        from rangesfm.ranging.plot import plot_error_curve, write_figure
+
+        write_figure(plot_error_curve(calibration), args.plot)
+        lines.append(f"drawn in {args.plot}")
+    write_error_curve(calibration.curve, Path(args.output_path))
+    return Outcome(lines)
+
+
+def _lines(calibration: Calibration, num_in_log: int) -> Sequence[str]:
+    curve = calibration.curve
+    rows = zip(*(a.tolist() for a in (curve.distance_m, curve.error_m, curve.stddev_m, curve.noise_stddev_m)))
+    return [
+        f"ranges  {calibration.num_ranges} of {num_in_log} have a known length, "
+        f"{100 * calibration.outlier_share:.1f} % do not fit",
+        f"noise   {calibration.noise_stddev_m:.3f} m about the curve",
+        "",
+        f"{'distance m':>10}  {'error m':>8}  {'stddev m':>8}  {'noise m':>8}",
+        *(f"{distance:10.2f}  {error:+8.3f}  {stddev:8.3f}  {noise:8.3f}" for distance, error, stddev, noise in rows),
+        "",
+        "anchors beyond the curve: "
+        + ", ".join(f"{anchor_id} {bias:+.3f} m" for anchor_id, bias in calibration.anchor_bias_m.items()),
+    ]
