@@ -191,6 +191,15 @@ LIFETIMES = """
             blocks = [reconstruction.frame(frame_id).rig_from_world.params, np.ones(3), np.zeros(1)]
             _ceres.add_residual_block(adjuster, cost, loss, blocks)
             residuals.append((cost, loss, blocks))
+        poses = [reconstruction.frame(frame_id).rig_from_world.params for frame_id in reconstruction.reg_frame_ids()]
+        rows = np.arange(4)
+        ranges = _ceres.PlacedRanges(
+            range_m=np.ones(4), stddev_m=np.ones(4), before=rows % 2, after=rows % 2 + rows // 2, weight=rows / 4,
+            offset_in_world_m=np.zeros((4, 3)), anchor_index=0 * rows, tag_index=0 * rows,
+        )
+        many = _ceres.RangeBlocks(poses, [np.ones(3)], [np.zeros(1)], [np.zeros(3)], lever_arms_are_free=True)
+        _ceres.add_ranges(adjuster, ranges, many, _ceres.RangeErrorModel(loss_scale_too_long=1.0))
+        residuals.append((ranges, many))
         return dict(adjuster=adjuster, problem=adjuster.problem, reconstruction=reconstruction, residuals=residuals)
 
     for order in itertools.permutations(("adjuster", "problem", "reconstruction", "residuals")):
