@@ -33,6 +33,8 @@ LAYER_OF = {
     "ranging": DATA,
     "reference": DATA,
     "model_transform": DATA,
+    # What the stage ``refine`` is made of.
+    "refinement": DATA,
     "result_folder": DATA,
     "simulate": DATA,
     "strict_tables": DATA,

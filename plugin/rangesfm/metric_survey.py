@@ -70,6 +70,11 @@ class MetricSurvey:
         return self.scaled_weights if self.refinement is None else self.refinement.weights
 
     @property
+    def range_stddev_m(self) -> Array:
+        """(n,) noise of each range as weighted last; NaN without a place."""
+        return self.estimate.range_stddev_m if self.refinement is None else self.refinement.range_stddev_m
+
+    @property
     def residuals_m(self) -> Array:
         """(n,) predicted minus measured, by the final model."""
         return self.predicted_m - self.observations.log.range_m

@@ -138,7 +138,7 @@ def _write_ranges(survey: MetricSurvey, path: Path) -> None:
         "anchor_id": [log.anchor_ids[k] for k in log.anchor_index],
         "tag_id": [log.tag_ids[k] for k in log.tag_index],
         "range_m": [repr(r) for r in log.range_m.tolist()],
-        "range_stddev_m": _texts(survey.estimate.range_stddev_m),
+        "range_stddev_m": _texts(survey.range_stddev_m),
         "keyframe_before": [names[i] for i in observations.before],
         "keyframe_after": [names[i] for i in observations.after],
         **{name: _texts(values) for name, values in numbers.items()},

@@ -43,6 +43,7 @@ from rangesfm.passthrough import apply_options
 from rangesfm.progress import Progress
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock import TimeOffset, estimate_time_offset
+from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeObservations, RangeStatus, hold_out, robust_weights
 from rangesfm.reference import write_reference
 from rangesfm.refine import predicted_ranges, refine_with_ranges
@@ -149,6 +150,8 @@ def _to_metric(
             metric = _refine(survey, metric)
         if metric.refinement is not None and not metric.refinement.converged:
             journal.warn(f"the refinement stopped before it converged: {metric.refinement.message}")
+        for misfit in metric.refinement.misfits if metric.refinement is not None else ():
+            journal.warn(f"after the refinement {misfit}")
     # Comparison and results.
     with journal.stage("results"):
         result = survey_result(metric)
@@ -353,7 +356,9 @@ def _refine(survey: Survey, metric: MetricSurvey) -> MetricSurvey:
         estimate.anchors,
         tag_in_cam_m=survey.tag_in_cam_m,
         range_stddev_m=estimate.range_stddev_m,
+        stddev_is_estimated=_noise_is_estimated(survey, estimate.observations.log),
         correlation_inflation=estimate.correlation_inflation,
+        common_bias_stddev_m=survey.ranges.model.common_bias_stddev_m,
         first_pose_is_fixed=estimate.frame != "site",
         camera=survey.camera,
         options=survey.refine,
@@ -365,6 +370,11 @@ def _refine(survey: Survey, metric: MetricSurvey) -> MetricSurvey:
 def _georeference(inputs: RangingInputs, metric: MetricSurvey) -> Georeference | None:
     """Of the final map: that of the anchors, if the map could be carried to them."""
     return inputs.georeference if metric.estimate.frame == "site" else None
+
+
+def _noise_is_estimated(survey: Survey, log: RangeLog) -> npt.NDArray[np.bool_]:
+    """(n,) ranges of which neither the log nor the survey says how noisy they are."""
+    return np.isnan(log.range_stddev_m) & (survey.ranges.model.range_stddev_m is None)
 
 
 def _distances(inputs: RangingInputs, metric: MetricSurvey, journal: Journal) -> list[dict[str, Any]]:

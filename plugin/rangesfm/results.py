@@ -144,12 +144,15 @@ def _refine(survey: MetricSurvey) -> dict[str, Any] | None:
         return None
     return {
         "iterations": summary.num_iterations,
+        "keyframe_graph_steps": summary.num_graph_steps,
+        "bend_m": summary.bend_m,
         "initial_cost": summary.initial_cost,
         "final_cost": summary.final_cost,
         "reprojection_rms_px": summary.reprojection_rms_px,
         "pixel_stddev": summary.pixel_stddev,
+        "correlation_inflation": summary.correlation_inflation,
         "seconds": summary.seconds,
-        "converged": summary.converged,
-        "message": summary.message,
+        "converged": summary.converged and not summary.misfits,
+        "message": "; ".join(summary.misfits) or summary.message,
         "scale_value": survey.refined_scale,
     }

@@ -1,0 +1,1 @@
+"""What the refinement is made of; ``rangesfm.refine`` puts it together."""

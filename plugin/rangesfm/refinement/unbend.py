@@ -1,0 +1,112 @@
+"""Unbends a drifted map before the full problem is solved, and finds what the ranges are worth on the way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from rangesfm.geometry import align_points, rmse
+from rangesfm.ranging.anchors import AnchorEstimate
+from rangesfm.ranging.observations import RangeObservations
+from rangesfm.refinement.antennas import Antennas
+from rangesfm.refinement.carry import carry_model
+from rangesfm.refinement.keyframe_graph import GraphState, KeyframeGraph, local_scales, moved_anchors, solve_graph
+from rangesfm.refinement.vision_information import model_observations, model_poses, vision_information
+from rangesfm.refinement.weights import RangeWeights
+from rangesfm.trajectory import Trajectory
+
+Array = npt.NDArray[np.float64]
+
+_MAX_NUM_ROUNDS = 12
+# Relative; the noise itself is not known better from some hundred ranges.
+SAME_WEIGHTS = 0.05
+# Of the ranges' stddev: far less than what the full problem has to put right anyway.
+_TOLERANCE = 0.1
+
+
+@dataclass(frozen=True)
+class Unbent:
+    """What was found.
+
+    Attributes:
+        weights: of all ranges. num_absorbed: degrees of freedom that the map takes from them.
+        anchors: where they are now.
+        bend_m: root mean square distance of keyframes from where one similarity would have put them.
+        was_bent: whether the model was moved.
+        num_steps: of the keyframe graph's solver.
+    """
+
+    weights: RangeWeights
+    num_absorbed: float
+    anchors: tuple[AnchorEstimate, ...]
+    bend_m: float
+    was_bent: bool
+    num_steps: int
+
+
+def unbend(
+    metric: pycolmap.Reconstruction,
+    trajectory: Trajectory,
+    observations: RangeObservations,
+    antennas: Antennas,
+    weights: RangeWeights,
+    anchors: tuple[AnchorEstimate, ...],
+    *,
+    pixel_stddev: float,
+    common_bias_stddev_m: float,
+    first_pose_is_fixed: bool,
+) -> Unbent:
+    """Solve the keyframe graph and, where it bends the map by more than the ranges' noise, move the model, in place.
+
+    The weights are estimated anew with every solution. While drift is large, so are residuals and with them the
+    stddevs: the robust loss, which counts in stddevs, tightens as the map straightens and takes no drift for an
+    outlier.
+    """
+    others = np.setdiff1d(np.array(metric.reg_frame_ids(), dtype=np.int64), trajectory.frame_ids)
+    frame_ids = np.concatenate([trajectory.frame_ids, others])
+    rays = model_observations(metric, frame_ids, pixel_stddev)
+    before = model_poses(metric, frame_ids)
+    rows = np.flatnonzero(observations.has_place)
+    placed = weights.subset(rows)
+    graph = KeyframeGraph(
+        vision=vision_information(rays, before),
+        antennas=antennas.subset(rows),
+        anchor_index=placed.anchor_index,
+        range_m=observations.log.range_m[rows],
+        stddev_m=placed.weighted_m,
+        anchors=anchors,
+        common_bias_stddev_m=common_bias_stddev_m,
+        held_frame=0 if first_pose_is_fixed else None,
+        loss_scale=placed.loss_scale / placed.inflation,
+    )
+    state, placed, num_absorbed, num_steps = _solve_with_own_weights(graph, placed)
+    bend_m = _bend(before.centers, state.poses.centers)
+    was_bent = bend_m > float(np.median(placed.stddev_m))
+    if was_bent:
+        carry_model(metric, frame_ids, rays, before, state.poses, local_scales(graph.vision, state.poses))
+        anchors = moved_anchors(anchors, state)
+    return Unbent(weights.with_rows(rows, placed), num_absorbed, anchors, bend_m, was_bent, num_steps)
+
+
+def _solve_with_own_weights(graph: KeyframeGraph, weights: RangeWeights) -> tuple[GraphState, RangeWeights, float, int]:
+    """Alternate between the map and the weights that its residuals show."""
+    state, num_steps = graph.start(), 0
+    for _ in range(_MAX_NUM_ROUNDS):
+        solution = solve_graph(
+            graph.with_weights(weights.weighted_m, weights.loss_scale / weights.inflation),
+            state,
+            tolerance_m=_TOLERANCE * float(weights.stddev_m.min()),
+        )
+        state, num_steps = solution.state, num_steps + solution.num_steps
+        before, weights = weights, weights.estimated(graph.residuals_m(state), solution.num_absorbed)
+        if before.change(weights) < SAME_WEIGHTS:
+            break
+    return state, weights, solution.num_absorbed, num_steps
+
+
+def _bend(before: Array, after: Array) -> float:
+    """RMS distance that no similarity explains; of a path too short for one, nothing does not."""
+    return rmse(align_points(before, after).apply(before) - after) if len(before) > 2 else 0.0

@@ -1,0 +1,181 @@
+"""How far ranges are to be trusted, found from their own residuals (variance components), and whether they fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.ranging.noise import correlation_inflation, robust_stddev, short_range_stddev
+from rangesfm.ranging.observations import RangeObservations, robust_weights
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
+
+BLOCK_S = 10.0
+_MIN_STDDEV_M = 1e-3
+# In stddevs: an anchor whose noise differs less from that of all has the noise of all.
+_SIGNIFICANT = 3.0
+_MIN_ORDINARY = 0.3
+_MIN_BLOCK = 5
+
+
+@dataclass(frozen=True)
+class RangeWeights:
+    """Noise of n ranges and how much their correlation takes from them.
+
+    Attributes:
+        stddev_m: (n,) of each range.
+        inflation: of the stddev, by the errors' correlation in time.
+        fixed_m: (n,) the part that is not estimated: of a short range, of an interpolated place.
+        is_estimated: (n,) whether the rest is.
+        anchor_index: (n,). block: (n,) label of each range's stretch of time.
+        loss_scale: of the robust loss, stddevs.
+    """
+
+    stddev_m: Array
+    inflation: float
+    fixed_m: Array
+    is_estimated: Mask
+    anchor_index: Indices
+    block: Indices
+    loss_scale: float
+
+    @property
+    def weighted_m(self) -> Array:
+        """(n,) stddev with which a range stands against the photos."""
+        return self.inflation * self.stddev_m
+
+    def subset(self, rows: Indices) -> RangeWeights:
+        """Of some of the ranges."""
+        return RangeWeights(
+            self.stddev_m[rows],
+            self.inflation,
+            self.fixed_m[rows],
+            self.is_estimated[rows],
+            self.anchor_index[rows],
+            self.block[rows],
+            self.loss_scale,
+        )
+
+    def with_rows(self, rows: Indices, part: RangeWeights) -> RangeWeights:
+        """These, but some of the ranges as in a subset that was estimated anew."""
+        stddev = self.stddev_m.copy()
+        stddev[rows] = part.stddev_m
+        return replace(self, stddev_m=stddev, inflation=part.inflation)
+
+    def estimated(self, residuals_m: Array, num_absorbed: float) -> RangeWeights:
+        """As the residuals of a fit show them.
+
+        Args:
+            residuals_m: (n,). num_absorbed: degrees of freedom that the fit took from them.
+        """
+        if not self.is_estimated.any():
+            return self
+        noise = self._noise_m()
+        n = len(residuals_m)
+        widening = np.sqrt(n / max(n - num_absorbed, 0.1 * n))
+        ordinary = np.flatnonzero(self.is_estimated & (self.fixed_m < noise))
+        if len(ordinary) < _MIN_ORDINARY * np.count_nonzero(self.is_estimated):
+            ordinary = np.flatnonzero(self.is_estimated)
+        common = max(widening * robust_stddev(residuals_m[ordinary]), _MIN_STDDEV_M)
+        ratios = self._noise_ratios(residuals_m, ordinary)[self.anchor_index]
+        stddev = np.where(self.is_estimated, np.hypot(common * ratios, self.fixed_m), self.stddev_m)
+        scaled = residuals_m / stddev
+        groups = self.block * (self.anchor_index.max() + 1) + self.anchor_index
+        inflation = correlation_inflation(scaled, robust_weights(scaled, self.loss_scale), groups)
+        return replace(self, stddev_m=stddev, inflation=inflation)
+
+    def _noise_m(self) -> Array:
+        """(n,) the part of the stddevs that may be estimated."""
+        return np.sqrt(np.maximum(self.stddev_m**2 - self.fixed_m**2, 0.0))
+
+    def _noise_ratios(self, residuals_m: Array, rows: Indices) -> Array:
+        """(m,) noise of each anchor over that of all; 1 where the difference may be chance.
+
+        Noise is what scatters about the anchor's own median: what its ranges have in common is no noise, and taken for
+        it would silence whoever disagrees.
+        """
+        num_anchors = self.anchor_index.max() + 1
+        index, own = self.anchor_index[rows], residuals_m[rows].copy()
+        ratios = np.ones(num_anchors)
+        for k in range(num_anchors):
+            own[index == k] -= np.median(own[index == k]) if np.any(index == k) else 0.0
+        together = robust_stddev(own)
+        for k in range(num_anchors):
+            # The median deviation takes 2.7 times as many values as the variance to be as certain.
+            num_independent = np.count_nonzero(index == k) / self.inflation**2
+            if num_independent > 2:
+                chance = np.sqrt(2.7 / (2 * num_independent))
+                ratio = robust_stddev(own[index == k]) / together
+                ratios[k] = ratio if abs(np.log(ratio)) > _SIGNIFICANT * chance else 1.0
+        return ratios
+
+    def change(self, other: RangeWeights) -> float:
+        """Largest relative change of a weight from this one to another."""
+        return float(np.max(np.abs(np.log(other.weighted_m / self.weighted_m)), initial=0.0))
+
+
+def range_weights(
+    observations: RangeObservations,
+    range_stddev_m: Array,
+    inflation: float,
+    is_estimated: Mask | None,
+    metres_per_unit: float,
+    loss_scale: float,
+) -> RangeWeights:
+    """The weights to begin with.
+
+    Args:
+        range_stddev_m: (n,) as known or first estimated.
+        is_estimated: (n,) which of them are to be estimated; None: none.
+        metres_per_unit: of the observations' world.
+    """
+    log = observations.log
+    fixed = np.hypot(short_range_stddev(log.range_m), metres_per_unit * observations.center_stddev)
+    estimated = np.zeros(len(log), dtype=bool) if is_estimated is None else is_estimated
+    times = observations.before if log.timestamp_s is None else log.timestamp_s
+    length = 1.0 if log.timestamp_s is None else BLOCK_S
+    block = np.floor((times - times.min()) / length).astype(np.int64)
+    return RangeWeights(range_stddev_m, inflation, fixed, estimated, log.anchor_index, block, loss_scale)
+
+
+# Median block residuals beyond this many stddevs are no noise.
+_MAX_BLOCK_STDDEVS = 3.0
+# Real radios' errors stay alike for seconds; that makes their residuals twice as large as their scatter, not this.
+_MAX_STDDEV_OVER_SCATTER = 5.0
+_MIN_SCATTER_M = 0.01
+_MIN_DIFFERENCES = 20
+
+
+def misfits(weights: RangeWeights, residuals_m: Array, time_order: Array) -> tuple[str, ...]:
+    """Why ranges that took part do not fit as their noise lets expect; empty if they do.
+
+    Args:
+        weights, residuals_m: of the k ranges that took part. time_order: (k,) anything that grows with time.
+    """
+    reasons = []
+    stated = residuals_m / weights.stddev_m
+    typical = robust_stddev(stated)
+    if len(stated) >= _MIN_DIFFERENCES and typical > _MAX_BLOCK_STDDEVS:
+        reasons.append(f"range residuals are typically {typical:.1f} times their stddev")
+    group = weights.block * (weights.anchor_index.max() + 1) + weights.anchor_index
+    off = [np.median(stated[rows]) for rows in _by_group(group) if len(rows) >= _MIN_BLOCK]
+    num_off = int(np.sum(np.abs(off) > _MAX_BLOCK_STDDEVS))
+    if num_off:
+        reasons.append(f"in {num_off} of {len(off)} stretches of time the ranges to an anchor are off as a whole")
+    order = np.lexsort((time_order, weights.anchor_index))
+    steps = np.diff(residuals_m[order])[np.diff(weights.anchor_index[order]) == 0]
+    if len(steps) >= _MIN_DIFFERENCES:
+        scatter = max(robust_stddev(steps) / np.sqrt(2), _MIN_SCATTER_M)
+        size = robust_stddev(residuals_m)
+        if size > _MAX_STDDEV_OVER_SCATTER * scatter:
+            reasons.append(f"range residuals ({size:.2f} m) are far larger than the ranges' scatter ({scatter:.2f} m)")
+    return tuple(reasons)
+
+
+def _by_group(labels: Indices) -> list[Indices]:
+    order = np.argsort(labels, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
