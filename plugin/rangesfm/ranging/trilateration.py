@@ -125,7 +125,7 @@ def trilaterate(
 ) -> Trilateration:
     """Find an anchor from its ranges to known positions of the tag.
 
-    A good third of the ranges may be wrong by any amount. If the positions lie in a plane, the anchor's
+    Up to about half of the ranges may be wrong by any amount. If the positions lie in a plane, the anchor's
     mirror image in it fits as well: then both are returned, unless ``toward`` says which it is.
 
     Args:
