@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from rangesfm.config import Survey, read_survey, survey_from_tables
 from rangesfm.errors import InputError
 from rangesfm.options import KeyframeOptions, MapperOptions
+from rangesfm.ranging.twr import DW1000_TICK_S, VACUUM_M_PER_S, StampOptions
 
 WHOLE = """
 [images]
@@ -124,6 +125,34 @@ def test_time_offset_is_auto_or_seconds(folder: Path, given: str, seconds: float
     assert read_survey(write(folder, f"[ranges]\ntime_offset = {given}")).ranges.time_offset_s == seconds
 
 
+def test_several_tags_have_a_lever_arm_each(folder: Path) -> None:
+    survey = read_survey(write(folder, "[tag.lever_arms_m]\n7 = [1, 2, 3]\nB2 = [0.1, 0, 0]\n"))
+    assert survey.lever_arms_m == {"7": (1.0, 2.0, 3.0), "B2": (0.1, 0.0, 0.0)}
+
+
+def test_lever_arms_given_by_flag_take_the_place_of_those_in_the_file(folder: Path) -> None:
+    one, several = "[tag]\ntag_in_cam_m = [1, 2, 3]\n", "[tag.lever_arms_m]\n7 = [1, 2, 3]\n"
+    survey = read_survey(write(folder, one), {"tag.lever_arms_m": {"8": [0, 0, 1]}})
+    assert (survey.tag_in_cam_m, survey.lever_arms_m) == ((0.0, 0.0, 0.0), {"8": (0.0, 0.0, 1.0)})
+    survey = read_survey(write(folder, several), {"tag.tag_in_cam_m": [0, 0, 1]})
+    assert (survey.tag_in_cam_m, survey.lever_arms_m) == ((0.0, 0.0, 1.0), {})
+
+
+def test_time_stamps_are_described_in_the_survey(folder: Path) -> None:
+    ranges = read_survey(
+        write(
+            folder,
+            '[ranges]\nstamp_unit = "ticks"\nstamp_bits = 40\npropagation_speed = "vacuum"\nt_off_s = 1e-8\n'
+            "ranging_interval_s = 0.1\n",
+        )
+    ).ranges
+    assert ranges.stamps == StampOptions(DW1000_TICK_S, 2**40 * DW1000_TICK_S, VACUUM_M_PER_S, 1e-8)
+    assert ranges.ranging_interval_s == 0.1
+    assert read_survey(write(folder, "")).ranges.stamps == StampOptions()
+    speed = read_survey(write(folder, "[ranges]\npropagation_speed = 299.7e6\n")).ranges.stamps
+    assert speed.propagation_speed_m_per_s == 299.7e6
+
+
 def test_overrides_replace_keys_and_their_paths_are_relative_to_the_working_directory(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -171,6 +200,18 @@ def test_settings_are_plain_json(folder: Path) -> None:
         ("[ranges.columns]\nrange = 3", 1, "expected a table in which each value is text"),
         ("[anchors]\nframe = 'sight'", 2, "expected one of site, first_camera, unknown"),
         ("[tag]\ntag_in_cam_m = [1, 2]", 2, "expected a list of 3 numbers"),
+        (
+            "[tag]\ntag_in_cam_m = [1, 2, 3]\nlever_arms_m = { a = [1, 2, 3] }",
+            2,
+            "either one lever arm or one by tag id",
+        ),
+        ("[tag]\nlever_arms_m = { a = [1, 2] }", 2, "a table in which each value is a list of 3 numbers"),
+        ("[tag.lever_arms_m]\na = 1", 1, "a table in which each value is a list of 3 numbers"),
+        ("[ranges]\nstamp_bits = 33", 2, "expected 32 or 40"),
+        ("[ranges]\nstamp_unit = 'hours'", 2, "expected one of ns, us, ms, s, ticks"),
+        ("[ranges]\npropagation_speed = 'sound'", 2, "expected air, vacuum or a speed of light in m/s"),
+        ("[ranges]\npropagation_speed = 340", 2, "expected air, vacuum or a speed of light in m/s"),
+        ("[ranges]\nranging_interval_s = 0", 2, "expected more than 0"),
         ("[mapper]\nmatchng = 'auto'", 2, "unknown key 'matchng' in [mapper]; the nearest known one is 'matching'"),
         ("[mapper]\nfeatures = 3", 2, "features is 3, expected a table"),
         ("[refine]\nbundle_adjustmnt.x = 1", 2, "nearest known one is 'bundle_adjustment'"),

@@ -12,17 +12,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from rangesfm.config import RangesConfig, Survey
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.journal import Journal
+from rangesfm.model_files import read_model
 from rangesfm.options import CheckOptions, ExportOptions, ScaleOptions
 from rangesfm.outputs import forget_result, forgetting_result_if_changed, refuse_to_overwrite, write_result
 from rangesfm.pipeline import refine_model, scale_model
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.readers import read_ranges
+from rangesfm.simulate.model import SyntheticModel, synthetic_model
+from rangesfm.simulate.path import loop_path
 from rangesfm.tables import read_table
+from rangesfm.trajectory import trajectory_from_reconstruction
 
 if TYPE_CHECKING:
     from tests.conftest import WalkedSurvey
@@ -166,6 +171,74 @@ def test_what_cannot_be_held_out_is_refused(checks: CheckOptions, frame: str, sa
     wrong = replace(survey, ranges=replace(survey.ranges, checks=checks), anchor_frame=frame)
     with pytest.raises(InputError, match=said):
         scale_model(wrong, progress=SilentProgress())
+
+
+LEVER_ARMS_M = {"left": (0.15, -0.1, 0.05), "right": (-0.15, 0.05, -0.1)}
+ANCHORS_M = {"A1": (-6.0, -5.0, 0.5), "A2": (6.0, -5.0, 2.5), "A3": (6.0, 5.0, 0.7), "A4": (-6.0, 5.0, 4.2)}
+
+
+class TestSeveralTags:
+    """Two tags on the camera, no noise; the anchors also range with each other and so do the tags."""
+
+    @pytest.fixture
+    def made(self) -> SyntheticModel:
+        path, times = loop_path(42.0, start_s=0.0, seed=3), np.arange(1.0, 41.0)
+        return synthetic_model(times, path.centers(times), path.world_from_cam(times), num_observations=60, seed=1)
+
+    @pytest.fixture
+    def survey(self, made: SyntheticModel, tmp_path: Path) -> Survey:
+        (tmp_path / "sparse").mkdir()
+        made.reconstruction.write(tmp_path / "sparse")
+        rows = [
+            "image_name,anchor_id,range_m,tag_id",
+            "none.jpg,A1,12.0,A2",
+            f"{next(iter(made.timestamps_s))},left,0.8,right",
+        ]
+        for tag_id, lever_arm in LEVER_ARMS_M.items():
+            tags = made.centers_m + made.world_from_cam @ np.array(lever_arm)
+            for anchor_id, position in ANCHORS_M.items():
+                distances = np.linalg.norm(tags - position, axis=1).tolist()
+                rows += [f"{name},{anchor_id},{d!r},{tag_id}" for name, d in zip(made.timestamps_s, distances)]
+        (tmp_path / "uwb.csv").write_text("\n".join(rows))
+        anchors = [f"{name},{x},{y},{z}" for name, (x, y, z) in ANCHORS_M.items()]
+        (tmp_path / "anchors.csv").write_text("\n".join(["anchor_id,x_m,y_m,z_m", *anchors]))
+        return Survey(
+            model_path=tmp_path / "sparse",
+            ranges=RangesConfig(path=tmp_path / "uwb.csv"),
+            anchors_path=tmp_path / "anchors.csv",
+            lever_arms_m=LEVER_ARMS_M,
+            scale=ScaleOptions(num_bootstrap=5),
+            export=ExportOptions(formats=()),
+            output_path=tmp_path / "out",
+        )
+
+    def centers(self, survey: Survey, model: str) -> npt.NDArray[np.float64]:
+        return trajectory_from_reconstruction(read_model(survey.output_path / model / "0")).centers
+
+    def test_map_is_exact_where_each_has_its_lever_arm(self, survey: Survey, made: SyntheticModel) -> None:
+        result = refine_model(survey, progress=SilentProgress()).result
+        assert result["scale"]["value"] == pytest.approx(made.metric_from_sfm.scale, rel=1e-6)
+        np.testing.assert_allclose(self.centers(survey, "sparse_scaled"), made.centers_m, atol=1e-6)
+        np.testing.assert_allclose(self.centers(survey, "sparse_metric"), made.centers_m, atol=1e-6)
+        assert result["ranges"]["num_used"] == result["ranges"]["num"] == 8 * len(made.centers_m)
+        assert result["ranges"]["rms_m"] < 1e-6
+
+    def test_map_is_wrong_with_the_lever_arms_of_each_other(self, survey: Survey, made: SyntheticModel) -> None:
+        left, right = LEVER_ARMS_M.values()
+        swapped = replace(survey, lever_arms_m={"left": right, "right": left})
+        result = scale_model(swapped, progress=SilentProgress()).result
+        assert np.abs(self.centers(survey, "sparse_scaled") - made.centers_m).max() > 0.01
+        assert result["ranges"]["rms_m"] > 0.05
+
+    def test_ranges_between_two_of_a_kind_are_in_the_results_with_their_status(self, survey: Survey) -> None:
+        result = scale_model(survey, progress=SilentProgress()).result
+        assert (result["ranges"]["num_anchor_anchor"], result["ranges"]["num_tag_tag"]) == (1, 1)
+        with (survey.output_path / "ranges.csv").open(newline="") as file:
+            rows = [row for row in csv.DictReader(file) if row["status"] in ("anchor-anchor", "tag-tag")]
+        assert [(row["tag_id"], row["anchor_id"], row["range_m"], row["residual_m"]) for row in rows] == [
+            ("A2", "A1", "12.0", ""),
+            ("right", "left", "0.8", ""),
+        ]
 
 
 def test_doubts_are_warnings_in_the_result_and_for_the_user(survey: Survey) -> None:

@@ -14,6 +14,7 @@ from rangesfm.options import (
     EXPORT_FRAMES,
     MATCHING_METHODS,
     SCALE_METHODS,
+    STAMP_UNITS,
     AssociationOptions,
     CameraOptions,
     CheckOptions,
@@ -24,10 +25,15 @@ from rangesfm.options import (
     RefineOptions,
     ScaleOptions,
 )
+from rangesfm.ranging.readers.time_units import SECONDS_PER_UNIT
+from rangesfm.ranging.twr import AIR_M_PER_S, DW1000_TICK_S, VACUUM_M_PER_S, StampOptions
 from rangesfm.strict_tables import Rule, Source, StrictTable, parse_toml
 
 TABLES = ("images", "camera", "ranges", "anchors", "tag", "mapper", "scale", "refine", "export", "report", "output")
 _LIKE_OURS = 0.85  # a [mapper] key this similar to one of ours is a slip; others are pycolmap's
+
+# An override of the first takes the place of the others in the file.
+_INSTEAD_OF = {"tag.tag_in_cam_m": ("lever_arms_m",), "tag.lever_arms_m": ("tag_in_cam_m",)}
 
 _MORE_THAN_0 = Rule("more than 0", lambda value: value > 0)
 _FROM_0 = Rule("0 or more", lambda value: value >= 0)
@@ -50,6 +56,9 @@ _RULES = {
     "range_bias_stddev_m": _FROM_0,
     "common_bias_stddev_m": _FROM_0,
     "max_relative_stddev": _MORE_THAN_0,
+    "ranging_interval_s": _MORE_THAN_0,
+    "stamp_unit": _one_of(STAMP_UNITS),
+    "stamp_bits": Rule("32 or 40", lambda value: value in (32, 40)),
     "separator": Rule("one character", lambda value: len(value) == 1),
     "matching": _one_of(MATCHING_METHODS),
     "num_threads": Rule("1 or more, or -1 for all cores", lambda value: value == -1 or value >= 1),
@@ -71,7 +80,8 @@ class RangesConfig:
     Attributes:
         path: the log; None if not given.
         format: name of a reader; None: recognised by content.
-        columns, timestamp_unit, range_unit, separator: as in ``read_ranges``.
+        columns, timestamp_unit, range_unit, separator, ranging_interval_s: as in ``read_ranges``.
+        stamps: how time stamps of two-way ranging become ranges.
         error_curve_path: the radio's error by distance, as ``rangesfm ranges calibrate`` writes it; None: not known.
         time_offset_s: image time = range time + offset; None: searched for ("auto").
         association: where ranges are put on the path.
@@ -85,6 +95,8 @@ class RangesConfig:
     timestamp_unit: str | None = None
     range_unit: str | None = None
     separator: str | None = None
+    ranging_interval_s: float | None = None
+    stamps: StampOptions = field(default_factory=StampOptions)
     error_curve_path: Path | None = None
     time_offset_s: float | None = None
     association: AssociationOptions = field(default_factory=AssociationOptions)
@@ -105,7 +117,8 @@ class Survey:
         anchor_crs: coordinate system of their positions, as "EPSG:2056"; None: metres of a frame of their own.
         use_anchors: ids of the anchors whose ranges are used; empty: all.
         tag_in_cam_m: lever arm: the tag's antenna in the camera frame, metres.
-        tag_id: which tag of the log the camera carries; None: there is only one.
+        lever_arms_m: the same by tag id, for a camera with several tags; empty: there is only one.
+        tag_id: which tag of the log counts; None: all that have a lever arm.
         distances_path, markers_path: taped distances, and the marks in photos between which they were taken.
         reference_path: true positions, for comparison.
         export: what to write beside the COLMAP models, and in which frame.
@@ -124,6 +137,7 @@ class Survey:
     anchor_crs: str | None = None
     use_anchors: tuple[str, ...] = ()
     tag_in_cam_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    lever_arms_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     tag_id: str | None = None
     mapper: MapperOptions = field(default_factory=MapperOptions)
     scale: ScaleOptions = field(default_factory=ScaleOptions)
@@ -226,6 +240,8 @@ class _SurveyReader:
             timestamp_unit=table.value("timestamp_unit", str),
             range_unit=table.value("range_unit", str),
             separator=table.value("separator", str),
+            ranging_interval_s=table.value("ranging_interval_s", float),
+            stamps=_stamps(table),
             error_curve_path=self._path("ranges", "error_curve"),
             time_offset_s=_time_offset(table),
             association=table.options(AssociationOptions),
@@ -243,8 +259,13 @@ class _SurveyReader:
 
     def tag(self) -> dict[str, Any]:
         table = self.table("tag")
+        tag_in_cam_m = table.value("tag_in_cam_m", tuple[float, float, float])
+        lever_arms_m = table.value("lever_arms_m", dict[str, tuple[float, float, float]], {})
+        if tag_in_cam_m is not None and lever_arms_m:
+            raise table.error("tag_in_cam_m", "nothing beside lever_arms_m: either one lever arm or one by tag id")
         return {
-            "tag_in_cam_m": table.value("tag_in_cam_m", tuple[float, float, float], (0.0, 0.0, 0.0)),
+            "tag_in_cam_m": tag_in_cam_m or (0.0, 0.0, 0.0),
+            "lever_arms_m": lever_arms_m,
             "tag_id": table.value("tag_id", str),
         }
 
@@ -285,6 +306,27 @@ class _SurveyReader:
         return path
 
 
+def _stamps(table: StrictTable) -> StampOptions:
+    """Keys stamp_unit, stamp_bits, propagation_speed ("air", "vacuum" or m/s) and t_off_s."""
+    unit = table.value("stamp_unit", str, "ns")
+    return StampOptions(
+        unit_s=DW1000_TICK_S if unit == "ticks" else SECONDS_PER_UNIT[unit],
+        wrap_s=2 ** table.value("stamp_bits", int, 32) * DW1000_TICK_S,
+        propagation_speed_m_per_s=_propagation_speed(table),
+        t_off_s=table.value("t_off_s", float, 0.0),
+    )
+
+
+def _propagation_speed(table: StrictTable) -> float:
+    key = "propagation_speed"
+    speed = table.value(key, Any, "air")
+    if speed in ("air", "vacuum"):
+        return {"air": AIR_M_PER_S, "vacuum": VACUUM_M_PER_S}[speed]
+    if not isinstance(speed, (int, float)) or not 1e8 < speed < 3e8:
+        raise table.error(key, "air, vacuum or a speed of light in m/s")
+    return float(speed)
+
+
 def _time_offset(table: StrictTable) -> float | None:
     key = "time_offset"
     offset = table.value(key, Any, "auto")
@@ -302,6 +344,8 @@ def _merged(tables: Mapping[str, Any], overrides: Mapping[str, object]) -> dict[
         table_name, _, key = dotted_key.partition(".")
         table = merged.setdefault(table_name, {})
         if isinstance(table, dict):
+            for other in _INSTEAD_OF.get(dotted_key, ()):
+                table.pop(other, None)
             table[key] = str(value) if isinstance(value, Path) else value
     return merged
 

@@ -12,6 +12,7 @@ ANCHOR_FRAMES = ("site", "first_camera", "unknown")
 SCALE_METHODS = ("robust", "two-candidate")
 EXPORT_FRAMES = ("result", "level", "enu")
 DEFAULT_FORMATS = ("tum", "ply")
+STAMP_UNITS = ("ns", "us", "ms", "s", "ticks")
 MATCHING_METHODS = ("sequential", "exhaustive", "auto")
 
 

@@ -119,7 +119,7 @@ def write_scale_tables(survey: MetricSurvey, folder: Path) -> None:
 
 
 def _write_ranges(survey: MetricSurvey, path: Path) -> None:
-    """ranges.csv as used: every range of the log, in its order."""
+    """ranges.csv as used: every range of the log, in its order; a peer of its kind stands in a range's other column."""
     observations, log = survey.observations, survey.observations.log
     refined = np.full(len(log), np.nan) if survey.refinement is None else survey.refinement.predicted_m
     has_say = np.isin(observations.status, (*USED, RangeStatus.OUTLIER))
@@ -132,11 +132,12 @@ def _write_ranges(survey: MetricSurvey, path: Path) -> None:
     }
     labels = {int(status): status.label for status in RangeStatus}
     names = (*survey.trajectory.image_names, "")
+    tag_ids, anchor_ids = log.end_ids()
     columns: dict[str, Iterable[str]] = {
         "timestamp_s": [""] * len(log) if log.timestamp_s is None else [repr(t) for t in log.timestamp_s.tolist()],
         "image_name": [""] * len(log) if log.image_name is None else log.image_name,
-        "anchor_id": [log.anchor_ids[k] for k in log.anchor_index],
-        "tag_id": [log.tag_ids[k] for k in log.tag_index],
+        "anchor_id": anchor_ids,
+        "tag_id": tag_ids,
         "range_m": [repr(r) for r in log.range_m.tolist()],
         "range_stddev_m": _texts(survey.range_stddev_m),
         "keyframe_before": [names[i] for i in observations.before],

@@ -43,7 +43,7 @@ from rangesfm.passthrough import apply_options
 from rangesfm.progress import Progress
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock import TimeOffset, estimate_time_offset
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.observations import RangeObservations, RangeStatus, hold_out, robust_weights
 from rangesfm.reference import write_reference
 from rangesfm.refine import predicted_ranges, refine_with_ranges
@@ -147,7 +147,7 @@ def _to_metric(
     # Global refinement: photos and ranges together.
     if refine:
         with journal.stage("refinement"):
-            metric = _refine(survey, metric)
+            metric = _refine(survey, inputs, metric)
         if metric.refinement is not None and not metric.refinement.converged:
             journal.warn(f"the refinement stopped before it converged: {metric.refinement.message}")
         for misfit in metric.refinement.misfits if metric.refinement is not None else ():
@@ -273,7 +273,7 @@ def _time_offset(survey: Survey, inputs: RangingInputs, trajectory: Trajectory, 
         offset = estimate_time_offset(
             inputs.log,
             trajectory,
-            survey.tag_in_cam_m,
+            inputs.tag_in_cam_m,
             association=survey.ranges.association,
             seed=survey.seed,
             progress=journal.progress,
@@ -313,7 +313,7 @@ def _scale(
         trajectory,
         estimate.observations,
         estimate.metric_from_sfm,
-        survey.tag_in_cam_m,
+        inputs.tag_in_cam_m,
         [anchor.position_m for anchor in estimate.anchors],
         [anchor.range_bias_m for anchor in estimate.anchors],
     )
@@ -326,7 +326,7 @@ def _observations(
 ) -> RangeObservations:
     """Ranges on the path; refused where the clocks cannot be right."""
     association = survey.ranges.association
-    observations = associate(inputs.log, trajectory, survey.tag_in_cam_m, time_offset_s=offset_s, options=association)
+    observations = associate(inputs.log, trajectory, inputs.tag_in_cam_m, time_offset_s=offset_s, options=association)
     if not observations.has_place.any():
         raise InputError(
             _why_no_range_has_a_place(observations, trajectory, float(np.mean(offset_s))), survey.ranges.path
@@ -338,7 +338,7 @@ def _why_no_range_has_a_place(observations: RangeObservations, trajectory: Traje
     times, photo_times = observations.log.timestamp_s, trajectory.timestamps_s
     if times is None or photo_times is None:
         return "none of the photos that the log names is in the model"
-    if np.all(observations.status == RangeStatus.OUTSIDE_PATH):
+    if np.all(observations.status[observations.log.kind == RangeKind.TAG_ANCHOR] == RangeStatus.OUTSIDE_PATH):
         return (
             f"the log's times ({times.min():.3f} to {times.max():.3f} s, plus an offset of {offset_s:g} s) do not "
             f"overlap the photos' ({photo_times[0]:.3f} to {photo_times[-1]:.3f} s): give another time offset, or auto"
@@ -346,7 +346,7 @@ def _why_no_range_has_a_place(observations: RangeObservations, trajectory: Traje
     return "no range is near enough to a keyframe in time: use more photos, or a larger max_interpolation_gap_s"
 
 
-def _refine(survey: Survey, metric: MetricSurvey) -> MetricSurvey:
+def _refine(survey: Survey, inputs: RangingInputs, metric: MetricSurvey) -> MetricSurvey:
     estimate = metric.estimate
     refined, summary = refine_with_ranges(
         metric.scaled,
@@ -354,7 +354,7 @@ def _refine(survey: Survey, metric: MetricSurvey) -> MetricSurvey:
         estimate.observations,
         estimate.metric_from_sfm,
         estimate.anchors,
-        tag_in_cam_m=survey.tag_in_cam_m,
+        tag_in_cam_m=inputs.tag_in_cam_m,
         range_stddev_m=estimate.range_stddev_m,
         stddev_is_estimated=_noise_is_estimated(survey, estimate.observations.log),
         correlation_inflation=estimate.correlation_inflation,

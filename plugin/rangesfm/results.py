@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.metric_survey import MetricSurvey
 from rangesfm.ranging.anchors import AnchorEstimate
+from rangesfm.ranging.log import RangeKind
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.two_candidate import TwoCandidate
@@ -94,12 +95,16 @@ def _time_offset(survey: MetricSurvey) -> dict[str, Any]:
 
 
 def _ranges(survey: MetricSurvey) -> dict[str, Any]:
+    """Of the ranges between tag and anchor; the others are only counted."""
     log = survey.observations.log
     used = np.isin(survey.observations.status, USED)
+    is_of_camera = log.kind == RangeKind.TAG_ANCHOR
     return {
-        **_residual_summary(survey.residuals_m, used, np.ones(len(log), dtype=bool)),
+        **_residual_summary(survey.residuals_m, used, is_of_camera),
+        "num_anchor_anchor": int(np.count_nonzero(log.kind == RangeKind.ANCHOR_ANCHOR)),
+        "num_tag_tag": int(np.count_nonzero(log.kind == RangeKind.TAG_TAG)),
         "per_anchor": {
-            anchor_id: _residual_summary(survey.residuals_m, used, log.anchor_index == k)
+            anchor_id: _residual_summary(survey.residuals_m, used, is_of_camera & (log.anchor_index == k))
             for k, anchor_id in enumerate(log.anchor_ids)
         },
     }

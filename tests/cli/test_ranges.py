@@ -44,7 +44,42 @@ def test_time_stamps_are_converted_as_told(tmp_path: Path) -> None:
     assert read_ranges(out).range_m[0] == pytest.approx(299_792_458 / 2 * (0.5e-6 - 1e-7), abs=1e-4)
 
 
-@pytest.mark.parametrize("speed", ["fast", "5", "3e9"])
+@pytest.mark.parametrize("speed", ["fast", "5", "3e9", "nan"])
 def test_speed_that_is_not_lights_is_refused(speed: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["ranges", "uwb.csv", "--propagation_speed", speed]) == 2
-    assert "is no speed of light" in capsys.readouterr().err
+    assert "expected air, vacuum or a speed of light in m/s" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("flag", "value", "said"),
+    [
+        ("--stamp_bits", "33", "expected 32 or 40"),
+        ("--ranging_interval_s", "0", "expected more than 0"),
+        ("--separator", "ab", "expected one character"),
+    ],
+)
+def test_description_of_a_log_that_cannot_be_is_refused(
+    flag: str, value: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["ranges", "uwb.csv", flag, value]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_counted_rounds_are_as_long_as_told(tmp_path: Path) -> None:
+    log, out = tmp_path / "uwb.log", tmp_path / "out.csv"
+    log.write_text('{"Block":7, "results":[{"Addr":"0x0001","Status":"Ok","D_cm":61}]}\n')
+    assert main(["ranges", str(log), "--ranging_interval_s", "0.5", "--output_path", str(out)]) == 0
+    times = read_ranges(out).timestamp_s
+    assert times is not None
+    assert times.tolist() == [3.5]
+
+
+def test_ranges_between_known_anchors_are_labelled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log, anchors = tmp_path / "uwb.csv", tmp_path / "anchors.csv"
+    log.write_text("timestamp_s,anchor_id,range_m,tag_id\n0,A,1,t\n1,B,2,t\n2,B,4.5,A\n3,A,4.7,B\n")
+    anchors.write_text("anchor_id,x_m,y_m,z_m\nA,,,\nB,,,\n")
+    assert main(["ranges", str(log), "--anchors", str(anchors)]) == 0
+    text = capsys.readouterr().out
+    assert "tags    t" in text
+    assert "2 ranges are between two anchors" in text
+    assert text.splitlines()[-1].split() == ["anchor-anchor", "A", "-", "B", "2", "4.500", "4.600", "4.700"]

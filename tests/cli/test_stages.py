@@ -102,3 +102,37 @@ def test_doctor_fails_where_a_part_does_not_fit(
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == (2 if ok else 3)
     assert ok or "expected 2.6; pip install pyceres==2.6" in lines[-1]
+
+
+def test_lever_arms_of_several_tags_are_given_one_by_one(calls: Calls) -> None:
+    start = ["scale", "--input_path", "model", "--ranges", "uwb.csv"]
+    assert main([*start, "--tag-in-cam", "T1:-0.1,0,2", "--tag_in_cam", "A:B:0,0,1"]) == 0
+    assert main([*start, "--tag_in_cam", "-0.1,0,2"]) == 0
+    (_, several, _), (_, one, _) = calls.made
+    assert several.lever_arms_m == {"T1": (-0.1, 0.0, 2.0), "A:B": (0.0, 0.0, 1.0)}
+    assert (one.tag_in_cam_m, one.lever_arms_m) == ((-0.1, 0.0, 2.0), {})
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--tag_in_cam", ":1,2,3"], "has no tag's id before the colon"),
+        (["--tag_in_cam", "T:1,2"], "has 2 numbers, expected X,Y,Z in metres"),
+        (["--tag_in_cam", "1,2,3", "--tag_in_cam", "T:1,2,3"], "--tag_in_cam is given with an ID and without"),
+    ],
+)
+def test_lever_arms_that_cannot_be_are_refused(
+    flags: list[str], said: str, calls: Calls, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["scale", "--input_path", "model", "--ranges", "uwb.csv", *flags]) == 2
+    assert said in capsys.readouterr().err
+    assert not calls.made
+
+
+def test_radio_log_is_described_by_the_flags_of_the_ranges_command(calls: Calls) -> None:
+    flags = ["--columns", "timestamp=t,anchor_id=n", "--stamp_unit", "us", "--propagation_speed", "299.7e6"]
+    assert main(["refine", "--input_path", "model", "--ranges", "uwb.csv", *flags, "--ranging_interval_s", "0.1"]) == 0
+    ranges = calls.made[0][1].ranges
+    assert ranges.columns == {"timestamp": "t", "anchor_id": "n"}
+    assert (ranges.stamps.unit_s, ranges.stamps.propagation_speed_m_per_s) == (1e-6, 299.7e6)
+    assert ranges.ranging_interval_s == 0.1

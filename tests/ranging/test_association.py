@@ -249,6 +249,36 @@ def test_lever_arms_that_do_not_suit_the_tags_of_the_log_are_refused(lever_arms:
         associate(log_at([1.5]), path, lever_arms)
 
 
+def test_ranges_between_two_of_a_kind_have_no_place_and_say_why() -> None:
+    keyframe_times = np.arange(0.0, 5.0)
+    log = RangeLog.from_arrays(
+        ["A", "B", "u", "A"], np.full(4, 5.0), timestamp_s=[0.0, 1.5, 2.0, 9.0], tag_id=["t", "A", "t", "B"]
+    ).with_anchors({"A", "B"})
+    found = associate(log, trajectory_of(keyframe_times, straight(keyframe_times)), TAG_IN_CAM_M)
+    assert statuses(found) == ["used", "anchor-anchor", "tag-tag", "anchor-anchor"]
+    assert found.has_place.tolist() == [True, False, False, False]
+    assert found.before.tolist() == [0, -1, -1, -1]
+    assert np.isnan(found.tag_from_center[1:]).all()
+
+
+def test_anchors_that_range_with_each_other_do_not_make_the_camera_stand_still() -> None:
+    keyframe_times = np.arange(0.0, 50.0, 10.0)
+    times = np.concatenate([time + np.linspace(-0.5, 0.5, 12) for time in keyframe_times])
+    moving = 5.0 + 0.8 * np.tile(np.linspace(-0.5, 0.5, 12), 5)
+    path = trajectory_of(keyframe_times, straight(keyframe_times))
+    alone = associate(log_at(times, moving), path, TAG_IN_CAM_M)
+    static = np.full((4, len(times)), 7.0)
+    log = RangeLog.from_arrays(
+        ["A"] * len(times) + ["B", "C", "D", "E"] * len(times),
+        np.concatenate([moving, static.T.ravel()]),
+        timestamp_s=np.concatenate([times, np.repeat(times, 4)]),
+        tag_id=["t"] * len(times) + ["C", "D", "E", "B"] * len(times),
+    ).with_anchors({"A", "B", "C", "D", "E"})
+    beside = associate(log, path, TAG_IN_CAM_M)
+    assert "no-keyframe-near" in statuses(alone)
+    assert statuses(beside)[: len(times)] == statuses(alone)
+
+
 def test_an_empty_log_gives_nothing() -> None:
     keyframe_times = np.arange(0.0, 5.0)
     found = associate(log_at([]), trajectory_of(keyframe_times, straight(keyframe_times)), TAG_IN_CAM_M)

@@ -55,9 +55,17 @@ def test_same_range_of_another_tag_is_no_duplicate() -> None:
     assert summarize_ranges(log).num_duplicates == 0
 
 
-def test_ranges_between_anchors_are_counted() -> None:
-    log = RangeLog.from_arrays(["a", "b", "b"], [1, 1, 3], timestamp_s=[0, 1, 2], tag_id=["t", "t", "a"])
-    assert summarize_ranges(log).num_between_anchors == 1
+def test_ranges_between_two_of_a_kind_are_told_apart_from_those_of_the_camera() -> None:
+    log = RangeLog.from_arrays(
+        ["a", "b", "b", "a", "u"], [1, 2, 3, 5, 9], timestamp_s=range(5), tag_id=["t", "t", "a", "b", "t"]
+    ).with_anchors({"a", "b"})
+    summary = summarize_ranges(log)
+    assert (summary.num_between_anchors, summary.num_between_tags) == (2, 1)
+    assert [(anchor.anchor_id, anchor.num) for anchor in summary.anchors] == [("a", 1), ("b", 1)]
+    between, tags = summary.pairs
+    assert (between.kind, set(between.ids), between.num) == ("anchor-anchor", {"a", "b"}, 2)
+    assert (between.min_m, between.median_m, between.max_m) == (3, 4, 5)
+    assert (tags.kind, tags.ids, tags.num, tags.median_m) == ("tag-tag", ("t", "u"), 1, 9)
 
 
 # Rounded ranges

@@ -31,15 +31,18 @@ def add_command(commands: Commands) -> None:
         ),
     )
     add_log_arguments(parser)
+    parser.add_argument("--anchors", metavar="CSV", help="who is an anchor, to tell ranges between two of them")
     parser.add_argument("--output_path", metavar="CSV", help="write the ranges there")
     parser.add_argument("--plot", metavar="PNG", help="draw the ranges over time there")
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
+    from rangesfm.ranging.anchor_file import read_anchors
     from rangesfm.ranging.readers import read_anchors_in_log, write_ranges_csv
     from rangesfm.ranging.summary import summarize_ranges
 
-    log = read_log(args)
+    anchors = read_anchors(args.anchors) if args.anchors is not None else ()
+    log = read_log(args, [anchor.anchor_id for anchor in anchors])
     lines = [*_lines(summarize_ranges(log)), *_anchors(read_anchors_in_log(args.log, format=log.format))]
     if args.output_path is not None:
         write_ranges_csv(log, args.output_path)
@@ -61,6 +64,7 @@ def _lines(summary: RangeSummary) -> list[str]:
         *(f"note    {note}" for note in _notes(summary)),
         "",
         *_table(summary),
+        *_pairs(summary),
     ]
 
 
@@ -70,6 +74,7 @@ def _notes(summary: RangeSummary) -> list[str]:
         f"{summary.num_duplicates} ranges stand in the log twice": summary.num_duplicates,
         f"{summary.num_out_of_order} ranges are earlier than the one before them": summary.num_out_of_order,
         f"{summary.num_between_anchors} ranges are between two anchors": summary.num_between_anchors,
+        f"{summary.num_between_tags} ranges are between two tags": summary.num_between_tags,
         f"all ranges are multiples of {step_m} m: rounded": step_m,
     }
     return [note for note, applies in notes.items() if applies]
@@ -106,6 +111,22 @@ def _table(summary: RangeSummary) -> list[str]:
             f"  {anchor.max_m:9.3f}{f'  {_number(anchor.noise_stddev_m):>7}' if has_noise else ''}"
             f"  {_number(anchor.largest_gap_s):>13}"
             for anchor in summary.anchors
+        ),
+    ]
+
+
+def _pairs(summary: RangeSummary) -> list[str]:
+    """One row for each two of a kind that ranged with each other."""
+    if not summary.pairs:
+        return []
+    names = [" - ".join(pair.ids) for pair in summary.pairs]
+    width = max(map(len, names))
+    return [
+        "",
+        f"{'between':13}  {'':{width}}  {'number':>8}  {'min m':>9}  {'median m':>9}  {'max m':>9}",
+        *(
+            f"{pair.kind:13}  {name:{width}}  {pair.num:8}  {pair.min_m:9.3f}  {pair.median_m:9.3f}  {pair.max_m:9.3f}"
+            for name, pair in zip(names, summary.pairs)
         ),
     ]
 

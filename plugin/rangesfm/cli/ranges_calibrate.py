@@ -63,7 +63,7 @@ def add_command(commands: Commands) -> None:
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
-    from rangesfm.inputs import of_wanted_tag
+    from rangesfm.inputs import of_one_tag
     from rangesfm.ranging.anchor_file import read_anchors
     from rangesfm.ranging.calibration import calibrate_ranges
     from rangesfm.ranging.error_curve import write_error_curve
@@ -71,7 +71,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     from rangesfm.reference import read_reference
 
     anchors = read_anchors(args.anchors)
-    log = of_wanted_tag(read_log(args), args.tag_id)
+    log = of_one_tag(read_log(args), args.tag_id)
     tags = tag_positions(
         log,
         read_reference(args.positions),

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rangesfm.errors import InputError
-from rangesfm.options import ANCHOR_FRAMES, MATCHING_METHODS, SCALE_METHODS
+from rangesfm.options import ANCHOR_FRAMES, MATCHING_METHODS, SCALE_METHODS, STAMP_UNITS
 
 if TYPE_CHECKING:
     from rangesfm.config import Survey
@@ -24,6 +24,7 @@ class Flag:
         name: without the dashes.
         key: dotted key of the survey file.
         convert: from the text to the key's value.
+        repeated: whether it may be given several times; its value is the list of all.
     """
 
     name: str
@@ -32,6 +33,7 @@ class Flag:
     convert: Callable[[str], Any] = str
     choices: tuple[str, ...] | None = None
     metavar: str | None = None
+    repeated: bool = False
 
 
 def _numbers(text: str) -> list[float]:
@@ -53,12 +55,36 @@ def position(text: str) -> list[float]:
     return numbers
 
 
+def _lever_arm(text: str) -> tuple[str | None, list[float]]:
+    """The tag's id, None without one, and its lever arm."""
+    tag_id, colon, lever_arm = text.rpartition(":")
+    if colon and not tag_id:
+        raise argparse.ArgumentTypeError(f"'{text}' has no tag's id before the colon, expected X,Y,Z or ID:X,Y,Z")
+    return tag_id or None, position(lever_arm)
+
+
 def _offset(text: str) -> str | float:
     try:
         return text if text == "auto" else float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"'{text}' is neither auto nor a number of seconds") from None
 
+
+def _columns(text: str) -> dict[str, str]:
+    pairs = [pair.partition("=") for pair in text.split(",")]
+    if not all(quantity and name for quantity, _, name in pairs):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a mapping, expected as timestamp=t,anchor_id=node,range=d")
+    return {quantity.strip(): name.strip() for quantity, _, name in pairs}
+
+
+def _speed(text: str) -> str | float:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+_LEVER_ARMS = "tag.by_id"
 
 IMAGE_FLAGS = (
     Flag("image_times", "images.times", "CSV image_name,timestamp_s (default: EXIF, else file names)", metavar="CSV"),
@@ -71,9 +97,44 @@ RECONSTRUCTION_FLAGS = (
     Flag("camera_params", "camera.params", "its parameters in COLMAP's order", _numbers, metavar="A,B,.."),
     Flag("matching", "mapper.matching", "which photos are matched", choices=MATCHING_METHODS),
 )
+LOG_FLAGS = (
+    Flag(
+        "columns",
+        "ranges.columns",
+        "names of its columns for timestamp (or image_name), anchor_id, range, tag_id, range_stddev, los; without "
+        "range, the time stamps tx1, rx1, tx2, rx2 and possibly tx3, rx3 of two-way ranging",
+        _columns,
+        metavar="QUANTITY=NAME,..",
+    ),
+    Flag("timestamp_unit", "ranges.timestamp_unit", "s, ms, us, ns or iso (default: by format)", metavar="UNIT"),
+    Flag("range_unit", "ranges.range_unit", "m, cm or mm (default: by format)", metavar="UNIT"),
+    Flag("separator", "ranges.separator", "between cells (default: told from the header row)", metavar="CHARACTER"),
+    Flag(
+        "ranging_interval_s",
+        "ranges.ranging_interval_s",
+        "between two rounds, for a Qorvo log without the host's times (default: 0.2)",
+        float,
+        metavar="S",
+    ),
+    Flag(
+        "stamp_unit", "ranges.stamp_unit", "of time stamps, in a log without ranges (default: ns)", choices=STAMP_UNITS
+    ),
+    Flag(
+        "stamp_bits", "ranges.stamp_bits", "32 or 40: their counter's (default: 32, up to 67 ms)", int, metavar="BITS"
+    ),
+    Flag(
+        "propagation_speed",
+        "ranges.propagation_speed",
+        "air (default), vacuum or m/s, for stamps",
+        _speed,
+        metavar="SPEED",
+    ),
+    Flag("t_off_s", "ranges.t_off_s", "what all delays together add to a round trip of stamps", float, metavar="S"),
+)
 RANGE_FLAGS = (
     Flag("ranges", "ranges.path", "the radio's log", metavar="LOG"),
     Flag("ranges_format", "ranges.format", "its format (default: recognised by content)", metavar="FORMAT"),
+    *LOG_FLAGS,
     Flag("ranges_time_offset", "ranges.time_offset", "image time minus range time", _offset, metavar="auto|SECONDS"),
     Flag("range_stddev_m", "ranges.range_stddev_m", "noise of a range (default: estimated)", float, metavar="METRES"),
     Flag("error_curve", "ranges.error_curve", "the radio's, by rangesfm ranges calibrate", metavar="CSV"),
@@ -81,8 +142,15 @@ RANGE_FLAGS = (
     Flag("anchor_frame", "anchors.frame", "what their coordinates refer to", choices=ANCHOR_FRAMES),
     Flag("anchor_crs", "anchors.crs", "coordinate system of their positions, as EPSG:2056", metavar="CRS"),
     Flag("use_anchors", "anchors.use", "only these anchors' ranges are used", _names, metavar="ID,ID"),
-    Flag("tag_in_cam", "tag.tag_in_cam_m", "the tag's antenna in the camera frame, metres", position, metavar="X,Y,Z"),
-    Flag("tag_id", "tag.tag_id", "the camera's tag, if the log has several", metavar="ID"),
+    Flag(
+        "tag_in_cam",
+        _LEVER_ARMS,
+        "the tag's antenna in the camera frame, metres; of several tags, once for each with its ID",
+        _lever_arm,
+        metavar="[ID:]X,Y,Z",
+        repeated=True,
+    ),
+    Flag("tag_id", "tag.tag_id", "the tag that counts, if the log has others", metavar="ID"),
     Flag("check_share", "ranges.check_share", "share of the ranges held out as checks", float, metavar="SHARE"),
     Flag("check_anchors", "ranges.check_anchors", "anchors whose ranges are all held out", _names, metavar="ID,ID"),
     Flag("check_times_s", "ranges.check_times_s", "times between which ranges are held out", _numbers, metavar="A,B"),
@@ -108,15 +176,35 @@ def add_survey_arguments(parser: argparse.ArgumentParser, *groups: tuple[Flag, .
         "--base_path", metavar="FOLDER", help="what the file's paths are relative to (default: its folder)"
     )
     parser.add_argument("--images", metavar="PATH", help="folder of the photos, or CSV of their times")
-    for flag in (flag for group in (IMAGE_FLAGS, *groups, OUTPUT_FLAGS) for flag in group):
+    for group in (IMAGE_FLAGS, *groups, OUTPUT_FLAGS):
+        add_flags(parser, group)
+
+
+def add_flags(parser: argparse.ArgumentParser, flags: tuple[Flag, ...]) -> None:
+    """Flags whose values ``overrides_from_arguments`` finds again."""
+    for flag in flags:
         parser.add_argument(
             f"--{flag.name}",
             dest=flag.key,
+            action="append" if flag.repeated else "store",
             type=flag.convert,
             choices=flag.choices,
             help=flag.help,
             metavar=flag.metavar,
         )
+
+
+def overrides_from_arguments(args: argparse.Namespace) -> dict[str, Any]:
+    """The values of all flags that were given, by their keys in a survey file."""
+    overrides = {key: value for key, value in vars(args).items() if "." in key and value is not None}
+    lever_arms = dict(overrides.pop(_LEVER_ARMS, []))
+    if None in lever_arms and len(lever_arms) > 1:
+        raise InputError("--tag_in_cam is given with an ID and without, expected X,Y,Z once, or ID:X,Y,Z for each tag")
+    if None in lever_arms:
+        overrides["tag.tag_in_cam_m"] = lever_arms[None]
+    elif lever_arms:
+        overrides["tag.lever_arms_m"] = lever_arms
+    return overrides
 
 
 def add_model_argument(parser: argparse.ArgumentParser) -> None:
@@ -131,7 +219,7 @@ def survey_from_arguments(args: argparse.Namespace) -> Survey:
     """The survey file, if any, with the flags in place of its keys."""
     from rangesfm.config import read_survey, survey_from_tables
 
-    overrides = {key: value for key, value in vars(args).items() if "." in key and value is not None}
+    overrides = overrides_from_arguments(args)
     if args.images is not None:
         overrides["images.times" if _is_table(args.images) else "images.path"] = args.images
     if args.survey is None:

@@ -100,14 +100,14 @@ def _add_estimate_options(parser: argparse.ArgumentParser) -> None:
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     from rangesfm.errors import GeometryError
-    from rangesfm.inputs import of_wanted_tag
+    from rangesfm.inputs import of_one_tag
     from rangesfm.ranging.anchor_file import write_anchors
     from rangesfm.ranging.anchor_survey import trilaterate_anchors
     from rangesfm.ranging.tag_positions import tag_positions
     from rangesfm.ranging.trilateration import TrilaterationOptions
     from rangesfm.reference import read_reference
 
-    log = of_wanted_tag(read_log(args), args.tag_id)
+    log = of_one_tag(read_log(args), args.tag_id)
     positions = tag_positions(
         log,
         read_reference(args.positions),

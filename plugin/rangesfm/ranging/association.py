@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
 from rangesfm.options import AssociationOptions
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
 from rangesfm.trajectory import Trajectory
 
@@ -54,7 +54,8 @@ def associate(
         anchor_ids: ranges to other anchors are kept with status UNKNOWN_ANCHOR; None: all are wanted.
 
     Returns:
-        all n ranges, each with a place or a status that says why it has none.
+        all n ranges, each with a place or a status that says why it has none; those between two anchors or two
+        tags have none.
 
     Raises:
         InputError: the log needs image times and there are none, or the log has more tags than lever arms.
@@ -69,9 +70,12 @@ def associate(
     else:
         raise InputError("the log has timestamps but the photos have none: give image times", log.source)
     if anchor_ids is not None:
-        wanted = np.array([anchor_id in anchor_ids for anchor_id in log.anchor_ids], dtype=bool)
-        status[(status == RangeStatus.USED) & ~wanted[log.anchor_index]] = RangeStatus.UNKNOWN_ANCHOR
-    tags = lever_arms(log, tag_in_cam_m)[log.tag_index]
+        unwanted = [index for index, anchor_id in enumerate(log.anchor_ids) if anchor_id not in anchor_ids]
+        status[(status == RangeStatus.USED) & np.isin(log.anchor_index, unwanted)] = RangeStatus.UNKNOWN_ANCHOR
+    status[log.kind == RangeKind.ANCHOR_ANCHOR] = RangeStatus.ANCHOR_ANCHOR
+    status[log.kind == RangeKind.TAG_TAG] = RangeStatus.TAG_TAG
+    # The last entry stands for the index of no tag.
+    tags = np.vstack([lever_arms(log, tag_in_cam_m), np.full(3, np.nan)])[log.tag_index]
     return _observe(log, trajectory, tags, status, before, after, weight, options)
 
 
@@ -115,7 +119,8 @@ def _places_by_time(
 
     at_keyframe = distance <= options.max_time_difference_s
     interpolated = inside & (gap <= options.max_interpolation_gap_s)
-    lonely = ~interpolated & _keyframe_is_isolated(keyframe_times, options)[nearest]
+    of_camera = log.kind == RangeKind.TAG_ANCHOR
+    lonely = of_camera & ~interpolated & _keyframe_is_isolated(keyframe_times, options)[nearest]
     still = lonely & _camera_is_still(log, nearest, distance, times, lonely, keyframe_times)
     snapped = at_keyframe | (still & ~interpolated)
 

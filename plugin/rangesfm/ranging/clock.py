@@ -17,7 +17,7 @@ from rangesfm.ranging.clock_drift import drift_note, fit_clocks, without_drift
 from rangesfm.ranging.clock_fit import OffsetFit, refine_offset
 from rangesfm.ranging.clock_path import PathSamples, moving_path
 from rangesfm.ranging.clock_search import TimedRanges, ranges_on_path, scan_offsets
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.trajectory import Trajectory
 
@@ -115,6 +115,7 @@ def estimate_time_offset(
     association = association or AssociationOptions()
     tags = lever_arms(log, tag_in_cam_m)
     ranges = TimedRanges(log.timestamp_s, log.range_m, log.anchor_index, log.tag_index)
+    ranges = ranges.take(log.kind == RangeKind.TAG_ANCHOR)
     gap_s = float(np.median(np.diff(trajectory.timestamps_s)))
     if gap_s > association.max_interpolation_gap_s:
         bursts = find_bursts(ranges, trajectory.timestamps_s)

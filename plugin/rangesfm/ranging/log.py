@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from enum import IntEnum
 from pathlib import Path
 
 import numpy as np
@@ -11,21 +13,50 @@ import numpy.typing as npt
 DEFAULT_TAG_ID = "tag"
 
 
+class RangeKind(IntEnum):
+    """Between which nodes a range was measured. Tags hang on the camera, anchors stand."""
+
+    TAG_ANCHOR = 0
+    ANCHOR_ANCHOR = 1
+    TAG_TAG = 2
+
+
+@dataclass(frozen=True)
+class PeerRanges:
+    """k ranges between two anchors, or between two tags.
+
+    Attributes:
+        rows: (k,) which ranges of the log these are.
+        ends: (k, 2) int, the two nodes, into the log's ``anchor_ids`` or ``tag_ids``.
+        end_ids: k pairs of their ids.
+        range_m: (k,) metres.
+        range_stddev_m: (k,) metres, NaN where the log does not say.
+    """
+
+    rows: npt.NDArray[np.int64]
+    ends: npt.NDArray[np.int64]
+    end_ids: tuple[tuple[str, str], ...]
+    range_m: npt.NDArray[np.float64]
+    range_stddev_m: npt.NDArray[np.float64]
+
+
 @dataclass(frozen=True)
 class RangeLog:
-    """n ranges between a moving tag and static anchors, in the order of the log.
+    """n ranges between moving tags and static anchors, in the order of the log; some between two of a kind.
 
     Either ``timestamp_s`` or ``image_name`` says when: the other is None.
 
     Attributes:
         anchor_ids: the distinct anchors, in order of first appearance.
-        anchor_index: (n,) int, into ``anchor_ids``.
+        anchor_index: (n,) int, into ``anchor_ids``; -1 for a range between two tags.
         range_m: (n,) metres, finite and positive.
         timestamp_s: (n,) seconds on the radio's clock, in any order; or None.
         image_name: n names of the photos at which each range was taken; or None.
         range_stddev_m: (n,) metres, NaN where the log does not say.
         tag_ids: the distinct tags, in order of first appearance.
-        tag_index: (n,) int, into ``tag_ids``.
+        tag_index: (n,) int, into ``tag_ids``; -1 for a range between two anchors.
+        peer_index: (n,) int, the other end of a range between two anchors (into ``anchor_ids``) or two tags (into
+            ``tag_ids``); -1 for one between a tag and an anchor.
         los: (n,) int8: 1 line of sight, 0 none, -1 not said.
         line: (n,) int, 1-based line (or record) in the source.
         source: the file it came from, for messages; None if made in memory.
@@ -43,6 +74,7 @@ class RangeLog:
     range_stddev_m: npt.NDArray[np.float64]
     tag_ids: tuple[str, ...]
     tag_index: npt.NDArray[np.int64]
+    peer_index: npt.NDArray[np.int64]
     los: npt.NDArray[np.int8]
     line: npt.NDArray[np.int64]
     source: Path | None = None
@@ -54,34 +86,112 @@ class RangeLog:
         n = len(self.range_m)
         if (self.timestamp_s is None) == (self.image_name is None):
             raise ValueError("a range log has either timestamps or image names")
-        for name in ("anchor_index", "range_stddev_m", "tag_index", "los", "line"):
+        for name in ("anchor_index", "range_stddev_m", "tag_index", "peer_index", "los", "line"):
             if len(getattr(self, name)) != n:
                 raise ValueError(f"{name} has {len(getattr(self, name))} entries, range_m has {n}")
         if not (np.all(np.isfinite(self.range_m)) and np.all(self.range_m > 0)):
             raise ValueError("ranges are finite and positive")
         if self.timestamp_s is not None and not np.all(np.isfinite(self.timestamp_s)):
             raise ValueError("timestamps are finite")
+        num_ends = np.sum([self.anchor_index >= 0, self.tag_index >= 0, self.peer_index >= 0], axis=0)
+        if np.any(num_ends != 2):
+            raise ValueError("a range has two ends: tag and anchor, or one of them and a peer")
 
     def __len__(self) -> int:
         return len(self.range_m)
 
+    @property
+    def kind(self) -> npt.NDArray[np.int8]:
+        """(n,) RangeKind."""
+        kind = np.full(len(self), RangeKind.TAG_ANCHOR, dtype=np.int8)
+        kind[self.tag_index < 0] = RangeKind.ANCHOR_ANCHOR
+        kind[self.anchor_index < 0] = RangeKind.TAG_TAG
+        return kind
+
+    def anchor_anchor_ranges(self) -> PeerRanges:
+        """The ranges between two anchors: distances that do not depend on the camera."""
+        return self._peer_ranges(RangeKind.ANCHOR_ANCHOR, first_node=0)
+
+    def tag_tag_ranges(self) -> PeerRanges:
+        """The ranges between two tags."""
+        return self._peer_ranges(RangeKind.TAG_TAG, first_node=len(self.anchor_ids))
+
+    def _peer_ranges(self, kind: RangeKind, first_node: int) -> PeerRanges:
+        rows = np.flatnonzero(self.kind == kind)
+        ids, first, second = self._ends()
+        ends = np.column_stack([first[rows], second[rows]])
+        end_ids = tuple((ids[one], ids[other]) for one, other in ends.tolist())
+        return PeerRanges(rows, ends - first_node, end_ids, self.range_m[rows], self.range_stddev_m[rows])
+
+    def end_ids(self) -> tuple[list[str], list[str]]:
+        """The ids of each range's two ends: n tags (or peers, where there is none) and n anchors (or peers)."""
+        ids, first, second = self._ends()
+        texts = np.array(ids, dtype=object)
+        return texts[first].tolist(), texts[second].tolist()
+
+    def _ends(self) -> tuple[list[str], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Ids of all anchors and then all tags, and (n,) and (n,) into them: both ends of each range."""
+        num_anchors = len(self.anchor_ids)
+        first = np.where(self.tag_index < 0, self.peer_index, num_anchors + self.tag_index)
+        second = np.where(self.anchor_index < 0, num_anchors + self.peer_index, self.anchor_index)
+        return [*self.anchor_ids, *self.tag_ids], first, second
+
+    def with_anchors(self, anchor_ids: Collection[str]) -> RangeLog:
+        """The same ranges if nodes of these ids are anchors and all others tags; an id stands for one node."""
+        ids, first, second = self._ends()
+        node_of = {node_id: node for node, node_id in enumerate(dict.fromkeys(ids))}
+        node = np.array([node_of[node_id] for node_id in ids], dtype=np.int64)
+        is_anchor = np.array([node_id in anchor_ids for node_id in node_of], dtype=bool)
+        return self._between(list(node_of), is_anchor, node[first], node[second])
+
+    def _between(
+        self,
+        ids: list[str],
+        is_anchor: npt.NDArray[np.bool_],
+        first: npt.NDArray[np.int64],
+        second: npt.NDArray[np.int64],
+    ) -> RangeLog:
+        """The same ranges between other nodes; those without ranges are forgotten."""
+        swapped = is_anchor[first] & ~is_anchor[second]
+        first, second = np.where(swapped, second, first), np.where(swapped, first, second)
+        peer = np.where(is_anchor[first], first, np.where(is_anchor[second], -1, second))
+        # Of several rows the last one to be written counts, so that this is the first in which a node appears.
+        row, first_row = np.arange(len(self))[::-1], np.full(len(ids), len(self))
+        first_row[second[::-1]] = row
+        first_row[first[::-1]] = np.minimum(first_row[first[::-1]], row)
+        in_order = [node for node in np.argsort(first_row, kind="stable").tolist() if first_row[node] < len(self)]
+        anchors = [node for node in in_order if is_anchor[node]]
+        tags = [node for node in in_order if not is_anchor[node]]
+        # The last entry stands for no node.
+        index = np.full(len(ids) + 1, -1)
+        index[anchors], index[tags] = np.arange(len(anchors)), np.arange(len(tags))
+        return replace(
+            self,
+            anchor_ids=tuple(ids[node] for node in anchors),
+            anchor_index=index[np.where(is_anchor[second], second, -1)],
+            tag_ids=tuple(ids[node] for node in tags),
+            tag_index=index[np.where(is_anchor[first], -1, first)],
+            peer_index=index[peer],
+        )
+
     def subset(self, rows: npt.NDArray[np.int64] | npt.NDArray[np.bool_]) -> RangeLog:
         """The same log with some of its ranges; anchors and tags that are left without any are forgotten."""
         rows = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
-        return RangeLog.from_arrays(
-            [self.anchor_ids[k] for k in self.anchor_index[rows]],
-            self.range_m[rows],
+        chosen = replace(
+            self,
+            anchor_index=self.anchor_index[rows],
+            range_m=self.range_m[rows],
             timestamp_s=None if self.timestamp_s is None else self.timestamp_s[rows],
-            image_name=None if self.image_name is None else [self.image_name[i] for i in rows],
+            image_name=None if self.image_name is None else tuple(self.image_name[i] for i in rows),
             range_stddev_m=self.range_stddev_m[rows],
-            tag_id=[self.tag_ids[k] for k in self.tag_index[rows]],
+            tag_index=self.tag_index[rows],
+            peer_index=self.peer_index[rows],
             los=self.los[rows],
             line=self.line[rows],
-            source=self.source,
-            format=self.format,
-            num_no_measurement=self.num_no_measurement,
             shared_stddev_m=None if self.shared_stddev_m is None else self.shared_stddev_m[rows],
         )
+        ids, first, second = chosen._ends()
+        return chosen._between(ids, np.arange(len(ids)) < len(self.anchor_ids), first, second)
 
     @classmethod
     def from_arrays(
@@ -100,7 +210,10 @@ class RangeLog:
         num_no_measurement: int = 0,
         shared_stddev_m: npt.ArrayLike | None = None,
     ) -> RangeLog:
-        """Build a log from one value (or one string) per range; optional columns may be left out."""
+        """Build a log from one value (or one string) per range; optional columns may be left out.
+
+        Each range is between the tag and the anchor of its row; ``with_anchors`` tells those between two of a kind.
+        """
         ranges = np.asarray(range_m, dtype=np.float64)
         n = len(ranges)
         anchor_ids, anchor_index = _in_order_of_appearance(anchor_id)
@@ -116,6 +229,7 @@ class RangeLog:
             else np.asarray(range_stddev_m, dtype=np.float64),
             tag_ids=tag_ids,
             tag_index=tag_index,
+            peer_index=np.full(n, -1),
             los=np.full(n, -1, dtype=np.int8) if los is None else np.asarray(los, dtype=np.int8),
             line=np.arange(1, n + 1) if line is None else np.asarray(line, dtype=np.int64),
             source=source,

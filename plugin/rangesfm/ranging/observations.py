@@ -24,6 +24,8 @@ class RangeStatus(IntEnum):
     UNKNOWN_IMAGE = 5
     UNKNOWN_ANCHOR = 6
     CHECK = 7
+    ANCHOR_ANCHOR = 8
+    TAG_TAG = 9
 
     @property
     def label(self) -> str:

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.log import PeerRanges, RangeKind, RangeLog
 from rangesfm.ranging.noise_of_log import estimate_noise_m
 from rangesfm.ranging.quantization import find_quantization_m, quantization_stddev_m
 
 
 @dataclass(frozen=True)
 class AnchorSummary:
-    """The ranges to one anchor; without times, or with too few ranges, the last two are None.
+    """The ranges of tags to one anchor; without times, or with too few ranges, the last two are None.
 
     Attributes:
         num: ranges.
@@ -33,6 +34,25 @@ class AnchorSummary:
 
 
 @dataclass(frozen=True)
+class PairSummary:
+    """The ranges between two anchors, or between two tags.
+
+    Attributes:
+        kind: "anchor-anchor" or "tag-tag".
+        ids: both ends.
+        num: ranges.
+        min_m, median_m, max_m: of them.
+    """
+
+    kind: str
+    ids: tuple[str, str]
+    num: int
+    min_m: float
+    median_m: float
+    max_m: float
+
+
+@dataclass(frozen=True)
 class RangeSummary:
     """A log as a whole; times are None where it has image names instead.
 
@@ -41,12 +61,13 @@ class RangeSummary:
         num_no_measurement: records that said that there was none.
         num_duplicates: ranges that stand in the log already: same time, tag, anchor and range.
         num_out_of_order: ranges that are earlier than the one before them.
-        num_between_anchors: ranges whose tag is an anchor of others.
+        num_between_anchors, num_between_tags: ranges between two of a kind.
         quantization_m: suspected step of all ranges; None if there is none.
         start_s, end_s: first and last time on the radio's clock.
         rate_hz: ranges a second over the whole span.
         largest_gap_s: longest time without a range to any anchor.
-        anchors: in the order of their first appearance.
+        anchors: those that tags range with, in the order of their first appearance.
+        pairs: of anchors and of tags.
     """
 
     format: str
@@ -55,6 +76,7 @@ class RangeSummary:
     num_duplicates: int
     num_out_of_order: int
     num_between_anchors: int
+    num_between_tags: int
     quantization_m: float | None
     tag_ids: tuple[str, ...]
     start_s: float | None
@@ -62,6 +84,7 @@ class RangeSummary:
     rate_hz: float | None
     largest_gap_s: float | None
     anchors: tuple[AnchorSummary, ...]
+    pairs: tuple[PairSummary, ...]
 
 
 def summarize_ranges(log: RangeLog) -> RangeSummary:
@@ -77,19 +100,40 @@ def summarize_ranges(log: RangeLog) -> RangeSummary:
         num_no_measurement=log.num_no_measurement,
         num_duplicates=_num_duplicates(log),
         num_out_of_order=0 if log.timestamp_s is None else int(np.count_nonzero(np.diff(log.timestamp_s) < 0)),
-        num_between_anchors=int(np.count_nonzero(np.isin(log.tag_ids, log.anchor_ids)[log.tag_index])),
+        num_between_anchors=int(np.count_nonzero(log.kind == RangeKind.ANCHOR_ANCHOR)),
+        num_between_tags=int(np.count_nonzero(log.kind == RangeKind.TAG_TAG)),
         quantization_m=quantization,
         tag_ids=log.tag_ids,
         start_s=start,
         end_s=end,
         rate_hz=rate,
         largest_gap_s=_largest_gap(log.timestamp_s),
-        anchors=tuple(_summarize_anchor(log, index, quantization) for index in range(len(log.anchor_ids))),
+        anchors=tuple(
+            _summarize_anchor(log, index, quantization)
+            for index in np.unique(log.anchor_index[log.kind == RangeKind.TAG_ANCHOR]).tolist()
+        ),
+        pairs=(
+            *_summarize_pairs("anchor-anchor", log.anchor_anchor_ranges()),
+            *_summarize_pairs("tag-tag", log.tag_tag_ranges()),
+        ),
     )
 
 
+def _summarize_pairs(kind: str, ranges: PeerRanges) -> Iterator[PairSummary]:
+    """Whichever of the two asked."""
+    rows: dict[frozenset[str], list[int]] = {}
+    for row, ids in enumerate(ranges.end_ids):
+        rows.setdefault(frozenset(ids), []).append(row)
+    for mine in rows.values():
+        range_m = ranges.range_m[mine]
+        first, second = ranges.end_ids[mine[0]]
+        yield PairSummary(
+            kind, (first, second), len(mine), float(range_m.min()), float(np.median(range_m)), float(range_m.max())
+        )
+
+
 def _summarize_anchor(log: RangeLog, index: int, quantization_m: float | None) -> AnchorSummary:
-    mine = log.anchor_index == index
+    mine = (log.anchor_index == index) & (log.kind == RangeKind.TAG_ANCHOR)
     ranges = log.range_m[mine]
     return AnchorSummary(
         anchor_id=log.anchor_ids[index],
@@ -116,7 +160,7 @@ def _noise(log: RangeLog, mine: npt.NDArray[np.bool_], quantization_m: float | N
 def _num_duplicates(log: RangeLog) -> int:
     if log.timestamp_s is None:
         return 0
-    columns = (log.timestamp_s, log.anchor_index, log.tag_index, log.range_m)
+    columns = (log.timestamp_s, log.anchor_index, log.tag_index, log.peer_index, log.range_m)
     order = np.lexsort(columns)
     same = np.logical_and.reduce([np.diff(column[order]) == 0 for column in columns])
     return int(np.count_nonzero(same))

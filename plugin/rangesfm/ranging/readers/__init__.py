@@ -17,6 +17,7 @@ from rangesfm.ranging.readers.canonical import write_ranges_csv
 from rangesfm.ranging.readers.not_ranges import reason_without_ranges
 from rangesfm.ranging.readers.reader import Reader, ReadOptions
 from rangesfm.ranging.readers.registry import READERS, find_reader, reader_names, recognize
+from rangesfm.ranging.readers.roles import tell_roles
 from rangesfm.ranging.twr import StampOptions
 from rangesfm.tables import printable, read_head
 
@@ -32,6 +33,7 @@ def read_ranges(
     range_unit: str | None = None,
     separator: str | None = None,
     anchor_ids: Collection[str] = (),
+    tag_ids: Collection[str] = (),
     ranging_interval_s: float | None = None,
     stamps: StampOptions | None = None,
 ) -> RangeLog:
@@ -45,7 +47,8 @@ def read_ranges(
         timestamp_unit: s, ms, us, ns or iso; None: what the format says or the number of digits, else s.
         range_unit: m, cm or mm; None: what the format says, else m.
         separator: between cells (a blank: any run of blanks); None: told from the header row.
-        anchor_ids: known anchors, which tell tags from anchors where the log does not.
+        anchor_ids, tag_ids: known anchors and tags, which tell them apart where the log does not, and ranges
+            between two of a kind from those between a tag and an anchor.
         ranging_interval_s: time between two rounds, for radios that count rounds where nobody wrote times.
         stamps: how those time stamps become ranges; None: nanoseconds of a 32-bit DW1000, through air.
 
@@ -65,13 +68,12 @@ def read_ranges(
         timestamp_unit=timestamp_unit,
         range_unit=range_unit,
         separator=separator,
-        anchor_ids=frozenset(anchor_ids),
         ranging_interval_s=ranging_interval_s,
         stamps=stamps or StampOptions(),
     )
-    return _not_better_than_rounding(
-        _choose_reader(path, format or ("mapped" if columns else None)).read(path, options)
-    )
+    reader = _choose_reader(path, format or ("mapped" if columns else None))
+    log = tell_roles(reader.read(path, options), reader.sides, known_anchor_ids=anchor_ids, known_tag_ids=tag_ids)
+    return _not_better_than_rounding(log)
 
 
 def read_anchors_in_log(path: str | Path, *, format: str | None = None) -> tuple[Anchor, ...]:

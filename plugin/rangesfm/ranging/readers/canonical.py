@@ -29,6 +29,8 @@ _BY_IMAGE = replace(_BY_TIME, required={"image_name": "image_name", "anchor_id":
 def write_ranges_csv(log: RangeLog, path: str | Path) -> None:
     """Write ``log`` as canonical CSV; optional columns only where the log says anything.
 
+    Of a range between two of a kind, the peer stands in the column of the tag (or of the anchor).
+
     Raises:
         InputError: the file cannot be written.
     """
@@ -37,10 +39,10 @@ def write_ranges_csv(log: RangeLog, path: str | Path) -> None:
         columns["timestamp_s"] = map(repr, log.timestamp_s.tolist())
     else:
         columns["image_name"] = log.image_name or ()
-    columns["anchor_id"] = (log.anchor_ids[index] for index in log.anchor_index)
+    tag_id, columns["anchor_id"] = log.end_ids()
     columns["range_m"] = map(repr, log.range_m.tolist())
-    if log.tag_ids != (DEFAULT_TAG_ID,):
-        columns["tag_id"] = (log.tag_ids[index] for index in log.tag_index)
+    if set(tag_id) != {DEFAULT_TAG_ID}:
+        columns["tag_id"] = tag_id
     if not np.all(np.isnan(log.range_stddev_m)):
         columns["range_stddev_m"] = ("" if np.isnan(stddev) else repr(stddev) for stddev in log.range_stddev_m.tolist())
     if np.any(log.los >= 0):
@@ -63,7 +65,7 @@ def _read(path: Path, options: ReadOptions) -> RangeLog:
         raise InputError("the canonical CSV has fixed columns in seconds and metres; use format 'mapped'", path)
     names = header_names(read_head(path), options.separator)
     columns = _BY_IMAGE if "image_name" in names and "timestamp_s" not in names else _BY_TIME
-    return read_columns(path, replace(columns, separator=options.separator), READER.name, options.anchor_ids)
+    return read_columns(path, replace(columns, separator=options.separator), READER.name)
 
 
 READER = Reader("canonical", "CSV with the columns timestamp_s (or image_name), anchor_id, range_m", _recognizes, _read)

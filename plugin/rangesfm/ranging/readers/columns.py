@@ -12,7 +12,6 @@ import numpy.typing as npt
 
 from rangesfm.errors import InputError
 from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
-from rangesfm.ranging.readers.roles import tag_and_anchor
 from rangesfm.ranging.readers.time_units import SECONDS_PER_UNIT, seconds_from_iso
 from rangesfm.ranging.twr import StampOptions, double_sided_range, single_sided_range
 from rangesfm.tables import Table, read_table
@@ -36,7 +35,6 @@ class Columns:
         range_unit: one of UNITS_PER_METRE, also of range_stddev.
         separator: between cells; None: told from the header row.
         negative_is_no_measurement: as 0 is, and as an empty cell is then; otherwise they are errors.
-        sides_may_be_swapped: the tag may stand in the anchor's column.
         stamps: how time stamps become ranges, where there is no range.
     """
 
@@ -46,16 +44,14 @@ class Columns:
     range_unit: str = "m"
     separator: str | None = None
     negative_is_no_measurement: bool = False
-    sides_may_be_swapped: bool = False
     stamps: StampOptions = field(default_factory=StampOptions)
 
 
-def read_columns(path: Path, columns: Columns, format: str, known_anchor_ids: frozenset[str] = frozenset()) -> RangeLog:
+def read_columns(path: Path, columns: Columns, format: str) -> RangeLog:
     """Read a log off the named columns.
 
     Args:
         format: name of the reader, for the record.
-        known_anchor_ids: tell tags from anchors where the columns do not.
 
     Raises:
         InputError: with the line, for whatever is not a time, an id or a range; also if no range is left.
@@ -67,8 +63,6 @@ def read_columns(path: Path, columns: Columns, format: str, known_anchor_ids: fr
     image_name = table.text(name["image_name"]) if timestamps is None else None
     anchor_id = table.text(name["anchor_id"])
     tag_id = table.text(name["tag_id"], empty=DEFAULT_TAG_ID) if "tag_id" in name else None
-    if tag_id is not None and columns.sides_may_be_swapped:
-        tag_id, anchor_id = tag_and_anchor(tag_id, anchor_id, known_anchor_ids)
     stddevs = _stddevs(table, name["range_stddev"], columns) if "range_stddev" in name else None
     los = _line_of_sight(table, name["los"]) if "los" in name else None
     measured = ranges > 0

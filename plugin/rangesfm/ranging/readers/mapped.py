@@ -16,6 +16,7 @@ from rangesfm.ranging.readers.columns import (
     read_columns,
 )
 from rangesfm.ranging.readers.reader import Reader, ReadOptions
+from rangesfm.ranging.readers.roles import Sides
 from rangesfm.ranging.readers.time_units import TIMESTAMP_UNITS
 from rangesfm.tables import header_names, printable, read_head
 
@@ -53,10 +54,9 @@ def _read(format: str, preset: Mapping[str, str], path: Path, options: ReadOptio
         range_unit=options.range_unit or "m",
         separator=options.separator,
         negative_is_no_measurement=True,
-        sides_may_be_swapped=True,
         stamps=options.stamps,
     )
-    return read_columns(path, described, format, options.anchor_ids)
+    return read_columns(path, described, format)
 
 
 def _check_choice(what: str, given: Iterable[str], choices: Collection[str], path: Path) -> None:
@@ -67,7 +67,13 @@ def _check_choice(what: str, given: Iterable[str], choices: Collection[str], pat
 
 READERS = (
     *(
-        Reader(name, description, partial(_recognizes, preset), partial(_read, name, preset))
+        Reader(
+            name,
+            description,
+            partial(_recognizes, preset),
+            partial(_read, name, preset),
+            sides=Sides.ASKED if "from_id" in preset.values() else Sides.TOLD,
+        )
         for name, (description, preset) in _PRESETS.items()
     ),
     Reader("mapped", "any CSV or TSV by a mapping of its columns", lambda head: False, partial(_read, "mapped", {})),

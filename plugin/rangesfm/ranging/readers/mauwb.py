@@ -10,6 +10,7 @@ from rangesfm.ranging.readers.host_time import HostClock
 from rangesfm.ranging.readers.printed import check_only_time_is_described, numbered_lines
 from rangesfm.ranging.readers.reader import Reader, ReadOptions
 from rangesfm.ranging.readers.records import Records
+from rangesfm.ranging.readers.roles import Sides
 
 _BEGIN = re.compile(r"AT\+RANGE=tid:")
 _RECORD = re.compile(
@@ -57,4 +58,5 @@ READER = Reader(
     "MaUWB: AT+RANGE=tid:0,mask:03,seq:182,range:(232,401,..)..",
     recognizes=lambda head: _BEGIN.search(head) is not None,
     read=_read,
+    sides=Sides.APART,
 )

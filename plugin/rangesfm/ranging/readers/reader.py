@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rangesfm.ranging.anchors import Anchor
 from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.readers.roles import Sides
 from rangesfm.ranging.twr import StampOptions
 
 
@@ -20,7 +21,6 @@ class ReadOptions:
         timestamp_unit: s, ms, us, ns or iso.
         range_unit: m, cm or mm.
         separator: between cells; a blank means any run of blanks.
-        anchor_ids: known anchors, which tell tags from anchors where the log does not.
         ranging_interval_s: time between two rounds, of radios that count them instead of telling times.
         stamps: how time stamps of two-way ranging become ranges.
     """
@@ -29,7 +29,6 @@ class ReadOptions:
     timestamp_unit: str | None = None
     range_unit: str | None = None
     separator: str | None = None
-    anchor_ids: frozenset[str] = frozenset()
     ranging_interval_s: float | None = None
     stamps: StampOptions = field(default_factory=StampOptions)
 
@@ -44,6 +43,7 @@ class Reader:
         recognizes: whether the beginning of a file looks like this format.
         read: the whole file.
         read_anchors: the anchors whose positions the log tells; None: this format tells none.
+        sides: what the log says of the two ends of a range.
     """
 
     name: str
@@ -51,3 +51,4 @@ class Reader:
     recognizes: Callable[[str], bool]
     read: Callable[[Path, ReadOptions], RangeLog]
     read_anchors: Callable[[Path], tuple[Anchor, ...]] | None = None
+    sides: Sides = Sides.TOLD

@@ -12,7 +12,7 @@ from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers.printed import check_only_time_is_described
 from rangesfm.ranging.readers.reader import Reader, ReadOptions
 from rangesfm.ranging.readers.records import Records
-from rangesfm.ranging.readers.roles import tag_and_anchor
+from rangesfm.ranging.readers.roles import Sides
 from rangesfm.ranging.readers.ros_messages import RANGES_IN, MessageRange
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def _read(path: Path, options: ReadOptions) -> RangeLog:
     except Exception as error:  # whatever a broken bag makes its parsers do
         text = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"cannot be read as a ROS bag ({text})", path) from error
-    return _to_log(path, number, ranges, options.anchor_ids)
+    return _to_log(path, number, ranges)
 
 
 def _ranges(bag: AnyReader, path: Path) -> Iterator[tuple[int, MessageRange]]:
@@ -71,18 +71,15 @@ def _ranges(bag: AnyReader, path: Path) -> Iterator[tuple[int, MessageRange]]:
             yield number, found_range._replace(time_s=found_range.time_s or received_ns * 1e-9)
 
 
-def _to_log(path: Path, number: list[int], ranges: list[MessageRange], known_anchor_ids: frozenset[str]) -> RangeLog:
-    tag_ids, anchor_ids = tag_and_anchor(
-        [found.tag_id for found in ranges], [found.anchor_id for found in ranges], known_anchor_ids
-    )
+def _to_log(path: Path, number: list[int], ranges: list[MessageRange]) -> RangeLog:
     records = Records()
-    for message_number, found, tag_id, anchor_id in zip(number, ranges, tag_ids, anchor_ids):
+    for message_number, found in zip(number, ranges):
         records.add(
             found.time_s or 0.0,
-            anchor_id,
+            found.anchor_id,
             float(found.range_m),
             message_number,
-            tag_id=tag_id,
+            tag_id=found.tag_id,
             range_stddev_m=float(found.range_stddev_m or math.nan),
             los=found.los,
         )
@@ -93,4 +90,4 @@ def _type_name(message_type: str) -> str:
     return message_type.rpartition("/")[2]
 
 
-READER = Reader("ros", f"ROS 1 or ROS 2 bag with {', '.join(RANGES_IN)}", _recognizes, _read)
+READER = Reader("ros", f"ROS 1 or ROS 2 bag with {', '.join(RANGES_IN)}", _recognizes, _read, sides=Sides.ASKED)

@@ -1,0 +1,137 @@
+"""A range log knows between which nodes each range was measured."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rangesfm.ranging.log import RangeKind, RangeLog
+from rangesfm.ranging.readers.roles import Sides, tell_roles
+
+
+def log_of(*pairs: tuple[str, str]) -> RangeLog:
+    """One range of 1, 2, .. m for each pair of tag and anchor, as a reader hands them over."""
+    tags, anchors = zip(*pairs)
+    n = len(pairs)
+    return RangeLog.from_arrays(
+        list(anchors),
+        np.arange(1.0, n + 1),
+        timestamp_s=np.arange(n),
+        tag_id=list(tags),
+        range_stddev_m=np.full(n, 0.1),
+    )
+
+
+def ends_of(log: RangeLog) -> list[tuple[str, str]]:
+    return list(zip(*log.end_ids()))
+
+
+class TestWithAnchors:
+    def test_kind_follows_from_who_is_an_anchor(self) -> None:
+        log = log_of(("t", "A"), ("A", "t"), ("A", "B"), ("t", "u")).with_anchors({"A", "B"})
+        assert log.kind.tolist() == [
+            RangeKind.TAG_ANCHOR,
+            RangeKind.TAG_ANCHOR,
+            RangeKind.ANCHOR_ANCHOR,
+            RangeKind.TAG_TAG,
+        ]
+        assert (log.anchor_ids, log.tag_ids) == (("A", "B"), ("t", "u"))
+        assert ends_of(log) == [("t", "A"), ("t", "A"), ("A", "B"), ("t", "u")]
+        assert log.anchor_index.tolist() == [0, 0, 1, -1]
+        assert log.tag_index.tolist() == [0, 0, -1, 0]
+        assert log.peer_index.tolist() == [-1, -1, 0, 1]
+
+    def test_roles_can_be_told_anew(self) -> None:
+        pairs = (("t", "A"), ("A", "B"), ("u", "t"), ("B", "u"))
+        once = log_of(*pairs).with_anchors({"B", "u"})
+        again = once.with_anchors({"t", "u"}).with_anchors({"A", "B"})
+        direct = log_of(*pairs).with_anchors({"A", "B"})
+        assert (again.anchor_ids, again.tag_ids) == (direct.anchor_ids, direct.tag_ids)
+        assert again.kind.tolist() == direct.kind.tolist()
+        assert [set(ends) for ends in ends_of(again)] == [set(pair) for pair in pairs]
+
+    def test_ids_are_in_the_order_of_their_first_range(self) -> None:
+        log = log_of(("B", "t"), ("t", "A"), ("C", "t")).with_anchors({"A", "B", "C"})
+        assert log.anchor_ids == ("B", "A", "C")
+
+
+class TestPeerRanges:
+    def test_ranges_between_anchors_are_had_with_both_ends(self) -> None:
+        log = log_of(("t", "A"), ("B", "A"), ("t", "B"), ("C", "B")).with_anchors({"A", "B", "C"})
+        ranges = log.anchor_anchor_ranges()
+        assert ranges.rows.tolist() == [1, 3]
+        assert [set(ids) for ids in ranges.end_ids] == [{"A", "B"}, {"B", "C"}]
+        assert [tuple(log.anchor_ids[k] for k in ends) for ends in ranges.ends] == list(ranges.end_ids)
+        assert ranges.range_m.tolist() == [2.0, 4.0]
+        assert ranges.range_stddev_m.tolist() == [0.1, 0.1]
+
+    def test_ranges_between_tags_are_had_with_both_ends(self) -> None:
+        log = log_of(("t", "A"), ("t", "u")).with_anchors({"A"})
+        assert log.tag_tag_ranges().end_ids == (("t", "u"),)
+        assert len(log.anchor_anchor_ranges().rows) == 0
+
+    def test_subset_forgets_nodes_without_ranges_and_keeps_kinds(self) -> None:
+        log = log_of(("t", "A"), ("B", "C"), ("t", "u"), ("v", "A")).with_anchors({"A", "B", "C"})
+        part = log.subset(np.array([1, 2]))
+        assert part.kind.tolist() == [RangeKind.ANCHOR_ANCHOR, RangeKind.TAG_TAG]
+        assert (set(part.anchor_ids), part.tag_ids) == ({"B", "C"}, ("t", "u"))
+        assert part.range_m.tolist() == [2.0, 3.0]
+
+    def test_range_with_one_end_is_refused(self) -> None:
+        log = log_of(("t", "A"))
+        with pytest.raises(ValueError, match="two ends"):
+            RangeLog(**{**vars(log), "tag_index": np.array([-1])})
+
+
+class TestRoles:
+    def test_sides_decide_where_nothing_else_is_known(self) -> None:
+        log = log_of(("t", "A"), ("u", "A"))
+        assert tell_roles(log, Sides.TOLD) is log
+
+    def test_known_anchors_tell_ranges_between_two_of_a_kind(self) -> None:
+        log = log_of(("t", "A"), ("u", "A"), ("A", "B"), ("t", "u"), ("B", "t"))
+        for sides in (Sides.TOLD, Sides.ASKED):
+            told = tell_roles(log, sides, known_anchor_ids={"A", "B"})
+            assert told.kind.tolist() == [0, 0, RangeKind.ANCHOR_ANCHOR, RangeKind.TAG_TAG, 0]
+            assert told.tag_ids == ("t", "u")
+
+    def test_known_tags_do_as_well_where_sides_mean_nothing(self) -> None:
+        log = log_of(("A", "t"), ("t", "B"), ("t", "u"), ("A", "B"))
+        log = tell_roles(log, Sides.ASKED, known_tag_ids={"t", "u"})
+        assert log.kind.tolist() == [0, 0, RangeKind.TAG_TAG, RangeKind.ANCHOR_ANCHOR]
+        assert (log.tag_ids, log.anchor_ids) == (("t", "u"), ("A", "B"))
+
+    def test_node_on_both_sides_is_what_it_is_mostly(self) -> None:
+        log = tell_roles(log_of(("t", "A"), ("t", "A"), ("t", "B"), ("A", "B")), Sides.TOLD)
+        assert log.kind.tolist() == [0, 0, 0, RangeKind.ANCHOR_ANCHOR]
+        log = tell_roles(log_of(("t", "A"), ("u", "A"), ("u", "B"), ("t", "u")), Sides.TOLD)
+        assert log.kind.tolist() == [0, 0, 0, RangeKind.TAG_TAG]
+
+    def test_node_that_only_known_anchors_range_with_is_a_tag(self) -> None:
+        log = tell_roles(log_of(("A", "t"), ("B", "t")), Sides.TOLD, known_anchor_ids={"A", "B"})
+        assert (log.tag_ids, log.anchor_ids) == (("t",), ("A", "B"))
+
+    def test_stranger_on_the_side_of_the_anchors_stays_one(self) -> None:
+        log = tell_roles(log_of(("t", "A"), ("t", "X"), ("A", "t")), Sides.TOLD, known_anchor_ids={"A"})
+        assert log.anchor_ids == ("A", "X")
+
+    def test_single_node_that_several_ask_is_the_tag_if_the_sides_say_nothing(self) -> None:
+        log = log_of(("A", "t"), ("B", "t"))
+        assert tell_roles(log, Sides.ASKED).tag_ids == ("t",)
+        assert tell_roles(log, Sides.TOLD).tag_ids == ("A", "B")
+
+    @pytest.mark.parametrize("sides", Sides)
+    def test_id_that_ranges_with_itself_shows_that_tags_are_numbered_by_themselves(self, sides: Sides) -> None:
+        log = log_of(("0", "0"), ("0", "1"), ("1", "0"))
+        assert tell_roles(log, sides, known_anchor_ids={"0", "1"}) is log
+        part = log.subset(np.array([1, 2]))
+        assert (part.tag_ids, part.anchor_ids) == (("0", "1"), ("1", "0"))
+        assert part.kind.tolist() == [0, 0]
+
+    def test_id_known_as_both_is_that_of_two_nodes(self) -> None:
+        log = log_of(("1", "2"), ("1", "3"))
+        assert tell_roles(log, Sides.TOLD, known_anchor_ids={"1", "2", "3"}, known_tag_ids={"1"}) is log
+
+    def test_nodes_that_are_numbered_by_side_are_never_confused(self) -> None:
+        log = log_of(("0", "1"), ("1", "2"))
+        assert tell_roles(log, Sides.APART, known_anchor_ids={"0", "1", "2"}) is log
