@@ -17,11 +17,14 @@ from rangesfm.ranging.anchors import Anchor
 from rangesfm.ranging.error_curve import correct_ranges, read_error_curve
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges
+from rangesfm.ranging.time_resolution import time_resolution_s
 from rangesfm.reference import Reference, read_reference
 
 # Beyond these a unit is wrong, or the file: no camera carries its tag so far away, and no such radio reaches so far.
 _MAX_LEVER_ARM_M = 20.0
 _MAX_RANGE_M = 1e6
+# Times in coarser steps than this are worth a word.
+_COARSE_STEP_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -250,4 +253,6 @@ def _notes(log: RangeLog, anchors: Sequence[Anchor], survey: Survey, *, anchors_
         notes.append("the anchor positions are those that the log gives")
     if log.num_no_measurement:
         notes.append(f"{log.num_no_measurement} records of the log say that there was no measurement")
+    if (step_s := time_resolution_s(log)) >= _COARSE_STEP_S:
+        notes.append(f"the log's times come in steps of {step_s:.2g} s: at walking pace that is as much in metres")
     return notes

@@ -79,7 +79,8 @@ class AssociationOptions:
 
     Attributes:
         max_interpolation_gap_s: between keyframes further apart than this no pose is interpolated.
-        max_time_difference_s: a range this close to a keyframe counts as taken there in any case.
+        max_time_difference_s: a range this close to a keyframe counts as taken there, where no pose
+            can be interpolated.
     """
 
     max_interpolation_gap_s: float = 2.0

@@ -6,7 +6,6 @@ Scale Estimation and Drift Mitigation", 2018, with other means where real radios
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -54,8 +53,6 @@ from rangesfm.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images, read_image_times_csv
 from rangesfm.vision.keyframes import select_keyframes
 from rangesfm.vision.reconstruct import reconstruct
-
-TimesByName = Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -115,7 +112,7 @@ def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResul
         raise InputError("the model has no 3-D points to refine: a trajectory can only be scaled", survey.model_path)
     times = None
     if inputs.log.image_name is None:
-        times = _by_name(_times_of_model(survey, sfm, survey.model_path), journal)
+        times = _noted(_times_of_model(survey, sfm, survey.model_path), journal)
     make_output_folder(survey.output_path)
     return _to_metric(survey, inputs, sfm, times, journal, refine=refine)
 
@@ -124,13 +121,16 @@ def _to_metric(
     survey: Survey,
     inputs: RangingInputs,
     sfm: pycolmap.Reconstruction,
-    times: TimesByName | None,
+    times: ImageTimes | None,
     journal: Journal,
     *,
     refine: bool,
 ) -> RunResult:
     """From the unscaled model on: the same for photos just mapped and for a model brought along."""
-    trajectory = trajectory_from_reconstruction(sfm, times)
+    if times is None:
+        trajectory = trajectory_from_reconstruction(sfm)
+    else:
+        trajectory = trajectory_from_reconstruction(sfm, times.by_name(), time_resolution_s=times.resolution_s)
     if not len(trajectory):
         first = min(image.name for image in sfm.images.values())
         raise InputError(f"none of the model's photos has a time, the first is {first}", survey.image_times_path)
@@ -195,13 +195,12 @@ def _read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
     return inputs
 
 
-def _keyframes(survey: Survey, journal: Journal) -> TimesByName:
+def _keyframes(survey: Survey, journal: Journal) -> ImageTimes:
     """The photos to reconstruct, in time order."""
     folder = _images_path(survey)
     with journal.timed("keyframes"):
-        image_times = find_image_times(folder, list_images(folder), survey.image_times_path)
-        times = _by_name(image_times, journal)
-        return {name: times[name] for name in select_keyframes(image_times, survey.keyframes)}
+        image_times = _noted(find_image_times(folder, list_images(folder), survey.image_times_path), journal)
+        return image_times.of(select_keyframes(image_times, survey.keyframes))
 
 
 def _check_times(survey: Survey, inputs: RangingInputs, path: Trajectory) -> None:
@@ -213,18 +212,18 @@ def _check_times(survey: Survey, inputs: RangingInputs, path: Trajectory) -> Non
         _observations(survey, inputs, path, offset_s or 0.0)
 
 
-def _path_without_places(times: TimesByName) -> Trajectory:
+def _path_without_places(times: ImageTimes) -> Trajectory:
     n = len(times)
-    timestamps_s = np.array(list(times.values()), dtype=np.float64)
-    return Trajectory(np.arange(n), tuple(times), timestamps_s, np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))
+    rotations = np.tile(np.eye(3), (n, 1, 1))
+    return Trajectory(np.arange(n), times.image_names, times.timestamps_s, np.zeros((n, 3)), rotations)
 
 
-def _reconstruct(survey: Survey, keyframes: TimesByName, journal: Journal, restart: bool) -> pycolmap.Reconstruction:
+def _reconstruct(survey: Survey, keyframes: ImageTimes, journal: Journal, restart: bool) -> pycolmap.Reconstruction:
     """Map the keyframes into ``sparse``; returns ``sparse/0``."""
     with forgetting_result_if_changed(survey.output_path / "sparse" / "0", survey.output_path):
         summary = reconstruct(
             _images_path(survey),
-            tuple(keyframes),
+            keyframes.image_names,
             survey.output_path,
             camera=survey.camera,
             mapper=survey.mapper,
@@ -252,10 +251,10 @@ def _times_of_model(survey: Survey, sfm: pycolmap.Reconstruction, model_path: Pa
     return find_image_times(survey.images_path or model_path, names)
 
 
-def _by_name(image_times: ImageTimes, journal: Journal) -> TimesByName:
+def _noted(image_times: ImageTimes, journal: Journal) -> ImageTimes:
     for note in image_times.notes:
         journal.warn(note)
-    return image_times.by_name()
+    return image_times
 
 
 def _read_registered(path: Path) -> pycolmap.Reconstruction:

@@ -25,6 +25,7 @@ class Trajectory:
         timestamps_s: (n,) seconds on the camera's clock, strictly increasing; None if unknown.
         centers: (n, 3) projection centres in the world, in the world's unit.
         world_from_cam: (n, 3, 3) rotations.
+        time_resolution_s: step to which each of the times was rounded or cut; 0: they are exact.
     """
 
     frame_ids: npt.NDArray[np.int64]
@@ -32,6 +33,7 @@ class Trajectory:
     timestamps_s: npt.NDArray[np.float64] | None
     centers: npt.NDArray[np.float64]
     world_from_cam: npt.NDArray[np.float64]
+    time_resolution_s: float = 0.0
 
     def __len__(self) -> int:
         return len(self.image_names)
@@ -46,6 +48,7 @@ class Trajectory:
             self.timestamps_s,
             scale * self.centers @ rotation.T + translation,
             rotation @ self.world_from_cam,
+            self.time_resolution_s,
         )
 
     def resized(self, factor: float, frame: str) -> Trajectory:
@@ -60,7 +63,10 @@ class Trajectory:
 
 
 def trajectory_from_reconstruction(
-    reconstruction: pycolmap.Reconstruction, timestamps_s: Mapping[str, float] | None = None
+    reconstruction: pycolmap.Reconstruction,
+    timestamps_s: Mapping[str, float] | None = None,
+    *,
+    time_resolution_s: float = 0.0,
 ) -> Trajectory:
     """Read the path off a model.
 
@@ -68,6 +74,7 @@ def trajectory_from_reconstruction(
         reconstruction: a COLMAP model with registered frames.
         timestamps_s: camera-clock time of each photo by name; frames whose photo has
             no time are left out. None: the path has no times and is ordered by name.
+        time_resolution_s: step to which each of the times was rounded or cut.
     """
     rows = []
     for frame_id in reconstruction.reg_frame_ids():
@@ -86,6 +93,7 @@ def trajectory_from_reconstruction(
         timestamps_s=None if timestamps_s is None else np.array([row[0] for row in rows], dtype=np.float64),
         centers=np.array([row[3] for row in rows], dtype=np.float64).reshape(-1, 3),
         world_from_cam=np.array([row[4] for row in rows], dtype=np.float64).reshape(-1, 3, 3),
+        time_resolution_s=time_resolution_s,
     )
 
 

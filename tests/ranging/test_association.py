@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
@@ -87,6 +89,22 @@ class TestBetweenKeyframes:
         assert 0.5 < np.sqrt(np.mean(normalized**2)) < 2.0
         assert np.all(found.center_stddev[~between] == 0)
 
+    def test_stated_stddev_is_about_the_error_where_photos_are_too_rare_for_the_motion(self) -> None:
+        """A new direction about every second, and a photo in as much time or more: a spline says little."""
+        rng = np.random.default_rng(1)
+        knots = np.arange(0.0, 602.0, 1.0)
+        walk = CubicSpline(knots, rng.normal(0, 1, (len(knots), 3)))
+        for gap_s in (1.01, 1.5, 2.0):
+            keyframe_times = np.arange(0.5, 600.0, gap_s)
+            range_times = np.arange(10.0, 590.0, 0.13)
+            path = trajectory_of(keyframe_times, walk(keyframe_times))
+            options = AssociationOptions(max_interpolation_gap_s=5.0)
+            found = associate(log_at(range_times), path, np.zeros(3), options=options)
+            middle = np.abs(found.weight - 0.5) < 0.2
+            error = np.sqrt(np.mean((found.centers - walk(range_times))[middle] ** 2))
+            # With a gain taken for granted (that of a smooth path) 2.7 to 6.
+            assert 0.4 < error / np.mean(found.center_stddev[middle]) < 2.5
+
     def test_the_lever_arm_turns_with_the_camera(self) -> None:
         keyframe_times = np.arange(0.0, 5.0)
         turned = Rotation.from_rotvec(np.outer(keyframe_times, [0.0, 0.0, 0.3]))
@@ -124,13 +142,28 @@ class TestBetweenKeyframes:
 
 
 class TestNextToAKeyframe:
-    def test_a_range_counts_as_taken_there(self) -> None:
+    def test_a_range_is_interpolated_all_the_same(self) -> None:
         keyframe_times = np.array([0.0, 1.0, 2.0])
         path = trajectory_of(keyframe_times, straight(keyframe_times))
-        found = associate(log_at([0.995, 1.0, 1.015]), path, TAG_IN_CAM_M)
-        assert found.before.tolist() == found.after.tolist() == [1, 1, 1]
-        assert found.weight.tolist() == [0.0, 0.0, 0.0]
-        np.testing.assert_array_equal(found.centers, np.tile(path.centers[1], (3, 1)))
+        range_times = np.array([0.985, 0.995, 1.015])
+        found = associate(log_at(range_times), path, TAG_IN_CAM_M)
+        np.testing.assert_allclose(found.centers, straight(range_times), atol=1e-12)
+
+    def test_a_range_at_the_time_of_a_keyframe_was_taken_there(self) -> None:
+        keyframe_times = np.array([0.0, 1.0, 2.0])
+        path = trajectory_of(keyframe_times, straight(keyframe_times))
+        found = associate(log_at([0.0, 1.0, 1.00005, 2.0]), path, TAG_IN_CAM_M)
+        assert found.before.tolist() == found.after.tolist() == [0, 1, 1, 2]
+        assert found.weight.tolist() == [0.0] * 4
+        np.testing.assert_array_equal(found.centers, path.centers[[0, 1, 1, 2]])
+
+    def test_a_range_counts_as_taken_there_where_nothing_can_be_interpolated(self) -> None:
+        keyframe_times = np.array([0.0, 10.0, 20.0])
+        path = trajectory_of(keyframe_times, straight(keyframe_times))
+        found = associate(log_at([9.985, 10.0, 10.015, 10.03]), path, TAG_IN_CAM_M)
+        assert statuses(found) == ["used", "used", "used", "no-keyframe-near"]
+        assert found.before.tolist() == found.after.tolist() == [1, 1, 1, -1]
+        np.testing.assert_array_equal(found.centers[:3], path.centers[[1, 1, 1]])
 
     def test_a_range_just_outside_the_path_has_its_place(self) -> None:
         keyframe_times = np.array([0.0, 1.0, 2.0])
@@ -143,6 +176,44 @@ class TestNextToAKeyframe:
         path = trajectory_of(np.array([3.0]), np.array([[1.0, 2.0, 3.0]]))
         found = associate(log_at([2.99, 3.5]), path, TAG_IN_CAM_M)
         assert statuses(found) == ["used", "outside-path"]
+
+
+class TestCoarseTimes:
+    """A walk at 1.2 m/s; times of photos or ranges are written in steps, and say so by their stddev."""
+
+    def error_in_stddevs(self, photo_step_s: float, range_step_s: float, seed: int) -> tuple[float, float]:
+        """Root mean square of each coordinate's error in stated stddevs; median stddev."""
+        rng = np.random.default_rng(seed)
+        photo_times = np.cumsum(rng.uniform(1.2, 1.9, 80))
+        range_times = np.sort(rng.uniform(photo_times[2], photo_times[-3], 2000))
+
+        def walk(times: Array) -> Array:
+            turn = 0.04 * times
+            return np.stack([30 * np.cos(turn), 30 * np.sin(turn), 0 * times], axis=1)
+
+        written = np.rint(photo_times / photo_step_s) * photo_step_s if photo_step_s else photo_times
+        path = replace(trajectory_of(written, walk(photo_times)), time_resolution_s=photo_step_s)
+        log = log_at(np.rint(range_times / range_step_s) * range_step_s if range_step_s else range_times)
+        found = associate(log, path, np.zeros(3), options=AssociationOptions(max_interpolation_gap_s=5.0))
+        error = np.sqrt(np.sum((found.centers - walk(range_times)) ** 2, axis=1) / 3)
+        return float(np.sqrt(np.mean((error / found.center_stddev) ** 2))), float(np.median(found.center_stddev))
+
+    @pytest.mark.parametrize(("photo_step_s", "range_step_s"), [(1.0, 0.0), (0.0, 1.0), (1.0, 1.0)])
+    def test_stddev_of_a_place_includes_the_rounding(self, photo_step_s: float, range_step_s: float) -> None:
+        found = [self.error_in_stddevs(photo_step_s, range_step_s, seed) for seed in range(5)]
+        assert 0.6 < np.mean([error for error, _ in found]) < 1.5
+        # 1.2 m/s for 0.29 s, in each of three coordinates, as a photo's or a range's time is rounded or both are.
+        assert 0.1 < np.mean([stddev for _, stddev in found]) < 0.4
+
+    def test_exact_times_add_nothing(self) -> None:
+        assert self.error_in_stddevs(0.0, 0.0, 0)[1] < 0.01
+
+    def test_a_range_at_a_whole_second_photo_is_as_uncertain_as_the_photo(self) -> None:
+        keyframe_times = np.arange(0.0, 5.0)
+        path = replace(trajectory_of(keyframe_times, straight(keyframe_times)), time_resolution_s=1.0)
+        found = associate(log_at([2.0]), path, np.zeros(3))
+        speed = np.linalg.norm([0.5, -1.0, 0.25])
+        np.testing.assert_allclose(found.center_stddev, speed / np.sqrt(3) / np.sqrt(12), rtol=1e-9)
 
 
 class TestLongGaps:

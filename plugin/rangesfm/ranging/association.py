@@ -13,19 +13,23 @@ from rangesfm.errors import InputError
 from rangesfm.options import AssociationOptions
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
+from rangesfm.ranging.time_resolution import time_resolution_s
 from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
-# A spline through every second keyframe misses the others by this many times what one
+# A spline through every second keyframe misses the others by up to this many times what one
 # through all keyframes misses in between: 16 for a smooth path (the error grows with the
 # fourth power of the gap), 4 for a jerky one (second power).
-_HALVING_GAIN = 6.0
+_MAX_HALVING_GAIN = 6.0
+_MIN_TELLING_GAIN = 2.0
 # Median length of a Gaussian vector in space, in stddevs of its coordinates.
 _MEDIAN_LENGTH = 1.538
 # Early and late halves of a burst must agree to this many stddevs before the camera counts as still.
 _MAX_STILL_DRIFT_STDDEVS = 2.0
+# A range this close in time to a keyframe was taken there: at walking pace it is a tenth of a millimetre off.
+_SAME_TIME_S = 1e-4
 
 
 def associate(
@@ -40,7 +44,8 @@ def associate(
     """Find the camera pose at which each range was taken.
 
     Between keyframes that are close in time the centre follows a cubic spline and the
-    rotation the shortest turn. Between keyframes further apart than
+    rotation the shortest turn; the stddev of the centre says how far that, and times that
+    are written in coarse steps, can be trusted. Between keyframes further apart than
     ``options.max_interpolation_gap_s`` a range belongs to the nearest keyframe, and only
     if it is within ``max_time_difference_s`` or the ranges themselves show that the camera
     stood still around its photos.
@@ -122,7 +127,8 @@ def _places_by_time(
     of_camera = log.kind == RangeKind.TAG_ANCHOR
     lonely = of_camera & ~interpolated & _keyframe_is_isolated(keyframe_times, options)[nearest]
     still = lonely & _camera_is_still(log, nearest, distance, times, lonely, keyframe_times)
-    snapped = at_keyframe | (still & ~interpolated)
+    same_time = distance <= min(_SAME_TIME_S, options.max_time_difference_s)
+    snapped = same_time | ((at_keyframe | still) & ~interpolated)
 
     before, after = np.where(snapped, nearest, before), np.where(snapped, nearest, after)
     weight = np.where(snapped, 0.0, weight)
@@ -198,18 +204,58 @@ def _observe(
 
     b, a, w = before[placed], after[placed], weight[placed]
     linear = (1 - w)[:, None] * trajectory.centers[b] + w[:, None] * trajectory.centers[a]
-    turn = Rotation.from_matrix(np.swapaxes(trajectory.world_from_cam[b], 1, 2) @ trajectory.world_from_cam[a])
-    tag_in_before = (
-        Rotation.from_rotvec(w[:, None] * turn.as_rotvec()).apply(tags_in_cam_m[placed]) if len(w) else linear
-    )
-    lever[placed] = np.einsum("nij,nj->ni", trajectory.world_from_cam[b], tag_in_before)
+    lever[placed] = _turned_lever_arms(trajectory, tags_in_cam_m[placed], b, w)
     curved = np.flatnonzero(placed)[(w > 0) & (a != b)]
     if len(curved) and trajectory.timestamps_s is not None:
         offsets[curved], stddev[curved] = _curve_beyond_line(
             trajectory.timestamps_s, trajectory.centers, before[curved], weight[curved], options
         )
+    if trajectory.timestamps_s is not None:
+        stddev[placed] = np.hypot(stddev[placed], _timing_stddev(log, trajectory, b, a, w, options))
     centers[placed] = linear + offsets[placed]
     return RangeObservations(log, status, before, after, weight, centers, offsets, lever, stddev)
+
+
+def _turned_lever_arms(
+    trajectory: Trajectory, tags_in_cam_m: Array, before: npt.NDArray[np.int64], weight: Array
+) -> Array:
+    """(n, 3) lever arms in the world, part of the shortest turn from one keyframe to the next."""
+    rotations = trajectory.world_from_cam
+    if np.any(weight > 0):
+        to_next = Rotation.from_matrix(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:]).as_rotvec()
+        # The last keyframe has none, and every range there has weight 0.
+        turns = weight[:, None] * np.append(to_next, np.zeros((1, 3)), axis=0)[before]
+        tags_in_cam_m = Rotation.from_rotvec(turns).apply(tags_in_cam_m)
+    return np.einsum("nij,nj->ni", rotations[before], tags_in_cam_m)
+
+
+def _timing_stddev(
+    log: RangeLog,
+    trajectory: Trajectory,
+    before: npt.NDArray[np.int64],
+    after: npt.NDArray[np.int64],
+    weight: Array,
+    options: AssociationOptions,
+) -> Array:
+    """(n,) how far the camera moves, each coordinate, within the rounding of photo and range times.
+
+    Uniform rounding to a step has the stddev step / sqrt(12), each time its own.
+    """
+    times, centers = trajectory.timestamps_s, trajectory.centers
+    log_stddev_s, photo_stddev_s = (
+        step / np.sqrt(12) for step in (time_resolution_s(log), trajectory.time_resolution_s)
+    )
+    if times is None or len(times) < 2 or not log_stddev_s + photo_stddev_s > 0:
+        return np.zeros(len(before))
+    gaps = np.diff(times)
+    # Where photos are far apart, ranges have a place only if the camera stood still.
+    speeds = np.where(
+        gaps <= options.max_interpolation_gap_s, np.linalg.norm(np.diff(centers, axis=0), axis=1) / gaps, 0
+    )
+    around = np.concatenate([[0.0], speeds, [0.0]])
+    speed = np.where(before == after, np.maximum(around[before], around[before + 1]), around[before + 1])
+    photo_share = np.where(before == after, 1.0, np.hypot(1 - weight, weight))
+    return np.asarray(speed / np.sqrt(3) * np.hypot(log_stddev_s, photo_share * photo_stddev_s))
 
 
 def _curve_beyond_line(
@@ -234,6 +280,28 @@ def _spline_error(times: Array, centers: Array) -> float:
     """Stddev (each coordinate) half-way between keyframes, from how well every second one predicts the others."""
     if len(times) < 8:
         return 0.0
+    missed = _median_miss(times, centers)
+    gain = _MAX_HALVING_GAIN
+    if len(times) >= 16:
+        gain = _halving_gain(_median_miss(times[::2], centers[::2]), missed)
+    return missed / (_MEDIAN_LENGTH * gain)
+
+
+def _median_miss(times: Array, centers: Array) -> float:
+    """How far a spline through every second place passes by the others."""
     missed = CubicSpline(times[::2], centers[::2])(times[1:-1:2]) - centers[1:-1:2]
     # Of lengths, so that it does not depend on how the world's axes lie.
-    return float(np.median(np.linalg.norm(missed, axis=1))) / (_MEDIAN_LENGTH * _HALVING_GAIN)
+    return float(np.median(np.linalg.norm(missed, axis=1)))
+
+
+def _halving_gain(missed_by_fourth: float, missed_by_second: float) -> float:
+    """What all keyframes gain over every second one, from what these gain over every fourth.
+
+    Both gain the same as long as the motion lasts longer than the gaps. Where already every second
+    keyframe says little of the others, these tell no more than that it is between nothing and the
+    most: the mean of the two (of logarithms) is within a factor of about two.
+    """
+    ratio = missed_by_fourth / max(missed_by_second, 1e-300)
+    if ratio >= _MIN_TELLING_GAIN:
+        return min(ratio, _MAX_HALVING_GAIN)
+    return float(np.sqrt(_MAX_HALVING_GAIN * max(ratio, 1.0)))

@@ -51,7 +51,8 @@ class RangeObservations:
         centers: (n, 3) camera centres, model units; NaN without a place.
         center_offsets: (n, 3) model units.
         tag_from_center: (n, 3) lever arm turned into the world, metres.
-        center_stddev: (n,) of the interpolated centre, each coordinate, model units; 0 at a keyframe.
+        center_stddev: (n,) of the interpolated centre, each coordinate, model units; 0 at a keyframe
+            if the times are exact.
     """
 
     log: RangeLog

@@ -6,7 +6,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import NamedTuple
@@ -58,6 +58,12 @@ class ImageTimes:
 
     def __len__(self) -> int:
         return len(self.image_names)
+
+    def of(self, names: Sequence[str]) -> ImageTimes:
+        """The same of some of the photos."""
+        rows = np.flatnonzero(np.isin(self.image_names, names))
+        kept = tuple(self.image_names[row] for row in rows)
+        return replace(self, image_names=kept, timestamps_s=self.timestamps_s[rows])
 
     def by_name(self) -> dict[str, float]:
         """The time of each photo, seconds."""
