@@ -248,6 +248,25 @@ def test_photos_with_whole_seconds_only_make_the_offset_less_certain() -> None:
     assert abs(rounded.value_s - 3.0) < 3 * rounded.stddev_s
 
 
+@pytest.mark.parametrize(("photos_are_rounded", "log_is_rounded"), [(True, False), (False, True)])
+def test_stddev_covers_what_whole_seconds_do_to_the_offset(photos_are_rounded: bool, log_is_rounded: bool) -> None:
+    errors_in_stddevs, stddevs = [], []
+    for seed in range(8):
+        walk, times = handheld(80, seed), np.cumsum(np.random.default_rng(seed).uniform(1.05, 1.3, 66))
+        log, photos = walk.log(range_times(0, 80, seed=seed), 3.0, seed=seed), walk.photos(times)
+        if photos_are_rounded:
+            photos = replace(photos, timestamps_s=np.rint(times), time_resolution_s=1.0)
+        if log_is_rounded:
+            log = replace(log, timestamp_s=np.rint(times_of(log)))
+        found = estimate(log, photos)
+        errors_in_stddevs.append((found.value_s - 3.0) / found.stddev_s)
+        stddevs.append(found.stddev_s)
+    assert 0.3 < np.sqrt(np.mean(np.square(errors_in_stddevs))) < 1.5
+    assert np.mean(np.abs(errors_in_stddevs) < 1.96) >= 7 / 8
+    # 0.29 s a photo, 65 photos: 0.036 s at the least; ranges share a second, so that theirs averages out better.
+    assert np.median(stddevs) > (0.02 if photos_are_rounded else 0.003)
+
+
 def test_photos_three_seconds_apart_along_a_smooth_way_are_enough() -> None:
     way = Walk(
         lambda t: np.stack([8 * np.sin(t / 9), 6 * np.sin(t / 13 + 1), 1 + 0.5 * np.sin(t / 5)], axis=1), no_turn

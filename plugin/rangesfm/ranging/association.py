@@ -170,9 +170,7 @@ def _camera_is_still(
     for burst in np.split(log.range_m[order], starts[1:]):
         if len(burst) >= 6:
             early, late = np.array_split(burst, 2)
-            noise = 1.4826 * float(
-                np.median(np.abs(np.concatenate([early - np.median(early), late - np.median(late)])))
-            )
+            noise = 1.4826 * float(np.median(np.concatenate([_deviations(early), _deviations(late)])))
             drifts.append((np.median(late) - np.median(early)) * np.sqrt(len(burst) / 4))
             noises.append(noise)
     if not drifts:
@@ -182,6 +180,11 @@ def _camera_is_still(
     noise_stddev = 1.25 * max(float(np.median(noises)), 1e-3)
     still[near] = drift_stddev <= _MAX_STILL_DRIFT_STDDEVS * noise_stddev
     return still
+
+
+def _deviations(values: Array) -> Array:
+    """Absolute, from the median; the value that is the median says nothing of the noise, and of few that is much."""
+    return np.sort(np.abs(values - np.median(values)))[len(values) % 2 :]
 
 
 def _observe(
@@ -226,7 +229,7 @@ def _turned_lever_arms(
         # The last keyframe has none, and every range there has weight 0.
         turns = weight[:, None] * np.append(to_next, np.zeros((1, 3)), axis=0)[before]
         tags_in_cam_m = Rotation.from_rotvec(turns).apply(tags_in_cam_m)
-    return np.einsum("nij,nj->ni", rotations[before], tags_in_cam_m)
+    return np.asarray(np.einsum("nij,nj->ni", rotations[before], tags_in_cam_m))
 
 
 def _timing_stddev(
