@@ -18,7 +18,7 @@ _NUM_FINE = 81
 # Around the best offset: at least this far, and so many stddevs.
 _FINE_REACH_S = 1.0
 _FINE_REACH_STDDEVS = 6.0
-_NUM_RANGES = 1500
+_NUM_RANGES = 600
 
 
 @dataclass(frozen=True)
