@@ -438,6 +438,29 @@ class TestResultFolder:
         assert all(path.exists() for path in written)
         assert pycolmap.Reconstruction(out.parent / "more" / "colmap_text").num_reg_images() == 40
 
+    def test_is_exported_level_and_on_the_earth(self, out: Path, rangesfm_command: Command) -> None:
+        place = ("--origin_anchor", "A1", "--origin_lat_lon_height", "47.4,8.5,430", "--heading_deg", "90")
+        flags = ("--formats", "laz,geojson,nerfstudio", "--frame", "enu", *place, "--output_path", "exported")
+        done = rangesfm_command("export", out, *flags, cwd=out)
+        assert done.stdout.split() == [
+            f"exported/{name}" for name in ("points.laz", "survey.geojson", "transforms.json")
+        ]
+        features = json.loads((out / "exported" / "survey.geojson").read_text())["features"]
+        (anchor,) = (f for f in features if f["properties"]["name"] == "A1")
+        assert anchor["geometry"]["coordinates"] == pytest.approx([8.5, 47.4, 430.0], abs=1e-6)
+
+    def test_carries_over_what_was_made_from_the_unscaled_model(
+        self, out: Path, walked_survey: WalkedSurvey, rangesfm_command: Command
+    ) -> None:
+        shutil.copytree(walked_survey.folder / "sparse", out / "sparse")
+        rangesfm_command("export", out, "--apply_to", "sparse/0", "--output_path", "applied", cwd=out)
+        moved, refined = (pycolmap.Reconstruction(out / path) for path in ("applied/0", "sparse_metric/0"))
+        apart = [
+            np.linalg.norm(image.projection_center() - refined.image(image_id).projection_center())
+            for image_id, image in moved.images.items()
+        ]
+        assert max(apart) < 0.1
+
     def test_gets_its_report_anew(self, out: Path, rangesfm_command: Command) -> None:
         before = (out / "report.html").read_bytes()
         (out / "report.html").unlink()

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pycolmap
 import pytest
+from PIL import Image
 
 from rangesfm.config import read_survey
 from rangesfm.strict_tables import parse_toml
 
 if TYPE_CHECKING:
-    from tests.conftest import WalkedSurvey
+    from tests.conftest import PhotoRun, WalkedSurvey
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
@@ -31,7 +32,13 @@ def run_example(name: str, *arguments: str, cwd: Path) -> str:
 
 
 def test_every_program_is_tested_here() -> None:
-    assert {path.name for path in EXAMPLES.glob("*.py")} == {"own_problem.py", "scale_existing_model.py"}
+    assert {path.name for path in EXAMPLES.glob("*.py")} == {
+        "compare_two_surveys.py",
+        "floor_plan.py",
+        "gaussian_splatting.py",
+        "own_problem.py",
+        "scale_existing_model.py",
+    }
 
 
 def test_own_problem_converges_on_a_model_that_fits_its_ranges(walked_survey: WalkedSurvey) -> None:
@@ -56,6 +63,32 @@ def test_scale_existing_model_takes_it_to_metres(walked_survey: WalkedSurvey, tm
         np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in (centers, walked_survey.centers_m)
     )
     assert length_m == pytest.approx(true_m, rel=0.02)
+
+
+def test_input_for_gaussian_splatting_is_undistorted_and_metric(photo_run: PhotoRun, tmp_path: Path) -> None:
+    printed = run_example("gaussian_splatting.py", str(photo_run.output_path), str(tmp_path), cwd=tmp_path)
+    model = pycolmap.Reconstruction(tmp_path / "undistorted" / "sparse" / "0")
+    assert printed.startswith(f"{model.num_reg_images()} photos")
+    centers = np.array([image.projection_center() for image in model.images.values()])
+    refined = pycolmap.Reconstruction(photo_run.output_path / "sparse_metric" / "0")
+    expected = np.array([image.projection_center() for image in refined.images.values()])
+    assert np.ptp(centers, axis=0).max() == pytest.approx(np.ptp(expected, axis=0).max(), rel=0.2)
+
+
+def test_floor_plan_is_drawn_with_its_extent(photo_run: PhotoRun, tmp_path: Path) -> None:
+    printed = run_example("floor_plan.py", str(photo_run.output_path), "plan.png", cwd=tmp_path)
+    width, depth = (float(number) for number in re.findall(r"([\d.]+) m", printed)[:2])
+    assert 2 < width < 60
+    assert 2 < depth < 60
+    with Image.open(tmp_path / "plan.png") as plan:
+        assert min(plan.size) > 500
+
+
+def test_a_survey_compared_with_itself_has_not_changed(photo_run: PhotoRun, tmp_path: Path) -> None:
+    folder = str(photo_run.output_path)
+    printed = run_example("compare_two_surveys.py", folder, folder, "changes.ply", cwd=tmp_path)
+    assert "explain: 0 (0.0 %)" in printed
+    assert (tmp_path / "changes.ply").is_file()
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda path: path.name)

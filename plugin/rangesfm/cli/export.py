@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.cli.result_argument import add_result_argument, result_path
 from rangesfm.cli.survey_flags import position
+from rangesfm.errors import InputError
 from rangesfm.options import DEFAULT_FORMATS, EXPORT_FRAMES
 from rangesfm.progress import Progress
+
+if TYPE_CHECKING:
+    from rangesfm.options import ExportOptions
 
 
 def add_command(commands: Commands) -> None:
@@ -30,6 +35,12 @@ def add_command(commands: Commands) -> None:
         "--origin_lat_lon_height", metavar="LAT,LON,H", type=position, help="its place: degrees and metres, WGS 84"
     )
     parser.add_argument("--heading_deg", metavar="DEG", type=float, help="azimuth in which the first camera looks")
+    parser.add_argument(
+        "--apply_to",
+        nargs="+",
+        metavar="FILE",
+        help="carry these, made from the unscaled model, over instead: PLY, OBJ, camera JSON, COLMAP folders",
+    )
     parser.add_argument("--images", metavar="FOLDER", help="the photos (default: where the run found them)")
     parser.add_argument("--output_path", metavar="FOLDER", help="where to (default: the result folder)")
 
@@ -49,6 +60,19 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
         origin_lat_lon_height=None if place is None else (place[0], place[1], place[2]),
         heading_deg=args.heading_deg,
     )
+    if args.apply_to is not None:
+        return _apply(source, args, options)
     images_path = None if args.images is None else Path(args.images)
     written = export_result(source, formats, Path(args.output_path or source), options=options, images_path=images_path)
     return Outcome([str(path) for path in written])
+
+
+def _apply(source: Path, args: argparse.Namespace, options: ExportOptions) -> Outcome:
+    from rangesfm.export import apply_result
+
+    if args.formats is not None:
+        raise InputError("--apply_to writes files in their own formats: leave out --formats")
+    destination = Path(args.output_path or source / "applied")
+    paths, residual_m = apply_result(source, [Path(path) for path in args.apply_to], destination, options=options)
+    note = f"cameras of the refined map are {residual_m:.3f} m (rms) from where the similarity puts them"
+    return Outcome([*map(str, paths), *([note] if residual_m else [])])

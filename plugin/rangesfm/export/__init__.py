@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rangesfm.errors import InputError
+from rangesfm.export.apply import apply_to, best_similarity
 from rangesfm.export.colmap import write_model
 from rangesfm.export.features import write_features
 from rangesfm.export.frames import in_frame
@@ -24,7 +25,7 @@ from rangesfm.export.tum import write_trajectory
 from rangesfm.export.undistorted import write_undistorted
 from rangesfm.files import make_output_folder
 from rangesfm.options import ExportOptions
-from rangesfm.result_folder import read_result_folder
+from rangesfm.result_folder import ResultFolder, read_result_folder
 
 if TYPE_CHECKING:
     import pycolmap
@@ -35,6 +36,9 @@ if TYPE_CHECKING:
 __all__ = [
     "EXPORTERS",
     "MetricMap",
+    "apply_result",
+    "apply_to",
+    "best_similarity",
     "export_map",
     "export_model",
     "export_result",
@@ -139,11 +143,43 @@ def export_result(
     """
     options = replace(options or ExportOptions(), formats=tuple(formats))
     check_formats(options.formats)
+    return export_map(_read_map(read_result_folder(output_path), images_path), destination, options)
+
+
+def apply_result(
+    output_path: Path, paths: Iterable[Path], destination: Path, *, options: ExportOptions | None = None
+) -> tuple[tuple[Path, ...], float]:
+    """Carry what was made from a run's unscaled model into the frame of its metric one.
+
+    Args:
+        paths: meshes and clouds (PLY, OBJ), camera files (JSON), folders of COLMAP models.
+        options: of the frame.
+
+    Returns:
+        The files written, and by how much the refined cameras are off what any similarity gives (root mean square,
+        metres): a refinement bends the map, and a mesh cannot follow.
+
+    Raises:
+        InputError: a file cannot be carried over, or the result lacks its models.
+    """
     result = read_result_folder(output_path)
+    map_ = _read_map(result, None)
+    residual_m = 0.0
+    sfm = result.read_model("sparse")
+    if result.read_model("sparse_metric") is not None and sfm is not None:
+        similarity, residual_m = best_similarity(sfm, map_.reconstruction)
+        map_ = replace(map_, metric_from_sfm=similarity)
+    similarity_in_frame = in_frame(map_, options or ExportOptions()).metric_from_sfm
+    if similarity_in_frame is None:
+        raise InputError("the result does not say how its metric model follows from the unscaled one", output_path)
+    return apply_to(list(paths), similarity_in_frame, destination), residual_m
+
+
+def _read_map(result: ResultFolder, images_path: Path | None) -> MetricMap:
     reconstruction = result.read_model("sparse_metric") or result.read_model("sparse_scaled")
     if reconstruction is None:
-        raise InputError("there is no metric model (sparse_metric/0 or sparse_scaled/0) to export", output_path)
-    map_ = MetricMap(
+        raise InputError("there is no metric model (sparse_metric/0 or sparse_scaled/0) to export", result.path)
+    return MetricMap(
         reconstruction,
         timestamps_s=result.timestamps_s,
         anchors_m=result.anchor_positions_m,
@@ -152,4 +188,3 @@ def export_result(
         images_path=images_path or result.images_path,
         georeference=result.georeference,
     )
-    return export_map(map_, destination, options)

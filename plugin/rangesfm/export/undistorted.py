@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pycolmap
 
+from rangesfm.colmap_log import colmap_log
 from rangesfm.errors import InputError
 from rangesfm.export.metric_map import MetricMap
 from rangesfm.files import new_folder
@@ -28,13 +29,14 @@ def write_undistorted(map_: MetricMap, folder: Path) -> Path:
             raise InputError(f"there is no photo {image.name}, which the map needs, in this folder", images_path)
     with new_folder(folder) as temporary, tempfile.TemporaryDirectory() as model_path:
         map_.reconstruction.write(model_path)
-        pycolmap.undistort_images(temporary, model_path, images_path)
+        with colmap_log(temporary / "undistortion.log"):
+            pycolmap.undistort_images(temporary, model_path, images_path)
         _into_sparse_0(temporary)
     return folder
 
 
 def _into_sparse_0(folder: Path) -> None:
-    """COLMAP writes the model to sparse/; everybody else looks for it in sparse/0. Its scripts for MVS stay out."""
+    """The model to where everybody looks for it; COLMAP's scripts for MVS and its log stay out."""
     files = list((folder / "sparse").iterdir())
     (folder / "sparse" / "0").mkdir()
     for path in files:

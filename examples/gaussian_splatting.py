@@ -1,0 +1,32 @@
+"""Metric input for 3D Gaussian splatting: undistorted photos and a model in metres, z up.
+
+    python gaussian_splatting.py RESULT_FOLDER OUTPUT_FOLDER [PHOTOS_FOLDER]
+
+Give OUTPUT_FOLDER/undistorted to any trainer that takes COLMAP data (images/ and sparse/0); what it learns is then in
+metres. Trainers that recentre and rescale scenes must be told not to: nerfstudio and gsplat by
+``--auto-scale-poses False --center-method none``, and so on.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from rangesfm import export_result
+from rangesfm.options import ExportOptions
+
+
+def main() -> None:
+    result_folder, output_folder, *photos = map(Path, sys.argv[1:])
+    (folder,) = export_result(
+        result_folder,
+        ["undistorted"],
+        output_folder,
+        options=ExportOptions(frame="level"),
+        images_path=photos[0] if photos else None,
+    )
+    print(f"{len(list((folder / 'images').iterdir()))} photos and a metric model in {folder}")
+
+
+if __name__ == "__main__":
+    main()

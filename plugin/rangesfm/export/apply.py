@@ -1,0 +1,146 @@
+"""The metric similarity, applied to what other programs made from the unscaled model.
+
+Meshes and clouds (PLY, OBJ), camera files (nerfstudio's ``transforms.json``, the ``cameras.json`` of Gaussian
+splatting) and COLMAP models.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from rangesfm.errors import InputError
+from rangesfm.export.colmap import write_model
+from rangesfm.export.metric_map import Array
+from rangesfm.export.ply_transform import transform_ply
+from rangesfm.files import make_output_folder, new_file
+from rangesfm.geometry import Similarity, align_points, rmse
+from rangesfm.model_files import read_model
+from rangesfm.model_transform import rescale
+from rangesfm.tables import read_text
+
+Json = Any
+
+
+def best_similarity(sfm: pycolmap.Reconstruction, metric: pycolmap.Reconstruction) -> tuple[Similarity, float]:
+    """The similarity that brings an unscaled model's cameras closest to those of a refined one.
+
+    Returns:
+        metric_from_sfm, and the root mean square distance in metres that is left, for the refinement has bent the map.
+
+    Raises:
+        InputError: fewer than three photos are in both.
+    """
+    places = [{i.name: i.projection_center() for i in model.images.values() if i.has_pose} for model in (sfm, metric)]
+    names = sorted(places[0].keys() & places[1].keys())
+    if len(names) < 3:
+        raise InputError(f"{len(names)} photos are in both the unscaled and the metric model, expected three or more")
+    source, target = (np.array([centers[name] for name in names]) for centers in places)
+    similarity = align_points(source, target)
+    return similarity, rmse(similarity.apply(source) - target)
+
+
+def apply_to(paths: list[Path], metric_from_sfm: Similarity, folder: Path) -> tuple[Path, ...]:
+    """Write each file (or model folder) into ``folder`` under its own name, carried into the metric world.
+
+    Raises:
+        InputError: a file is none of those that this module knows, or would be overwritten.
+    """
+    chosen = [(path, _transformer_of(path)) for path in paths]
+    for path in paths:
+        if (folder / path.name).resolve() == path.resolve():
+            raise InputError("the metric file would overwrite this one, expected another output path", path)
+    if len({path.name for path in paths}) < len(paths):
+        raise InputError("two of the files to carry over have the same name")
+    make_output_folder(folder)
+    return tuple(transform(path, metric_from_sfm, folder / path.name) for path, transform in chosen)
+
+
+Transform = Callable[[Path, Similarity, Path], Path]
+
+
+def _transformer_of(path: Path) -> Transform:
+    if path.is_dir():
+        return _transform_model
+    if not path.is_file():
+        raise InputError("there is no such file", path)
+    known: dict[str, Transform] = {".ply": transform_ply, ".obj": _transform_obj, ".json": _transform_json}
+    if path.suffix.lower() not in known:
+        raise InputError(f"cannot be carried over, expected {', '.join(known)} or the folder of a COLMAP model", path)
+    return known[path.suffix.lower()]
+
+
+def _transform_model(path: Path, metric_from_sfm: Similarity, target: Path) -> Path:
+    return write_model(rescale(read_model(path), metric_from_sfm), target)
+
+
+def _transform_obj(path: Path, metric_from_sfm: Similarity, target: Path) -> Path:
+    """Vertices and normals move; faces, colours and the rest stay as they are written."""
+    lines = []
+    for number, line in enumerate(read_text(path).splitlines(), 1):
+        words = line.split()
+        if words[:1] in (["v"], ["vn"]):
+            try:
+                at = np.array([float(word) for word in words[1:4]])
+            except ValueError:
+                at = np.zeros(0)
+            if len(at) != 3:
+                raise InputError(f"'{line[:60]}' is no vertex, expected three numbers", path, number)
+            moved = metric_from_sfm.apply(at) if words[0] == "v" else metric_from_sfm.rotation @ at
+            line = " ".join([words[0], *(f"{value:.10g}" for value in moved), *words[4:]])
+        lines.append(line)
+    with new_file(target) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return target
+
+
+def _transform_json(path: Path, metric_from_sfm: Similarity, target: Path) -> Path:
+    try:
+        content = json.loads(read_text(path))
+    except json.JSONDecodeError as error:
+        raise InputError(f"not JSON: {error.msg}", path, error.lineno) from error
+    try:
+        if isinstance(content, dict) and "frames" in content:
+            _move_nerfstudio(content, metric_from_sfm)
+        elif isinstance(content, list) and content and "position" in content[0]:
+            _move_splatting(content, metric_from_sfm)
+        else:
+            raise InputError(
+                "holds no cameras, expected nerfstudio's transforms.json or a splatting cameras.json", path
+            )
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"a camera is not as expected ({error!r})", path) from error
+    with new_file(target) as temporary:
+        temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    return target
+
+
+def _move_nerfstudio(content: Json, metric_from_sfm: Similarity) -> None:
+    """Poses are in a world that ``applied_transform`` has turned away from COLMAP's; the metric one needs none."""
+    applied = np.eye(4)
+    if "applied_transform" in content:
+        applied[:3] = np.array(content["applied_transform"], dtype=np.float64).reshape(-1, 4)[:3]
+    sfm_from_world = np.linalg.inv(applied)
+    stretch = float(np.cbrt(abs(np.linalg.det(sfm_from_world[:3, :3]))))
+    for frame in content["frames"]:
+        pose = sfm_from_world @ np.array(frame["transform_matrix"], dtype=np.float64).reshape(4, 4)
+        pose[:3, :3] = metric_from_sfm.rotation @ pose[:3, :3] / stretch
+        pose[:3, 3] = metric_from_sfm.apply(pose[:3, 3])
+        frame["transform_matrix"] = pose.tolist()
+    if "applied_transform" in content:
+        content["applied_transform"] = np.eye(4)[:3].tolist()
+    # Of the file as it was, and wrong from now on.
+    content.pop("applied_scale", None)
+
+
+def _move_splatting(content: Json, metric_from_sfm: Similarity) -> None:
+    for camera in content:
+        position: Array = np.array(camera["position"], dtype=np.float64).reshape(3)
+        rotation: Array = np.array(camera["rotation"], dtype=np.float64).reshape(3, 3)
+        camera["position"] = metric_from_sfm.apply(position).tolist()
+        camera["rotation"] = (metric_from_sfm.rotation @ rotation).tolist()

@@ -1,0 +1,200 @@
+"""Files made from the unscaled model, carried into the metric world."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rangesfm.errors import InputError
+from rangesfm.export import MetricMap, apply_to, best_similarity, export_map
+from rangesfm.export.metric_map import Array
+from rangesfm.geometry import IDENTITY, Similarity
+from rangesfm.model_transform import rescale
+from rangesfm.options import ExportOptions
+
+METRIC_FROM_SFM = Similarity(2.5, Rotation.from_rotvec([0.3, -0.7, 1.1]).as_matrix(), np.array([10.0, -20.0, 3.0]))
+VERTICES = np.random.default_rng(0).normal(size=(5, 3))
+NORMALS = Rotation.random(5, random_state=1).as_matrix()[:, 0]
+FACES = b"\x03\x00\x00\x00\x00\x01\x00\x00\x00\x02\x00\x00\x00"
+
+
+def carry(path: Path, folder: Path) -> Path:
+    (written,) = apply_to([path], METRIC_FROM_SFM, folder)
+    assert written == folder / path.name
+    return written
+
+
+def header(encoding: str, kind: str = "float") -> bytes:
+    names = ("x", "y", "z", "nx", "ny", "nz")
+    lines = ["ply", f"format {encoding} 1.0", "comment made elsewhere", "element vertex 5"]
+    lines += [f"property {kind} {name}" for name in names] + ["property uchar red"]
+    lines += ["element face 1", "property list uchar int vertex_indices", "end_header", ""]
+    return "\n".join(lines).encode()
+
+
+def vertices_as(code: str) -> npt.NDArray[np.void]:
+    columns = [(name, code) for name in ("x", "y", "z", "nx", "ny", "nz")]
+    made = np.empty(5, dtype=[*columns, ("red", "u1")])
+    for name, values in zip(("x", "y", "z", "nx", "ny", "nz"), np.column_stack([VERTICES, NORMALS]).T, strict=True):
+        made[name] = values
+    made["red"] = np.arange(5)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("encoding", "code", "kind"),
+    [
+        ("binary_little_endian", "<f4", "float"),
+        ("binary_little_endian", "<f8", "double"),
+        ("binary_big_endian", ">f4", "float"),
+    ],
+)
+def test_a_binary_mesh_moves_and_keeps_its_faces_and_colours(
+    encoding: str, code: str, kind: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "mesh.ply"
+    path.write_bytes(header(encoding, kind) + vertices_as(code).tobytes() + FACES)
+    head, _, body = carry(path, tmp_path / "out").read_bytes().partition(b"end_header\n")
+    assert head + b"end_header\n" == header(encoding, kind)
+    read = np.frombuffer(body[: -len(FACES)], dtype=vertices_as(code).dtype)
+    assert body.endswith(FACES)
+    tolerance = 1e-5 if code.endswith("4") else 1e-12
+    found = np.column_stack([read[name] for name in "xyz"])
+    np.testing.assert_allclose(found, METRIC_FROM_SFM.apply(VERTICES), atol=tolerance)
+    turned = np.column_stack([read[name] for name in ("nx", "ny", "nz")])
+    np.testing.assert_allclose(turned, NORMALS @ METRIC_FROM_SFM.rotation.T, atol=1e-6)
+    np.testing.assert_array_equal(read["red"], range(5))
+
+
+def test_a_mesh_in_words_moves_as_well(tmp_path: Path) -> None:
+    rows = "".join(
+        " ".join(map(str, [*v, *n, i])) + "\n" for i, (v, n) in enumerate(zip(VERTICES, NORMALS, strict=True))
+    )
+    path = tmp_path / "mesh.ply"
+    path.write_bytes(header("ascii") + rows.encode() + b"3 0 1 2\n")
+    lines = carry(path, tmp_path / "out").read_text().partition("end_header\n")[2].splitlines()
+    found = np.array([[float(word) for word in line.split()] for line in lines[:5]])
+    np.testing.assert_allclose(found[:, :3], METRIC_FROM_SFM.apply(VERTICES), atol=1e-7)
+    assert lines[3].split()[-1] == "3"
+    assert lines[5:] == ["3 0 1 2"]
+
+
+def test_far_from_the_origin_a_mesh_becomes_double(tmp_path: Path) -> None:
+    path = tmp_path / "mesh.ply"
+    path.write_bytes(header("binary_little_endian") + vertices_as("<f4").tobytes() + FACES)
+    far = Similarity(1.0, np.eye(3), np.array([2.6e6, 1.2e6, 400.0]))
+    (written,) = apply_to([path], far, tmp_path / "out")
+    head, _, body = written.read_bytes().partition(b"end_header\n")
+    assert head.count(b"property double") == 3
+    kind = np.dtype([*((n, "<f8") for n in "xyz"), *((n, "<f4") for n in ("nx", "ny", "nz")), ("red", "u1")])
+    read = np.frombuffer(body[: -len(FACES)], dtype=kind)
+    np.testing.assert_allclose(np.column_stack([read[n] for n in "xyz"]), far.apply(VERTICES), rtol=0, atol=1e-6)
+
+
+def test_an_obj_moves_and_keeps_the_rest(tmp_path: Path) -> None:
+    path = tmp_path / "mesh.obj"
+    path.write_text("# made elsewhere\nmtllib a.mtl\nv 1 2 3 0.5 0.5 0.5\nvn 0 0 1\nf 1//1 1//1 1//1\n")
+    lines = carry(path, tmp_path / "out").read_text().splitlines()
+    assert [lines[0], lines[1], lines[4]] == ["# made elsewhere", "mtllib a.mtl", "f 1//1 1//1 1//1"]
+    v, vn = (np.array(lines[i].split()[1:], dtype=np.float64) for i in (2, 3))
+    np.testing.assert_allclose(v, [*METRIC_FROM_SFM.apply(np.array([1.0, 2.0, 3.0])), 0.5, 0.5, 0.5], rtol=1e-9)
+    np.testing.assert_allclose(vn, METRIC_FROM_SFM.rotation[:, 2], rtol=1e-9)
+
+
+@pytest.fixture
+def sfm() -> pycolmap.Reconstruction:
+    pycolmap.set_random_seed(2)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 6, 40
+    return pycolmap.synthesize_dataset(options)
+
+
+def nerfstudio_poses(path: Path) -> Array:
+    return np.array([frame["transform_matrix"] for frame in json.loads(path.read_text())["frames"]])
+
+
+def test_cameras_of_nerfstudio_go_where_an_export_of_the_metric_model_puts_them(
+    sfm: pycolmap.Reconstruction, tmp_path: Path
+) -> None:
+    options = ExportOptions(formats=("nerfstudio",))
+    (path,) = export_map(MetricMap(sfm), tmp_path / "sfm", options)
+    # As nerfstudio's own converter does: another world, and a note of it.
+    content = json.loads(path.read_text())
+    applied = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    content["applied_transform"] = applied[:3].tolist()
+    for frame in content["frames"]:
+        frame["transform_matrix"] = (applied @ np.array(frame["transform_matrix"])).tolist()
+    path.write_text(json.dumps(content))
+    (expected,) = export_map(MetricMap(rescale(sfm, METRIC_FROM_SFM)), tmp_path / "metric", options)
+    found = carry(path, tmp_path / "out")
+    np.testing.assert_allclose(nerfstudio_poses(found), nerfstudio_poses(expected), atol=1e-9)
+
+
+def test_cameras_of_splatting_move_and_turn(tmp_path: Path) -> None:
+    path = tmp_path / "cameras.json"
+    path.write_text(json.dumps([{"id": 0, "position": [1, 2, 3], "rotation": np.eye(3).tolist(), "fx": 500.0}]))
+    (camera,) = json.loads(carry(path, tmp_path / "out").read_text())
+    np.testing.assert_allclose(camera["position"], METRIC_FROM_SFM.apply(np.array([1.0, 2.0, 3.0])))
+    np.testing.assert_allclose(camera["rotation"], METRIC_FROM_SFM.rotation)
+    assert camera["fx"] == 500.0
+
+
+def test_a_model_folder_moves(sfm: pycolmap.Reconstruction, tmp_path: Path) -> None:
+    (tmp_path / "dense").mkdir()
+    sfm.write(tmp_path / "dense")
+    moved = pycolmap.Reconstruction(carry(tmp_path / "dense", tmp_path / "out"))
+    similarity, residual_m = best_similarity(sfm, moved)
+    assert residual_m == pytest.approx(0, abs=1e-9)
+    assert similarity.scale == pytest.approx(2.5)
+
+
+def test_what_a_refinement_bent_is_said(sfm: pycolmap.Reconstruction) -> None:
+    bent = rescale(sfm, IDENTITY)
+    frame = bent.frame(min(bent.reg_frame_ids()))
+    pose = frame.rig_from_world
+    assert pose is not None
+    frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, pose.translation + np.array([0.1, 0, 0]))
+    _, residual_m = best_similarity(sfm, bent)
+    assert 0.01 < residual_m < 0.1
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.stl", b"solid", "cannot be carried over, expected .ply, .obj, .json or the folder"),
+        ("a.ply", b"plyp", "not a PLY file"),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement face 1\nend_header\n", "first element is vertex"),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "no x, y and z"),
+        ("a.ply", header("binary_little_endian") + b"short", "ends within its 5 vertices"),
+        ("a.ply", header("ascii") + b"1 2 3\n" * 6, "a.ply:15: not a vertex of 7 numbers"),
+        ("a.obj", b"v 1 two 3\n", "a.obj:1: 'v 1 two 3' is no vertex"),
+        ("a.json", b"{", "a.json:1: not JSON"),
+        ("a.json", b"[]", "no cameras"),
+        ("a.json", b'{"frames": [{}]}', "a camera is not as expected"),
+        (
+            "a.ply",
+            header("ascii").replace(b"property uchar red", b"property float rot_0") + b"",
+            "Gaussian splats cannot be carried over",
+        ),
+    ],
+)
+def test_what_cannot_be_carried_over_is_refused(name: str, content: bytes, said: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError) as refused:
+        apply_to([tmp_path / name], METRIC_FROM_SFM, tmp_path / "out")
+    assert said in str(refused.value)
+    assert not list((tmp_path / "out").glob("*"))
+
+
+def test_nothing_is_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "a.obj"
+    path.write_text("v 1 2 3\n")
+    with pytest.raises(InputError, match="would overwrite"):
+        apply_to([path], METRIC_FROM_SFM, tmp_path)
+    assert path.read_text() == "v 1 2 3\n"
