@@ -180,6 +180,9 @@ class TestRefineInASiteFrame:
             "images.csv",
             "reference.csv",
             "report.html",
+            "scale_bootstrap.csv",
+            "scale_candidates.csv",
+            "scale_consensus.csv",
             "trajectory.tum",
             "points.ply",
         }
@@ -331,6 +334,9 @@ class TestModelWithoutSurveyedAnchors:
             "ranges.csv",
             "images.csv",
             "report.html",
+            "scale_bootstrap.csv",
+            "scale_candidates.csv",
+            "scale_consensus.csv",
             "trajectory.tum",
         }
 
@@ -498,6 +504,9 @@ class TestRunOnPhotos:
             "images.csv",
             "reference.csv",
             "report.html",
+            "scale_bootstrap.csv",
+            "scale_candidates.csv",
+            "scale_consensus.csv",
             "trajectory.tum",
             "points.ply",
         }
