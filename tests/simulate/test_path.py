@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rangesfm.simulate.path import CameraPath, look_at, loop_path, orbit_path, sequence_path
+from rangesfm.simulate.path import CameraPath, lap_path, look_at, loop_path, orbit_path, sequence_path
 
 PATHS = {
     "loop": loop_path(40.0, start_s=1e9, seed=3),
@@ -75,3 +75,15 @@ def test_same_seed_same_path_and_another_seed_another() -> None:
     times = np.linspace(0.0, 20.0, 9)
     np.testing.assert_array_equal(loop_path(20.0, seed=4).centers(times), loop_path(20.0, seed=4).centers(times))
     assert np.abs(loop_path(20.0, seed=4).centers(times) - loop_path(20.0, seed=5).centers(times)).max() > 0.01
+
+
+def test_a_lap_goes_round_the_field_and_looks_ahead() -> None:
+    path = lap_path(300.0)
+    times = _times(path, 0.5)
+    centers = path.centers(times)
+    np.testing.assert_allclose(centers[:, :2].min(axis=0), [-52.5, -34.0], atol=0.2)
+    np.testing.assert_allclose(centers[:, :2].max(axis=0), [52.5, 34.0], atol=0.2)
+    assert np.linalg.norm(centers[-1] - centers[0]) < 8.0
+    ahead = np.diff(centers, axis=0) / np.linalg.norm(np.diff(centers, axis=0), axis=1, keepdims=True)
+    gaze = path.world_from_cam(times)[:-1, :, 2]
+    assert np.sum(ahead * gaze, axis=1).min() > 0.99

@@ -28,7 +28,7 @@ Array = npt.NDArray[np.float64]
 # Ceres' default of 1e4 damps the scale, which all poses share, so strongly that it creeps
 # and is then taken for converged.
 _INITIAL_TRUST_REGION_RADIUS = 1e8
-_TOLERANCE = 1e-10
+_TOLERANCE = 1e-8
 # No feature is located better; weighed against a smaller one, ranges lose all say in a model without noise.
 _MIN_PIXEL_STDDEV = 0.05
 # What is still to be gained when it stops, as a share of the smallest range stddev.

@@ -145,3 +145,39 @@ def sequence_path(
     position = direction.antiderivative()
     centers = speed_m_per_s * position(times)
     return CameraPath.through(times, centers, look_at(centers, centers + direction(times)))
+
+
+def lap_path(
+    duration_s: float,
+    *,
+    size_m: tuple[float, float] = (105.0, 68.0),
+    corner_radius_m: float = 8.0,
+    height_m: float = 1.0,
+    unevenness_m: float = 0.15,
+    share: float = 0.98,
+) -> CameraPath:
+    """A rover's lap round a soccer field, looking ahead; it ends before it sees the start again.
+
+    Args:
+        duration_s: from time 0, at constant speed.
+        size_m: of the field along x and y; its middle is the origin, the first side runs along +x at -y.
+        corner_radius_m: of the turns.
+        height_m: of the camera. unevenness_m: how far the ground goes up and down.
+        share: of the lap.
+    """
+    sides = [size - 2 * corner_radius_m for size in size_m] * 2
+    corner = 0.5 * np.pi * corner_radius_m
+    ends = np.cumsum([length for side in sides for length in (side, corner)])
+    way = np.linspace(0.0, ends[-1], 20000)
+    is_corner = np.searchsorted(ends, way, side="right") % 2 == 1
+    heading = np.concatenate([[0.0], np.cumsum(np.diff(way) * is_corner[1:])]) / corner_radius_m
+    steps = np.diff(way)[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])[1:]
+    plan = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]) - [0.5 * sides[0], 0.5 * size_m[1]]
+    times = np.linspace(0.0, duration_s, max(8, round(duration_s)))
+    at = share * ends[-1] * times / duration_s
+    x, y, turn = (np.interp(at, way, values) for values in (plan[:, 0], plan[:, 1], heading))
+    wave = at / corner_radius_m
+    centers = np.column_stack([x, y, height_m + unevenness_m * np.sin(wave)])
+    climb = unevenness_m / corner_radius_m * np.cos(wave)
+    ahead = np.column_stack([np.cos(turn), np.sin(turn), climb])
+    return CameraPath.through(times, centers, look_at(centers, centers + ahead))

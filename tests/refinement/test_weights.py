@@ -1,0 +1,89 @@
+"""Noise found from residuals, and residuals that are none."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from rangesfm.refinement.weights import RangeWeights, misfits
+
+Array = npt.NDArray[np.float64]
+NUM_EACH = 400
+
+
+def make_weights(stddev_m: float = 1.0, *, is_estimated: bool = True) -> RangeWeights:
+    """Three anchors in turn for 400 rounds of half a second."""
+    n = 3 * NUM_EACH
+    rounds = np.arange(n) // 3
+    return RangeWeights(
+        stddev_m=np.full(n, stddev_m),
+        inflation=1.0,
+        fixed_m=np.zeros(n),
+        is_estimated=np.full(n, is_estimated),
+        anchor_index=np.arange(n) % 3,
+        block=rounds // 20,
+        loss_scale=2.385,
+    )
+
+
+def noise(stddevs_m: tuple[float, float, float]) -> Array:
+    values: Array = np.random.default_rng(0).standard_normal(3 * NUM_EACH) * np.tile(stddevs_m, NUM_EACH)
+    return values
+
+
+def test_a_noisier_anchor_is_known_by_its_residuals() -> None:
+    found = make_weights().estimated(noise((0.05, 0.05, 0.3)), 0.0)
+    assert found.stddev_m[2] == pytest.approx(0.3, rel=0.15)
+    assert found.stddev_m[0] == pytest.approx(0.05, rel=0.15)
+    assert found.inflation == pytest.approx(1.0, abs=0.25)
+
+
+def test_anchors_of_like_noise_share_it() -> None:
+    found = make_weights().estimated(noise((0.1, 0.1, 0.1)), 0.0)
+    np.testing.assert_array_equal(found.stddev_m, found.stddev_m[0])
+    assert found.stddev_m[0] == pytest.approx(0.1, rel=0.07)
+
+
+def test_an_anchor_that_disagrees_as_a_whole_is_not_silenced() -> None:
+    residuals = noise((0.1, 0.1, 0.1)) + np.tile([0.0, 0.0, 0.3], NUM_EACH)
+    found = make_weights().estimated(residuals, 0.0)
+    np.testing.assert_array_equal(found.stddev_m, found.stddev_m[0])
+
+
+def test_what_the_map_takes_from_the_residuals_is_given_back() -> None:
+    plain, widened = (make_weights().estimated(noise((0.1, 0.1, 0.1)), num) for num in (0.0, 900.0))
+    assert widened.stddev_m[0] == pytest.approx(2 * plain.stddev_m[0])
+
+
+def test_slow_errors_weigh_less_than_their_size_says() -> None:
+    slow = np.repeat(np.random.default_rng(1).standard_normal(20), 60) * 0.2
+    assert make_weights().estimated(noise((0.1, 0.1, 0.1)) + slow, 0.0).inflation > 3
+
+
+def test_known_noise_stays_as_it_is() -> None:
+    weights = make_weights(0.2, is_estimated=False)
+    assert weights.estimated(noise((1.0, 1.0, 1.0)), 0.0) is weights
+
+
+def test_noise_is_no_misfit() -> None:
+    assert misfits(make_weights(0.1), noise((0.1, 0.1, 0.1)), np.arange(3.0 * NUM_EACH)) == ()
+
+
+def test_residuals_far_beyond_their_stddev_are_told() -> None:
+    reasons = misfits(make_weights(0.01), noise((0.1, 0.1, 0.1)), np.arange(3.0 * NUM_EACH))
+    assert any("times their stddev" in reason for reason in reasons)
+
+
+def test_a_stretch_that_is_off_is_told() -> None:
+    residuals = noise((0.1, 0.1, 0.1))
+    residuals[300:360] += 1.0
+    (reason,) = misfits(make_weights(0.1), residuals, np.arange(3.0 * NUM_EACH))
+    assert "in 3 of 60 stretches" in reason
+
+
+def test_drift_that_is_left_is_told_even_where_the_noise_was_estimated_with_it() -> None:
+    drift = 3.0 * np.sin(np.arange(3 * NUM_EACH) / 150)
+    weights = make_weights().estimated(noise((0.1, 0.1, 0.1)) + drift, 0.0)
+    reasons = misfits(weights, noise((0.1, 0.1, 0.1)) + drift, np.arange(3.0 * NUM_EACH))
+    assert any("far larger than the ranges' scatter" in reason for reason in reasons)
