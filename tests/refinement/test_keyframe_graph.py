@@ -19,7 +19,7 @@ from rangesfm.refinement.vision_information import Poses, vision_information
 from rangesfm.simulate.model import SyntheticModel
 
 Array = npt.NDArray[np.float64]
-ANCHORS_M = np.array([[5.0, 5.0, 12.0], [-20.0, -10.0, 4.0], [-30.0, -50.0, 7.0], [10.0, -45.0, 1.0]])
+ANCHORS_M = np.array([[-40.0, -28.0, 12.0], [-15.0, -28.0, 0.0], [-28.0, -42.0, 9.0], [-30.0, -20.0, 15.0]])
 TAG_IN_CAM_M = np.array([0.1, -0.2, 0.05])
 
 
@@ -120,7 +120,7 @@ def test_ranges_unbend_a_drifted_chain(chain: SyntheticModel, anchors_are_free: 
     # The relative poses of the bent map are wrong by nature; exact ranges to four anchors outvote them.
     assert np.sqrt(np.mean(graph.residuals_m(solution.state) ** 2)) < 0.02
     centers = solution.state.poses.centers
-    assert rmse(align_points(centers, truth.centers).apply(centers) - truth.centers) < 0.5 * drift
+    # Unknown anchors beside a way this straight would let it bend; known ones do not.
     if not anchors_are_free:
         assert rmse(centers - truth.centers) < 0.5 * drift
     if held_frame is not None:
