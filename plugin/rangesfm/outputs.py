@@ -24,11 +24,14 @@ from rangesfm.options import ExportOptions
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.results import USED
 from rangesfm.scale.diagnostics import scale_diagnostics
+from rangesfm.scale.estimate import ScaleSensitivity
 
 Array = npt.NDArray[np.float64]
 
 _SCALE_TABLES = ("scale_candidates.csv", "scale_consensus.csv", "scale_bootstrap.csv")
 _CURVES = (*_SCALE_TABLES, "time_offset_curve.csv")
+# Percents of the scale for a centimetre that the summary mentions.
+_NOTABLE_PERCENT = 0.5
 # The first says that a result is whole: it is the last to be written and the first to go.
 _RESULT_FILES = ("result.json", "report.html", "ranges.csv", "images.csv", "reference.csv", *_CURVES)
 _WRITTEN = (*_RESULT_FILES, "trajectory.tum", "points.ply", "sparse_scaled/0", "sparse_metric/0")
@@ -189,12 +192,27 @@ def _plain(value: Any) -> Any:
     return value
 
 
+def _notable_sensitivity(sensitivity: ScaleSensitivity) -> Iterator[str]:
+    """What to measure to the centimetre: where one is worth much of the scale."""
+    values = {
+        "of bias in short ranges": sensitivity.short_range_per_cm,
+        "of bias in all ranges": sensitivity.common_bias_per_cm,
+        **{f"of lever arm in {axis}": value for axis, value in zip("xyz", sensitivity.lever_arm_per_cm)},
+    }
+    notable = [f"{value:+.2f} % per cm {what}" for what, value in values.items() if abs(value) > _NOTABLE_PERCENT]
+    if notable:
+        yield f"the scale is sensitive: {', '.join(notable)}"
+
+
 def summary_lines(survey: MetricSurvey, result: dict[str, Any], table: str | None, folder: Path) -> Iterator[str]:
     """What a user wants to know at the end of a run."""
     estimate, ranges = survey.estimate, result["ranges"]
-    relative = max(estimate.uncertainty.formal, estimate.uncertainty.empirical)
-    yield f"scale: {estimate.value:.6g} m per SfM unit +- {100 * relative:.2f} % (1 stddev)"
+    low, high = estimate.interval_95
+    yield f"scale: {estimate.value:.6g} m per SfM unit, 95 % interval {low:.6g} to {high:.6g}"
     yield f"verdict: {estimate.verdict}: {'; '.join(estimate.reasons)}"
+    for advice in estimate.advice:
+        yield f"next time: {advice}"
+    yield from _notable_sensitivity(estimate.sensitivity)
     if survey.refinement is not None:
         refined = survey.refined_scale
         yield f"refined: {refined:.6g} m per SfM unit after {survey.refinement.num_iterations} iterations"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -99,3 +100,19 @@ def test_four_times_the_ranges_halve_it(make_survey: MakeSurvey) -> None:
     )
     assert many.uncertainty.formal / few.uncertainty.formal == pytest.approx(0.5, rel=0.2)
     assert many.uncertainty.bootstrap / few.uncertainty.bootstrap == pytest.approx(0.5, rel=0.5)
+
+
+def test_few_blocks_or_anchors_widen_the_interval_as_students_t_does() -> None:
+    many = ScaleUncertainty(0.001, 0.002, None, 0.0, 0.001, 1000, 1)
+    assert many.half_width_95 == pytest.approx(1.96 * 0.002, rel=0.01)
+    assert replace(many, num_blocks=5).half_width_95 == pytest.approx(2.776 * 0.002, rel=0.01)
+    assert replace(many, jackknife=0.002, num_anchors=3).half_width_95 == pytest.approx(4.303 * 0.002, rel=0.01)
+    assert replace(many, range_model=0.03).half_width_95 == pytest.approx(1.96 * 0.03, rel=0.01)
+
+
+def test_an_error_curve_that_nobody_knows_widens_the_interval_and_a_known_one_hardly(make_survey: MakeSurvey) -> None:
+    survey = make_survey(radio=Radio(range_stddev_m=0.03), num_epochs=5)
+    log = survey.simulated.log
+    calibrated = replace(log, shared_stddev_m=np.full(len(log), 0.01))
+    unknown, known = (survey.scale("unknown", (), each).uncertainty.range_model for each in (log, calibrated))
+    assert known == pytest.approx(unknown / 7, rel=0.5)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy import stats
 
 from rangesfm.geometry import Similarity
 from rangesfm.ranging.anchors import AnchorEstimate
@@ -13,6 +14,8 @@ from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.two_candidate import TwoCandidate
 
 Array = npt.NDArray[np.float64]
+
+NORMAL_95 = 1.96
 
 
 @dataclass(frozen=True)
@@ -23,18 +26,71 @@ class ScaleUncertainty:
         formal: from the Jacobian, as if every range erred on its own (Cramer-Rao).
         bootstrap: resampling blocks of time, so that correlated errors count.
         jackknife: leaving out one anchor at a time; None with fewer than three.
-        range_model: what an unmodelled offset and short-range error of usual size would do.
+        range_model: what an unknown error curve of the radio would do.
+        correlated: the formal one, widened by how the residuals hang together in time.
+        num_blocks, num_anchors: that bootstrap and jackknife rest on.
     """
 
     formal: float
     bootstrap: float
     jackknife: float | None
     range_model: float
+    correlated: float = 0.0
+    num_blocks: int = 1000
+    num_anchors: int = 1
 
     @property
     def empirical(self) -> float:
-        """The honest one: the larger resampling figure, and the range model beside it."""
-        return float(np.hypot(max(self.bootstrap, self.jackknife or 0.0), self.range_model))
+        """The honest one: the largest of what the data show, and the range model beside it."""
+        return float(np.hypot(max(self.bootstrap, self.correlated, self.jackknife or 0.0), self.range_model))
+
+    @property
+    def half_width_95(self) -> float:
+        """Of the 95 % interval of the scale's logarithm; few blocks or anchors widen it as Student's t does."""
+        seen = max(
+            NORMAL_95 * max(self.formal, self.correlated),
+            _student_95(self.num_blocks - 1) * self.bootstrap,
+            _student_95(self.num_anchors - 1) * (self.jackknife or 0.0),
+        )
+        return float(np.hypot(seen, NORMAL_95 * self.range_model))
+
+
+def _student_95(degrees_of_freedom: int) -> float:
+    return float(stats.t.ppf(0.975, max(degrees_of_freedom, 1)))
+
+
+@dataclass(frozen=True)
+class CutoffTest:
+    """The scale from ranges of at least some length, short ones weighing as much as others.
+
+    Attributes:
+        min_range_m: what is left out is shorter.
+        scale: metres per SfM unit.
+        stddev: metres per SfM unit, widened by the errors' correlation; not of the range model.
+    """
+
+    min_range_m: float
+    scale: float
+    stddev: float
+
+
+@dataclass(frozen=True)
+class ScaleSensitivity:
+    """By how many percent the scale would change; where a bias is estimated, by what is left of it.
+
+    Attributes:
+        common_bias_per_cm: if all ranges were a centimetre longer.
+        short_range_per_cm: if the ranges of the shorter half were.
+        anchor_bias_per_cm: if those of one anchor were, by id.
+        range_slope_per_percent: if all ranges were one percent longer.
+        lever_arm_per_cm: if the tag sat a centimetre further along x, y, z of the camera.
+    """
+
+    common_bias_per_cm: float
+    short_range_per_cm: float
+    anchor_bias_per_cm: dict[str, float]
+    range_slope_per_percent: float
+    lever_arm_per_cm: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -48,6 +104,9 @@ class ScaleEstimate:
         uncertainty: relative stddevs.
         verdict: "good" or "doubtful" (a refusal is a GeometryError).
         reasons: why, in words.
+        advice: what to do next time, in words.
+        cutoff_test: whether the scale moves as short ranges are left out.
+        sensitivity: to what the range model may have wrong.
         per_anchor: scale from each anchor alone; anchors that do not determine one are missing.
         two_candidate: the paper's table; None where no range has candidates.
         anchors: in the order of the log.
@@ -64,6 +123,9 @@ class ScaleEstimate:
     uncertainty: ScaleUncertainty
     verdict: str
     reasons: tuple[str, ...]
+    advice: tuple[str, ...]
+    cutoff_test: tuple[CutoffTest, ...]
+    sensitivity: ScaleSensitivity
     per_anchor: dict[str, float]
     two_candidate: TwoCandidate | None
     anchors: tuple[AnchorEstimate, ...]
@@ -87,3 +149,9 @@ class ScaleEstimate:
     def stddev_empirical(self) -> float:
         """Metres per SfM unit, by resampling and by what the range model leaves out."""
         return self.value * self.uncertainty.empirical
+
+    @property
+    def interval_95(self) -> tuple[float, float]:
+        """Metres per SfM unit between which the scale is with 95 % probability."""
+        half_width = self.uncertainty.half_width_95
+        return self.value * float(np.exp(-half_width)), self.value * float(np.exp(half_width))

@@ -16,11 +16,13 @@ from rangesfm.ranging.anchors import Anchor
 from rangesfm.ranging.noise import shared_stddev
 from rangesfm.ranging.observations import RangeObservations, RangeStatus, status_by_weight
 from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
+from rangesfm.scale.cutoff import cutoff_test
 from rangesfm.scale.estimate import ScaleEstimate
-from rangesfm.scale.problem import survey_problem
+from rangesfm.scale.problem import SurveyProblem, survey_problem
+from rangesfm.scale.sensitivity import scale_sensitivity
 from rangesfm.scale.solution import Solution, solve_survey
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
-from rangesfm.scale.uncertainty import resampled_log_scales, scale_uncertainty
+from rangesfm.scale.uncertainty import CURVE_STDDEV_M, resampled_log_scales, scale_uncertainty
 from rangesfm.scale.verdict import judge
 from rangesfm.trajectory import Trajectory
 
@@ -56,22 +58,24 @@ def initialize_scale(
     options, range_model = options or ScaleOptions(), range_model or RangeModelOptions()
     survey = survey_problem(observations, trajectory, anchors, anchor_frame, range_model, distances)
     blocks = _time_blocks(observations, survey.rows, options.bootstrap_block_s)
+    shared = shared_stddev(observations.log)[survey.rows]
     solution = solve_survey(
         survey.ranges,
         anchors_are_known=survey.anchors_are_known,
         center_stddev=observations.center_stddev[survey.rows],
         noise_stddev_m=_given_noise(observations, survey.rows, range_model),
-        shared_stddev_m=shared_stddev(observations.log)[survey.rows],
+        shared_stddev_m=shared,
         groups=blocks * survey.ranges.num_anchors + survey.ranges.anchor_index,
         seed=seed,
     )
     table = _paper_table(solution)
-    uncertainty = scale_uncertainty(
-        solution.problem, solution.fit, blocks, num_bootstrap=options.num_bootstrap, seed=seed
-    )
+    curve_stddev = shared if observations.log.shared_stddev_m is not None else np.full(len(shared), CURVE_STDDEV_M)
+    uncertainty = scale_uncertainty(solution, blocks, curve_stddev, num_bootstrap=options.num_bootstrap, seed=seed)
     per_anchor = scale_per_anchor(solution, observations.log.anchor_ids)
     found = anchor_estimates(survey, solution, observations.log.anchor_ids)
-    verdict, reasons = judge(survey, solution, uncertainty, per_anchor, found, options)
+    tests = cutoff_test(solution, shared)
+    judged = judge(survey, solution, uncertainty, per_anchor, found, tests, options)
+    verdict, reasons = judged.verdict, judged.reasons
     if options.method == "two-candidate":
         robust = solution.fit.state.metric_from_model.scale
         verdict = "doubtful"
@@ -87,6 +91,11 @@ def initialize_scale(
         uncertainty=uncertainty,
         verdict=verdict,
         reasons=reasons,
+        advice=judged.advice,
+        cutoff_test=tests,
+        sensitivity=scale_sensitivity(
+            solution, _model_from_cam(observations, trajectory, survey), observations.log.anchor_ids
+        ),
         per_anchor=per_anchor,
         two_candidate=table,
         anchors=found,
@@ -101,6 +110,13 @@ def initialize_scale(
 def _resampled_scales(solution: Solution, blocks: npt.NDArray[np.int64], num: int, seed: int) -> Array:
     steps = resampled_log_scales(solution.fit, blocks, num=num, seed=seed)
     return np.asarray(solution.fit.state.metric_from_model.scale * np.exp(steps))
+
+
+def _model_from_cam(observations: RangeObservations, trajectory: Trajectory, survey: SurveyProblem) -> Array:
+    """(k, 3, 3) rotation at the keyframe nearest to each range, into the first camera's frame."""
+    nearest = np.where(observations.weight < 0.5, observations.before, observations.after)[survey.rows]
+    turned: Array = survey.first_camera_from_sfm.rotation @ trajectory.world_from_cam[nearest]
+    return turned
 
 
 def _time_blocks(observations: RangeObservations, rows: npt.NDArray[np.int64], block_s: float) -> npt.NDArray[np.int64]:

@@ -11,29 +11,46 @@ import numpy.typing as npt
 
 from rangesfm.scale.estimate import ScaleUncertainty
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, predicted_ranges
+from rangesfm.scale.solution import Solution
 
 Array = npt.NDArray[np.float64]
 
-# Sizes of unmodelled errors that calibrated radios show: an offset common to all anchors, and a
-# short-range error that fades with distance. Every anchor has the latter alike, so no resampling sees it.
-_COMMON_OFFSET_M = 0.03
-_SHORT_RANGE_ERROR_M = 0.15
-_SHORT_RANGE_LENGTH_M = 2.0
+# How wrong a radio's range may be as a smooth function of distance, where no error curve was learnt: the DW1000's
+# own error changes by 0.05 to 0.1 m when the distance grows e-fold (Decawave application note APS011), in either
+# direction once antennas and cases have their say. Every anchor has it alike, so no resampling sees it.
+CURVE_STDDEV_M = 0.07
+_CURVE_LOG_LENGTH = 1.0
+_NUM_CURVE_KNOTS = 25
+_MIN_DISTANCE_M = 0.05
 # Where most ranges are outliers, so that the curvature says nothing.
 _MIN_CURVATURE = 0.3
 
 
 def scale_uncertainty(
-    problem: RangeProblem, fit: RangeFit, blocks: npt.NDArray[np.int64], *, num_bootstrap: int, seed: int
+    solution: Solution,
+    blocks: npt.NDArray[np.int64],
+    curve_stddev_m: Array,
+    *,
+    num_bootstrap: int,
+    seed: int,
 ) -> ScaleUncertainty:
-    """Relative stddevs of the scale of ``fit``; ``blocks`` (n,) labels stretches of time."""
+    """Relative stddevs of the scale.
+
+    Args:
+        blocks: (n,) labels of stretches of time.
+        curve_stddev_m: (n,) what ranges of about this length may be off together.
+    """
+    problem, fit = solution.problem, solution.fit
     anchor_blocks = problem.anchor_index
     present = np.unique(anchor_blocks)
     return ScaleUncertainty(
         formal=fit.log_scale_stddev,
         bootstrap=_bootstrap(fit, blocks, num_bootstrap, seed),
         jackknife=_jackknife(fit, anchor_blocks) if len(present) >= 3 else None,
-        range_model=_range_model_sensitivity(problem, fit),
+        range_model=_range_model_stddev(problem, fit, curve_stddev_m),
+        correlated=fit.log_scale_stddev * solution.inflation,
+        num_blocks=len(np.unique(blocks)),
+        num_anchors=len(present),
     )
 
 
@@ -105,8 +122,11 @@ def _jackknife(fit: RangeFit, anchor_blocks: npt.NDArray[np.int64]) -> float:
     return float(np.sqrt((num - 1) / num * np.sum((steps - steps.mean()) ** 2)))
 
 
-def _range_model_sensitivity(problem: RangeProblem, fit: RangeFit) -> float:
-    distance = predicted_ranges(problem, fit.state)
-    offset = scale_shift(fit, problem, np.full(len(distance), _COMMON_OFFSET_M))
-    short = scale_shift(fit, problem, _SHORT_RANGE_ERROR_M * np.exp(-distance / _SHORT_RANGE_LENGTH_M))
-    return float(np.hypot(offset, short))
+def _range_model_stddev(problem: RangeProblem, fit: RangeFit, curve_stddev_m: Array) -> float:
+    """What an error curve with this stddev, smooth in the logarithm of distance, does to the scale."""
+    place = np.log(np.maximum(predicted_ranges(problem, fit.state), _MIN_DISTANCE_M))
+    knots = np.linspace(place.min(), place.max() + 1e-6, _NUM_CURVE_KNOTS)
+    hats = np.column_stack([np.interp(place, knots, unit) for unit in np.eye(_NUM_CURVE_KNOTS)])
+    shifts = np.array([scale_shift(fit, problem, hat * curve_stddev_m) for hat in hats.T])
+    correlation = np.exp(-0.5 * ((knots[:, None] - knots) / _CURVE_LOG_LENGTH) ** 2)
+    return float(np.sqrt(max(shifts @ correlation @ shifts, 0.0)))

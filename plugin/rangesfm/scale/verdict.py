@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,17 +11,41 @@ from rangesfm.errors import GeometryError
 from rangesfm.geometry import path_shape
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.anchors import AnchorEstimate
-from rangesfm.scale.estimate import ScaleUncertainty
+from rangesfm.scale.cutoff import scale_drift
+from rangesfm.scale.estimate import NORMAL_95, CutoffTest, ScaleUncertainty
 from rangesfm.scale.problem import SurveyProblem
 from rangesfm.scale.range_equation import RangeFit
 from rangesfm.scale.solution import NEARLY_STRAIGHT, Solution
 
-# Relative stddev of the scale from which it is called doubtful.
-DOUBTFUL_ABOVE = 0.02
+# Half of the 95 % interval of the scale, relative, from which it is called doubtful.
+DOUBTFUL_ABOVE = 0.04
+# Smaller changes with the least range are no news to a surveyor.
+_MIN_DRIFT_PERCENT = 1.0
 _PLANAR = 0.05
 _MANY_OUTLIERS = 0.3
 _FEW_RANGES = 50
 _MAX_ANCHOR_SPREAD = 0.03
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What to think of a scale.
+
+    Attributes:
+        verdict: "good" or "doubtful".
+        reasons: why.
+        advice: what to do next time.
+    """
+
+    verdict: str
+    reasons: tuple[str, ...]
+    advice: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Doubt:
+    reason: str
+    advice: str
 
 
 def judge(
@@ -29,60 +54,101 @@ def judge(
     uncertainty: ScaleUncertainty,
     per_anchor: dict[str, float],
     anchors: Sequence[AnchorEstimate],
+    cutoff_tests: tuple[CutoffTest, ...],
     options: ScaleOptions,
-) -> tuple[str, tuple[str, ...]]:
-    """The verdict ("good" or "doubtful") and its reasons.
+) -> Verdict:
+    """The verdict, by the 95 % interval and by what makes even that doubtful.
 
     Raises:
         GeometryError: refused, as the scale is less certain than ``options.max_relative_stddev``.
     """
-    relative = max(uncertainty.empirical, uncertainty.formal)
+    half_width = uncertainty.half_width_95
     doubts = [
-        *survey.notes,
+        *(_Doubt(note, "survey three anchors or more that are not on one line") for note in survey.notes),
         *_path_doubts(solution, anchors),
         *_range_doubts(solution.fit),
         *_anchor_doubts(per_anchor),
+        *_drift_doubts(cutoff_tests),
     ]
-    if relative > options.max_relative_stddev:
-        why = f" ({doubts[0]})" if doubts else ": walk a wider path, or survey the anchors"
+    if half_width > NORMAL_95 * options.max_relative_stddev:
+        why = f"{doubts[0].reason}; " if doubts else ""
         raise GeometryError(
-            f"the scale is only known to {100 * relative:.1f} % (1 stddev), "
-            f"more than the {100 * options.max_relative_stddev:g} % allowed{why}"
+            f"the scale is only known to {100 * half_width / NORMAL_95:.1f} % (1 stddev), "
+            f"more than the {100 * options.max_relative_stddev:g} % allowed: {why}"
+            f"next time: {_what_narrows_it(solution, uncertainty)}"
         )
-    summary = f"the scale is known to {100 * relative:.2f} % (1 stddev)"
-    if relative > DOUBTFUL_ABOVE:
-        doubts.insert(0, f"{summary}, worse than {100 * DOUBTFUL_ABOVE:g} %")
-    return ("doubtful", tuple(doubts)) if doubts else ("good", (summary,))
+    summary = f"the scale is known to {100 * half_width:.1f} % (95 % interval)"
+    if half_width > DOUBTFUL_ABOVE:
+        worse = _Doubt(f"{summary}, worse than {100 * DOUBTFUL_ABOVE:g} %", _what_narrows_it(solution, uncertainty))
+        doubts.insert(0, worse)
+    if not doubts:
+        return Verdict("good", (summary,), ())
+    advice = dict.fromkeys(doubt.advice for doubt in doubts)
+    return Verdict("doubtful", tuple(doubt.reason for doubt in doubts), tuple(advice))
 
 
-def _path_doubts(solution: Solution, anchors: Sequence[AnchorEstimate]) -> list[str]:
+def _what_narrows_it(solution: Solution, uncertainty: ScaleUncertainty) -> str:
+    """Advice by the largest part of the uncertainty."""
+    seen = max(uncertainty.bootstrap, uncertainty.correlated)
+    if uncertainty.range_model > max(seen, uncertainty.jackknife or 0.0):
+        return (
+            "calibrate the radio (rangesfm ranges calibrate), or tape a distance; failing that, keep the anchors "
+            "farther from the path"
+        )
+    if uncertainty.jackknife is not None and uncertainty.jackknife > seen:
+        return "survey the anchors again, and place them where they see the whole path"
+    if np.isinf(solution.problem.anchor_stddev_m).any():
+        return "walk a wider or longer loop, or survey the anchors"
+    return "walk a wider or longer loop"
+
+
+def _path_doubts(solution: Solution, anchors: Sequence[AnchorEstimate]) -> list[_Doubt]:
     stddevs = path_shape(solution.problem.centers).stddevs
-    doubts = []
     if stddevs[1] < NEARLY_STRAIGHT * stddevs[0]:
+        bend = "walk a bend or a loop instead of a straight line"
         if np.isinf(solution.problem.anchor_stddev_m).any():
-            doubts.append("the path is nearly straight: an unknown anchor can lie anywhere on a circle around it")
-        elif solution.problem.frame_is_free:
-            doubts.append("the path is nearly straight: how the map is turned about it rests on little")
+            reason = "the path is nearly straight: an unknown anchor can lie anywhere on a circle around it"
+            return [_Doubt(reason, f"{bend}, or survey the anchors")]
+        if solution.problem.frame_is_free:
+            return [_Doubt("the path is nearly straight: how the map is turned about it rests on little", bend)]
     elif stddevs[2] < _PLANAR * stddevs[0] and any(a.mirror_position_m is not None for a in anchors):
-        doubts.append("the path is nearly flat: the side of the unknown anchors is open (the scale is not)")
-    return doubts
+        reason = "the path is nearly flat: the side of the unknown anchors is open (the scale is not)"
+        return [_Doubt(reason, "raise and lower the camera on the way, or survey the anchors")]
+    return []
 
 
-def _range_doubts(fit: RangeFit) -> list[str]:
+def _range_doubts(fit: RangeFit) -> list[_Doubt]:
     doubts = []
     if len(fit.weights) < _FEW_RANGES:
-        doubts.append(f"only {len(fit.weights)} ranges lie on the path")
+        reason = f"only {len(fit.weights)} ranges lie on the path"
+        doubts.append(_Doubt(reason, "range more often, and all along the path"))
     outliers = float(np.mean(fit.weights < 0.1))
     if outliers > _MANY_OUTLIERS:
-        doubts.append(f"{100 * outliers:.0f} % of the ranges do not fit")
+        reason = f"{100 * outliers:.0f} % of the ranges do not fit"
+        doubts.append(_Doubt(reason, "place the anchors where nothing stands between them and the path"))
     return doubts
 
 
-def _anchor_doubts(per_anchor: dict[str, float]) -> list[str]:
+def _anchor_doubts(per_anchor: dict[str, float]) -> list[_Doubt]:
     """Anchors that disagree on the scale."""
     if len(per_anchor) < 2:
         return []
     spread = float(np.std(np.log(np.array(list(per_anchor.values()))), ddof=1))
     if spread <= _MAX_ANCHOR_SPREAD:
         return []
-    return [f"the anchors disagree on the scale: each alone, they spread by {100 * spread:.1f} %"]
+    reason = f"the anchors disagree on the scale: each alone, they spread by {100 * spread:.1f} %"
+    return [_Doubt(reason, "check the anchors' positions and delays, and place them in the open")]
+
+
+def _drift_doubts(tests: tuple[CutoffTest, ...]) -> list[_Doubt]:
+    """A scale that moves as short ranges are left out."""
+    drift = scale_drift(tests)
+    if drift is None or abs(percent := 100 * (drift.scale / tests[0].scale - 1)) < _MIN_DRIFT_PERCENT:
+        return []
+    reason = (
+        f"the radio reads short ranges wrong: without those under {drift.min_range_m:g} m the scale would change by "
+        f"{percent:+.1f} %"
+    )
+    return [
+        _Doubt(reason, "calibrate the radio (rangesfm ranges calibrate), and keep the anchors farther from the path")
+    ]
