@@ -102,6 +102,7 @@ def read_table(
     *,
     aliases: Mapping[str, str] | None = None,
     separator: str | None = ",",
+    header: Sequence[str] | None = None,
 ) -> Table:
     """Read the named columns of a file; others are ignored.
 
@@ -110,6 +111,7 @@ def read_table(
         optional: columns that it may have.
         aliases: other names by which a file may call them, ``{name in the file: name}``.
         separator: one character; a blank means any run of blanks; None: told from the header row.
+        header: names of all columns, of a file that has no header row, or one that is a comment.
 
     Raises:
         InputError: the file is missing, empty or not text, lacks a column, or has a row with too
@@ -118,6 +120,8 @@ def read_table(
     path = Path(path)
     text = read_text(path)
     header_row, header_line, body = _split_header(text)
+    if header is not None and separator is not None:
+        header_row, header_line, body = separator.join(header), 0, text
     if not header_row:
         raise InputError(f"the file is empty, expected a header row with {_listed(required)}", path)
     if separator is None:

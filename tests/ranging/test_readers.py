@@ -246,6 +246,38 @@ def test_miluv_log_is_recognised_whatever_the_order_of_its_columns(tmp_path: Pat
     np.testing.assert_array_equal(log.timestamp_s, [1.1735])
 
 
+INROL = """\
+# index timestamp anchor_id r
+0 0.032284736633 6 2.410469089846
+1 0.012478828430 2 1.746998299780
+2 0.012478828430 1 1.003056942908
+3 0.032284736633 7 3.113442167141
+"""
+
+
+def test_inrols_text_is_recognised_by_its_comment(tmp_path: Path) -> None:
+    log = read_ranges(write(tmp_path, INROL))
+    assert (log.format, log.anchor_ids, log.tag_ids) == ("inrol", ("6", "2", "1", "7"), ("tag",))
+    np.testing.assert_array_equal(log.timestamp_s, [0.032284736633, 0.012478828430, 0.012478828430, 0.032284736633])
+    np.testing.assert_array_equal(log.range_m, [2.410469089846, 1.746998299780, 1.003056942908, 3.113442167141])
+    np.testing.assert_array_equal(log.line, [2, 3, 4, 5])
+
+
+def test_line_of_inrols_text_that_was_cut_off_is_refused_with_its_number(tmp_path: Path) -> None:
+    error = refusal(write(tmp_path, INROL[:-18]))
+    assert error.line == 5
+    assert "has 3 cells" in str(error)
+    error = refusal(write(tmp_path, INROL.replace("1.7469", "1.7x469")))
+    assert error.line == 3
+    assert "r is '1.7x4698299780'" in str(error)
+    assert "fixed columns" in str(refusal(write(tmp_path, INROL), range_unit="mm"))
+
+
+def test_other_texts_of_inrols_are_no_log(tmp_path: Path) -> None:
+    for header in ("# anchor_id tx ty tz qx qy qz qw", "# index timestamp image_name"):
+        assert "not a known log format" in str(refusal(write(tmp_path, f"{header}\n1 2 3 4\n")))
+
+
 def test_unknown_log_is_refused_naming_the_known_formats(tmp_path: Path) -> None:
     error = refusal(write(tmp_path, "distances 7.10 5.24\n"))
     assert "distances 7.10" in str(error)
@@ -279,6 +311,70 @@ def test_any_cells_under_a_good_header_are_a_log_or_an_input_error(
         for options in ({}, {"columns": columns, "timestamp_unit": unit, "range_unit": "mm"}):
             with contextlib.suppress(InputError):
                 assert len(read_ranges(path, **options)) > 0  # type: ignore[arg-type]
+
+
+HEADERS = (
+    "time_s,range,from_id,to_id",
+    "timestamp,range,from_id,to_id",
+    "t,ID_Tag,ID_Anchor,range",
+    "image_name,anchor_id,range_m,tag_id",
+)
+
+
+@any_bytes_in_one_folder
+@given(
+    rows=st.lists(st.lists(cells, min_size=3, max_size=5), max_size=5),
+    header=st.sampled_from(HEADERS),
+    known=st.sets(st.sampled_from(["1", "a", "0"])),
+)
+def test_any_cells_under_the_header_of_a_preset_are_a_log_or_an_input_error(
+    tmp_path: Path, rows: list[list[str]], header: str, known: set[str]
+) -> None:
+    path = write(tmp_path, (header + "\n" + "\n".join(",".join(row) for row in rows)).encode())
+    with contextlib.suppress(InputError):
+        assert len(read_ranges(path, anchor_ids=known)) > 0
+
+
+@any_bytes_in_one_folder
+@given(rows=st.lists(st.lists(cells, min_size=4, max_size=9), max_size=4), num=st.sampled_from([4, 6]))
+def test_any_time_stamps_are_a_log_or_an_input_error(tmp_path: Path, rows: list[list[str]], num: int) -> None:
+    header = ",".join(["t", "node", *("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")[:num]])
+    path = write(tmp_path, (header + "\n" + "\n".join(",".join(row) for row in rows)).encode())
+    with contextlib.suppress(InputError):
+        assert len(read_ranges(path, columns={"timestamp": "t", "anchor_id": "node"})) > 0
+
+
+@any_bytes_in_one_folder
+@given(rows=st.lists(st.lists(cells, max_size=5), max_size=5))
+def test_any_cells_of_inrols_text_are_a_log_or_an_input_error(tmp_path: Path, rows: list[list[str]]) -> None:
+    path = write(tmp_path, ("# index timestamp anchor_id r\n" + "\n".join(" ".join(row) for row in rows)).encode())
+    with contextlib.suppress(InputError):
+        assert len(read_ranges(path)) > 0
+
+
+@any_bytes_in_one_folder
+@given(
+    good=st.integers(0, 6),
+    row=st.lists(cells, min_size=1, max_size=5),
+    format=st.sampled_from(["canonical", "starloc", "uwb_init", "inrol"]),
+)
+def test_only_a_wrong_line_can_spoil_a_good_log_and_is_told(
+    tmp_path: Path, good: int, row: list[str], format: str
+) -> None:
+    header, line = {
+        "canonical": ("timestamp_s,anchor_id,range_m", "0.5,a,1.5"),
+        "starloc": ("time_s,range,from_id,to_id", "0.5,1.5,t,a"),
+        "uwb_init": ("t,ID_Tag,ID_Anchor,range", "0.5,t,a,1.5"),
+        "inrol": ("# index timestamp anchor_id r", "0 0.5 a 1.5"),
+    }[format]
+    spoilt = (" " if format == "inrol" else ",").join(row)
+    lines = [header, *[line] * (good + 1), spoilt]
+    told = len(lines)
+    try:
+        read_ranges(write(tmp_path, "\n".join(lines).encode()))
+    except InputError as error:
+        told = error.line or 0
+    assert told >= len(lines)
 
 
 @any_bytes_in_one_folder

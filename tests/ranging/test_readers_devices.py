@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from rangesfm.errors import InputError
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges, reader_names
+from rangesfm.ranging.summary import summarize_ranges
 
 LEC = (
     "DIST,4,AN0,022E,7.94,8.03,0.00,3.44,AN1,9280,7.95,0.00,0.00,5.68,AN2,DCAE,0.00,8.03,0.00,7.76,"
@@ -88,6 +89,28 @@ def test_lines_with_the_hosts_time_are_recognised_and_read(
     assert ranges_by_anchor(log) == ranges
     np.testing.assert_array_equal(log.timestamp_s, [1615984968.807] * len(log))
     np.testing.assert_array_equal(log.line, [2] * len(log))
+
+
+def test_line_without_a_fix_has_ranges_all_the_same(tmp_path: Path) -> None:
+    line = "DIST,3,AN0,2F2F,3.05,2.68,0.00,2.20,AN1,2ED0,3.02,0.00,0.00,2.23,AN2,0487,0.00,0.00,0.00,3.18"
+    log = read_ranges(write(tmp_path, f"1.5 {line}\n"))
+    assert ranges_by_anchor(log) == {"2F2F": [2.2], "2ED0": [2.23], "0487": [3.18]}
+
+
+def test_name_of_the_command_before_a_line_is_no_time_and_no_hindrance(tmp_path: Path) -> None:
+    log = read_ranges(write(tmp_path, f"1.5 les : {LES}\n2.5 les : {LES}\n"))
+    np.testing.assert_array_equal(log.timestamp_s, [1.5] * 4 + [2.5] * 4)
+
+
+def test_lines_that_come_twice_are_kept_and_counted(tmp_path: Path) -> None:
+    log = read_ranges(write(tmp_path, f"1.5 {LEC}\n1.5 {LEC}\n"))
+    assert summarize_ranges(log).num_duplicates == 4
+
+
+def test_tenths_of_a_metre_are_noticed(tmp_path: Path) -> None:
+    lines = [f'{k} {{"links":[{{"A":"1782","R":"{1 + (k % 7) / 10:.1f}"}}]}}' for k in range(30)]
+    log = read_ranges(write(tmp_path, "\n".join(lines)))
+    assert summarize_ranges(log).quantization_m == 0.1
 
 
 @pytest.mark.parametrize(

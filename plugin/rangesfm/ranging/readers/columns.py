@@ -34,6 +34,7 @@ class Columns:
         timestamp_unit: one of TIMESTAMP_UNITS.
         range_unit: one of UNITS_PER_METRE, also of range_stddev.
         separator: between cells; None: told from the header row.
+        header: names of all columns where the file's own header row is a comment; needs the separator.
         negative_is_no_measurement: as 0 is, and as an empty cell is then; otherwise they are errors.
         stamps: how time stamps become ranges, where there is no range.
     """
@@ -43,6 +44,7 @@ class Columns:
     timestamp_unit: str = "s"
     range_unit: str = "m"
     separator: str | None = None
+    header: tuple[str, ...] | None = None
     negative_is_no_measurement: bool = False
     stamps: StampOptions = field(default_factory=StampOptions)
 
@@ -56,7 +58,13 @@ def read_columns(path: Path, columns: Columns, format: str) -> RangeLog:
     Raises:
         InputError: with the line, for whatever is not a time, an id or a range; also if no range is left.
     """
-    table = read_table(path, [*columns.required.values()], [*columns.optional.values()], separator=columns.separator)
+    table = read_table(
+        path,
+        [*columns.required.values()],
+        [*columns.optional.values()],
+        separator=columns.separator,
+        header=columns.header,
+    )
     name = {key: column for key, column in {**columns.optional, **columns.required}.items() if column in table}
     ranges = _ranges(table, name["range"], columns) if "range" in name else _ranges_by_stamps(table, name, columns)
     timestamps = _timestamps(table, name["timestamp"], columns.timestamp_unit) if "timestamp" in name else None

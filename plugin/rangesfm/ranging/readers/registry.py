@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from rangesfm.ranging.readers import canonical, dwm1001, leaps, makerfabs, mapped, mauwb, qorvo, ros
+from rangesfm.ranging.readers import canonical, dwm1001, inrol, leaps, makerfabs, mapped, mauwb, qorvo, ros
 from rangesfm.ranging.readers.reader import Reader
 
 READERS: tuple[Reader, ...] = (
     ros.READER,
     canonical.READER,
     *mapped.READERS,
+    inrol.READER,
     leaps.MEAS,
     leaps.LEA,
     dwm1001.LEC,
