@@ -505,3 +505,46 @@ class TestCtrlC:
         lines = interrupt_when(lambda: any(tmp_path.glob("yard/.images.*")), start("demo", "yard", cwd=tmp_path))
         assert lines[-1] == "rangesfm: error: interrupted; stages that were done are kept"
         assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (
+            "[refine]\n[refine.bundle_adjustment]\nrefine_extra_parms = true",
+            r"^survey.toml:3: unknown key 'refine_extra_par",
+        ),
+        (
+            "[refine]\nbundle_adjustment.print_summary = 3",
+            r"^survey.toml:2: .* print_summary is 3, expected true or false",
+        ),
+        ("[refine.bundle_adjustment.ceres]\nloss_scle = 1", r"^survey.toml:2: unknown key 'loss_scle' in \[refine.bun"),
+    ],
+)
+def test_option_that_the_adjustment_does_not_take_is_named_with_its_line(
+    content: str, said: str, own_survey: WalkedSurvey, refusal: Refusal
+) -> None:
+    (own_survey.folder / "survey.toml").write_text(content)
+    assert re.search(said, refusal("refine", "survey.toml", *own_survey.flags, "--output_path", "out"))
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("[mapper]\n\nmin_num_machtes = 3", r"^survey.toml:3: unknown key 'min_num_machtes'"),
+        (
+            "[mapper.pipeline]\nmin_num_matches = 'x'",
+            r"^survey.toml:2: .* min_num_matches is 'x', expected a whole numb",
+        ),
+        ("[mapper]\n[mapper.features.sift]\nnum_octavs = 3", r"^survey.toml:3: unknown key 'num_octavs'"),
+        ("[mapper.matcher]\nnum_threads = 0\nuse_gpuu = true", r"^survey.toml:3: unknown key 'use_gpuu'"),
+    ],
+)
+def test_option_that_the_mapper_does_not_take_is_named_with_its_line(
+    content: str, said: str, own_survey: WalkedSurvey, refusal: Refusal
+) -> None:
+    (own_survey.folder / "photos").mkdir()
+    for name in "abc":
+        (own_survey.folder / "photos" / f"{name}.jpg").touch()
+    (own_survey.folder / "survey.toml").write_text(content)
+    assert re.search(said, refusal("reconstruct", "survey.toml", "--images", "photos", "--output_path", "out"))

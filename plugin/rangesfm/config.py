@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from rangesfm.errors import InputError
+from rangesfm.errors import InputError, OptionError
 from rangesfm.options import (
     ANCHOR_FRAMES,
     EXPORT_FRAMES,
@@ -124,6 +125,7 @@ class Survey:
         export: what to write beside the COLMAP models, and in which frame.
         output_path: folder of the results.
         seed: of everything random.
+        source: the survey file, for messages; no setting.
     """
 
     images_path: Path | None = None
@@ -149,11 +151,24 @@ class Survey:
     report_enabled: bool = True
     output_path: Path = Path("out")
     seed: int = 0
+    source: Source = field(default_factory=Source, repr=False, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, fit for JSON."""
-        plain: dict[str, Any] = _plain(asdict(self))
+        plain: dict[str, Any] = _plain(asdict(replace(self, source=Source())))
+        del plain["source"]
         return plain
+
+    @contextmanager
+    def naming_its_lines(self) -> Iterator[None]:
+        """Say in which line of the survey file an option stands that a stage finds wrong."""
+        try:
+            yield
+        except OptionError as error:
+            # Keys of [mapper] that are not ours are the pipeline's.
+            tables = (error.table, error.table.replace("mapper.pipeline", "mapper"))
+            found = [self.source.error(str(error), table, error.key) for table in tables]
+            raise next((named for named in found if named.line is not None), found[0]) from None
 
 
 def read_survey(
@@ -200,7 +215,7 @@ def _survey(tables: Mapping[str, Any], folder: Path, overrides: Mapping[str, obj
         export=reader.table("export").options(ExportOptions),
     )
     reader.refuse_unknown()
-    return survey
+    return replace(survey, source=source)
 
 
 class _SurveyReader:

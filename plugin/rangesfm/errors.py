@@ -27,6 +27,15 @@ class InputError(RangesfmError):
         super().__init__(where + message)
 
 
+class OptionError(InputError):
+    """An option that is passed through to another library, which does not take it: a key of a table."""
+
+    def __init__(self, message: str, table: str, key: str | None = None):
+        self.table = table
+        self.key = key
+        super().__init__(message)
+
+
 class GeometryError(RangesfmError):
     """The geometry does not determine what was asked; the text says what and why."""
 

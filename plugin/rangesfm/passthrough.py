@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rangesfm.colmap_log import colmap_log
-from rangesfm.errors import InputError
+from rangesfm.errors import OptionError
 from rangesfm.tables import printable
 
 _EXPECTED = {
@@ -33,7 +33,7 @@ def apply_options(options: Any, values: Mapping[str, Any], table: str) -> None:
         table: what the user calls this table, for messages (for example ``"mapper.pipeline"``).
 
     Raises:
-        InputError: an unknown key (names the nearest known one), a value of another type, or
+        OptionError: an unknown key (names the nearest known one), a value of another type, or
             values that COLMAP itself refuses (with its reason).
     """
     _assign(options, values, table)
@@ -52,7 +52,8 @@ def _assign(options: Any, values: Mapping[str, Any], table: str) -> None:
     for key, value in values.items():
         if key not in known:
             nearest = nearest_known(key, known)
-            raise InputError(f"unknown key '{printable(key)}' in [{table}]; the nearest known one is '{nearest}'")
+            message = f"unknown key '{printable(key)}' in [{table}]; the nearest known one is '{nearest}'"
+            raise OptionError(message, table, key)
         # On the type: asking a pycolmap object for an attribute that it lacks writes to its log.
         if hasattr(type(known[key]), "todict"):
             if not isinstance(value, Mapping):
@@ -88,9 +89,9 @@ def _check(options: Any, table: str) -> None:
             accepted = options.check()
         if not accepted:
             found = re.search(r"Check failed: (.*)", log.read_text(errors="replace"))
-            raise InputError(f"[{table}] COLMAP refuses a value" + (f", expected {found[1]}" if found else ""))
+            raise OptionError(f"[{table}] COLMAP refuses a value" + (f", expected {found[1]}" if found else ""), table)
 
 
-def _wrong_value(table: str, key: str, value: Any, expected: str) -> InputError:
+def _wrong_value(table: str, key: str, value: Any, expected: str) -> OptionError:
     shown = f"'{value}'" if isinstance(value, str) else "a table" if isinstance(value, Mapping) else str(value)
-    return InputError(f"[{table}] {key} is {printable(shown)}, expected {expected}")
+    return OptionError(f"[{table}] {key} is {printable(shown)}, expected {expected}", table, key)

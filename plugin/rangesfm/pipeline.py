@@ -6,6 +6,7 @@ Scale Estimation and Drift Mitigation", 2018, with other means where real radios
 
 from __future__ import annotations
 
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -77,16 +78,17 @@ def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> 
     """Photos and ranges to a metric model. Steps of the reconstruction that are done are reused."""
     journal = Journal(progress)
     inputs = _read_inputs(survey, journal)
-    keyframes = _keyframes(survey, journal)
-    _check_times(survey, inputs, _path_without_places(keyframes))
+    keyframes, times = _keyframes(survey, journal, log_names_photos=inputs.log.image_name is not None)
+    _check_times(survey, inputs, _path_without_places(keyframes, times))
     sfm = _reconstruct(survey, keyframes, journal, restart)
-    return _to_metric(survey, inputs, sfm, keyframes, journal, refine=survey.refine.enabled)
+    return _to_metric(survey, inputs, sfm, times, journal, refine=survey.refine.enabled)
 
 
 def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> RunResult:
     """Photos to an unscaled model."""
     journal = Journal(progress)
-    sfm = _reconstruct(survey, _keyframes(survey, journal), journal, restart)
+    keyframes, _ = _keyframes(survey, journal)
+    sfm = _reconstruct(survey, keyframes, journal, restart)
     path = survey.output_path / "sparse" / "0"
     line = f"unscaled model: {sfm.num_reg_images()} photos, {sfm.num_points3D()} points, in {path}"
     return RunResult(survey.output_path, {"seconds": journal.all_seconds(), "warnings": journal.warnings}, (line,))
@@ -177,7 +179,8 @@ def _to_metric(
 def _read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
     """Everything that can be wrong is found before the long work begins."""
     check_formats(survey.export.formats)
-    apply_options(pycolmap.BundleAdjustmentOptions(), survey.refine.bundle_adjustment, table="refine.bundle_adjustment")
+    with survey.naming_its_lines():
+        apply_options(pycolmap.BundleAdjustmentOptions(), survey.refine.bundle_adjustment, "refine.bundle_adjustment")
     refuse_to_overwrite(
         (
             survey.ranges.path,
@@ -195,12 +198,24 @@ def _read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
     return inputs
 
 
-def _keyframes(survey: Survey, journal: Journal) -> ImageTimes:
-    """The photos to reconstruct, in time order."""
+def _keyframes(
+    survey: Survey, journal: Journal, *, log_names_photos: bool | None = None
+) -> tuple[tuple[str, ...], ImageTimes | None]:
+    """The photos to reconstruct and their times; without times, where none are needed, in the order of their names.
+
+    Args:
+        log_names_photos: then no photo is left out for want of a time; None: there is no log.
+    """
     folder = _images_path(survey)
     with journal.timed("keyframes"):
-        image_times = _noted(find_image_times(folder, list_images(folder), survey.image_times_path), journal)
-        return image_times.of(select_keyframes(image_times, survey.keyframes))
+        names = list_images(folder)
+        image_times = None
+        with nullcontext() if survey.image_times_path or log_names_photos is False else suppress(InputError):
+            image_times = find_image_times(folder, names, survey.image_times_path)
+        if image_times is None or (log_names_photos and not survey.image_times_path and image_times.num_left_out):
+            return select_keyframes(names, survey.keyframes), None
+        keyframes = select_keyframes(image_times, survey.keyframes)
+        return keyframes, _noted(image_times, journal).of(keyframes)
 
 
 def _check_times(survey: Survey, inputs: RangingInputs, path: Trajectory) -> None:
@@ -212,18 +227,21 @@ def _check_times(survey: Survey, inputs: RangingInputs, path: Trajectory) -> Non
         _observations(survey, inputs, path, offset_s or 0.0)
 
 
-def _path_without_places(times: ImageTimes) -> Trajectory:
-    n = len(times)
-    rotations = np.tile(np.eye(3), (n, 1, 1))
-    return Trajectory(np.arange(n), times.image_names, times.timestamps_s, np.zeros((n, 3)), rotations)
+def _path_without_places(keyframes: tuple[str, ...], times: ImageTimes | None) -> Trajectory:
+    n = len(keyframes)
+    timestamps_s = None if times is None else times.timestamps_s
+    return Trajectory(np.arange(n), keyframes, timestamps_s, np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))
 
 
-def _reconstruct(survey: Survey, keyframes: ImageTimes, journal: Journal, restart: bool) -> pycolmap.Reconstruction:
+def _reconstruct(
+    survey: Survey, keyframes: tuple[str, ...], journal: Journal, restart: bool
+) -> pycolmap.Reconstruction:
     """Map the keyframes into ``sparse``; returns ``sparse/0``."""
-    with forgetting_result_if_changed(survey.output_path / "sparse" / "0", survey.output_path):
+    forgetting = forgetting_result_if_changed(survey.output_path / "sparse" / "0", survey.output_path)
+    with survey.naming_its_lines(), forgetting:
         summary = reconstruct(
             _images_path(survey),
-            keyframes.image_names,
+            keyframes,
             survey.output_path,
             camera=survey.camera,
             mapper=survey.mapper,

@@ -264,12 +264,12 @@ def test_inrols_text_is_recognised_by_its_comment(tmp_path: Path) -> None:
 
 
 def test_line_of_inrols_text_that_was_cut_off_is_refused_with_its_number(tmp_path: Path) -> None:
-    error = refusal(write(tmp_path, INROL[:-18]))
+    error = refusal(write(tmp_path, INROL[:-16]))
     assert error.line == 5
     assert "has 3 cells" in str(error)
     error = refusal(write(tmp_path, INROL.replace("1.7469", "1.7x469")))
     assert error.line == 3
-    assert "r is '1.7x4698299780'" in str(error)
+    assert "r is '1.7x46998299780'" in str(error)
     assert "fixed columns" in str(refusal(write(tmp_path, INROL), range_unit="mm"))
 
 

@@ -59,3 +59,10 @@ def test_all_conditions_hold_together() -> None:
 def test_refuses_options_that_leave_nothing_to_reconstruct(options: dict[str, float], message: str) -> None:
     with pytest.raises(InputError, match=message):
         select(photos_at(*range(10)), **options)
+
+
+def test_photos_without_times_keep_the_order_of_their_names() -> None:
+    names = [f"{k}.jpg" for k in range(10)]
+    assert select_keyframes(names, KeyframeOptions(every_nth=3)) == ("0.jpg", "3.jpg", "6.jpg", "9.jpg")
+    with pytest.raises(InputError, match="min_interval_s is 1, but the photos have no times"):
+        select_keyframes(names, KeyframeOptions(min_interval_s=1.0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -15,8 +16,8 @@ MIN_NUM_KEYFRAMES = 3
 _ROUNDING_S = 1e-6  # of a difference of two times that are seconds since 1970
 
 
-def select_keyframes(image_times: ImageTimes, options: KeyframeOptions) -> tuple[str, ...]:
-    """Names of the keyframes in time order.
+def select_keyframes(photos: ImageTimes | Sequence[str], options: KeyframeOptions) -> tuple[str, ...]:
+    """Names of the keyframes in time order; of photos without times, their names alone, in the order given.
 
     First every n-th photo, of those the ones far enough apart in time, and of those evenly as many
     as are allowed; the first photo always is a keyframe.
@@ -25,17 +26,20 @@ def select_keyframes(image_times: ImageTimes, options: KeyframeOptions) -> tuple
         InputError: an option that makes no sense, or fewer than three keyframes left.
     """
     _check(options)
-    kept = np.arange(0, len(image_times), options.every_nth)
+    names = photos.image_names if isinstance(photos, ImageTimes) else tuple(photos)
+    kept = np.arange(0, len(names), options.every_nth)
     if options.min_interval_s > 0:
-        kept = kept[_far_enough_apart(image_times.timestamps_s[kept], options.min_interval_s)]
+        if not isinstance(photos, ImageTimes):
+            raise InputError(f"min_interval_s is {options.min_interval_s:g}, but the photos have no times")
+        kept = kept[_far_enough_apart(photos.timestamps_s[kept], options.min_interval_s)]
     if options.max_num_keyframes is not None and len(kept) > options.max_num_keyframes:
         kept = kept[np.linspace(0, len(kept) - 1, options.max_num_keyframes).round().astype(int)]
     if len(kept) < MIN_NUM_KEYFRAMES:
         raise InputError(
-            f"{len(kept)} of {len(image_times)} photos chosen as keyframes, expected at least {MIN_NUM_KEYFRAMES}"
+            f"{len(kept)} of {len(names)} photos chosen as keyframes, expected at least {MIN_NUM_KEYFRAMES}"
             f" (every_nth {options.every_nth}, min_interval_s {options.min_interval_s:g})"
         )
-    return tuple(image_times.image_names[index] for index in kept)
+    return tuple(names[index] for index in kept)
 
 
 def _far_enough_apart(timestamps_s: np.typing.NDArray[np.float64], min_interval_s: float) -> list[int]:
