@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -184,7 +184,7 @@ def format_table(rows: tuple[ComparisonRow, ...]) -> str:
         )
         for row in rows
     ]
-    return _align([header, *cells])
+    return align_rows([header, *cells])
 
 
 @dataclass(frozen=True)
@@ -288,7 +288,7 @@ def format_models(comparison: ModelComparison) -> str:
         f"{comparison.num_keyframes} keyframes moved by {comparison.mean_displacement_m:.4f} m on average, "
         f"at most {comparison.max_displacement_m:.4f} m"
     )
-    return f"{_align(rows)}\n{moved}"
+    return f"{align_rows(rows)}\n{moved}"
 
 
 @dataclass(frozen=True)
@@ -379,7 +379,7 @@ def _text(value: float | None, spec: str, unit: str = "") -> str:
     return "-" if value is None else f"{value:{spec}}{unit}"
 
 
-def _align(rows: list[tuple[str, ...]]) -> str:
+def align_rows(rows: Sequence[tuple[str, ...]]) -> str:
     """Columns as wide as their longest cell: the first to the left, the others to the right."""
     widths = [max(len(cell) for cell in column) for column in zip(*rows)]
     lines = []

@@ -18,6 +18,7 @@ from rangesfm.geometry import Similarity
 from rangesfm.georeference import Georeference
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.tables import read_table
+from rangesfm.trajectory import Trajectory
 
 if TYPE_CHECKING:
     import pycolmap
@@ -175,6 +176,41 @@ class ResultFolder:
             keyframe_after=tuple(after),
             weight=table.numbers("weight", empty=np.nan) if "weight" in table else np.full(len(table), np.nan),
         )
+
+    @property
+    def has_ranges(self) -> bool:
+        return (self.path / "ranges.csv").is_file()
+
+    def range_residuals_m(self, path: Trajectory) -> Array:
+        """(k,) predicted minus measured with other cameras, of the ranges used between photos that ``path`` has.
+
+        Anchors and their biases are the result's; the radio stands between two photos on the
+        straight line (a run itself follows the curve).
+
+        Raises:
+            InputError: the files are not what a run writes.
+        """
+        ranges, anchors = self.read_ranges(), self.anchor_positions_m
+        if ranges is None:
+            return np.zeros(0)
+        with self._expecting("anchors"):
+            biases = {id_: float(self.summary["anchors"][id_].get("range_bias_m") or 0.0) for id_ in anchors}
+        with self._expecting("settings"):
+            given = (self.summary.get("settings") or {}).get("tag_in_cam_m") or (0.0, 0.0, 0.0)
+            tag_in_cam_m = np.array(given, dtype=np.float64).reshape(3)
+        index = {name: i for i, name in enumerate(path.image_names)}
+        before = np.array([index.get(name, -1) for name in ranges.keyframe_before], dtype=np.int64)
+        after = np.array([index.get(name, -1) for name in ranges.keyframe_after], dtype=np.int64)
+        has_anchor = np.isin(np.array(ranges.anchor_id, dtype=str), list(anchors))
+        rows = np.flatnonzero(ranges.is_used & has_anchor & (before >= 0) & (after >= 0) & np.isfinite(ranges.weight))
+        before, after, weight = before[rows], after[rows], ranges.weight[rows, None]
+        centers = (1 - weight) * path.centers[before] + weight * path.centers[after]
+        nearest = np.where(weight[:, 0] < 0.5, before, after)
+        ids = [ranges.anchor_id[row] for row in rows]
+        places = np.array([anchors[id_] for id_ in ids], dtype=np.float64).reshape(-1, 3)
+        tags = centers + path.world_from_cam[nearest] @ tag_in_cam_m
+        predicted = np.linalg.norm(tags - places, axis=1) + np.array([biases[id_] for id_ in ids])
+        return np.asarray(predicted - ranges.range_m[rows])
 
     def read_numbers(self, name: str, columns: Sequence[str]) -> dict[str, Array] | None:
         """Columns of numbers of ``name``.csv, NaN where a cell is empty; None if not there."""

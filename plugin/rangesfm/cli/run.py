@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
 from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.cli.survey_flags import (
@@ -19,6 +20,10 @@ from rangesfm.cli.survey_flags import (
 )
 from rangesfm.progress import Progress
 
+if TYPE_CHECKING:
+    from rangesfm.config import Survey
+    from rangesfm.pipeline import RunResult
+
 
 def add_command(commands: Commands) -> None:
     parser = commands.add(
@@ -31,6 +36,7 @@ def add_command(commands: Commands) -> None:
     add_survey_arguments(parser, RECONSTRUCTION_FLAGS, RANGE_FLAGS, REFINE_FLAGS)
     add_model_argument(parser)
     add_restart_argument(parser)
+    parser.add_argument("--live", action="store_true", help="keep live.html, a page to watch, in the output folder")
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
@@ -40,10 +46,20 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     else:
         require_model(survey)
     require_ranges(survey)
+    if not args.live:
+        return Outcome(_run(survey, progress, args.restart).summary_lines())
+    from rangesfm.report.live import live_page
+
+    with live_page(progress, survey.output_path) as page:
+        page.message(f"this run can be watched in {page.path}")
+        result = _run(survey, page, args.restart)
+        page.finish(survey.output_path / "report.html" if survey.report_enabled else None)
+    return Outcome(result.summary_lines())
+
+
+def _run(survey: Survey, progress: Progress, restart: bool) -> RunResult:
     from rangesfm.pipeline import refine_model, run_survey
 
     if survey.model_path is None:
-        result = run_survey(survey, progress=progress, restart=args.restart)
-    else:
-        result = refine_model(survey, progress=progress)
-    return Outcome(result.summary_lines())
+        return run_survey(survey, progress=progress, restart=restart)
+    return refine_model(survey, progress=progress)

@@ -6,17 +6,24 @@ from pathlib import Path
 
 from rangesfm.files import new_file
 from rangesfm.report.content import gather
+from rangesfm.report.figures import all_figures
 from rangesfm.report.page import render
+from rangesfm.report.pictures import write_pictures
 from rangesfm.result_folder import read_result_folder
 
-__all__ = ["write_report"]
+__all__ = ["write_report", "write_report_pictures"]
+
+PICTURES_FOLDER = "figures"
 
 
-def write_report(result_folder: Path) -> Path:
+def write_report(result_folder: Path, *, images_path: Path | None = None) -> Path:
     """Write ``report.html`` into a run's output folder.
 
     The page shows what the folder holds: ``result.json`` must be there; ``ranges.csv``,
     ``images.csv``, ``reference.csv`` (in the map's frame) and the models may be.
+
+    Args:
+        images_path: folder of the photos, for thumbnails; None: where the run had them, if they are still there.
 
     Returns:
         The page's path.
@@ -24,8 +31,17 @@ def write_report(result_folder: Path) -> Path:
     Raises:
         InputError: the folder is not a result, or a file in it cannot be read.
     """
-    page = render(gather(read_result_folder(result_folder)))
+    page = render(gather(read_result_folder(result_folder), images_path=images_path))
     path = result_folder / "report.html"
     with new_file(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return path
+
+
+def write_report_pictures(result_folder: Path) -> list[Path]:
+    """Write the report's figures as PNG files into ``figures`` in a run's output folder; returns their paths.
+
+    Raises:
+        InputError: as ``write_report``, or matplotlib is not installed.
+    """
+    return write_pictures(all_figures(gather(read_result_folder(result_folder))), result_folder / PICTURES_FOLDER)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
@@ -34,11 +35,11 @@ class Summary:
     """``result.json``, read so that a missing or odd part is None instead of an error."""
 
     def __init__(self, values: dict[str, Any]):
-        self._values = values
+        self.values = values
 
     def get(self, *keys: str) -> Any:
         """The value under nested keys; None if there is none."""
-        value: Any = self._values
+        value: Any = self.values
         for key in keys:
             value = value.get(key) if isinstance(value, dict) else None
         return value
@@ -93,6 +94,7 @@ class Content:
         cameras: intrinsics in the scaled and in the final model.
         true_scale: the path before the refinement with the reference's scale; None if that is not known.
         reference_by_photo: (3,) by name, in the map's frame.
+        images_path: folder of the photos; None where it is not known.
         tables: columns of the small tables beside the result (see TABLES), by name; those there are.
     """
 
@@ -109,6 +111,7 @@ class Content:
     cameras: tuple[CameraIntrinsics, ...]
     true_scale: Trajectory | None
     reference_by_photo: dict[str, Array]
+    images_path: Path | None
     tables: dict[str, dict[str, Array]]
 
     @property
@@ -135,8 +138,11 @@ class Content:
         return str(self.summary.get("frame") or "first_camera")
 
 
-def gather(result: ResultFolder) -> Content:
+def gather(result: ResultFolder, *, images_path: Path | None = None) -> Content:
     """Read what the report needs.
+
+    Args:
+        images_path: folder of the photos; None: where the run had them.
 
     Raises:
         InputError: a file of the result is there but cannot be read.
@@ -149,6 +155,7 @@ def gather(result: ResultFolder) -> Content:
     reference_path = result.path / "reference.csv"
     reference = read_reference(reference_path) if reference_path.is_file() else None
     summary = Summary(result.summary)
+    known = summary.get("settings", "images_path")
     return Content(
         title=result.path.resolve().name,
         summary=summary,
@@ -163,6 +170,7 @@ def gather(result: ResultFolder) -> Content:
         cameras=() if final is None else _cameras(scaled, refined, final),
         true_scale=None if path_scaled is None else _with_true_scale(path_scaled, summary),
         reference_by_photo={} if reference is None else dict(zip(reference.image_names or (), reference.positions_m)),
+        images_path=images_path or (Path(known) if isinstance(known, str) else None),
         tables={name: table for name, columns in TABLES.items() if (table := result.read_numbers(name, columns))},
     )
 

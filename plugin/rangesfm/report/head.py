@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 
 from rangesfm.report.checks import larger_stddev
 from rangesfm.report.content import Content, Summary, as_number
 from rangesfm.report.markup import Child, Markup, element
+from rangesfm.report.numbers import keyed
 from rangesfm.report.text import count, decimals_for, duration, fixed, plain, signed
 from rangesfm.report.traffic_lights import traffic_light
 
@@ -53,20 +57,29 @@ def _scale(summary: Summary) -> Markup:
     plus_minus = None if stddev is None else element("span", f" ± {fixed(stddev, decimals)}", class_="plus-minus")
     lines: list[Child] = [
         element("p", "Metres per unit of the unscaled model", class_="name"),
-        element("p", fixed(value, decimals), plus_minus, class_="scale-value"),
+        element("p", keyed("scale.value", value, fixed(value, decimals)), plus_minus, class_="scale-value"),
     ]
     interval = scale_interval(summary)
     if value and stddev is not None and interval is not None:
         low, high = (fixed(end, decimals) for end in interval)
         lines.append(element("p", f"± {fixed(100.0 * stddev / value, 2, '%')} · 95 % interval {low} to {high}"))
-    stddevs = [(kind, summary.number("scale", f"stddev_{kind}")) for kind in ("formal", "empirical")]
-    known = [f"{kind} {fixed(number, decimals_for(number, default=5))}" for kind, number in stddevs if number]
+    known = _stddevs(summary)
     if known:
-        text = f"The larger of the standard deviations found: {', '.join(known)}."
-        lines.append(element("p", text, class_="small"))
+        lines.append(element("p", "The larger of the standard deviations found: ", known, ".", class_="small"))
     if summary.get("scale", "method") is not None:
         lines.append(element("p", f"Method: {plain(summary.get('scale', 'method'))}", class_="small"))
     return element("div", lines, class_="scale")
+
+
+def _stddevs(summary: Summary) -> list[Child]:
+    """The formal and the empirical stddev, as far as they are known."""
+    parts: list[Child] = []
+    for kind in ("formal", "empirical"):
+        number = summary.number("scale", f"stddev_{kind}")
+        if number:
+            text = fixed(number, decimals_for(number, default=5))
+            parts += [f"{', ' if parts else ''}{kind} ", keyed(f"scale.stddev_{kind}", number, text)]
+    return parts
 
 
 def scale_interval(summary: Summary) -> tuple[float, float] | None:
@@ -84,36 +97,37 @@ def scale_interval(summary: Summary) -> tuple[float, float] | None:
 def _tiles(content: Content) -> Markup:
     summary, path = content.summary, content.final
     num_points = None if content.points_m is None else len(content.points_m)
-    tiles = [
+
+    def shown(key: str, write: Callable[[Any], str]) -> Child:
+        value = summary.number(*key.split("."))
+        return keyed(key, value, write(value))
+
+    def metres(value: Any) -> str:
+        return fixed(value, 3, "m")
+
+    num_checks = summary.number("check_ranges", "num") or 0
+    tiles: list[tuple[str, Child, Child]] = [
         (
             "Keyframes",
             count(None if path is None else len(path)),
             f"path of {fixed(_path_length_m(content), 2, 'm')}",
         ),
-        (
-            "Ranges used",
-            count(summary.number("ranges", "num_used")),
-            f"of {count(summary.number('ranges', 'num'))} in the log",
-        ),
-        (
-            "Range RMS",
-            fixed(summary.number("ranges", "rms_m"), 3, "m"),
-            f"median {fixed(summary.number('ranges', 'median_abs_m'), 3, 'm')}",
-        ),
+        ("Ranges used", shown("ranges.num_used", count), ["of ", shown("ranges.num", count), " in the log"]),
+        ("Range RMS", shown("ranges.rms_m", metres), ["median ", shown("ranges.median_abs_m", metres)]),
         (
             "Check range RMS",
-            fixed(summary.number("check_ranges", "rms_m"), 3, "m"),
-            f"{count(summary.number('check_ranges', 'num') or 0)} held out",
+            shown("check_ranges.rms_m", metres),
+            [keyed("check_ranges.num", num_checks, count(num_checks)), " held out"],
         ),
         (
             "Reprojection RMS",
-            fixed(summary.number("refine", "reprojection_rms_px"), 2, "px"),
+            shown("refine.reprojection_rms_px", lambda value: fixed(value, 2, "px")),
             f"{count(num_points)} map points",
         ),
         (
             "Clock offset",
-            signed(summary.number("time_offset", "value_s"), 3, "s"),
-            f"± {fixed(summary.number('time_offset', 'stddev_s'), 4, 's')}",
+            shown("time_offset.value_s", lambda value: signed(value, 3, "s")),
+            ["± ", shown("time_offset.stddev_s", lambda value: fixed(value, 4, "s"))],
         ),
         ("Time taken", duration(_total_seconds(summary)), "all stages"),
     ]

@@ -37,9 +37,15 @@ def render(content: Content) -> str:
     return document(f"{content.title} – rangesfm report", content.title, head(content), parts)
 
 
-def document(title: str, heading: str, *parts: Child) -> str:
-    """A whole self-contained page."""
-    script = view_script()
+def document(title: str, heading: str, *parts: Child, has_script: bool = True, reload: str | None = None) -> str:
+    """A whole self-contained page.
+
+    Args:
+        has_script: whether it holds a view or buttons that need the page's script.
+        reload: seconds after which it loads itself anew, or goes elsewhere ("0; url=..."); None: never.
+    """
+    script = view_script() if has_script else None
+    policy = CONTENT_POLICY.format(script="'none'" if script is None else policy_source(script))
     return "<!DOCTYPE html>\n" + element(
         "html",
         element(
@@ -50,8 +56,9 @@ def document(title: str, heading: str, *parts: Child) -> str:
             element(
                 "meta",
                 http_equiv="Content-Security-Policy",
-                content=CONTENT_POLICY.format(script=policy_source(script)),
+                content=policy,
             ),
+            None if reload is None else element("meta", http_equiv="refresh", content=reload),
             element("title", title),
             [element("style", Markup((ASSETS / name).read_text(encoding="utf-8"))) for name in STYLES],
         ),
@@ -63,7 +70,7 @@ def document(title: str, heading: str, *parts: Child) -> str:
                 element("h1", heading),
             ),
             element("main", parts),
-            element("script", Markup(script)),
+            None if script is None else element("script", Markup(script)),
         ),
         lang="en",
     )

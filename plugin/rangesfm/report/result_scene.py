@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.report.content import Content, as_number, is_position
+from rangesfm.report.content import Content, Summary, as_number, is_position
 from rangesfm.report.head import scale_interval
 from rangesfm.report.scene import Scene, SceneAnchor, ScenePath
 from rangesfm.trajectory import Trajectory
@@ -22,19 +22,18 @@ def scene_of(content: Content) -> Scene | None:
     if content.final is None or len(content.final) == 0:
         return None
     interval, value = scale_interval(content.summary), content.summary.number("scale", "value")
-    images = content.summary.get("settings", "images_path")
     return Scene(
         frame=content.frame,
         paths=paths,
         points_m=_or_empty(content.points_m, np.float64),
         points_rgb=_or_empty(content.points_rgb, np.uint8),
-        anchors=_anchors(content),
+        anchors=anchors_in_scene(content.summary.values, content.anchors_m),
         ranges=content.ranges,
         range_times_s=content.range_times_s,
         true_ranges_m=content.true_ranges_m,
         tag_in_cam_m=content.tag_in_cam_m,
         frustum_shape=content.cameras[0].half_angles if content.cameras else (0.6, 0.4),
-        images_path=Path(images) if isinstance(images, str) else None,
+        images_path=content.images_path,
         scale_interval=None if interval is None or not value else (interval[0] / value, interval[1] / value),
     )
 
@@ -42,11 +41,11 @@ def scene_of(content: Content) -> Scene | None:
 def _paths(content: Content) -> tuple[ScenePath, ...]:
     paths = []
     if content.reference_m is not None:
-        paths.append(ScenePath("reference", "reference", "reference", _of_positions(content.reference_m), False))
+        paths.append(ScenePath("reference", "Reference", "reference", _of_positions(content.reference_m), False))
     if content.scaled is not None and len(content.scaled):
-        paths.append(ScenePath("scaled", "cameras, scaled only", "before", content.scaled))
+        paths.append(ScenePath("scaled", "Cameras, scaled only", "before", content.scaled))
     if content.refined is not None and len(content.refined):
-        paths.append(ScenePath("refined", "cameras, refined", "after", content.refined))
+        paths.append(ScenePath("refined", "Cameras, refined", "after", content.refined))
     return tuple(paths)
 
 
@@ -56,11 +55,13 @@ def _of_positions(positions_m: Array) -> Trajectory:
     return Trajectory(np.arange(n), tuple(map(str, range(n))), None, positions_m, nowhere)
 
 
-def _anchors(content: Content) -> tuple[SceneAnchor, ...]:
+def anchors_in_scene(summary: dict[str, Any], positions_m: Mapping[str, Array]) -> tuple[SceneAnchor, ...]:
+    """Anchors at their positions, with what ``result.json`` says of their errors and mirror images."""
+    reader = Summary(summary)
     found = []
-    for anchor_id, position_m in content.anchors_m.items():
-        stddev = content.summary.get("anchors", anchor_id, "stddev_m")
-        mirror = content.summary.get("anchors", anchor_id, "mirror_position_m")
+    for anchor_id, position_m in positions_m.items():
+        stddev = reader.get("anchors", anchor_id, "stddev_m")
+        mirror = reader.get("anchors", anchor_id, "mirror_position_m")
         stddev_m = np.array(stddev if is_position(stddev) else [_number_or_nan(stddev)] * 3, dtype=np.float64)
         mirror_m = np.array(mirror, dtype=np.float64) if is_position(mirror) else None
         found.append(SceneAnchor(anchor_id, position_m, stddev_m, mirror_m))

@@ -18,30 +18,30 @@ WIDE = 600
 def checks(content: Content) -> Markup | None:
     """Traffic lights with their limits."""
     cards = [card(check) for check in quality_checks(content.summary)]
-    return _section("checks", "Quality checks", element("div", cards, class_="checks"))
+    return section("checks", "Quality checks", element("div", cards, class_="checks"))
 
 
 def view(content: Content) -> Markup | None:
     """The map in 3-D."""
     scene = scene_of(content)
-    return None if scene is None else _section("view-section", "Map in 3-D", scene_view(scene))
+    return None if scene is None else section("view-section", "Map in 3-D", scene_view(scene))
 
 
 def path(content: Content) -> Markup | None:
     """The path in plan and elevation, and the paper's table."""
-    return _section("path", "Path", _figures(content, "path"), tables.comparison(content))
+    return section("path", "Path", _figures(content, "path"), tables.comparison(content))
 
 
 def scale(content: Content) -> Markup | None:
     """The scale from each anchor, how it was found, and the paper's two candidates."""
-    return _section(
+    return section(
         "scale", "Scale", _figures(content, "scale"), tables.two_candidates(content), tables.sensitivity(content)
     )
 
 
 def ranges(content: Content) -> Markup | None:
     """Residuals over time, their distribution, and what became of the ranges of each anchor."""
-    return _section(
+    return section(
         "ranges",
         "Ranges",
         _figures(content, "ranges"),
@@ -52,14 +52,14 @@ def ranges(content: Content) -> Markup | None:
 
 def anchors(content: Content) -> Markup | None:
     """Where the anchors are, and what a tape says."""
-    return _section("anchors", "Anchors", tables.anchors(content), tables.distances(content))
+    return section("anchors", "Anchors", tables.anchors(content), tables.distances(content))
 
 
 def run(content: Content) -> Markup | None:
     """How the result came about."""
     columns = _columns(tables.stages(content), tables.refinement(content), tables.versions(content))
     parts = (tables.intrinsics(content), tables.inputs(content), tables.settings(content))
-    return _section("run", "Run", columns, *parts)
+    return section("run", "Run", columns, *parts)
 
 
 def _figures(content: Content, section: str) -> list[Markup]:
@@ -82,6 +82,7 @@ def _columns(*parts: Markup | None) -> Markup | None:
     return element("div", known, class_="columns") if known else None
 
 
-def _section(id_: str, title: str, *parts: Child) -> Markup | None:
+def section(id_: str, title: str, *parts: Child) -> Markup | None:
+    """A card with a heading; None without anything in it."""
     known = [part for part in parts if part]
     return element("section", element("h2", title), known, id=id_, class_="card") if known else None

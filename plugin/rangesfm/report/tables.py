@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from rangesfm.report.content import Content, Summary, as_number, in_natural_order, is_position
 from rangesfm.report.markup import Child, Markup, element
+from rangesfm.report.numbers import keyed
 from rangesfm.report.text import count, duration, fixed, plain, signed
 
 Array = npt.NDArray[np.float64]
@@ -22,7 +23,7 @@ def range_statuses(content: Content) -> Markup | None:
         return None
     statuses = Counter(content.ranges.status)
     rows = [[name, count(num), fixed(100.0 * num / statuses.total(), 1, "%")] for name, num in statuses.most_common()]
-    return _table("What became of the ranges", ["status", "ranges", "share"], rows)
+    return table("What became of the ranges", ["status", "ranges", "share"], rows)
 
 
 def ranges_per_anchor(content: Content) -> Markup | None:
@@ -41,24 +42,25 @@ def ranges_per_anchor(content: Content) -> Markup | None:
             row += [_fixed_or_nothing(known**2, np.mean, root=True), _fixed_or_nothing(known, np.median)]
         rows.append(row)
     header = ["anchor", "ranges", "used", "scaled: RMS m", "median m", "refined: RMS m", "median m"]
-    return _table("Ranges of each anchor", header, rows)
+    return table("Ranges of each anchor", header, rows)
 
 
 def comparison(content: Content) -> Markup | None:
     """The paper's table."""
-    given = content.summary.get("comparison")
+    columns = (
+        ("rmse_m", fixed, 4),
+        ("rmse_se3_m", fixed, 4),
+        ("rmse_sim3_m", fixed, 4),
+        ("scale_error_percent", signed, 3),
+    )
     rows = [
         [
             plain(row.get("name")),
-            fixed(row.get("rmse_m"), 4),
-            fixed(row.get("rmse_se3_m"), 4),
-            fixed(row.get("rmse_sim3_m"), 4),
-            signed(row.get("scale_error_percent"), 3),
+            *(keyed(f"comparison.{i}.{key}", row.get(key), write(row.get(key), n)) for key, write, n in columns),
         ]
-        for row in (given if isinstance(given, list) else [])
-        if isinstance(row, dict)
+        for i, row in _rows_of(content, "comparison")
     ]
-    return _table(
+    return table(
         "Keyframe centres against the reference",
         ["trajectory", "RMSE m", "after SE(3) m", "after Sim(3) m", "scale error %"],
         rows,
@@ -66,16 +68,29 @@ def comparison(content: Content) -> Markup | None:
     )
 
 
+def _rows_of(content: Content, key: str) -> list[tuple[int, dict[str, Any]]]:
+    """Entries of a list of the result, each with its place in it; whatever is not an object is left out."""
+    given = content.summary.get(key)
+    return [(i, row) for i, row in enumerate(given if isinstance(given, list) else []) if isinstance(row, dict)]
+
+
 def two_candidates(content: Content) -> Markup | None:
     """Mean and standard deviation of the paper's two branches."""
     given = content.summary.table("scale", "two_candidate")
     branches = [(name, given.get(name)) for name in ("alpha0", "alpha1")]
     rows = [
-        [name, plain(branch.get("mean")), plain(branch.get("std")), "chosen" if given.get("chosen") == name else ""]
+        [
+            name,
+            *(
+                keyed(f"scale.two_candidate.{name}.{key}", branch.get(key), plain(branch.get(key)))
+                for key in ("mean", "std")
+            ),
+            "chosen" if given.get("chosen") == name else "",
+        ]
         for name, branch in branches
         if isinstance(branch, dict)
     ]
-    return _table(
+    return table(
         "The paper's two candidates",
         ["branch", "mean", "stddev", ""],
         rows,
@@ -89,10 +104,15 @@ def anchors(content: Content) -> Markup | None:
     rows = [
         [
             anchor_id,
-            *_coordinates(anchor.get("position_m")),
-            " ".join(fixed(value, 3) for value in _as_list(anchor.get("stddev_m"))),
+            *_keyed_coordinates(f"anchors.{anchor_id}.position_m", anchor.get("position_m")),
+            [
+                [keyed(f"anchors.{anchor_id}.{key}", value, fixed(value, 3)), " "]
+                for key, value in _stddevs(anchor.get("stddev_m"))
+            ],
             *(signed(value, 3) for value in _difference(anchor)),
-            signed(anchor.get("range_bias_m"), 3),
+            keyed(
+                f"anchors.{anchor_id}.range_bias_m", anchor.get("range_bias_m"), signed(anchor.get("range_bias_m"), 3)
+            ),
             " ".join(_coordinates(anchor["mirror_position_m"])) if anchor.get("mirror_position_m") else "none",
         ]
         for anchor_id, anchor in content.summary.table("anchors").items()
@@ -100,7 +120,7 @@ def anchors(content: Content) -> Markup | None:
     ]
     header = ["anchor", "x m", "y m", "z m", "stddev m", "Δx m", "Δy m", "Δz m", "range bias m", "mirror image at m"]
     note = "Δ: estimated minus surveyed position, where it was surveyed."
-    return _table("Anchors in the map's frame", header, rows, note)
+    return table("Anchors in the map's frame", header, rows, note)
 
 
 def _difference(anchor: dict[str, Any]) -> list[float | None]:
@@ -113,21 +133,17 @@ def _difference(anchor: dict[str, Any]) -> list[float | None]:
 
 def distances(content: Content) -> Markup | None:
     """Taped distances, those that held the scale and those that check it."""
-    given = content.summary.get("distances")
+    columns = (("measured_m", fixed), ("stddev_m", fixed), ("estimated_m", fixed), ("residual_m", signed))
     rows = [
         [
             f"{plain(row.get('from'))} to {plain(row.get('to'))}",
             plain(row.get("kind")),
-            fixed(row.get("measured_m"), 4),
-            fixed(row.get("stddev_m"), 4),
-            fixed(row.get("estimated_m"), 4),
-            signed(row.get("residual_m"), 4),
+            *(keyed(f"distances.{i}.{key}", row.get(key), write(row.get(key), 4)) for key, write in columns),
         ]
-        for row in (given if isinstance(given, list) else [])
-        if isinstance(row, dict)
+        for i, row in _rows_of(content, "distances")
     ]
     header = ["distance", "kind", "by tape m", "stddev m", "in the map m", "difference m"]
-    return _table("Control and check distances", header, rows)
+    return table("Control and check distances", header, rows)
 
 
 def intrinsics(content: Content) -> Markup | None:
@@ -143,24 +159,27 @@ def intrinsics(content: Content) -> Markup | None:
         for camera in content.cameras
         for name, before, after in camera.parameters
     ]
-    return _table("Cameras", header[:num_columns], rows)
+    return table("Cameras", header[:num_columns], rows)
 
 
 def sensitivity(content: Content) -> Markup | None:
     """How the scale answers to what was assumed, where the run tells."""
     rows = _flattened(content.summary, "scale", "cutoff_test") + _flattened(content.summary, "scale", "sensitivity")
-    return _table("How the scale answers to what was assumed", [], rows)
+    return table("How the scale answers to what was assumed", [], rows)
 
 
 def inputs(content: Content) -> Markup | None:
     """The files that the result was made from."""
-    given = content.summary.get("inputs")
     rows = [
-        [plain(row.get("path")), count(row.get("bytes")), plain(row.get("sha256")), plain(row.get("hashed"))]
-        for row in (given if isinstance(given, list) else [])
-        if isinstance(row, dict)
+        [
+            plain(row.get("path")),
+            keyed(f"inputs.{i}.bytes", row.get("bytes"), count(row.get("bytes"))),
+            plain(row.get("sha256")),
+            plain(row.get("hashed")),
+        ]
+        for i, row in _rows_of(content, "inputs")
     ]
-    return _table("Inputs", ["file", "bytes", "SHA-256", "of"], rows, class_="settings")
+    return table("Inputs", ["file", "bytes", "SHA-256", "of"], rows, class_="settings")
 
 
 def stages(content: Content) -> Markup | None:
@@ -176,23 +195,26 @@ def stages(content: Content) -> Markup | None:
         ]
         for name, value in known.items()
     ]
-    return _table("Time", ["stage", "time", ""], rows, class_="stages")
+    return table("Time", ["stage", "time", ""], rows, class_="stages")
 
 
 def refinement(content: Content) -> Markup | None:
     """What the solver did."""
-    rows = [[name.replace("_", " "), plain(value)] for name, value in content.summary.table("refine").items()]
-    return _table("Refinement", [], rows)
+    rows = [
+        [name.replace("_", " "), keyed(f"refine.{name}", value, plain(value))]
+        for name, value in content.summary.table("refine").items()
+    ]
+    return table("Refinement", [], rows)
 
 
 def versions(content: Content) -> Markup | None:
     """What the result was made with."""
-    return _table("Versions", [], _flattened(content.summary, "versions"))
+    return table("Versions", [], _flattened(content.summary, "versions"))
 
 
 def settings(content: Content) -> Markup | None:
     """What was asked for."""
-    return _table("Settings", [], _flattened(content.summary, "settings"), class_="settings")
+    return table("Settings", [], _flattened(content.summary, "settings"), class_="settings")
 
 
 def _fixed_or_nothing(values: Array, measure: Any, *, root: bool = False) -> str:
@@ -207,8 +229,16 @@ def _coordinates(position: Any) -> list[str]:
     return [fixed(value, 3) for value in values]
 
 
-def _as_list(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else [value]
+def _keyed_coordinates(key: str, position: Any) -> list[Child]:
+    values = position if is_position(position) else [None] * 3
+    return [keyed(f"{key}.{axis}", value, fixed(value, 3)) for axis, value in enumerate(values)]
+
+
+def _stddevs(value: Any) -> list[tuple[str, Any]]:
+    """One for all coordinates or one for each, with their keys."""
+    if isinstance(value, list):
+        return [(f"stddev_m.{axis}", item) for axis, item in enumerate(value)]
+    return [("stddev_m", value)]
 
 
 def _flattened(summary: Summary, *keys: str) -> list[list[str]]:
@@ -222,7 +252,7 @@ def _flattened(summary: Summary, *keys: str) -> list[list[str]]:
     return rows
 
 
-def _table(
+def table(
     caption: str,
     header: Sequence[str],
     rows: Sequence[Sequence[Child]],

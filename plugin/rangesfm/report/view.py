@@ -44,7 +44,7 @@ def _stage(scene: Scene) -> Markup:
 
 def _layers(scene: Scene) -> Markup:
     layers = [("points", "Map points", "map-point")] if len(scene.points_m) else []
-    layers += [(path.id, _capitalized(path.name), path.color) for path in scene.paths]
+    layers += [(path.id, path.name, path.color) for path in scene.paths]
     layers += [("anchors", "Anchors", "anchor")] if scene.anchors else []
     layers += [("grid", "Grid", "grid")]
     boxes = [_checkbox("layer", id_, name, swatch=swatch) for id_, name, swatch in layers]
@@ -96,8 +96,9 @@ def _photo(scene: Scene, *, has_ranges: bool) -> Markup | None:
     thumbnail = element(
         "div", element("img", alt=""), element("p", "No picture of this photo here.", class_="small no-thumbnail")
     )
-    text = element("div", element("h3"), element("p", class_="place"), element("p", class_="num-ranges small"))
-    ranges = element("div", table, class_="scroll photo-ranges", tabindex="0") if has_ranges else element("div", table)
+    num_ranges = element("p", class_="num-ranges small") if has_ranges else None
+    text = element("div", element("h3"), element("p", class_="place"), num_ranges)
+    ranges = element("div", table, class_="scroll photo-ranges", tabindex="0") if has_ranges else None
     return element("div", slider, element("div", thumbnail, text, ranges, class_="photo", aria_live="polite"))
 
 
@@ -121,7 +122,3 @@ def _group(name: str, *parts: Child) -> Markup:
 def _checkbox(name: str, value: str, text: str, *, is_checked: bool = True, swatch: str | None = None) -> Markup:
     box = element("input", type="checkbox", name=name, value=value, checked="" if is_checked else None)
     return element("label", box, element("i", class_=f"swatch {swatch}") if swatch else None, text)
-
-
-def _capitalized(name: str) -> str:
-    return name[:1].upper() + name[1:]

@@ -8,7 +8,7 @@ class PhotoPanel {
     this.scene = scene;
     this.image = panel.querySelector("img");
     this.note = panel.querySelector(".no-thumbnail");
-    this.body = panel.querySelector("tbody");
+    this.body = panel.querySelector("tbody"); // none where the page has no ranges
   }
 
   show(path, i, ranges, numbers) {
@@ -21,7 +21,7 @@ class PhotoPanel {
     if (thumbnail === undefined) this.image.removeAttribute("src");
     else this.image.src = thumbnail;
     this.image.alt = `Photo ${name}`;
-    this.#list(ranges, numbers);
+    if (this.body !== null) this.#list(ranges, numbers);
   }
 
   #place(path, i) {

@@ -1,0 +1,115 @@
+"""A page that follows a run: it loads itself anew every few seconds, and ends as the report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rangesfm.files import make_output_folder, new_file
+from rangesfm.progress import Progress
+from rangesfm.report.markup import Child, Markup, element
+from rangesfm.report.page import document
+from rangesfm.report.text import count, duration
+
+PAGE_NAME = "live.html"
+RELOAD_S = 2
+_MIN_INTERVAL_S = 1.0
+
+
+class LivePage:
+    """Passes a run's progress on and keeps a page of it up to date."""
+
+    def __init__(self, listener: Progress, folder: Path, *, clock: Callable[[], float] = time.monotonic):
+        make_output_folder(folder)
+        self.path = folder / PAGE_NAME
+        self._listener = listener
+        self._clock = clock
+        self._start = self._stage_start = self._last_written = clock()
+        self._stage: str | None = None
+        self._done: list[tuple[str, float]] = []
+        self._counts: tuple[int, int | None] | None = None
+        self._messages: list[str] = []
+        self._write("The run has begun.", reload=f"{RELOAD_S}")
+
+    def stage(self, name: str) -> None:
+        self._listener.stage(name)
+        self._end_stage()
+        self._stage, self._stage_start = name, self._clock()
+        self._write_running()
+
+    def update(self, num_done: int, num_total: int | None = None) -> None:
+        self._listener.update(num_done, num_total)
+        self._counts = (num_done, num_total)
+        if self._clock() - self._last_written >= _MIN_INTERVAL_S:
+            self._write_running()
+
+    def message(self, text: str) -> None:
+        self._listener.message(text)
+        self._messages.append(text)
+        self._write_running()
+
+    def finish(self, report: Path | None) -> None:
+        """The run is over: from here the reader is taken to the report, if there is one."""
+        self._end_stage()
+        to_report = None if report is None else f"0; url={report.name}"
+        self._write("The run is done.", reload=to_report)
+
+    def fail(self) -> None:
+        """The run stopped before its end."""
+        self._end_stage()
+        self._write("The run stopped before its end; the terminal says why.", reload=None)
+
+    def _end_stage(self) -> None:
+        if self._stage is not None:
+            self._done.append((self._stage, self._clock() - self._stage_start))
+        self._stage = self._counts = None
+
+    def _write_running(self) -> None:
+        self._write(f"Running for {duration(self._clock() - self._start)}.", reload=f"{RELOAD_S}")
+
+    def _write(self, headline: str, *, reload: str | None) -> None:
+        self._last_written = self._clock()
+        page = document(
+            "rangesfm run",
+            self.path.parent.resolve().name,
+            element("section", element("h2", headline), self._stages(), self._notes(), class_="card", id="progress"),
+            has_script=False,
+            reload=reload,
+        )
+        with new_file(self.path) as temporary:
+            temporary.write_text(page, encoding="utf-8")
+
+    def _stages(self) -> Markup:
+        rows = [element("tr", element("th", name, scope="row"), element("td", duration(s))) for name, s in self._done]
+        if self._stage is not None:
+            rows.append(element("tr", element("th", self._stage, scope="row"), element("td", self._progress())))
+        return element("table", element("tbody", rows))
+
+    def _progress(self) -> list[Child]:
+        seconds = self._clock() - self._stage_start
+        if self._counts is None:
+            return ["..."]
+        num_done, num_total = self._counts
+        if num_total is None or num_total <= 0:
+            return [count(num_done)]
+        text = f"{count(num_done)} of {count(num_total)}"
+        if 0 < num_done < num_total:
+            text += f", {duration(seconds * (num_total - num_done) / num_done)} left"
+        return [text, element("progress", value=num_done, max=num_total, aria_label=self._stage)]
+
+    def _notes(self) -> Markup | None:
+        notes = [element("li", message) for message in self._messages]
+        return element("div", element("ul", notes), class_="warnings") if notes else None
+
+
+@contextmanager
+def live_page(listener: Progress, folder: Path) -> Iterator[LivePage]:
+    """A LivePage that says so if the block fails; the block itself finishes it."""
+    page = LivePage(listener, folder)
+    try:
+        yield page
+    except BaseException:
+        page.fail()
+        raise
