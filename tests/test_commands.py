@@ -602,7 +602,7 @@ class TestRunOnPhotos:
 def test_a_run_can_be_watched_and_ends_as_its_report(rangesfm_command: Command, own_survey: WalkedSurvey) -> None:
     flags = (*own_survey.flags, "--anchors", "anchors.csv", "--anchor_frame", "site")
     done = rangesfm_command("run", *flags, "--live", "--output_path", "out", cwd=own_survey.folder)
-    assert "this run can be watched in out/live.html" in done.stderr
+    assert f"this run can be watched in {own_survey.folder / 'out' / 'live.html'}" in done.stderr
     page = (own_survey.folder / "out" / "live.html").read_text(encoding="utf-8")
     assert 'content="0; url=report.html"' in page
     assert (own_survey.folder / "out" / "report.html").is_file()
