@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from rangesfm.report.markup import Markup, element
-from rangesfm.report.plot import Figure, Mark, Panel, Picture, Series, csv_text
+from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Panel, Picture, Series, csv_text
 from rangesfm.report.svg import Chart, equal_chart, legend
 
 MIN_LABEL_DISTANCE_PX = 12.0
@@ -39,6 +39,10 @@ def _download(figure: Figure) -> Markup:
 
 def _with_title(panel: Panel) -> Markup:
     picture = draw_panel(panel)
+    if panel.size[0] >= WIDE_SIZE[0]:
+        picture = element(
+            "div", picture, class_="scroll wide", tabindex="0", role="group", aria_label=panel.description
+        )
     return element("div", element("h3", panel.title), picture) if panel.title else picture
 
 

@@ -169,7 +169,7 @@ def _around(scene: Scene) -> Array:
 
 
 def _box(scene: Scene) -> dict[str, Any]:
-    """Middle and radius of what is to be seen at first, and the height of the ground."""
+    """Corners and radius of what is to be seen at first, and the height of the ground."""
     seen = [_around(scene)]
     if len(scene.points_m):
         seen.append(np.quantile(scene.points_m, [_SEEN_QUANTILE, 1 - _SEEN_QUANTILE], axis=0))
@@ -177,7 +177,7 @@ def _box(scene: Scene) -> dict[str, Any]:
     low, high = corners.min(axis=0), corners.max(axis=0)
     radius = max(float(np.linalg.norm(high - low)) / 2, 1e-3)
     ground = float(low[2]) if scene.frame == "site" else float(high[1])
-    return {"center": ((low + high) / 2).tolist(), "radius": radius, "ground": ground}
+    return {"low": low.tolist(), "high": high.tolist(), "radius": radius, "ground": ground}
 
 
 def _frustum_size(path: Trajectory, radius: float) -> float:

@@ -13,7 +13,10 @@ NOTHING = "–"
 def fixed(value: Any, decimals: int, unit: str = "", *, nothing: str = NOTHING) -> str:
     """With so many decimals and a unit; ``nothing`` for what is not a number."""
     number = as_number(value)
-    return nothing if number is None else f"{number:.{decimals}f}".replace("-", "−") + (f"\u00a0{unit}" if unit else "")
+    if number is None:
+        return nothing
+    text = f"{round(number, decimals) + 0.0:.{decimals}f}"  # no minus before what rounds to zero
+    return text.replace("-", "−") + (f"\u00a0{unit}" if unit else "")
 
 
 def signed(value: Any, decimals: int, unit: str = "") -> str:

@@ -155,7 +155,7 @@ def test_two_clicks_measure_a_distance_with_its_interval(opened: Browser) -> Non
 
 def test_a_drag_turns_the_view_and_chooses_nothing(opened: Browser) -> None:
     before, chosen = opened.picture(".stage canvas"), opened.run("return rangesfmView.chosen")
-    x, y = place_of(opened, "rangesfmView.scene.box.center")
+    x, y = place_of(opened, "rangesfmView.stage.center")
     opened.drag((x, y), (x + 60, y + 20))
     assert np.any(opened.picture(".stage canvas") != before)
     assert opened.run("return rangesfmView.chosen") == chosen

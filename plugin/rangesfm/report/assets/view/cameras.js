@@ -27,8 +27,8 @@ function lineGeometry(positions) {
   return geometry;
 }
 
-/** All cameras of a path and the line through them, in the colour of the theme's name. */
-function makePath(path, size, shape) {
+/** All cameras of a path and the line through them, in the colour of the theme's name; later paths over earlier. */
+function makePath(path, size, shape, order) {
   const group = new THREE.Group();
   const material = new THREE.LineBasicMaterial();
   onTheme(() => material.color.set(themeColor(path.color)));
@@ -40,7 +40,10 @@ function makePath(path, size, shape) {
     group.add(new THREE.LineSegments(lineGeometry(edges), material));
   }
   group.add(new THREE.Line(lineGeometry(path.names.map((_, i) => row3(path.centers, i))), material));
-  for (const part of group.children) part.frustumCulled = false;
+  for (const part of group.children) {
+    part.frustumCulled = false;
+    part.renderOrder = order;
+  }
   return group;
 }
 

@@ -18,7 +18,7 @@ function makeGrid(box, up) {
   const vertical = up.findIndex((value) => value !== 0);
   const [first, second] = [0, 1, 2].filter((axis) => axis !== vertical);
   const half = cell * Math.ceil((1.2 * box.radius) / cell);
-  const middle = box.center.map((value) => cell * Math.round(value / cell));
+  const middle = box.low.map((value, axis) => cell * Math.round((value + box.high[axis]) / 2 / cell));
   const lines = [];
   for (let offset = -half; offset <= half + cell / 2; offset += cell) {
     for (const [along, across] of [[first, second], [second, first]]) {

@@ -83,9 +83,11 @@ class View {
     const { scene, stage } = this;
     const { grid, cell } = makeGrid(scene.box, scene.up);
     this.root.querySelector(".grid-cell").textContent = `grid ${lengthText(cell)}`;
-    this.layers = { grid, anchors: makeAnchors(scene.anchors, 0.012 * scene.box.radius) };
+    this.layers = { grid, anchors: makeAnchors(scene.anchors, 0.016 * scene.box.radius) };
     if (scene.points !== null) this.layers.points = makePoints(stage, scene.points);
-    for (const path of scene.paths) this.layers[path.id] = makePath(path, scene.frustum_size, scene.frustum_shape);
+    for (const [order, path] of scene.paths.entries()) {
+      this.layers[path.id] = makePath(path, scene.frustum_size, scene.frustum_shape, order);
+    }
     this.chosenCamera = new ChosenCamera(scene.frustum_size, scene.frustum_shape);
     this.rangeLines = null;
     if (scene.ranges !== null && this.path !== null && this.path.rotations !== null) {

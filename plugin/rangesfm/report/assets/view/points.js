@@ -1,6 +1,7 @@
 // The map's points. They come in random order, so that the first so many are an even sample of all.
 
 const LEAST_SHARE_WHILE_MOVING = 0.1;
+const MANY_POINTS = 30000;
 
 const POINT_VERTEX = `
   attribute vec3 rgb;
@@ -30,7 +31,7 @@ function makePoints(stage, data) {
   points.scale.setScalar(data.extent);
   points.frustumCulled = false;
   points.onBeforeRender = () => {
-    material.uniforms.size.value = 2 * stage.renderer.getPixelRatio();
+    material.uniforms.size.value = (data.num < MANY_POINTS ? 3 : 2) * stage.renderer.getPixelRatio();
   };
   let share = 1;
   stage.on("slow", () => {

@@ -3,6 +3,7 @@
 const SLOW_FRAME_MS = 45;
 const MAX_PIXEL_RATIO = 2;
 const FIELD_OF_VIEW_DEG = 45;
+const MARGIN = 1.08;
 
 class Stage {
   /** Returns null where the browser has no WebGL. */
@@ -15,6 +16,7 @@ class Stage {
     THREE.ColorManagement.enabled = false; // colours go to the screen as the photos have them
     this.canvas = canvas;
     this.box = box;
+    this.center = box.low.map((value, axis) => (value + box.high[axis]) / 2);
     this.up = new THREE.Vector3(...up);
     this.renderer = new THREE.WebGLRenderer({ canvas, context, antialias: true });
     this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
@@ -67,15 +69,30 @@ class Stage {
     if (this.isMoving) this.#watchTime();
   }
 
-  /** Look at the middle of the scene from a direction, near enough to fill the view. */
+  /** Look at the middle of the scene from a direction, as near as shows all corners of its box. */
   lookFrom(direction) {
-    const target = new THREE.Vector3(...this.box.center);
-    const narrow = Math.min(1, this.canvas.clientWidth / Math.max(1, this.canvas.clientHeight));
-    const distance = (1.05 * this.box.radius) / Math.sin((FIELD_OF_VIEW_DEG * Math.PI) / 360) / narrow;
+    const target = new THREE.Vector3(...this.center);
+    const towards = new THREE.Vector3(...direction).normalize();
+    const right = this.up.clone().cross(towards).normalize();
+    const above = towards.clone().cross(right);
+    const slope = Math.tan((FIELD_OF_VIEW_DEG * Math.PI) / 360) / MARGIN;
+    const aspect = this.canvas.clientWidth / Math.max(1, this.canvas.clientHeight);
+    const distances = this.#corners().map((corner) => {
+      const from = corner.sub(target);
+      const sideways = Math.max(Math.abs(from.dot(right)) / aspect, Math.abs(from.dot(above)));
+      return from.dot(towards) + sideways / slope;
+    });
     this.controls.target.copy(target);
-    this.camera.position.copy(target).addScaledVector(new THREE.Vector3(...direction).normalize(), distance);
+    this.camera.position.copy(target).addScaledVector(towards, Math.max(...distances, 0.1 * this.box.radius));
     this.controls.update();
     this.requestFrame();
+  }
+
+  #corners() {
+    const { low, high } = this.box;
+    return [0, 1, 2, 3, 4, 5, 6, 7].map(
+      (i) => new THREE.Vector3(...[0, 1, 2].map((axis) => ((i >> axis) & 1 ? high : low)[axis])),
+    );
   }
 
   /** Pixels [x, y] on the canvas of a position in metres; null behind the camera or outside the view. */
