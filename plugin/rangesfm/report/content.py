@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 
+DEFAULT_FOLDER = "out"
 TABLES = {
     "scale_candidates": ("timestamp_s", "alpha0", "alpha1"),
     "scale_consensus": ("scale", "num_agreeing"),
@@ -157,7 +158,7 @@ def gather(result: ResultFolder, *, images_path: Path | None = None) -> Content:
     summary = Summary(result.summary)
     known = summary.get("settings", "images_path")
     return Content(
-        title=result.path.resolve().name,
+        title=_title(result.path.resolve()),
         summary=summary,
         ranges=ranges,
         range_times_s=None if ranges is None else _range_times(ranges, result.timestamps_s or {}),
@@ -173,6 +174,11 @@ def gather(result: ResultFolder, *, images_path: Path | None = None) -> Content:
         images_path=images_path or (Path(known) if isinstance(known, str) else None),
         tables={name: table for name, columns in TABLES.items() if (table := result.read_numbers(name, columns))},
     )
+
+
+def _title(folder: Path) -> str:
+    """The folder's name; that of the survey around it where the folder has the name that all results have."""
+    return folder.parent.name if folder.name == DEFAULT_FOLDER and folder.parent.name else folder.name
 
 
 def _with_true_scale(path: Trajectory, summary: Summary) -> Trajectory | None:
