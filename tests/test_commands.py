@@ -597,6 +597,33 @@ class TestRunOnPhotos:
         assert not (out / "report.html").exists()
 
 
+def test_photos_and_a_log_that_names_them_need_no_times(
+    photo_run: PhotoRun, rangesfm_command: Command, tmp_path: Path
+) -> None:
+    survey = photo_run.survey
+    (tmp_path / "images").mkdir()
+    for name in survey.image_names:
+        with Image.open(survey.folder / "images" / name) as photo:
+            photo.save(tmp_path / "images" / name, quality=95)  # without EXIF
+    radio = Radio(range_stddev_m=0.02)
+    measured = simulate_ranges_at(
+        survey.timestamps_s, survey.centers_m, survey.world_from_cam, survey.anchors_m, TAG_IN_CAM_M, radio, seed=1
+    ).log
+    names = np.repeat(survey.image_names, len(survey.anchors_m)).tolist()
+    log = RangeLog.from_arrays(measured.end_ids()[1], measured.range_m, image_name=names)
+    write_ranges_csv(log, tmp_path / "uwb.csv")
+    flags = ("--images", "images", "--ranges", "uwb.csv", "--anchors", survey.folder / "anchors.csv", "--seed", "0")
+    camera = ("--camera_model", survey.camera.model, "--camera_params", ",".join(map(str, survey.camera.params)))
+    tag = ("--tag_in_cam", ",".join(map(str, TAG_IN_CAM_M)), "--num_threads", "1")
+    rangesfm_command("run", *flags, *camera, *tag, "--output_path", "out", cwd=tmp_path)
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert result["ranges"]["num"] == len(log)
+    assert result["time_offset"]["value_s"] is None
+    centers = trajectory_from_reconstruction(read_model(tmp_path / "out" / "sparse_metric" / "0"))
+    true = dict(zip(survey.image_names, survey.centers_m))
+    errors = [np.linalg.norm(center - true[name]) for name, center in zip(centers.image_names, centers.centers)]
+    assert len(errors) > 10
+    assert np.median(errors) < 0.1
 
 
 def test_a_run_can_be_watched_and_ends_as_its_report(rangesfm_command: Command, own_survey: WalkedSurvey) -> None:

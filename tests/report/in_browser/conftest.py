@@ -42,7 +42,7 @@ class Browser:
         self._driver = selenium.Chrome(options=options, service=service)
 
     def open(self, page: Path, *, width: int = 1280, height: int = 900, theme: str = "light") -> None:
-        """Open a page from disk as wide as asked for; what was logged before is forgotten."""
+        """Open a page from disk as wide as asked for, its view too; what was logged before is forgotten."""
         features = [{"name": "prefers-color-scheme", "value": theme}]
         self.command("Emulation.setEmulatedMedia", features=features)
         is_phone = width < 600
@@ -51,6 +51,7 @@ class Browser:
         for kind in ("browser", "performance"):
             self._driver.get_log(kind)
         self._driver.get(page.as_uri())
+        self.wait_for("!document.querySelector('#view') || window.rangesfmView")
 
     def run(self, script: str, *arguments: Any) -> Any:
         """What a script in the page returns."""

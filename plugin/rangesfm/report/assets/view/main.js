@@ -152,5 +152,9 @@ const scene = readBlock("scene");
 if (scene !== null) {
   if (scene.ranges !== null) scene.ranges.residual = scene.ranges[scene.ranges.final];
   attachDownloads(scene);
-  window.rangesfmView = new View(document.getElementById("view"), scene);
+  // The page is there to read before the view is: setting up WebGL may take longer than all the rest.
+  const start = () => {
+    window.rangesfmView = new View(document.getElementById("view"), scene);
+  };
+  addEventListener("load", () => requestAnimationFrame(() => setTimeout(start)));
 }
