@@ -11,6 +11,7 @@ from rangesfm.geometry import IDENTITY, Similarity
 from rangesfm.ranging.anchors import AnchorEstimate
 from rangesfm.scale.problem import SurveyProblem
 from rangesfm.scale.range_equation import RangeProblem, RangeState, solve
+from rangesfm.scale.robust_loss import GEMAN_MCCLURE
 from rangesfm.scale.solution import MIN_COST_GAP, Solution
 from rangesfm.scale.starts import anchor_alone, choose_sides, mirrored, spread_subset
 
@@ -33,7 +34,7 @@ def scale_per_anchor(solution: Solution, anchor_ids: tuple[str, ...]) -> dict[st
         problem, start = _one_anchor(solution, k)
         if len(problem.range_m) < _MIN_RANGES_ALONE:
             continue
-        fit = solve(problem, start)
+        fit = solve(problem, start, loss=GEMAN_MCCLURE)
         if fit.log_scale_stddev * solution.inflation < _MAX_LOG_SCALE_STDDEV:
             scales[anchor_id] = fit.state.metric_from_model.scale
     return scales

@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.geometry import Similarity
-from rangesfm.ranging.observations import CAUCHY_WIDTH, robust_weights
 from rangesfm.scale.distance_equation import distance_jacobian, distance_residuals
+from rangesfm.scale.robust_loss import CAUCHY, RobustLoss
 
 Array = npt.NDArray[np.float64]
 
@@ -91,6 +91,7 @@ class RangeFit:
         state: the estimate.
         residuals_m: (n,) predicted minus measured.
         weights: (n,) of the robust loss, 1 for a range that fits.
+        curvatures: (n,) its second derivative; negative for outliers.
         cost: half the robust sum of squares, priors included.
         information: (p, p) Gauss-Newton approximation with the robust weights, in ``free``'s parameters.
         gradients: (n, p) of each range's weighted residual, for resampling.
@@ -103,6 +104,7 @@ class RangeFit:
     state: RangeState
     residuals_m: Array
     weights: Array
+    curvatures: Array
     cost: float
     information: Array
     gradients: Array
@@ -168,23 +170,26 @@ def predicted_ranges(problem: RangeProblem, state: RangeState) -> Array:
 
 
 def solve(
-    problem: RangeProblem, start: RangeState, *, tolerance: float = 1e-12, max_num_evaluations: int = 100
+    problem: RangeProblem,
+    start: RangeState,
+    *,
+    loss: RobustLoss = CAUCHY,
+    tolerance: float = 1e-12,
+    max_num_evaluations: int = 100,
 ) -> RangeFit:
     """Robust least squares from a start, by scipy's trust region solver with an analytic Jacobian.
 
     Args:
+        loss: of the ranges.
         tolerance: relative change of cost and of parameters at which it stops.
     """
     columns = _columns(problem)
     num_ranges = len(problem.range_m)
 
-    def loss(z: Array) -> Array:
+    def rho_with_derivatives(z: Array) -> Array:
         # Priors are believed as they are; only ranges have outliers.
         rho = np.stack([z, np.ones_like(z), np.zeros_like(z)])
-        t = 1 + z[:num_ranges] / CAUCHY_WIDTH**2
-        rho[0, :num_ranges] = CAUCHY_WIDTH**2 * np.log(t)
-        rho[1, :num_ranges] = 1 / t
-        rho[2, :num_ranges] = -1 / (CAUCHY_WIDTH * t) ** 2
+        rho[:, :num_ranges] = loss.rho(z[:num_ranges])
         return rho
 
     def residuals(x: Array) -> Array:
@@ -202,7 +207,7 @@ def solve(
         residuals,
         np.zeros(columns.num),
         jac=jacobian,
-        loss=loss,
+        loss=rho_with_derivatives,
         x_scale="jac",
         method="trf",
         ftol=tolerance,
@@ -210,13 +215,15 @@ def solve(
         gtol=None,
         max_nfev=max_num_evaluations,
     )
-    return _fit(problem, columns, start, _state(problem, columns, start, result.x), float(result.cost))
+    return _fit(problem, columns, start, _state(problem, columns, start, result.x), float(result.cost), loss)
 
 
-def _fit(problem: RangeProblem, columns: _Columns, start: RangeState, state: RangeState, cost: float) -> RangeFit:
+def _fit(
+    problem: RangeProblem, columns: _Columns, start: RangeState, state: RangeState, cost: float, loss: RobustLoss
+) -> RangeFit:
     residuals_m = predicted_ranges(problem, state) - problem.range_m
     scaled = residuals_m / problem.stddev_m
-    weights = robust_weights(scaled)
+    weights = loss.weights(scaled)
     jacobian = _range_jacobian(problem, columns, start, state)
     prior_jacobian = _prior_jacobian(problem, columns, state)
     prior_information = prior_jacobian.T @ prior_jacobian
@@ -224,6 +231,7 @@ def _fit(problem: RangeProblem, columns: _Columns, start: RangeState, state: Ran
         state=state,
         residuals_m=residuals_m,
         weights=weights,
+        curvatures=loss.curvatures(scaled),
         cost=cost,
         information=(jacobian * weights[:, None]).T @ jacobian + prior_information,
         gradients=jacobian * weights[:, None],

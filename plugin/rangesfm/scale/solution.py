@@ -14,6 +14,7 @@ from rangesfm.geometry import path_shape
 from rangesfm.ranging.noise import correlation_inflation
 from rangesfm.scale.inlier_noise import inlier_stddev
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, solve
+from rangesfm.scale.robust_loss import GEMAN_MCCLURE
 from rangesfm.scale.starts import (
     complete_unknown_anchors,
     first_camera_starts,
@@ -156,8 +157,7 @@ def _with_own_noise(
         problem.common_bias_stddev_m,
         problem.distances,
     )
-    fit = solve(problem, start.state)
-    inflation, noise = 1.0, inlier_stddev(fit.residuals_m)
+    fit, inflation, noise = start, 1.0, inlier_stddev(start.residuals_m)
     for _ in range(_NUM_NOISE_ROUNDS):
         base = np.where(np.isfinite(noise_stddev_m), noise_stddev_m, noise)
         interpolation = fit.state.metric_from_model.scale * center_stddev
@@ -171,7 +171,7 @@ def _with_own_noise(
             common_bias_stddev_m=common_bias_stddev / inflation,
             distances=None if distances is None else replace(distances, stddev_m=distances.stddev_m / inflation),
         )
-        fit = solve(problem, fit.state)
+        fit = solve(problem, fit.state, loss=GEMAN_MCCLURE)
         inflation = correlation_inflation(fit.residuals_m / stddev, fit.weights, groups)
         ordinary = shared_stddev_m < noise
         noise = inlier_stddev(fit.residuals_m[ordinary] if np.mean(ordinary) > _MIN_ORDINARY else fit.residuals_m)
@@ -180,7 +180,7 @@ def _with_own_noise(
 
 def _refuse_ambiguity(solution: Solution, rivals: list[RangeFit]) -> None:
     for rival in rivals:
-        other = solve(solution.problem, rival.state, tolerance=1e-8)
+        other = solve(solution.problem, rival.state, loss=GEMAN_MCCLURE, tolerance=1e-8)
         if not _differ(solution.problem, other, solution.fit):
             continue
         gap = (other.cost - solution.fit.cost) / solution.inflation**2

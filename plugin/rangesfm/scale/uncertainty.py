@@ -64,7 +64,7 @@ def _block_sums(fit: RangeFit, blocks: npt.NDArray[np.int64]) -> tuple[Array, Ar
     """(b, p, p) information and (b, p) gradient of each block; priors left out."""
     labels, index = np.unique(blocks, return_inverse=True)
     informations, gradients = [], []
-    curvature = _relative_curvature(fit.weights)
+    curvature = _relative_curvature(fit)
     root_weights = np.sqrt(fit.weights)[:, None]
     # gradients = weight * jacobian, so dividing by the root leaves what squares to the information.
     rows = fit.gradients / np.maximum(root_weights, 1e-12)
@@ -75,13 +75,13 @@ def _block_sums(fit: RangeFit, blocks: npt.NDArray[np.int64]) -> tuple[Array, Ar
     return np.array(informations), np.array(gradients)
 
 
-def _relative_curvature(weights: Array) -> float:
-    """Mean second derivative of the Cauchy loss over the mean weight: 0.8 for Gaussian errors.
+def _relative_curvature(fit: RangeFit) -> float:
+    """Mean second derivative of the loss over the mean weight: 0.8 for Gaussian errors and a Cauchy loss.
 
-    A weight w is the loss' slope over the residual; the second derivative is w (2 w - 1), less. With
-    w in its place the steps would be too short. The mean keeps all informations positive.
+    The second derivative is less than the weight, and with the weight in its place the steps would be too short. The
+    mean keeps all informations positive.
     """
-    return max(float(np.mean(weights * (2 * weights - 1)) / np.mean(weights)), _MIN_CURVATURE)
+    return max(float(np.mean(fit.curvatures) / np.mean(fit.weights)), _MIN_CURVATURE)
 
 
 def _steps(fit: RangeFit, informations: Array, gradients: Array, counts: Array) -> Array:
