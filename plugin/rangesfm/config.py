@@ -12,6 +12,7 @@ from typing import Any
 from rangesfm.errors import InputError, OptionError
 from rangesfm.options import (
     ANCHOR_FRAMES,
+    CAMERA_SIDES,
     EXPORT_FRAMES,
     MATCHING_METHODS,
     SCALE_METHODS,
@@ -64,6 +65,8 @@ _RULES = {
     "matching": _one_of(MATCHING_METHODS),
     "num_threads": Rule("1 or more, or -1 for all cores", lambda value: value == -1 or value >= 1),
     "method": _one_of(SCALE_METHODS),
+    "camera_side": _one_of(CAMERA_SIDES),
+    "up_in_first_camera": Rule("a direction, not 0,0,0", lambda value: any(value)),
     "num_bootstrap": _FROM_0,
     "bootstrap_block_s": _MORE_THAN_0,
     "max_num_iterations": _FROM_0,

@@ -10,6 +10,7 @@ from typing import Any
 
 ANCHOR_FRAMES = ("site", "first_camera", "unknown")
 SCALE_METHODS = ("robust", "two-candidate")
+CAMERA_SIDES = ("above", "below")
 EXPORT_FRAMES = ("result", "level", "enu")
 DEFAULT_FORMATS = ("tum", "ply")
 STAMP_UNITS = ("ns", "us", "ms", "s", "ticks")
@@ -128,12 +129,19 @@ class ScaleOptions:
         num_bootstrap: resamplings of the block bootstrap over time.
         bootstrap_block_s: length of its blocks.
         max_relative_stddev: a scale less certain than this is refused.
+        up_in_first_camera: (3,) the upward direction in the first keyframe's camera frame, of any length: (0, -1, 0)
+            for a camera held level. Two anchors of a site are enough with it, and a mirror image is ruled out that
+            would stand the map on its head.
+        camera_side: "above" or "below": where the camera went, seen from surveyed anchors that are all in one
+            plane; None: not told.
     """
 
     method: str = "robust"
     num_bootstrap: int = 200
     bootstrap_block_s: float = 10.0
     max_relative_stddev: float = 0.1
+    up_in_first_camera: tuple[float, float, float] | None = None
+    camera_side: str | None = None
 
 
 @dataclass(frozen=True)

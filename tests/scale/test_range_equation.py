@@ -104,7 +104,7 @@ def test_jacobians_are_finite_differences_in_every_column(rng: np.random.Generat
     state = range_equation._state(problem, columns, start, at)
     jacobian = range_equation._range_jacobian(problem, columns, start, state)
     np.testing.assert_allclose(jacobian, finite_differences(residuals, at), rtol=1e-6, atol=1e-6)
-    prior_jacobian = range_equation._prior_jacobian(problem, columns, state)
+    prior_jacobian = range_equation._prior_jacobian(problem, columns, start, state)
     np.testing.assert_allclose(prior_jacobian, finite_differences(prior_residuals, at), rtol=1e-6, atol=1e-6)
 
 

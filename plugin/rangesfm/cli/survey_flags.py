@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rangesfm.errors import InputError
-from rangesfm.options import ANCHOR_FRAMES, MATCHING_METHODS, SCALE_METHODS, STAMP_UNITS
+from rangesfm.options import ANCHOR_FRAMES, CAMERA_SIDES, MATCHING_METHODS, SCALE_METHODS, STAMP_UNITS
 
 if TYPE_CHECKING:
     from rangesfm.config import Survey
@@ -154,6 +154,19 @@ RANGE_FLAGS = (
     Flag("check_share", "ranges.check_share", "share of the ranges held out as checks", float, metavar="SHARE"),
     Flag("check_anchors", "ranges.check_anchors", "anchors whose ranges are all held out", _names, metavar="ID,ID"),
     Flag("check_times_s", "ranges.check_times_s", "times between which ranges are held out", _numbers, metavar="A,B"),
+    Flag(
+        "up_in_first_camera",
+        "scale.up_in_first_camera",
+        "upward in the first photo's camera frame; 0,-1,0 if it was level",
+        position,
+        metavar="X,Y,Z",
+    ),
+    Flag(
+        "camera_side",
+        "scale.camera_side",
+        "where the camera went, seen from anchors all in one plane",
+        choices=CAMERA_SIDES,
+    ),
     Flag("scale_method", "scale.method", "how the scale is found", choices=SCALE_METHODS),
     Flag("distances", "scale.distances", "CSV from,to,distance_m[,stddev_m,kind]: taped distances", metavar="CSV"),
     Flag("markers", "scale.markers", "CSV marker,image_name,x_px,y_px: marks that they refer to", metavar="CSV"),

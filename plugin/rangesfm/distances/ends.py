@@ -49,6 +49,16 @@ class LocatedDistances:
             self.is_check[rows],
         )
 
+    def joined(self, others: LocatedDistances) -> LocatedDistances:
+        """These, then others."""
+        return LocatedDistances(
+            np.concatenate([self.model_length, others.model_length]),
+            np.concatenate([self.anchor_pair, others.anchor_pair]),
+            np.concatenate([self.distance_m, others.distance_m]),
+            np.concatenate([self.stddev_m, others.stddev_m]),
+            np.concatenate([self.is_check, others.is_check]),
+        )
+
     def lengths_m(self, scale: float, anchors_m: Array) -> Array:
         """(k,) as a map has them, with the model's scale and the anchors (m, 3); NaN where an anchor has no place."""
         lengths = scale * self.model_length

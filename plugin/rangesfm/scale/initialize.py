@@ -18,6 +18,7 @@ from rangesfm.ranging.observations import RangeObservations, RangeStatus, status
 from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
 from rangesfm.scale.cutoff import cutoff_test
 from rangesfm.scale.estimate import ScaleEstimate
+from rangesfm.scale.gravity import gravity_of, levelled_places
 from rangesfm.scale.problem import SurveyProblem, survey_problem
 from rangesfm.scale.sensitivity import scale_sensitivity
 from rangesfm.scale.solution import Solution, solve_survey
@@ -56,7 +57,8 @@ def initialize_scale(
         GeometryError: the scale, or the place in the site frame, is not determined.
     """
     options, range_model = options or ScaleOptions(), range_model or RangeModelOptions()
-    survey = survey_problem(observations, trajectory, anchors, anchor_frame, range_model, distances)
+    gravity = gravity_of(options.up_in_first_camera)
+    survey = survey_problem(observations, trajectory, anchors, anchor_frame, range_model, distances, gravity)
     blocks = _time_blocks(observations, survey.rows, options.bootstrap_block_s)
     shared = shared_stddev(observations.log)[survey.rows]
     solution = solve_survey(
@@ -66,6 +68,7 @@ def initialize_scale(
         noise_stddev_m=_given_noise(observations, survey.rows, range_model),
         shared_stddev_m=shared,
         groups=blocks * survey.ranges.num_anchors + survey.ranges.anchor_index,
+        camera_side=options.camera_side,
         seed=seed,
     )
     table = _paper_table(solution)
@@ -76,6 +79,8 @@ def initialize_scale(
     tests = cutoff_test(solution, shared)
     judged = judge(survey, solution, uncertainty, per_anchor, found, tests, options)
     verdict, reasons = judged.verdict, judged.reasons
+    if gravity is not None and survey.frame == "first_camera" and anchor_frame == "site":
+        reasons = (*reasons, *levelled_places(gravity, anchors, found))
     if options.method == "two-candidate":
         robust = solution.fit.state.metric_from_model.scale
         verdict = "doubtful"

@@ -15,6 +15,8 @@ from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.anchors import Anchor
 from rangesfm.ranging.noise import shared_stddev
 from rangesfm.ranging.observations import RangeObservations
+from rangesfm.scale.anchor_plane import is_line, is_steep
+from rangesfm.scale.gravity import Gravity
 from rangesfm.scale.range_equation import RangeProblem
 from rangesfm.trajectory import Trajectory
 
@@ -25,8 +27,8 @@ _MIN_RANGES = 8
 _MIN_KEYFRAMES = 4
 # A place of its own takes three numbers, and one range more to see that they fit.
 _MIN_RANGES_OF_UNKNOWN = 5
-# Anchors closer to a line than this share of their extent leave the turn about it open.
-_COLLINEAR = 0.02
+# Of a distance between surveyed anchors, so that it can be divided by.
+_MIN_DISTANCE_STDDEV_M = 1e-3
 
 
 @dataclass(frozen=True)
@@ -57,11 +59,13 @@ def survey_problem(
     anchor_frame: str,
     range_model: RangeModelOptions,
     distances: LocatedDistances | None = None,
+    gravity: Gravity | None = None,
 ) -> SurveyProblem:
     """Set up the estimation.
 
     Args:
         distances: taped ones, with the anchors of the log in its order.
+        gravity: as somebody told it.
 
     Raises:
         InputError: an anchor of the log has no place in ``anchors``.
@@ -71,7 +75,9 @@ def survey_problem(
     in_log = _anchors_of_log(log.anchor_ids, anchors)
     given = np.array([a.position_m is not None for a in in_log], dtype=bool) & (anchor_frame != "unknown")
     rows, heard = _usable_ranges(observations, given)
-    known, notes = _usable_positions(in_log, given & heard, anchor_frame)
+    known, notes = _usable_positions(in_log, given & heard, anchor_frame, gravity is not None)
+    if anchor_frame == "site" and not known.any():
+        distances = _with_surveyed(distances, in_log, given & heard)
     # A surveyed anchor whose ranges are all held out keeps its place, to check them against.
     placed = known | (given & known.any())
     left_out = [a.anchor_id for a, k in zip(in_log, heard | placed, strict=True) if not k]
@@ -95,6 +101,7 @@ def survey_problem(
         common_bias_stddev_m=range_model.common_bias_stddev_m,
         frame_is_free=anchor_frame == "site" and bool(known.any()),
         distances=_control(distances, heard | placed),
+        gravity=gravity if anchor_frame == "site" and bool(known.any()) else None,
     )
     frame = "site" if ranges.frame_is_free else "first_camera"
     return SurveyProblem(ranges, rows, first_camera_from_sfm, frame, bool(known.any()), tuple(notes))
@@ -152,15 +159,42 @@ def _require_enough(observations: RangeObservations, rows: npt.NDArray[np.int64]
 
 
 def _usable_positions(
-    anchors: Sequence[Anchor], given: npt.NDArray[np.bool_], anchor_frame: str
+    anchors: Sequence[Anchor], given: npt.NDArray[np.bool_], anchor_frame: str, gravity_is_known: bool
 ) -> tuple[npt.NDArray[np.bool_], list[str]]:
     """(m,) anchors whose given positions can be used in this frame, and why others cannot."""
-    if anchor_frame != "site" or not given.any():
+    num = int(given.sum())
+    if anchor_frame != "site" or num == 0:
         return given, []
-    positions = np.array([_position(a) for a, k in zip(anchors, given, strict=True) if k])
-    spread = path_shape(positions).stddevs
-    if len(positions) >= 3 and spread[1] > _COLLINEAR * spread[0]:
+    shape = path_shape(np.array([_position(a) for a, k in zip(anchors, given, strict=True) if k]))
+    if num >= 2 and (not is_line(shape) or (gravity_is_known and not is_steep(shape))):
         return given, []
-    why = f"{len(positions)} surveyed anchor(s)" if len(positions) < 3 else "anchors on one line"
-    note = f"{why} cannot fix the map in the site frame, three not on a line can: scale only, first camera frame"
+    if num == 1:
+        why = "1 surveyed anchor leaves every turn of the map about it open"
+    else:
+        which = "2 surveyed anchors" if num == 2 else "surveyed anchors on one line"
+        why = f"{which} leave the turn of the map about their line open"
+    fix = "a third anchor off it" if num > 1 else "three anchors not on a line"
+    # About a plumb line gravity fixes nothing, and with one anchor no heading.
+    help_of_gravity = "" if gravity_is_known else " (two not above each other, with up_in_first_camera)"
+    note = f"{why}: scale only, in the first camera's frame; {fix} would fix it{help_of_gravity}"
     return np.zeros(len(anchors), dtype=bool), [note]
+
+
+def _with_surveyed(
+    distances: LocatedDistances | None, anchors: Sequence[Anchor], given: npt.NDArray[np.bool_]
+) -> LocatedDistances | None:
+    """The distances between anchors with given positions as well, which hold in any frame."""
+    pairs = np.array([(i, j) for i in np.flatnonzero(given) for j in np.flatnonzero(given) if i < j], dtype=np.int64)
+    if not len(pairs):
+        return distances
+    positions = np.array([_position(a) for a in anchors])
+    stddevs = np.array([a.position_stddev_m for a in anchors])
+    first, second = pairs.T
+    surveyed = LocatedDistances(
+        model_length=np.full(len(pairs), np.nan),
+        anchor_pair=pairs,
+        distance_m=np.linalg.norm(positions[first] - positions[second], axis=1),
+        stddev_m=np.maximum(np.hypot(stddevs[first], stddevs[second]), _MIN_DISTANCE_STDDEV_M),
+        is_check=np.zeros(len(pairs), dtype=bool),
+    )
+    return surveyed if distances is None else distances.joined(surveyed)

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.geometry import Similarity
 from rangesfm.scale.distance_equation import distance_jacobian, distance_residuals
+from rangesfm.scale.gravity import Gravity
 from rangesfm.scale.robust_loss import CAUCHY, RobustLoss
 
 Array = npt.NDArray[np.float64]
@@ -42,6 +43,7 @@ class RangeProblem:
         bias_mean_m, bias_stddev_m: (m,) prior of each bias; stddev 0 fixes it.
         common_bias_stddev_m: prior of what all (free) biases share, the tag's own delay.
         frame_is_free: whether rotation and translation are estimated, or stay as started.
+        gravity: the upward direction, where somebody told it and the frame is free; None otherwise.
         distances: taped ones that are to be kept to; their anchors are indices as ``anchor_index``.
     """
 
@@ -57,6 +59,7 @@ class RangeProblem:
     common_bias_stddev_m: float
     frame_is_free: bool
     distances: LocatedDistances | None = None
+    gravity: Gravity | None = None
 
     @property
     def num_anchors(self) -> int:
@@ -200,7 +203,7 @@ def solve(
     def jacobian(x: Array) -> Array:
         state = _state(problem, columns, start, x)
         return np.concatenate(
-            [_range_jacobian(problem, columns, start, state), _prior_jacobian(problem, columns, state)]
+            [_range_jacobian(problem, columns, start, state), _prior_jacobian(problem, columns, start, state)]
         )
 
     result = least_squares(
@@ -225,7 +228,7 @@ def _fit(
     scaled = residuals_m / problem.stddev_m
     weights = loss.weights(scaled)
     jacobian = _range_jacobian(problem, columns, start, state)
-    prior_jacobian = _prior_jacobian(problem, columns, state)
+    prior_jacobian = _prior_jacobian(problem, columns, start, state)
     prior_information = prior_jacobian.T @ prior_jacobian
     return RangeFit(
         state=state,
@@ -312,21 +315,29 @@ def _prior_residuals(problem: RangeProblem, columns: _Columns, state: RangeState
     priors = [off_anchor.ravel(), off_bias]
     if problem.distances is not None:
         priors.append(distance_residuals(problem.distances, state.metric_from_model.scale, state.anchors_m))
+    if problem.gravity is not None and columns.frame >= 0:
+        priors.append(problem.gravity.residuals(state.metric_from_model.rotation))
     return np.concatenate(priors)
 
 
-def _prior_jacobian(problem: RangeProblem, columns: _Columns, state: RangeState) -> Array:
+def _prior_jacobian(problem: RangeProblem, columns: _Columns, start: RangeState, state: RangeState) -> Array:
     anchors, biases = _prior_rows(problem, columns)
     jacobian = np.zeros((3 * len(anchors) + len(biases), columns.num))
     for row, k in enumerate(anchors):
         for axis in range(3):
             jacobian[3 * row + axis, columns.anchor[k] + axis] = 1 / problem.anchor_stddev_m[k]
     jacobian[3 * len(anchors) :, columns.bias[biases]] = _bias_whitening(problem, biases)
-    if problem.distances is None:
-        return jacobian
-    scale = state.metric_from_model.scale
-    taped = distance_jacobian(problem.distances, scale, state.anchors_m, columns.anchor, columns.num)
-    return np.concatenate([jacobian, taped])
+    blocks, similarity = [jacobian], state.metric_from_model
+    if problem.distances is not None:
+        blocks.append(
+            distance_jacobian(problem.distances, similarity.scale, state.anchors_m, columns.anchor, columns.num)
+        )
+    if problem.gravity is not None and columns.frame >= 0:
+        block = np.zeros((3, columns.num))
+        left = _left_jacobian(Rotation.from_matrix(similarity.rotation @ start.metric_from_model.rotation.T))
+        block[:, 1:4] = problem.gravity.jacobian(similarity.rotation, left)
+        blocks.append(block)
+    return np.concatenate(blocks)
 
 
 def _bias_whitening(problem: RangeProblem, biases: npt.NDArray[np.int64]) -> Array:

@@ -12,6 +12,7 @@ from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry import path_shape
 from rangesfm.ranging.noise import correlation_inflation
+from rangesfm.scale.anchor_plane import camera_side_of, mirrored_map, on_side
 from rangesfm.scale.inlier_noise import inlier_stddev
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, solve
 from rangesfm.scale.robust_loss import GEMAN_MCCLURE
@@ -65,6 +66,7 @@ def solve_survey(
     noise_stddev_m: Array,
     shared_stddev_m: Array,
     groups: npt.NDArray[np.int64],
+    camera_side: str | None,
     seed: int,
 ) -> Solution:
     """Solve from all starts, estimate the noise, and refuse where two answers fit alike.
@@ -76,13 +78,17 @@ def solve_survey(
         noise_stddev_m: (n,) NaN where it is to be estimated.
         shared_stddev_m: (n,) what ranges of about this length may be off together.
         groups: (n,) labels of stretches of one anchor's ranges whose errors go together.
+        camera_side: as of the scale options.
 
     Raises:
         GeometryError: nothing fits, or two different maps do.
     """
     rivals = _distinct_fits(problem, anchors_are_known, seed)
+    camera_side = camera_side if problem.frame_is_free else None
+    rivals = on_side(problem, rivals, camera_side)
     solution = _with_own_noise(problem, rivals[0], center_stddev, noise_stddev_m, shared_stddev_m, groups)
-    _refuse_ambiguity(solution, rivals[1:])
+    on_side(problem, [solution.fit], camera_side)
+    _refuse_ambiguity(solution, rivals[1:], camera_side)
     return solution
 
 
@@ -98,6 +104,10 @@ def _distinct_fits(problem: RangeProblem, anchors_are_known: bool, seed: int) ->
     if not fits:
         raise GeometryError("the scale is not determined: no scale explains the ranges")
     distinct = _each_once(small, fits)
+    if problem.frame_is_free:
+        mirrored = [mirrored_map(problem, fit.state) for fit in distinct]
+        again = [solve(_known_only(small), state, tolerance=1e-8) for state in mirrored if state is not None]
+        distinct = _each_once(small, distinct + again)
     if anchors_are_known and np.isinf(problem.anchor_stddev_m).any():
         distinct = [solve(small, complete_unknown_anchors(small, fit.state)) for fit in distinct]
     if not anchors_are_known:
@@ -157,6 +167,7 @@ def _with_own_noise(
         problem.common_bias_stddev_m,
         problem.distances,
     )
+    gravity = problem.gravity
     fit, inflation, noise = start, 1.0, inlier_stddev(start.residuals_m)
     for _ in range(_NUM_NOISE_ROUNDS):
         base = np.where(np.isfinite(noise_stddev_m), noise_stddev_m, noise)
@@ -170,6 +181,7 @@ def _with_own_noise(
             bias_stddev_m=bias_stddev / inflation,
             common_bias_stddev_m=common_bias_stddev / inflation,
             distances=None if distances is None else replace(distances, stddev_m=distances.stddev_m / inflation),
+            gravity=None if gravity is None else replace(gravity, stddev=gravity.stddev / inflation),
         )
         fit = solve(problem, fit.state, loss=GEMAN_MCCLURE)
         inflation = correlation_inflation(fit.residuals_m / stddev, fit.weights, groups)
@@ -178,10 +190,12 @@ def _with_own_noise(
     return Solution(problem, fit, inflation, noise)
 
 
-def _refuse_ambiguity(solution: Solution, rivals: list[RangeFit]) -> None:
+def _refuse_ambiguity(solution: Solution, rivals: list[RangeFit], camera_side: str | None) -> None:
+    problem = solution.problem
     for rival in rivals:
         other = solve(solution.problem, rival.state, loss=GEMAN_MCCLURE, tolerance=1e-8)
-        if not _differ(solution.problem, other, solution.fit):
+        is_elsewhere = camera_side is not None and camera_side_of(problem, other.state) not in (camera_side, None)
+        if is_elsewhere or not _differ(solution.problem, other, solution.fit):
             continue
         gap = (other.cost - solution.fit.cost) / solution.inflation**2
         if gap < MIN_COST_GAP:
@@ -207,5 +221,5 @@ def _what_is_open(problem: RangeProblem) -> str:
         return "the map fits the ranges turned about the path, which is nearly straight: walk a bend"
     return (
         "the map and its mirror image in the anchors' plane fit the ranges equally well, as the path is flat too: "
-        "add an anchor at another height"
+        "add an anchor at another height, or say on which side of that plane the camera went (camera_side)"
     )

@@ -24,6 +24,7 @@ Array = npt.NDArray[np.float64]
 _NUM_SCALES = 80
 _SCALE_SPAN = 200.0
 _NUM_ROTATIONS = 400
+_NUM_HEADINGS = 60
 _MAX_RANGES_PER_ANCHOR = 200
 _MAX_RANGES_FOR_ROTATIONS = 240
 _NUM_STARTS = 12
@@ -92,8 +93,11 @@ def site_starts(problem: RangeProblem, seed: int = 0) -> list[RangeState]:
     rows = np.flatnonzero(np.isin(problem.anchor_index, known))
     per_anchor = max(_MAX_RANGES_FOR_ROTATIONS // max(len(known), 1), 8)
     small = spread_subset(problem.subset(rows), per_anchor)
-    rotations = Rotation.random(_NUM_ROTATIONS, rng=np.random.default_rng(seed))
-    rotations = Rotation.concatenate([Rotation.identity(), rotations])
+    if problem.gravity is None:
+        rotations = Rotation.random(_NUM_ROTATIONS, rng=np.random.default_rng(seed))
+        rotations = Rotation.concatenate([Rotation.identity(), rotations])
+    else:
+        rotations = problem.gravity.level_rotations(_NUM_HEADINGS)
     trials: list[tuple[float, Similarity]] = []
     for scale in scale_candidates(problem)[::2]:
         translations, costs = _translations(small, float(scale), rotations.as_matrix())

@@ -1,0 +1,108 @@
+"""The plane of coplanar anchors, and the side of it on which the camera went."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.errors import GeometryError
+from rangesfm.geometry import PathShape, Similarity, path_shape
+from rangesfm.scale.gravity import UP_IN_SITE
+from rangesfm.scale.range_equation import RangeFit, RangeProblem, RangeState
+
+Array = npt.NDArray[np.float64]
+
+# Extent of the anchors across their plane, in widths, below which it is one.
+_COPLANAR = 0.1
+# Anchors closer to a line than this share of their extent leave the turn about it open.
+_COLLINEAR = 0.02
+_MIN_OFF_VERTICAL_DEG = 20.0
+# Of the plane's normal against the vertical: of a steeper plane nothing is above.
+_MAX_TILT_DEG = 60.0
+
+
+def anchor_plane(problem: RangeProblem) -> tuple[Array, Array] | None:
+    """A point of it (3,) and its normal (3,), upward; None if the given positions lie in none.
+
+    On a level line they do where gravity is known: in the one plane through it that is level across it.
+    """
+    known = problem.anchor_mean_m[np.isfinite(problem.anchor_mean_m).all(axis=1)]
+    if len(known) < 2:
+        return None
+    shape = path_shape(known)
+    if is_line(shape):
+        if problem.gravity is None or is_steep(shape):
+            return None
+        along = shape.axes[:, 0]
+        normal = UP_IN_SITE - (UP_IN_SITE @ along) * along
+    elif shape.stddevs[2] < _COPLANAR * shape.stddevs[1]:
+        normal = shape.axes[:, 2] * np.copysign(1.0, shape.axes[:, 2] @ UP_IN_SITE)
+    else:
+        return None
+    return shape.centroid, normal / np.linalg.norm(normal)
+
+
+def is_line(anchors: PathShape) -> bool:
+    """Whether these positions leave a turn about their line open."""
+    return bool(anchors.stddevs[1] <= _COLLINEAR * anchors.stddevs[0])
+
+
+def is_steep(anchors: PathShape) -> bool:
+    """Whether their line is so near the vertical that gravity does not fix the turn about it."""
+    return bool(abs(anchors.axes[:, 0] @ UP_IN_SITE) > np.cos(np.deg2rad(_MIN_OFF_VERTICAL_DEG)))
+
+
+def mirrored_map(problem: RangeProblem, state: RangeState) -> RangeState | None:
+    """The map on the other side of the anchors' plane; of a flat path, it fits as well. None without a plane.
+
+    The mirror image of a map is no map, as it is left-handed; reflected in the plane of its own path as well, it is,
+    and a flat path stays as it is by that.
+    """
+    plane = anchor_plane(problem)
+    if plane is None:
+        return None
+    point, normal = plane
+    placed, path = state.metric_from_model, path_shape(problem.centers)
+    across = _reflection(normal)
+    rotation = across @ placed.rotation @ _reflection(path.axes[:, 2])
+    middle = point + across @ (placed.apply(path.centroid) - point)
+    translation = middle - placed.scale * rotation @ path.centroid
+    return RangeState(Similarity(placed.scale, rotation, translation), state.anchors_m.copy(), state.bias_m.copy())
+
+
+def camera_side_of(problem: RangeProblem, state: RangeState) -> str | None:
+    """ "above" or "below" the anchors' plane; None where they have none.
+
+    Raises:
+        GeometryError: the plane stands upright.
+    """
+    plane = anchor_plane(problem)
+    if plane is None:
+        return None
+    point, normal = plane
+    if np.rad2deg(np.arccos(normal @ UP_IN_SITE)) > _MAX_TILT_DEG:
+        raise GeometryError("the anchors stand in an upright plane, so that nothing is above or below it: camera_side")
+    middle = state.metric_from_model.apply(path_shape(problem.centers).centroid)
+    return "above" if (middle - point) @ normal > 0 else "below"
+
+
+def on_side(problem: RangeProblem, fits: list[RangeFit], camera_side: str | None) -> list[RangeFit]:
+    """The fits whose path runs above or below the anchors' plane, as told; all of them where there is no such plane.
+
+    Raises:
+        GeometryError: the plane stands upright, or no fit is on that side.
+    """
+    if camera_side is None:
+        return fits
+    kept = [fit for fit in fits if camera_side_of(problem, fit.state) in (camera_side, None)]
+    if fits and not kept:
+        raise GeometryError(
+            f"the ranges put the camera {'below' if camera_side == 'above' else 'above'} the anchors' plane, not "
+            f"{camera_side} as said: check camera_side and the anchors' heights"
+        )
+    return kept
+
+
+def _reflection(normal: Array) -> Array:
+    reflection: Array = np.eye(3) - 2 * np.outer(normal, normal)
+    return reflection
