@@ -110,6 +110,26 @@ def test_mapper_keys_that_are_not_ours_are_the_pipelines(folder: Path) -> None:
     )
 
 
+def test_words_on_gravity_and_side_are_read(folder: Path) -> None:
+    survey = read_survey(write(folder, '[scale]\nup_in_first_camera = [0, -1, 0]\ncamera_side = "below"\n'))
+    assert survey.scale.up_in_first_camera == (0.0, -1.0, 0.0)
+    assert survey.scale.camera_side == "below"
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("up_in_first_camera = [0, 0, 0]", "a direction, not 0,0,0"),
+        ("up_in_first_camera = [0, 1]", "3"),
+        ('camera_side = "left"', "one of above, below"),
+    ],
+)
+def test_a_word_on_gravity_or_side_that_says_nothing_is_refused(folder: Path, line: str, said: str) -> None:
+    error = refusal(write(folder, f"[scale]\n{line}\n"))
+    assert said in str(error)
+    assert error.line == 2
+
+
 def test_empty_survey_has_the_defaults(folder: Path) -> None:
     assert read_survey(write(folder, "")) == Survey(output_path=folder / "out")
 

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.geometry import IDENTITY, Similarity
 from rangesfm.scale import range_equation
+from rangesfm.scale.gravity import gravity_of
 from rangesfm.scale.range_equation import RangeProblem, RangeState, predicted_ranges, solve
 
 Array = npt.NDArray[np.float64]
@@ -88,7 +89,7 @@ def test_jacobians_are_finite_differences_in_every_column(rng: np.random.Generat
         stddev_m=np.array([0.1, 0.2, 0.5]),
         is_check=np.zeros(3, dtype=bool),
     )
-    problem = replace(random_problem(rng, random_state(rng)), distances=taped)
+    problem = replace(random_problem(rng, random_state(rng)), distances=taped, gravity=gravity_of((0.3, -1.0, 0.2)))
     columns = range_equation._columns(problem)
     assert columns.num == 1 + 6 + 3 * NUM_ANCHORS + NUM_ANCHORS
     at = 0.2 * rng.normal(size=columns.num)

@@ -45,7 +45,10 @@ def heights(survey: Survey, options: ScaleOptions) -> Array:
 
 
 def test_the_side_that_is_told_places_a_flat_path_among_anchors_in_a_plane(make_survey: MakeSurvey) -> None:
-    survey = make_survey(centers_m=flat_loop(make_survey), anchors_m=FLAT_ANCHORS_M, radio=NOISE, num_epochs=2)
+    # It is the tag that is mirrored; on the camera itself, so is the camera.
+    survey = make_survey(
+        centers_m=flat_loop(make_survey), anchors_m=FLAT_ANCHORS_M, radio=NOISE, num_epochs=2, tag_in_cam_m=(0, 0, 0)
+    )
     np.testing.assert_allclose(heights(survey, ScaleOptions(camera_side="above")), 2.4, atol=0.1)
     # The mirror image: the ranges cannot tell.
     np.testing.assert_allclose(heights(survey, ScaleOptions(camera_side="below")), -0.4, atol=0.1)
