@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rangesfm.geometry import IDENTITY, Similarity, align_points, path_shape, rmse
+from rangesfm.geometry import IDENTITY, Similarity, align_points, path_kind, path_shape, rmse, round_middle
 from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
@@ -113,3 +113,39 @@ def test_a_moved_trajectory_sees_the_same_points(rng: np.random.Generator) -> No
     in_cam = np.einsum("nji,nj->ni", path.world_from_cam, point - path.centers)
     still_in_cam = np.einsum("nji,nj->ni", moved.world_from_cam, truth.apply(point) - moved.centers)
     np.testing.assert_allclose(still_in_cam, truth.scale * in_cam, atol=1e-9)
+
+
+ANGLES = np.linspace(0.0, 2 * np.pi, 50)
+CIRCLE = np.stack([np.cos(ANGLES), np.sin(ANGLES), 0 * ANGLES], axis=1)
+UP_AND_DOWN = np.stack([np.cos(ANGLES), np.sin(ANGLES), 0.6 * np.sin(2 * ANGLES)], axis=1)
+KINDS = {
+    "straight": np.stack([ANGLES, 0.02 * np.sin(ANGLES), 0 * ANGLES], axis=1),
+    "circular": CIRCLE,
+    "flat": CIRCLE * [2.0, 1.0, 1.0],
+    "spherical": UP_AND_DOWN / np.linalg.norm(UP_AND_DOWN, axis=1, keepdims=True),
+    "general": UP_AND_DOWN * [2.0, 1.0, 1.0],
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_the_kind_of_a_path_is_told_in_any_place_and_unit(rng: np.random.Generator, kind: str, scale: float) -> None:
+    assert path_kind(random_similarity(rng, scale).apply(KINDS[kind])) == kind
+
+
+def test_a_quarter_of_a_circle_is_a_circle_and_a_slight_bend_is_none() -> None:
+    assert path_kind(CIRCLE[ANGLES < 2.0]) == "circular"
+    assert path_kind(CIRCLE[ANGLES < 0.8]) in ("flat", "straight")
+
+
+def test_the_middle_of_a_circle_and_of_a_sphere_is_found(rng: np.random.Generator) -> None:
+    moved = random_similarity(rng, 3.0)
+    for kind in ("circular", "spherical"):
+        middle, radius = round_middle(moved.apply(KINDS[kind]))
+        np.testing.assert_allclose(middle, moved.translation, atol=1e-6)
+        assert radius == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize("num_points", [1, 2, 3])
+def test_few_points_are_of_some_kind(num_points: int) -> None:
+    assert path_kind(np.eye(3)[:num_points]) in ("straight", "flat", "circular")

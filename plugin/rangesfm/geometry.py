@@ -89,3 +89,41 @@ def path_shape(points: Array) -> PathShape:
     stddevs = np.zeros(3)
     stddevs[: len(singular_values)] = singular_values / np.sqrt(len(points))
     return PathShape(centroid, vt.T, stddevs)
+
+
+# Extents of a path across itself, in lengths, that ranges with noise of about a decimetre hardly see.
+NEARLY_STRAIGHT = 0.03
+NEARLY_FLAT = 0.05
+# Stddev of the distance from the fitted centre, in radii, and the largest radius in lengths of the path: a short arc
+# lies near many circles and is none.
+_ROUND = 0.02
+_MAX_RADIUS = 2.0
+
+
+def path_kind(points: Array) -> str:
+    """ "straight", "circular" (and flat), "flat", "spherical" or "general": the symmetries that ranges cannot see past.
+
+    Args:
+        points: (n, 3), n >= 1.
+    """
+    shape = path_shape(points)
+    if shape.stddevs[1] <= NEARLY_STRAIGHT * shape.stddevs[0]:
+        return "straight"
+    is_flat = bool(shape.stddevs[2] < NEARLY_FLAT * shape.stddevs[0])
+    middle, radius = round_middle(points)
+    off = np.linalg.norm(points - middle, axis=1) - radius
+    is_round = bool(rmse(off[:, None]) < _ROUND * radius and radius < _MAX_RADIUS * shape.stddevs[0])
+    if is_flat:
+        return "circular" if is_round else "flat"
+    return "spherical" if is_round else "general"
+
+
+def round_middle(points: Array) -> tuple[Array, float]:
+    """Centre (3,) and radius of the sphere nearest to (n, 3) points; of flat ones, of the circle in their plane."""
+    shape = path_shape(points)
+    local = (points - shape.centroid) @ shape.axes
+    seen = shape.stddevs > 0.02 * shape.stddevs[0]
+    design = np.column_stack([2 * local[:, seen], np.ones(len(local))])
+    solution = np.linalg.lstsq(design, np.sum(local**2, axis=1), rcond=None)[0]
+    middle = shape.centroid + shape.axes[:, seen] @ solution[:-1]
+    return middle, float(np.sqrt(max(solution[-1] + solution[:-1] @ solution[:-1], 0.0)))

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import path_shape
+from rangesfm.geometry import NEARLY_STRAIGHT, path_kind, path_shape
 from rangesfm.ranging.noise import correlation_inflation
 from rangesfm.scale.anchor_plane import camera_side_of, mirrored_map, on_side
 from rangesfm.scale.inlier_noise import inlier_stddev
@@ -35,8 +35,6 @@ _SAME_LOG_SCALE = 0.03
 _SAME_ROTATION_DEG = 5.0
 # Of the path's middle, in extents of the path.
 _SAME_SHIFT = 0.05
-# Extent of a path across itself, in lengths.
-NEARLY_STRAIGHT = 0.03
 # Half of 3 stddevs squared: a rival this close in cost is not ruled out.
 MIN_COST_GAP = 4.5
 
@@ -209,9 +207,20 @@ def _refuse_ambiguity(solution: Solution, rivals: list[RangeFit], camera_side: s
                     f"(anchor frame unknown; about {ours:.4g} here)"
                 )
             raise GeometryError(
-                f"two scales fit the ranges equally well ({ours:.4g} and {theirs:.4g} m per unit): the path is too "
-                "straight or runs round the anchor; vary it, or add an anchor"
+                f"two scales fit the ranges equally well ({ours:.4g} and {theirs:.4g} m per unit): "
+                f"{_WHY_TWO_SCALES[path_kind(problem.centers)]}"
             )
+
+
+_WHY_TWO_SCALES = {
+    "straight": "the path is straight; walk a bend",
+    "circular": "the path is a flat circle, and its radius and the anchors' heights can make up for each other; walk "
+    "another shape, or survey an anchor",
+    "spherical": "the path lies on a sphere, and its radius and the anchor's distance from its centre can change "
+    "places; walk another shape, or add an anchor",
+    "flat": "the path is flat; go up and down too, or add an anchor",
+    "general": "the path is too short or runs round the anchor; vary it, or add an anchor",
+}
 
 
 def _what_is_open(problem: RangeProblem) -> str:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import IDENTITY, Similarity, path_shape
+from rangesfm.geometry import IDENTITY, Similarity, path_shape, round_middle
 from rangesfm.ranging.multilateration import multilaterate
 from rangesfm.scale.consensus import consensus_scales
 from rangesfm.scale.range_equation import RangeProblem, RangeState, solve
@@ -128,13 +128,7 @@ def sphere_swaps(problem: RangeProblem, state: RangeState) -> list[RangeState]:
     their sum tells apart, and one that depends on scale times a alone. So the radius of the path and
     the distance of an anchor from its centre can change places.
     """
-    shape = path_shape(problem.centers)
-    local = (problem.centers - shape.centroid) @ shape.axes
-    seen = shape.stddevs > 0.02 * shape.stddevs[0]
-    design = np.column_stack([2 * local[:, seen], np.ones(len(local))])
-    solution = np.linalg.lstsq(design, np.sum(local**2, axis=1), rcond=None)[0]
-    middle = shape.centroid + shape.axes[:, seen] @ solution[:-1]
-    radius = float(np.sqrt(solution[-1] + solution[:-1] @ solution[:-1]))
+    middle, radius = round_middle(problem.centers)
     placed = state.metric_from_model
     from_middle = state.anchors_m - placed.apply(middle)
     swaps = []

@@ -8,20 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import path_shape
+from rangesfm.geometry import NEARLY_FLAT, NEARLY_STRAIGHT, path_shape
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.anchors import AnchorEstimate
 from rangesfm.scale.cutoff import scale_drift
 from rangesfm.scale.estimate import NORMAL_95, CutoffTest, ScaleUncertainty
 from rangesfm.scale.problem import SurveyProblem
 from rangesfm.scale.range_equation import RangeFit
-from rangesfm.scale.solution import NEARLY_STRAIGHT, Solution
+from rangesfm.scale.solution import Solution
 
 # Half of the 95 % interval of the scale, relative, from which it is called doubtful.
 DOUBTFUL_ABOVE = 0.04
 # Smaller changes with the least range are no news to a surveyor.
 _MIN_DRIFT_PERCENT = 1.0
-_PLANAR = 0.05
 _MANY_OUTLIERS = 0.3
 _FEW_RANGES = 50
 _MAX_ANCHOR_SPREAD = 0.03
@@ -111,7 +110,7 @@ def _path_doubts(solution: Solution, anchors: Sequence[AnchorEstimate]) -> list[
             return [_Doubt(reason, f"{bend}, or survey the anchors")]
         if solution.problem.frame_is_free:
             return [_Doubt("the path is nearly straight: how the map is turned about it rests on little", bend)]
-    elif stddevs[2] < _PLANAR * stddevs[0] and any(a.mirror_position_m is not None for a in anchors):
+    elif stddevs[2] < NEARLY_FLAT * stddevs[0] and any(a.mirror_position_m is not None for a in anchors):
         reason = "the path is nearly flat: the side of the unknown anchors is open (the scale is not)"
         return [_Doubt(reason, "raise and lower the camera on the way, or survey the anchors")]
     return []
