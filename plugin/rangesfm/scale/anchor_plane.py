@@ -19,6 +19,8 @@ _COLLINEAR = 0.02
 _MIN_OFF_VERTICAL_DEG = 20.0
 # Of the plane's normal against the vertical: of a steeper plane nothing is above.
 _MAX_TILT_DEG = 60.0
+# Share of a path that makes a side its own.
+_ON_ONE_SIDE = 0.9
 
 
 def anchor_plane(problem: RangeProblem) -> tuple[Array, Array] | None:
@@ -71,7 +73,7 @@ def mirrored_map(problem: RangeProblem, state: RangeState) -> RangeState | None:
 
 
 def camera_side_of(problem: RangeProblem, state: RangeState) -> str | None:
-    """ "above" or "below" the anchors' plane; None where they have none.
+    """ "above" or "below" the anchors' plane, or "on both sides of" it; None where they have none.
 
     Raises:
         GeometryError: the plane stands upright.
@@ -82,8 +84,10 @@ def camera_side_of(problem: RangeProblem, state: RangeState) -> str | None:
     point, normal = plane
     if np.rad2deg(np.arccos(normal @ UP_IN_SITE)) > _MAX_TILT_DEG:
         raise GeometryError("the anchors stand in an upright plane, so that nothing is above or below it: camera_side")
-    middle = state.metric_from_model.apply(path_shape(problem.centers).centroid)
-    return "above" if (middle - point) @ normal > 0 else "below"
+    share_above = float(np.mean((state.metric_from_model.apply(problem.centers) - point) @ normal > 0))
+    if share_above >= _ON_ONE_SIDE:
+        return "above"
+    return "below" if share_above <= 1 - _ON_ONE_SIDE else "on both sides of"
 
 
 def on_side(problem: RangeProblem, fits: list[RangeFit], camera_side: str | None) -> list[RangeFit]:
@@ -97,7 +101,7 @@ def on_side(problem: RangeProblem, fits: list[RangeFit], camera_side: str | None
     kept = [fit for fit in fits if camera_side_of(problem, fit.state) in (camera_side, None)]
     if fits and not kept:
         raise GeometryError(
-            f"the ranges put the camera {'below' if camera_side == 'above' else 'above'} the anchors' plane, not "
+            f"the ranges put the camera {camera_side_of(problem, fits[0].state)} the anchors' plane, not "
             f"{camera_side} as said: check camera_side and the anchors' heights"
         )
     return kept
