@@ -215,6 +215,24 @@ def test_an_anchor_of_the_log_that_is_not_given_is_bad_input(make_survey: MakeSu
 
 
 class TestOpenButNotFatal:
+    @pytest.mark.parametrize("obstructed_share", [0.0, 0.3, 0.5])
+    @pytest.mark.parametrize("seed", range(2))
+    def test_three_unknown_anchors_settle_the_scale_of_a_path_on_a_sphere(
+        self, make_survey: MakeSurvey, seed: int, obstructed_share: float
+    ) -> None:
+        """Their distances from its centre differ, so that only the true radius can stand for all of them."""
+        anchors_m = {"A": (6.5, 1.0, 1.2), "B": (-6.0, 2.0, -1.2), "C": (0.5, -8.5, 1.4)}
+        radio = Radio(range_stddev_m=0.05, obstructed_share=obstructed_share, obstructed_mean_m=2.0)
+        survey = make_survey(
+            centers_m=on_a_sphere(),
+            anchors_m=anchors_m,
+            tag_in_cam_m=(0, 0, 0),
+            radio=radio,
+            num_epochs=3,
+            seed=seed,
+        )
+        assert survey.relative_error(survey.scale("unknown")) == pytest.approx(0.0, abs=0.01)
+
     @pytest.mark.parametrize(
         ("anchors_m", "why"),
         [

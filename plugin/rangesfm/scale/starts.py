@@ -28,6 +28,7 @@ _NUM_HEADINGS = 60
 _MAX_RANGES_PER_ANCHOR = 200
 _MAX_RANGES_FOR_ROTATIONS = 240
 _NUM_STARTS = 12
+_NUM_MINIMA = 4
 # Trials closer than this run into the same minimum.
 _BASIN_LOG_SCALE = 0.3
 _BASIN_ROTATION_RAD = 0.6
@@ -79,9 +80,15 @@ def unknown_anchor_starts(problem: RangeProblem) -> list[RangeState]:
         anchors, cost = _multilaterate_all(small, scale)
         costs.append(cost)
         states.append(RangeState(Similarity(scale, np.eye(3), np.zeros(3)), anchors, problem.bias_mean_m.copy()))
-    minima = [i for i in range(len(costs)) if costs[i] <= min(costs[max(i - 1, 0)], costs[min(i + 1, len(costs) - 1)])]
-    best = sorted(minima, key=lambda i: costs[i])[:4]
+    best = dict.fromkeys(i for kind in np.array(costs).T for i in _lowest_minima(kind))
     return [choose_sides(small, states[i])[0] for i in best]
+
+
+def _lowest_minima(costs: Array) -> list[int]:
+    """Where a sweep's costs are no higher than beside, lowest first; some of them."""
+    padded = np.concatenate([[np.inf], costs, [np.inf]])
+    minima = np.flatnonzero((costs <= padded[:-2]) & (costs <= padded[2:]))
+    return [int(i) for i in minima[np.argsort(costs[minima], kind="stable")][:_NUM_MINIMA]]
 
 
 def site_starts(problem: RangeProblem, seed: int = 0) -> list[RangeState]:
@@ -212,17 +219,24 @@ def _at_scale(problem: RangeProblem, scale: float) -> RangeState:
     )
 
 
-def _multilaterate_all(problem: RangeProblem, scale: float) -> tuple[Array, float]:
-    """Each anchor from the tag's positions at a given scale; and the mean of the robust residuals."""
-    anchors, cost = np.zeros((problem.num_anchors, 3)), 0.0
+def _multilaterate_all(problem: RangeProblem, scale: float) -> tuple[Array, tuple[float, float]]:
+    """Each anchor from the tag's positions at a given scale; and the mean of the robust residuals, two ways.
+
+    Those of the linear equation tell more where an anchor is badly placed; those of the distances where the path lies
+    on a sphere, which leaves the linear equation free to fit at any scale.
+    """
+    anchors, linear, distances = np.zeros((problem.num_anchors, 3)), 0.0, 0.0
     tags = scale * problem.centers + problem.tag_from_center
+    unit = _residual_unit(problem)
     for k in range(problem.num_anchors):
         rows = problem.anchor_index == k
         if rows.any():
             ranges = problem.range_m[rows] - problem.bias_mean_m[k]
             anchors[k], residuals = multilaterate(tags[rows], ranges)
-            cost += float(np.sum(np.log1p((residuals / _residual_unit(problem)) ** 2)))
-    return anchors, cost / len(tags)
+            linear += float(np.sum(np.log1p((residuals / unit) ** 2)))
+            off = np.linalg.norm(tags[rows] - anchors[k], axis=1) - ranges
+            distances += float(np.sum(np.log1p((off / unit) ** 2)))
+    return anchors, (linear / len(tags), distances / len(tags))
 
 
 def _residual_unit(problem: RangeProblem) -> float:
