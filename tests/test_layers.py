@@ -37,6 +37,7 @@ LAYER_OF = {
     "refinement": DATA,
     "result_folder": DATA,
     "simulate": DATA,
+    "site": DATA,
     "strict_tables": DATA,
     "plain_tables": DATA,
     "tables": DATA,

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+import pycolmap
 import pytest
 
 from rangesfm.config import RangesConfig, Survey
@@ -239,6 +240,28 @@ class TestSeveralTags:
             ("A2", "A1", "12.0", ""),
             ("right", "left", "0.8", ""),
         ]
+
+
+def test_a_site_in_national_coordinates_loses_nothing(survey: Survey, tmp_path: Path) -> None:
+    far = np.array([2_600_000.0, 1_200_000.0, 400.0])
+    header, *rows = (survey.anchors_path or Path()).read_text().splitlines()
+    lines = []
+    for row in rows:
+        name, *numbers = row.split(",")
+        lines.append(",".join([name, *(repr(float(n) + float(o)) for n, o in zip(numbers, far, strict=True))]))
+    (tmp_path / "far.csv").write_text("\n".join([header, *lines]) + "\n")
+    near = refine_model(survey, progress=SilentProgress()).result
+    moved = replace(survey, anchors_path=tmp_path / "far.csv", output_path=tmp_path / "far")
+    away = refine_model(moved, progress=SilentProgress()).result
+    assert away["scale"]["value"] == pytest.approx(near["scale"]["value"], rel=1e-9)
+    assert away["refine"]["scale_value"] == pytest.approx(near["refine"]["scale_value"], rel=1e-7)
+    for anchor_id, anchor in near["anchors"].items():
+        np.testing.assert_allclose(away["anchors"][anchor_id]["position_m"] - far, anchor["position_m"], atol=1e-6)
+    paths = (survey.output_path, tmp_path / "far")
+    models = [pycolmap.Reconstruction(path / "sparse_metric" / "0") for path in paths]
+    for image_id, image in models[0].images.items():
+        apart = models[1].image(image_id).projection_center() - far - image.projection_center()
+        assert np.linalg.norm(apart) < 1e-6
 
 
 def test_doubts_are_warnings_in_the_result_and_for_the_user(survey: Survey) -> None:

@@ -25,6 +25,9 @@ Array = npt.NDArray[np.float64]
 GEOGRAPHIC = "EPSG:4979"
 """WGS 84: longitude and latitude in degrees, ellipsoidal height in metres; always in this order here."""
 
+# Around the area for which a coordinate system was made.
+_MARGIN_DEG = 1.0
+
 _ENU = (
     "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
     "+step +proj=topocentric +ellps=WGS84 +lon_0={lon_deg!r} +lat_0={lat_deg!r} +h_0={height_m!r}"
@@ -79,7 +82,7 @@ def georeference_at(coordinates: Array, crs: str) -> tuple[Georeference, Array]:
         InputError: the system is not known, or the points lie outside of where it holds.
     """
     geographic = _apply(_geographic_from(crs), coordinates)
-    if not np.isfinite(geographic[np.isfinite(coordinates).all(axis=1)]).all():
+    if not _holds_at(crs, geographic[np.isfinite(coordinates).all(axis=1)]):
         raise InputError(f"coordinates lie outside of where {crs} holds: are they east, north, height?")
     lon_deg, lat_deg, height_m = np.nanmean(geographic, axis=0).tolist()
     georeference = Georeference(lat_deg, lon_deg, height_m, crs)
@@ -130,6 +133,20 @@ def check_crs(crs: str) -> None:
 def is_geographic(crs: str) -> bool:
     """Whether the system counts in degrees."""
     return bool(_pyproj().CRS.from_user_input(crs).is_geographic)
+
+
+def _holds_at(crs: str, geographic: Array) -> bool:
+    """Whether (n, 3) places lie where the system is meant to be used; formulas give some place for any nonsense."""
+    if not np.isfinite(geographic).all():
+        return False
+    area = _pyproj().CRS.from_user_input(crs).area_of_use
+    if area is None:
+        return True
+    lon, lat = geographic[:, 0], geographic[:, 1]
+    within_lon = (lon >= area.west - _MARGIN_DEG) & (lon <= area.east + _MARGIN_DEG)
+    if area.west > area.east:  # across the date line
+        within_lon = (lon >= area.west - _MARGIN_DEG) | (lon <= area.east + _MARGIN_DEG)
+    return bool(np.all(within_lon & (lat >= area.south - _MARGIN_DEG) & (lat <= area.north + _MARGIN_DEG)))
 
 
 def _geographic_from(crs: str) -> Transformer:

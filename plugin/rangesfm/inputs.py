@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +11,6 @@ import numpy.typing as npt
 from rangesfm.config import RangesConfig, Survey
 from rangesfm.distances.tape import Tape, read_tape
 from rangesfm.errors import InputError
-from rangesfm.georeference import Georeference, georeference_at
 from rangesfm.ranging.anchor_file import default_anchor_frame, read_anchors
 from rangesfm.ranging.anchors import Anchor
 from rangesfm.ranging.error_curve import correct_ranges, read_error_curve
@@ -19,6 +18,7 @@ from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges
 from rangesfm.ranging.time_resolution import time_resolution_s
 from rangesfm.reference import Reference, read_reference
+from rangesfm.site import Site, local_site
 
 # Beyond these a unit is wrong, or the file: no camera carries its tag so far away, and no such radio reaches so far.
 _MAX_LEVER_ARM_M = 20.0
@@ -37,7 +37,7 @@ class RangingInputs:
             tags only.
         anchors: every anchor of the log.
         anchor_frame: one of ANCHOR_FRAMES.
-        georeference: of the anchors' frame; None if their coordinates are in a frame of their own.
+        site: the frame of the anchors' positions.
         tape: taped distances, if given.
         reference: true positions, if given.
         notes: what the user should know.
@@ -47,7 +47,7 @@ class RangingInputs:
     tag_in_cam_m: npt.NDArray[np.float64]
     anchors: tuple[Anchor, ...]
     anchor_frame: str
-    georeference: Georeference | None
+    site: Site
     tape: Tape | None
     reference: Reference | None
     notes: tuple[str, ...]
@@ -69,8 +69,8 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     tag_in_cam_m = _lever_arms_of_log(log, survey)
     anchors = _anchors_of_log(log) if given is None else given
     _check_anchors_known(log, anchors, survey)
-    georeference, anchors = _on_the_earth(anchors, survey)
     frame = survey.anchor_frame or default_anchor_frame(anchors)
+    site, anchors = local_site(anchors, frame, survey.anchor_crs, survey.anchors_path)
     if frame != "unknown" and all(anchor.position_m is None for anchor in anchors):
         raise InputError(
             f"anchor frame {frame!r} needs anchor positions and there are none: give anchors.csv, or frame unknown",
@@ -81,28 +81,7 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     tape = None if survey.distances_path is None else read_tape(survey.distances_path, survey.markers_path)
     reference = None if survey.reference_path is None else read_reference(survey.reference_path)
     notes = (*_notes(log, anchors, survey, anchors_are_of_log=given is None), *curve_notes)
-    return RangingInputs(log, tag_in_cam_m, anchors, frame, georeference, tape, reference, notes)
-
-
-def _on_the_earth(anchors: tuple[Anchor, ...], survey: Survey) -> tuple[Georeference | None, tuple[Anchor, ...]]:
-    """Anchors given in a coordinate system, in the local frame of metres around them."""
-    crs = survey.anchor_crs
-    if crs is None:
-        return None, anchors
-    if survey.anchor_frame not in (None, "site"):
-        raise InputError(f"[anchors] crs {crs} needs the frame 'site', not {survey.anchor_frame!r}")
-    given = np.array([np.full(3, np.nan) if a.position_m is None else a.position_m for a in anchors]).reshape(-1, 3)
-    if np.isnan(given).all():
-        raise InputError(f"[anchors] crs is {crs}, but no anchor has a position", survey.anchors_path)
-    try:
-        georeference, local = georeference_at(given, crs)
-    except InputError as error:
-        raise InputError(str(error), survey.anchors_path) from None
-    moved = tuple(
-        anchor if anchor.position_m is None else replace(anchor, position_m=position)
-        for anchor, position in zip(anchors, local, strict=True)
-    )
-    return georeference, moved
+    return RangingInputs(log, tag_in_cam_m, anchors, frame, site, tape, reference, notes)
 
 
 def _check_held_out(survey: Survey, anchors: Sequence[Anchor], frame: str) -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from rangesfm.geometry import align_points
+from rangesfm.geometry import Similarity, align_points
+from rangesfm.model_transform import rescale
 from rangesfm.ranging.anchors import AnchorEstimate
 from rangesfm.ranging.clock import TimeOffset
 from rangesfm.ranging.observations import RangeObservations
@@ -86,8 +87,39 @@ class MetricSurvey:
             return None
         return align_points(self.trajectory.centers, self.path_of(self.refined).centers).scale
 
+    def moved(self, offset_m: Array) -> MetricSurvey:
+        """The same in a world whose coordinates are larger by ``offset_m`` (3,)."""
+        if not offset_m.any():
+            return self
+        shift = Similarity(1.0, np.eye(3), offset_m)
+        estimate = replace(
+            self.estimate,
+            metric_from_sfm=shift @ self.estimate.metric_from_sfm,
+            anchors=tuple(_moved_anchor(anchor, offset_m) for anchor in self.estimate.anchors),
+        )
+        refinement = self.refinement and replace(
+            self.refinement, anchors=tuple(_moved_anchor(anchor, offset_m) for anchor in self.refinement.anchors)
+        )
+        return replace(
+            self,
+            estimate=estimate,
+            scaled=rescale(self.scaled, shift),
+            refined=None if self.refined is None else rescale(self.refined, shift),
+            refinement=refinement,
+        )
+
     def path_of(self, model: pycolmap.Reconstruction) -> Trajectory:
         """The keyframes as another model has them."""
         times = self.trajectory.timestamps_s
         by_name = None if times is None else dict(zip(self.trajectory.image_names, times.tolist(), strict=True))
         return trajectory_from_reconstruction(model, by_name)
+
+
+def _moved_anchor(anchor: AnchorEstimate, offset_m: Array) -> AnchorEstimate:
+    prior, mirror = anchor.prior_position_m, anchor.mirror_position_m
+    return replace(
+        anchor,
+        position_m=anchor.position_m + offset_m,
+        prior_position_m=None if prior is None else prior + offset_m,
+        mirror_position_m=None if mirror is None else mirror + offset_m,
+    )

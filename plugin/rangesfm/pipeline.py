@@ -156,6 +156,8 @@ def _to_metric(
             journal.warn(f"after the refinement {misfit}")
     # Comparison and results.
     with journal.stage("results"):
+        if metric.estimate.frame == "site":
+            metric = metric.moved(inputs.site.offset_m)
         result = survey_result(metric)
         forget_result(survey.output_path)
         result["distances"] = _distances(inputs, metric, journal)
@@ -386,7 +388,7 @@ def _refine(survey: Survey, inputs: RangingInputs, metric: MetricSurvey) -> Metr
 
 def _georeference(inputs: RangingInputs, metric: MetricSurvey) -> Georeference | None:
     """Of the final map: that of the anchors, if the map could be carried to them."""
-    return inputs.georeference if metric.estimate.frame == "site" else None
+    return inputs.site.georeference if metric.estimate.frame == "site" else None
 
 
 def _noise_is_estimated(survey: Survey, log: RangeLog) -> npt.NDArray[np.bool_]:
