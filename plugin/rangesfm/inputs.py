@@ -225,9 +225,12 @@ def _notes(log: RangeLog, anchors: Sequence[Anchor], survey: Survey, *, anchors_
     notes = [f"no ranges to anchor {', '.join(silent)}"] if silent else []
     silent = [tag_id for tag_id in survey.lever_arms_m if tag_id not in log.tag_ids and survey.tag_id is None]
     notes += [f"no ranges of tag {', '.join(silent)}"] if silent else []
-    for kind, what in ((RangeKind.ANCHOR_ANCHOR, "anchors"), (RangeKind.TAG_TAG, "tags")):
+    for kind, what in (
+        (RangeKind.ANCHOR_ANCHOR, "anchors: they are distances for the map to keep to"),
+        (RangeKind.TAG_TAG, "tags: they have no say"),
+    ):
         if num := int(np.count_nonzero(log.kind == kind)):
-            notes.append(f"{num} ranges are between two {what}: they have no place on the path")
+            notes.append(f"{num} ranges are between two {what}")
     if anchors_are_of_log and any(anchor.position_m is not None for anchor in anchors):
         notes.append("the anchor positions are those that the log gives")
     if log.num_no_measurement:

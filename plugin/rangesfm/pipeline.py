@@ -381,6 +381,7 @@ def _refine(survey: Survey, inputs: RangingInputs, metric: MetricSurvey) -> Metr
         first_pose_is_fixed=estimate.frame != "site",
         camera=survey.camera,
         options=survey.refine,
+        tape=inputs.tape,
         num_threads=survey.mapper.num_threads,
     )
     return replace(metric, refined=refined, refinement=summary)

@@ -9,12 +9,21 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from rangesfm.distances.by_radio import distances_by_radio
+from rangesfm.distances.ends import LocatedDistances
+from rangesfm.distances.tape import Tape
 from rangesfm.geometry import Similarity
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.anchors import AnchorEstimate
 from rangesfm.ranging.observations import RangeObservations, robust_weights, status_by_weight
 from rangesfm.refinement.antennas import Antennas, antennas, predicted_ranges
 from rangesfm.refinement.bundle_adjustment import Adjustment, BundleAdjustment, adjust_with_ranges, bundle_adjustment
+from rangesfm.refinement.distances import (
+    MeasuredDistances,
+    add_distances,
+    add_marker_points,
+    remove_marker_points,
+)
 from rangesfm.refinement.unbend import SAME_WEIGHTS, Unbent, unbend
 from rangesfm.refinement.weights import RangeWeights, misfits, range_weights
 from rangesfm.trajectory import Trajectory
@@ -84,6 +93,7 @@ def refine_with_ranges(
     first_pose_is_fixed: bool,
     camera: CameraOptions | None = None,
     options: RefineOptions | None = None,
+    tape: Tape | None = None,
     num_threads: int = -1,
 ) -> tuple[pycolmap.Reconstruction, RefineSummary]:
     """Bundle adjustment of a scaled model with range residuals.
@@ -102,17 +112,27 @@ def refine_with_ranges(
         common_bias_stddev_m: of an error that all biases' priors share, as drift leaves one to the scale stage.
         first_pose_is_fixed: the gauge: True in the first camera's frame, False where
             surveyed anchors hold the map.
+        tape: taped distances, of which the map keeps to the control ones; as it does to the ranges between anchors
+            that the log holds.
 
     Returns:
         the refined model and the summary.
 
     Raises:
         SolverError: the solver failed.
-        InputError: an unknown key among the options passed through.
+        InputError: an unknown key among the options passed through, or a distance's end that is not in the model.
     """
     options = options or RefineOptions()
+    metric = pycolmap.Reconstruction(reconstruction)
+    tape = (tape or Tape()).control()
+    distances = MeasuredDistances(
+        _between_anchors(observations, anchors, range_stddev_m),
+        common_bias_stddev_m,
+        tape,
+        add_marker_points(metric, tape),
+    )
     survey = _Survey(
-        pycolmap.Reconstruction(reconstruction),
+        metric,
         trajectory,
         observations,
         metric_from_sfm,
@@ -121,6 +141,7 @@ def refine_with_ranges(
         options,
         first_pose_is_fixed,
         num_threads,
+        distances,
     )
     weights = range_weights(
         observations,
@@ -130,7 +151,21 @@ def refine_with_ranges(
         metric_from_sfm.scale,
         options.range_loss_scale,
     )
-    return survey.metric, _refine(survey, weights, tuple(anchors), common_bias_stddev_m)
+    summary = _refine(survey, weights, tuple(anchors), common_bias_stddev_m)
+    remove_marker_points(metric, distances.marker_ids)
+    return metric, summary
+
+
+def _between_anchors(
+    observations: RangeObservations, anchors: Sequence[AnchorEstimate], range_stddev_m: Array
+) -> LocatedDistances:
+    return distances_by_radio(
+        observations.log,
+        float(np.median(range_stddev_m[observations.has_place])),
+        np.array([anchor.prior_bias_m for anchor in anchors]),
+        np.array([anchor.prior_bias_stddev_m for anchor in anchors]),
+        common_bias_stddev_m=0.0,
+    )
 
 
 @dataclass(frozen=True)
@@ -146,6 +181,7 @@ class _Survey:
     options: RefineOptions
     first_pose_is_fixed: bool
     num_threads: int
+    distances: MeasuredDistances
 
     @property
     def antennas(self) -> Antennas:
@@ -159,6 +195,21 @@ class _Survey:
             fixed_frame_id=int(self.trajectory.frame_ids[0]) if self.first_pose_is_fixed else None,
             max_num_iterations=max_num_iterations,
             num_threads=self.num_threads,
+            marker_ids=self.distances.marker_ids.values(),
+        )
+
+    def adjust(
+        self, problem: BundleAdjustment, weights: RangeWeights, anchors: tuple[AnchorEstimate, ...]
+    ) -> Adjustment:
+        """Solve with the ranges and distances."""
+        return adjust_with_ranges(
+            problem,
+            self.trajectory,
+            self.observations,
+            self.antennas,
+            weights,
+            anchors,
+            lambda blocks: add_distances(problem, self.distances, anchors, blocks.positions, weights.loss_scale),
         )
 
     def residuals_m(self, anchors: Sequence[AnchorEstimate]) -> Array:
@@ -194,9 +245,7 @@ def _refine(
     weights, anchors = start.weights, start.anchors
     adjustments: list[Adjustment] = []
     while True:
-        adjustments.append(
-            adjust_with_ranges(problem, survey.trajectory, survey.observations, survey.antennas, weights, anchors)
-        )
+        adjustments.append(survey.adjust(problem, weights, anchors))
         anchors = adjustments[-1].anchors
         residuals_m = survey.residuals_m(anchors)
         better = _estimated(weights, survey.observations, residuals_m, start.num_absorbed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -383,6 +384,27 @@ def test_control_distances_between_anchors_put_unknown_anchors_in_their_places(m
     assert spread_m(alone) > 0.2
     assert spread_m(held) < 0.5 * spread_m(alone)
     assert abs(held.value / survey.truth("first_camera").scale - 1) < 0.02
+
+
+def test_ranges_between_anchors_of_the_log_do_so_too(make_survey: MakeSurvey) -> None:
+    survey = make_survey(radio=NOISE)
+    log, ids = survey.log_with(survey.simulated.log.range_m + 0.3), list(survey.anchors_m)
+    pairs = list(itertools.combinations(ids, 2))
+    lengths = pdist(np.array(list(survey.anchors_m.values())))
+    assert log.timestamp_s is not None
+    with_peers = RangeLog.from_arrays(
+        [*(log.anchor_ids[k] for k in log.anchor_index), *(b for _, b in pairs)],
+        np.append(log.range_m, lengths),
+        timestamp_s=np.append(log.timestamp_s, np.full(len(pairs), log.timestamp_s[0])),
+        tag_id=["tag"] * len(log) + [a for a, _ in pairs],
+        range_stddev_m=np.append(np.full(len(log), np.nan), np.full(len(pairs), 0.01)),
+    ).with_anchors(set(ids))
+    alone, held = survey.scale("unknown", log=log), survey.scale("unknown", log=with_peers)
+    off_m = [
+        np.abs(pdist(np.array([anchor.position_m for anchor in estimate.anchors])) - lengths).max()
+        for estimate in (alone, held)
+    ]
+    assert off_m[1] < 0.75 * off_m[0]
 
 
 def test_check_distances_have_no_say(make_survey: MakeSurvey) -> None:

@@ -1,1 +1,1 @@
-"""Taped distances: lengths that somebody measured, to hold the scale (control) or to try it (check)."""
+"""Measured lengths, by tape or by radio, to hold the scale (control) or to try it (check)."""

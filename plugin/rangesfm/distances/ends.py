@@ -76,9 +76,8 @@ def locate_distances(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Seq
             distance from an anchor to what is none, and marks that are too few, seen from one direction only, or not
             of one point.
     """
-    images = {image.name: image for image in model.images.values() if image.has_pose}
-    markers = {name: _triangulate(name, marker, images, tape) for name, marker in _wanted_markers(tape).items()}
-    points = {name: image.projection_center() for name, image in images.items()} | markers
+    images = images_by_name(model)
+    points = {name: image.projection_center() for name, image in images.items()} | triangulate_markers(tape, model)
     lengths = np.full(len(tape.distances), np.nan)
     pairs = np.full((len(tape.distances), 2), -1, dtype=np.int64)
     for row, taped in enumerate(tape.distances):
@@ -103,6 +102,21 @@ def _what_is_wrong(taped: TapedDistance, points: dict[str, Array], anchor_ids: S
         if name not in points and name not in anchor_ids:
             return f"an end is {name!r}, expected a photo that is in the model, a marker or an anchor of the log"
     return f"from {taped.ends[0]!r} to {taped.ends[1]!r}: expected two anchors, or two ends of which none is an anchor"
+
+
+def images_by_name(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Image]:
+    """Those that have a pose."""
+    return {image.name: image for image in model.images.values() if image.has_pose}
+
+
+def triangulate_markers(tape: Tape, model: pycolmap.Reconstruction) -> dict[str, Array]:
+    """(3,) place of each marker that is the end of a distance.
+
+    Raises:
+        InputError: as ``locate_distances`` does.
+    """
+    images = images_by_name(model)
+    return {name: _triangulate(name, marker, images, tape) for name, marker in _wanted_markers(tape).items()}
 
 
 def _wanted_markers(tape: Tape) -> dict[str, Marker]:

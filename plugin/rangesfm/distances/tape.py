@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +65,10 @@ class Tape:
     markers: dict[str, Marker] | None = None
     distances_path: Path | None = None
     markers_path: Path | None = None
+
+    def control(self) -> Tape:
+        """The distances that are to be kept to."""
+        return replace(self, distances=tuple(taped for taped in self.distances if taped.kind == CONTROL))
 
 
 def read_tape(distances_path: str | Path, markers_path: str | Path | None = None) -> Tape:

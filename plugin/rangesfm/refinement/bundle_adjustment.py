@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import heapq
 import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -33,6 +32,7 @@ _TOLERANCE = 1e-8
 _MIN_PIXEL_STDDEV = 0.05
 # What is still to be gained when it stops, as a share of the smallest range stddev.
 _MAX_LAST_MOVEMENT = 0.01
+_MAX_NUM_TIE_POINTS = 500
 
 
 @dataclass(frozen=True)
@@ -59,10 +59,10 @@ class Adjustment:
 
 
 @dataclass(frozen=True)
-class _Blocks:
+class AnchorBlocks:
     """Parameter blocks that the solver changes in place."""
 
-    anchors: list[Array]
+    positions: list[Array]
     biases: list[Array]
 
 
@@ -76,6 +76,7 @@ class BundleAdjustment:
         num_reprojections: residuals of features.
         pixel_stddev: of one coordinate of a feature, estimated from the residuals before.
         max_num_iterations: of the solver, in all.
+        tie_points: blocks of 3-D points that few images see, for ``keep_from_elimination``.
     """
 
     metric: pycolmap.Reconstruction
@@ -83,6 +84,17 @@ class BundleAdjustment:
     num_reprojections: int
     pixel_stddev: float
     max_num_iterations: int
+    tie_points: Iterator[Array]
+
+    def keep_from_elimination(self, block: Array) -> None:
+        """Have Ceres eliminate the map's points only: its kernels are made for them, and their residuals are alike.
+
+        It eliminates what shares residuals with few other blocks, and not two blocks that share one.
+        """
+        tie_point = next(self.tie_points, None)
+        if tie_point is not None:
+            tie = _ceres.zero_tie_cost(size_a=len(block), size_b=3)
+            _ceres.add_residual_block(self.adjuster, tie, None, [block, tie_point])
 
 
 def bundle_adjustment(
@@ -93,8 +105,12 @@ def bundle_adjustment(
     fixed_frame_id: int | None,
     max_num_iterations: int,
     num_threads: int,
+    marker_ids: Collection[int] = (),
 ) -> BundleAdjustment:
     """Set it up, with a gauge that leaves the scale to the ranges.
+
+    Args:
+        marker_ids: 3-D points that will have other residuals than their reprojections.
 
     Raises:
         SolverError: nothing takes part.
@@ -105,7 +121,17 @@ def bundle_adjustment(
     if num_reprojections == 0:
         raise SolverError("no point of the model takes part in the bundle adjustment")
     pixel_stddev = _pixel_stddev(adjuster, num_reprojections)
-    return BundleAdjustment(metric, adjuster, num_reprojections, pixel_stddev, max_num_iterations)
+    tie_points = _tie_points(metric, adjuster, marker_ids)
+    return BundleAdjustment(metric, adjuster, num_reprojections, pixel_stddev, max_num_iterations, tie_points)
+
+
+def _tie_points(
+    metric: pycolmap.Reconstruction, adjuster: pycolmap.CeresBundleAdjuster, marker_ids: Collection[int]
+) -> Iterator[Array]:
+    """Points in turn, those of few images first: one that held many ties would itself have many neighbours."""
+    by_track_length = sorted(metric.points3D.items(), key=lambda item: (item[1].track.length(), item[0]))
+    own = (point.xyz for point_id, point in by_track_length if point_id not in marker_ids)
+    return itertools.cycle(itertools.islice(filter(adjuster.problem.has_parameter_block, own), _MAX_NUM_TIE_POINTS))
 
 
 def adjust_with_ranges(
@@ -115,14 +141,19 @@ def adjust_with_ranges(
     antennas: Antennas,
     weights: RangeWeights,
     anchors: Sequence[AnchorEstimate],
+    add_more: Callable[[AnchorBlocks], object],
 ) -> Adjustment:
     """Add the ranges and solve, in place.
+
+    Args:
+        add_more: adds further residuals, which may act on the anchors' blocks.
 
     Raises:
         SolverError: the solver failed.
     """
-    blocks = _Blocks([a.position_m.copy() for a in anchors], [np.array([a.range_bias_m]) for a in anchors])
+    blocks = AnchorBlocks([a.position_m.copy() for a in anchors], [np.array([a.range_bias_m]) for a in anchors])
     _add_ranges(problem, trajectory, observations, antennas, weights, blocks)
+    add_more(blocks)
     _add_anchor_priors(problem, anchors, blocks)
     finest = float(np.nanmin(weights.stddev_m[observations.has_place], initial=np.inf))
     start = time.monotonic()
@@ -140,7 +171,7 @@ def adjust_with_ranges(
         message=last.message,
         anchors=tuple(
             replace(anchor, position_m=position, range_bias_m=float(bias[0]))
-            for anchor, position, bias in zip(anchors, blocks.anchors, blocks.biases, strict=True)
+            for anchor, position, bias in zip(anchors, blocks.positions, blocks.biases, strict=True)
         ),
     )
 
@@ -211,7 +242,7 @@ def _add_ranges(
     observations: RangeObservations,
     antennas: Antennas,
     weights: RangeWeights,
-    blocks: _Blocks,
+    blocks: AnchorBlocks,
 ) -> None:
     """Ranges in units of pixels: one stddev of either weighs the same."""
     log, adjuster = observations.log, problem.adjuster
@@ -220,7 +251,7 @@ def _add_ranges(
     poses = [pose_of(problem.metric.frame(int(frame_id))).params for frame_id in trajectory.frame_ids]
     for i in np.flatnonzero(observations.has_place):
         k, before, after = log.anchor_index[i], antennas.before[i], antennas.after[i]
-        end_blocks = [blocks.anchors[k], blocks.biases[k]]
+        end_blocks = [blocks.positions[k], blocks.biases[k]]
         if before == after:
             cost = _ceres.range_cost(range_m=log.range_m[i], tag_in_cam_m=antennas.tag_in_cam_m[i], stddev_m=stddev[i])
             _ceres.add_residual_block(adjuster, cost, loss, [poses[before], *end_blocks])
@@ -238,30 +269,22 @@ def _add_ranges(
 def _add_anchor_priors(
     bundle: BundleAdjustment,
     anchors: Sequence[AnchorEstimate],
-    blocks: _Blocks,
+    blocks: AnchorBlocks,
 ) -> None:
     """Hold, draw or free each anchor and bias that has ranges; stddevs in the unit of pixels."""
     problem, adjuster = bundle.adjuster.problem, bundle.adjuster
-    # A point of few images for each block: one that held many ties would itself have many neighbours.
-    by_track_length = heapq.nsmallest(
-        2 * len(anchors), bundle.metric.points3D.items(), key=lambda item: (item[1].track.length(), item[0])
-    )
-    tie_points = itertools.cycle([point.xyz for _, point in by_track_length])
-    for anchor, position, bias in zip(anchors, blocks.anchors, blocks.biases, strict=True):
-        if not problem.has_parameter_block(position):
-            continue
+    for anchor, position, bias in zip(anchors, blocks.positions, blocks.biases, strict=True):
         priors = [
             (position, anchor.prior_position_m, np.full(3, anchor.prior_position_stddev_m)),
             (bias, np.array([anchor.prior_bias_m]), np.array([anchor.prior_bias_stddev_m])),
         ]
         for block, mean, stddev in priors:
+            if not problem.has_parameter_block(block):
+                continue
             if stddev[0] == 0:
                 problem.set_parameter_block_constant(block)
                 continue
             if mean is not None:
                 cost = _ceres.normal_prior_cost(mean=mean, stddev=stddev / bundle.pixel_stddev)
                 _ceres.add_residual_block(adjuster, cost, None, [block])
-            tie_point = next(tie_points)
-            if problem.has_parameter_block(tie_point):
-                tie = _ceres.zero_tie_cost(size_a=len(block), size_b=3)
-                _ceres.add_residual_block(adjuster, tie, None, [block, tie_point])
+            bundle.keep_from_elimination(block)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.distances.by_radio import distances_by_radio
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry import Similarity, path_shape
@@ -64,7 +65,8 @@ def survey_problem(
     """Set up the estimation.
 
     Args:
-        distances: taped ones, with the anchors of the log in its order.
+        distances: taped ones, with the anchors of the log in its order; those between anchors that the log holds
+            are added.
         gravity: as somebody told it.
 
     Raises:
@@ -100,19 +102,35 @@ def survey_problem(
         bias_stddev_m=np.where(heard, np.array([_bias_stddev(a, range_model) for a in in_log]), 0.0),
         common_bias_stddev_m=range_model.common_bias_stddev_m,
         frame_is_free=anchor_frame == "site" and bool(known.any()),
-        distances=_control(distances, heard | placed),
+        distances=_control(_all_distances(observations, in_log, range_model, distances, noise), heard | placed),
         gravity=gravity if anchor_frame == "site" and bool(known.any()) else None,
     )
     frame = "site" if ranges.frame_is_free else "first_camera"
     return SurveyProblem(ranges, rows, first_camera_from_sfm, frame, bool(known.any()), tuple(notes))
 
 
-def _control(distances: LocatedDistances | None, has_place: npt.NDArray[np.bool_]) -> LocatedDistances | None:
-    """Those that are to be kept to, between points or anchors that take part."""
-    if distances is None:
-        return None
-    takes_part = np.append(has_place, True)[distances.anchor_pair].all(axis=1)
-    return distances.subset(takes_part & ~distances.is_check)
+def _all_distances(
+    observations: RangeObservations,
+    anchors: Sequence[Anchor],
+    range_model: RangeModelOptions,
+    taped: LocatedDistances | None,
+    noise_m: float,
+) -> LocatedDistances:
+    """The taped ones, and those between anchors that the radios measured."""
+    by_radio = distances_by_radio(
+        observations.log,
+        noise_m,
+        np.array([a.range_bias_m for a in anchors]),
+        np.array([_bias_stddev(a, range_model) for a in anchors]),
+        range_model.common_bias_stddev_m,
+    )
+    return by_radio if taped is None else taped.joined(by_radio)
+
+
+def _control(distances: LocatedDistances, has_place: npt.NDArray[np.bool_]) -> LocatedDistances | None:
+    """Those that are to be kept to, between points or anchors that take part; None if there are none."""
+    takes_part = np.append(has_place, True)[distances.anchor_pair].all(axis=1) & ~distances.is_check
+    return distances.subset(takes_part) if takes_part.any() else None
 
 
 def _anchors_of_log(anchor_ids: tuple[str, ...], anchors: Sequence[Anchor]) -> list[Anchor]:
