@@ -12,6 +12,8 @@ import numpy.typing as npt
 import pycolmap
 import pytest
 from PIL import Image
+from pyopf.cameras import CameraList
+from pyopf.cps import Constraints, InputControlPoints
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
@@ -172,6 +174,18 @@ def test_scale_constraints_are_distances_of_the_map_between_points_that_are_mark
         length = float(np.linalg.norm(ends[0] - ends[1]))
         assert constraint["distance"] == pytest.approx(length, rel=1e-6)
         assert constraint["sigma"] == pytest.approx(0.02 * length, rel=1e-6)
+
+
+def test_the_formats_own_library_reads_the_constraints(tmp_path: Path) -> None:
+    folder = export(made(), "opf", tmp_path)
+    constraints = Constraints.from_dict(load(folder / "constraints.json"))
+    control = InputControlPoints.from_dict(load(folder / "input_control_points.json"))
+    cameras = CameraList.from_dict(load(folder / "camera_list.json"))
+    points, photos = {point.id for point in control.mtps}, {camera.id for camera in cameras.cameras}
+    assert len(constraints.scale_constraints) == 10
+    for constraint in constraints.scale_constraints:
+        assert {constraint.id_from, constraint.id_to} <= points
+    assert {mark.camera_id for point in control.mtps for mark in point.marks} <= photos
 
 
 def triangulated(model: pycolmap.Reconstruction, marks: list[dict[str, Any]], cameras: dict[int, str]) -> Array:

@@ -64,7 +64,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
         return _apply(source, args, options)
     images_path = None if args.images is None else Path(args.images)
     written = export_result(source, formats, Path(args.output_path or source), options=options, images_path=images_path)
-    return Outcome([str(path) for path in written])
+    return Outcome([*map(str, written), *_frame_note(options)])
 
 
 def _apply(source: Path, args: argparse.Namespace, options: ExportOptions) -> Outcome:
@@ -75,4 +75,14 @@ def _apply(source: Path, args: argparse.Namespace, options: ExportOptions) -> Ou
     destination = Path(args.output_path or source / "applied")
     paths, residual_m = apply_result(source, [Path(path) for path in args.apply_to], destination, options=options)
     note = f"cameras of the refined map are {residual_m:.3f} m (rms) from where the similarity puts them"
-    return Outcome([*map(str, paths), *([note] if residual_m else [])])
+    return Outcome([*map(str, paths), *_frame_note(options), *([note] if residual_m else [])])
+
+
+def _frame_note(options: ExportOptions) -> list[str]:
+    """Where up came from, if it was asked for: nobody can see it in the files."""
+    if options.frame == "result" and options.origin_anchor is None:
+        return []
+    if options.frame == "enu" and options.origin_anchor is None:
+        return ["up is away from the ellipsoid, by the anchors' coordinates"]
+    source = {"cameras": "the mean of what is up in the photos", "path": "across the plane of the path"}
+    return [f"up is {source.get(options.up, f'{options.up} in the frame of the result')}"]
