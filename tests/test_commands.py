@@ -455,9 +455,9 @@ class TestResultFolder:
         place = ("--origin_anchor", "A1", "--origin_lat_lon_height", "47.4,8.5,430", "--heading_deg", "90")
         flags = ("--formats", "laz,geojson,nerfstudio", "--frame", "enu", *place, "--output_path", "exported")
         done = rangesfm_command("export", out, *flags, cwd=out)
-        assert done.stdout.split() == [
-            f"exported/{name}" for name in ("points.laz", "survey.geojson", "transforms.json")
-        ]
+        names = ("points.laz", "survey.geojson", "transforms.json")
+        lines = [*(f"exported/{name}" for name in names), "up is the mean of what is up in the photos"]
+        assert done.stdout.splitlines() == lines
         features = json.loads((out / "exported" / "survey.geojson").read_text())["features"]
         (anchor,) = (f for f in features if f["properties"]["name"] == "A1")
         assert anchor["geometry"]["coordinates"] == pytest.approx([8.5, 47.4, 430.0], abs=1e-6)
