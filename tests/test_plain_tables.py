@@ -77,3 +77,16 @@ def test_no_rows_are_no_cells() -> None:
     numbers = columns[1].numbers()
     assert numbers is not None
     assert len(numbers) == 0
+
+
+@pytest.mark.parametrize("num_names", [1, 7, 50, 400])
+@pytest.mark.parametrize("width", [1, 5, 12])
+def test_categories_are_the_texts_told_apart(num_names: int, width: int) -> None:
+    rng = np.random.default_rng(num_names + width)
+    names = [f"{k:0{width}d}" for k in range(num_names)]
+    texts = [names[k] for k in rng.integers(0, num_names, 3000)]
+    columns = find_columns("".join(f"{text},1\n" for text in texts), 2, ",")
+    assert columns is not None
+    found, index = columns[0].categories()
+    assert [found[k] for k in index] == texts
+    assert found == list(dict.fromkeys(texts))

@@ -6,6 +6,7 @@ header. Whatever else there may be is left to the reader of all tables, which al
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,8 @@ import numpy.typing as npt
 
 _CHUNK_ROWS = 1 << 16
 _MAX_WIDTH = 40
+_KEY_BYTES = 8
+_MAX_PASSES = 32
 _NOT_PLAIN = ('"', "#", "\0")
 _ZERO, _POINT, _MINUS, _LINE_END = b"0.-\n"
 _MAX_EXACT = 2.0**53  # whole numbers below, divided by a power of ten up to 1e22, are rounded once: as by float()
@@ -50,6 +53,42 @@ class PlainColumn:
             raw += cells.view(f"S{width}").ravel().tolist()
         text_of = {cell: cell.decode("ascii") for cell in dict.fromkeys(raw)}
         return list(map(text_of.__getitem__, raw))
+
+    def categories(self) -> tuple[list[str], npt.NDArray[np.int64]]:
+        """The different cells, in order of first appearance, and (n,) which of them each cell is."""
+        if int(np.max(self.end - self.start, initial=0)) > _KEY_BYTES:
+            texts = self.texts()
+            index_of = {text: index for index, text in enumerate(dict.fromkeys(texts))}
+            return list(index_of), np.fromiter(map(index_of.__getitem__, texts), np.int64, len(texts))
+        keys = self._keys()
+        index = np.full(len(keys), -1)
+        found: list[np.uint64] = []
+        first = 0
+        # A few names, as nodes of a radio have: one pass for each is faster than sorting.
+        while first < len(keys) and len(found) < _MAX_PASSES:
+            key = keys[first]
+            index[keys == key] = len(found)
+            found.append(key)
+            unknown = index[first:] < 0
+            first = first + int(np.argmax(unknown)) if unknown.any() else len(keys)
+        if first < len(keys):
+            values, first_row, index = np.unique(keys, return_index=True, return_inverse=True)
+            order = np.argsort(first_row)
+            rank = np.empty_like(order)
+            rank[order] = np.arange(len(order))
+            found, index = list(values[order]), rank[index]
+        return [int(key).to_bytes(_KEY_BYTES, sys.byteorder).rstrip(b"\0").decode("ascii") for key in found], index
+
+    def _keys(self) -> npt.NDArray[np.uint64]:
+        """(n,) the bytes of each cell as one number."""
+        windows = np.lib.stride_tricks.sliding_window_view(self.data, _KEY_BYTES)
+        keys = np.empty(len(self.start), np.uint64)
+        for first in range(0, len(keys), _CHUNK_ROWS):
+            rows = slice(first, first + _CHUNK_ROWS)
+            cells = windows[self.start[rows]]
+            cells[np.arange(_KEY_BYTES) >= (self.end[rows] - self.start[rows])[:, np.newaxis]] = 0
+            keys[rows] = cells.view(np.uint64).ravel()
+        return keys
 
     def numbers(self) -> npt.NDArray[np.float64] | None:
         """The cells just as float() reads them; None if any is not plain.

@@ -25,6 +25,35 @@ _MAX_SHOWN = 100
 
 
 @dataclass(frozen=True)
+class Categories:
+    """n texts of which few differ.
+
+    Attributes:
+        names: the different ones, in order of first appearance.
+        index: (n,) which of them each is.
+    """
+
+    names: tuple[str, ...]
+    index: npt.NDArray[np.int64]
+
+    @classmethod
+    def of(cls, texts: Sequence[str]) -> Categories:
+        index_of = {text: index for index, text in enumerate(dict.fromkeys(texts))}
+        return cls(tuple(index_of), np.fromiter(map(index_of.__getitem__, texts), np.int64, len(texts)))
+
+    def subset(self, rows: npt.NDArray[np.bool_]) -> Categories:
+        """Some of the texts; names without any are forgotten."""
+        if rows.all():
+            return self
+        chosen = self.index[rows]
+        used, first = np.unique(chosen, return_index=True)
+        order = used[np.argsort(first)]
+        rank = np.zeros(len(self.names), dtype=np.int64)
+        rank[order] = np.arange(len(order))
+        return Categories(tuple(self.names[k] for k in order.tolist()), rank[chosen])
+
+
+@dataclass(frozen=True)
 class Table:
     """The asked-for columns of a file, n rows.
 
@@ -54,6 +83,18 @@ class Table:
                 raise self.error(texts.index(""), column, "some text")
             texts = [text or empty for text in texts]
         return texts
+
+    def categories(self, column: str, *, empty: str | None = None) -> Categories:
+        """The cells as ``text`` has them, told apart: fast where they are few."""
+        cells = self.cells[column]
+        if not isinstance(cells, PlainColumn):
+            return Categories.of(self.text(column, empty=empty))
+        raw, index = cells.categories()
+        names = [name.strip() for name in raw]
+        if "" in names and empty is None:
+            raise self.error(int(np.argmax(index == names.index(""))), column, "some text")
+        kinds = Categories.of([name or str(empty) for name in names])
+        return Categories(kinds.names, kinds.index[index])
 
     def numbers(
         self, column: str, *, empty: float | None = None, expected: str = "a number"

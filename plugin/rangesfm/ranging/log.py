@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+
+from rangesfm.tables import Categories
 
 DEFAULT_TAG_ID = "tag"
 
@@ -196,13 +198,13 @@ class RangeLog:
     @classmethod
     def from_arrays(
         cls,
-        anchor_id: list[str] | npt.NDArray[np.str_],
+        anchor_id: Sequence[str] | npt.NDArray[np.str_] | Categories,
         range_m: npt.ArrayLike,
         *,
         timestamp_s: npt.ArrayLike | None = None,
         image_name: list[str] | None = None,
         range_stddev_m: npt.ArrayLike | None = None,
-        tag_id: list[str] | None = None,
+        tag_id: Sequence[str] | Categories | None = None,
         los: npt.ArrayLike | None = None,
         line: npt.ArrayLike | None = None,
         source: Path | None = None,
@@ -216,19 +218,19 @@ class RangeLog:
         """
         ranges = np.asarray(range_m, dtype=np.float64)
         n = len(ranges)
-        anchor_ids, anchor_index = _in_order_of_appearance(anchor_id)
-        tag_ids, tag_index = _in_order_of_appearance(tag_id) if tag_id is not None else _only(DEFAULT_TAG_ID, n)
+        anchor = _categories(anchor_id)
+        tag = _categories(tag_id) if tag_id is not None else _only(DEFAULT_TAG_ID, n)
         return cls(
-            anchor_ids=anchor_ids,
-            anchor_index=anchor_index,
+            anchor_ids=anchor.names,
+            anchor_index=anchor.index,
             range_m=ranges,
             timestamp_s=None if timestamp_s is None else np.asarray(timestamp_s, dtype=np.float64),
             image_name=None if image_name is None else tuple(image_name),
             range_stddev_m=np.full(n, np.nan)
             if range_stddev_m is None
             else np.asarray(range_stddev_m, dtype=np.float64),
-            tag_ids=tag_ids,
-            tag_index=tag_index,
+            tag_ids=tag.names,
+            tag_index=tag.index,
             peer_index=np.full(n, -1),
             los=np.full(n, -1, dtype=np.int8) if los is None else np.asarray(los, dtype=np.int8),
             line=np.arange(1, n + 1) if line is None else np.asarray(line, dtype=np.int64),
@@ -239,13 +241,11 @@ class RangeLog:
         )
 
 
-def _in_order_of_appearance(
-    ids: list[str] | npt.NDArray[np.str_],
-) -> tuple[tuple[str, ...], npt.NDArray[np.int64]]:
-    texts: list[str] = ids if isinstance(ids, list) else ids.tolist()
-    index_of = {text: index for index, text in enumerate(dict.fromkeys(texts))}
-    return tuple(index_of), np.fromiter(map(index_of.__getitem__, texts), np.int64, len(texts))
+def _categories(ids: Sequence[str] | npt.NDArray[np.str_] | Categories) -> Categories:
+    if isinstance(ids, Categories):
+        return ids
+    return Categories.of(ids if isinstance(ids, Sequence) else ids.tolist())
 
 
-def _only(id: str, num: int) -> tuple[tuple[str, ...], npt.NDArray[np.int64]]:
-    return (id,) if num else (), np.zeros(num, np.int64)
+def _only(id: str, num: int) -> Categories:
+    return Categories((id,) if num else (), np.zeros(num, np.int64))

@@ -69,22 +69,21 @@ def read_columns(path: Path, columns: Columns, format: str) -> RangeLog:
     ranges = _ranges(table, name["range"], columns) if "range" in name else _ranges_by_stamps(table, name, columns)
     timestamps = _timestamps(table, name["timestamp"], columns.timestamp_unit) if "timestamp" in name else None
     image_name = table.text(name["image_name"]) if timestamps is None else None
-    anchor_id = table.text(name["anchor_id"])
-    tag_id = table.text(name["tag_id"], empty=DEFAULT_TAG_ID) if "tag_id" in name else None
+    anchor = table.categories(name["anchor_id"])
+    tag = table.categories(name["tag_id"], empty=DEFAULT_TAG_ID) if "tag_id" in name else None
     stddevs = _stddevs(table, name["range_stddev"], columns) if "range_stddev" in name else None
     los = _line_of_sight(table, name["los"]) if "los" in name else None
     measured = ranges > 0
     if not np.any(measured):
         said = f"all {len(table)} records say that there was no measurement" if len(table) else "no records"
         raise InputError(f"no usable range: {said}", path)
-    chosen = measured.tolist()
     return RangeLog.from_arrays(
-        list(compress(anchor_id, chosen)),
+        anchor.subset(measured),
         ranges[measured],
         timestamp_s=None if timestamps is None else timestamps[measured],
-        image_name=None if image_name is None else list(compress(image_name, chosen)),
+        image_name=None if image_name is None else list(compress(image_name, measured.tolist())),
         range_stddev_m=None if stddevs is None else stddevs[measured],
-        tag_id=None if tag_id is None else list(compress(tag_id, chosen)),
+        tag_id=None if tag is None else tag.subset(measured),
         los=None if los is None else los[measured],
         line=table.line[measured],
         source=path,
