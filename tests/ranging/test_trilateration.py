@@ -13,6 +13,8 @@ import pytest
 from scipy.stats import chi2
 
 from rangesfm.errors import GeometryError
+from rangesfm.ranging.anchor_survey import trilaterate_anchors
+from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.trilateration import Trilateration, TrilaterationOptions, trilaterate
 from rangesfm.simulate.path import loop_path
 
@@ -236,3 +238,35 @@ def test_study_in_small_finds_every_anchor_among_15_percent_outliers(
     assert np.max(summary.error_m) < 0.30
     low, high = chi2.ppf([5e-4, 1 - 5e-4], 3 * 40) / 40
     assert (low if options is KNOWN_BIAS else 1.0) < np.mean(summary.squares) < high
+
+
+class TestErrorCurve:
+    def test_short_ranges_weigh_in_full_once_their_error_was_learnt(self) -> None:
+        positions = 0.2 * flight()
+        near = np.array([1.0, -0.8, 1.0])
+        ranges = distances(positions, near) + noise(100, 0.05)
+        unknown, learnt = (
+            trilaterate(positions, ranges, shared_stddev_m=shared, options=KNOWN_BIAS)
+            for shared in (None, np.full(100, 0.01))
+        )
+        assert learnt.position_stddev_m < 0.5 * unknown.position_stddev_m
+        assert squared_error(learnt, near) < chi2.ppf(0.999, 3)
+
+    def test_ranges_where_the_curve_was_not_learnt_count_for_less(self) -> None:
+        wrong = np.arange(100) % 2 == 0
+        ranges = distances(flight()) + noise(100, 0.05) + np.where(wrong, 0.3, 0.0)
+        equal, doubted = (
+            trilaterate(flight(), ranges, shared_stddev_m=np.where(wrong, stddev, 0.01), options=KNOWN_BIAS)
+            for stddev in (0.01, 1.0)
+        )
+        assert np.linalg.norm(doubted.position_m - ANCHOR_M) < 0.5 * np.linalg.norm(equal.position_m - ANCHOR_M)
+
+    def test_a_log_brings_what_its_curve_left_uncertain(self) -> None:
+        ranges = distances(flight()) + noise(100, 0.05)
+        shared = np.full(100, 0.2)
+        log = RangeLog.from_arrays(["A"] * 100, ranges, timestamp_s=np.arange(100.0), shared_stddev_m=shared)
+        (placement,) = trilaterate_anchors(log, flight())
+        alone = trilaterate(flight(), ranges, shared_stddev_m=shared, timestamp_s=np.arange(100.0))
+        assert placement.found is not None
+        np.testing.assert_allclose(placement.found.position_m, alone.position_m, atol=1e-9)
+        np.testing.assert_allclose(placement.found.covariance_m2, alone.covariance_m2, atol=1e-9)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from rangesfm.errors import GeometryError
 from rangesfm.ranging.anchors import Anchor
 from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.noise import shared_stddev
 from rangesfm.ranging.trilateration import Trilateration, TrilaterationOptions, trilaterate
 
 
@@ -78,6 +79,7 @@ def _place(
             tag_positions_m[rows],
             log.range_m[rows],
             range_stddev_m=log.range_stddev_m[rows],
+            shared_stddev_m=shared_stddev(log)[rows],
             timestamp_s=None if log.timestamp_s is None else log.timestamp_s[rows],
             toward=None if toward is None else toward.get(anchor_id),
             options=options,

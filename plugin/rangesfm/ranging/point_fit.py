@@ -33,6 +33,7 @@ class PointProblem:
         positions_m: (n, 3) of the tag.
         range_m: (n,) measured.
         stddev_m: (n,), or (k, n) if the k starts differ.
+        shared_stddev_m: (n,) the part of it that ranges of about this length have in common.
         prior_mean: (4,) or (k, 4).
         prior_information: (4, 4), symmetric; zero where nothing is known.
     """
@@ -40,6 +41,7 @@ class PointProblem:
     positions_m: Array
     range_m: Array
     stddev_m: Array
+    shared_stddev_m: Array
     prior_mean: Array
     prior_information: Array
 
@@ -50,6 +52,7 @@ class PointProblem:
             positions_m=self.positions_m[rows],
             range_m=self.range_m[rows],
             stddev_m=self.stddev_m[..., rows],
+            shared_stddev_m=self.shared_stddev_m[rows],
         )
 
     def residuals_m(self, x: Array) -> Array:

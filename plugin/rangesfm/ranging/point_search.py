@@ -13,7 +13,6 @@ import numpy.typing as npt
 
 from rangesfm.geometry import path_shape
 from rangesfm.ranging.multilateration import multilaterate
-from rangesfm.ranging.noise import short_range_stddev
 from rangesfm.ranging.point_fit import PointProblem, improve
 
 Array = npt.NDArray[np.float64]
@@ -36,7 +35,7 @@ def best_start(problem: PointProblem, unit_m: Array) -> tuple[Array, float]:
     """The most likely point.
 
     Args:
-        problem: its stddevs are not looked at.
+        problem: of its stddevs only the shared ones are looked at.
         unit_m: (n,) how the noise of the ranges compares.
 
     Returns:
@@ -47,7 +46,7 @@ def best_start(problem: PointProblem, unit_m: Array) -> tuple[Array, float]:
     x = _starts(part)
     best_x, best_noise, least = x[0], float(_NOISES[0]), np.inf
     for step, noise in enumerate(_NOISES):
-        now = replace(part, stddev_m=np.hypot(noise * unit_m, short_range_stddev(part.range_m)))
+        now = replace(part, stddev_m=np.hypot(noise * unit_m, part.shared_stddev_m))
         x, _ = improve(now, x, _NUM_STEPS)
         unlikelihood = now.unlikelihood(x)
         if np.min(unlikelihood) < least:

@@ -119,6 +119,7 @@ def trilaterate(
     range_m: npt.ArrayLike,
     *,
     range_stddev_m: npt.ArrayLike | None = None,
+    shared_stddev_m: npt.ArrayLike | None = None,
     timestamp_s: npt.ArrayLike | None = None,
     toward: npt.ArrayLike | None = None,
     options: TrilaterationOptions | None = None,
@@ -132,6 +133,8 @@ def trilaterate(
         tag_positions_m: (n, 3) positions of the tag's antenna, metres.
         range_m: (n,) measured distances.
         range_stddev_m: (n,) noise of each range, NaN where unknown; or None.
+        shared_stddev_m: (n,) what ranges of about this length may be off together, by the radio's error curve;
+            None: without one, short ranges weigh less.
         timestamp_s: (n,) when they were taken, so that errors that last count for what they are; or None.
         toward: (3,) direction in which the anchor lies, seen from its mirror image; or None.
 
@@ -149,6 +152,7 @@ def trilaterate(
         positions,
         ranges,
         np.full(len(ranges), _USUAL_NOISE_M),
+        short_range_stddev(ranges) if shared_stddev_m is None else np.asarray(shared_stddev_m, dtype=np.float64),
         np.array([0.0, 0.0, 0.0, options.range_bias_m]),
         np.diag([0.0, 0.0, 0.0, bias_information]),
     )
@@ -195,17 +199,16 @@ def _fit_with_own_noise(
     given = np.where(np.isfinite(given), given, options.range_stddev_m or np.nan)
     is_given = np.isfinite(given)
     unit = np.where(is_given, given, np.median(given[is_given]) if is_given.any() else _USUAL_NOISE_M)
-    short = short_range_stddev(problem.range_m)
     x, noise = best_start(problem, unit)
     inflation = 1.0
     for _ in range(_NUM_NOISE_ROUNDS):
         noise = max(noise, 1.0) if is_given.all() else noise
         # Ranges keep their weight among themselves; the prior gains by what correlated errors cost them.
         prior = problem.prior_information * inflation**2
-        now = replace(problem, stddev_m=np.hypot(noise * unit, short), prior_information=prior)
+        now = replace(problem, stddev_m=np.hypot(noise * unit, problem.shared_stddev_m), prior_information=prior)
         fit = _Fit(now, improve(now, x[None])[0][0], noise * float(np.median(unit)), inflation)
         x = fit.x
-        ordinary = short < noise * unit
+        ordinary = problem.shared_stddev_m < noise * unit
         rows = ordinary if np.mean(ordinary) > _MIN_ORDINARY else np.ones(num, dtype=np.bool_)
         noise = _noise_of(fit.residuals_m[rows] / unit[rows], noise)
         if groups is not None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.ranging.noise import correlation_inflation, robust_stddev, short_range_stddev
+from rangesfm.ranging.noise import correlation_inflation, robust_stddev, shared_stddev
 from rangesfm.ranging.observations import RangeObservations, robust_weights
 
 Array = npt.NDArray[np.float64]
@@ -134,7 +134,7 @@ def range_weights(
         metres_per_unit: of the observations' world.
     """
     log = observations.log
-    fixed = np.hypot(short_range_stddev(log.range_m), metres_per_unit * observations.center_stddev)
+    fixed = np.hypot(shared_stddev(log), metres_per_unit * observations.center_stddev)
     estimated = np.zeros(len(log), dtype=bool) if is_estimated is None else is_estimated
     times = observations.before if log.timestamp_s is None else log.timestamp_s
     length = 1.0 if log.timestamp_s is None else BLOCK_S
