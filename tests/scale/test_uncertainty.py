@@ -11,6 +11,7 @@ import pytest
 
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.scale.estimate import ScaleUncertainty
+from rangesfm.scale.uncertainty import ANTENNA_STDDEV_M
 from rangesfm.simulate.ranges import Radio
 
 if TYPE_CHECKING:
@@ -108,6 +109,41 @@ def test_few_blocks_or_anchors_widen_the_interval_as_students_t_does() -> None:
     assert replace(many, num_blocks=5).half_width_95 == pytest.approx(2.776 * 0.002, rel=0.01)
     assert replace(many, jackknife=0.002, num_anchors=3).half_width_95 == pytest.approx(4.303 * 0.002, rel=0.01)
     assert replace(many, range_model=0.03).half_width_95 == pytest.approx(1.96 * 0.03, rel=0.01)
+
+
+def test_what_leaving_out_anchors_shows_of_their_antennas_is_not_counted_twice() -> None:
+    alone = ScaleUncertainty(0.001, 0.003, None, 0.0, 0.001, 1000, 1, antennas=0.004)
+    assert alone.empirical == pytest.approx(0.005)
+    assert alone.half_width_95 == pytest.approx(1.96 * 0.005, rel=0.01)
+    many = replace(alone, jackknife=0.006, num_anchors=1000)
+    assert many.empirical == pytest.approx(0.006)
+    assert many.half_width_95 == pytest.approx(1.96 * 0.006, rel=0.01)
+
+
+def antenna_error(directions: Array, rng: np.random.Generator, num: int = 200) -> Array:
+    """(n,) one draw of an antenna's error: lobes of random strength about random axes, half linear, half quadratic."""
+    axes = rng.standard_normal((num, 3))
+    cosines = directions @ (axes / np.linalg.norm(axes, axis=1)[:, None]).T
+    lobes = np.sqrt(1.5) * cosines + np.sqrt(2.5) * (3 * cosines**2 - 1) / 2
+    error: Array = ANTENNA_STDDEV_M * lobes @ rng.standard_normal(num) / np.sqrt(num)
+    return error
+
+
+def test_the_scatter_that_an_antenna_causes_is_the_one_stated(make_survey: MakeSurvey) -> None:
+    anchor_m = FAR_ANCHORS_M["A"]
+    survey = make_survey(anchors_m={"A": anchor_m}, radio=Radio(range_stddev_m=0.05), num_epochs=4)
+    log, path = survey.simulated.log, survey.trajectory
+    of_keyframe = np.repeat(np.arange(len(path)), 4)
+    tags = survey.centers_m + survey.world_from_cam @ survey.tag_in_cam_m
+    directions = (tags - anchor_m)[of_keyframe]
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    errors, stated = [], []
+    for seed in range(60):
+        wrong = survey.log_with(log.range_m + antenna_error(directions, np.random.default_rng(seed)))
+        estimate = survey.scale("first_camera", "A", wrong, range_model=WITHOUT_BIASES)
+        errors.append(survey.relative_error(estimate))
+        stated.append(estimate.uncertainty.antennas)
+    assert np.std(errors) / np.median(stated) == pytest.approx(1.0, abs=0.25)
 
 
 def test_an_error_curve_that_nobody_knows_widens_the_interval_and_a_known_one_hardly(make_survey: MakeSurvey) -> None:

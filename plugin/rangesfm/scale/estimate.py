@@ -29,6 +29,7 @@ class ScaleUncertainty:
         range_model: what an unknown error curve of the radio would do.
         correlated: the formal one, widened by how the residuals hang together in time.
         num_blocks, num_anchors: that bootstrap and jackknife rest on.
+        antennas: what anchors' antennas would do that err with the direction.
     """
 
     formal: float
@@ -38,20 +39,23 @@ class ScaleUncertainty:
     correlated: float = 0.0
     num_blocks: int = 1000
     num_anchors: int = 1
+    antennas: float = 0.0
 
     @property
     def empirical(self) -> float:
-        """The honest one: the largest of what the data show, and the range model beside it."""
-        return float(np.hypot(max(self.bootstrap, self.correlated, self.jackknife or 0.0), self.range_model))
+        """The honest one: what the data show and what single antennas hide, and the range model beside it.
+
+        Leaving out anchors in turn shows what their antennas do, so it is not counted on top.
+        """
+        one_survey = np.hypot(max(self.bootstrap, self.correlated), self.antennas)
+        return float(np.hypot(max(one_survey, self.jackknife or 0.0), self.range_model))
 
     @property
     def half_width_95(self) -> float:
         """Of the 95 % interval of the scale's logarithm; few blocks or anchors widen it as Student's t does."""
-        seen = max(
-            NORMAL_95 * max(self.formal, self.correlated),
-            _student_95(self.num_blocks - 1) * self.bootstrap,
-            _student_95(self.num_anchors - 1) * (self.jackknife or 0.0),
-        )
+        in_time = max(NORMAL_95 * max(self.formal, self.correlated), _student_95(self.num_blocks - 1) * self.bootstrap)
+        by_anchor = _student_95(self.num_anchors - 1) * (self.jackknife or 0.0)
+        seen = max(np.hypot(in_time, NORMAL_95 * self.antennas), by_anchor)
         return float(np.hypot(seen, NORMAL_95 * self.range_model))
 
 

@@ -165,6 +165,13 @@ def tag_positions(problem: RangeProblem, metric_from_model: Similarity) -> Array
     return metric_from_model.apply(problem.centers) + turned
 
 
+def directions_to_tag(problem: RangeProblem, state: RangeState) -> Array:
+    """(n, 3) unit vectors from anchor to tag in the metric world; zero where one lies on the other."""
+    from_anchor = tag_positions(problem, state.metric_from_model) - state.anchors_m[problem.anchor_index]
+    directions: Array = from_anchor / np.maximum(np.linalg.norm(from_anchor, axis=1), _TINY_DISTANCE_M)[:, None]
+    return directions
+
+
 def predicted_ranges(problem: RangeProblem, state: RangeState) -> Array:
     """(n,) metres."""
     difference = tag_positions(problem, state.metric_from_model) - state.anchors_m[problem.anchor_index]

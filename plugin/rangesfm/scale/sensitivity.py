@@ -6,9 +6,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.scale.estimate import ScaleSensitivity
-from rangesfm.scale.range_equation import predicted_ranges, tag_positions
+from rangesfm.scale.range_equation import directions_to_tag, predicted_ranges
 from rangesfm.scale.solution import Solution
-from rangesfm.scale.uncertainty import scale_shift
+from rangesfm.scale.uncertainty import scale_influence
 
 Array = npt.NDArray[np.float64]
 
@@ -23,13 +23,13 @@ def scale_sensitivity(solution: Solution, model_from_cam: Array, anchor_ids: tup
     """
     problem, state = solution.problem, solution.fit.state
 
+    influence = scale_influence(solution.fit, problem)
+
     def percent(range_error_m: Array) -> float:
-        return 100 * scale_shift(solution.fit, problem, range_error_m)
+        return 100 * float(influence @ range_error_m)
 
     distance = predicted_ranges(problem, state)
-    from_anchor = tag_positions(problem, state.metric_from_model) - state.anchors_m[problem.anchor_index]
-    direction = from_anchor / np.maximum(np.linalg.norm(from_anchor, axis=1), 1e-9)[:, None]
-    in_model = direction @ state.metric_from_model.rotation
+    in_model = directions_to_tag(problem, state) @ state.metric_from_model.rotation
     along_axes = np.einsum("ni,nij->nj", in_model, model_from_cam)
     return ScaleSensitivity(
         common_bias_per_cm=percent(np.full(len(distance), _CM)),

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.scale.estimate import ScaleUncertainty
-from rangesfm.scale.range_equation import RangeFit, RangeProblem, predicted_ranges
+from rangesfm.scale.range_equation import RangeFit, RangeProblem, directions_to_tag, predicted_ranges
 from rangesfm.scale.solution import Solution
 
 Array = npt.NDArray[np.float64]
@@ -22,6 +22,11 @@ CURVE_STDDEV_M = 0.07
 _CURVE_LOG_LENGTH = 1.0
 _NUM_CURVE_KNOTS = 25
 _MIN_DISTANCE_M = 0.05
+# How wrong a range may be as a smooth function of the direction in which an anchor's antenna sees the tag: turning one
+# antenna changes ranges by 0.1 to 0.25 m from least to most (Pelka, Cimdins and Hellbrück, "Impact of the antenna
+# orientation for distance estimation", 2018), which is this stddev as for a uniform distribution. Each anchor has its
+# own, which leaving out one anchor in turn shows; the data of a single one do not.
+ANTENNA_STDDEV_M = 0.05
 # Where most ranges are outliers, so that the curvature says nothing.
 _MIN_CURVATURE = 0.3
 
@@ -51,13 +56,15 @@ def scale_uncertainty(
         correlated=fit.log_scale_stddev * solution.inflation,
         num_blocks=len(np.unique(blocks)),
         num_anchors=len(present),
+        antennas=_antennas_stddev(problem, fit),
     )
 
 
-def scale_shift(fit: RangeFit, problem: RangeProblem, range_error_m: Array) -> float:
-    """Relative change of the scale if each range were longer by ``range_error_m`` (n,)."""
-    step = np.linalg.lstsq(fit.information, fit.gradients.T @ (range_error_m / problem.stddev_m), rcond=1e-12)[0]
-    return float(step[0])
+def scale_influence(fit: RangeFit, problem: RangeProblem) -> Array:
+    """(n,) relative change of the scale for each metre by which a range is longer."""
+    to_scale = np.linalg.lstsq(fit.information, np.eye(len(fit.information))[0], rcond=1e-12)[0]
+    influence: Array = fit.gradients @ to_scale / problem.stddev_m
+    return influence
 
 
 def _block_sums(fit: RangeFit, blocks: npt.NDArray[np.int64]) -> tuple[Array, Array]:
@@ -127,6 +134,20 @@ def _range_model_stddev(problem: RangeProblem, fit: RangeFit, curve_stddev_m: Ar
     place = np.log(np.maximum(predicted_ranges(problem, fit.state), _MIN_DISTANCE_M))
     knots = np.linspace(place.min(), place.max() + 1e-6, _NUM_CURVE_KNOTS)
     hats = np.column_stack([np.interp(place, knots, unit) for unit in np.eye(_NUM_CURVE_KNOTS)])
-    shifts = np.array([scale_shift(fit, problem, hat * curve_stddev_m) for hat in hats.T])
+    shifts: Array = hats.T @ (scale_influence(fit, problem) * curve_stddev_m)
     correlation = np.exp(-0.5 * ((knots[:, None] - knots) / _CURVE_LOG_LENGTH) ** 2)
-    return float(np.sqrt(max(shifts @ correlation @ shifts, 0.0)))
+    return float(np.sqrt(max(float(shifts @ correlation @ shifts), 0.0)))
+
+
+def _antennas_stddev(problem: RangeProblem, fit: RangeFit) -> float:
+    """What antennas do to the scale whose error is a random polynomial of the direction, one for each anchor.
+
+    Half of its variance is linear, half quadratic in the unit vector; the constant part is the bias, which has its
+    own prior. The covariance depends on the angle alone: c / 2 + (3 c^2 - 1) / 4 with c its cosine.
+    """
+    direction = directions_to_tag(problem, fit.state)
+    quadratic = np.sqrt(1.5) * (direction[:, :, None] * direction[:, None, :] - np.eye(3) / 3)
+    lobes = np.sqrt(0.5) * np.column_stack([direction, quadratic.reshape(-1, 9)])
+    shifts = lobes * (ANTENNA_STDDEV_M * scale_influence(fit, problem))[:, np.newaxis]
+    of_anchors = [shifts[problem.anchor_index == k].sum(axis=0) for k in range(problem.num_anchors)]
+    return float(np.linalg.norm(of_anchors))
