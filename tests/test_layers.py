@@ -19,6 +19,7 @@ LAYER_OF = {
     "errors": ERRORS,
     "progress": ERRORS,
     "files": ERRORS,
+    "sole_writer": ERRORS,
     "_ceres": DATA,
     "colmap_log": DATA,
     "config": DATA,

@@ -21,7 +21,7 @@ from rangesfm.errors import GeometryError, InputError
 from rangesfm.journal import Journal
 from rangesfm.model_files import read_model
 from rangesfm.options import CheckOptions, ExportOptions, ScaleOptions
-from rangesfm.outputs import forget_result, forgetting_result_if_changed, refuse_to_overwrite, write_result
+from rangesfm.outputs import forget_result, refuse_to_overwrite, replacing_result, write_result
 from rangesfm.pipeline import refine_model, scale_model
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.readers import read_ranges
@@ -302,26 +302,34 @@ class TestForgetting:
         forget_result(folder)
         assert files_of(folder) == {"sparse", "report.html", "ranges.csv", "mine.txt"}
 
-    def test_happens_when_the_model_is_removed_even_by_something_that_fails(self, folder: Path) -> None:
-        def remove_and_fail() -> None:
-            with forgetting_result_if_changed(folder / "sparse" / "0", folder):
-                (folder / "sparse" / "0").rmdir()
+    def test_goes_on_where_it_was_killed(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        def die(path: Path, **_: Any) -> None:
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patched:
+            patched.setattr(Path, "unlink", die)
+            with pytest.raises(KeyboardInterrupt):
+                forget_result(folder)
+        assert {"report.html", "ranges.csv"} < files_of(folder)
+        assert "result.json" not in files_of(folder)
+        forget_result(folder)
+        assert files_of(folder) == {"sparse", "mine.txt"}
+
+    def test_comes_before_a_new_result_of_which_nothing_stays_if_it_fails(self, folder: Path) -> None:
+        def write_and_fail() -> None:
+            with replacing_result(folder):
+                assert {path.name for path in folder.glob("[!.]*")} == {"sparse", "mine.txt"}
+                (folder / "ranges.csv").touch()
                 raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            remove_and_fail()
-        assert not (folder / "result.json").exists()
+            write_and_fail()
+        assert files_of(folder) == {"sparse", "mine.txt"}
 
-    def test_happens_when_the_model_is_replaced(self, folder: Path) -> None:
-        with forgetting_result_if_changed(folder / "sparse" / "0", folder):
-            (folder / "sparse").rename(folder / "old")
-            (folder / "sparse" / "0").mkdir(parents=True)
-        assert not (folder / "result.json").exists()
-
-    def test_does_not_happen_when_the_model_stays(self, folder: Path) -> None:
-        with forgetting_result_if_changed(folder / "sparse" / "0", folder):
-            pass
-        assert (folder / "result.json").exists()
+    def test_leaves_nothing_beside_a_new_result(self, folder: Path) -> None:
+        with replacing_result(folder):
+            (folder / "result.json").touch()
+        assert files_of(folder) == {"sparse", "mine.txt", "result.json"}
 
 
 def test_result_file_is_plain_json_whatever_the_numbers(tmp_path: Path) -> None:

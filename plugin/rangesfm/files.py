@@ -11,6 +11,9 @@ from pathlib import Path
 
 from rangesfm.errors import InputError
 
+LEFTOVER = r"\..+\.(?P<pid>\d+)\.(part(\..+)?|old)"
+"""Names of what the functions here have in the making, with the number of the process that made it."""
+
 
 def make_output_folder(path: Path) -> None:
     """Make ``path`` and check that it can be written to; raise InputError if not."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import os
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -34,6 +35,8 @@ _CURVES = (*_SCALE_TABLES, "time_offset_curve.csv")
 _NOTABLE_PERCENT = 0.5
 # The first says that a result is whole: it is the last to be written and the first to go.
 _RESULT_FILES = ("result.json", "report.html", "ranges.csv", "images.csv", "reference.csv", *_CURVES)
+# Stands in the place of result.json while the files beside it belong to no result.
+_UNFINISHED = ".result.unfinished"
 _WRITTEN = (*_RESULT_FILES, "trajectory.tum", "points.ply", "sparse_scaled/0", "sparse_metric/0")
 
 
@@ -46,30 +49,35 @@ def refuse_to_overwrite(inputs: Iterable[Path | None], folder: Path) -> None:
 
 
 def forget_result(folder: Path) -> None:
-    """Take away what an earlier run wrote about models that are about to change."""
-    if (folder / "result.json").is_file():
+    """Take away what an earlier run wrote about models that are about to change.
+
+    Killed at any moment, it leaves a whole result or none; the next call goes on where it stopped.
+    """
+    result, unfinished = (folder / name for name in (_RESULT_FILES[0], _UNFINISHED))
+    if result.is_file():
+        os.replace(result, unfinished)
+    if unfinished.is_file():
         for name in _RESULT_FILES:
             (folder / name).unlink(missing_ok=True)
+        unfinished.unlink()
 
 
 @contextmanager
-def forgetting_result_if_changed(model_path: Path, folder: Path) -> Iterator[None]:
-    """Forget the result if the block replaces or removes the model, even if it fails."""
-    before = _state(model_path)
+def replacing_result(folder: Path) -> Iterator[None]:
+    """Forget the result before the block, which writes a new one; none of its files stay if it fails.
+
+    Whoever is killed inside it leaves a mark, by which the next run knows the files for what they are.
+    """
+    forget_result(folder)
+    unfinished = folder / _UNFINISHED
+    unfinished.touch()
     try:
         yield
+        # Now there is a result. Should this be the last that happens, the next run takes it for one that is whole.
+        unfinished.unlink()
     finally:
-        if _state(model_path) != before:
+        if unfinished.is_file():
             forget_result(folder)
-
-
-def _state(path: Path) -> tuple[int, int] | None:
-    """The same only for a folder that nobody has replaced."""
-    try:
-        state = path.stat()
-    except OSError:
-        return None
-    return state.st_ino, state.st_mtime_ns
 
 
 def write_outputs(

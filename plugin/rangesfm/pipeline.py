@@ -22,7 +22,6 @@ from rangesfm.distances.rows import disagreements, distance_rows
 from rangesfm.doctor import versions
 from rangesfm.errors import InputError
 from rangesfm.export import check_formats
-from rangesfm.files import make_output_folder
 from rangesfm.georeference import Georeference
 from rangesfm.input_hashes import input_hashes
 from rangesfm.inputs import RangingInputs, read_ranging_inputs
@@ -32,8 +31,8 @@ from rangesfm.model_files import read_model
 from rangesfm.model_transform import rescale
 from rangesfm.outputs import (
     forget_result,
-    forgetting_result_if_changed,
     refuse_to_overwrite,
+    replacing_result,
     summary_lines,
     write_outputs,
     write_result,
@@ -50,6 +49,7 @@ from rangesfm.refine import predicted_ranges, refine_with_ranges
 from rangesfm.report import write_report
 from rangesfm.results import survey_result
 from rangesfm.scale.initialize import initialize_scale
+from rangesfm.sole_writer import sole_writer
 from rangesfm.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images, read_image_times_csv
 from rangesfm.vision.keyframes import select_keyframes
@@ -80,15 +80,17 @@ def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> 
     inputs = _read_inputs(survey, journal)
     keyframes, times = _keyframes(survey, journal, log_names_photos=inputs.log.image_name is not None)
     _check_times(survey, inputs, _path_without_places(keyframes, times))
-    sfm = _reconstruct(survey, keyframes, journal, restart)
-    return _to_metric(survey, inputs, sfm, times, journal, refine=survey.refine.enabled)
+    with sole_writer(survey.output_path):
+        sfm = _reconstruct(survey, keyframes, journal, restart)
+        return _to_metric(survey, inputs, sfm, times, journal, refine=survey.refine.enabled)
 
 
 def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> RunResult:
     """Photos to an unscaled model."""
     journal = Journal(progress)
     keyframes, _ = _keyframes(survey, journal)
-    sfm = _reconstruct(survey, keyframes, journal, restart)
+    with sole_writer(survey.output_path):
+        sfm = _reconstruct(survey, keyframes, journal, restart)
     path = survey.output_path / "sparse" / "0"
     line = f"unscaled model: {sfm.num_reg_images()} photos, {sfm.num_points3D()} points, in {path}"
     return RunResult(survey.output_path, {"seconds": journal.all_seconds(), "warnings": journal.warnings}, (line,))
@@ -115,8 +117,8 @@ def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResul
     times = None
     if inputs.log.image_name is None:
         times = _noted(_times_of_model(survey, sfm, survey.model_path), journal)
-    make_output_folder(survey.output_path)
-    return _to_metric(survey, inputs, sfm, times, journal, refine=refine)
+    with sole_writer(survey.output_path):
+        return _to_metric(survey, inputs, sfm, times, journal, refine=refine)
 
 
 def _to_metric(
@@ -155,23 +157,28 @@ def _to_metric(
         for misfit in metric.refinement.misfits if metric.refinement is not None else ():
             journal.warn(f"after the refinement {misfit}")
     # Comparison and results.
-    with journal.stage("results"):
-        if metric.estimate.frame == "site":
-            metric = metric.moved(inputs.site.offset_m)
-        result = survey_result(metric)
-        forget_result(survey.output_path)
-        result["distances"] = _distances(inputs, metric, journal)
-        table = _compare(survey, inputs, metric, result)
-        georeference = _georeference(inputs, metric)
-        result["georeference"] = georeference and georeference.to_dict()
-        write_outputs(
-            metric, survey.export, survey.output_path, images_path=survey.images_path, georeference=georeference
-        )
-        write_scale_tables(metric, survey.output_path)
-    result["versions"], result["settings"] = versions(), survey.to_dict()
-    result["inputs"] = input_hashes(survey)
-    result["seconds"], result["warnings"] = journal.all_seconds(), journal.warnings
-    write_result(result, survey.output_path / "result.json")
+    return _write_results(survey, inputs, metric, journal)
+
+
+def _write_results(survey: Survey, inputs: RangingInputs, metric: MetricSurvey, journal: Journal) -> RunResult:
+    """All files of the result, ``result.json`` after all others, and the report on them."""
+    if metric.estimate.frame == "site":
+        metric = metric.moved(inputs.site.offset_m)
+    result = survey_result(metric)
+    with replacing_result(survey.output_path):
+        with journal.stage("results"):
+            result["distances"] = _distances(inputs, metric, journal)
+            table = _compare(survey, inputs, metric, result)
+            georeference = _georeference(inputs, metric)
+            result["georeference"] = georeference and georeference.to_dict()
+            write_outputs(
+                metric, survey.export, survey.output_path, images_path=survey.images_path, georeference=georeference
+            )
+            write_scale_tables(metric, survey.output_path)
+        result["versions"], result["settings"] = versions(), survey.to_dict()
+        result["inputs"] = input_hashes(survey)
+        result["seconds"], result["warnings"] = journal.all_seconds(), journal.warnings
+        write_result(result, survey.output_path / "result.json")
     lines = [*summary_lines(metric, result, table, survey.output_path)]
     if survey.report_enabled:
         lines.append(f"report: {write_report(survey.output_path)}")
@@ -239,8 +246,7 @@ def _reconstruct(
     survey: Survey, keyframes: tuple[str, ...], journal: Journal, restart: bool
 ) -> pycolmap.Reconstruction:
     """Map the keyframes into ``sparse``; returns ``sparse/0``."""
-    forgetting = forgetting_result_if_changed(survey.output_path / "sparse" / "0", survey.output_path)
-    with survey.naming_its_lines(), forgetting:
+    with survey.naming_its_lines():
         summary = reconstruct(
             _images_path(survey),
             keyframes,
@@ -250,6 +256,7 @@ def _reconstruct(
             seed=survey.seed,
             progress=journal.progress,
             restart=restart,
+            before_change=lambda: forget_result(survey.output_path),
         )
     journal.seconds.update(summary.seconds)
     if summary.num_registered < summary.num_keyframes:

@@ -49,8 +49,9 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     if not args.live:
         return Outcome(_run(survey, progress, args.restart).summary_lines())
     from rangesfm.report.live import live_page
+    from rangesfm.sole_writer import sole_writer
 
-    with live_page(progress, survey.output_path) as page:
+    with sole_writer(survey.output_path), live_page(progress, survey.output_path) as page:
         page.message(f"this run can be watched in {page.path}")
         result = _run(survey, page, args.restart)
         page.finish(survey.output_path / "report.html" if survey.report_enabled else None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,6 +52,7 @@ def reconstruct(
     seed: int = 0,
     progress: Progress | None = None,
     restart: bool = False,
+    before_change: Callable[[], None] = lambda: None,
 ) -> ReconstructionSummary:
     """Reconstruct photos of one camera.
 
@@ -67,6 +68,7 @@ def reconstruct(
         camera: of all photos; photos of another size are left out.
         seed: the same one gives the same models.
         restart: take nothing over.
+        before_change: called before models of an earlier run are removed or replaced.
 
     Raises:
         InputError: options that COLMAP does not take, or a folder that cannot be written to.
@@ -88,13 +90,17 @@ def reconstruct(
     if restart:
         steps.forget("features")
 
-    def prepare_features() -> None:
+    def remove_old_models() -> None:
+        before_change()
         remove_models(models)
+
+    def prepare_features() -> None:
+        remove_old_models()
         log.unlink(missing_ok=True)
         create_database(database, photos.names, its_camera)
 
     def prepare_matching() -> None:
-        remove_models(models)
+        remove_old_models()
         clear_matches(database)
 
     with colmap_log(log), _pointing_to(log):
@@ -119,7 +125,7 @@ def reconstruct(
             "mapping",
             inputs,
             models / "0",
-            lambda: remove_models(models),
+            remove_old_models,
             lambda: map_incrementally(database, photos, models, for_mapping, progress),
         )
     found = read_models(models)
