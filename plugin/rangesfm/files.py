@@ -1,7 +1,8 @@
-"""Outputs appear whole or not at all."""
+"""Outputs appear whole or not at all; files are known by their content."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 import tempfile
@@ -13,6 +14,18 @@ from rangesfm.errors import InputError
 
 LEFTOVER = r"\..+\.(?P<pid>\d+)\.(part(\..+)?|old)"
 """Names of what the functions here have in the making, with the number of the process that made it."""
+
+
+_CHUNK_BYTES = 1 << 20
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file's content, in hexadecimal."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while chunk := file.read(_CHUNK_BYTES):
+            digest.update(chunk)
+    return digest.hexdigest()
 
 
 def make_output_folder(path: Path) -> None:

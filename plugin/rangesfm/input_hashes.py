@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rangesfm.config import Survey
-
-_CHUNK_BYTES = 1 << 20
+from rangesfm.files import sha256_of
 
 
 def input_hashes(survey: Survey) -> list[dict[str, Any]]:
@@ -33,11 +32,7 @@ def input_hashes(survey: Survey) -> list[dict[str, Any]]:
 
 
 def _file(path: Path) -> dict[str, Any]:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while chunk := file.read(_CHUNK_BYTES):
-            digest.update(chunk)
-    return {"path": str(path), "sha256": digest.hexdigest(), "bytes": path.stat().st_size, "hashed": "content"}
+    return {"path": str(path), "sha256": sha256_of(path), "bytes": path.stat().st_size, "hashed": "content"}
 
 
 def _folder(path: Path) -> dict[str, Any]:

@@ -203,6 +203,56 @@ class TestEarlierRun:
         assert list(summary.seconds) == steps
         assert summary.num_registered == 6
 
+    def test_is_taken_over_while_the_photos_are_the_same_whatever_the_times_of_their_files(
+        self, room: Room, output: Path, tmp_path: Path, listener: Listener
+    ) -> None:
+        copies = tmp_path / "copies"
+        shutil.copytree(room.folder, copies, copy_function=shutil.copyfile)
+        reconstruct(copies, room.names, output, camera=room.camera, mapper=MAPPER, progress=listener)
+        assert listener.stages == []
+
+    def test_is_not_taken_over_when_a_photo_changes_behind_its_size_and_time(
+        self, room: Room, tmp_path: Path, listener: Listener
+    ) -> None:
+        photos, output = tmp_path / "photos", tmp_path / "out"
+        photos.mkdir()
+        for name in room.names:  # without compression, so that all are of one size
+            with Image.open(room.folder / name) as photo:
+                photo.save((photos / name).with_suffix(".bmp"))
+        names = [Path(name).with_suffix(".bmp").name for name in room.names]
+        reconstruct(photos, names, output, camera=room.camera, mapper=MAPPER)
+        before = (photos / names[0]).stat()
+        changed = Image.eval(Image.open(photos / names[0]), lambda value: 255 - value)
+        changed.save(photos / names[0])
+        os.utime(photos / names[0], ns=(before.st_atime_ns, before.st_mtime_ns))
+        assert (photos / names[0]).stat().st_size == before.st_size
+        reconstruct(photos, names, output, camera=room.camera, mapper=MAPPER, progress=listener)
+        assert listener.stages == ["features", "matching", "mapping"]
+
+    def test_of_unchanged_photos_does_not_read_them_again(
+        self, room: Room, output: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("rangesfm.vision.photos.sha256_of", pytest.fail)
+        summary = reconstruct(room.folder, room.names, output, camera=room.camera, mapper=MAPPER)
+        assert summary.seconds == {}
+
+    def test_killed_while_it_matched_in_time_order_can_be_matched_otherwise(
+        self, room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def die(*_: Any, **__: Any) -> None:
+            shutil.copytree(tmp_path / "out", tmp_path / "killed")
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patched:
+            patched.setattr(pycolmap, "match_sequential", die)
+            mapper = MapperOptions(features=FEATURES, matching="sequential")
+            with pytest.raises(KeyboardInterrupt):
+                reconstruct(room.folder, room.names, tmp_path / "out", camera=room.camera, mapper=mapper)
+        mapper = MapperOptions(features=FEATURES, matching="exhaustive")
+        summary = reconstruct(room.folder, room.names, tmp_path / "killed", camera=room.camera, mapper=mapper)
+        assert list(summary.seconds) == ["matching", "mapping"]
+        assert set(centers_by_name(summary.models[0])) == set(room.names)
+
     def test_on_other_photos_leaves_nothing_behind_when_these_do_not_reconstruct(
         self, room: Room, output: Path
     ) -> None:

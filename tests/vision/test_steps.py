@@ -96,11 +96,19 @@ def test_what_is_lost_is_done_anew(run: Run, tmp_path: Path, lost: str, done: li
     assert run() == done
 
 
-@pytest.mark.parametrize("text", ["", "{", "[1]", '{"a": 1}'])
+@pytest.mark.parametrize("text", ["", "{", "[1]", '{"a": 1}', '{"steps": {"a": 1}}'])
 def test_a_damaged_record_is_no_record(run: Run, tmp_path: Path, text: str) -> None:
     run()
     (tmp_path / "steps.json").write_text(text)
     assert run() == ALL
+
+
+def test_notes_outlive_the_steps(tmp_path: Path, listener: Listener) -> None:
+    steps = Steps(tmp_path / "steps.json", listener)
+    steps.run("a", "1", tmp_path, lambda: None, lambda: None)
+    steps.note("photos", {"a.jpg": [1, 2]})
+    steps.forget("a")
+    assert Steps(tmp_path / "steps.json", listener).notes == {"photos": {"a.jpg": [1, 2]}}
 
 
 def test_fingerprints_tell_values_apart_but_not_the_order_of_keys() -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from PIL import Image
 
 from rangesfm.errors import ReconstructionError
+from rangesfm.files import sha256_of
 
 MIN_NUM_PHOTOS = 2
 
@@ -31,10 +33,23 @@ class Photos:
     height: int
     left_out: dict[str, str]
 
-    def states(self) -> list[tuple[str, int, int]]:
-        """Name, size and time of change of each file: what tells these photos from others."""
-        states = [(name, (self.folder / name).stat()) for name in self.names]
-        return [(name, state.st_size, state.st_mtime_ns) for name, state in states]
+    def contents(self, known: Mapping[str, Any]) -> dict[str, tuple[list[int], str]]:
+        """State and SHA-256 of each file, by name in the order given: what tells these photos from others.
+
+        Args:
+            known: what an earlier call returned, perhaps by way of JSON; a file is not read again
+                while its size and its times of change are the same.
+        """
+        return {name: _content(self.folder / name, known.get(name)) for name in self.names}
+
+
+def _content(path: Path, known: Any) -> tuple[list[int], str]:
+    found = path.stat()
+    # The second time is the file system's own: it also moves when a program sets the first one back.
+    state = [found.st_size, found.st_mtime_ns, found.st_ctime_ns]
+    if isinstance(known, (list, tuple)) and len(known) == 2 and known[0] == state:
+        return state, str(known[1])
+    return state, sha256_of(path)
 
 
 def usable_photos(folder: Path, names: Sequence[str]) -> Photos:

@@ -58,7 +58,7 @@ def reconstruct(
 
     Writes ``database.db``, the models ``sparse/0`` (the largest), ``sparse/1``, ..., ``mapper.log``
     and ``reconstruct.json`` to ``output_path``. Steps that an earlier run into the same folder did
-    with the same photos and options are taken over, and so are the features and matches that an
+    with the same photos (by their content) and options are taken over, and so are the features and matches that an
     interrupted one had found.
 
     Args:
@@ -101,10 +101,12 @@ def reconstruct(
 
     def prepare_matching() -> None:
         remove_old_models()
-        clear_matches(database)
+        clear_matches(database, photos.names)
 
     with colmap_log(log), _pointing_to(log):
-        inputs = fingerprint(pycolmap.__version__, photos.states(), camera.model, camera.params, mapper.features)
+        steps.note("photos", photos.contents(steps.notes.get("photos", {})))
+        content = [(name, sha256) for name, (_, sha256) in steps.notes["photos"].items()]
+        inputs = fingerprint(pycolmap.__version__, content, camera.model, camera.params, mapper.features)
         steps.run(
             "features",
             inputs,

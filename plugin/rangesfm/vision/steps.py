@@ -22,13 +22,15 @@ class Steps:
     """A series of steps, each of which needs the one before; their state is kept in a JSON file.
 
     Attributes:
+        notes: what else is kept there, plain values by name; see ``note``.
         seconds: how long each step took that was done here, by name.
     """
 
     def __init__(self, record_path: Path, progress: Progress):
         self._path = record_path
         self._progress = progress
-        self._record = _read(record_path)
+        self._record = _read(record_path, "steps")
+        self.notes = _read(record_path, "notes")
         self.seconds: dict[str, float] = {}
 
     def run(self, name: str, inputs: str, output: Path, prepare: Callable[[], None], work: Callable[[], None]) -> None:
@@ -49,9 +51,9 @@ class Steps:
         if not is_begun:
             self.forget(name)
             prepare()
-        self._note(name, inputs, done=False)
+        self._set_state(name, inputs, done=False)
         work()
-        self._note(name, inputs, done=True)
+        self._set_state(name, inputs, done=True)
         self.seconds[name] = time.perf_counter() - start
 
     def forget(self, first: str) -> None:
@@ -61,18 +63,25 @@ class Steps:
             del self._record[name]
         self._write()
 
-    def _note(self, name: str, inputs: str, *, done: bool) -> None:
+    def note(self, name: str, value: dict[str, Any]) -> None:
+        """Keep something for the next run, whatever becomes of the steps."""
+        self.notes[name] = value
+        self._write()
+
+    def _set_state(self, name: str, inputs: str, *, done: bool) -> None:
         self._record[name] = {"inputs": inputs, "done": done}
         self._write()
 
     def _write(self) -> None:
         with new_file(self._path) as temporary:
-            temporary.write_text(json.dumps(self._record, indent=2) + "\n", encoding="utf-8")
+            temporary.write_text(
+                json.dumps({"steps": self._record, "notes": self.notes}, indent=2) + "\n", encoding="utf-8"
+            )
 
 
-def _read(path: Path) -> dict[str, dict[str, Any]]:
+def _read(path: Path, part: str) -> dict[str, dict[str, Any]]:
     try:
-        steps = json.loads(path.read_text(encoding="utf-8"))
-        return {str(name): dict(state) for name, state in steps.items()}
-    except (OSError, ValueError, AttributeError, TypeError):  # none yet, or not ours: nothing is known
+        entries = json.loads(path.read_text(encoding="utf-8"))[part]
+        return {str(name): dict(entry) for name, entry in entries.items()}
+    except (OSError, ValueError, AttributeError, TypeError, LookupError):  # none yet, or not ours: nothing is known
         return {}
