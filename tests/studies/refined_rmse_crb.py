@@ -1,0 +1,94 @@
+"""Are refined positions as good as the data allow? Their error over many noisy surveys, against the Cramer-Rao bound.
+
+    python -m tests.studies.refined_rmse_crb [--num_seeds 40]
+
+Simulated surveys with Gaussian noise: a yard with four site anchors, the same with one anchor known in the first
+camera's frame, and a rover's lap that drifts. Each seed draws noise of features and ranges anew, and the anchors'
+biases from the prior that the stages assume, so that the prior's information counts like that of a measurement (van
+Trees' Bayesian form of the bound). COLMAP adjusts the model, as a mapper leaves it, then scale and refinement run
+with their defaults; they estimate the noise of features and ranges themselves.
+
+The error is the root mean square distance of all keyframes of all seeds from the truth, without alignment. The bound
+is that of ``simulated_survey.rmse_bound_m``. Exit status 1 if the error exceeds 1.15 times the bound, or is so far
+below that the bound itself must be wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from tests.studies.simulated_survey import (
+    Survey,
+    drawn_biases,
+    lap_survey,
+    mapped,
+    path_error_m,
+    range_log,
+    rmse_bound_m,
+    run_stages,
+    unit_pixel_errors,
+    yard_survey,
+)
+
+Array = npt.NDArray[np.float64]
+
+MAX_RATIO = 1.15
+# Errors are those of a few slow modes of the whole map: 40 seeds know their size to some 10 %.
+MIN_RATIO = 0.75
+
+
+@dataclass(frozen=True)
+class Case:
+    """A survey, and the noise of its features in pixels."""
+
+    name: str
+    survey: Callable[[], Survey]
+    pixel_stddev: float
+
+
+CASES = (
+    Case("yard, four site anchors", yard_survey, 0.5),
+    Case("yard, one anchor in the first camera's frame", lambda: yard_survey(anchor_frame="first_camera"), 0.5),
+    Case("lap, one anchor inside", lambda: lap_survey(num_observations=60, anchor_m=(10.0, 5.0, 8.0)), 0.5),
+    Case("lap, one anchor beside", lambda: lap_survey(num_observations=60, anchor_m=(0.0, -44.0, 8.0)), 0.5),
+)
+
+
+def refined_errors(survey: Survey, pixel_stddev: float, num_seeds: int) -> Array:
+    """(num_seeds,) root mean square error of each run, metres."""
+    errors = []
+    for seed in range(num_seeds):
+        sfm = mapped(survey, pixel_stddev * unit_pixel_errors(survey, seed))
+        result = run_stages(survey, sfm, range_log(survey, seed, biases_m=drawn_biases(survey, seed)))
+        errors.append(path_error_m(survey, result.refined))
+    return np.array(errors)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Refined positions against the Cramer-Rao bound.")
+    parser.add_argument("--num_seeds", type=int, default=40)
+    num_seeds = parser.parse_args().num_seeds
+    print(f"{num_seeds} seeds; errors in metres")
+    print(f"{'case':46} {'bound':>7} {'RMSE':>7} {'ratio':>6} {'worst':>7}")
+    is_good = True
+    for case in CASES:
+        survey = case.survey()
+        errors = refined_errors(survey, case.pixel_stddev, num_seeds)
+        bound, rmse = rmse_bound_m(survey, case.pixel_stddev), float(np.sqrt(np.mean(errors**2)))
+        is_inside = MIN_RATIO <= rmse / bound <= MAX_RATIO
+        is_good &= is_inside
+        print(
+            f"{case.name:46} {bound:7.4f} {rmse:7.4f} {rmse / bound:6.3f} {errors.max():7.4f}"
+            f"  {'' if is_inside else 'OUTSIDE'}",
+            flush=True,
+        )
+    return 0 if is_good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

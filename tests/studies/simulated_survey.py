@@ -1,0 +1,282 @@
+"""Simulated surveys of known truth, for the studies of the refinement: one noisy run, and the bound on its error."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from rangesfm.costs import add_residual_block, normal_prior_cost, range_cost
+from rangesfm.covariance import joint_covariance
+from rangesfm.geometry import IDENTITY, rmse
+from rangesfm.model_transform import rescale
+from rangesfm.options import CameraOptions, RangeModelOptions
+from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.association import associate
+from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.observations import RangeObservations
+from rangesfm.refine import RefineSummary, refine_with_ranges
+from rangesfm.scale.estimate import ScaleEstimate
+from rangesfm.scale.initialize import initialize_scale
+from rangesfm.simulate.model import SyntheticModel, synthetic_model
+from rangesfm.simulate.path import CameraPath, lap_path, loop_path
+from rangesfm.simulate.ranges import Radio, simulate_ranges_at
+from rangesfm.trajectory import Trajectory, pose_of, trajectory_from_reconstruction
+
+Array = npt.NDArray[np.float64]
+
+TAG_IN_CAM_M = np.array([0.05, -0.12, -0.03])
+RANGE_MODEL = RangeModelOptions()
+# As COLMAP's mapper filters: points of less may go behind the horizon, where an adjustment gets stuck.
+MIN_TRI_ANGLE_DEG = 1.5
+SITE_ANCHORS_M = {"A1": (9.0, 7.0, 3.0), "A2": (-9.0, 6.0, 0.5), "A3": (-8.0, -8.0, 3.5), "A4": (9.0, -7.0, 0.2)}
+
+
+@dataclass(frozen=True)
+class Survey:
+    """A survey without noise, and what is measured in it.
+
+    Attributes:
+        model: the truth, in the world that the result will be in: the site, or the first camera's frame.
+        anchors_m: (3,) true positions in that world, by id.
+        anchor_frame: as of ``initialize_scale``.
+        range_stddev_m: of one range to each anchor at each keyframe.
+    """
+
+    model: SyntheticModel
+    anchors_m: dict[str, Array]
+    anchor_frame: str
+    range_stddev_m: float
+
+    @property
+    def is_in_first_camera(self) -> bool:
+        return self.anchor_frame != "site"
+
+
+def lap_survey(
+    *,
+    num_observations: int,
+    anchor_m: tuple[float, float, float],
+    anchor_frame: str = "first_camera",
+    num_keyframes: int = 600,
+    range_stddev_m: float = 0.1,
+) -> Survey:
+    """A rover's lap round a soccer field: forward camera, tracks of at most 8 keyframes, no loop closure, one anchor.
+
+    Args:
+        num_observations: features in a keyframe. anchor_m: origin in the middle of the field, z up.
+        num_keyframes: fewer make it a part of the lap.
+    """
+    path = lap_path(300.0, share=0.98 * num_keyframes / 600)
+    times = np.linspace(0.0, 300.0, num_keyframes)
+    return _survey(
+        path,
+        times,
+        {"A1": anchor_m},
+        anchor_frame,
+        range_stddev_m,
+        num_observations=num_observations,
+        max_track_length=8,
+        depth_range_m=(6.0, 40.0),
+    )
+
+
+def yard_survey(*, anchor_frame: str = "site", range_stddev_m: float = 0.1) -> Survey:
+    """A walk round a yard, its middle in view: four anchors in the site's frame, else the first of them alone."""
+    path = loop_path(40.0, height_amplitude_m=0.8, unsteadiness_m=0.1, seed=3)
+    anchors = SITE_ANCHORS_M if anchor_frame == "site" else {"A1": SITE_ANCHORS_M["A1"]}
+    return _survey(path, np.linspace(0.0, 40.0, 60), anchors, anchor_frame, range_stddev_m, num_observations=80)
+
+
+def _survey(
+    path: CameraPath,
+    times: Array,
+    anchors_m: dict[str, tuple[float, float, float]],
+    anchor_frame: str,
+    range_stddev_m: float,
+    *,
+    num_observations: int,
+    max_track_length: int | None = None,
+    depth_range_m: tuple[float, float] = (2.0, 20.0),
+) -> Survey:
+    centers, world_from_cam = path.centers(times), path.world_from_cam(times)
+    rotation, origin = (np.eye(3), np.zeros(3)) if anchor_frame == "site" else (world_from_cam[0], centers[0])
+    model = synthetic_model(
+        times,
+        (centers - origin) @ rotation,
+        rotation.T @ world_from_cam,
+        num_observations=num_observations,
+        max_track_length=max_track_length,
+        depth_range_m=depth_range_m,
+        metric_from_sfm=IDENTITY,
+    )
+    points = model.reconstruction
+    pycolmap.ObservationManager(points).filter_points3D_with_small_triangulation_angle(
+        MIN_TRI_ANGLE_DEG, set(points.point3D_ids())
+    )
+    anchors = {name: (np.array(at) - origin) @ rotation for name, at in anchors_m.items()}
+    return Survey(model, anchors, anchor_frame, range_stddev_m)
+
+
+def unit_pixel_errors(survey: Survey, seed: int) -> Array:
+    """(num_observations, 2) of stddev 1."""
+    num = sum(len(survey.model.reconstruction.image(i).points2D) for i in _image_ids(survey))
+    return np.random.default_rng([seed, 1]).standard_normal((num, 2))
+
+
+def mapped(survey: Survey, pixel_errors: Array) -> pycolmap.Reconstruction:
+    """The model as a mapper leaves it: COLMAP's bundle adjustment, without ranges, of features with these errors."""
+    sfm = pycolmap.Reconstruction(survey.model.reconstruction)
+    config = pycolmap.BundleAdjustmentConfig()
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    remaining = iter(pixel_errors)
+    for image_id in _image_ids(survey):
+        config.add_image(image_id)
+        for point, error in zip(sfm.image(image_id).points2D, remaining, strict=False):
+            point.xy = point.xy + error
+    options = _adjustment_options()
+    solver = options.ceres.solver_options
+    solver.max_num_iterations, solver.initial_trust_region_radius = 200, 1e8
+    solver.function_tolerance = solver.gradient_tolerance = solver.parameter_tolerance = 1e-10
+    pycolmap.create_default_ceres_bundle_adjuster(options, config, sfm).solve()
+    return sfm
+
+
+def _adjustment_options() -> pycolmap.BundleAdjustmentOptions:
+    options = pycolmap.BundleAdjustmentOptions(
+        print_summary=False, refine_focal_length=False, refine_extra_params=False
+    )
+    options.ceres.solver_options.num_threads = 1
+    return options
+
+
+def _image_ids(survey: Survey) -> list[int]:
+    return sorted(survey.model.reconstruction.reg_image_ids())
+
+
+def range_log(survey: Survey, seed: int, *, biases_m: Array | None = None, obstructed_share: float = 0.0) -> RangeLog:
+    """One range to each anchor at each keyframe.
+
+    Args:
+        biases_m: of the anchors, in their order; None: none have any.
+        obstructed_share: of the ranges, which read 1 m long on average.
+    """
+    biases = {} if biases_m is None else dict(zip(survey.anchors_m, biases_m.tolist(), strict=True))
+    model = survey.model
+    radio = Radio(range_stddev_m=survey.range_stddev_m, range_bias_m=biases, obstructed_share=obstructed_share)
+    times = np.array(list(model.timestamps_s.values()))
+    return simulate_ranges_at(
+        times, model.centers_m, model.world_from_cam, survey.anchors_m, TAG_IN_CAM_M, radio, seed
+    ).log
+
+
+def drawn_biases(survey: Survey, seed: int) -> Array:
+    """(num_anchors,) from the prior that the stages assume: each anchor's own, and one that all share."""
+    rng = np.random.default_rng([seed, 2])
+    own = RANGE_MODEL.range_bias_stddev_m * rng.standard_normal(len(survey.anchors_m))
+    drawn: Array = own + RANGE_MODEL.common_bias_stddev_m * rng.standard_normal()
+    return drawn
+
+
+@dataclass(frozen=True)
+class Result:
+    """One run of the stages after the mapping.
+
+    Attributes:
+        scaled, refined: paths in the truth's world.
+    """
+
+    scaled: Trajectory
+    refined: Trajectory
+    summary: RefineSummary
+
+
+def run_stages(
+    survey: Survey, sfm: pycolmap.Reconstruction, log: RangeLog, *, range_stddev_m: float | None = None
+) -> Result:
+    """Scale and refinement with their defaults.
+
+    Args:
+        range_stddev_m: with which the refinement weighs all ranges; None: it estimates their noise.
+    """
+    times = survey.model.timestamps_s
+    trajectory = trajectory_from_reconstruction(sfm, times)
+    observations: RangeObservations = associate(log, trajectory, TAG_IN_CAM_M)
+    anchors = [Anchor(name, position) for name, position in survey.anchors_m.items()]
+    estimate: ScaleEstimate = initialize_scale(
+        observations, trajectory, anchors, anchor_frame=survey.anchor_frame, range_model=RANGE_MODEL
+    )
+    is_estimated = range_stddev_m is None
+    num = len(log)
+    scaled = rescale(sfm, estimate.metric_from_sfm)
+    refined, summary = refine_with_ranges(
+        scaled,
+        trajectory,
+        estimate.observations,
+        estimate.metric_from_sfm,
+        estimate.anchors,
+        tag_in_cam_m=TAG_IN_CAM_M,
+        range_stddev_m=estimate.range_stddev_m if range_stddev_m is None else np.full(num, range_stddev_m),
+        stddev_is_estimated=np.full(num, is_estimated),
+        correlation_inflation=estimate.correlation_inflation if is_estimated else 1.0,
+        common_bias_stddev_m=RANGE_MODEL.common_bias_stddev_m,
+        first_pose_is_fixed=survey.is_in_first_camera,
+        camera=CameraOptions(refine_intrinsics=False),
+        num_threads=1,
+    )
+    paths = [trajectory_from_reconstruction(one, times) for one in (scaled, refined)]
+    return Result(paths[0], paths[1], summary)
+
+
+def path_error_m(survey: Survey, path: Trajectory) -> float:
+    """Root mean square distance of the keyframes from the truth, without alignment."""
+    return rmse(path.centers - survey.model.centers_m)
+
+
+def rmse_bound_m(survey: Survey, pixel_stddev: float, *, with_ranges: bool = True) -> float:
+    """Cramer-Rao bound on the root mean square error of the keyframes' centres.
+
+    From the information that features, ranges and the biases' prior have on poses, points, biases and, where they
+    are unknown, anchors, at the truth. Without ranges: of the map that moves least, which has about the true scale.
+    """
+    truth = pycolmap.Reconstruction(survey.model.reconstruction)
+    config = pycolmap.BundleAdjustmentConfig()
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.UNSPECIFIED)
+    for image_id in _image_ids(survey):
+        config.add_image(image_id)
+    if survey.is_in_first_camera:
+        config.set_constant_rig_from_world_pose(min(truth.reg_frame_ids()))
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(_adjustment_options(), config, truth)
+    anchors = [position.copy() for position in survey.anchors_m.values()]
+    biases = [np.zeros(1) for _ in range(len(anchors) + 1)]
+    if with_ranges:
+        _add_ranges(adjuster, truth, survey, anchors, biases, pixel_stddev)
+    covariance = joint_covariance(adjuster.problem, truth, anchors=anchors, others=biases, residual_stddev=pixel_stddev)
+    return float(np.sqrt(np.mean(np.trace(covariance.centers, axis1=1, axis2=2))))
+
+
+def _add_ranges(
+    adjuster: pycolmap.CeresBundleAdjuster,
+    truth: pycolmap.Reconstruction,
+    survey: Survey,
+    anchors: list[Array],
+    biases: list[Array],
+    pixel_stddev: float,
+) -> None:
+    """In pixels, as the features are; biases are each anchor's and, last, the one that all share."""
+    model = survey.model
+    antenna = model.centers_m + model.world_from_cam @ TAG_IN_CAM_M
+    poses = [pose_of(truth.frame(frame_id)).params for frame_id in sorted(truth.reg_frame_ids())]
+    stddev = survey.range_stddev_m / pixel_stddev
+    for anchor, bias in zip(anchors, biases, strict=False):
+        for pose, distance in zip(poses, np.linalg.norm(antenna - anchor, axis=1), strict=True):
+            cost = range_cost(range_m=distance, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=stddev, has_common_bias=True)
+            add_residual_block(adjuster, cost, None, [pose, anchor, bias, biases[-1]])
+        if survey.anchor_frame != "unknown":
+            adjuster.problem.set_parameter_block_constant(anchor)
+    own, common = RANGE_MODEL.range_bias_stddev_m, RANGE_MODEL.common_bias_stddev_m
+    for bias, stddev_m in zip(biases, [own] * len(anchors) + [common], strict=True):
+        prior = normal_prior_cost(mean=np.zeros(1), stddev=np.array([stddev_m / pixel_stddev]))
+        add_residual_block(adjuster, prior, None, [bias])
