@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ import pytest
 from rangesfm.errors import GeometryError
 from rangesfm.options import ScaleOptions
 from rangesfm.scale.cutoff import scale_drift
-from rangesfm.scale.estimate import CutoffTest
+from rangesfm.scale.estimate import CutoffTest, ScaleUncertainty
+from rangesfm.scale.initialize import initialize_scale
 from rangesfm.simulate.ranges import Radio
 
 if TYPE_CHECKING:
@@ -70,9 +72,73 @@ def test_two_surveyed_anchors_ask_for_a_third(make_survey: MakeSurvey) -> None:
     assert any("survey three anchors or more" in advice for advice in estimate.advice)
 
 
+def test_a_straight_path_leaves_the_roll_of_a_map_in_the_site_uncertain(make_survey: MakeSurvey) -> None:
+    centers = on_a_line() + 0.05 * np.sin(np.linspace(0.0, 9.0, 40))[:, None] * [0.0, 1.0, 0.7]
+    survey = make_survey(centers_m=centers, radio=NOISE, num_epochs=3)
+    estimate = survey.scale("site", "ABCDE")
+    assert any("rolled about it" in reason for reason in estimate.reasons)
+    assert "walk a bend or a loop instead of a straight line" in estimate.advice
+
+
+def test_an_anchor_that_is_hardly_heard_is_named(make_survey: MakeSurvey) -> None:
+    survey = make_survey(radio=NOISE, num_epochs=3)
+    log = survey.simulated.log
+    rows = np.flatnonzero((log.anchor_index != 4) | (np.cumsum(log.anchor_index == 4) <= 3))
+    estimate = survey.scale("first_camera", "ABCD", log.subset(rows))
+    assert "anchor E has too few ranges on the path to be placed: left out" in estimate.reasons
+    assert "range more often, or survey them all" in estimate.advice
+
+
+def test_anchors_in_wrong_places_disagree(make_survey: MakeSurvey) -> None:
+    survey = make_survey(radio=NOISE, num_epochs=3)
+    anchors = [
+        replace(anchor, position_m=np.asarray(anchor.position_m) + shift)
+        for anchor, shift in zip(survey.anchors("first_camera", "ABCDE"), np.linspace(-1.0, 1.0, 5), strict=True)
+    ]
+    options = ScaleOptions(max_relative_stddev=0.5)
+    estimate = initialize_scale(
+        survey.observations(), survey.trajectory, anchors, anchor_frame="first_camera", options=options
+    )
+    assert any("the anchors disagree" in reason for reason in estimate.reasons)
+    assert any("check the anchors' positions" in advice for advice in estimate.advice)
+
+
+class TestAdvice:
+    """By the largest part of the uncertainty, each the only large one here."""
+
+    @staticmethod
+    def advice(make_survey: MakeSurvey, frame: str, monkeypatch: pytest.MonkeyPatch, **parts: Any) -> tuple[str, ...]:
+        small = {"formal": 0.001, "bootstrap": 0.001, "jackknife": 0.001, "range_model": 0.001}
+        told = ScaleUncertainty(**(small | parts), num_anchors=5)
+        monkeypatch.setattr("rangesfm.scale.initialize.scale_uncertainty", lambda *_, **__: told)
+        return make_survey(radio=NOISE, num_epochs=3).scale(frame, "ABCDE").advice
+
+    def test_an_error_curve(self, make_survey: MakeSurvey, monkeypatch: pytest.MonkeyPatch) -> None:
+        (advice,) = self.advice(make_survey, "first_camera", monkeypatch, range_model=0.04)
+        assert "calibrate the radio" in advice
+        assert "tape a distance" in advice
+
+    def test_anchors_that_were_surveyed(self, make_survey: MakeSurvey, monkeypatch: pytest.MonkeyPatch) -> None:
+        (advice,) = self.advice(make_survey, "first_camera", monkeypatch, jackknife=0.04)
+        assert advice.startswith("check the surveyed positions of the anchors")
+
+    def test_anchors_that_were_not(self, make_survey: MakeSurvey, monkeypatch: pytest.MonkeyPatch) -> None:
+        (advice,) = self.advice(make_survey, "unknown", monkeypatch, jackknife=0.04)
+        assert advice.startswith("survey the anchors")
+
+    def test_antennas(self, make_survey: MakeSurvey, monkeypatch: pytest.MonkeyPatch) -> None:
+        (advice,) = self.advice(make_survey, "first_camera", monkeypatch, antennas=0.04)
+        assert advice.startswith("range to more anchors")
+
+    def test_errors_in_time(self, make_survey: MakeSurvey, monkeypatch: pytest.MonkeyPatch) -> None:
+        assert self.advice(make_survey, "first_camera", monkeypatch, bootstrap=0.04) == ("walk a wider or longer loop",)
+        (advice,) = self.advice(make_survey, "unknown", monkeypatch, bootstrap=0.04)
+        assert advice == "walk a wider or longer loop, or survey the anchors"
+
+
 def test_a_refusal_says_what_to_do(make_survey: MakeSurvey) -> None:
     survey = make_survey(anchors_m=ONE_ANCHOR_M, radio=Radio(range_stddev_m=0.1))
-    with pytest.raises(GeometryError, match=r"more than the 0.1 % allowed: .*next time: "):
+    with pytest.raises(GeometryError, match=r"more than the 0.1 % allowed \(max_relative_stddev\): .*next time: "):
         survey.scale("unknown", options=ScaleOptions(max_relative_stddev=0.001))
 
 
@@ -84,7 +150,7 @@ def test_a_radio_that_reads_short_at_short_range_is_noticed(make_survey: MakeSur
     for error, noticed in ((0 * true, False), (-0.4 * np.exp(-true / 1.0), True)):
         estimate = survey.scale("unknown", (), survey.log_with(true + noise + error))
         assert (scale_drift(estimate.cutoff_test) is not None) == noticed
-        assert any("reads short ranges wrong" in reason for reason in estimate.reasons) == noticed
+        assert any("short ranges disagree with long ones" in reason for reason in estimate.reasons) == noticed
 
 
 def test_a_change_is_judged_by_the_variance_that_leaving_out_adds() -> None:

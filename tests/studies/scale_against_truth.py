@@ -5,14 +5,15 @@ Run: python tests/studies/scale_against_truth.py --ranges uwb.csv --anchors surv
 
 With a model: its path, and the truth is the scale of its similarity to the reference, which holds camera poses.
 Without: the reference is the path of the tag, divided by a factor that is to be found again. Prints for surveyed
-anchors (site frame), all unknown, and each alone unknown: the error, the interval about the truth, whether that lies
-within, the parts of the stddev, and the verdict.
+anchors (site frame; without a model also in the frame of the first pose), all unknown, and each alone unknown: the
+error, the interval about the truth, whether that lies within, the parts of the stddev, and the verdict.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +61,7 @@ def main() -> None:
     else:
         path, truth = tag_path(reference), FACTOR
     options = AssociationOptions(max_interpolation_gap_s=args.max_gap)
-    for name, frame, heard in cases(log, anchors):
+    for name, frame, heard in cases(log, anchors, None if args.model else FACTOR * path.centers[0]):
         part = log.subset(np.isin(np.array(log.anchor_ids)[log.anchor_index], [a.anchor_id for a in heard]))
         observations = associate(part, path, args.tag_in_cam, time_offset_s=args.time_offset, options=options)
         try:
@@ -73,10 +74,15 @@ def main() -> None:
         print(f"{name:16} {described(found, truth)}", flush=True)
 
 
-def cases(log: RangeLog, anchors: Sequence[Anchor]) -> Iterator[tuple[str, str, list[Anchor]]]:
+def cases(
+    log: RangeLog, anchors: Sequence[Anchor], first_position_m: Array | None
+) -> Iterator[tuple[str, str, list[Anchor]]]:
     """Name, frame and the anchors that are heard."""
     in_log = [anchor for anchor in anchors if anchor.anchor_id in log.anchor_ids]
     yield "surveyed", "site", in_log
+    if first_position_m is not None:
+        from_there = [replace(a, position_m=np.asarray(a.position_m) - first_position_m) for a in in_log]
+        yield "first pose known", "first_camera", from_there
     yield "unknown", "unknown", in_log
     for anchor in in_log:
         yield f"unknown, only {anchor.anchor_id}", "unknown", [anchor]

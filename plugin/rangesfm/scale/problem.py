@@ -42,7 +42,8 @@ class SurveyProblem:
         first_camera_from_sfm: rigid motion from the world of the unscaled model.
         frame: "site" or "first_camera": the metric world of the solution.
         anchors_are_known: whether the scale can lean on given anchor positions.
-        notes: what was not possible, for the user.
+        notes: why the map has no place in the site frame, for the user.
+        left_out: anchors with too few ranges on the path to be placed.
     """
 
     ranges: RangeProblem
@@ -51,6 +52,7 @@ class SurveyProblem:
     frame: str
     anchors_are_known: bool
     notes: tuple[str, ...]
+    left_out: tuple[str, ...]
 
 
 def survey_problem(
@@ -82,9 +84,7 @@ def survey_problem(
         distances = _with_surveyed(distances, in_log, given & heard)
     # A surveyed anchor whose ranges are all held out keeps its place, to check them against.
     placed = known | (given & known.any())
-    left_out = [a.anchor_id for a, k in zip(in_log, heard | placed, strict=True) if not k]
-    if left_out:
-        notes.append(f"too few ranges on the path to place anchor {', '.join(left_out)}: left out")
+    left_out = tuple(a.anchor_id for a, k in zip(in_log, heard | placed, strict=True) if not k)
     first_camera_from_sfm = _first_camera_from_sfm(trajectory)
     noise = range_model.range_stddev_m or _START_STDDEV_M
     stddev = np.where(np.isfinite(log.range_stddev_m), log.range_stddev_m, noise)
@@ -106,7 +106,7 @@ def survey_problem(
         gravity=gravity if anchor_frame == "site" and bool(known.any()) else None,
     )
     frame = "site" if ranges.frame_is_free else "first_camera"
-    return SurveyProblem(ranges, rows, first_camera_from_sfm, frame, bool(known.any()), tuple(notes))
+    return SurveyProblem(ranges, rows, first_camera_from_sfm, frame, bool(known.any()), tuple(notes), left_out)
 
 
 def _all_distances(

@@ -24,6 +24,7 @@ _MIN_DRIFT_PERCENT = 1.0
 _MANY_OUTLIERS = 0.3
 _FEW_RANGES = 50
 _MAX_ANCHOR_SPREAD = 0.03
+_CALIBRATE = "calibrate the radio at the distances of this survey (rangesfm ranges calibrate)"
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,7 @@ def judge(
     half_width = uncertainty.half_width_95
     doubts = [
         *(_Doubt(note, "survey three anchors or more that are not on one line") for note in survey.notes),
+        *_left_out_doubts(survey.left_out),
         *_path_doubts(solution, anchors),
         *_range_doubts(solution.fit),
         *_anchor_doubts(per_anchor),
@@ -73,7 +75,7 @@ def judge(
         why = f"{doubts[0].reason}; " if doubts else ""
         raise GeometryError(
             f"the scale is only known to {100 * half_width / NORMAL_95:.1f} % (1 stddev), "
-            f"more than the {100 * options.max_relative_stddev:g} % allowed: {why}"
+            f"more than the {100 * options.max_relative_stddev:g} % allowed (max_relative_stddev): {why}"
             f"next time: {_what_narrows_it(solution, uncertainty)}"
         )
     summary = f"the scale is known to {100 * half_width:.1f} % (95 % interval)"
@@ -88,17 +90,28 @@ def judge(
 
 def _what_narrows_it(solution: Solution, uncertainty: ScaleUncertainty) -> str:
     """Advice by the largest part of the uncertainty."""
-    seen = max(uncertainty.bootstrap, uncertainty.correlated)
-    if uncertainty.range_model > max(seen, uncertainty.jackknife or 0.0):
+    seen, by_anchor = max(uncertainty.bootstrap, uncertainty.correlated), uncertainty.jackknife or 0.0
+    some_unknown = bool(np.isinf(solution.problem.anchor_stddev_m).any())
+    if uncertainty.range_model > max(seen, by_anchor, uncertainty.antennas):
         return (
-            "calibrate the radio (rangesfm ranges calibrate), or tape a distance; failing that, keep the anchors "
-            "farther from the path"
+            f"{_CALIBRATE}, or tape a distance between two photos or points; failing both, keep the anchors farther "
+            "from the path"
         )
-    if uncertainty.jackknife is not None and uncertainty.jackknife > seen:
-        return "survey the anchors again, and place them where they see the whole path"
-    if np.isinf(solution.problem.anchor_stddev_m).any():
-        return "walk a wider or longer loop, or survey the anchors"
-    return "walk a wider or longer loop"
+    if by_anchor > max(seen, uncertainty.antennas):
+        survey = "survey the anchors" if some_unknown else "check the surveyed positions of the anchors"
+        return f"{survey}, and place them where they see the whole path"
+    if uncertainty.antennas > seen:
+        return "range to more anchors, on all sides of the path: a single antenna errs with the direction"
+    return "walk a wider or longer loop, or survey the anchors" if some_unknown else "walk a wider or longer loop"
+
+
+def _left_out_doubts(anchor_ids: tuple[str, ...]) -> list[_Doubt]:
+    if not anchor_ids:
+        return []
+    which = f"anchor {anchor_ids[0]} has" if len(anchor_ids) == 1 else f"anchors {', '.join(anchor_ids)} have"
+    return [
+        _Doubt(f"{which} too few ranges on the path to be placed: left out", "range more often, or survey them all")
+    ]
 
 
 def _path_doubts(solution: Solution, anchors: Sequence[AnchorEstimate]) -> list[_Doubt]:
@@ -106,12 +119,15 @@ def _path_doubts(solution: Solution, anchors: Sequence[AnchorEstimate]) -> list[
     if stddevs[1] < NEARLY_STRAIGHT * stddevs[0]:
         bend = "walk a bend or a loop instead of a straight line"
         if np.isinf(solution.problem.anchor_stddev_m).any():
-            reason = "the path is nearly straight: an unknown anchor can lie anywhere on a circle around it"
+            reason = "the path is nearly straight: an unknown anchor may stand anywhere on a circle around it"
             return [_Doubt(reason, f"{bend}, or survey the anchors")]
         if solution.problem.frame_is_free:
-            return [_Doubt("the path is nearly straight: how the map is turned about it rests on little", bend)]
+            return [_Doubt("the path is nearly straight: how far the map is rolled about it is uncertain", bend)]
     elif stddevs[2] < NEARLY_FLAT * stddevs[0] and any(a.mirror_position_m is not None for a in anchors):
-        reason = "the path is nearly flat: the side of the unknown anchors is open (the scale is not)"
+        reason = (
+            "the path is nearly flat: on which side of it the unknown anchors stand is open; the scale does not "
+            "depend on it"
+        )
         return [_Doubt(reason, "raise and lower the camera on the way, or survey the anchors")]
     return []
 
@@ -123,7 +139,7 @@ def _range_doubts(fit: RangeFit) -> list[_Doubt]:
         doubts.append(_Doubt(reason, "range more often, and all along the path"))
     outliers = float(np.mean(fit.weights < 0.1))
     if outliers > _MANY_OUTLIERS:
-        reason = f"{100 * outliers:.0f} % of the ranges do not fit"
+        reason = f"{100 * outliers:.0f} % of the ranges do not fit the map: blocked, reflected, or of another anchor"
         doubts.append(_Doubt(reason, "place the anchors where nothing stands between them and the path"))
     return doubts
 
@@ -135,8 +151,8 @@ def _anchor_doubts(per_anchor: dict[str, float]) -> list[_Doubt]:
     spread = float(np.std(np.log(np.array(list(per_anchor.values()))), ddof=1))
     if spread <= _MAX_ANCHOR_SPREAD:
         return []
-    reason = f"the anchors disagree on the scale: each alone, they spread by {100 * spread:.1f} %"
-    return [_Doubt(reason, "check the anchors' positions and delays, and place them in the open")]
+    reason = f"the anchors disagree: the scales found with each of them alone scatter by {100 * spread:.1f} %"
+    return [_Doubt(reason, "check the anchors' positions and antenna delays, and place them in the open")]
 
 
 def _drift_doubts(tests: tuple[CutoffTest, ...]) -> list[_Doubt]:
@@ -145,9 +161,7 @@ def _drift_doubts(tests: tuple[CutoffTest, ...]) -> list[_Doubt]:
     if drift is None or abs(percent := 100 * (drift.scale / tests[0].scale - 1)) < _MIN_DRIFT_PERCENT:
         return []
     reason = (
-        f"the radio reads short ranges wrong: without those under {drift.min_range_m:g} m the scale would change by "
+        f"short ranges disagree with long ones: without those under {drift.min_range_m:g} m the scale would change by "
         f"{percent:+.1f} %"
     )
-    return [
-        _Doubt(reason, "calibrate the radio (rangesfm ranges calibrate), and keep the anchors farther from the path")
-    ]
+    return [_Doubt(reason, f"{_CALIBRATE}, and keep the anchors farther from the path")]
