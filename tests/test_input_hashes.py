@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
-from rangesfm.config import Survey
+from rangesfm.config import RangesConfig, Survey
 from rangesfm.input_hashes import input_hashes
 
 
@@ -27,6 +28,23 @@ def test_a_folder_of_photos_is_known_by_names_and_sizes(tmp_path: Path) -> None:
     assert len({entry["sha256"] for entry in (one, renamed, grown)}) == 3
     assert one["hashed"] == "names and sizes of 2 files"
     assert one["bytes"] == 8
+
+
+def test_every_file_that_a_survey_names_is_listed(tmp_path: Path) -> None:
+    names = ("uwb.csv", "curve.csv", "anchors.csv", "images.csv", "taped.csv", "marks.csv", "truth.csv")
+    for name in names:
+        (tmp_path / name).write_text(name)
+    ranges, curve, anchors, times, distances, markers, reference = (tmp_path / name for name in names)
+    survey = Survey(
+        ranges=RangesConfig(path=ranges, error_curve_path=curve),
+        anchors_path=anchors,
+        image_times_path=times,
+        distances_path=distances,
+        markers_path=markers,
+        reference_path=reference,
+    )
+    listed = {entry["path"]: entry["sha256"] for entry in input_hashes(survey)}
+    assert listed == {str(tmp_path / name): hashlib.sha256(name.encode()).hexdigest() for name in names}
 
 
 def test_what_is_not_there_is_not_named(tmp_path: Path) -> None:

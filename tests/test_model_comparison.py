@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,8 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.comparison_page import write_comparison
 from rangesfm.config import RangesConfig, Survey
+from rangesfm.distances.tape import read_tape
 from rangesfm.errors import InputError
+from rangesfm.inputs import read_ranging_inputs
 from rangesfm.model_comparison import ModelsComparison, compare_many, read_models
+from rangesfm.model_ranges import ranges_of_survey
 from rangesfm.options import ScaleOptions
 from rangesfm.pipeline import scale_model
 from rangesfm.progress import SilentProgress
@@ -99,9 +103,105 @@ def test_ranges_tell_the_metric_model_from_the_unscaled(result: Path, models: tu
     metric, unscaled, _ = compared(result, models[0], models[1]).rows
     assert metric.range_rms_m is not None
     assert unscaled.range_rms_m is not None
-    assert metric.range_rms_m[0] < 0.15  # the radio's 0.05 m, and the straight line between photos
+    assert metric.range_rms_m[0] < 0.1  # the radio's 0.05 m, and the path between photos
     assert unscaled.range_rms_m[0] > 3 * metric.range_rms_m[0]
     assert unscaled.range_rms_m[1] == pytest.approx(metric.range_rms_m[0], rel=1e-6)
+
+
+def test_a_results_ranges_fit_its_own_model_as_its_file_says(result: Path, models: tuple[Path, Path, Path]) -> None:
+    own, _ = compared(result, models[0]).rows
+    assert own.range_rms_m is not None
+    said = json.loads((result / "result.json").read_text())["ranges"]["rms_m"]
+    assert own.range_rms_m[0] == pytest.approx(said, rel=1e-4)
+
+
+def test_a_log_is_held_against_models_that_no_run_has_made(
+    walked_survey: WalkedSurvey, models: tuple[Path, Path, Path]
+) -> None:
+    files = walked_survey.folder
+    survey = Survey(
+        image_times_path=files / "images.csv",
+        ranges=RangesConfig(path=files / "uwb.csv", time_offset_s=2.0),
+        anchors_path=files / "anchors.csv",
+        tag_in_cam_m=TAG_IN_CAM_M,
+        scale=ScaleOptions(num_bootstrap=20),
+    )
+    named = read_models(models)
+    assert named[0].model is not None
+    ranges = ranges_of_survey(survey, read_ranging_inputs(survey), named[0].model, models[0])
+    (first, similar, moved) = compare_many(named, ranges).rows
+    rms = [row.range_rms_m for row in (first, similar, moved) if row.range_rms_m is not None]
+    assert len(rms) == 3
+    assert rms[0][1] < 0.1  # the radio's 0.05 m, and the path between photos
+    assert rms[0][0] > 3 * rms[0][1]
+    assert rms[1][1] == pytest.approx(rms[0][1], rel=1e-6)
+    assert rms[2][1] > 1.2 * rms[0][1]  # one camera in forty is wrong
+
+
+def test_a_path_without_orientations_has_no_antenna_and_so_no_range_residuals(
+    result: Path, walked_survey: WalkedSurvey
+) -> None:
+    _, row = compared(result, walked_survey.folder / "reference.csv").rows
+    assert row.range_rms_m is None
+
+
+def test_a_taped_distance_is_found_in_each_model_and_placed_by_the_ranges(
+    result: Path, models: tuple[Path, Path, Path], tmp_path: Path
+) -> None:
+    first, last = (compared(*models[:2]).models[0].path.image_names[i] for i in (0, -1))
+    taped = tmp_path / "taped.csv"
+    taped.write_text(f"from,to,distance_m\n{first},{last},5.0\n")
+    (row,) = compare_many(read_models([result, *models[:2]]), tape=read_tape(taped)).taped
+    metric, whole, half = row.lengths
+    assert whole is not None
+    assert half == pytest.approx(whole / 2)
+    assert row.lengths_m == pytest.approx((metric, metric, metric), rel=1e-6)
+    assert row.measured_m == 5.0
+    (unplaced,) = compare_many(read_models(models[:2]), tape=read_tape(taped)).taped
+    assert unplaced.lengths_m is None
+    taped.write_text(f"from,to,distance_m\n{first},nowhere,5.0\n")
+    with pytest.raises(InputError, match=r"taped.csv:2: an end is 'nowhere'.*model"):
+        compare_many(read_models(models[:2]), tape=read_tape(taped))
+
+
+def test_the_command_takes_the_log_and_the_tape(
+    rangesfm_command: Command, models: tuple[Path, Path, Path], walked_survey: WalkedSurvey, tmp_path: Path
+) -> None:
+    files = walked_survey.folder
+    names = compared(*models[:2]).models[0].path.image_names
+    (tmp_path / "taped.csv").write_text(f"from,to,distance_m\n{names[0]},{names[9]},1.25\n")
+    log = ("--ranges", files / "uwb.csv", "--anchors", files / "anchors.csv", "--images", files / "images.csv")
+    tag = ("--tag-in-cam", ",".join(map(str, TAG_IN_CAM_M)), "--ranges_time_offset", "2")
+    tape = ("--distances", "taped.csv", "--output_path", "page")
+    printed = rangesfm_command("compare", *models[:2], *log, *tag, *tape, cwd=tmp_path).stdout
+    rows = {line.split()[0]: line.split() for line in printed.splitlines() if line.startswith(str(models[0].parent))}
+    assert all(0 < float(rows[str(path)][-1]) < 0.1 for path in models[:2])
+    (taped,) = (line.split() for line in printed.splitlines() if line.startswith(f"{names[0]} to {names[9]}  1.25"))
+    assert taped[-2] == taped[-1]
+    assert "Taped distances" in (tmp_path / "page" / "comparison.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--anchors", "anchors.csv"), "--anchors given without a log to use it for, expected --ranges LOG"),
+        (("--images", "images.csv"), "expected --ranges LOG"),
+        (("--markers", "marks.csv"), "no --distances"),
+        (("--ranges", "gone.csv"), "gone.csv"),
+    ],
+)
+def test_flags_that_say_nothing_together_are_refused(
+    rangesfm_command: Command,
+    models: tuple[Path, Path, Path],
+    tmp_path: Path,
+    arguments: tuple[str, ...],
+    said: str,
+) -> None:
+    for name in ("anchors.csv", "images.csv", "marks.csv"):
+        (tmp_path / name).touch()
+    done = rangesfm_command("compare", *models[:2], *arguments, cwd=tmp_path, status=2)
+    assert said in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
 
 
 def test_a_file_of_positions_is_a_model_too(models: tuple[Path, Path, Path], walked_survey: WalkedSurvey) -> None:

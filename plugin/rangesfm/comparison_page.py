@@ -7,10 +7,19 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.files import make_output_folder, new_file
-from rangesfm.model_comparison import SIMILARITY_HEADER, ModelRow, ModelsComparison, NamedModel, similarity_cells
+from rangesfm.model_comparison import (
+    SIMILARITY_HEADER,
+    ModelRow,
+    ModelsComparison,
+    NamedModel,
+    similarity_cells,
+    taped_cells,
+    taped_header,
+)
 from rangesfm.report.content import points_of
 from rangesfm.report.drawing import draw
 from rangesfm.report.figures_path import VIEW_SIZE
+from rangesfm.report.markup import Markup
 from rangesfm.report.page import document
 from rangesfm.report.plot import WIDE_SIZE, Figure, Panel, Series
 from rangesfm.report.result_scene import anchors_in_scene
@@ -46,7 +55,8 @@ def render_comparison(comparison: ModelsComparison) -> str:
         SIMILARITY_HEADER,
         [[row.name, *similarity_cells(row)] for row in comparison.rows],
         "Scale and turn carry a model onto the first. Moved: RMS distance of the cameras from where the first has "
-        "them, as they are and after that similarity, in the first's unit.",
+        "them, as they are and after that similarity, in the first's unit. Range RMS: of the ranges used, with the "
+        "cameras as they are, and carried onto the path that the ranges themselves have placed.",
     )
     distances = table(
         "Distances between photos, in each model's unit",
@@ -61,8 +71,19 @@ def render_comparison(comparison: ModelsComparison) -> str:
         section("models", "Models", similarity),
         section("view-section", "All of them in 3-D", view(_scene(comparison, aligned))),
         section("moved", "What moved where", [draw(figure) for figure in figures if figure is not None]),
-        section("distances", "Distances", distances),
+        section("distances", "Distances", distances, *_taped(comparison)),
     )
+
+
+def _taped(comparison: ModelsComparison) -> list[Markup | None]:
+    if not comparison.taped:
+        return []
+    rows = [taped_cells(row) for row in comparison.taped]
+    note = (
+        "Each model's length in its own unit; after Sim(3): with the scale that carries its cameras onto those of the "
+        "first model that the ranges have placed."
+    )
+    return [table("Taped distances", taped_header(comparison), rows, note)]
 
 
 def _aligned(model: NamedModel, row: ModelRow) -> Trajectory:

@@ -18,6 +18,7 @@ def input_hashes(survey: Survey) -> list[dict[str, Any]]:
     """
     files = (
         survey.ranges.path,
+        survey.ranges.error_curve_path,
         survey.anchors_path,
         survey.image_times_path,
         survey.distances_path,

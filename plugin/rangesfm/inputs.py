@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +21,10 @@ from rangesfm.ranging.readers import read_anchors_in_log, read_ranges
 from rangesfm.ranging.time_resolution import time_resolution_s
 from rangesfm.reference import Reference, read_reference
 from rangesfm.site import Site, local_site
+from rangesfm.vision.image_times import ImageTimes, find_image_times, read_image_times_csv
+
+if TYPE_CHECKING:
+    import pycolmap
 
 # Beyond these a unit is wrong, or the file: no camera carries its tag so far away, and no such radio reaches so far.
 _MAX_LEVER_ARM_M = 20.0
@@ -173,6 +179,14 @@ def _anchors_of_log(log: RangeLog) -> tuple[Anchor, ...]:
     in_log = read_anchors_in_log(log.source, format=log.format) if log.source is not None else ()
     by_id = {anchor.anchor_id: anchor for anchor in in_log}
     return tuple(by_id.get(anchor_id, Anchor(anchor_id)) for anchor_id in log.anchor_ids)
+
+
+def times_of_model(survey: Survey, sfm: pycolmap.Reconstruction, model_path: Path) -> ImageTimes:
+    """Times of a model's photos; the table may list others, which did not become keyframes."""
+    if survey.image_times_path is not None:
+        return read_image_times_csv(survey.image_times_path)
+    names = tuple(sorted(image.name for image in sfm.images.values()))
+    return find_image_times(survey.images_path or model_path, names)
 
 
 def of_one_tag(log: RangeLog, tag_id: str | None) -> RangeLog:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,9 +12,12 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 from rangesfm.comparison import MIN_NUM_ALIGNED, align_rows, reprojection_rms_px
+from rangesfm.distances.ends import locate_distances
+from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
 from rangesfm.geometry import Similarity, align_points, rmse
 from rangesfm.model_files import read_model
+from rangesfm.model_ranges import ModelRanges, ranges_of_result
 from rangesfm.reference import read_reference
 from rangesfm.result_folder import ResultFolder, read_result_folder
 from rangesfm.trajectory import Trajectory, trajectory_from_reconstruction
@@ -33,12 +36,14 @@ class NamedModel:
         path: the keyframes in the model's own world.
         model: None where only positions are known.
         result: the result folder it comes from; None where it does not.
+        has_orientations: whether the path's rotations are the cameras'.
     """
 
     name: str
     path: Trajectory
     model: pycolmap.Reconstruction | None
     result: ResultFolder | None
+    has_orientations: bool = True
 
 
 @dataclass(frozen=True)
@@ -53,8 +58,8 @@ class ModelRow:
         moved, moved_aligned: (num_common,) distance of each camera from where the first has it, as it is and after
             that similarity, in the first's unit; the latter None without one.
         reprojection_rms_px: None without points.
-        range_rms_m: of the ranges of the first result folder given, as it is and after the similarity onto that
-            result; None without one.
+        range_rms_m: of the ranges given, else of those that the first result folder used: of the cameras as they are,
+            and carried by a similarity onto the path that the ranges themselves have placed; None without ranges.
     """
 
     name: str
@@ -76,6 +81,23 @@ class ModelRow:
 
 
 @dataclass(frozen=True)
+class TapedRow:
+    """One taped distance.
+
+    Attributes:
+        ends: between what.
+        measured_m: by tape.
+        lengths: in each model, in its own unit; None where there is only a path.
+        lengths_m: the same, with the scale that carries the model onto the placed path; None without ranges.
+    """
+
+    ends: tuple[str, str]
+    measured_m: float
+    lengths: tuple[float | None, ...]
+    lengths_m: tuple[float | None, ...] | None
+
+
+@dataclass(frozen=True)
 class ModelsComparison:
     """Models of the same photos.
 
@@ -83,14 +105,19 @@ class ModelsComparison:
         models: as given; the first is what the others are compared with.
         rows: one for each.
         distances: of a few pairs of photos that all models have: both names, and the length in each model's unit.
+        taped: taped distances; empty without.
     """
 
     models: tuple[NamedModel, ...]
     rows: tuple[ModelRow, ...]
     distances: tuple[tuple[str, str, tuple[float, ...]], ...]
+    taped: tuple[TapedRow, ...] = ()
 
     def __str__(self) -> str:
-        return f"{_similarity_table(self)}\n\n{_distance_table(self)}"
+        tables = [_similarity_table(self), _distance_table(self)]
+        if self.taped:
+            tables.append(align_rows([taped_header(self), *(tuple(taped_cells(row)) for row in self.taped)]))
+        return "\n\n".join(tables)
 
 
 def read_models(paths: Sequence[Path]) -> tuple[NamedModel, ...]:
@@ -107,15 +134,27 @@ def read_models(paths: Sequence[Path]) -> tuple[NamedModel, ...]:
     return tuple(models)
 
 
-def compare_many(models: Sequence[NamedModel]) -> ModelsComparison:
+def compare_many(
+    models: Sequence[NamedModel], ranges: ModelRanges | None = None, tape: Tape | None = None
+) -> ModelsComparison:
     """Compare models with the first of them.
 
+    Args:
+        ranges: to hold the models against; None: those of the first result folder among them, if there is one.
+        tape: taped distances to look up in each model.
+
     Raises:
-        InputError: one has no photo in common with the first.
+        InputError: one has no photo in common with the first, or lacks the end of a taped distance.
     """
-    ranged = next((model for model in models if model.result is not None and model.result.has_ranges), None)
-    rows = tuple(_row(models[0], model, ranged) for model in models)
-    return ModelsComparison(tuple(models), rows, _distances(models))
+    ranges = ranges or _ranges_of_first_result(models)
+    rows = tuple(_row(models[0], model, ranges) for model in models)
+    taped = () if tape is None else _taped(models, ranges, tape)
+    return ModelsComparison(tuple(models), rows, _distances(models), taped)
+
+
+def _ranges_of_first_result(models: Sequence[NamedModel]) -> ModelRanges | None:
+    found = (None if model.result is None else ranges_of_result(model.result, model.path) for model in models)
+    return next((ranges for ranges in found if ranges is not None), None)
 
 
 def _read_model(path: Path) -> NamedModel:
@@ -142,10 +181,10 @@ def _read_positions(path: Path, base: Trajectory) -> NamedModel:
         centers=positions[known],
         world_from_cam=np.tile(np.eye(3), (len(known), 1, 1)) if rotations is None else rotations[known],
     )
-    return NamedModel(str(path), trajectory, None, None)
+    return NamedModel(str(path), trajectory, None, None, has_orientations=rotations is not None)
 
 
-def _row(base: NamedModel, other: NamedModel, ranged: NamedModel | None) -> ModelRow:
+def _row(base: NamedModel, other: NamedModel, ranges: ModelRanges | None) -> ModelRow:
     names, ours, theirs = _common(base.path, other.path)
     if not names:
         raise InputError(f"it has no photo in common with {base.name}", other.name)
@@ -159,7 +198,7 @@ def _row(base: NamedModel, other: NamedModel, ranged: NamedModel | None) -> Mode
         moved=np.linalg.norm(theirs - ours, axis=1),
         moved_aligned=None if similarity is None else np.linalg.norm(similarity.apply(theirs) - ours, axis=1),
         reprojection_rms_px=_reprojection(other.model),
-        range_rms_m=None if ranged is None else _range_rms(ranged, other.path),
+        range_rms_m=None if ranges is None else _range_rms(ranges, other),
     )
 
 
@@ -183,17 +222,57 @@ def _similarity(source: Array, target: Array) -> Similarity | None:
     return found if found.scale > 0 else None
 
 
-def _range_rms(ranged: NamedModel, path: Trajectory) -> tuple[float, float] | None:
-    """RMS of the residuals of a result's ranges with another model's cameras, as they are and carried onto it."""
-    assert ranged.result is not None
-    _, goal, source = _common(ranged.path, path)
-    similarity = _similarity(source, goal)
-    as_it_is = ranged.result.range_residuals_m(path)
-    if similarity is None or len(as_it_is) == 0:
+def _onto_ranges(ranges: ModelRanges, path: Trajectory) -> Similarity | None:
+    """What carries a path onto the one that the ranges have placed."""
+    _, goal, source = _common(ranges.metric_path, path)
+    return _similarity(source, goal)
+
+
+def _scale_onto(ranges: ModelRanges, path: Trajectory) -> float | None:
+    similarity = _onto_ranges(ranges, path)
+    return None if similarity is None else similarity.scale
+
+
+def _range_rms(ranges: ModelRanges, model: NamedModel) -> tuple[float, float] | None:
+    """RMS of the residuals with a model's cameras, as they are and carried."""
+    similarity = _onto_ranges(ranges, model.path)
+    if similarity is None or not model.has_orientations:
         return None
-    carried = path.transformed(similarity.scale, similarity.rotation, similarity.translation)
-    both = (as_it_is, ranged.result.range_residuals_m(carried))
+    carried = model.path.transformed(similarity.scale, similarity.rotation, similarity.translation)
+    both = [ranges.residuals_m(path) for path in (model.path, carried)]
+    if not len(both[0]):
+        return None
     return float(np.sqrt(np.mean(both[0] ** 2))), float(np.sqrt(np.mean(both[1] ** 2)))
+
+
+def _taped(models: Sequence[NamedModel], ranges: ModelRanges | None, tape: Tape) -> tuple[TapedRow, ...]:
+    anchors = {} if ranges is None else ranges.anchors_m
+    own = [_taped_lengths(model, tape, 1.0, anchors) for model in models]
+    placed = None
+    if ranges is not None:
+        scales = [_scale_onto(ranges, model.path) for model in models]
+        placed = [_taped_lengths(model, tape, scale, anchors) for model, scale in zip(models, scales)]
+    return tuple(
+        TapedRow(
+            taped.ends,
+            taped.distance_m,
+            tuple(lengths[row] for lengths in own),
+            None if placed is None else tuple(lengths[row] for lengths in placed),
+        )
+        for row, taped in enumerate(tape.distances)
+    )
+
+
+def _taped_lengths(
+    model: NamedModel, tape: Tape, scale: float | None, anchors_m: Mapping[str, Array]
+) -> list[float | None]:
+    if model.model is None or scale is None:
+        return [None] * len(tape.distances)
+    try:
+        located = locate_distances(tape, model.model, list(anchors_m))
+    except InputError as error:
+        raise InputError(f"{error} (model {model.name})") from None
+    return [float(length) for length in located.lengths_m(scale, np.array(list(anchors_m.values())).reshape(-1, 3))]
 
 
 def _distances(models: Sequence[NamedModel]) -> tuple[tuple[str, str, tuple[float, ...]], ...]:
@@ -205,6 +284,19 @@ def _distances(models: Sequence[NamedModel]) -> tuple[tuple[str, str, tuple[floa
     pairs = [(quarters[i], quarters[j]) for i, j in ((0, 4), (0, 2), (2, 4), (1, 3), (0, 1), (3, 4))]
     distinct = dict.fromkeys((names[a], names[b]) for a, b in pairs[:NUM_DISTANCES] if names and a != b)
     return tuple((a, b, tuple(float(np.linalg.norm(place[a] - place[b])) for place in places)) for a, b in distinct)
+
+
+def taped_header(comparison: ModelsComparison) -> tuple[str, ...]:
+    """Titles of the columns of ``taped_cells``."""
+    names = [model.name for model in comparison.models]
+    placed = [f"{name} after Sim(3)" for name in names] if comparison.taped[0].lengths_m is not None else []
+    return ("taped distance", "tape m", *names, *placed)
+
+
+def taped_cells(row: TapedRow) -> list[str]:
+    """The row as text."""
+    lengths = (*row.lengths, *(row.lengths_m or ()))
+    return ["{} to {}".format(*row.ends), *(_text(length, ".4f") for length in (row.measured_m, *lengths))]
 
 
 def similarity_cells(row: ModelRow) -> list[str]:

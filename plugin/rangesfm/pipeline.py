@@ -24,7 +24,7 @@ from rangesfm.errors import InputError
 from rangesfm.export import check_formats
 from rangesfm.georeference import Georeference
 from rangesfm.input_hashes import input_hashes
-from rangesfm.inputs import RangingInputs, read_ranging_inputs
+from rangesfm.inputs import RangingInputs, read_ranging_inputs, times_of_model
 from rangesfm.journal import Journal
 from rangesfm.metric_survey import MetricSurvey
 from rangesfm.model_files import read_model
@@ -51,7 +51,7 @@ from rangesfm.results import survey_result
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.sole_writer import sole_writer
 from rangesfm.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images, read_image_times_csv
+from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images
 from rangesfm.vision.keyframes import select_keyframes
 from rangesfm.vision.reconstruct import reconstruct
 
@@ -116,7 +116,7 @@ def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResul
         raise InputError("the model has no 3-D points to refine: a trajectory can only be scaled", survey.model_path)
     times = None
     if inputs.log.image_name is None:
-        times = _noted(_times_of_model(survey, sfm, survey.model_path), journal)
+        times = _noted(times_of_model(survey, sfm, survey.model_path), journal)
     with sole_writer(survey.output_path):
         return _to_metric(survey, inputs, sfm, times, journal, refine=refine)
 
@@ -268,14 +268,6 @@ def _images_path(survey: Survey) -> Path:
     if survey.images_path is None:
         raise InputError("no photos: give [images] path in a survey file, or --images FOLDER")
     return survey.images_path
-
-
-def _times_of_model(survey: Survey, sfm: pycolmap.Reconstruction, model_path: Path) -> ImageTimes:
-    """Times of a model's photos; the table may list others, which did not become keyframes."""
-    if survey.image_times_path is not None:
-        return read_image_times_csv(survey.image_times_path)
-    names = tuple(sorted(image.name for image in sfm.images.values()))
-    return find_image_times(survey.images_path or model_path, names)
 
 
 def _noted(image_times: ImageTimes, journal: Journal) -> ImageTimes:

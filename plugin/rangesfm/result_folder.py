@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from rangesfm.errors import InputError
 from rangesfm.geometry import Similarity
 from rangesfm.georeference import Georeference
+from rangesfm.options import AssociationOptions
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.tables import read_table
-from rangesfm.trajectory import Trajectory
 
 if TYPE_CHECKING:
     import pycolmap
@@ -34,6 +34,7 @@ RANGES_COLUMNS = (
     "predicted_refined_m",
     "status",
 )
+TAG_COLUMN = "tag_id"
 PLACE_COLUMNS = ("keyframe_before", "keyframe_after", "weight")
 USED_STATUSES = (RangeStatus.USED.label, RangeStatus.DOWN_WEIGHTED.label)
 
@@ -46,6 +47,7 @@ class RangesAsUsed:
         timestamp_s: (n,) on the radio's clock, NaN where the log gives photos instead.
         image_name: n names, empty where the log gives times.
         anchor_id: n ids.
+        tag_id: n ids.
         range_m: (n,) measured.
         residual_scaled_m, residual_refined_m: (n,) predicted minus measured with the
             scaled and with the refined model; NaN where not applicable.
@@ -57,6 +59,7 @@ class RangesAsUsed:
     timestamp_s: Array
     image_name: tuple[str, ...]
     anchor_id: tuple[str, ...]
+    tag_id: tuple[str, ...]
     range_m: Array
     residual_scaled_m: Array
     residual_refined_m: Array
@@ -69,6 +72,14 @@ class RangesAsUsed:
     def is_used(self) -> npt.NDArray[np.bool_]:
         """(n,) ranges with a say in the final model, however small."""
         return np.isin(np.array(self.status, dtype=str), USED_STATUSES)
+
+
+@dataclass(frozen=True)
+class ResultAnchor:
+    """(3,) position in the metric models' world, and what its ranges read too long; metres."""
+
+    position_m: Array
+    range_bias_m: float
 
 
 @dataclass(frozen=True)
@@ -91,15 +102,21 @@ class ResultFolder:
         return str(self.summary.get("frame", "first_camera"))
 
     @property
-    def anchor_positions_m(self) -> dict[str, Array]:
-        """(3,) position by anchor id, in the metric models' world; anchors without one are left out."""
+    def anchors(self) -> dict[str, ResultAnchor]:
+        """By id; those without a position are left out."""
         with self._expecting("anchors"):
-            anchors = self.summary.get("anchors") or {}
             return {
-                str(anchor_id): np.array(anchor["position_m"], dtype=np.float64).reshape(3)
-                for anchor_id, anchor in anchors.items()
+                str(anchor_id): ResultAnchor(
+                    np.array(anchor["position_m"], dtype=np.float64).reshape(3), float(anchor.get("range_bias_m") or 0)
+                )
+                for anchor_id, anchor in (self.summary.get("anchors") or {}).items()
                 if anchor.get("position_m") is not None
             }
+
+    @property
+    def anchor_positions_m(self) -> dict[str, Array]:
+        """(3,) position by anchor id, in the metric models' world; anchors without one are left out."""
+        return {anchor_id: anchor.position_m for anchor_id, anchor in self.anchors.items()}
 
     @property
     def metric_from_sfm(self) -> Similarity | None:
@@ -160,7 +177,7 @@ class ResultFolder:
         path = self.path / "ranges.csv"
         if not path.is_file():
             return None
-        table = read_table(path, RANGES_COLUMNS, PLACE_COLUMNS)
+        table = read_table(path, RANGES_COLUMNS, (*PLACE_COLUMNS, TAG_COLUMN))
         range_m = table.numbers("range_m")
         nowhere = [""] * len(table)
         before, after = (table.text(name, empty="") if name in table else nowhere for name in PLACE_COLUMNS[:2])
@@ -168,6 +185,7 @@ class ResultFolder:
             timestamp_s=table.numbers("timestamp_s", empty=np.nan),
             image_name=tuple(table.text("image_name", empty="")),
             anchor_id=tuple(table.text("anchor_id")),
+            tag_id=tuple(table.text(TAG_COLUMN) if TAG_COLUMN in table else nowhere),
             range_m=range_m,
             residual_scaled_m=table.numbers("predicted_scaled_m", empty=np.nan) - range_m,
             residual_refined_m=table.numbers("predicted_refined_m", empty=np.nan) - range_m,
@@ -177,40 +195,26 @@ class ResultFolder:
             weight=table.numbers("weight", empty=np.nan) if "weight" in table else np.full(len(table), np.nan),
         )
 
-    @property
-    def has_ranges(self) -> bool:
-        return (self.path / "ranges.csv").is_file()
-
-    def range_residuals_m(self, path: Trajectory) -> Array:
-        """(k,) predicted minus measured with other cameras, of the ranges used between photos that ``path`` has.
-
-        Anchors and their biases are the result's; the radio stands between two photos on the
-        straight line (a run itself follows the curve).
+    def lever_arms_m(self, tag_ids: Sequence[str]) -> Array:
+        """(n, 3) antenna in the camera's frame of each tag of a list; of one that the settings do not name, the common.
 
         Raises:
-            InputError: the files are not what a run writes.
+            InputError: the settings are not what a run writes.
         """
-        ranges, anchors = self.read_ranges(), self.anchor_positions_m
-        if ranges is None:
-            return np.zeros(0)
-        with self._expecting("anchors"):
-            biases = {id_: float(self.summary["anchors"][id_].get("range_bias_m") or 0.0) for id_ in anchors}
         with self._expecting("settings"):
-            given = (self.summary.get("settings") or {}).get("tag_in_cam_m") or (0.0, 0.0, 0.0)
-            tag_in_cam_m = np.array(given, dtype=np.float64).reshape(3)
-        index = {name: i for i, name in enumerate(path.image_names)}
-        before = np.array([index.get(name, -1) for name in ranges.keyframe_before], dtype=np.int64)
-        after = np.array([index.get(name, -1) for name in ranges.keyframe_after], dtype=np.int64)
-        has_anchor = np.isin(np.array(ranges.anchor_id, dtype=str), list(anchors))
-        rows = np.flatnonzero(ranges.is_used & has_anchor & (before >= 0) & (after >= 0) & np.isfinite(ranges.weight))
-        before, after, weight = before[rows], after[rows], ranges.weight[rows, None]
-        centers = (1 - weight) * path.centers[before] + weight * path.centers[after]
-        nearest = np.where(weight[:, 0] < 0.5, before, after)
-        ids = [ranges.anchor_id[row] for row in rows]
-        places = np.array([anchors[id_] for id_ in ids], dtype=np.float64).reshape(-1, 3)
-        tags = centers + path.world_from_cam[nearest] @ tag_in_cam_m
-        predicted = np.linalg.norm(tags - places, axis=1) + np.array([biases[id_] for id_ in ids])
-        return np.asarray(predicted - ranges.range_m[rows])
+            settings = self.summary.get("settings") or {}
+            common = np.array(settings.get("tag_in_cam_m") or (0.0, 0.0, 0.0), dtype=np.float64).reshape(3)
+            given = settings.get("lever_arms_m") or {}
+            arms = {str(id_): np.array(arm, dtype=np.float64).reshape(3) for id_, arm in given.items()}
+        return np.array([arms.get(tag_id, common) for tag_id in tag_ids], dtype=np.float64).reshape(-1, 3)
+
+    @property
+    def association(self) -> AssociationOptions:
+        """How the run put ranges on the path."""
+        with self._expecting("settings"):
+            given = ((self.summary.get("settings") or {}).get("ranges") or {}).get("association") or {}
+            known = (field.name for field in fields(AssociationOptions) if field.name in given)
+            return AssociationOptions(**{name: float(given[name]) for name in known})
 
     def read_numbers(self, name: str, columns: Sequence[str]) -> dict[str, Array] | None:
         """Columns of numbers of ``name``.csv, NaN where a cell is empty; None if not there."""

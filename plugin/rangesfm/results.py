@@ -89,6 +89,7 @@ def _time_offset(survey: MetricSurvey) -> dict[str, Any]:
             "value_s": found.value_s,
             "stddev_s": found.stddev_s,
             "estimated": True,
+            "offset_matters": found.offset_matters,
             "drift_ppm": 1e6 * found.drift,
             "drift_stddev_ppm": 1e6 * found.drift_stddev,
             "drift_is_followed": found.drift_is_followed,

@@ -8,6 +8,7 @@ import pytest
 
 from rangesfm.report.checks import Check, quality_checks
 from rangesfm.report.content import Summary
+from rangesfm.report.traffic_lights import card
 
 
 def light_of(name: str, summary: dict[str, Any]) -> str:
@@ -40,6 +41,17 @@ def test_one_anchor_cannot_agree_with_others() -> None:
 def test_no_check_ranges_is_no_good_check() -> None:
     assert light_of("Check ranges", {"check_ranges": {"num": 0, "rms_m": 0.0}}) == "off"
     assert light_of("Check ranges", {"check_ranges": {"num": 10, "rms_m": 0.1}}) == "green"
+
+
+def test_an_offset_that_does_not_matter_is_no_fault_however_uncertain() -> None:
+    note = "the camera stands still at every photo"
+    assert light_of("Clock offset", {"time_offset": {"stddev_s": 0.6, "offset_matters": True}}) == "red"
+    plateau = {"time_offset": {"stddev_s": 0.6, "offset_matters": False, "note": note}}
+    assert light_of("Clock offset", plateau) == "green"
+    (check,) = (check for check in quality_checks(Summary(plateau)) if check.name == "Clock offset")
+    shown = str(card(check))
+    assert "The camera stands still at every photo." in shown
+    assert "amber" not in shown
 
 
 def test_nothing_measured_means_no_light() -> None:

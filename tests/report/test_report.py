@@ -7,14 +7,20 @@ import hashlib
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from rangesfm.errors import InputError
 from rangesfm.report import write_report
+from rangesfm.report.content import gather
+from rangesfm.report.result_scene import scene_of
+from rangesfm.report.scene import scene_data
+from rangesfm.result_folder import read_result_folder
 
 MakeResult = Callable[..., Path]
 SECTIONS = ["verdict", "checks", "view-section", "path", "scale", "ranges", "anchors", "run"]
@@ -257,3 +263,31 @@ def test_a_broken_table_is_named_with_its_line(make_result: MakeResult) -> None:
     with pytest.raises(InputError, match=r"ranges\.csv:4: range_m is 'far'"):
         write_report(folder)
     assert not (folder / "report.html").exists()
+
+
+def test_each_range_begins_at_its_own_tag(make_result: MakeResult) -> None:
+    arms = {"tag": [0.0, -0.1, 0.0], "other": [0.4, 0.0, 0.2]}
+    folder = make_result(num_keyframes=20, num_ranges_per_anchor=10)
+    summary = json.loads((folder / "result.json").read_text())
+    summary["settings"]["lever_arms_m"] = arms
+    (folder / "result.json").write_text(json.dumps(summary))
+    lines = (folder / "ranges.csv").read_text().splitlines()
+    changed = [line.replace(",tag,", ",other,") if number % 2 else line for number, line in enumerate(lines)]
+    (folder / "ranges.csv").write_text("\n".join(changed))
+    content = gather(read_result_folder(folder))
+    assert content.ranges is not None
+    expected = np.array([arms[tag_id] for tag_id in content.ranges.tag_id])
+    assert set(content.ranges.tag_id) == {"tag", "other"}
+    np.testing.assert_array_equal(content.tags_in_cam_m, expected)
+    # A tag in another place of the camera is nearer to the anchor or farther by at most as much.
+    moved = replace(content, tags_in_cam_m=np.zeros((len(expected), 3)))
+    assert content.true_ranges_m is not None
+    assert moved.true_ranges_m is not None
+    known = np.isfinite(content.true_ranges_m)
+    assert known.any()
+    differences = np.abs(content.true_ranges_m - moved.true_ranges_m)[known]
+    assert np.all(differences <= np.linalg.norm(expected[known], axis=1) + 1e-9)
+    assert differences.max() > 0.2
+    scene = scene_of(content)
+    assert scene is not None
+    assert sorted(scene_data(scene)["ranges"]["tags_in_cam_m"]) == sorted(arms.values())

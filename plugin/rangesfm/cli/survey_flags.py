@@ -172,6 +172,8 @@ RANGE_FLAGS = (
     Flag("markers", "scale.markers", "CSV marker,image_name,x_px,y_px: marks that they refer to", metavar="CSV"),
     Flag("reference", "report.reference", "true positions, for comparison", metavar="FILE"),
 )
+_OF_A_RUN = ("check_share", "check_anchors", "check_times_s", "scale_method", "reference")
+COMPARE_FLAGS = tuple(flag for flag in RANGE_FLAGS if flag.name not in _OF_A_RUN)
 REFINE_FLAGS = (
     Flag("max_num_iterations", "refine.max_num_iterations", "of the refinement's solver", int, metavar="N"),
 )
@@ -235,7 +237,7 @@ def survey_from_arguments(args: argparse.Namespace) -> Survey:
     overrides = overrides_from_arguments(args)
     if args.images is not None:
         overrides["images.times" if _is_table(args.images) else "images.path"] = args.images
-    if args.survey is None:
+    if getattr(args, "survey", None) is None:
         survey = survey_from_tables({}, Path.cwd(), overrides)
     else:
         survey = read_survey(args.survey, overrides, args.base_path)

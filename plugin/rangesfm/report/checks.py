@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rangesfm.report.content import Summary, as_number
+from rangesfm.report.text import sentence
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,7 @@ class Check:
             (from the first upwards, where larger is better).
         decimals: of the printed numbers.
         larger_is_better: the limits are lower ones.
+        no_matter: why any value is as good here, so that the light is green; None: it matters.
     """
 
     name: str
@@ -30,12 +32,15 @@ class Check:
     amber_limit: float
     decimals: int
     larger_is_better: bool = False
+    no_matter: str | None = None
 
     @property
     def light(self) -> str:
         """ "green", "amber", "red", or "off" without a value."""
         if self.value is None:
             return "off"
+        if self.no_matter is not None:
+            return "green"
         sign = -1.0 if self.larger_is_better else 1.0
         if sign * self.value <= sign * self.green_limit:
             return "green"
@@ -91,6 +96,7 @@ def quality_checks(summary: Summary) -> tuple[Check, ...]:
             0.02,
             0.10,
             4,
+            no_matter=_why_no_offset_matters(summary),
         ),
         Check(
             "Reprojection",
@@ -108,6 +114,12 @@ def larger_stddev(summary: Summary) -> float | None:
     """The larger of the scale's formal and empirical stddev: formal ones are far too small on real logs."""
     both = (summary.number("scale", "stddev_formal"), summary.number("scale", "stddev_empirical"))
     return max((stddev for stddev in both if stddev is not None), default=None)
+
+
+def _why_no_offset_matters(summary: Summary) -> str | None:
+    if summary.get("time_offset", "offset_matters") is not False:
+        return None
+    return sentence(str(summary.get("time_offset", "note") or "any offset near this one gives the same result"))
 
 
 def _relative_percent(part: float | None, whole: float | None) -> float | None:

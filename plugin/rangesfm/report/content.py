@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.errors import InputError
 from rangesfm.reference import read_reference
 from rangesfm.report.true_ranges import true_ranges_m
 from rangesfm.result_folder import RangesAsUsed, ResultFolder
@@ -87,6 +89,7 @@ class Content:
         title: name of the result.
         summary: ``result.json``.
         ranges: ``ranges.csv``.
+        tags_in_cam_m: (n, 3) antenna of each range's tag in the camera's frame; None without ranges.
         range_times_s: (n,) when each range was taken, seconds since the first; NaN where unknown.
         scaled, refined: the path before and after the refinement.
         reference_m: (k, 3) positions in the map's frame.
@@ -102,6 +105,7 @@ class Content:
     title: str
     summary: Summary
     ranges: RangesAsUsed | None
+    tags_in_cam_m: Array | None
     range_times_s: Array | None
     scaled: Trajectory | None
     refined: Trajectory | None
@@ -115,18 +119,12 @@ class Content:
     images_path: Path | None
     tables: dict[str, dict[str, Array]]
 
-    @property
-    def tag_in_cam_m(self) -> Array:
-        """(3,) the radio's antenna in the camera's frame, zero where the settings do not say."""
-        given = self.summary.get("settings", "tag_in_cam_m")
-        return np.array(given if is_position(given) else [0.0, 0.0, 0.0], dtype=np.float64)
-
     @cached_property
     def true_ranges_m(self) -> Array | None:
         """(n,) by the reference, NaN where it says nothing; None where it says nothing at all."""
-        if self.ranges is None or self.final is None or not self.reference_by_photo:
+        if self.ranges is None or self.tags_in_cam_m is None or self.final is None or not self.reference_by_photo:
             return None
-        distances = true_ranges_m(self.ranges, self.final, self.reference_by_photo, self.anchors_m, self.tag_in_cam_m)
+        distances = true_ranges_m(self.ranges, self.final, self.reference_by_photo, self.anchors_m, self.tags_in_cam_m)
         return distances if np.isfinite(distances).any() else None
 
     @property
@@ -161,6 +159,7 @@ def gather(result: ResultFolder, *, images_path: Path | None = None) -> Content:
         title=_title(result.path.resolve()),
         summary=summary,
         ranges=ranges,
+        tags_in_cam_m=None if ranges is None else _tags_in_cam_m(result, ranges),
         range_times_s=None if ranges is None else _range_times(ranges, result.timestamps_s or {}),
         scaled=path_scaled,
         refined=None if refined is None else trajectory_from_reconstruction(refined, result.timestamps_s),
@@ -174,6 +173,13 @@ def gather(result: ResultFolder, *, images_path: Path | None = None) -> Content:
         images_path=images_path or (Path(known) if isinstance(known, str) else None),
         tables={name: table for name, columns in TABLES.items() if (table := result.read_numbers(name, columns))},
     )
+
+
+def _tags_in_cam_m(result: ResultFolder, ranges: RangesAsUsed) -> Array:
+    """At the camera itself where the settings do not say."""
+    with suppress(InputError):
+        return result.lever_arms_m(ranges.tag_id)
+    return np.zeros((len(ranges.tag_id), 3))
 
 
 def _title(folder: Path) -> str:

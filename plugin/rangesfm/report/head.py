@@ -11,7 +11,7 @@ from rangesfm.report.checks import larger_stddev
 from rangesfm.report.content import Content, Summary, as_number
 from rangesfm.report.markup import Child, Markup, element
 from rangesfm.report.numbers import keyed
-from rangesfm.report.text import count, decimals_for, duration, fixed, plain, signed
+from rangesfm.report.text import count, decimals_for, duration, fixed, plain, sentence, signed
 from rangesfm.report.traffic_lights import traffic_light
 
 VERDICTS = {
@@ -33,9 +33,9 @@ def _verdict(summary: Summary) -> Markup:
     unknown = ("off", verdict.capitalize(), "The run gave no verdict on the scale.")
     light, word, meaning = VERDICTS.get(verdict, unknown)
     text = element("div", element("h2", word), element("p", meaning))
-    reasons = [element("li", reason) for reason in summary.texts("scale", "reasons")]
+    reasons = [element("li", sentence(reason)) for reason in summary.texts("scale", "reasons")]
     advice = _advice(summary)
-    warnings = [element("li", warning) for warning in summary.texts("warnings")]
+    warnings = [element("li", sentence(warning)) for warning in summary.texts("warnings")]
     return element(
         "div",
         element("div", traffic_light(light), text, class_=f"verdict {light}"),
@@ -48,7 +48,7 @@ def _verdict(summary: Summary) -> Markup:
 def _advice(summary: Summary) -> list[Markup]:
     given = summary.get("scale", "advice")
     texts = [given] if isinstance(given, str) else summary.texts("scale", "advice")
-    return [element("li", text) for text in texts if text]
+    return [element("li", sentence(text)) for text in texts if text]
 
 
 def _scale(summary: Summary) -> Markup:
@@ -105,6 +105,7 @@ def _tiles(content: Content) -> Markup:
     def metres(value: Any) -> str:
         return fixed(value, 3, "m")
 
+    offset_decimals = min(decimals_for(summary.number("time_offset", "stddev_s"), default=3), 6)
     num_checks = summary.number("check_ranges", "num") or 0
     tiles: list[tuple[str, Child, Child]] = [
         (
@@ -126,8 +127,8 @@ def _tiles(content: Content) -> Markup:
         ),
         (
             "Clock offset",
-            shown("time_offset.value_s", lambda value: signed(value, 3, "s")),
-            ["± ", shown("time_offset.stddev_s", lambda value: fixed(value, 4, "s"))],
+            shown("time_offset.value_s", lambda value: signed(value, offset_decimals, "s")),
+            ["± ", shown("time_offset.stddev_s", lambda value: fixed(value, offset_decimals, "s"))],
         ),
         ("Time taken", duration(_total_seconds(summary)), "all stages"),
     ]

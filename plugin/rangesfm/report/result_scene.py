@@ -31,7 +31,7 @@ def scene_of(content: Content) -> Scene | None:
         ranges=content.ranges,
         range_times_s=content.range_times_s,
         true_ranges_m=content.true_ranges_m,
-        tag_in_cam_m=content.tag_in_cam_m,
+        tags_in_cam_m=content.tags_in_cam_m,
         frustum_shape=content.cameras[0].half_angles if content.cameras else (0.6, 0.4),
         images_path=content.images_path,
         scale_interval=None if interval is None or not value else (interval[0] / value, interval[1] / value),

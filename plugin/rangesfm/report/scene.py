@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.ranging.observations import RangeStatus
 from rangesfm.report.packing import pack
 from rangesfm.report.thumbnails import thumbnails
 from rangesfm.result_folder import RangesAsUsed
@@ -67,7 +68,7 @@ class Scene:
         points_m, points_rgb: (m, 3) of the map.
         anchors: where the ranges end.
         ranges: with times (n,) in seconds; or None.
-        tag_in_cam_m: where they begin.
+        tags_in_cam_m: (n, 3) where each begins, in the camera's frame; or None.
         frustum_shape: half width and half height of a camera's picture at unit distance.
         images_path: folder of the photos; None where it is not known.
         true_ranges_m: (n,) by a reference, NaN where unknown; or None.
@@ -82,7 +83,7 @@ class Scene:
     ranges: RangesAsUsed | None = None
     range_times_s: Array | None = None
     true_ranges_m: Array | None = None
-    tag_in_cam_m: Array = field(default_factory=lambda: np.zeros(3))
+    tags_in_cam_m: Array | None = None
     frustum_shape: tuple[float, float] = (0.6, 0.4)
     images_path: Path | None = None
     scale_interval: tuple[float, float] | None = None
@@ -102,7 +103,6 @@ def scene_data(scene: Scene) -> dict[str, Any]:
         "points": _points(scene),
         "anchors": [_anchor(anchor) for anchor in scene.anchors],
         "ranges": _ranges(scene),
-        "tag_in_cam_m": scene.tag_in_cam_m.tolist(),
         "frustum_size": _frustum_size(scene.result, box["radius"]),
         "frustum_shape": list(scene.frustum_shape),
         "thumbnails": thumbnails(scene.images_path, scene.result.image_names),
@@ -209,16 +209,21 @@ def _ranges(scene: Scene) -> dict[str, Any] | None:
     weight = ranges.weight[rows]
     has_place = (before >= 0) & (after >= 0) & np.isfinite(weight)
     anchor_ids, anchor = np.unique(np.array(ranges.anchor_id, dtype=str), return_inverse=True)
-    statuses, status = np.unique(np.array(ranges.status, dtype=str), return_inverse=True)
+    statuses = _statuses_in_order(ranges)
+    status = np.array([statuses.index(label) for label in ranges.status])
     times = scene.range_times_s
     is_refined = bool(np.isfinite(ranges.residual_refined_m).any())
     final = ranges.residual_refined_m if is_refined else ranges.residual_scaled_m
     weight = np.where(has_place, weight, 0.0)
+    of_ranges = np.zeros((len(ranges.status), 3)) if scene.tags_in_cam_m is None else scene.tags_in_cam_m
+    tags, tag = np.unique(of_ranges[rows], axis=0, return_inverse=True)
     return {
         "num": len(rows),
         "anchor_ids": anchor_ids.tolist(),
         "anchor": pack(anchor[rows], "uint16"),
-        "statuses": statuses.tolist(),
+        "tags_in_cam_m": tags.tolist(),
+        "tag": pack(tag.reshape(-1), "uint8"),
+        "statuses": statuses,
         "status": pack(status[rows], "uint8"),
         "time": pack(np.full(len(rows), np.nan) if times is None else times[rows], "float32"),
         "measured": pack(ranges.range_m[rows], "float32"),
@@ -233,6 +238,13 @@ def _ranges(scene: Scene) -> dict[str, Any] | None:
         "weight": pack(np.round(255 * weight), "uint8"),
         "camera": pack(np.where(has_place, np.where(weight < 0.5, before, after), -1), "int32"),
     }
+
+
+def _statuses_in_order(ranges: RangesAsUsed) -> list[str]:
+    """Those that there are, the used first."""
+    present = set(ranges.status)
+    known = [status.label for status in RangeStatus if status.label in present]
+    return [*known, *sorted(present.difference(known))]
 
 
 def _indices(names: Sequence[str], index_of: dict[str, int], rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

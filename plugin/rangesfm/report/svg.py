@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.report.markup import Child, Markup, element
+from rangesfm.report.text import fixed
 
 Array = npt.NDArray[np.float64]
 
@@ -157,7 +158,7 @@ def ticks(low: float, high: float, max_num: int) -> list[tuple[float, str]]:
     step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= rough * 0.999)
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
     decimals = max(0, -math.floor(math.log10(step) + 1e-9))
-    return [(i * step, f"{i * step + 0.0:.{decimals}f}") for i in range(first, last + 1)]
+    return [(i * step, fixed(i * step, decimals)) for i in range(first, last + 1)]
 
 
 def running_median(points: Array, x_range: tuple[float, float], num_bins: int) -> Array:

@@ -115,12 +115,18 @@ def anchors(content: Content) -> Markup | None:
             ),
             " ".join(_coordinates(anchor["mirror_position_m"])) if anchor.get("mirror_position_m") else "none",
         ]
-        for anchor_id, anchor in content.summary.table("anchors").items()
-        if isinstance(anchor, dict)
+        for anchor_id, anchor in _anchors_in_order(content.summary)
     ]
     header = ["anchor", "x m", "y m", "z m", "stddev m", "Δx m", "Δy m", "Δz m", "range bias m", "mirror image at m"]
-    note = "Δ: estimated minus surveyed position, where it was surveyed."
+    note = "Δ: estimated minus surveyed position, where it was surveyed. A stddev of 0: held there."
     return table("Anchors in the map's frame", header, rows, note)
+
+
+def _anchors_in_order(summary: Summary) -> list[tuple[str, dict[str, Any]]]:
+    given = summary.table("anchors")
+    return [
+        (anchor_id, given[anchor_id]) for anchor_id in in_natural_order(given) if isinstance(given[anchor_id], dict)
+    ]
 
 
 def _difference(anchor: dict[str, Any]) -> list[float | None]:

@@ -50,6 +50,12 @@ def duration(seconds: Any) -> str:
     return f"{hours}\u00a0h {minutes:02d}\u00a0min" if hours else f"{minutes}\u00a0min {rest:02d}\u00a0s"
 
 
+def sentence(text: str) -> str:
+    """A message as a sentence of its own: it begins with a capital and ends with a full stop."""
+    whole = text[:1].upper() + text[1:]
+    return whole if whole.endswith((".", "!", "?")) else f"{whole}."
+
+
 def plain(value: Any) -> str:
     """Any JSON value on one line."""
     if value is None:
@@ -57,7 +63,7 @@ def plain(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return f"{value:.6g}"
+        return f"{value:.6g}".replace("-", "−", 1) if value < 0 else f"{value:.6g}"
     if isinstance(value, list):
         return ", ".join(map(plain, value)) or NOTHING
     return str(value)

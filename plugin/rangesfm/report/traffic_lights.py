@@ -22,11 +22,16 @@ def card(check: Check) -> Markup:
         "div",
         element("div", traffic_light(check.light), element("h3", check.name), class_="check-name"),
         element("p", fixed(check.value, check.decimals, check.unit, nothing="not measured"), class_="check-value"),
-        _gauge(check),
-        element("p", _limits(check), class_="small"),
+        *_measured_against(check),
         element("p", check.meaning, class_="small"),
         class_=f"check {check.light}",
     )
+
+
+def _measured_against(check: Check) -> list[Markup]:
+    if check.no_matter is not None:
+        return [element("p", check.no_matter, class_="small")]
+    return [_gauge(check), element("p", _limits(check), class_="small")]
 
 
 def _limits(check: Check) -> str:

@@ -24,7 +24,7 @@ def view(scene: Scene) -> Markup:
         element("div", _layers(scene), _ranges(data["ranges"]), _tools(), class_="view-controls"),
         _stage(scene),
         _photo(scene, has_ranges=data["ranges"] is not None),
-        element("p", _note(scene), class_="small"),
+        element("p", _note(scene, num_thumbnails=len(data["thumbnails"])), class_="small"),
         data_block("scene", data),
         id="view",
     )
@@ -102,7 +102,7 @@ def _photo(scene: Scene, *, has_ranges: bool) -> Markup | None:
     return element("div", slider, element("div", thumbnail, text, ranges, class_="photo", aria_live="polite"))
 
 
-def _note(scene: Scene) -> list[str]:
+def _note(scene: Scene, *, num_thumbnails: int) -> list[str]:
     sentences = [
         "Drag to turn, wheel or pinch to zoom, right drag or two fingers to move; click a camera for its photo."
     ]
@@ -110,6 +110,8 @@ def _note(scene: Scene) -> list[str]:
         sentences.append(f"{count(num_left_out)} points far away or beyond the view's limit are not drawn.")
     if scene.ranges is not None and (stride := range_stride(scene.ranges)) > 1:
         sentences.append(f"One in {stride} ranges is drawn and listed; ranges.csv holds all.")
+    if 0 < num_thumbnails < (num_photos := len(scene.result)):
+        sentences.append(f"{count(num_thumbnails)} of {count(num_photos)} photos have a picture: the page stays small.")
     if scene.anchors:
         sentences.append("Ellipsoids around the anchors hold 95 %, at their true size.")
     return [" ".join(sentences)]

@@ -20,7 +20,6 @@ WIDTHS_PX = (390, 1280)
 REFINED, SCALED = (29, 95, 209), (194, 87, 12)
 NUM_KEYFRAMES = 40
 CENTER = "Array.from(rangesfmView.path.centers.subarray(3 * ({0}), 3 * ({0}) + 3))"
-CENTER = "Array.from(rangesfmView.path.centers.subarray(3 * ({0}), 3 * ({0}) + 3))"
 
 
 @pytest.fixture(scope="module")

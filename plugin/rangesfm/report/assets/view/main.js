@@ -91,7 +91,7 @@ class View {
     this.chosenCamera = new ChosenCamera(scene.frustum_size, scene.frustum_shape);
     this.rangeLines = null;
     if (scene.ranges !== null && this.path !== null && this.path.rotations !== null) {
-      this.rangeLines = new RangeLines(scene.ranges, this.path, scene.anchors, scene.tag_in_cam_m);
+      this.rangeLines = new RangeLines(scene.ranges, this.path, scene.anchors);
       stage.add(this.rangeLines.lines);
     }
     stage.add(...Object.values(this.layers), this.chosenCamera.group);

@@ -16,8 +16,9 @@ function bytesOf(color) {
 }
 
 /** The radio's antenna when a range was taken: on the line between the two keyframes. */
-function tagPosition(path, ranges, i, tagInCam) {
+function tagPosition(path, ranges, i) {
   const [before, after, weight] = [ranges.before[i], ranges.after[i], ranges.weight[i] / 255];
+  const tagInCam = ranges.tags_in_cam_m[ranges.tag[i]];
   const nearest = weight < 0.5 ? before : after;
   const rotation = path.rotations.subarray(9 * nearest, 9 * nearest + 9);
   return [0, 1, 2].map((axis) => {
@@ -28,7 +29,7 @@ function tagPosition(path, ranges, i, tagInCam) {
 }
 
 class RangeLines {
-  constructor(ranges, path, anchors, tagInCam) {
+  constructor(ranges, path, anchors) {
     this.ranges = ranges;
     this.statuses = new Set();
     this.camera = null;
@@ -37,7 +38,7 @@ class RangeLines {
     this.hasLine = Array.from(ranges.anchor, (id, i) => ranges.has_place[i] === 1 && positionOf.has(ranges.anchor_ids[id]));
     const ends = this.hasLine.map((known, i) =>
       known
-        ? [...tagPosition(path, ranges, i, tagInCam), ...positionOf.get(ranges.anchor_ids[ranges.anchor[i]])]
+        ? [...tagPosition(path, ranges, i), ...positionOf.get(ranges.anchor_ids[ranges.anchor[i]])]
         : [0, 0, 0, 0, 0, 0],
     );
     this.geometry = new THREE.BufferGeometry();
