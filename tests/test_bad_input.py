@@ -124,7 +124,10 @@ def refusal(own_survey: WalkedSurvey, monkeypatch: pytest.MonkeyPatch, capfd: py
         (write("uwb.csv", ""), r"/uwb.csv: the file is empty, expected a log of ranges"),
         (write("uwb.csv", "timestamp_s,anchor_id,range_m\n"), r"/uwb.csv: no usable range: no records"),
         (write("uwb.csv", "t,d\n1,2\n"), r"/uwb.csv: .*canonical"),
-        (set_line("uwb.csv", 7, "103.0,A9,3.0"), r"/uwb.csv:7: anchor_id is 'A9', expected one of .*anchors.csv: A1, "),
+        (
+            set_line("uwb.csv", 7, "103.0,A9,3.0"),
+            r"/uwb.csv:7: anchor_id is 'A9', expected one of .*: A1, .*--use_anchors",
+        ),
         (set_line("uwb.csv", 7, "103.0,A1,nan"), r"/uwb.csv:7: range_m is nan, expected a positive number of metres"),
         (set_line("uwb.csv", 8, "103.0,A1,-3"), r"/uwb.csv:8: range_m is -3, expected a positive number of metres"),
         (set_line("uwb.csv", 9, "103.0,A1,x"), r"/uwb.csv:9: range_m is 'x', expected a positive number of metres"),

@@ -263,6 +263,19 @@ def test_missing_files_are_named_with_the_line_that_asks_for_them(folder: Path, 
     assert f"there is no file {folder / 'none.csv'}" in str(error)
 
 
+def test_folder_in_place_of_a_file_is_named_as_one(folder: Path) -> None:
+    (folder / "logs").mkdir()
+    error = refusal(write(folder, "[ranges]\npath = 'logs'\n"))
+    assert f"[ranges] path: {folder / 'logs'} is a folder, expected a file" in str(error)
+
+
+def test_marks_without_distances_are_refused(folder: Path) -> None:
+    (folder / "marks.csv").touch()
+    error = refusal(write(folder, "[scale]\nmarkers = 'marks.csv'\n"))
+    assert error.line == 2
+    assert "expected distances beside it" in str(error)
+
+
 def test_wrong_flag_is_not_blamed_on_the_file(folder: Path) -> None:
     error = refusal(write(folder, "[images]\nevery_nth = 2\n"), {"images.every_nth": 0})
     assert error.path is None

@@ -166,6 +166,11 @@ def test_an_anchor_and_a_stretch_of_time_can_be_held_out(survey: Survey) -> None
         (CheckOptions(check_anchors=("nobody",)), "site", "the position of anchor 'nobody' is not known, .*"),
         (CheckOptions(check_anchors=("A1",)), "unknown", "the position of anchor 'A1' is not known, .* none"),
         (CheckOptions(check_times_s=(-20.0, -10.0)), "site", "no range from -20 to -10 s, expected within .*"),
+        (
+            CheckOptions(check_times_s=(1778768400.5, 1778768401.0)),
+            "site",
+            "no range from 1778768400.5 to 1778768401 s",
+        ),
     ],
 )
 def test_what_cannot_be_held_out_is_refused(checks: CheckOptions, frame: str, said: str, survey: Survey) -> None:

@@ -288,10 +288,12 @@ class _SurveyReader:
         }
 
     def tape(self) -> dict[str, Any]:
-        return {
-            "distances_path": self._path("scale", "distances"),
-            "markers_path": self._path("scale", "markers"),
-        }
+        distances_path, markers_path = self._path("scale", "distances"), self._path("scale", "markers")
+        if markers_path is not None and distances_path is None:
+            raise self.table("scale").error(
+                "markers", "distances beside it: marks are only the ends of taped distances"
+            )
+        return {"distances_path": distances_path, "markers_path": markers_path}
 
     def mapper(self) -> MapperOptions:
         """Keys that are not ours belong to pycolmap's pipeline options, which know best what they may be."""
@@ -320,7 +322,8 @@ class _SurveyReader:
         folder = Path.cwd() if f"{table_name}.{key}" in self._source.overridden else self._folder
         path = folder / text
         if must_exist and not os.path.isfile(path):
-            raise self._source.error(f"[{table_name}] {key}: there is no file {path}", table_name, key)
+            found = f"{path} is a folder, expected a file" if os.path.isdir(path) else f"there is no file {path}"
+            raise self._source.error(f"[{table_name}] {key}: {found}", table_name, key)
         return path
 
 

@@ -228,7 +228,8 @@ def _check_anchors_known(log: RangeLog, anchors: Sequence[Anchor], survey: Surve
         if anchor_id not in known:
             first = int(np.argmax((log.anchor_index == k) | ((log.tag_index < 0) & (log.peer_index == k))))
             raise InputError(
-                f"anchor_id is {anchor_id!r}, expected one of {survey.anchors_path}: {', '.join(sorted(known))}",
+                f"anchor_id is {anchor_id!r}, expected one of {survey.anchors_path}: {', '.join(sorted(known))} "
+                "(--use_anchors leaves others out)",
                 log.source,
                 int(log.line[first]),
             )

@@ -181,6 +181,14 @@ def test_traceback_is_shown_to_those_who_ask(
     assert "Traceback" in capsys.readouterr().err
 
 
+def test_closed_stderr_is_no_error(folder: Path) -> None:
+    env = {**os.environ, "PYTHONPATH": str(Path(rangesfm.__path__[-1]).parent)}
+    script = f'"{sys.executable}" -m rangesfm ranges uwb.csv 2>&-'
+    done = subprocess.run(["bash", "-c", script], cwd=folder, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    assert "canonical" in done.stdout
+
+
 def test_reader_that_goes_away_is_no_error(folder: Path) -> None:
     script = f'"{sys.executable}" -m rangesfm ranges uwb.csv | true; echo "${{PIPESTATUS[0]}}"'
     env = {**os.environ, "PYTHONPATH": str(Path(rangesfm.__path__[-1]).parent)}

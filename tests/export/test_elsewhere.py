@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import json
+import os
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -219,6 +222,16 @@ def test_undistorted_photos_come_with_a_metric_model_in_sparse_0(tmp_path: Path)
         with Image.open(folder / "images" / name) as photo:
             camera = next(iter(read.cameras.values()))
             assert photo.size == (camera.width, camera.height)
+
+
+def test_photos_that_have_no_room_are_not_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = made()
+    for image in model.images.values():
+        Image.new("RGB", (640, 480)).save(tmp_path / image.name)
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
+    with pytest.raises(OSError, match=os.strerror(errno.ENOSPC)):
+        export(model, "undistorted", tmp_path / "out", tmp_path)
+    assert not list((tmp_path / "out").iterdir())
 
 
 @pytest.mark.parametrize(

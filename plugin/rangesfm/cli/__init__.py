@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import sys
 import traceback
@@ -23,7 +24,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         args = parse(normalize(sys.argv[1:] if argv is None else argv))
-        with terminal_progress(sys.stderr, quiet=args.quiet) as progress:
+        # There is no sys.stderr where the shell closed it.
+        with terminal_progress(sys.stderr or io.StringIO(), quiet=args.quiet) as progress:
             outcome: Outcome = args.execute(args, progress)
         print("\n".join(outcome.lines), flush=True)
         return outcome.status

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.cli.log_arguments import add_log_arguments, read_log
-from rangesfm.cli.survey_flags import position
+from rangesfm.cli.position_arguments import add_position_arguments, read_tag_positions
 from rangesfm.progress import Progress
 
 if TYPE_CHECKING:
@@ -34,30 +34,7 @@ def add_command(commands: Commands) -> None:
     )
     add_log_arguments(parser)
     parser.add_argument("--anchors", required=True, metavar="CSV", help="anchor_id,x_m,y_m,z_m: surveyed")
-    parser.add_argument(
-        "--positions",
-        required=True,
-        metavar="FILE",
-        help="CSV timestamp_s (or image_name),x_m,y_m,z_m[,qx,qy,qz,qw], or a TUM file, in the anchors' frame",
-    )
-    parser.add_argument(
-        "--tag_in_cam",
-        type=position,
-        default=[0.0, 0.0, 0.0],
-        metavar="X,Y,Z",
-        help="the antenna in the frame whose poses are given (default: they are the antenna's)",
-    )
-    parser.add_argument(
-        "--time_offset", type=float, default=0.0, metavar="SECONDS", help="time of positions minus time of ranges"
-    )
-    parser.add_argument("--tag_id", metavar="ID", help="the tag whose positions these are, if the log has several")
-    parser.add_argument(
-        "--max_interpolation_gap_s",
-        type=float,
-        default=0.2,
-        metavar="S",
-        help="between known positions further apart none is interpolated (default: 0.2)",
-    )
+    add_position_arguments(parser, max_interpolation_gap_s=0.2)
     parser.add_argument("--output_path", required=True, metavar="CSV", help="write the curve there")
     parser.add_argument("--plot", metavar="PNG", help="draw the curve and the ranges' errors there")
 
@@ -67,18 +44,10 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     from rangesfm.ranging.anchor_file import read_anchors
     from rangesfm.ranging.calibration import calibrate_ranges
     from rangesfm.ranging.error_curve import write_error_curve
-    from rangesfm.ranging.tag_positions import tag_positions
-    from rangesfm.reference import read_reference
 
     anchors = read_anchors(args.anchors)
     log = of_one_tag(read_log(args), args.tag_id)
-    tags = tag_positions(
-        log,
-        read_reference(args.positions),
-        args.tag_in_cam,
-        time_offset_s=args.time_offset,
-        max_gap_s=args.max_interpolation_gap_s,
-    )
+    tags = read_tag_positions(args, log)
     calibration = calibrate_ranges(log, tags, anchors)
     lines = [*_lines(calibration, len(log)), "", f"written to {args.output_path}"]
     if args.plot is not None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.cli.log_arguments import add_log_arguments, read_log
-from rangesfm.cli.survey_flags import position
+from rangesfm.cli.position_arguments import add_position_arguments, read_tag_positions
 from rangesfm.progress import Progress
 
 if TYPE_CHECKING:
@@ -43,30 +43,7 @@ def add_command(commands: Commands) -> None:
         ),
     )
     add_log_arguments(parser)
-    parser.add_argument(
-        "--positions",
-        required=True,
-        metavar="FILE",
-        help="of the tag: CSV timestamp_s,x_m,y_m,z_m (or image_name,.. with ranges by name), or a TUM trajectory",
-    )
-    parser.add_argument(
-        "--tag_in_cam",
-        type=position,
-        default=(0.0, 0.0, 0.0),
-        metavar="X,Y,Z",
-        help="the tag in the frame whose poses (with qx,qy,qz,qw) the file holds, metres (default: 0,0,0)",
-    )
-    parser.add_argument("--tag_id", metavar="ID", help="the tag whose positions these are, if the log has several")
-    parser.add_argument(
-        "--time_offset", type=float, default=0.0, metavar="SECONDS", help="time of positions minus time of ranges"
-    )
-    parser.add_argument(
-        "--max_interpolation_gap_s",
-        type=float,
-        default=0.5,
-        metavar="S",
-        help="between known positions further apart none is interpolated (default: 0.5)",
-    )
+    add_position_arguments(parser, max_interpolation_gap_s=0.5)
     parser.add_argument(
         "--side",
         type=_side,
@@ -103,18 +80,10 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     from rangesfm.inputs import of_one_tag
     from rangesfm.ranging.anchor_file import write_anchors
     from rangesfm.ranging.anchor_survey import trilaterate_anchors
-    from rangesfm.ranging.tag_positions import tag_positions
     from rangesfm.ranging.trilateration import TrilaterationOptions
-    from rangesfm.reference import read_reference
 
     log = of_one_tag(read_log(args), args.tag_id)
-    positions = tag_positions(
-        log,
-        read_reference(args.positions),
-        args.tag_in_cam,
-        time_offset_s=args.time_offset,
-        max_gap_s=args.max_interpolation_gap_s,
-    )
+    positions = read_tag_positions(args, log)
     options = TrilaterationOptions(
         range_stddev_m=args.range_stddev_m,
         range_bias_m=args.range_bias_m,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import tempfile
@@ -20,19 +21,28 @@ def write_undistorted(map_: MetricMap, folder: Path) -> Path:
 
     Raises:
         InputError: the photos are not where the map says, or nobody said where they are.
+        OSError: the disk has no room for them.
     """
     images_path = map_.images_path
     if images_path is None:
         raise InputError("the format 'undistorted' needs the photos: give their folder (--images)")
-    for image in map_.reconstruction.images.values():
-        if image.has_pose and not os.path.isfile(images_path / image.name):
-            raise InputError(f"there is no photo {image.name}, which the map needs, in this folder", images_path)
+    names = [image.name for image in map_.reconstruction.images.values() if image.has_pose]
+    for name in names:
+        if not os.path.isfile(images_path / name):
+            raise InputError(f"there is no photo {name}, which the map needs, in this folder", images_path)
     with new_folder(folder) as temporary, tempfile.TemporaryDirectory() as model_path:
         map_.reconstruction.write(model_path)
+        _require_room(temporary, sum(os.path.getsize(images_path / name) for name in names))
         with colmap_log(temporary / "undistortion.log"):
             pycolmap.undistort_images(temporary, model_path, images_path)
         _into_sparse_0(temporary)
     return folder
+
+
+def _require_room(folder: Path, num_bytes: int) -> None:
+    """On a full disk the library that writes the photos ends the whole process, without a word of ours."""
+    if shutil.disk_usage(folder).free < num_bytes:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
 
 
 def _into_sparse_0(folder: Path) -> None:

@@ -99,7 +99,9 @@ def _in_time(log: RangeLog, times_s: tuple[float, ...]) -> npt.NDArray[np.bool_]
     inside: npt.NDArray[np.bool_] = (log.timestamp_s >= first) & (log.timestamp_s <= last)
     if not inside.any():
         start, end = log.timestamp_s.min(), log.timestamp_s.max()
-        raise InputError(f"no range from {first:g} to {last:g} s, expected within {start:g} to {end:g} s", log.source)
+        # Twelve digits: times may be seconds since 1970.
+        found, expected = f"{first:.12g} to {last:.12g} s", f"{start:.12g} to {end:.12g} s"
+        raise InputError(f"no range from {found}, expected within {expected}", log.source)
     return inside
 
 
