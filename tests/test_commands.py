@@ -77,6 +77,8 @@ REFINE = {
     "reprojection_rms_px": NUMBER,
     "pixel_stddev": NUMBER,
     "seconds": NUMBER,
+    "relative_scale_stddev": NUMBER,
+    "tag_in_cam_m": {"*": LIST},
 }
 COMPARISON = {
     "name": TEXT,
@@ -385,6 +387,8 @@ def test_taped_distances_hold_the_scale_and_check_it(
     assert rows[1]["residual_m"] == pytest.approx(0, abs=0.03)
     assert rows[2]["residual_m"] == pytest.approx(-0.5, abs=0.03)
     assert len([text for text in left.result["warnings"] if text.startswith("check distance")]) == 1
+    refined = run_on(rangesfm_command, own_survey, tmp_path / "refined", "refine", *flags)
+    assert refined.result["distances"][0]["residual_m"] == pytest.approx(0, abs=0.01)
     error = left.result["scale"]["value"] / own_survey.site_from_sfm.scale - 1
     assert abs(error) < 0.003
 

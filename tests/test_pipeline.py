@@ -20,8 +20,13 @@ from rangesfm.config import RangesConfig, Survey
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.journal import Journal
 from rangesfm.model_files import read_model
+<<<<<<< HEAD
 from rangesfm.options import CheckOptions, ExportOptions, ScaleOptions
 from rangesfm.outputs import forget_result, refuse_to_overwrite, replacing_result, write_result
+=======
+from rangesfm.options import CheckOptions, ExportOptions, RefineOptions, ScaleOptions
+from rangesfm.outputs import forget_result, forgetting_result_if_changed, refuse_to_overwrite, write_result
+>>>>>>> e08ea54 (The refinement may estimate lever arm, clock offset and the error of short ranges; ranges go in by the bulk; covariances of centres, anchors and scale in the result)
 from rangesfm.pipeline import refine_model, scale_model
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.readers import read_ranges
@@ -245,6 +250,36 @@ class TestSeveralTags:
             ("A2", "A1", "12.0", ""),
             ("right", "left", "0.8", ""),
         ]
+
+
+def test_what_the_refinement_found_beside_the_map_is_in_the_result(survey: Survey) -> None:
+    options = RefineOptions(lever_arm_stddev_m=0.05, time_offset_stddev_s=0.05, short_range_stddev_m=0.1)
+    result = refine_model(replace(survey, refine=options), progress=SilentProgress()).result
+    found = result["refine"]
+    (tag_id,) = found["tag_in_cam_m"]
+    assert 0 < np.linalg.norm(np.subtract(found["tag_in_cam_m"][tag_id], survey.tag_in_cam_m)) < 0.15
+    assert 0 < abs(found["time_offset_change_s"]) < 0.15
+    assert 0 < abs(found["short_range_error_m"]) < 0.3
+    held = refine_model(survey, progress=SilentProgress()).result["refine"]
+    assert list(held["tag_in_cam_m"].values()) == [list(survey.tag_in_cam_m)]
+    assert (held["time_offset_change_s"], held["short_range_error_m"]) == (None, None)
+
+
+def test_covariances_of_the_centres_are_in_the_result_unless_unwanted(survey: Survey) -> None:
+    result = refine_model(survey, progress=SilentProgress()).result
+    path = survey.output_path / "pose_covariance.csv"
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    model = pycolmap.Reconstruction(survey.output_path / "sparse_metric" / "0")
+    assert {row["image_name"] for row in rows} == {image.name for image in model.images.values()}
+    for row in rows:
+        xx, xy, xz, yy, yz, zz = (float(row[f"cov_{axes}_m2"]) for axes in ("xx", "xy", "xz", "yy", "yz", "zz"))
+        stddevs = np.sqrt(np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+        assert 1e-5 < stddevs.min() < stddevs.max() < 1.0
+    assert 0 < result["refine"]["relative_scale_stddev"] < 0.1
+    without = refine_model(replace(survey, refine=RefineOptions(covariance=False)), progress=SilentProgress()).result
+    assert without["refine"]["relative_scale_stddev"] is None
+    assert not path.exists()
 
 
 def test_a_site_in_national_coordinates_loses_nothing(survey: Survey, tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.anchors import AnchorEstimate
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.noise import shared_stddev
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
 from rangesfm.refine import RefineSummary, predicted_ranges, refine_with_ranges
 from rangesfm.simulate.model import synthetic_model
@@ -515,6 +516,123 @@ class TestWithNoise:
         assert drift > 0.2
         refined, _ = replace(survey, metric_from_sfm=best).refine(survey.anchors(0.0))
         assert rmse(survey.centers(refined) - survey.centers_m) < 0.3 * drift
+
+
+class TestBesideTheMap:
+    """What is held by default, and found if it is given a stddev."""
+
+    def survey(self, **options: Any) -> Survey:
+        options = {"num_keyframes": 41, "radio": Radio(rate_hz=10.0, range_stddev_m=0.03), **options}
+        return make_survey(pixel_stddev=0.5, at_keyframes=False, **options)
+
+    @pytest.mark.parametrize("at_keyframes", [True, False], ids=["at keyframes", "between"])
+    def test_a_wrong_lever_arm_is_put_right(self, at_keyframes: bool) -> None:
+        survey = (
+            make_survey(num_keyframes=41, pixel_stddev=0.5, radio=Radio(range_stddev_m=0.03), num_epochs=5)
+            if at_keyframes
+            else self.survey()
+        )
+        wrong = TAG_IN_CAM_M + np.array([0.1, -0.05, 0.08])
+        placed = associate(survey.observations.log, survey.trajectory, wrong)
+        given: dict[str, Any] = {"observations": placed, "tag_in_cam_m": wrong}
+        given["range_stddev_m"] = np.full(len(placed.log), 0.03)
+        bent, held = survey.refine(survey.anchors(0.0), **given)
+        np.testing.assert_array_equal(held.tags_in_cam_m, [wrong])
+        options = RefineOptions(lever_arm_stddev_m=0.1)
+        refined, summary = survey.refine(survey.anchors(0.0), options=options, **given)
+        np.testing.assert_allclose(summary.tags_in_cam_m, [TAG_IN_CAM_M], atol=0.015)
+        assert rmse(survey.centers(refined) - survey.centers_m) < 0.02
+        assert rmse(survey.centers(refined) - survey.centers_m) < 0.5 * rmse(survey.centers(bent) - survey.centers_m)
+
+    def test_a_prior_holds_the_lever_arm_as_far_as_it_is_sure(self) -> None:
+        survey = self.survey()
+        wrong = TAG_IN_CAM_M + np.array([0.1, 0.0, 0.0])
+        placed = associate(survey.observations.log, survey.trajectory, wrong)
+        options = RefineOptions(lever_arm_stddev_m=1e-4)
+        _, summary = survey.refine(survey.anchors(0.0), observations=placed, tag_in_cam_m=wrong, options=options)
+        np.testing.assert_allclose(summary.tags_in_cam_m, [wrong], atol=1e-3)
+        assert (summary.tags_in_cam_m != wrong).any()
+
+    def test_a_wrong_clock_offset_is_put_right(self) -> None:
+        # At an even speed round a loop, a late clock and a map turned back are the same.
+        survey = self.survey(path=loop_path(20.0, unsteadiness_m=1.0, seed=3), num_keyframes=81)
+        late = associate(survey.observations.log, survey.trajectory, TAG_IN_CAM_M, time_offset_s=-0.1)
+        stddev = np.full(len(late.log), 0.03)
+        bent, held = survey.refine(survey.anchors(0.0), observations=late, range_stddev_m=stddev)
+        assert held.time_shift_s is None
+        options = RefineOptions(time_offset_stddev_s=0.1)
+        refined, summary = survey.refine(survey.anchors(0.0), observations=late, range_stddev_m=stddev, options=options)
+        assert summary.time_shift_s == pytest.approx(0.1, abs=0.01)
+        assert rmse(survey.centers(refined) - survey.centers_m) < 0.02
+        assert rmse(survey.centers(refined) - survey.centers_m) < 0.5 * rmse(survey.centers(bent) - survey.centers_m)
+
+    def test_a_clock_offset_needs_times(self) -> None:
+        survey = make_survey()
+        untimed = replace(survey.trajectory, timestamps_s=None)
+        with pytest.raises(InputError, match="time_offset_stddev_s"):
+            replace(survey, trajectory=untimed).refine(
+                survey.anchors(0.0), options=RefineOptions(time_offset_stddev_s=0.1)
+            )
+
+    def test_an_error_that_all_short_ranges_share_is_found(self) -> None:
+        near = {"A": (3.0, 0.5, 0.5), "B": (-6.0, 1.0, 0.4), "C": (0.5, 4.0, 1.0), "D": (1.0, -3.5, 0.2)}
+        survey = self.survey(anchors_m=near)
+        log = survey.observations.log
+        short = -0.3 * np.exp(-log.range_m)
+        assert np.abs(short).max() > 0.05
+        observations = replace(survey.observations, log=replace(log, range_m=log.range_m + short))
+        stddev = np.hypot(0.03, shared_stddev(observations.log))
+        _, held = survey.refine(survey.anchors(0.0), observations=observations, range_stddev_m=stddev)
+        assert held.short_range_error_m is None
+        options = RefineOptions(short_range_stddev_m=0.3)
+        _, summary = survey.refine(
+            survey.anchors(0.0), observations=observations, range_stddev_m=stddev, options=options
+        )
+        assert summary.short_range_error_m == pytest.approx(-0.3, abs=0.05)
+
+    def test_many_ranges_that_share_residual_blocks_say_the_same(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        survey = self.survey(frame="first_camera")
+        anchors = survey.anchors(np.inf, bias_stddev_m=0.01)
+        alone, _ = survey.refine(anchors)
+        monkeypatch.setattr("rangesfm.refinement.radio._MANY_RANGES", 1)
+        together, summary = survey.refine(anchors)
+        assert summary.converged
+        np.testing.assert_allclose(survey.centers(together), survey.centers(alone), atol=1e-4)
+
+
+class TestCovariance:
+    def test_errors_of_centres_are_as_large_as_their_covariances_say(self) -> None:
+        squares = []
+        for seed in range(4):
+            survey = make_survey(
+                num_keyframes=15, pixel_stddev=0.5, radio=Radio(range_stddev_m=0.1), num_epochs=2, seed=seed
+            )
+            refined, summary = survey.refine(survey.anchors(0.0))
+            assert summary.covariance is not None
+            errors = survey.centers(refined) - survey.centers_m
+            squares += [e @ np.linalg.solve(c, e) for e, c in zip(errors, summary.covariance.centers, strict=True)]
+        assert 0.5 < np.mean(squares) / 3 < 2.0
+
+    def test_anchors_have_the_stddevs_of_the_joint_problem(self) -> None:
+        survey = make_survey("first_camera", pixel_stddev=0.5, radio=Radio(range_stddev_m=RANGE_STDDEV_M))
+        _, free = survey.refine(survey.anchors(np.inf))
+        assert all(0.01 < anchor.position_stddev_m < 2.0 for anchor in free.anchors)
+        _, held = survey.refine(survey.anchors(0.0))
+        assert all(anchor.position_stddev_m == 0.0 for anchor in held.anchors)
+
+    def test_correlated_ranges_widen_it(self) -> None:
+        survey = make_survey(pixel_stddev=0.5, radio=Radio(range_stddev_m=RANGE_STDDEV_M))
+        scale_stddevs = []
+        for inflation in (1.0, 5.0):
+            _, summary = survey.refine(survey.anchors(0.0), correlation_inflation=inflation)
+            assert summary.covariance is not None
+            scale_stddevs.append(summary.covariance.relative_scale_stddev)
+        assert scale_stddevs[1] > 2.5 * scale_stddevs[0]
+
+    def test_none_is_found_where_none_is_wanted(self) -> None:
+        survey = make_survey(pixel_stddev=0.5)
+        _, summary = survey.refine(survey.anchors(0.0), options=RefineOptions(covariance=False))
+        assert summary.covariance is None
 
 
 class TestProblem:

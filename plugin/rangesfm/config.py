@@ -71,6 +71,9 @@ _RULES = {
     "bootstrap_block_s": _MORE_THAN_0,
     "max_num_iterations": _FROM_0,
     "range_loss_scale": _MORE_THAN_0,
+    "lever_arm_stddev_m": _FROM_0,
+    "time_offset_stddev_s": _FROM_0,
+    "short_range_stddev_m": _FROM_0,
     "seed": _FROM_0,
 }
 # Where one name means different things.

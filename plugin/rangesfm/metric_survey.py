@@ -81,6 +81,15 @@ class MetricSurvey:
         return self.predicted_m - self.observations.log.range_m
 
     @property
+    def center_covariance_m2(self) -> dict[str, Array]:
+        """(3, 3) of each keyframe's projection centre, by its photo; empty where it was not found."""
+        found = None if self.refinement is None else self.refinement.covariance
+        if found is None:
+            return {}
+        index = np.searchsorted(found.frame_ids, self.trajectory.frame_ids)
+        return dict(zip(self.trajectory.image_names, found.centers[index], strict=True))
+
+    @property
     def refined_scale(self) -> float | None:
         """Metres per SfM unit after refinement, by the keyframe centres."""
         if self.refined is None:

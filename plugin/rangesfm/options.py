@@ -152,12 +152,22 @@ class RefineOptions:
         enabled: False leaves the map as scaled.
         max_num_iterations: of the solver.
         range_loss_scale: residual in stddevs from which a range is down-weighted (Cauchy).
+        lever_arm_stddev_m: of each coordinate of the tags' places in the camera frame, which are estimated if this is
+            more than 0.
+        time_offset_stddev_s: of the clocks' offset, likewise.
+        short_range_stddev_m: of an error of short ranges that all share and that dies out with a length of 1 m,
+            likewise.
+        covariance: whether to find that of poses, anchors and scale; of more than 1500 keyframes it is not found.
         bundle_adjustment: passed through to pycolmap's BundleAdjustmentOptions.
     """
 
     enabled: bool = True
     max_num_iterations: int = 200
     range_loss_scale: float = 2.4
+    lever_arm_stddev_m: float = 0.0
+    time_offset_stddev_s: float = 0.0
+    short_range_stddev_m: float = 0.0
+    covariance: bool = True
     bundle_adjustment: dict[str, Any] = field(default_factory=dict)
 
 

@@ -34,7 +34,15 @@ _CURVES = (*_SCALE_TABLES, "time_offset_curve.csv")
 # Percents of the scale for a centimetre that the summary mentions.
 _NOTABLE_PERCENT = 0.5
 # The first says that a result is whole: it is the last to be written and the first to go.
-_RESULT_FILES = ("result.json", "report.html", "ranges.csv", "images.csv", "reference.csv", *_CURVES)
+_RESULT_FILES = (
+    "result.json",
+    "report.html",
+    "ranges.csv",
+    "images.csv",
+    "reference.csv",
+    "pose_covariance.csv",
+    *_CURVES,
+)
 # Stands in the place of result.json while the files beside it belong to no result.
 _UNFINISHED = ".result.unfinished"
 _WRITTEN = (*_RESULT_FILES, "trajectory.tum", "points.ply", "sparse_scaled/0", "sparse_metric/0")
@@ -97,6 +105,7 @@ def write_outputs(
         write_model(survey.refined, folder / "sparse_metric" / "0")
     _write_ranges(survey, folder / "ranges.csv")
     _write_time_offset_curve(survey, folder / "time_offset_curve.csv")
+    _write_pose_covariance(survey, folder / "pose_covariance.csv")
     times = survey.trajectory.timestamps_s
     by_name = None
     if times is not None:
@@ -168,6 +177,18 @@ def _write_time_offset_curve(survey: MetricSurvey, path: Path) -> None:
     curve = survey.time_offset.curve
     offsets = [repr(offset_s) for offset_s in curve.offsets_s.tolist()]
     _write_csv(path, ["time_offset_s", "cost"], zip(offsets, _texts(curve.costs_m), strict=True))
+
+
+def _write_pose_covariance(survey: MetricSurvey, path: Path) -> None:
+    """Covariance of each keyframe's projection centre by the refinement, square metres, in the result's frame."""
+    covariance_m2 = survey.center_covariance_m2
+    if not covariance_m2:
+        # An earlier run's would not belong to this result.
+        path.unlink(missing_ok=True)
+        return
+    entries = {f"cov_{'xyz'[i]}{'xyz'[j]}_m2": (i, j) for i in range(3) for j in range(i, 3)}
+    rows = ([name, *(f"{of[at]:.9g}" for at in entries.values())] for name, of in covariance_m2.items())
+    _write_csv(path, ["image_name", *entries], rows)
 
 
 def _write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

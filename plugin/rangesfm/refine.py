@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -9,21 +10,30 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from rangesfm.covariance import JointCovariance, joint_covariance
 from rangesfm.distances.by_radio import distances_by_radio
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.distances.tape import Tape
+from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry import Similarity
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.anchors import AnchorEstimate
 from rangesfm.ranging.observations import RangeObservations, robust_weights, status_by_weight
-from rangesfm.refinement.antennas import Antennas, antennas, predicted_ranges
-from rangesfm.refinement.bundle_adjustment import Adjustment, BundleAdjustment, adjust_with_ranges, bundle_adjustment
+from rangesfm.refinement.antennas import antennas, predicted_ranges, tags_in_cam
+from rangesfm.refinement.bundle_adjustment import (
+    BundleAdjustment,
+    Solution,
+    bundle_adjustment,
+    solve,
+    solve_until_still,
+)
 from rangesfm.refinement.distances import (
     MeasuredDistances,
     add_distances,
     add_marker_points,
     remove_marker_points,
 )
+from rangesfm.refinement.radio import RadioBlocks, RadioEstimate, RadioRanges, add_radio_priors, add_ranges
 from rangesfm.refinement.unbend import SAME_WEIGHTS, Unbent, unbend
 from rangesfm.refinement.weights import RangeWeights, misfits, range_weights
 from rangesfm.trajectory import Trajectory
@@ -34,6 +44,10 @@ Array = npt.NDArray[np.float64]
 
 # Solutions of the full problem, with the weights of ranges and pixels estimated anew in between.
 _MAX_NUM_ROUNDS = 3
+# What is still to be gained at the end, as a share of the smallest range stddev.
+_MAX_LAST_MOVEMENT = 0.01
+# The covariance of all poses takes time and memory by their square, and more where they hang together.
+_MAX_NUM_FRAMES_FOR_COVARIANCE = 1500
 
 
 @dataclass(frozen=True)
@@ -44,7 +58,8 @@ class RefineSummary:
         num_iterations: of the solver on the full problem, successful and not.
         num_graph_steps: of the solver on the keyframe graph before.
         bend_m: by how much (root mean square) the keyframe graph saw the map bend, beyond any similarity.
-        initial_cost, final_cost: half the sum of squares, pixels at unit weight; of the last solution.
+        initial_cost, final_cost: half the sum of squares, pixels at unit weight; at the start, with the weights of
+            then, and at the end.
         reprojection_rms_px: root mean square length of the final reprojection errors.
         pixel_stddev: of one coordinate of a feature, estimated from the residuals before.
         range_stddev_m: (n,) of each range, as weighted at the end; NaN without a place.
@@ -53,7 +68,13 @@ class RefineSummary:
         converged: whether it stopped because nothing was left to gain.
         message: the solver's own words.
         misfits: why the ranges do not fit as their noise lets expect; empty if they do.
-        anchors: with refined positions and biases.
+        anchors: with refined positions and biases, and their stddevs by the covariance, if there is one.
+        tags_in_cam_m: (num_tags, 3) lever arms, as given or estimated.
+        time_shift_s: how much later than thought the ranges were taken; None if that was not estimated.
+        short_range_error_m: of very short ranges, what they read too long, which dies out with a length of 1 m; None
+            if it was not estimated.
+        covariance: of poses, anchors and scale; None if it was not asked for, the model is too large or ranges and
+            photos leave something undetermined.
         observations: with status by the final weight of each range.
         predicted_m: (n,) ranges by the refined model; NaN without a place.
         weights: (n,) robust weights in [0, 1]; NaN without a place.
@@ -73,6 +94,10 @@ class RefineSummary:
     message: str
     misfits: tuple[str, ...]
     anchors: tuple[AnchorEstimate, ...]
+    tags_in_cam_m: Array
+    time_shift_s: float | None
+    short_range_error_m: float | None
+    covariance: JointCovariance | None
     observations: RangeObservations
     predicted_m: Array
     weights: Array
@@ -120,9 +145,12 @@ def refine_with_ranges(
 
     Raises:
         SolverError: the solver failed.
-        InputError: an unknown key among the options passed through, or a distance's end that is not in the model.
+        InputError: an unknown key among the options passed through, a clock offset to estimate without times, or a
+            distance's end that is not in the model.
     """
     options = options or RefineOptions()
+    if options.time_offset_stddev_s and trajectory.timestamps_s is None:
+        raise InputError("[refine] time_offset_stddev_s needs a log with times, this one names photos")
     metric = pycolmap.Reconstruction(reconstruction)
     tape = (tape or Tape()).control()
     distances = MeasuredDistances(
@@ -131,17 +159,11 @@ def refine_with_ranges(
         tape,
         add_marker_points(metric, tape),
     )
+    tags_in_cam_m = tags_in_cam(observations.log, tag_in_cam_m)
+    placed = antennas(trajectory, observations, metric_from_sfm, tags_in_cam_m)
+    ranges = RadioRanges(observations, trajectory, placed, np.flatnonzero(observations.has_place))
     survey = _Survey(
-        metric,
-        trajectory,
-        observations,
-        metric_from_sfm,
-        np.asarray(tag_in_cam_m, dtype=np.float64),
-        camera or CameraOptions(),
-        options,
-        first_pose_is_fixed,
-        num_threads,
-        distances,
+        metric, ranges, tags_in_cam_m, distances, camera or CameraOptions(), options, first_pose_is_fixed, num_threads
     )
     weights = range_weights(
         observations,
@@ -150,6 +172,7 @@ def refine_with_ranges(
         stddev_is_estimated,
         metric_from_sfm.scale,
         options.range_loss_scale,
+        short_range_error_is_estimated=options.short_range_stddev_m > 0,
     )
     summary = _refine(survey, weights, tuple(anchors), common_bias_stddev_m)
     remove_marker_points(metric, distances.marker_ids)
@@ -173,127 +196,169 @@ class _Survey:
     """What stays the same from one solution to the next; only the model changes, in place."""
 
     metric: pycolmap.Reconstruction
-    trajectory: Trajectory
-    observations: RangeObservations
-    metric_from_sfm: Similarity
-    tag_in_cam_m: Array
+    ranges: RadioRanges
+    tags_in_cam_m: Array
+    distances: MeasuredDistances
     camera: CameraOptions
     options: RefineOptions
     first_pose_is_fixed: bool
     num_threads: int
-    distances: MeasuredDistances
-
-    @property
-    def antennas(self) -> Antennas:
-        return antennas(self.trajectory, self.observations, self.metric_from_sfm, self.tag_in_cam_m)
 
     def problem(self, max_num_iterations: int) -> BundleAdjustment:
+        """Of the photos alone."""
         return bundle_adjustment(
             self.metric,
             self.camera,
             self.options,
-            fixed_frame_id=int(self.trajectory.frame_ids[0]) if self.first_pose_is_fixed else None,
+            fixed_frame_id=int(self.ranges.trajectory.frame_ids[0]) if self.first_pose_is_fixed else None,
             max_num_iterations=max_num_iterations,
             num_threads=self.num_threads,
             marker_ids=self.distances.marker_ids.values(),
         )
 
-    def adjust(
-        self, problem: BundleAdjustment, weights: RangeWeights, anchors: tuple[AnchorEstimate, ...]
-    ) -> Adjustment:
-        """Solve with the ranges and distances."""
-        return adjust_with_ranges(
-            problem,
-            self.trajectory,
-            self.observations,
-            self.antennas,
-            weights,
-            anchors,
-            lambda blocks: add_distances(problem, self.distances, anchors, blocks.positions, weights.loss_scale),
+    def add_to(self, problem: BundleAdjustment, weights: RangeWeights, radio: RadioEstimate) -> RadioBlocks:
+        """All else that was measured."""
+        blocks = RadioBlocks.at(radio, self.options)
+        add_ranges(problem, self.ranges, weights, blocks, self.options)
+        blocks.others.extend(
+            add_distances(problem, self.distances, radio.anchors, blocks.positions, weights.loss_scale)
         )
+        add_radio_priors(problem, radio, self.tags_in_cam_m, blocks, self.options)
+        return blocks
 
-    def residuals_m(self, anchors: Sequence[AnchorEstimate]) -> Array:
+    def residuals_m(self, radio: RadioEstimate) -> Array:
         """(n,) predicted minus measured; NaN without a place."""
-        predicted = predicted_ranges(
-            self.metric,
-            self.trajectory,
-            self.observations,
-            self.metric_from_sfm,
-            self.tag_in_cam_m,
-            [anchor.position_m for anchor in anchors],
-            [anchor.range_bias_m for anchor in anchors],
-        )
-        return predicted - self.observations.log.range_m
+        return self.ranges.predicted_m(self.metric, radio) - self.ranges.observations.log.range_m
+
+
+@dataclass(frozen=True)
+class _Adjusted:
+    """What the full problem came to.
+
+    Attributes:
+        solutions: one for each time that it was solved.
+        is_still: whether nothing was left to gain.
+    """
+
+    solutions: tuple[Solution, ...]
+    is_still: bool
+    weights: RangeWeights
+    radio: RadioEstimate
+    covariance: JointCovariance | None
+    pixel_stddev: float
+    reprojection_rms_px: float
 
 
 def _refine(
     survey: _Survey, weights: RangeWeights, anchors: tuple[AnchorEstimate, ...], common_bias_stddev_m: float
 ) -> RefineSummary:
-    """Unbend the map, then alternate between the full problem and the weights that its residuals show."""
+    """Unbend the map, then solve the full problem."""
     problem = survey.problem(survey.options.max_num_iterations)
     start = unbend(
         survey.metric,
-        survey.trajectory,
-        survey.observations,
-        survey.antennas,
+        survey.ranges.trajectory,
+        survey.ranges.observations,
+        survey.ranges.antennas,
         weights,
         anchors,
         pixel_stddev=problem.pixel_stddev,
         common_bias_stddev_m=common_bias_stddev_m,
         first_pose_is_fixed=survey.first_pose_is_fixed,
     )
-    weights, anchors = start.weights, start.anchors
-    adjustments: list[Adjustment] = []
+    adjusted = _adjust(survey, problem, start)
+    survey.metric.update_point_3d_errors()
+    return _summary(survey, start, adjusted)
+
+
+def _adjust(survey: _Survey, problem: BundleAdjustment, start: Unbent) -> _Adjusted:
+    """Alternate between the full problem and the weights that its residuals show."""
+    weights, radio = start.weights, RadioEstimate(start.anchors, survey.tags_in_cam_m)
+    solutions: list[Solution] = []
     while True:
-        adjustments.append(survey.adjust(problem, weights, anchors))
-        anchors = adjustments[-1].anchors
-        residuals_m = survey.residuals_m(anchors)
-        better = _estimated(weights, survey.observations, residuals_m, start.num_absorbed)
-        num_left = survey.options.max_num_iterations - sum(a.num_iterations for a in adjustments)
-        is_final = weights.change(better) < SAME_WEIGHTS or len(adjustments) == _MAX_NUM_ROUNDS
-        if is_final or not adjustments[-1].converged or num_left <= 0:
-            survey.metric.update_point_3d_errors()
-            return _summary(adjustments, start, problem.pixel_stddev, survey.observations, weights, residuals_m)
+        blocks = survey.add_to(problem, weights, radio)
+        solutions.append(solve(problem))
+        radio = blocks.estimate(radio)
+        better = _estimated(weights, survey.ranges, survey.residuals_m(radio), start.num_absorbed)
+        num_left = survey.options.max_num_iterations - sum(solution.num_iterations for solution in solutions)
+        is_last = weights.change(better) < SAME_WEIGHTS or len(solutions) == _MAX_NUM_ROUNDS
+        if is_last or not solutions[-1].converged or num_left <= 0:
+            break
         weights, problem = better, survey.problem(num_left)
+    finest_m = float(np.min(weights.stddev_m[survey.ranges.rows]))
+    more, is_still = solve_until_still(problem, _MAX_LAST_MOVEMENT * finest_m, num_left)
+    return _Adjusted(
+        (*solutions, *more),
+        is_still,
+        weights,
+        blocks.estimate(radio),
+        _covariance(survey, problem, blocks),
+        problem.pixel_stddev,
+        problem.reprojection_rms_px,
+    )
 
 
-def _estimated(
-    weights: RangeWeights, observations: RangeObservations, residuals_m: Array, num_absorbed: float
-) -> RangeWeights:
+def _covariance(survey: _Survey, problem: BundleAdjustment, blocks: RadioBlocks) -> JointCovariance | None:
+    if not survey.options.covariance or survey.metric.num_reg_frames() > _MAX_NUM_FRAMES_FOR_COVARIANCE:
+        return None
+    try:
+        return joint_covariance(
+            problem.adjuster.problem,
+            survey.metric,
+            anchors=blocks.positions,
+            others=blocks.all_but_positions,
+            residual_stddev=problem.pixel_stddev,
+        )
+    except GeometryError as error:
+        logging.getLogger(__name__).info("%s", error)
+        return None
+
+
+def _estimated(weights: RangeWeights, ranges: RadioRanges, residuals_m: Array, num_absorbed: float) -> RangeWeights:
     """The weights that the residuals of the ranges that took part show."""
-    rows = np.flatnonzero(observations.has_place)
-    return weights.with_rows(rows, weights.subset(rows).estimated(residuals_m[rows], num_absorbed))
+    return weights.with_rows(ranges.rows, weights.subset(ranges.rows).estimated(residuals_m[ranges.rows], num_absorbed))
 
 
-def _summary(
-    adjustments: Sequence[Adjustment],
-    start: Unbent,
-    pixel_stddev: float,
-    observations: RangeObservations,
-    weights: RangeWeights,
-    residuals_m: Array,
-) -> RefineSummary:
-    last, log = adjustments[-1], observations.log
+def _summary(survey: _Survey, start: Unbent, adjusted: _Adjusted) -> RefineSummary:
+    observations, rows, weights = survey.ranges.observations, survey.ranges.rows, adjusted.weights
+    log, radio, options = observations.log, adjusted.radio, survey.options
+    residuals_m = survey.residuals_m(radio)
     robust = robust_weights(residuals_m / weights.stddev_m, weights.loss_scale)
-    status, rows = observations.status.copy(), np.flatnonzero(observations.has_place)
+    status = observations.status.copy()
     status[rows] = status_by_weight(robust[rows])
     times = observations.before + observations.weight if log.timestamp_s is None else log.timestamp_s
+    last = adjusted.solutions[-1]
     return RefineSummary(
-        num_iterations=sum(adjustment.num_iterations for adjustment in adjustments),
+        num_iterations=sum(solution.num_iterations for solution in adjusted.solutions),
         num_graph_steps=start.num_steps,
         bend_m=start.bend_m,
-        initial_cost=last.initial_cost,
+        initial_cost=adjusted.solutions[0].initial_cost,
         final_cost=last.final_cost,
-        reprojection_rms_px=last.reprojection_rms_px,
-        pixel_stddev=pixel_stddev,
+        reprojection_rms_px=adjusted.reprojection_rms_px,
+        pixel_stddev=adjusted.pixel_stddev,
         range_stddev_m=weights.stddev_m,
         correlation_inflation=weights.inflation,
-        seconds=sum(adjustment.seconds for adjustment in adjustments),
-        converged=last.converged,
+        seconds=sum(solution.seconds for solution in adjusted.solutions),
+        converged=last.converged and adjusted.is_still,
         message=last.message,
         misfits=misfits(weights.subset(rows), residuals_m[rows], times[rows]),
-        anchors=last.anchors,
+        anchors=_with_stddevs(radio.anchors, adjusted.covariance),
+        tags_in_cam_m=radio.tags_in_cam_m,
+        time_shift_s=radio.time_shift_s if options.time_offset_stddev_s else None,
+        short_range_error_m=radio.short_range_error_m if options.short_range_stddev_m else None,
+        covariance=adjusted.covariance,
         observations=replace(observations, status=status),
         predicted_m=residuals_m + log.range_m,
         weights=robust,
+    )
+
+
+def _with_stddevs(
+    anchors: tuple[AnchorEstimate, ...], covariance: JointCovariance | None
+) -> tuple[AnchorEstimate, ...]:
+    if covariance is None:
+        return anchors
+    variances = np.trace(covariance.anchors, axis1=1, axis2=2) / 3
+    return tuple(
+        replace(anchor, position_stddev_m=float(np.sqrt(variance))) if np.isfinite(anchor.position_m).all() else anchor
+        for anchor, variance in zip(anchors, variances, strict=True)
     )

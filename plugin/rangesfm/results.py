@@ -165,4 +165,8 @@ def _refine(survey: MetricSurvey) -> dict[str, Any] | None:
         "converged": summary.converged and not summary.misfits,
         "message": "; ".join(summary.misfits) or summary.message,
         "scale_value": survey.refined_scale,
+        "relative_scale_stddev": None if summary.covariance is None else summary.covariance.relative_scale_stddev,
+        "tag_in_cam_m": dict(zip(survey.observations.log.tag_ids, summary.tags_in_cam_m.tolist(), strict=True)),
+        "time_offset_change_s": summary.time_shift_s,
+        "short_range_error_m": summary.short_range_error_m,
     }

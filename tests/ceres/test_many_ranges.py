@@ -117,6 +117,19 @@ def test_cost_and_gradient_are_those_of_the_ranges_one_by_one(
     assert added.num_residual_blocks == together.problem.num_residual_blocks() - before < NUM_RANGES / 2
 
 
+def test_a_loss_of_ceres_leaves_each_range_its_own_block(
+    reconstruction: pycolmap.Reconstruction, ranges: PlacedRanges, adjuster_of: AdjusterOf, pose_block: PoseBlock
+) -> None:
+    blocks = blocks_of(reconstruction, pose_block)
+    one_by_one, at_once = adjuster_of(reconstruction), adjuster_of(reconstruction)
+    add_one_by_one(one_by_one, ranges, blocks)
+    added = add_ranges(at_once, ranges, blocks, loss=cauchy_loss(2.0))
+    assert added.num_residual_blocks == added.num_residuals == NUM_RANGES
+    residuals = [np.asarray(adjuster.problem.evaluate_residuals()) for adjuster in (at_once, one_by_one)]
+    np.testing.assert_allclose(residuals[0], residuals[1], atol=1e-12)
+    assert initial_cost(at_once) == pytest.approx(initial_cost(one_by_one), rel=1e-12)
+
+
 def test_ranges_at_one_keyframe_become_one_by_least_squares(
     reconstruction: pycolmap.Reconstruction, ranges: PlacedRanges, adjuster_of: AdjusterOf, pose_block: PoseBlock
 ) -> None:

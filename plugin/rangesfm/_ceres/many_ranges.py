@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from rangesfm._ceres.costs import RangeErrorModel, interpolated_range_cost, range_cost
 from rangesfm._ceres.problem import ResidualAdder
-from rangesfm._ceres.types import CostFunction
+from rangesfm._ceres.types import CostFunction, LossFunction
 
 if TYPE_CHECKING:
     import pycolmap
@@ -93,6 +93,7 @@ def add_ranges(
     ranges: PlacedRanges,
     blocks: RangeBlocks,
     error_model: RangeErrorModel | None = None,
+    loss: LossFunction | None = None,
 ) -> AddedRanges:
     """Add ranges to a bundle adjuster's problem: those of one place, anchor and tag as one residual block.
 
@@ -105,6 +106,8 @@ def add_ranges(
         ranges: n, in any order.
         blocks: of which those that no range refers to do not become part of the problem.
         error_model: None is least squares, without a curve.
+        loss: of Ceres; with one, each range is a residual block of its own, in their order: from a bad start that
+            takes fewer iterations than a loss of the error model.
 
     Raises:
         ValueError: as ``range_cost`` and ``add_residual_block``; a time shift without intervals; an amplitude
@@ -118,7 +121,7 @@ def add_ranges(
     adder = ResidualAdder(adjuster)
     num_residuals = num_blocks = 0
     constant_cost = 0.0
-    for rows in _groups(ranges):
+    for rows in _groups(ranges) if loss is None else np.arange(len(ranges.range_m))[:, None]:
         if ranges.before[rows[0]] == ranges.after[rows[0]]:
             range_m, stddev_m = ranges.range_m[rows], ranges.stddev_m[rows]
             if error_model.is_least_squares:
@@ -127,7 +130,7 @@ def add_ranges(
             cost = _cost_at_keyframe(range_m, stddev_m, blocks, int(ranges.tag_index[rows[0]]), error_model)
         else:
             cost = _cost_between_keyframes(ranges, rows, blocks, error_model)
-        adder.add(cost, None, _blocks_of_group(ranges, int(rows[0]), blocks))
+        adder.add(cost, loss, _blocks_of_group(ranges, int(rows[0]), blocks))
         num_blocks += 1
         num_residuals += cost.num_residuals()
     return AddedRanges(num_blocks, num_residuals, constant_cost)

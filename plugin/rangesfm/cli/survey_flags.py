@@ -176,6 +176,27 @@ _OF_A_RUN = ("check_share", "check_anchors", "check_times_s", "scale_method", "r
 COMPARE_FLAGS = tuple(flag for flag in RANGE_FLAGS if flag.name not in _OF_A_RUN)
 REFINE_FLAGS = (
     Flag("max_num_iterations", "refine.max_num_iterations", "of the refinement's solver", int, metavar="N"),
+    Flag(
+        "lever_arm_stddev_m",
+        "refine.lever_arm_stddev_m",
+        "of the tag's place in the camera frame, which is then refined (default: 0, it is exact)",
+        float,
+        metavar="METRES",
+    ),
+    Flag(
+        "time_offset_stddev_s",
+        "refine.time_offset_stddev_s",
+        "of the clocks' offset, which is then refined (default: 0)",
+        float,
+        metavar="SECONDS",
+    ),
+    Flag(
+        "short_range_stddev_m",
+        "refine.short_range_stddev_m",
+        "of what the shortest ranges err all alike, which is then refined (default: 0, they are trusted less instead)",
+        float,
+        metavar="METRES",
+    ),
 )
 OUTPUT_FLAGS = (
     Flag("output_path", "output.path", "folder of the results (default: out)", metavar="FOLDER"),

@@ -13,7 +13,7 @@ Array = npt.NDArray[np.float64]
 # on the antennas (Decawave application note APS011). An error common to all short ranges does
 # not average out, so they are trusted far less than their scatter says.
 _SHORT_RANGE_STDDEV_M = 2.0
-_SHORT_RANGE_LENGTH_M = 1.0
+SHORT_RANGE_LENGTH_M = 1.0
 _MIN_STDDEV_M = 1e-9
 _MAX_INFLATION = 30.0
 
@@ -25,7 +25,7 @@ def robust_stddev(residuals: Array) -> float:
 
 def short_range_stddev(range_m: Array) -> Array:
     """(n,) how far a range of this length may be off for being short, metres."""
-    stddev: Array = _SHORT_RANGE_STDDEV_M * np.exp(-range_m / _SHORT_RANGE_LENGTH_M)
+    stddev: Array = _SHORT_RANGE_STDDEV_M * np.exp(-range_m / SHORT_RANGE_LENGTH_M)
     return stddev
 
 

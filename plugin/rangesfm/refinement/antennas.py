@@ -91,12 +91,30 @@ def tags_in_cam_of_ranges(log: RangeLog, tag_in_cam_m: npt.ArrayLike) -> Array:
     Raises:
         ValueError: of another shape.
     """
-    tags = np.asarray(tag_in_cam_m, dtype=np.float64)
-    if tags.shape == (3,):
-        return np.broadcast_to(tags, (len(log), 3))
-    if tags.shape != (len(log.tag_ids), 3):
-        raise ValueError(f"tag_in_cam_m is {tags.shape}, expected (3,) or ({len(log.tag_ids)}, 3): one for each tag")
-    return tags[log.tag_index]
+    return tags_in_cam(log, tag_in_cam_m)[log.tag_index]
+
+
+def tags_in_cam(log: RangeLog, tag_in_cam_m: npt.ArrayLike) -> Array:
+    """(num_tags, 3) in the order of the log's tags, where all may have been given as one (3,).
+
+    Raises:
+        ValueError: of another shape.
+    """
+    tags, num_tags = np.asarray(tag_in_cam_m, dtype=np.float64), len(log.tag_ids)
+    if tags.shape not in ((3,), (num_tags, 3)):
+        raise ValueError(f"tag_in_cam_m is {tags.shape}, expected (3,) or ({num_tags}, 3): one for each tag")
+    return np.broadcast_to(tags, (num_tags, 3))
+
+
+def antenna_positions(metric: pycolmap.Reconstruction, trajectory: Trajectory, antennas: Antennas) -> Array:
+    """(n, 3) in the world of a metric model with the trajectory's keyframes."""
+    times = (
+        None
+        if trajectory.timestamps_s is None
+        else dict(zip(trajectory.image_names, trajectory.timestamps_s, strict=True))
+    )
+    now = trajectory_from_reconstruction(metric, times)
+    return antennas.positions(now.centers, now.world_from_cam)
 
 
 def predicted_ranges(
@@ -112,13 +130,7 @@ def predicted_ranges(
 
     Arguments as for ``refine_with_ranges``.
     """
-    times = (
-        None
-        if trajectory.timestamps_s is None
-        else dict(zip(trajectory.image_names, trajectory.timestamps_s, strict=True))
-    )
-    now = trajectory_from_reconstruction(metric, times)
-    at = antennas(trajectory, observations, metric_from_sfm, tag_in_cam_m).positions(now.centers, now.world_from_cam)
+    at = antenna_positions(metric, trajectory, antennas(trajectory, observations, metric_from_sfm, tag_in_cam_m))
     index = observations.log.anchor_index
     predicted = np.linalg.norm(at - np.array(anchors)[index], axis=1) + np.array(biases)[index]
     return np.where(observations.before >= 0, predicted, np.nan)

@@ -125,16 +125,23 @@ def range_weights(
     is_estimated: Mask | None,
     metres_per_unit: float,
     loss_scale: float,
+    *,
+    short_range_error_is_estimated: bool = False,
 ) -> RangeWeights:
     """The weights to begin with.
 
     Args:
-        range_stddev_m: (n,) as known or first estimated.
+        range_stddev_m: (n,) as known or first estimated, with what is shared by all ranges of a length.
         is_estimated: (n,) which of them are to be estimated; None: none.
         metres_per_unit: of the observations' world.
+        short_range_error_is_estimated: then the stddevs go without what is shared.
     """
     log = observations.log
-    fixed = np.hypot(shared_stddev(log), metres_per_unit * observations.center_stddev)
+    shared, fixed = shared_stddev(log), metres_per_unit * observations.center_stddev
+    if short_range_error_is_estimated:
+        range_stddev_m = np.sqrt(np.maximum(range_stddev_m**2 - shared**2, _MIN_STDDEV_M**2))
+    else:
+        fixed = np.hypot(shared, fixed)
     estimated = np.zeros(len(log), dtype=bool) if is_estimated is None else is_estimated
     times = observations.before if log.timestamp_s is None else log.timestamp_s
     length = 1.0 if log.timestamp_s is None else BLOCK_S
