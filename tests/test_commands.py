@@ -183,6 +183,7 @@ class TestRefineInASiteFrame:
         assert refined.files == {
             "sparse_scaled/0",
             "sparse_metric/0",
+            "pose_covariance.csv",
             "result.json",
             "ranges.csv",
             "images.csv",
@@ -510,6 +511,7 @@ class TestRunOnPhotos:
             "sparse/0",
             "sparse_scaled/0",
             "sparse_metric/0",
+            "pose_covariance.csv",
             "result.json",
             "ranges.csv",
             "images.csv",

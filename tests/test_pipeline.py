@@ -18,15 +18,11 @@ import pytest
 
 from rangesfm.config import RangesConfig, Survey
 from rangesfm.errors import GeometryError, InputError
+from rangesfm.export import export_result
 from rangesfm.journal import Journal
 from rangesfm.model_files import read_model
-<<<<<<< HEAD
-from rangesfm.options import CheckOptions, ExportOptions, ScaleOptions
-from rangesfm.outputs import forget_result, refuse_to_overwrite, replacing_result, write_result
-=======
 from rangesfm.options import CheckOptions, ExportOptions, RefineOptions, ScaleOptions
-from rangesfm.outputs import forget_result, forgetting_result_if_changed, refuse_to_overwrite, write_result
->>>>>>> e08ea54 (The refinement may estimate lever arm, clock offset and the error of short ranges; ranges go in by the bulk; covariances of centres, anchors and scale in the result)
+from rangesfm.outputs import forget_result, refuse_to_overwrite, replacing_result, write_result
 from rangesfm.pipeline import refine_model, scale_model
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.readers import read_ranges
@@ -266,8 +262,10 @@ def test_what_the_refinement_found_beside_the_map_is_in_the_result(survey: Surve
 
 
 def test_covariances_of_the_centres_are_in_the_result_unless_unwanted(survey: Survey) -> None:
-    result = refine_model(survey, progress=SilentProgress()).result
+    export = ExportOptions(formats=("tum_covariance",))
+    result = refine_model(replace(survey, export=export), progress=SilentProgress()).result
     path = survey.output_path / "pose_covariance.csv"
+    written = np.loadtxt(survey.output_path / "trajectory_covariance.tum")
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     model = pycolmap.Reconstruction(survey.output_path / "sparse_metric" / "0")
@@ -276,8 +274,13 @@ def test_covariances_of_the_centres_are_in_the_result_unless_unwanted(survey: Su
         xx, xy, xz, yy, yz, zz = (float(row[f"cov_{axes}_m2"]) for axes in ("xx", "xy", "xz", "yy", "yz", "zz"))
         stddevs = np.sqrt(np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
         assert 1e-5 < stddevs.min() < stddevs.max() < 1.0
+        assert np.isclose(written[:, 8:], [xx, xy, xz, yy, yz, zz], rtol=1e-6).all(axis=1).any()
+    (exported,) = export_result(survey.output_path, ["tum_covariance"], survey.output_path / "again")
+    np.testing.assert_allclose(np.loadtxt(exported), written, rtol=1e-6)
     assert 0 < result["refine"]["relative_scale_stddev"] < 0.1
-    without = refine_model(replace(survey, refine=RefineOptions(covariance=False)), progress=SilentProgress()).result
+    unwanted = replace(survey, export=export, refine=RefineOptions(covariance=False))
+    without = refine_model(unwanted, progress=SilentProgress()).result
+    assert "without covariances of the poses there is no tum_covariance" in without["warnings"]
     assert without["refine"]["relative_scale_stddev"] is None
     assert not path.exists()
 

@@ -17,12 +17,13 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import InputError
-from rangesfm.export import MetricMap, export_map, write_model
+from rangesfm.export import COVARIANCE_FORMATS, MetricMap, export_map, write_model
 from rangesfm.files import new_file
 from rangesfm.georeference import Georeference
 from rangesfm.metric_survey import MetricSurvey
 from rangesfm.options import ExportOptions
 from rangesfm.ranging.observations import RangeStatus
+from rangesfm.result_folder import COVARIANCE_COLUMNS
 from rangesfm.results import USED
 from rangesfm.scale.diagnostics import scale_diagnostics
 from rangesfm.scale.estimate import ScaleSensitivity
@@ -119,8 +120,11 @@ def write_outputs(
         relative_scale_stddev=survey.estimate.uncertainty.empirical,
         images_path=images_path,
         georeference=georeference,
+        center_covariance_m2=survey.center_covariance_m2,
     )
-    formats = tuple(name for name in export.formats if name != "ply" or survey.final.num_points3D())
+    impossible = [] if survey.final.num_points3D() else ["ply"]
+    impossible += [] if survey.center_covariance_m2 else COVARIANCE_FORMATS
+    formats = tuple(name for name in export.formats if name not in impossible)
     export_map(map_, folder, replace(export, formats=formats))
 
 
@@ -186,9 +190,9 @@ def _write_pose_covariance(survey: MetricSurvey, path: Path) -> None:
         # An earlier run's would not belong to this result.
         path.unlink(missing_ok=True)
         return
-    entries = {f"cov_{'xyz'[i]}{'xyz'[j]}_m2": (i, j) for i in range(3) for j in range(i, 3)}
-    rows = ([name, *(f"{of[at]:.9g}" for at in entries.values())] for name, of in covariance_m2.items())
-    _write_csv(path, ["image_name", *entries], rows)
+    upper = np.triu_indices(3)
+    rows = ([name, *(f"{entry:.9g}" for entry in of[upper].tolist())] for name, of in covariance_m2.items())
+    _write_csv(path, ["image_name", *COVARIANCE_COLUMNS], rows)
 
 
 def _write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

@@ -21,7 +21,7 @@ from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.rows import disagreements, distance_rows
 from rangesfm.doctor import versions
 from rangesfm.errors import InputError
-from rangesfm.export import check_formats
+from rangesfm.export import COVARIANCE_FORMATS, check_formats
 from rangesfm.georeference import Georeference
 from rangesfm.input_hashes import input_hashes
 from rangesfm.inputs import RangingInputs, read_ranging_inputs, times_of_model
@@ -154,8 +154,12 @@ def _to_metric(
             metric = _refine(survey, inputs, metric)
         if metric.refinement is not None and not metric.refinement.converged:
             journal.warn(f"the refinement stopped before it converged: {metric.refinement.message}")
+        if metric.refinement is not None and survey.refine.covariance and metric.refinement.covariance is None:
+            journal.warn("no covariance of the poses: too many keyframes, or photos and ranges leave some of it open")
         for misfit in metric.refinement.misfits if metric.refinement is not None else ():
             journal.warn(f"after the refinement {misfit}")
+    if not metric.center_covariance_m2 and (left_out := set(COVARIANCE_FORMATS) & set(survey.export.formats)):
+        journal.warn(f"without covariances of the poses there is no {', '.join(sorted(left_out))}")
     # Comparison and results.
     return _write_results(survey, inputs, metric, journal)
 

@@ -35,6 +35,7 @@ RANGES_COLUMNS = (
     "status",
 )
 TAG_COLUMN = "tag_id"
+COVARIANCE_COLUMNS = tuple(f"cov_{axes}_m2" for axes in ("xx", "xy", "xz", "yy", "yz", "zz"))
 PLACE_COLUMNS = ("keyframe_before", "keyframe_after", "weight")
 USED_STATUSES = (RangeStatus.USED.label, RangeStatus.DOWN_WEIGHTED.label)
 
@@ -194,6 +195,16 @@ class ResultFolder:
             keyframe_after=tuple(after),
             weight=table.numbers("weight", empty=np.nan) if "weight" in table else np.full(len(table), np.nan),
         )
+
+    def read_center_covariance_m2(self) -> dict[str, Array] | None:
+        """(3, 3) of each keyframe's projection centre, by its photo (``pose_covariance.csv``); None if not there."""
+        path = self.path / "pose_covariance.csv"
+        if not path.is_file():
+            return None
+        table = read_table(path, ["image_name", *COVARIANCE_COLUMNS])
+        upper = np.column_stack([table.numbers(name) for name in COVARIANCE_COLUMNS])
+        matrices = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        return dict(zip(table.text("image_name"), matrices, strict=True))
 
     def lever_arms_m(self, tag_ids: Sequence[str]) -> Array:
         """(n, 3) antenna in the camera's frame of each tag of a list; of one that the settings do not name, the common.

@@ -20,7 +20,7 @@ from pyopf.cps import Constraints, InputControlPoints
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
-from rangesfm.export import EXPORTERS, MetricMap, export_map
+from rangesfm.export import COVARIANCE_FORMATS, EXPORTERS, MetricMap, export_map
 from rangesfm.options import ExportOptions
 
 Array = npt.NDArray[np.float64]
@@ -106,7 +106,19 @@ def test_distances_between_cameras_agree_between_all_formats(tmp_path: Path) -> 
 
 
 # Formats that hold no cameras, or need photos or a place on the Earth.
-NEED_MORE = {"undistorted", "ply", "ply_cameras", "ply_anchors", "laz", "gpkg", "geojson", "kml", "transform", "opf"}
+NEED_MORE = {
+    *COVARIANCE_FORMATS,
+    "undistorted",
+    "ply",
+    "ply_cameras",
+    "ply_anchors",
+    "laz",
+    "gpkg",
+    "geojson",
+    "kml",
+    "transform",
+    "opf",
+}
 
 
 @pytest.mark.parametrize("camera_model", ["PINHOLE", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE"])

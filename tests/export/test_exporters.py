@@ -13,7 +13,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
-from rangesfm.export import EXPORTERS, export_model, export_result, write_model, write_positions
+from rangesfm.export import COVARIANCE_FORMATS, EXPORTERS, export_model, export_result, write_model, write_positions
 from rangesfm.geometry import Similarity
 
 Array = npt.NDArray[np.float64]
@@ -226,6 +226,11 @@ def write_result(folder: Path, model: pycolmap.Reconstruction, *, is_refined: bo
         shifted.write_binary(folder / name / "0")
     rows = [f"{name},{time}" for name, time in times_of(model).items()]
     (folder / "images.csv").write_text("\n".join(["image_name,timestamp_s", *rows]))
+    if is_refined:
+        axes = ("xx", "xy", "xz", "yy", "yz", "zz")
+        header = ",".join(["image_name", *(f"cov_{two}_m2" for two in axes)])
+        lines = [f"{name},1e-4,0,0,1e-4,0,1e-4" for name in times_of(model)]
+        (folder / "pose_covariance.csv").write_text("\n".join([header, *lines]))
     summary = {
         "scale": {"value": 2.0, "stddev_empirical": 0.02},
         "georeference": {"lat_deg": 47.4, "lon_deg": 8.5, "height_m": 400.0, "crs": "EPSG:2056"},
@@ -241,8 +246,9 @@ def test_a_result_is_exported_in_its_best_form_in_every_format(
 ) -> None:
     write_result(tmp_path / "out", model, is_refined=is_refined)
     photos = write_photos(tmp_path / "photos", model)
-    exported = export_result(tmp_path / "out", EXPORTERS, tmp_path / "exports", images_path=photos)
-    paths = dict(zip(EXPORTERS, exported))
+    formats = [name for name in EXPORTERS if is_refined or name not in COVARIANCE_FORMATS]
+    exported = export_result(tmp_path / "out", formats, tmp_path / "exports", images_path=photos)
+    paths = dict(zip(formats, exported, strict=True))
     assert all(path.exists() and path.parent == tmp_path / "exports" for path in paths.values())
     expected = np.mean(list(centers_of(model).values()), axis=0) + ([0, 0, 0] if is_refined else [1000, 0, 0])
     rows = np.loadtxt(paths["tum"])

@@ -20,6 +20,7 @@ from rangesfm.export.nerfstudio import write_nerfstudio
 from rangesfm.export.opensfm import write_opensfm
 from rangesfm.export.opf import write_opf
 from rangesfm.export.ply import write_anchors, write_cameras, write_points
+from rangesfm.export.pose_covariance import COVARIANCE_FORMATS, write_kitti_covariance, write_tum_covariance
 from rangesfm.export.transform import write_transform
 from rangesfm.export.tum import write_trajectory
 from rangesfm.export.undistorted import write_undistorted
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from rangesfm.geometry import Similarity
 
 __all__ = [
+    "COVARIANCE_FORMATS",
     "EXPORTERS",
     "MetricMap",
     "apply_result",
@@ -66,6 +68,8 @@ EXPORTERS: dict[str, Exporter] = {
     "undistorted": lambda map_, folder: write_undistorted(map_, folder / "undistorted"),
     "tum": lambda map_, folder: write_trajectory(map_.trajectory, folder / "trajectory.tum"),
     "kitti": lambda map_, folder: write_kitti(map_.trajectory, folder / "trajectory.kitti"),
+    "tum_covariance": lambda map_, folder: write_tum_covariance(map_, folder / "trajectory_covariance.tum"),
+    "kitti_covariance": lambda map_, folder: write_kitti_covariance(map_, folder / "trajectory_covariance.kitti"),
     "ply": lambda map_, folder: write_points(map_.reconstruction, folder / "points.ply"),
     "ply_cameras": lambda map_, folder: write_cameras(map_.trajectory, folder / "cameras.ply"),
     "ply_anchors": lambda map_, folder: write_anchors(map_.anchors_m or {}, folder / "anchors.ply"),
@@ -187,4 +191,5 @@ def _read_map(result: ResultFolder, images_path: Path | None) -> MetricMap:
         relative_scale_stddev=result.relative_scale_stddev,
         images_path=images_path or result.images_path,
         georeference=result.georeference,
+        center_covariance_m2=result.read_center_covariance_m2(),
     )

@@ -45,13 +45,15 @@ def moved(map_: MetricMap, new_from_old: Similarity) -> MetricMap:
     georeference = map_.georeference
     if georeference is not None:
         georeference = replace(georeference, enu_from_world=georeference.enu_from_world @ new_from_old.inverse())
-    known = map_.metric_from_sfm
+    known, covariance_m2 = map_.metric_from_sfm, map_.center_covariance_m2
+    turn = new_from_old.scale * new_from_old.rotation
     return replace(
         map_,
         reconstruction=rescale(map_.reconstruction, new_from_old),
         anchors_m={name: new_from_old.apply(at) for name, at in (map_.anchors_m or {}).items()},
         metric_from_sfm=None if known is None else new_from_old @ known,
         georeference=georeference,
+        center_covariance_m2=covariance_m2 and {name: turn @ of @ turn.T for name, of in covariance_m2.items()},
     )
 
 

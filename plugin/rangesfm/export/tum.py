@@ -10,13 +10,22 @@ from scipy.spatial.transform import Rotation
 from rangesfm.files import new_file
 from rangesfm.trajectory import Trajectory
 
+TUM_HEADER = "# world_from_cam: timestamp tx ty tz qx qy qz qw (seconds, metres)"
+
 
 def write_trajectory(trajectory: Trajectory, path: Path) -> Path:
     """Write the poses (world from camera, metres), one line each.
 
     Without times the first column counts the keyframes from 0, and a comment says so.
     """
-    lines = ["# world_from_cam: timestamp tx ty tz qx qy qz qw (seconds, metres)"]
+    with new_file(path) as temporary:
+        temporary.write_text("\n".join(tum_lines(trajectory)) + "\n", encoding="utf-8")
+    return path
+
+
+def tum_lines(trajectory: Trajectory) -> list[str]:
+    """The header, perhaps a comment, and a line for each pose."""
+    lines = [TUM_HEADER]
     timestamps_s = trajectory.timestamps_s
     if timestamps_s is None:
         lines.append("# the photos have no times: the first column is the keyframe's index, in order of its name")
@@ -26,6 +35,4 @@ def write_trajectory(trajectory: Trajectory, path: Path) -> Path:
         for time, center, quaternion in zip(timestamps_s, trajectory.centers, quaternions):
             numbers = [f"{value:.9f}" for value in center] + [f"{value:.12f}" for value in quaternion]
             lines.append(f"{time:.9f} {' '.join(numbers)}")
-    with new_file(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return path
+    return lines

@@ -1,0 +1,63 @@
+"""Trajectories with the covariance of each centre behind the pose."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rangesfm.errors import InputError
+from rangesfm.export import COVARIANCE_FORMATS, MetricMap, export_map
+from rangesfm.export.frames import moved
+from rangesfm.geometry import Similarity
+from rangesfm.model_transform import rescale
+from rangesfm.options import ExportOptions
+from rangesfm.simulate.model import synthetic_model
+from rangesfm.simulate.path import loop_path
+
+Array = npt.NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def map_() -> MetricMap:
+    path = loop_path(20.0, start_s=0.0, seed=1)
+    times = np.arange(6, dtype=np.float64)
+    made = synthetic_model(times, path.centers(times), path.world_from_cam(times), pixel_stddev=0.0, seed=2)
+    factors = np.random.default_rng(0).normal(0, 0.1, (6, 3, 3))
+    covariances = dict(zip(made.timestamps_s, factors @ np.swapaxes(factors, 1, 2), strict=True))
+    model = rescale(made.reconstruction, made.metric_from_sfm)
+    return MetricMap(model, made.timestamps_s, center_covariance_m2=covariances)
+
+
+def upper(covariance: Array) -> list[float]:
+    return [covariance[i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))]
+
+
+@pytest.mark.parametrize(("name", "num_pose_columns"), [("tum", 8), ("kitti", 12)])
+def test_behind_the_pose_stands_the_covariance(
+    map_: MetricMap, tmp_path: Path, name: str, num_pose_columns: int
+) -> None:
+    formats = (name, f"{name}_covariance")
+    poses, both = (np.loadtxt(path) for path in export_map(map_, tmp_path, ExportOptions(formats=formats)))
+    np.testing.assert_array_equal(both[:, :num_pose_columns], poses)
+    expected = [upper((map_.center_covariance_m2 or {})[image]) for image in map_.trajectory.image_names]
+    np.testing.assert_allclose(both[:, num_pose_columns:], expected, rtol=1e-8)
+
+
+def test_it_turns_and_grows_with_the_world(map_: MetricMap) -> None:
+    turn = Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix()
+    there = moved(map_, Similarity(2.0, turn, np.ones(3))).center_covariance_m2 or {}
+    assert len(there) == 6
+    for name, covariance in (map_.center_covariance_m2 or {}).items():
+        np.testing.assert_allclose(there[name], 4.0 * turn @ covariance @ turn.T, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", COVARIANCE_FORMATS)
+def test_without_covariances_there_is_nothing_to_write(map_: MetricMap, tmp_path: Path, name: str) -> None:
+    with pytest.raises(InputError, match="pose covariance"):
+        export_map(replace(map_, center_covariance_m2=None), tmp_path, ExportOptions(formats=(name,)))
+    assert not list(tmp_path.iterdir())
