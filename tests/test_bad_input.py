@@ -263,12 +263,9 @@ def test_damaged_model_is_refused_at_once(
     ("spoil", "said"),
     [
         (keep_lines("anchors.csv", slice(1)), "1 surveyed anchor"),
-        (
-            write("anchors.csv", "anchor_id,x_m,y_m,z_m\nA1,0,0,1\nA2,2,0,1\nA3,4,0,1\nA4,9,0,1\n"),
-            "anchors on one line",
-        ),
+        (keep_lines("anchors.csv", slice(2)), "2 surveyed anchors"),
     ],
-    ids=["one anchor", "a line of anchors"],
+    ids=["one anchor", "two anchors"],
 )
 def test_anchors_that_cannot_hold_the_site_frame_still_give_the_scale_with_a_warning(
     spoil: Spoil,
@@ -289,6 +286,16 @@ def test_anchors_that_cannot_hold_the_site_frame_still_give_the_scale_with_a_war
     assert result["frame"] == "first_camera"
     assert warning in result["warnings"]
     assert result["scale"]["value"] == pytest.approx(own_survey.site_from_sfm.scale, rel=0.02)
+
+
+def test_anchors_that_were_not_where_the_survey_puts_them_are_refused(
+    own_survey: WalkedSurvey, refusal: Refusal
+) -> None:
+    table = "anchor_id,x_m,y_m,z_m\nA1,0,0,1\nA2,2,0,1\nA3,4,0,1\nA4,9,0,1\n"
+    (own_survey.folder / "anchors.csv").write_text(table)
+    said = refusal("scale", *own_survey.flags, "--anchors", "anchors.csv", "--output_path", "out", status=3)
+    assert said.startswith("the scale is only known to ")
+    assert not (own_survey.folder / "out" / "result.json").exists()
 
 
 def test_model_photos_without_a_time_are_counted(

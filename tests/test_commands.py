@@ -216,7 +216,7 @@ class TestRefineInASiteFrame:
 
     def test_scale_is_right_within_its_stated_error(self, refined: Left, walked_survey: WalkedSurvey) -> None:
         error = refined.result["scale"]["value"] / walked_survey.site_from_sfm.scale - 1
-        assert abs(error) < 3 * refined.relative_stddev < 0.02
+        assert abs(error) < 3 * refined.relative_stddev < 0.05
 
     def test_map_is_in_the_site_frame_without_alignment(self, refined: Left, walked_survey: WalkedSurvey) -> None:
         for model, tolerance_m in (("sparse_scaled", 0.05), ("sparse_metric", 0.04)):
