@@ -432,7 +432,8 @@ class TestResultFolder:
 
     @pytest.fixture
     def out(self, refined: Left, tmp_path: Path) -> Path:
-        return shutil.copytree(refined.folder, tmp_path / "out")
+        # The survey's folder has the same name too: it is what the report is called by.
+        return shutil.copytree(refined.folder, tmp_path / refined.folder.parent.name / "out")
 
     def test_is_compared_with_and_without_a_reference(
         self, out: Path, refined: Left, walked_survey: WalkedSurvey, rangesfm_command: Command
