@@ -387,7 +387,9 @@ def test_taped_distances_hold_the_scale_and_check_it(
     assert rows[0]["residual_m"] == pytest.approx(0, abs=0.015)
     assert rows[1]["residual_m"] == pytest.approx(0, abs=0.03)
     assert rows[2]["residual_m"] == pytest.approx(-0.5, abs=0.03)
-    assert len([text for text in left.result["warnings"] if text.startswith("check distance")]) == 1
+    (note,) = (text for text in left.result["warnings"] if text.startswith("check distance"))
+    assert left.result["scale"]["verdict"] == "doubtful"
+    assert note in left.result["scale"]["reasons"]
     refined = run_on(rangesfm_command, own_survey, tmp_path / "refined", "refine", *flags)
     assert refined.result["distances"][0]["residual_m"] == pytest.approx(0, abs=0.01)
     error = left.result["scale"]["value"] / own_survey.site_from_sfm.scale - 1
@@ -462,7 +464,7 @@ class TestResultFolder:
         flags = ("--formats", "laz,geojson,nerfstudio", "--frame", "enu", *place, "--output_path", "exported")
         done = rangesfm_command("export", out, *flags, cwd=out)
         names = ("points.laz", "survey.geojson", "transforms.json")
-        lines = [*(f"exported/{name}" for name in names), "up is the mean of what is up in the photos"]
+        lines = [*(f"exported/{name}" for name in names), "up is z of the site"]
         assert done.stdout.splitlines() == lines
         features = json.loads((out / "exported" / "survey.geojson").read_text())["features"]
         (anchor,) = (f for f in features if f["properties"]["name"] == "A1")

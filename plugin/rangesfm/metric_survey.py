@@ -117,6 +117,13 @@ class MetricSurvey:
             refinement=refinement,
         )
 
+    def doubted(self, reasons: tuple[str, ...]) -> MetricSurvey:
+        """The same with further reasons to doubt it, if there are any."""
+        if not reasons:
+            return self
+        kept = self.estimate.reasons if self.estimate.verdict == "doubtful" else ()
+        return replace(self, estimate=replace(self.estimate, verdict="doubtful", reasons=(*reasons, *kept)))
+
     def path_of(self, model: pycolmap.Reconstruction) -> Trajectory:
         """The keyframes as another model has them."""
         times = self.trajectory.timestamps_s

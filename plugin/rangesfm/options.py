@@ -179,8 +179,8 @@ class ExportOptions:
         formats: names of exporters.
         frame: "result" (the site's or the first camera's, as the result has it), "level" (z up, y as the first camera
             looks, origin as it is) or "enu" (x east, y north, z up; for that the map must be georeferenced).
-        up: what is up, where the map itself does not know: "cameras" (the mean of what is up in the photos), "path"
-            (across the plane of the path) or three numbers, a direction in the result's frame.
+        up: what is up: "cameras" (the mean of what is up in the photos), "path" (across the plane of the path), three
+            numbers, a direction in the result's frame, or "auto": z in a site frame, else as "cameras".
         crs: coordinate system of what is written for maps (LAZ, GeoPackage), as "EPSG:2056"; None: that of the
             anchors, else longitude and latitude.
         origin_anchor: id of an anchor whose place on the Earth is known.
@@ -190,7 +190,7 @@ class ExportOptions:
 
     formats: tuple[str, ...] = DEFAULT_FORMATS
     frame: str = "result"
-    up: str = "cameras"
+    up: str = "auto"
     crs: str | None = None
     origin_anchor: str | None = None
     origin_lat_lon_height: tuple[float, float, float] | None = None

@@ -119,6 +119,7 @@ def write_outputs(
         metric_from_sfm=survey.estimate.metric_from_sfm,
         relative_scale_stddev=survey.estimate.uncertainty.empirical,
         images_path=images_path,
+        is_site=survey.estimate.frame == "site",
         georeference=georeference,
         center_covariance_m2=survey.center_covariance_m2,
     )

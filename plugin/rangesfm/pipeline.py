@@ -168,10 +168,15 @@ def _write_results(survey: Survey, inputs: RangingInputs, metric: MetricSurvey, 
     """All files of the result, ``result.json`` after all others, and the report on them."""
     if metric.estimate.frame == "site":
         metric = metric.moved(inputs.site.offset_m)
+    distances = _distances(inputs, metric)
+    disagreeing = tuple(disagreements(distances, metric.estimate.uncertainty.empirical))
+    for note in disagreeing:
+        journal.warn(note)
+    metric = metric.doubted(disagreeing)
     result = survey_result(metric)
     with replacing_result(survey.output_path):
         with journal.stage("results"):
-            result["distances"] = _distances(inputs, metric, journal)
+            result["distances"] = distances
             table = _compare(survey, inputs, metric, result)
             georeference = _georeference(inputs, metric)
             result["georeference"] = georeference and georeference.to_dict()
@@ -400,16 +405,13 @@ def _noise_is_estimated(survey: Survey, log: RangeLog) -> npt.NDArray[np.bool_]:
     return np.isnan(log.range_stddev_m) & (survey.ranges.model.range_stddev_m is None)
 
 
-def _distances(inputs: RangingInputs, metric: MetricSurvey, journal: Journal) -> list[dict[str, Any]]:
-    """The table of control and check distances in the final map; those that disagree are named."""
+def _distances(inputs: RangingInputs, metric: MetricSurvey) -> list[dict[str, Any]]:
+    """The table of control and check distances in the final map."""
     if inputs.tape is None:
         return []
     located = locate_distances(inputs.tape, metric.final, [anchor.anchor_id for anchor in metric.anchors])
     anchors_m = np.array([anchor.position_m for anchor in metric.anchors]).reshape(-1, 3)
-    rows = distance_rows(inputs.tape, located.lengths_m(1.0, anchors_m))
-    for note in disagreements(rows, metric.estimate.uncertainty.empirical):
-        journal.warn(note)
-    return rows
+    return distance_rows(inputs.tape, located.lengths_m(1.0, anchors_m))
 
 
 def _compare(survey: Survey, inputs: RangingInputs, metric: MetricSurvey, result: dict[str, Any]) -> str | None:

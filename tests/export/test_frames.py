@@ -67,6 +67,13 @@ def test_what_is_up_is_seen_by_the_cameras(map_: MetricMap) -> None:
     assert np.rad2deg(np.arccos(up[2])) < 10
 
 
+def test_in_a_site_frame_z_is_up(map_: MetricMap) -> None:
+    tilted = turned(map_, [0.3, 0.0, 0.0])
+    np.testing.assert_array_equal(up_in_world(tilted.trajectory, "auto", is_site=True), [0, 0, 1])
+    by_photos = up_in_world(tilted.trajectory, "cameras")
+    np.testing.assert_array_equal(up_in_world(tilted.trajectory, "auto"), by_photos)
+
+
 def test_what_is_up_is_across_a_flat_path(map_: MetricMap) -> None:
     flat = replace(map_.trajectory, centers=map_.trajectory.centers * [1.0, 1.0, 0.0])
     np.testing.assert_allclose(up_in_world(flat, "path"), [0, 0, 1], atol=1e-9)
@@ -74,7 +81,7 @@ def test_what_is_up_is_across_a_flat_path(map_: MetricMap) -> None:
 
 @pytest.mark.parametrize("up", ["sideways", "1,2", "0,0,0", "nan,0,1"])
 def test_nonsense_is_not_up(up: str, map_: MetricMap) -> None:
-    with pytest.raises(InputError, match="expected cameras, path or a direction"):
+    with pytest.raises(InputError, match="expected auto, cameras, path or a direction"):
         up_in_world(map_.trajectory, up)
 
 

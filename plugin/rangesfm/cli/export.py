@@ -28,7 +28,12 @@ def add_command(commands: Commands) -> None:
     add_result_argument(parser)
     parser.add_argument("--formats", metavar="A,B,..", help="what to write (default: what a run exports)")
     parser.add_argument("--frame", choices=EXPORT_FRAMES, default="result", help="its frame (default: the result's)")
-    parser.add_argument("--up", metavar="UP", default="cameras", help="cameras, path or a direction X,Y,Z")
+    parser.add_argument(
+        "--up",
+        metavar="UP",
+        default="auto",
+        help="what is up: cameras, path or a direction X,Y,Z (default: z in a site frame, else cameras)",
+    )
     parser.add_argument("--crs", metavar="CRS", help="coordinate system for maps, as EPSG:2056 (default: the anchors')")
     parser.add_argument("--origin_anchor", metavar="ID", help="an anchor whose place on the Earth is known")
     parser.add_argument(
@@ -64,7 +69,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
         return _apply(source, args, options)
     images_path = None if args.images is None else Path(args.images)
     written = export_result(source, formats, Path(args.output_path or source), options=options, images_path=images_path)
-    return Outcome([*map(str, written), *_frame_note(options)])
+    return Outcome([*map(str, written), *_frame_note(options, is_site=_is_site(source))])
 
 
 def _apply(source: Path, args: argparse.Namespace, options: ExportOptions) -> Outcome:
@@ -75,14 +80,21 @@ def _apply(source: Path, args: argparse.Namespace, options: ExportOptions) -> Ou
     destination = Path(args.output_path or source / "applied")
     paths, residual_m = apply_result(source, [Path(path) for path in args.apply_to], destination, options=options)
     note = f"cameras of the refined map are {residual_m:.3f} m (rms) from where the similarity puts them"
-    return Outcome([*map(str, paths), *_frame_note(options), *([note] if residual_m else [])])
+    return Outcome([*map(str, paths), *_frame_note(options, is_site=_is_site(source)), *([note] if residual_m else [])])
 
 
-def _frame_note(options: ExportOptions) -> list[str]:
+def _is_site(source: Path) -> bool:
+    from rangesfm.result_folder import read_result_folder
+
+    return read_result_folder(source).frame == "site"
+
+
+def _frame_note(options: ExportOptions, *, is_site: bool) -> list[str]:
     """Where up came from, if it was asked for: nobody can see it in the files."""
     if options.frame == "result" and options.origin_anchor is None:
         return []
     if options.frame == "enu" and options.origin_anchor is None:
         return ["up is away from the ellipsoid, by the anchors' coordinates"]
-    source = {"cameras": "the mean of what is up in the photos", "path": "across the plane of the path"}
+    photos = "the mean of what is up in the photos"
+    source = {"cameras": photos, "path": "across the plane of the path", "auto": "z of the site" if is_site else photos}
     return [f"up is {source.get(options.up, f'{options.up} in the frame of the result')}"]

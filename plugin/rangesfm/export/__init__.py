@@ -190,6 +190,7 @@ def _read_map(result: ResultFolder, images_path: Path | None) -> MetricMap:
         metric_from_sfm=result.metric_from_sfm,
         relative_scale_stddev=result.relative_scale_stddev,
         images_path=images_path or result.images_path,
+        is_site=result.frame == "site",
         georeference=result.georeference,
         center_covariance_m2=result.read_center_covariance_m2(),
     )

@@ -69,7 +69,7 @@ def _georeferenced(map_: MetricMap, options: ExportOptions) -> MetricMap:
         georeference = georeference_of_anchor(
             anchor,
             options.origin_lat_lon_height,
-            up_in_world=up_in_world(map_.trajectory, options.up),
+            up_in_world=up_in_world(map_.trajectory, options.up, is_site=map_.is_site),
             forward_in_world=map_.trajectory.world_from_cam[0][:, 2],
             heading_deg=options.heading_deg,
         )
@@ -79,14 +79,16 @@ def _georeferenced(map_: MetricMap, options: ExportOptions) -> MetricMap:
     return replace(map_, georeference=georeference)
 
 
-def up_in_world(trajectory: Trajectory, up: str) -> Array:
+def up_in_world(trajectory: Trajectory, up: str, *, is_site: bool = False) -> Array:
     """(3,) unit vector against gravity, by the rule ``up`` of ExportOptions.
 
     Raises:
         InputError: the photos disagree about it, the path is not flat, or it is no direction.
     """
+    if up == "auto" and is_site:
+        return np.array([0.0, 0.0, 1.0])
     photos_up = -trajectory.world_from_cam[:, :, 1].mean(axis=0)
-    if up == "cameras":
+    if up in ("auto", "cameras"):
         if np.linalg.norm(photos_up) < _MIN_AGREEMENT:
             raise InputError("the photos do not agree what is up: say it (--up path, or --up X,Y,Z)")
         return _unit(photos_up)
@@ -106,7 +108,7 @@ def direction(text: str) -> tuple[float, float, float]:
     except ValueError:
         numbers = ()
     if len(numbers) != 3 or not 0 < np.linalg.norm(numbers) < np.inf:
-        raise InputError(f"up is {text!r}, expected cameras, path or a direction X,Y,Z")
+        raise InputError(f"up is {text!r}, expected auto, cameras, path or a direction X,Y,Z")
     return numbers
 
 
@@ -117,7 +119,7 @@ def _unit(vector: Array) -> Array:
 
 def _level_from_world(map_: MetricMap, up: str) -> Array:
     """(3, 3) rotation: z up, y as the first camera looks (its upper edge, where it looks down)."""
-    vertical = up_in_world(map_.trajectory, up)
+    vertical = up_in_world(map_.trajectory, up, is_site=map_.is_site)
     first = map_.trajectory.world_from_cam[0]
     for ahead in (first[:, 2], -first[:, 1]):
         level = ahead - (ahead @ vertical) * vertical

@@ -53,11 +53,21 @@ def scale_uncertainty(
         bootstrap=_bootstrap(fit, blocks, num_bootstrap, seed),
         jackknife=_jackknife(fit, anchor_blocks) if len(present) >= 3 else None,
         range_model=_range_model_stddev(problem, fit, curve_stddev_m),
-        correlated=fit.log_scale_stddev * solution.inflation,
+        correlated=_correlated(solution, blocks),
         num_blocks=len(np.unique(blocks)),
         num_anchors=len(present),
         antennas=_antennas_stddev(problem, fit),
     )
+
+
+def _correlated(solution: Solution, blocks: npt.NDArray[np.int64]) -> float:
+    """Formal, widened by errors that go together; the fit has taken its share of these out of the residuals."""
+    problem, fit = solution.problem, solution.fit
+    num_groups = len(np.unique(blocks * problem.num_anchors + problem.anchor_index))
+    from_ranges = fit.information - fit.prior_information
+    num_fitted = float(np.trace(np.linalg.lstsq(fit.information, from_ranges, rcond=1e-12)[0]))
+    excess = (solution.inflation**2 - 1) * num_groups / max(num_groups - num_fitted, 1.0)
+    return fit.log_scale_stddev * float(np.sqrt(1 + excess))
 
 
 def scale_influence(fit: RangeFit, problem: RangeProblem) -> Array:
