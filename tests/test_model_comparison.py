@@ -186,7 +186,7 @@ def test_the_command_takes_the_log_and_the_tape(
     [
         (("--anchors", "anchors.csv"), "--anchors given without a log to use it for, expected --ranges LOG"),
         (("--images", "images.csv"), "expected --ranges LOG"),
-        (("--markers", "marks.csv"), "no --distances"),
+        (("--markers", "marks.csv"), "expected distances beside it"),
         (("--ranges", "gone.csv"), "gone.csv"),
     ],
 )

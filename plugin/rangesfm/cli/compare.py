@@ -91,10 +91,7 @@ def _survey(args: argparse.Namespace) -> Survey:
     of_log = [name for name in given if name not in _WITHOUT_LOG] + ["--images"] * (args.images is not None)
     if of_log and "--ranges" not in given:
         raise InputError(f"{', '.join(of_log)} given without a log to use it for, expected --ranges LOG as well")
-    survey = survey_from_arguments(args)
-    if survey.distances_path is None and survey.markers_path is not None:
-        raise InputError("--markers are given, but no --distances between them", survey.markers_path)
-    return survey
+    return survey_from_arguments(args)
 
 
 def _ranges(survey: Survey, first: NamedModel, path: Path) -> ModelRanges | None:
