@@ -69,7 +69,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
         return _apply(source, args, options)
     images_path = None if args.images is None else Path(args.images)
     written = export_result(source, formats, Path(args.output_path or source), options=options, images_path=images_path)
-    return Outcome([*map(str, written), *_frame_note(options, is_site=_is_site(source))])
+    return Outcome([*map(str, written), *_frame_note(options, source)])
 
 
 def _apply(source: Path, args: argparse.Namespace, options: ExportOptions) -> Outcome:
@@ -80,7 +80,7 @@ def _apply(source: Path, args: argparse.Namespace, options: ExportOptions) -> Ou
     destination = Path(args.output_path or source / "applied")
     paths, residual_m = apply_result(source, [Path(path) for path in args.apply_to], destination, options=options)
     note = f"cameras of the refined map are {residual_m:.3f} m (rms) from where the similarity puts them"
-    return Outcome([*map(str, paths), *_frame_note(options, is_site=_is_site(source)), *([note] if residual_m else [])])
+    return Outcome([*map(str, paths), *_frame_note(options, source), *([note] if residual_m else [])])
 
 
 def _is_site(source: Path) -> bool:
@@ -89,12 +89,14 @@ def _is_site(source: Path) -> bool:
     return read_result_folder(source).frame == "site"
 
 
-def _frame_note(options: ExportOptions, *, is_site: bool) -> list[str]:
+def _frame_note(options: ExportOptions, result_folder: Path) -> list[str]:
     """Where up came from, if it was asked for: nobody can see it in the files."""
     if options.frame == "result" and options.origin_anchor is None:
         return []
     if options.frame == "enu" and options.origin_anchor is None:
         return ["up is away from the ellipsoid, by the anchors' coordinates"]
+    if options.up == "auto" and _is_site(result_folder):
+        return ["up is z of the site"]
     photos = "the mean of what is up in the photos"
-    source = {"cameras": photos, "path": "across the plane of the path", "auto": "z of the site" if is_site else photos}
+    source = {"cameras": photos, "auto": photos, "path": "across the plane of the path"}
     return [f"up is {source.get(options.up, f'{options.up} in the frame of the result')}"]

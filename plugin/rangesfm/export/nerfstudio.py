@@ -14,6 +14,7 @@ import numpy as np
 import pycolmap
 
 from rangesfm.errors import InputError
+from rangesfm.export.intrinsics import distortion_params
 from rangesfm.export.metric_map import Array, MetricMap
 from rangesfm.export.ply import write_points
 from rangesfm.files import new_file
@@ -73,8 +74,6 @@ def _intrinsics(camera: pycolmap.Camera) -> dict[str, Any]:
     if name not in _DISTORTION:
         raise InputError(f"nerfstudio does not know the camera model {name}, expected one of: {', '.join(_DISTORTION)}")
     kind, names = _DISTORTION[name]
-    others = set(camera.focal_length_idxs()) | set(camera.principal_point_idxs())
-    distortion = [value for index, value in enumerate(camera.params) if index not in others]
     return {
         "camera_model": kind,
         "w": camera.width,
@@ -83,5 +82,5 @@ def _intrinsics(camera: pycolmap.Camera) -> dict[str, Any]:
         "fl_y": camera.focal_length_y,
         "cx": camera.principal_point_x,
         "cy": camera.principal_point_y,
-        **dict(zip(names, distortion, strict=True)),
+        **dict(zip(names, distortion_params(camera), strict=True)),
     }

@@ -13,6 +13,7 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
+from rangesfm.export.intrinsics import distortion_params
 from rangesfm.export.metric_map import MetricMap
 from rangesfm.files import new_file
 
@@ -59,8 +60,6 @@ def _camera(camera: pycolmap.Camera) -> dict[str, Any]:
         raise InputError(f"OpenSfM does not know the camera model {name}, expected one of: {', '.join(_PROJECTIONS)}")
     projection, names = _PROJECTIONS[name]
     size = max(camera.width, camera.height)
-    others = set(camera.focal_length_idxs()) | set(camera.principal_point_idxs())
-    distortion = [value for index, value in enumerate(camera.params) if index not in others]
     return {
         "projection_type": projection,
         "width": camera.width,
@@ -70,7 +69,7 @@ def _camera(camera: pycolmap.Camera) -> dict[str, Any]:
         "c_x": (camera.principal_point_x - camera.width / 2) / size,
         "c_y": (camera.principal_point_y - camera.height / 2) / size,
         **dict.fromkeys(_ALL_DISTORTION[projection], 0.0),
-        **dict(zip(names, distortion, strict=True)),
+        **dict(zip(names, distortion_params(camera), strict=True)),
     }
 
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from rangesfm.errors import GeometryError
 from rangesfm.geometry import PathShape, path_shape
-from rangesfm.ranging.noise import correlation_inflation, short_range_stddev
+from rangesfm.ranging.noise import correlation_inflation, inflation_before_fit, short_range_stddev
 from rangesfm.ranging.observations import robust_weights
 from rangesfm.ranging.point_fit import PointProblem, improve
 from rangesfm.ranging.point_search import best_start, inlier_noise
@@ -217,10 +217,9 @@ def _fit_with_own_noise(
 
 
 def _inflation(scaled: Array, groups: npt.NDArray[np.int64]) -> float:
-    """Of every stddev by errors that go together; the fit has taken its share of them out of the residuals."""
-    num_groups = len(np.unique(groups))
-    excess = correlation_inflation(scaled, robust_weights(scaled), groups) ** 2 - 1
-    return float(np.sqrt(1 + excess * num_groups / max(num_groups - _NUM_UNKNOWNS, 1)))
+    """Of every stddev by errors that go together."""
+    seen = correlation_inflation(scaled, robust_weights(scaled), groups)
+    return inflation_before_fit(seen, len(np.unique(groups)), _NUM_UNKNOWNS)
 
 
 def _noise_of(scaled: Array, start: float) -> float:

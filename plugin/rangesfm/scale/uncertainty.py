@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.ranging.noise import inflation_before_fit
 from rangesfm.scale.estimate import ScaleUncertainty
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, directions_to_tag, predicted_ranges
 from rangesfm.scale.solution import Solution
@@ -61,13 +62,12 @@ def scale_uncertainty(
 
 
 def _correlated(solution: Solution, blocks: npt.NDArray[np.int64]) -> float:
-    """Formal, widened by errors that go together; the fit has taken its share of these out of the residuals."""
+    """Formal, widened by errors that go together."""
     problem, fit = solution.problem, solution.fit
     num_groups = len(np.unique(blocks * problem.num_anchors + problem.anchor_index))
     from_ranges = fit.information - fit.prior_information
     num_fitted = float(np.trace(np.linalg.lstsq(fit.information, from_ranges, rcond=1e-12)[0]))
-    excess = (solution.inflation**2 - 1) * num_groups / max(num_groups - num_fitted, 1.0)
-    return fit.log_scale_stddev * float(np.sqrt(1 + excess))
+    return fit.log_scale_stddev * inflation_before_fit(solution.inflation, num_groups, num_fitted)
 
 
 def scale_influence(fit: RangeFit, problem: RangeProblem) -> Array:

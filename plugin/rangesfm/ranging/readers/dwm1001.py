@@ -7,10 +7,10 @@ import re
 from rangesfm.ranging.readers.printed import Phrases, printed_reader
 
 # Always two decimals: a number with fewer was cut off.
-_NUMBER = r"-?\d{1,6}\.\d\d(?![\d.])"
-_XYZ = rf"(?P<x>{_NUMBER}),(?P<y>{_NUMBER}),(?P<z>{_NUMBER})"
-_LEC = rf"AN\d{{1,2}},(?P<anchor_id>[0-9A-F]{{4}}),{_XYZ},(?P<range>{_NUMBER})"
-_LES = rf"(?<![0-9A-Za-z])(?P<anchor_id>[0-9A-F]{{4}})\[{_XYZ}\]=(?P<range>{_NUMBER})"
+NUMBER = r"-?\d{1,6}\.\d\d(?![\d.])"
+XYZ = rf"(?P<x>{NUMBER}),(?P<y>{NUMBER}),(?P<z>{NUMBER})"
+_LEC = rf"AN\d{{1,2}},(?P<anchor_id>[0-9A-F]{{4}}),{XYZ},(?P<range>{NUMBER})"
+_LES = rf"(?<![0-9A-Za-z])(?P<anchor_id>[0-9A-F]{{4}})\[{XYZ}\]=(?P<range>{NUMBER})"
 
 LEC = printed_reader(
     "dwm1001_lec",

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 
+from rangesfm.ranging.readers.dwm1001 import NUMBER, XYZ
 from rangesfm.ranging.readers.printed import Phrases, printed_reader
 
-_NUMBER = r"-?\d{1,6}\.\d\d(?![\d.])"
-_XYZ = rf"(?P<x>{_NUMBER}),(?P<y>{_NUMBER}),(?P<z>{_NUMBER})"
 _QUALITY = r"\d{1,3}"
-_MEAS = rf"AN\d{{1,2}},(?P<anchor_id>[0-9A-F]{{4}}),{_XYZ},{_QUALITY},(?P<range>{_NUMBER})"
-_LEA = rf"(?<![0-9A-Za-z])(?P<anchor_id>[0-9A-F]{{4}})\[{_XYZ},{_QUALITY}\]=(?P<range>{_NUMBER})"
+_MEAS = rf"AN\d{{1,2}},(?P<anchor_id>[0-9A-F]{{4}}),{XYZ},{_QUALITY},(?P<range>{NUMBER})"
+_LEA = rf"(?<![0-9A-Za-z])(?P<anchor_id>[0-9A-F]{{4}})\[{XYZ},{_QUALITY}\]=(?P<range>{NUMBER})"
 
 MEAS = printed_reader(
     "leaps_meas",
@@ -25,9 +24,7 @@ LEA = printed_reader(
     "leaps_lea",
     "LEAPS, lea: 8EAA[5.14,-2.16,0.00,100]=1.41 ..",
     Phrases(
-        begin=re.compile(
-            rf"(?:POS\[[-\d.,]{{0,60}}\]\s*)?(?<![0-9A-Za-z])[0-9A-F]{{4}}\[{_XYZ},{_QUALITY}\]", re.ASCII
-        ),
+        begin=re.compile(rf"(?:POS\[[-\d.,]{{0,60}}\]\s*)?(?<![0-9A-Za-z])[0-9A-F]{{4}}\[{XYZ},{_QUALITY}\]", re.ASCII),
         each=re.compile(r"(?<![0-9A-Za-z])[0-9A-F]{4}\[", re.ASCII),
         whole=re.compile(_LEA, re.ASCII),
     ),
