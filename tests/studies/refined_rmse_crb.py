@@ -17,12 +17,11 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from tests.studies.simulated_survey import (
+    Case,
     Survey,
     drawn_biases,
     lap_survey,
@@ -40,15 +39,6 @@ Array = npt.NDArray[np.float64]
 MAX_RATIO = 1.15
 # Errors are those of a few slow modes of the whole map: 40 seeds know their size to some 10 %.
 MIN_RATIO = 0.75
-
-
-@dataclass(frozen=True)
-class Case:
-    """A survey, and the noise of its features in pixels."""
-
-    name: str
-    survey: Callable[[], Survey]
-    pixel_stddev: float
 
 
 CASES = (

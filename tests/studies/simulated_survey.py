@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,6 +54,15 @@ class Survey:
     @property
     def is_in_first_camera(self) -> bool:
         return self.anchor_frame != "site"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A survey to study, and the noise of its features in pixels."""
+
+    name: str
+    survey: Callable[[], Survey]
+    pixel_stddev: float
 
 
 def lap_survey(

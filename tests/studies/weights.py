@@ -16,12 +16,10 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from tests.studies.simulated_survey import (
-    Survey,
+    Case,
     drawn_biases,
     lap_survey,
     mapped,
@@ -34,15 +32,6 @@ from tests.studies.simulated_survey import (
 
 FACTORS = (0.1, 0.3, 1.0, 3.0, 10.0)
 MAX_OVER_BEST = 1.1
-
-
-@dataclass(frozen=True)
-class Case:
-    """A survey, and the noise of its features in pixels."""
-
-    name: str
-    survey: Callable[[], Survey]
-    pixel_stddev: float
 
 
 CASES = (
