@@ -18,6 +18,7 @@ from rangesfm._ceres import (
     add_ranges,
     add_residual_block,
     distance_cost,
+    keep_from_elimination,
     normal_prior_cost,
     range_cost,
     tangent_jacobian,
@@ -133,6 +134,19 @@ def variable(survey: Joint) -> list[Array]:
     blocks = [*survey.poses, *survey.anchors, *survey.biases, *(p.xyz for p in survey.reconstruction.points3D.values())]
     problem = survey.problem
     return [b for b in blocks if problem.has_parameter_block(b) and not problem.is_parameter_block_constant(b)]
+
+
+def test_it_is_the_same_of_blocks_that_are_kept_from_elimination() -> None:
+    free, kept = joint(model(), hold_first=True), joint(model(), hold_first=True)
+    for block in (*kept.anchors, *kept.biases):
+        keep_from_elimination(kept.adjuster, block, next(iter(kept.reconstruction.points3D.values())).xyz)
+    expected, found = (
+        joint_covariance(one.problem, one.reconstruction, anchors=one.anchors, others=one.biases)
+        for one in (free, kept)
+    )
+    np.testing.assert_allclose(found.anchors, expected.anchors, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(found.others, expected.others, rtol=1e-6)
+    np.testing.assert_allclose(found.centers, expected.centers, rtol=1e-6, atol=1e-12)
 
 
 @pytest.mark.parametrize("hold_anchors", [False, True], ids=["anchors free", "anchors held"])

@@ -1,9 +1,10 @@
-// Factories of the cost functions for Python, checked at the gate.
+// Factories of the cost functions and of a manifold for Python, checked at the gate.
 //
-// No class is bound. The factories return ceres::CostFunction, a type that pyceres registers, and give the object
-// away: pyceres wraps it in the holder it chose itself, owns it and deletes it.
+// No class is bound. The factories return ceres::CostFunction or ceres::Manifold, types that pyceres registers, and
+// give the object away: pyceres wraps it in the holder it chose itself, owns it and deletes it.
 
 #include <ceres/cost_function.h>
+#include <ceres/manifold.h>
 #include <ceres/version.h>
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
@@ -19,6 +20,7 @@
 #include "gate.h"
 #include "rangesfm/distance_cost.h"
 #include "rangesfm/normal_prior_cost.h"
+#include "rangesfm/padded_manifold.h"
 #include "rangesfm/range_cost.h"
 #include "rangesfm/range_error_curve.h"
 #include "rangesfm/tag_place.h"
@@ -148,6 +150,14 @@ ceres::CostFunction* MakeZeroTieCost(int size_a, int size_b) {
   return new ZeroTieCost(BlockSize("size_a", size_a), BlockSize("size_b", size_b));
 }
 
+ceres::Manifold* MakePaddedManifold(int size, int tangent_size) {
+  if (BlockSize("size", size) > BlockSize("tangent_size", tangent_size)) {
+    throw py::value_error("tangent_size is " + std::to_string(tangent_size) + ", expected at least the block's size, " +
+                          std::to_string(size));
+  }
+  return new PaddedManifold(size, tangent_size);
+}
+
 constexpr double kLeastSquares = std::numeric_limits<double>::infinity();
 constexpr auto kOwn = py::return_value_policy::take_ownership;
 
@@ -195,4 +205,6 @@ PYBIND11_MODULE(_cpp, m) {
         py::arg("stddev"));
   m.def("zero_tie_cost", &rangesfm::MakeZeroTieCost, rangesfm::kOwn, py::kw_only(), py::arg("size_a"),
         py::arg("size_b"));
+  m.def("padded_manifold", &rangesfm::MakePaddedManifold, rangesfm::kOwn, py::kw_only(), py::arg("size"),
+        py::arg("tangent_size"));
 }

@@ -2,7 +2,7 @@
 
 import numpy.typing as npt
 
-from rangesfm._ceres.types import CostFunction
+from rangesfm._ceres.types import CostFunction, Manifold
 
 version: str
 ceres_version: str
@@ -56,3 +56,4 @@ def distance_cost(
 ) -> CostFunction: ...
 def normal_prior_cost(*, mean: npt.ArrayLike, stddev: npt.ArrayLike) -> CostFunction: ...
 def zero_tie_cost(*, size_a: int, size_b: int) -> CostFunction: ...
+def padded_manifold(*, size: int, tangent_size: int) -> Manifold: ...

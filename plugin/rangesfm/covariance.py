@@ -14,7 +14,7 @@ from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix, diags
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
-from rangesfm._ceres import tangent_jacobian
+from rangesfm._ceres import num_columns, tangent_jacobian
 from rangesfm.errors import GeometryError
 from rangesfm.trajectory import pose_of
 
@@ -139,7 +139,7 @@ class _Columns:
                 "reconstruction, of anchors and others"
             )
         variable = [(kind, block) for kind, block in known if not problem.is_parameter_block_constant(block)]
-        sizes = [problem.parameter_block_tangent_size(block) for _, block in variable]
+        sizes = [num_columns(problem, block) for _, block in variable]
         return cls(
             np.array(frames, dtype=np.int64),
             poses,

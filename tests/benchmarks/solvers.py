@@ -264,7 +264,7 @@ def hold_or_tie(
             if problem.has_parameter_block(block) and not (free and block is anchor):
                 problem.set_parameter_block_constant(block)
         if free and problem.has_parameter_block(anchor):
-            _ceres.add_residual_block(adjuster, _ceres.zero_tie_cost(size_a=3, size_b=3), None, [anchor, point.xyz])
+            _ceres.keep_from_elimination(adjuster, anchor, point.xyz)
 
 
 def add_python_ranges(

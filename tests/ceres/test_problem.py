@@ -18,8 +18,9 @@ from rangesfm._ceres import (
     add_residual_block,
     cauchy_loss,
     distance_cost,
+    keep_from_elimination,
+    normal_prior_cost,
     range_cost,
-    zero_tie_cost,
 )
 
 if TYPE_CHECKING:
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 TAG_IN_CAM_M = np.array([-0.0012, -0.0900, -0.0663])
+ANCHOR_IN_WORLD_M = np.array([3.0, -2.0, 1.0])
+START_ERROR_M = np.array([0.3, 0.2, -0.1])
 
 
 def cost_of(problem: pyceres.Problem) -> float:
@@ -145,24 +148,50 @@ def test_a_pose_that_the_adjuster_holds_is_no_part_of_its_problem_until_a_range_
 
 
 @pytest.mark.parametrize(
-    ("tied", "structure"), [(True, "2,3,d"), (False, "d,d,d")], ids=["tied to a point", "not tied"]
+    ("kept", "structure"), [(True, "2,3,6"), (False, "d,d,d")], ids=["kept from elimination", "left alone"]
 )
-def test_a_free_anchor_and_bias_keep_out_of_the_eliminated_points_where_tied(
-    reconstruction: pycolmap.Reconstruction, tied: bool, structure: str, adjuster_of: AdjusterOf, pose_block: PoseBlock
+def test_a_free_anchor_and_bias_leave_the_solver_its_kernels_where_kept_from_elimination(
+    reconstruction: pycolmap.Reconstruction, kept: bool, structure: str, adjuster_of: AdjusterOf, pose_block: PoseBlock
 ) -> None:
-    adjuster = adjuster_of(reconstruction)
-    anchor, bias = np.array([3.0, -2.0, 1.0]), np.zeros(1)
-    for frame_id in reconstruction.reg_frame_ids():
-        cost = range_cost(range_m=4.0, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=0.1)
-        add_residual_block(adjuster, cost, None, [pose_block(reconstruction, frame_id), anchor, bias])
-    if tied:
-        point = next(iter(reconstruction.points3D.values())).xyz
-        add_residual_block(adjuster, zero_tie_cost(size_a=3, size_b=3), None, [anchor, point])
-        add_residual_block(adjuster, zero_tie_cost(size_a=1, size_b=3), None, [bias, point])
-    adjuster.options.ceres.solver_options.linear_solver_type = pyceres.LinearSolverType.SPARSE_SCHUR
+    adjuster, anchor, bias = adjuster_with_free_anchor(reconstruction, adjuster_of, pose_block)
+    if kept:
+        keep_from_elimination(adjuster, anchor, next(iter(reconstruction.points3D.values())).xyz)
+        keep_from_elimination(adjuster, bias, next(iter(reconstruction.points3D.values())).xyz)
     summary = adjuster.solve()
     assert isinstance(summary, pycolmap.CeresBundleAdjustmentSummary)
     assert summary.ceres_summary.schur_structure_used == structure
+
+
+def test_what_is_kept_from_elimination_ends_at_the_same_place(
+    reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf, pose_block: PoseBlock
+) -> None:
+    ends = []
+    for kept in (True, False):
+        copy = pycolmap.Reconstruction(reconstruction)
+        adjuster, anchor, bias = adjuster_with_free_anchor(copy, adjuster_of, pose_block)
+        if kept:
+            keep_from_elimination(adjuster, anchor, next(iter(copy.points3D.values())).xyz)
+            keep_from_elimination(adjuster, bias, next(iter(copy.points3D.values())).xyz)
+        adjuster.solve()
+        ends.append(np.concatenate([anchor, bias]))
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
+    assert np.linalg.norm(ends[0][:3] - ANCHOR_IN_WORLD_M) < 1e-4
+
+
+def adjuster_with_free_anchor(
+    reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf, pose_block: PoseBlock
+) -> tuple[pycolmap.CeresBundleAdjuster, Array, Array]:
+    """Ranges without error from every frame to an anchor that is thought to be elsewhere, and its bias."""
+    adjuster, anchor, bias = adjuster_of(reconstruction), ANCHOR_IN_WORLD_M + START_ERROR_M, np.zeros(1)
+    for frame_id in reconstruction.reg_frame_ids():
+        pose = pose_block(reconstruction, frame_id)
+        unbiased = range_cost(range_m=1.0, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=1.0)
+        distance = unbiased.evaluate(pose, ANCHOR_IN_WORLD_M, bias)[0].item() + 1.0
+        cost = range_cost(range_m=distance, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=0.1)
+        add_residual_block(adjuster, cost, None, [pose, anchor, bias])
+    add_residual_block(adjuster, normal_prior_cost(mean=[0.0], stddev=[0.1]), None, [bias])
+    adjuster.options.ceres.solver_options.linear_solver_type = pyceres.LinearSolverType.SPARSE_SCHUR
+    return adjuster, anchor, bias
 
 
 LIFETIMES = """
@@ -191,6 +220,8 @@ LIFETIMES = """
             blocks = [reconstruction.frame(frame_id).rig_from_world.params, np.ones(3), np.zeros(1)]
             _ceres.add_residual_block(adjuster, cost, loss, blocks)
             residuals.append((cost, loss, blocks))
+            point = next(iter(reconstruction.points3D.values())).xyz
+            _ceres.keep_from_elimination(adjuster, blocks[1], point)
         poses = [reconstruction.frame(frame_id).rig_from_world.params for frame_id in reconstruction.reg_frame_ids()]
         rows = np.arange(4)
         ranges = _ceres.PlacedRanges(

@@ -14,8 +14,8 @@ namespace rangesfm {
 // does a free bias. Then the blocks to eliminate are no longer all of size 3 in rows of 2, Ceres falls back from its
 // specialised kernels (2,3,6 or 2,3,d) to the general one (d,d,d), and eliminating the anchor couples all the poses it
 // was ranged from. Tied to a 3-D point that is seen in fewer images than the block has neighbours, it stays out of the
-// set. Every free anchor and every free bias needs a tie of its own. Two rows, since a reprojection has two: the rows
-// of the points must all be of that size.
+// set, and padded_manifold.h makes it as wide as a pose. Every free anchor and every free bias needs a tie of its own.
+// Two rows, since a reprojection has two: the rows of the points must all be of that size.
 //
 // Blocks: any two, for example anchor_in_world (3) and a 3-D point (3).
 class ZeroTieCost final : public ceres::CostFunction {

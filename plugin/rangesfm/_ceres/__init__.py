@@ -33,9 +33,9 @@ from rangesfm._ceres.costs import (
     range_cost,
     zero_tie_cost,
 )
-from rangesfm._ceres.jacobian import tangent_jacobian
+from rangesfm._ceres.jacobian import num_columns, tangent_jacobian
 from rangesfm._ceres.many_ranges import AddedRanges, PlacedRanges, RangeBlocks, add_ranges, combine_ranges
-from rangesfm._ceres.problem import add_residual_block, cauchy_loss
+from rangesfm._ceres.problem import add_residual_block, cauchy_loss, keep_from_elimination
 from rangesfm._ceres.types import CostFunction, LossFunction
 
 __all__ = [
@@ -57,7 +57,9 @@ __all__ = [
     "fixed_pose_range_cost",
     "installed_version",
     "interpolated_range_cost",
+    "keep_from_elimination",
     "normal_prior_cost",
+    "num_columns",
     "pyceres_ceres_version",
     "range_cost",
     "tangent_jacobian",

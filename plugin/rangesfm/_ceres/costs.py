@@ -201,11 +201,7 @@ def normal_prior_cost(*, mean: npt.ArrayLike, stddev: npt.ArrayLike) -> CostFunc
 
 
 def zero_tie_cost(*, size_a: int, size_b: int) -> CostFunction:
-    """Two residuals, always zero, that tie two blocks of these sizes; for the solver's sake only.
-
-    Each free anchor and each free range bias should be tied to a 3-D point that few images see: otherwise
-    Ceres eliminates it together with the points and loses its specialised kernels.
-    """
+    """Two residuals, always zero, that tie two blocks of these sizes; ``keep_from_elimination`` says what for."""
     check_compatibility()
     from rangesfm import _cpp
 

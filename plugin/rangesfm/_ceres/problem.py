@@ -10,12 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm._ceres.compatibility import check_compatibility
+from rangesfm._ceres.costs import zero_tie_cost
 from rangesfm._ceres.types import CostFunction, LossFunction
 
 if TYPE_CHECKING:
     import pycolmap
 
 _NUM_POSE_PARAMS = 7
+_NUM_POSE_COLUMNS = 6
 
 
 def cauchy_loss(scale: float) -> LossFunction:
@@ -52,6 +55,31 @@ def add_residual_block(
         ValueError: a block is no such array, or given twice, or not of the cost's size.
     """
     ResidualAdder(adjuster).add(cost, loss, blocks)
+
+
+def keep_from_elimination(
+    adjuster: pycolmap.CeresBundleAdjuster, block: npt.NDArray[np.float64], point: npt.NDArray[np.float64]
+) -> None:
+    """Have Ceres eliminate the 3-D points alone, with its fastest kernels; for each free anchor, bias and the like.
+
+    Ceres eliminates a set of blocks no two of which share a residual, first those of few neighbours, and has kernels
+    for blocks of one size that see blocks of one other size. Left alone, an anchor is taken for one of the points, and
+    eliminating it couples all poses that it was ranged from. So it is tied to a point by residuals that are always
+    zero; and takes as many columns as a pose, the last of them zero, since the kernels are for one size.
+
+    Args:
+        adjuster: as in ``add_residual_block``.
+        block: part of its problem, not constant, of 6 numbers at most.
+        point: a 3-D point's block that fewer images see than ``block`` has neighbours; it may hold several ties.
+    """
+    check_compatibility()
+    from rangesfm import _cpp
+
+    add_residual_block(adjuster, zero_tie_cost(size_a=len(block), size_b=len(point)), None, [block, point])
+    if not adjuster.problem.has_manifold(block):
+        manifold = _cpp.padded_manifold(size=len(block), tangent_size=_NUM_POSE_COLUMNS)
+        adjuster.problem.set_manifold(block, manifold)
+        _used_by_adjuster[adjuster].append(manifold)
 
 
 class ResidualAdder:

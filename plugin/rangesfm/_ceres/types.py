@@ -19,6 +19,13 @@ class CostFunction(Protocol):
         """Residuals (n, 1), and for each block of size k the Jacobian (n, k)."""
 
 
+class Manifold(Protocol):
+    """A ``pyceres.Manifold``."""
+
+    def ambient_size(self) -> int: ...
+    def tangent_size(self) -> int: ...
+
+
 class LossFunction(Protocol):
     """A ``pyceres.LossFunction``."""
 

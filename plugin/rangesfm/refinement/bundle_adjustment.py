@@ -73,14 +73,10 @@ class BundleAdjustment:
         return float(np.sqrt(2 * np.mean(residuals**2)))
 
     def keep_from_elimination(self, block: Array) -> None:
-        """Have Ceres eliminate the map's points only: its kernels are made for them, and their residuals are alike.
-
-        It eliminates what shares residuals with few other blocks, and not two blocks that share one.
-        """
+        """Have Ceres eliminate the map's points only; see ``keep_from_elimination`` of the costs."""
         tie_point = next(self.tie_points, None)
         if tie_point is not None:
-            tie = _ceres.zero_tie_cost(size_a=len(block), size_b=3)
-            _ceres.add_residual_block(self.adjuster, tie, None, [block, tie_point])
+            _ceres.keep_from_elimination(self.adjuster, block, tie_point)
 
 
 def bundle_adjustment(
