@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rangesfm.scale.inlier_noise import inlier_stddev
+from rangesfm.scale.inlier_noise import inlier_noise, inlier_stddev
 
 
 def spoilt(num: int, share: float, side: float, seed: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
@@ -39,3 +39,16 @@ def test_the_order_and_the_unit_do_not_matter() -> None:
 @pytest.mark.parametrize("num", [0, 3, 50])
 def test_residuals_of_zero_leave_a_stddev_that_can_be_divided_by(num: int) -> None:
     assert 0 < inlier_stddev(np.zeros(num)) < 1e-6
+
+
+def test_the_likelier_of_two_explanations_leaves_a_narrow_bulk_and_outliers() -> None:
+    residuals = spoilt(400, 0.7, 1.0, seed=0)
+    smeared = residuals - np.median(residuals)
+    assert inlier_noise(residuals).log_likelihood > inlier_noise(smeared).log_likelihood + 10
+
+
+@pytest.mark.parametrize("num", [300, 20_000])
+def test_the_likelihood_without_outliers_is_that_of_gaussian_noise(num: int) -> None:
+    residuals = spoilt(num, 0.0, 1.0, seed=1)
+    gaussian = -0.5 * np.sum((residuals / 0.1) ** 2) - num * np.log(0.1 * np.sqrt(2 * np.pi))
+    assert inlier_noise(residuals).log_likelihood == pytest.approx(gaussian, rel=0.02)

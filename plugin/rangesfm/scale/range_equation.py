@@ -327,6 +327,12 @@ def _prior_residuals(problem: RangeProblem, columns: _Columns, state: RangeState
     return np.concatenate(priors)
 
 
+def prior_cost(problem: RangeProblem, state: RangeState) -> float:
+    """Half the sum of squares of what priors, distances and gravity have against a state."""
+    off = _prior_residuals(problem, _columns(problem), state)
+    return 0.5 * float(off @ off)
+
+
 def _prior_jacobian(problem: RangeProblem, columns: _Columns, start: RangeState, state: RangeState) -> Array:
     anchors, biases = _prior_rows(problem, columns)
     jacobian = np.zeros((3 * len(anchors) + len(biases), columns.num))

@@ -13,8 +13,8 @@ from rangesfm.errors import GeometryError
 from rangesfm.geometry import NEARLY_STRAIGHT, path_kind, path_shape
 from rangesfm.ranging.noise import correlation_inflation
 from rangesfm.scale.anchor_plane import camera_side_of, mirrored_map, on_side
-from rangesfm.scale.inlier_noise import inlier_stddev
-from rangesfm.scale.range_equation import RangeFit, RangeProblem, solve
+from rangesfm.scale.inlier_noise import InlierNoise, inlier_noise
+from rangesfm.scale.range_equation import RangeFit, RangeProblem, RangeState, predicted_ranges, prior_cost, solve
 from rangesfm.scale.robust_loss import GEMAN_MCCLURE
 from rangesfm.scale.starts import (
     complete_unknown_anchors,
@@ -81,13 +81,65 @@ def solve_survey(
     Raises:
         GeometryError: nothing fits, or two different maps do.
     """
-    rivals = _distinct_fits(problem, anchors_are_known, seed)
+    errors = _ErrorModel(center_stddev, noise_stddev_m, shared_stddev_m, groups)
     camera_side = camera_side if problem.frame_is_free else None
-    rivals = on_side(problem, rivals, camera_side)
-    solution = _with_own_noise(problem, rivals[0], center_stddev, noise_stddev_m, shared_stddev_m, groups)
-    on_side(problem, [solution.fit], camera_side)
-    _refuse_ambiguity(solution, rivals[1:], camera_side)
-    return solution
+    fits = on_side(problem, _distinct_fits(problem, anchors_are_known, seed), camera_side)
+    starts = [fit.state for fit in fits]
+    if anchors_are_known and not problem.frame_is_free:
+        starts += _consensus_states(problem)
+    solutions = [_with_own_noise(problem, errors, start) for start in _likeliest_each_once(problem, errors, starts)]
+    solutions.sort(key=lambda solution: _view(problem, errors, solution.fit.state).unlikeliness)
+    on_side(problem, [solutions[0].fit], camera_side)
+    _refuse_ambiguity(solutions[0], [solution.fit.state for solution in solutions[1:]], camera_side)
+    return solutions[0]
+
+
+@dataclass(frozen=True)
+class _ErrorModel:
+    """What is known of the ranges' errors; the arrays are those of ``solve_survey``."""
+
+    center_stddev: Array
+    noise_stddev_m: Array
+    shared_stddev_m: Array
+    groups: npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class _View:
+    """A state as its residuals show it.
+
+    Attributes:
+        noise: of the ranges without special cases.
+        unlikeliness: negative logarithm of the posterior, up to a constant.
+    """
+
+    noise: InlierNoise
+    unlikeliness: float
+
+
+def _view(problem: RangeProblem, errors: _ErrorModel, state: RangeState) -> _View:
+    residuals = predicted_ranges(problem, state) - problem.range_m
+    # Ranges that are off together for being short say nothing on the noise of the others.
+    ordinary = errors.shared_stddev_m**2 < 0.5 * problem.stddev_m**2
+    noise = inlier_noise(residuals[ordinary] if np.mean(ordinary) > _MIN_ORDINARY else residuals)
+    return _View(noise, prior_cost(problem, state) - noise.log_likelihood)
+
+
+def _consensus_states(problem: RangeProblem) -> list[RangeState]:
+    """Where most ranges agree, as it stands: a fit that starts there may follow the outliers away."""
+    starts = first_camera_starts(_known_only(problem))[:_NUM_ALTERNATIVES]
+    if np.isinf(problem.anchor_stddev_m).any():
+        return [complete_unknown_anchors(problem, start) for start in starts]
+    return starts
+
+
+def _likeliest_each_once(problem: RangeProblem, errors: _ErrorModel, states: list[RangeState]) -> list[RangeState]:
+    """The likeliest states, best first, of each map one."""
+    distinct: list[RangeState] = []
+    for state in sorted(states, key=lambda state: _view(problem, errors, state).unlikeliness):
+        if all(_differ(problem, state, other) for other in distinct) and len(distinct) < _NUM_ALTERNATIVES:
+            distinct.append(state)
+    return distinct
 
 
 def _distinct_fits(problem: RangeProblem, anchors_are_known: bool, seed: int) -> list[RangeFit]:
@@ -118,7 +170,7 @@ def _each_once(problem: RangeProblem, fits: list[RangeFit]) -> list[RangeFit]:
     """The best fits, best first, of each map one."""
     distinct: list[RangeFit] = []
     for fit in sorted(fits, key=lambda f: f.cost):
-        if all(_differ(problem, fit, other) for other in distinct) and len(distinct) < _NUM_ALTERNATIVES:
+        if all(_differ(problem, fit.state, other.state) for other in distinct) and len(distinct) < _NUM_ALTERNATIVES:
             distinct.append(fit)
     return distinct
 
@@ -139,9 +191,9 @@ def _between_points(distances: LocatedDistances | None) -> LocatedDistances | No
     return None if distances is None else distances.subset(distances.anchor_pair[:, 0] < 0)
 
 
-def _differ(problem: RangeProblem, first: RangeFit, second: RangeFit) -> bool:
-    """Whether two fits are different maps, not the same one twice."""
-    a, b = first.state.metric_from_model, second.state.metric_from_model
+def _differ(problem: RangeProblem, first: RangeState, second: RangeState) -> bool:
+    """Whether two states are different maps, not the same one twice."""
+    a, b = first.metric_from_model, second.metric_from_model
     scales_differ = bool(abs(np.log(a.scale / b.scale)) > _SAME_LOG_SCALE)
     if scales_differ or not problem.frame_is_free:
         return scales_differ
@@ -151,49 +203,49 @@ def _differ(problem: RangeProblem, first: RangeFit, second: RangeFit) -> bool:
     return bool(turn > _SAME_ROTATION_DEG or shift > _SAME_SHIFT)
 
 
-def _with_own_noise(
-    problem: RangeProblem,
-    start: RangeFit,
-    center_stddev: Array,
-    noise_stddev_m: Array,
-    shared_stddev_m: Array,
-    groups: npt.NDArray[np.int64],
-) -> Solution:
-    """Alternate between the fit and the noise it shows."""
-    bias_stddev, common_bias_stddev, distances = (
-        problem.bias_stddev_m,
-        problem.common_bias_stddev_m,
-        problem.distances,
-    )
-    gravity = problem.gravity
-    fit, inflation, noise = start, 1.0, inlier_stddev(start.residuals_m)
+def _with_own_noise(given: RangeProblem, errors: _ErrorModel, start: RangeState) -> Solution:
+    """Alternate between the fit and the noise it shows.
+
+    Where most ranges are wrong, a fit can follow them, find the noise larger, take in more of them, and so on. Such a
+    fit is less likely than the state that it came from, and then the noise stays as that showed it.
+    """
+    likeliest, state, inflation = _view(given, errors, start), start, 1.0
     for _ in range(_NUM_NOISE_ROUNDS):
-        base = np.where(np.isfinite(noise_stddev_m), noise_stddev_m, noise)
-        interpolation = fit.state.metric_from_model.scale * center_stddev
-        stddev = np.sqrt(base**2 + interpolation**2 + shared_stddev_m**2)
-        # Correlated errors are worth fewer ranges; the ranges keep their nominal weight among
-        # themselves and the priors gain by as much instead.
-        problem = replace(
-            problem,
-            stddev_m=stddev,
-            bias_stddev_m=bias_stddev / inflation,
-            common_bias_stddev_m=common_bias_stddev / inflation,
-            distances=None if distances is None else replace(distances, stddev_m=distances.stddev_m / inflation),
-            gravity=None if gravity is None else replace(gravity, stddev=gravity.stddev / inflation),
-        )
-        fit = solve(problem, fit.state, loss=GEMAN_MCCLURE)
-        inflation = correlation_inflation(fit.residuals_m / stddev, fit.weights, groups)
-        ordinary = shared_stddev_m < noise
-        noise = inlier_stddev(fit.residuals_m[ordinary] if np.mean(ordinary) > _MIN_ORDINARY else fit.residuals_m)
-    return Solution(problem, fit, inflation, noise)
+        problem = _weighted(given, errors, state, likeliest.noise.stddev, inflation)
+        fit = solve(problem, state, loss=GEMAN_MCCLURE)
+        inflation = correlation_inflation(fit.residuals_m / problem.stddev_m, fit.weights, errors.groups)
+        state = fit.state
+        likeliest = min(likeliest, _view(given, errors, state), key=lambda view: view.unlikeliness)
+    return Solution(problem, fit, inflation, likeliest.noise.stddev)
 
 
-def _refuse_ambiguity(solution: Solution, rivals: list[RangeFit], camera_side: str | None) -> None:
+def _weighted(
+    problem: RangeProblem, errors: _ErrorModel, state: RangeState, noise: float, inflation: float
+) -> RangeProblem:
+    """The problem as set up, weighted by the noise.
+
+    Correlated errors are worth fewer ranges; the ranges keep their nominal weight among themselves and the priors gain
+    by as much instead.
+    """
+    base = np.where(np.isfinite(errors.noise_stddev_m), errors.noise_stddev_m, noise)
+    interpolation = state.metric_from_model.scale * errors.center_stddev
+    distances, gravity = problem.distances, problem.gravity
+    return replace(
+        problem,
+        stddev_m=np.sqrt(base**2 + interpolation**2 + errors.shared_stddev_m**2),
+        bias_stddev_m=problem.bias_stddev_m / inflation,
+        common_bias_stddev_m=problem.common_bias_stddev_m / inflation,
+        distances=None if distances is None else replace(distances, stddev_m=distances.stddev_m / inflation),
+        gravity=None if gravity is None else replace(gravity, stddev=gravity.stddev / inflation),
+    )
+
+
+def _refuse_ambiguity(solution: Solution, rivals: list[RangeState], camera_side: str | None) -> None:
     problem = solution.problem
     for rival in rivals:
-        other = solve(solution.problem, rival.state, loss=GEMAN_MCCLURE, tolerance=1e-8)
+        other = solve(solution.problem, rival, loss=GEMAN_MCCLURE, tolerance=1e-8)
         is_elsewhere = camera_side is not None and camera_side_of(problem, other.state) not in (camera_side, None)
-        if is_elsewhere or not _differ(solution.problem, other, solution.fit):
+        if is_elsewhere or not _differ(solution.problem, other.state, solution.fit.state):
             continue
         gap = (other.cost - solution.fit.cost) / solution.inflation**2
         if gap < MIN_COST_GAP:
