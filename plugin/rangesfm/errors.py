@@ -9,10 +9,18 @@ from __future__ import annotations
 from pathlib import Path
 
 
+def one_line(text: str) -> str:
+    """``text`` without line breaks and whatever else a terminal would not print but obey."""
+    return "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in text)
+
+
 class RangesfmError(Exception):
-    """Root of all errors raised on purpose. Its text is one line for the user."""
+    """Root of all errors raised on purpose. Its text is one line for the user, whatever names the files hold."""
 
     exit_status = 4
+
+    def __init__(self, message: str):
+        super().__init__(one_line(message))
 
 
 class InputError(RangesfmError):

@@ -36,6 +36,11 @@ class Similarity:
         return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
 
 
+def overflow_raised() -> np.errstate:
+    """Within it, numbers that run over, and infinite ones that cancel, raise FloatingPointError."""
+    return np.errstate(over="raise", invalid="raise", divide="raise")
+
+
 IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 
 

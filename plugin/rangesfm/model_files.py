@@ -2,122 +2,103 @@
 
 from __future__ import annotations
 
-import mmap
-import struct
-from collections.abc import Callable
+import tempfile
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
 from rangesfm.errors import InputError
+from rangesfm.model_records import MAX_COORDINATE, MODEL_FILES, check_map, read_records
 
 _EXPECTED = "expected cameras, images and points3D files that COLMAP wrote"
+# Text files round quaternions, and some programs write a few digits only.
+_MAX_QUATERNION_ERROR = 1e-2
+_UNIT_LENGTH_ERROR = 1e-9
+_MAX_IMAGE_SIZE = 1_000_000
 
 
 def read_model(path: Path) -> pycolmap.Reconstruction:
     """A COLMAP model, binary or text.
 
     Raises:
-        InputError: there is none, or its files are damaged.
+        InputError: there is none, or its files are damaged: COLMAP takes much of them for granted, and what it does
+            with the rest later, in its own code, is not for a user to meet.
     """
     if not any((path / f"cameras{ending}").is_file() for ending in (".bin", ".txt")):
         nested = f"; is it {path / '0'}?" if (path / "0").is_dir() else ""
         raise InputError(f"not a COLMAP model, {_EXPECTED}{nested}", path)
-    for name, walk in _WALKS.items():
-        _check_length(path / name, walk)
+    records = {name: read_records(path / name) for name in MODEL_FILES if (path / name).is_file()}
     try:
         model = pycolmap.Reconstruction(path)
     except (OSError, ValueError, RuntimeError, LookupError, MemoryError) as error:
         raise InputError(f"not a readable COLMAP model, {_EXPECTED}", path) from error
-    for image in model.images.values():
-        if image.has_pose and not np.isfinite(image.cam_from_world().matrix()).all():
-            raise InputError(f"the pose of {image.name} is not finite", path)
+    _check_names(model, path)
+    _check_cameras(model, path)
+    _check_poses(model, path)
+    if "images.bin" in records and "points3D.bin" in records:
+        check_map(records["images.bin"], records["points3D.bin"])
+    else:
+        _check_map_of_text(model, path)
     return model
 
 
-class _Cursor:
-    """Steps through the records of a binary file, and fails beyond its end."""
-
-    def __init__(self, data: mmap.mmap):
-        self._data = data
-        self._place = 0
-
-    def number(self, code: str) -> int:
-        """The next integer, little-endian, by its struct code."""
-        (value,) = struct.unpack_from(f"<{code}", self._data, self._place)
-        self._place += struct.calcsize(f"<{code}")
-        return int(value)
-
-    def skip(self, num_bytes: int) -> None:
-        self._place += num_bytes
-        if self._place > len(self._data):
-            raise struct.error
-
-    def skip_text(self) -> None:
-        """Up to and with the zero byte that ends it."""
-        end = self._data.find(b"\0", self._place)
-        self.skip(end + 1 - self._place if end >= 0 else len(self._data))
+def _check_names(model: pycolmap.Reconstruction, path: Path) -> None:
+    names: Counter[str] = Counter()
+    for image_id, image in model.images.items():
+        try:
+            name = str(image.name)
+        except UnicodeDecodeError:
+            name = ""
+        if not name or not name.isprintable():
+            raise InputError(f"image {image_id} has no printable name", path)
+        names[name] += 1
+    repeated = next((name for name, num in names.items() if num > 1), None)
+    if repeated is not None:
+        raise InputError(f"{names[repeated]} images are called {repeated}, expected each name once", path)
 
 
-def _check_length(path: Path, walk: Callable[[_Cursor], None]) -> None:
-    """Refuse a binary file that ends before the records that it announces.
-
-    COLMAP goes on reading then, and may take any count for granted: it runs for minutes and fills the memory.
-    """
-    if not path.is_file():
-        return
-    try:
-        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            cursor = _Cursor(data)
-            for _ in range(cursor.number("Q")):
-                walk(cursor)
-    except (OSError, OverflowError, ValueError, struct.error) as error:
-        raise InputError("is damaged or cut off: it announces more than it holds", path) from error
+def _check_cameras(model: pycolmap.Reconstruction, path: Path) -> None:
+    for camera_id, camera in model.cameras.items():
+        if not (1 <= camera.width <= _MAX_IMAGE_SIZE and 1 <= camera.height <= _MAX_IMAGE_SIZE):
+            raise InputError(f"camera {camera_id} has photos of {camera.width} x {camera.height} pixels", path)
+        if not (np.isfinite(camera.params).all() and np.all(camera.params[camera.focal_length_idxs()] > 0)):
+            raise InputError(f"the parameters of camera {camera_id} are not those of a camera", path)
 
 
-def _walk_camera(cursor: _Cursor) -> None:
-    cursor.skip(4)
-    model = cursor.number("i")
-    cursor.skip(16 + 8 * _NUM_PARAMS.get(model, 0))
+def _check_poses(model: pycolmap.Reconstruction, path: Path) -> None:
+    """Check all poses, and make the quaternions of unit length, which everything later takes them for."""
+    for rig_id, rig in model.rigs.items():
+        for sensor_id, sensor_from_rig in rig.non_ref_sensors.items():
+            if sensor_from_rig is not None:
+                what = f"the pose of sensor {sensor_id.id} in rig {rig_id}"
+                rig.set_sensor_from_rig(sensor_id, _checked(sensor_from_rig, what, path))
+    for frame_id in model.reg_frame_ids():
+        frame = model.frame(frame_id)
+        image_ids = [data_id.id for data_id in frame.image_ids]
+        if not image_ids or not all(map(model.exists_image, image_ids)):
+            raise InputError(f"frame {frame_id} has a pose and no image, or one that is not there", path)
+        what = f"the pose of {min(model.image(image_id).name for image_id in image_ids)}"
+        frame.rig_from_world = _checked(frame.rig_from_world, what, path)
 
 
-def _walk_rig(cursor: _Cursor) -> None:
-    cursor.skip(4)
-    num_sensors = cursor.number("I")
-    cursor.skip(8 if num_sensors else 0)
-    for _ in range(num_sensors - 1):
-        cursor.skip(8)
-        cursor.skip(56 if cursor.number("B") else 0)
+def _checked(pose: pycolmap.Rigid3d | None, what: str, path: Path) -> pycolmap.Rigid3d:
+    assert pose is not None
+    params = np.array(pose.params)
+    if not np.all(np.abs(params) <= MAX_COORDINATE):
+        raise InputError(f"{what} is not finite", path)
+    length = float(np.linalg.norm(params[:4]))
+    if abs(length - 1) > _MAX_QUATERNION_ERROR:
+        raise InputError(f"{what} has a quaternion of length {length:.4g}, expected 1", path)
+    if abs(length - 1) <= _UNIT_LENGTH_ERROR:
+        return pose
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(params[:4] / length), params[4:])
 
 
-def _walk_frame(cursor: _Cursor) -> None:
-    cursor.skip(64)
-    cursor.skip(16 * cursor.number("I"))
-
-
-def _walk_image(cursor: _Cursor) -> None:
-    cursor.skip(64)
-    cursor.skip_text()
-    cursor.skip(24 * cursor.number("Q"))
-
-
-def _walk_point(cursor: _Cursor) -> None:
-    cursor.skip(43)
-    cursor.skip(8 * cursor.number("Q"))
-
-
-_NUM_PARAMS = {
-    int(model): len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params)
-    for name, model in pycolmap.CameraModelId.__members__.items()
-    if name != "INVALID"
-}
-
-# COLMAP's binary files, each a count and so many records.
-_WALKS = {
-    "cameras.bin": _walk_camera,
-    "rigs.bin": _walk_rig,
-    "frames.bin": _walk_frame,
-    "images.bin": _walk_image,
-    "points3D.bin": _walk_point,
-}
+def _check_map_of_text(model: pycolmap.Reconstruction, path: Path) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        model.write_binary(folder)
+        images, points = (read_records(Path(folder) / name) for name in ("images.bin", "points3D.bin"))
+    check_map(replace(images, path=path), replace(points, path=path))

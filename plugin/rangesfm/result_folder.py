@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -16,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.errors import InputError
 from rangesfm.geometry import Similarity
 from rangesfm.georeference import Georeference
+from rangesfm.json_files import read_json
 from rangesfm.options import AssociationOptions
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.tables import read_table
@@ -245,12 +245,7 @@ def read_result_folder(path: Path) -> ResultFolder:
     result_path = path / "result.json"
     if not result_path.is_file():
         raise InputError("not a result folder: it has no result.json (expected the output_path of a run)", path)
-    try:
-        summary = json.loads(result_path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        raise InputError(f"not JSON: {error.msg}", result_path, error.lineno) from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError("cannot be read as text", result_path) from error
+    summary = read_json(result_path)
     if not isinstance(summary, dict):
         raise InputError("expected a JSON object", result_path, 1)
     return ResultFolder(path, summary, _read_image_times(path / "images.csv"))

@@ -103,7 +103,7 @@ def _whose(text: str) -> str:
         host = "" if holder["host"] == socket.gethostname() else f" on {holder['host']}"
         who, since = f"process {holder['pid']}{host} ({holder['command']})", holder["since"]
         return f"{who} has been writing to this folder since {since}"
-    except (ValueError, TypeError, KeyError):  # it has only just begun
+    except (ValueError, TypeError, KeyError, RecursionError):  # it has only just begun
         return "another process is writing to this folder"
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.errors import InputError
+from rangesfm.errors import InputError, one_line
 from rangesfm.plain_tables import PlainColumn, find_columns
 
 _HEAD_BYTES = 1 << 16
@@ -226,8 +226,7 @@ def guess_separator(row: str) -> str:
 
 def printable(text: str) -> str:
     """``text`` fit for one line of a message."""
-    shown = text if len(text) <= _MAX_SHOWN else text[:_MAX_SHOWN] + "..."
-    return "".join(character if character.isprintable() else "?" for character in shown)
+    return one_line(text if len(text) <= _MAX_SHOWN else text[:_MAX_SHOWN] + "...")
 
 
 def _read_bytes(path: str | Path, num: int = -1) -> bytes:

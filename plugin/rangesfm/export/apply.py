@@ -19,7 +19,8 @@ from rangesfm.export.colmap import write_model
 from rangesfm.export.metric_map import Array
 from rangesfm.export.ply_transform import transform_ply
 from rangesfm.files import make_output_folder, new_file
-from rangesfm.geometry import Similarity, align_points, rmse
+from rangesfm.geometry import Similarity, align_points, overflow_raised, rmse
+from rangesfm.json_files import read_json
 from rangesfm.model_files import read_model
 from rangesfm.model_transform import rescale
 from rangesfm.tables import read_text
@@ -86,12 +87,11 @@ def _transform_obj(path: Path, metric_from_sfm: Similarity, target: Path) -> Pat
         words = line.split()
         if words[:1] in (["v"], ["vn"]):
             try:
-                at = np.array([float(word) for word in words[1:4]])
-            except ValueError:
-                at = np.zeros(0)
-            if len(at) != 3:
-                raise InputError(f"'{line[:60]}' is no vertex, expected three numbers", path, number)
-            moved = metric_from_sfm.apply(at) if words[0] == "v" else metric_from_sfm.rotation @ at
+                at = np.array([float(word) for word in words[1:4]]).reshape(3)
+                with overflow_raised():
+                    moved = metric_from_sfm.apply(at) if words[0] == "v" else metric_from_sfm.rotation @ at
+            except (ValueError, FloatingPointError):
+                raise InputError(f"'{line[:60]}' is no vertex, expected three numbers", path, number) from None
             line = " ".join([words[0], *(f"{value:.10g}" for value in moved), *words[4:]])
         lines.append(line)
     with new_file(target) as temporary:
@@ -100,24 +100,24 @@ def _transform_obj(path: Path, metric_from_sfm: Similarity, target: Path) -> Pat
 
 
 def _transform_json(path: Path, metric_from_sfm: Similarity, target: Path) -> Path:
+    content = read_json(path)
     try:
-        content = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
-        raise InputError(f"not JSON: {error.msg}", path, error.lineno) from error
-    try:
-        if isinstance(content, dict) and "frames" in content:
-            _move_nerfstudio(content, metric_from_sfm)
-        elif isinstance(content, list) and content and "position" in content[0]:
-            _move_splatting(content, metric_from_sfm)
-        else:
-            raise InputError(
-                "holds no cameras, expected nerfstudio's transforms.json or a splatting cameras.json", path
-            )
-    except (KeyError, TypeError, ValueError) as error:
+        with overflow_raised():
+            _move_cameras(content, metric_from_sfm, path)
+    except (ArithmeticError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"a camera is not as expected ({error!r})", path) from error
     with new_file(target) as temporary:
         temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     return target
+
+
+def _move_cameras(content: Json, metric_from_sfm: Similarity, path: Path) -> None:
+    if isinstance(content, dict) and "frames" in content:
+        _move_nerfstudio(content, metric_from_sfm)
+    elif isinstance(content, list) and content and "position" in content[0]:
+        _move_splatting(content, metric_from_sfm)
+    else:
+        raise InputError("holds no cameras, expected nerfstudio's transforms.json or a splatting cameras.json", path)
 
 
 def _move_nerfstudio(content: Json, metric_from_sfm: Similarity) -> None:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from rangesfm.errors import InputError
 from rangesfm.files import new_file
-from rangesfm.geometry import Similarity
+from rangesfm.geometry import Similarity, overflow_raised
 
 Array = npt.NDArray[np.float64]
 Vertices = npt.NDArray[np.void]
@@ -62,15 +62,26 @@ def transform_ply(path: Path, new_from_old: Similarity, target: Path) -> Path:
     if "rot_0" in header.columns:
         raise InputError("Gaussian splats cannot be carried over: train them anew on the metric model", path)
     vertices, rest = _split(path, content, header)
+    try:
+        with overflow_raised():
+            written = _moved(vertices, new_from_old)
+    except FloatingPointError:
+        raise InputError("the vertices hold infinite numbers, or too large ones", path) from None
+    is_double = written.dtype != vertices.dtype
+    with new_file(target) as temporary:
+        temporary.write_bytes(_header_text(header, is_double) + _body(written, header) + rest)
+    return target
+
+
+def _moved(vertices: Vertices, new_from_old: Similarity) -> Vertices:
+    """Moved and turned; far from the origin in double precision."""
     moved = new_from_old.apply(_vectors(vertices, ("x", "y", "z")))
     kinds = dict.fromkeys("xyz", np.float64) if np.abs(moved).max(initial=0.0) > _MAX_SINGLE else {}
     written = _with_types(vertices, kinds)
     _set(written, ("x", "y", "z"), moved)
-    if {"nx", "ny", "nz"} <= header.columns.keys():
+    if {"nx", "ny", "nz"} <= set(vertices.dtype.names or ()):
         _set(written, ("nx", "ny", "nz"), _vectors(vertices, ("nx", "ny", "nz")) @ new_from_old.rotation.T)
-    with new_file(target) as temporary:
-        temporary.write_bytes(_header_text(header, bool(kinds)) + _body(written, header) + rest)
-    return target
+    return written
 
 
 def _read_header(path: Path, content: bytes) -> _Header:
@@ -112,12 +123,13 @@ def _split(path: Path, content: bytes, header: _Header) -> tuple[Vertices, bytes
     if len(lines) < header.num_vertices:
         raise InputError(f"ends within its {header.num_vertices} vertices", path)
     vertices = np.empty(header.num_vertices, dtype=kind)
-    for row, line in enumerate(lines[: header.num_vertices]):
-        try:
-            vertices[row] = tuple(float(word) for word in line.split())
-        except ValueError:
-            message = f"not a vertex of {len(header.columns)} numbers"
-            raise InputError(message, path, len(header.lines) + row + 1) from None
+    with overflow_raised():
+        for row, line in enumerate(lines[: header.num_vertices]):
+            try:
+                vertices[row] = tuple(float(word) for word in line.split())
+            except (ValueError, ArithmeticError):
+                message = f"not a vertex of {len(header.columns)} numbers"
+                raise InputError(message, path, len(header.lines) + row + 1) from None
     return vertices, lines[header.num_vertices] if len(lines) > header.num_vertices else b""
 
 

@@ -9,6 +9,7 @@ import pycolmap
 
 from rangesfm.errors import ReconstructionError
 from rangesfm.files import new_folder, scratch_folder
+from rangesfm.model_files import read_model
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.passthrough import apply_options
 from rangesfm.progress import Progress
@@ -72,8 +73,8 @@ def map_incrementally(
 
 def read_models(models_path: Path) -> tuple[pycolmap.Reconstruction, ...]:
     """The models that ``map_incrementally`` wrote, in their order."""
-    folders = sorted(models_path.iterdir(), key=lambda folder: int(folder.name))
-    return tuple(pycolmap.Reconstruction(folder) for folder in folders)
+    folders = [folder for folder in models_path.iterdir() if folder.name.isdecimal()]
+    return tuple(read_model(folder) for folder in sorted(folders, key=lambda folder: int(folder.name)))
 
 
 def remove_models(models_path: Path) -> None:

@@ -83,5 +83,12 @@ def _read(path: Path, part: str) -> dict[str, dict[str, Any]]:
     try:
         entries = json.loads(path.read_text(encoding="utf-8"))[part]
         return {str(name): dict(entry) for name, entry in entries.items()}
-    except (OSError, ValueError, AttributeError, TypeError, LookupError):  # none yet, or not ours: nothing is known
+    except (
+        OSError,
+        ValueError,
+        AttributeError,
+        TypeError,
+        LookupError,
+        RecursionError,
+    ):  # none yet, or not ours: nothing is known
         return {}

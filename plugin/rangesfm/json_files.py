@@ -1,0 +1,30 @@
+"""JSON read strictly."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, NoReturn
+
+from rangesfm.errors import InputError
+from rangesfm.tables import read_text
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file.
+
+    Raises:
+        InputError: it is not there or no JSON (which knows no NaN and no infinity), with the line where there is one.
+    """
+    try:
+        return json.loads(read_text(path), parse_constant=_refuse)
+    except json.JSONDecodeError as error:
+        raise InputError(f"not JSON: {error.msg}", path, error.lineno) from None
+    except RecursionError:
+        raise InputError("not JSON that can be read: nested too deeply", path) from None
+    except ValueError as error:  # numbers that Python refuses
+        raise InputError(f"not JSON: {error}", path) from None
+
+
+def _refuse(constant: str) -> NoReturn:
+    raise ValueError(f"{constant} is no number")

@@ -1,0 +1,205 @@
+"""What is fuzzed: the readers of all files that a user brings, and what must hold of whatever they accept."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rangesfm.config import Survey, read_survey
+from rangesfm.distances.tape import Tape, read_tape
+from rangesfm.errors import GeometryError, InputError
+from rangesfm.export.apply import apply_to
+from rangesfm.geometry import Similarity
+from rangesfm.ranging.anchor_file import read_anchors
+from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.error_curve import ErrorCurve, read_error_curve
+from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.readers import read_anchors_in_log, read_ranges, write_ranges_csv
+from rangesfm.ranging.summary import summarize_ranges
+from rangesfm.reference import Reference, read_reference
+from rangesfm.result_folder import ResultFolder, read_result_folder
+from rangesfm.vision.image_times import ImageTimes, read_image_times_csv
+
+CORPUS = Path(__file__).parent / "corpus"
+REFUSALS = (InputError, GeometryError)
+
+
+class SilentAcceptanceError(Exception):
+    """A reader took what it should have refused, or gave back what is not as its type promises."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A reader.
+
+    Attributes:
+        name: of the target, and of its folder of seeds.
+        file_name: what the file is called; endings may matter.
+        read: the file, refused by one of REFUSALS.
+        check: raises SilentAcceptanceError for what should not have been accepted.
+        companions: files beside it that stay as they are: what they are called, and where in the corpus they are.
+    """
+
+    name: str
+    file_name: str
+    read: Callable[[Path], Any]
+    check: Callable[[Any], None]
+    companions: tuple[tuple[str, str], ...] = ()
+
+    def seeds(self) -> list[Path]:
+        return sorted((CORPUS / self.name).iterdir())
+
+    def run(self, data: bytes, folder: Path) -> bool:
+        """Whether the file is accepted; whatever escapes from here is a finding."""
+        path = folder / self.file_name
+        path.write_bytes(data)
+        for name, seed in self.companions:
+            (folder / name).write_bytes((CORPUS / seed).read_bytes())
+        try:
+            found = self.read(path)
+        except REFUSALS as refusal:
+            _expect("\n" not in str(refusal) and str(refusal).isprintable(), f"a message of one line: {refusal!r}")
+            return False
+        self.check(found)
+        return True
+
+
+def _expect(holds: object, what: str) -> None:
+    if not holds:
+        raise SilentAcceptanceError(what)
+
+
+def _check_log(log: RangeLog) -> None:
+    """A log is good for whatever comes next: it is summed up, and written and read again without loss."""
+    _expect(len(log) > 0, "a log without ranges")
+    _expect(np.all(np.isfinite(log.range_m)) and np.all(log.range_m > 0), "ranges that are finite and positive")
+    _expect(log.timestamp_s is None or np.all(np.isfinite(log.timestamp_s)), "times that are finite")
+    _expect(not np.any(log.range_stddev_m <= 0), "stddevs that are positive or unknown")
+    _expect(not np.any(np.isinf(log.range_stddev_m)), "stddevs that are finite or unknown")
+    _expect(all(name == name.strip() and name for name in (*log.anchor_ids, *log.tag_ids)), "ids that are some text")
+    summarize_ranges(log)
+    with tempfile.TemporaryDirectory() as folder:
+        write_ranges_csv(log, Path(folder) / "ranges.csv")
+        again = read_ranges(Path(folder) / "ranges.csv", format="canonical")
+    _expect(np.array_equal(again.range_m, log.range_m), "a log that is read as it was written")
+    _expect(again.end_ids()[1] == log.end_ids()[1], "ids that are read as they were written")
+
+
+def _check_anchors(anchors: tuple[Anchor, ...]) -> None:
+    ids = [anchor.anchor_id for anchor in anchors]
+    _expect(len(set(ids)) == len(ids), "each anchor once")
+    for anchor in anchors:
+        _expect(anchor.position_m is None or np.all(np.isfinite(anchor.position_m)), "positions that are finite")
+        _expect(0 <= anchor.position_stddev_m < np.inf, "a stddev")
+
+
+def _check_times(times: ImageTimes) -> None:
+    _expect(len(times) > 0, "a time")
+    _expect(np.all(np.isfinite(times.timestamps_s)), "times that are finite")
+    _expect(np.all(np.diff(times.timestamps_s) > 0), "times in order")
+
+
+def _check_reference(reference: Reference) -> None:
+    _expect(len(reference) > 0, "a pose")
+    _expect(np.all(np.isfinite(reference.positions_m)), "positions that are finite")
+    rotations = reference.world_from_cam
+    _expect(rotations is None or np.allclose(np.linalg.det(rotations), 1), "rotations")
+
+
+def _check_tape(tape: Tape) -> None:
+    for taped in tape.distances:
+        _expect(0 < taped.distance_m < np.inf, "distances that are finite and positive")
+        _expect(0 < taped.stddev_m < np.inf, "stddevs that are finite and positive")
+    for marker in (tape.markers or {}).values():
+        _expect(np.all(np.isfinite(marker.pixels)), "pixels that are finite")
+
+
+def _check_curve(curve: ErrorCurve) -> None:
+    distance, stddev = curve.true_distance(np.array([1e-3, 1.0, 50.0]))
+    _expect(np.all(distance > 0) and np.all(np.isfinite(distance)), "distances that are finite and positive")
+    _expect(np.all(stddev >= 0) and np.all(np.isfinite(stddev)), "stddevs that are finite")
+
+
+def _check_survey(survey: Survey) -> None:
+    _expect(survey.output_path.is_absolute(), "an absolute path")
+    _expect(isinstance(survey.to_dict(), dict), "plain values")
+
+
+def _read_whole_result(path: Path) -> ResultFolder:
+    """Everything that pages and exports ask for."""
+    result = read_result_folder(path.parent)
+    for name in (item.name for item in fields(result)):
+        getattr(result, name)
+    for ask in (
+        lambda: (result.frame, result.anchors, result.metric_from_sfm, result.relative_scale_stddev),
+        lambda: (result.images_path, result.georeference, result.association, result.lever_arms_m(["T1"])),
+    ):
+        ask()
+    return result
+
+
+def _carry(path: Path) -> Path:
+    """Into another world, and back from there: what is written can be read again."""
+    similarity = Similarity(2.0, np.eye(3), np.array([1.0, 2.0, 3.0]))
+    with tempfile.TemporaryDirectory() as folder:
+        (written,) = apply_to([path], similarity, Path(folder))
+        with tempfile.TemporaryDirectory() as other_folder:
+            apply_to([written], similarity.inverse(), Path(other_folder))
+    return path
+
+
+def _accept_all(found: object) -> None:
+    pass
+
+
+def _log_target(format: str, **options: Any) -> Target:
+    return Target(format, "uwb.log", partial(read_ranges, format=format, **options), _check_log)
+
+
+def _read_any_log(path: Path) -> RangeLog:
+    read_anchors_in_log(path)
+    return read_ranges(path)
+
+
+def _read_bag_folder(path: Path) -> RangeLog:
+    return read_ranges(path.parent)
+
+
+_COLUMNS = {"timestamp": "t", "anchor_id": "node", "range": "d", "tag_id": "tag", "range_stddev": "s", "los": "los"}
+_UNITS = {"range_unit": "mm", "timestamp_unit": "us"}
+_STAMPED = {"timestamp": "t", "anchor_id": "node"}
+_LOG_FORMATS = (
+    *("canonical", "starloc", "miluv", "uwb_init", "inrol", "leaps_meas", "leaps_lea", "dwm1001_lec", "dwm1001_les"),
+    *("qorvo", "mauwb", "arduino", "makerfabs_json"),
+)
+
+TARGETS: tuple[Target, ...] = (
+    Target("any_log", "uwb.log", _read_any_log, _check_log),
+    *(_log_target(format) for format in _LOG_FORMATS),
+    Target("ros1", "uwb.bag", _read_any_log, _check_log),
+    Target("ros2_mcap", "log.mcap", _read_bag_folder, _check_log, (("metadata.yaml", "ros2_metadata/metadata.yaml"),)),
+    Target("ros2_metadata", "metadata.yaml", _read_bag_folder, _check_log, (("log.mcap", "ros2_mcap/log.mcap"),)),
+    Target(
+        "mapped", "uwb.csv", partial(read_ranges, columns=_COLUMNS, range_unit="mm", timestamp_unit="us"), _check_log
+    ),
+    Target("mapped_iso", "uwb.csv", partial(read_ranges, columns=_COLUMNS, timestamp_unit="iso"), _check_log),
+    Target("mapped_stamps", "uwb.csv", partial(read_ranges, columns=_STAMPED), _check_log),
+    Target("anchors", "anchors.csv", read_anchors, _check_anchors),
+    Target("image_times", "images.csv", read_image_times_csv, _check_times),
+    Target("reference", "reference.csv", read_reference, _check_reference),
+    Target("tum", "reference.tum", read_reference, _check_reference),
+    Target("distances", "distances.csv", read_tape, _check_tape),
+    Target("markers", "markers.csv", lambda path: read_tape(CORPUS / "distances" / "plain.csv", path), _check_tape),
+    Target("error_curve", "curve.csv", read_error_curve, _check_curve),
+    Target("survey", "survey.toml", read_survey, _check_survey),
+    Target("result_json", "result.json", _read_whole_result, _accept_all),
+    Target("apply_ply", "mesh.ply", _carry, _accept_all),
+    Target("apply_obj", "mesh.obj", _carry, _accept_all),
+    Target("apply_json", "cameras.json", _carry, _accept_all),
+)
