@@ -15,6 +15,7 @@ from rangesfm.json_files import read_json
     [
         ('{"a":\n', ":2: not JSON: "),
         ('{"a": NaN}', ": not JSON: NaN is no number"),
+        ("[1e999]", ": not JSON: 1e999 is no number"),
         ("[-Infinity]", ": not JSON: -Infinity is no number"),
         ("[" * 100_000, ": not JSON that can be read: nested too deeply"),
         ("1" * 10_000, ": not JSON: "),

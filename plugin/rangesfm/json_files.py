@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -17,7 +18,7 @@ def read_json(path: Path) -> Any:
         InputError: it is not there or no JSON (which knows no NaN and no infinity), with the line where there is one.
     """
     try:
-        return json.loads(read_text(path), parse_constant=_refuse)
+        return json.loads(read_text(path), parse_constant=_refuse, parse_float=_finite)
     except json.JSONDecodeError as error:
         raise InputError(f"not JSON: {error.msg}", path, error.lineno) from None
     except RecursionError:
@@ -28,3 +29,10 @@ def read_json(path: Path) -> Any:
 
 def _refuse(constant: str) -> NoReturn:
     raise ValueError(f"{constant} is no number")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if math.isinf(value):
+        _refuse(text)
+    return value

@@ -182,7 +182,7 @@ def test_what_a_refinement_bent_is_said(sfm: pycolmap.Reconstruction) -> None:
         ("a.ply", header("ascii") + b"0 0 0 0 0 1 inf\n" * 5, "a.ply:14: not a vertex of 7 numbers"),
         ("a.obj", b"v 1 two 3\n", "a.obj:1: 'v 1 two 3' is no vertex"),
         ("a.obj", b"v 1 inf 3\n", "a.obj:1: 'v 1 inf 3' is no vertex"),
-        ("a.json", b'[{"position": [1, 1e999, 3], "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}]', "not as expected"),
+        ("a.json", b'[{"position": [1, 1e308, 3], "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}]', "not as expected"),
         ("a.json", b"{", "a.json:1: not JSON"),
         ("a.json", b"[]", "no cameras"),
         ("a.json", b'{"frames": [{}]}', "a camera is not as expected"),

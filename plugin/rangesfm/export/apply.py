@@ -90,6 +90,8 @@ def _transform_obj(path: Path, metric_from_sfm: Similarity, target: Path) -> Pat
                 at = np.array([float(word) for word in words[1:4]]).reshape(3)
                 with overflow_raised():
                     moved = metric_from_sfm.apply(at) if words[0] == "v" else metric_from_sfm.rotation @ at
+                if not np.isfinite(moved).all():
+                    raise ValueError("infinite")
             except (ValueError, FloatingPointError):
                 raise InputError(f"'{line[:60]}' is no vertex, expected three numbers", path, number) from None
             line = " ".join([words[0], *(f"{value:.10g}" for value in moved), *words[4:]])

@@ -134,7 +134,11 @@ def _split(path: Path, content: bytes, header: _Header) -> tuple[Vertices, bytes
 
 
 def _vectors(vertices: Vertices, names: tuple[str, str, str]) -> Array:
-    return np.column_stack([vertices[name] for name in names]).astype(np.float64).reshape(-1, 3)
+    """(n, 3); NaN stands for no point, infinity for nothing."""
+    values: Array = np.column_stack([vertices[name] for name in names]).astype(np.float64).reshape(-1, 3)
+    if np.isinf(values).any():
+        raise FloatingPointError("infinite")
+    return values
 
 
 def _with_types(vertices: Vertices, kinds: dict[str, type[np.float64]]) -> Vertices:
