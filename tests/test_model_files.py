@@ -102,9 +102,9 @@ class TestContent:
             ("cameras.bin", "height", 0, "camera 1 has photos of 1024 x 0 pixels"),
             ("frames.bin", "tx", 1e300, r"the pose of \S+\.png is not finite"),
             ("frames.bin", "qw", 3.0, r"the pose of \S+\.png has a quaternion of length 3\.\d+, expected 1"),
-            ("images.bin", "name", b"", "image 1 has no printable name"),
-            ("images.bin", "name", b"\xff.jpg", "image 1 has no printable name"),
-            ("images.bin", "name", b"two\nlines.jpg", "image 1 has no printable name"),
+            ("images.bin", "name", b"", "image 1 has no name of printable text"),
+            ("images.bin", "name", b"\xff.jpg", "image 1 has no name of printable text"),
+            ("images.bin", "name", b"two\nlines.jpg", "image 1 has no name of printable text"),
             ("points3D.bin", "x", math.inf, r"points3D.bin: point \d+ is at \(inf, .*\), expected finite coordinates"),
         ],
     )

@@ -42,7 +42,7 @@ def write_comparison(comparison: ModelsComparison, folder: Path) -> Path:
     make_output_folder(folder)
     path = folder / PAGE_NAME
     with new_file(path) as temporary:
-        temporary.write_text(render_comparison(comparison), encoding="utf-8")
+        temporary.write_text(render_comparison(comparison), encoding="utf-8", errors="xmlcharrefreplace")
     return path
 
 

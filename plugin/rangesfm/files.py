@@ -6,6 +6,7 @@ import hashlib
 import os
 import shutil
 import tempfile
+import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,7 @@ LEFTOVER = r"\..+\.(?P<pid>\d+)\.(part(\..+)?|old)"
 
 
 _CHUNK_BYTES = 1 << 20
+_NOT_IN_NAMES = ("Cc", "Cs", "Zl", "Zp")  # control characters, bytes that are no text, ends of lines and paragraphs
 
 
 def sha256_of(path: Path) -> str:
@@ -26,6 +28,17 @@ def sha256_of(path: Path) -> str:
         while chunk := file.read(_CHUNK_BYTES):
             digest.update(chunk)
     return digest.hexdigest()
+
+
+def stays_inside(name: str) -> bool:
+    """Whether a name from a file, taken relative to a folder, cannot lead out of it."""
+    path = Path(name)
+    return not path.is_absolute() and ".." not in path.parts
+
+
+def is_plain_name(name: str) -> bool:
+    """Whether a photo's name can stand in tables and files: some UTF-8 text on one line."""
+    return bool(name) and not any(unicodedata.category(character) in _NOT_IN_NAMES for character in name)
 
 
 def make_output_folder(path: Path) -> None:

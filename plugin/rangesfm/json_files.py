@@ -5,20 +5,20 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from rangesfm.errors import InputError
 from rangesfm.tables import read_text
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file.
+    """The content of a JSON file; NaN and infinity, which some programs write and JSON does not know, become None.
 
     Raises:
-        InputError: it is not there or no JSON (which knows no NaN and no infinity), with the line where there is one.
+        InputError: it is not there or no JSON, with the line where there is one.
     """
     try:
-        return json.loads(read_text(path), parse_constant=_refuse, parse_float=_finite)
+        return json.loads(read_text(path), parse_constant=lambda constant: None, parse_float=_finite)
     except json.JSONDecodeError as error:
         raise InputError(f"not JSON: {error.msg}", path, error.lineno) from None
     except RecursionError:
@@ -27,12 +27,8 @@ def read_json(path: Path) -> Any:
         raise InputError(f"not JSON: {error}", path) from None
 
 
-def _refuse(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is no number")
-
-
 def _finite(text: str) -> float:
     value = float(text)
     if math.isinf(value):
-        _refuse(text)
+        raise ValueError(f"{text} is too large a number")
     return value

@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 
 from rangesfm.errors import InputError
+from rangesfm.files import is_plain_name
 from rangesfm.model_records import MAX_COORDINATE, MODEL_FILES, check_map, read_records
 
 _EXPECTED = "expected cameras, images and points3D files that COLMAP wrote"
@@ -52,8 +53,8 @@ def _check_names(model: pycolmap.Reconstruction, path: Path) -> None:
             name = str(image.name)
         except UnicodeDecodeError:
             name = ""
-        if not name or not name.isprintable():
-            raise InputError(f"image {image_id} has no printable name", path)
+        if not is_plain_name(name):
+            raise InputError(f"image {image_id} has no name of printable text", path)
         names[name] += 1
     repeated = next((name for name, num in names.items() if num > 1), None)
     if repeated is not None:

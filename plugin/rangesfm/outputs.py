@@ -208,10 +208,13 @@ def _texts(values: Array) -> list[str]:
 
 
 def write_result(result: dict[str, Any], path: Path) -> None:
-    """result.json; numbers that are not finite become null, as JSON has no others."""
+    """result.json; numbers that are not finite become null, as JSON has no others.
+
+    Of paths that are no UTF-8, what is none becomes JSON's own escapes, by which they are read as they were.
+    """
     with new_file(path) as temporary:
         text = json.dumps(_plain(result), indent=2, ensure_ascii=False, allow_nan=False)
-        temporary.write_text(text + "\n", encoding="utf-8")
+        temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 
 def _plain(value: Any) -> Any:

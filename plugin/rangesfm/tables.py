@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import csv
 import itertools
+import os
+import stat
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -231,6 +233,9 @@ def printable(text: str) -> str:
 
 def _read_bytes(path: str | Path, num: int = -1) -> bytes:
     try:
+        mode = os.stat(path).st_mode
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # a device may never end, a pipe never begin
+            raise InputError("is no regular file", path)
         with open(path, "rb") as file:
             return file.read(num)
     except FileNotFoundError:

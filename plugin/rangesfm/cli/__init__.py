@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from rangesfm.cli.arguments import Outcome, normalize, parse
 from rangesfm.cli.terminal import terminal_progress
-from rangesfm.errors import RangesfmError
+from rangesfm.errors import RangesfmError, one_line
 
 _BAD_INPUT, _FAILED = 2, 4
 _INTERNAL_ERROR, _INTERRUPTED, _BROKEN_PIPE = 1, 130, 141  # as shells have it
@@ -22,12 +22,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return its exit status. Only this function turns errors into messages."""
     # numpy's and scipy's matrices are small here: threads make them slower, and many times so beside other work.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # whatever the locale, a name that it cannot spell is no failure
+            stream.reconfigure(errors="backslashreplace")
     try:
         args = parse(normalize(sys.argv[1:] if argv is None else argv))
         # There is no sys.stderr where the shell closed it.
         with terminal_progress(sys.stderr or io.StringIO(), quiet=args.quiet) as progress:
             outcome: Outcome = args.execute(args, progress)
-        print("\n".join(outcome.lines), flush=True)
+        print("\n".join(map(one_line, outcome.lines)), flush=True)
         return outcome.status
     except SystemExit as ended:  # --help and --version
         return int(ended.code or 0)
@@ -51,5 +54,5 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _fail(message: str, status: int) -> int:
-    print("rangesfm: error:", " ".join(message.split()), file=sys.stderr)
+    print("rangesfm: error:", " ".join(one_line(message).split()), file=sys.stderr)
     return status

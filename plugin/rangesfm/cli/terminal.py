@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TextIO
 
+from rangesfm.errors import one_line
+
 _ERASE_LINE = "\r\033[K"
 _TERMINAL_INTERVAL_S = 0.1
 _PLAIN_INTERVAL_S = 10.0
@@ -38,7 +40,7 @@ class TerminalProgress:
             self._write(line[: shutil.get_terminal_size().columns - 1] if self._is_terminal else f"{line}\n")
 
     def message(self, text: str) -> None:
-        self._write(f"{text}\n")
+        self._write(f"{one_line(text)}\n")
 
     def end_stage(self, *, failed: bool = False) -> None:
         """The current stage, if any, has ended."""

@@ -109,7 +109,9 @@ def _transform_json(path: Path, metric_from_sfm: Similarity, target: Path) -> Pa
     except (ArithmeticError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"a camera is not as expected ({error!r})", path) from error
     with new_file(target) as temporary:
-        temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        temporary.write_text(
+            json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8", errors="backslashreplace"
+        )
     return target
 
 

@@ -13,7 +13,7 @@ import pycolmap
 from rangesfm.colmap_log import colmap_log
 from rangesfm.errors import InputError
 from rangesfm.export.metric_map import MetricMap
-from rangesfm.files import new_folder
+from rangesfm.files import new_folder, stays_inside
 
 
 def write_undistorted(map_: MetricMap, folder: Path) -> Path:
@@ -28,6 +28,8 @@ def write_undistorted(map_: MetricMap, folder: Path) -> Path:
         raise InputError("the format 'undistorted' needs the photos: give their folder (--images)")
     names = [image.name for image in map_.reconstruction.images.values() if image.has_pose]
     for name in names:
+        if not stays_inside(name):
+            raise InputError(f"the photo {name} would be written outside of it, expected names inside a folder", folder)
         if not os.path.isfile(images_path / name):
             raise InputError(f"there is no photo {name}, which the map needs, in this folder", images_path)
     with new_folder(folder) as temporary, tempfile.TemporaryDirectory() as model_path:

@@ -23,7 +23,7 @@ def plot_ranges(log: RangeLog) -> Figure:
         InputError: matplotlib is not installed.
     """
     figure = _new_figure()
-    from matplotlib import colormaps
+    from matplotlib import colormaps, rc_context
 
     axes = figure.add_subplot()
     time = np.arange(len(log)) if log.timestamp_s is None else log.timestamp_s - log.timestamp_s.min()
@@ -35,7 +35,8 @@ def plot_ranges(log: RangeLog) -> Figure:
     axes.set_ylabel("m")
     axes.set_ylim(bottom=0)
     axes.grid(alpha=0.3)
-    figure.legend(loc="outside right upper", title="anchor", markerscale=4)
+    with rc_context({"text.parse_math": False}):  # names may hold dollars
+        figure.legend(loc="outside right upper", title="anchor", markerscale=4)
     return figure
 
 

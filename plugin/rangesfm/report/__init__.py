@@ -34,7 +34,7 @@ def write_report(result_folder: Path, *, images_path: Path | None = None) -> Pat
     page = render(gather(read_result_folder(result_folder), images_path=images_path))
     path = result_folder / "report.html"
     with new_file(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+        temporary.write_text(page, encoding="utf-8", errors="xmlcharrefreplace")
     return path
 
 

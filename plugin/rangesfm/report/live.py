@@ -79,7 +79,7 @@ class LivePage:
             reload=reload,
         )
         with new_file(self.path) as temporary:
-            temporary.write_text(page, encoding="utf-8")
+            temporary.write_text(page, encoding="utf-8", errors="xmlcharrefreplace")
 
     def _stages(self) -> Markup:
         rows = [element("tr", element("th", name, scope="row"), element("td", duration(s))) for name, s in self._done]

@@ -39,7 +39,10 @@ def write_pictures(figures: list[Figure], folder: Path) -> list[Path]:
     if find_spec("matplotlib") is None:
         raise InputError("pictures need the package matplotlib: python -m pip install 'rangesfm[plot]'")
     make_output_folder(folder)
-    return [_write(figure, folder / f"{figure.name}.png") for figure in figures]
+    from matplotlib import rc_context
+
+    with rc_context({"text.parse_math": False}):  # names may hold dollars
+        return [_write(figure, folder / f"{figure.name}.png") for figure in figures]
 
 
 def _write(figure: Figure, path: Path) -> Path:

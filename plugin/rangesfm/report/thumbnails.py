@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageOps
 
+from rangesfm.files import stays_inside
+
 MAX_NUM_THUMBNAILS = 160
 MAX_BYTES = 600_000
 """Of all thumbnails as they stand in the page."""
@@ -21,8 +23,11 @@ _QUALITY = 60
 def thumbnails(folder: Path | None, image_names: Sequence[str]) -> dict[str, str]:
     """JPEGs as data URIs by photo, evenly over the path; photos that cannot be read are left out.
 
+    So are those that a name from a file would fetch from outside the folder: the page is handed on.
+
     All are made as wide as fits into MAX_BYTES; if even the smallest do not fit, there are fewer.
     """
+    image_names = [name for name in image_names if stays_inside(name)]
     if folder is None or not folder.is_dir() or not image_names:
         return {}
     chosen = np.unique(np.linspace(0, len(image_names) - 1, MAX_NUM_THUMBNAILS).round().astype(int))

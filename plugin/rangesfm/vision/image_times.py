@@ -16,6 +16,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from rangesfm.errors import InputError
+from rangesfm.files import is_plain_name
 from rangesfm.tables import Table, read_table
 
 IMAGE_EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
@@ -74,7 +75,7 @@ def list_images(folder: str | Path) -> tuple[str, ...]:
     """Names of all photos in a folder and its subfolders, sorted; hidden files are no photos.
 
     Raises:
-        InputError: there is no such folder, or no photo in it.
+        InputError: there is no such folder, or no photo in it, or one whose name no table could hold.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -86,6 +87,9 @@ def list_images(folder: str | Path) -> tuple[str, ...]:
         names += [(Path(parent) / name).relative_to(folder).as_posix() for name in photos]
     if not names:
         raise InputError(f"no photos ({' '.join(e[1:] for e in IMAGE_EXTENSIONS)}) in this folder", folder)
+    for name in names:
+        if not is_plain_name(name):
+            raise InputError(f"the photo '{name}' has a name that is no printable UTF-8 text: rename it", folder)
     return tuple(sorted(names))
 
 

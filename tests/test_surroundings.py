@@ -1,0 +1,157 @@
+"""Commands in odd places: names, locales, terminals, disks and clocks that nobody had in mind."""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rangesfm.cli import main
+
+if TYPE_CHECKING:
+    from tests.conftest import WalkedSurvey
+
+ODD_NAME = "Über das 測量 <b>'x' \"y\" & $z\\foo$ %s"
+MAX_FILE_BYTES = 20_000
+NOT_TEXT = os.fsdecode(b"caf\xe9")
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """All files under a folder, hidden ones too."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def quick_flags(survey: WalkedSurvey, folder: Path | None = None) -> tuple[str, ...]:
+    """All that ``rangesfm scale`` needs inside the survey's folder, or another like it, without resampling."""
+    ((folder or survey.folder) / "quick.toml").write_text("[scale]\nnum_bootstrap = 0\n")
+    return ("quick.toml", *survey.flags, "--anchors", "anchors.csv")
+
+
+@pytest.mark.parametrize("name", [ODD_NAME, NOT_TEXT], ids=["odd", "not text"])
+def test_a_folder_of_any_name_is_written_to_and_nothing_else(
+    name: str, walked_survey: WalkedSurvey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / name
+    shutil.copytree(walked_survey.folder, folder)
+    home, temporary = tmp_path / "home", tmp_path / "tmp"
+    home.mkdir()
+    temporary.mkdir()
+    for variable in ("HOME", "XDG_CONFIG_HOME", "XDG_CACHE_HOME", "XDG_DATA_HOME", "MPLCONFIGDIR"):
+        monkeypatch.setenv(variable, str(home))
+    monkeypatch.setenv("TMPDIR", str(temporary))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    monkeypatch.chdir(folder)
+    flags = quick_flags(walked_survey, folder)
+    before = contents(tmp_path)
+    out = f"{name} out"
+    assert main(["scale", *flags, "--output_path", out, "--quiet"]) == 0
+    assert main(["report", out, "--quiet"]) == 0
+    assert main(["export", out, "--formats", "tum,ply,nerfstudio", "--quiet"]) == 0
+    after = contents(tmp_path)
+    new = [path for path in after if path not in before]
+    assert all(path.startswith(f"{name}/{out}/") for path in new), new
+    assert {f"{name}/{out}/result.json", f"{name}/{out}/report.html"} <= set(new)
+    assert {path: after[path] for path in before} == before
+
+
+@pytest.fixture
+def command(own_survey: WalkedSurvey) -> Callable[..., subprocess.CompletedProcess[bytes]]:
+    """Run ``rangesfm`` inside a survey whose anchor A1 has an odd name, in surroundings of one's own."""
+    folder = own_survey.folder
+    for name in ("uwb.csv", "anchors.csv"):
+        text = (folder / name).read_text(encoding="utf-8").replace("A1", "Tür-測")
+        (folder / name).write_text(text, encoding="utf-8")
+
+    def run(*arguments: str, **surroundings: object) -> subprocess.CompletedProcess[bytes]:
+        given: dict[str, object] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "stdin": subprocess.DEVNULL}
+        command = [sys.executable, "-m", "rangesfm", *arguments]
+        return subprocess.run(command, cwd=folder, check=False, **(given | surroundings))  # type: ignore[call-overload,no-any-return]
+
+    return run
+
+
+@pytest.mark.parametrize(
+    "locale",
+    [
+        {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+        {"PYTHONIOENCODING": "ascii"},
+        {"LC_ALL": "tr_TR.ISO-8859-9", "PYTHONUTF8": "0", "PYTHONIOENCODING": "iso-8859-9", "COLUMNS": "0"},
+    ],
+    ids=["C", "ascii", "Turkish"],
+)
+def test_any_locale_will_do(
+    locale: dict[str, str], command: Callable[..., subprocess.CompletedProcess[bytes]], own_survey: WalkedSurvey
+) -> None:
+    flags = ("ranges", "uwb.csv", "--output_path", "ränges.csv")
+    done = command(*flags, env={**os.environ, **locale})
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert b"T\\xfcr-\\u6e2c" in done.stdout or "Tür".encode("iso-8859-9") in done.stdout
+    assert "Tür-測" in (own_survey.folder / "ränges.csv").read_text(encoding="utf-8")
+
+
+def test_closed_streams_do_no_harm_and_nothing_is_in_the_encoding_of_the_locale(
+    command: Callable[..., subprocess.CompletedProcess[bytes]], own_survey: WalkedSurvey
+) -> None:
+    def close_all() -> None:
+        for descriptor in range(3):
+            os.close(descriptor)
+
+    flags = ("scale", *quick_flags(own_survey), "--output_path", "out")
+    strict = {**os.environ, "PYTHONWARNDEFAULTENCODING": "1", "PYTHONWARNINGS": "error::EncodingWarning"}
+    done = command(*flags, preexec_fn=close_all, stdin=None, stdout=None, stderr=None, env=strict)
+    assert done.returncode == 0
+    assert (own_survey.folder / "out" / "result.json").is_file()
+
+
+def test_full_disk_is_one_line_and_leaves_nothing_half_written(
+    command: Callable[..., subprocess.CompletedProcess[bytes]], own_survey: WalkedSurvey
+) -> None:
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (MAX_FILE_BYTES, MAX_FILE_BYTES))
+
+    flags = ("scale", *quick_flags(own_survey), "--output_path", "out", "--quiet")
+    done = command(*flags, preexec_fn=limit)
+    assert done.returncode == 4, done.stderr
+    assert done.stderr.startswith(b"rangesfm: error: ")
+    assert done.stderr.count(b"\n") == 1
+    assert b"internal error" not in done.stderr
+    left = (
+        [path.name for path in (own_survey.folder / "out").rglob("*")] if (own_survey.folder / "out").exists() else []
+    )
+    assert "result.json" not in left
+    assert not [name for name in left if name.startswith(".")]
+
+
+def test_full_device_for_a_file_is_one_line(command: Callable[..., subprocess.CompletedProcess[bytes]]) -> None:
+    with open("/dev/full", "wb") as full:
+        done = command("ranges", "uwb.csv", stdout=full)
+    assert done.returncode == 4
+    assert done.stderr == b"rangesfm: error: No space left on device\n"
+
+
+@pytest.mark.parametrize("path", ["/dev/zero", "fifo"])
+def test_what_is_no_regular_file_is_not_read(
+    path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("fifo")
+    assert main(["ranges", path]) == 2
+    assert capfd.readouterr().err == f"rangesfm: error: {path}: is no regular file\n"
+
+
+def test_clock_that_jumps_changes_nothing(
+    own_survey: WalkedSurvey, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(own_survey.folder)
+    jumps = iter([4e9, 0.0, -1e9, 2e9] * 1000)
+    monkeypatch.setattr(time, "time", lambda: next(jumps))
+    assert main(["scale", *quick_flags(own_survey), "--output_path", "out"]) == 0
+    assert "scale: -" not in capfd.readouterr().err
