@@ -111,7 +111,7 @@ def write_outputs(
     by_name = None
     if times is not None:
         by_name = dict(zip(survey.trajectory.image_names, times.tolist(), strict=True))
-        _write_csv(folder / "images.csv", ["image_name", "timestamp_s"], ((n, repr(t)) for n, t in by_name.items()))
+        write_csv(folder / "images.csv", ["image_name", "timestamp_s"], ((n, repr(t)) for n, t in by_name.items()))
     map_ = MetricMap(
         survey.final,
         timestamps_s=by_name,
@@ -137,10 +137,10 @@ def write_scale_tables(survey: MetricSurvey, folder: Path) -> None:
     times = [""] * len(rows) if log.timestamp_s is None else [repr(log.timestamp_s[row].item()) for row in rows]
     ids = [log.anchor_ids[log.anchor_index[row]] for row in rows]
     columns = [times, ids, *(_texts(values) for values in found.candidates.T)]
-    _write_csv(candidates, ["timestamp_s", "anchor_id", "alpha0", "alpha1"], zip(*columns, strict=True))
+    write_csv(candidates, ["timestamp_s", "anchor_id", "alpha0", "alpha1"], zip(*columns, strict=True))
     counts = map(str, found.num_agreeing.tolist())
-    _write_csv(consensus, ["scale", "num_agreeing"], zip(_texts(found.curve_scales), counts, strict=True))
-    _write_csv(bootstrap, ["scale"], zip(_texts(found.resampled_scales)))
+    write_csv(consensus, ["scale", "num_agreeing"], zip(_texts(found.curve_scales), counts, strict=True))
+    write_csv(bootstrap, ["scale"], zip(_texts(found.resampled_scales)))
 
 
 def _write_ranges(survey: MetricSurvey, path: Path) -> None:
@@ -170,7 +170,7 @@ def _write_ranges(survey: MetricSurvey, path: Path) -> None:
         **{name: _texts(values) for name, values in numbers.items()},
         "status": [labels[status] for status in observations.status.tolist()],
     }
-    _write_csv(path, list(columns), zip(*columns.values(), strict=True))
+    write_csv(path, list(columns), zip(*columns.values(), strict=True))
 
 
 def _write_time_offset_curve(survey: MetricSurvey, path: Path) -> None:
@@ -181,7 +181,7 @@ def _write_time_offset_curve(survey: MetricSurvey, path: Path) -> None:
         return
     curve = survey.time_offset.curve
     offsets = [repr(offset_s) for offset_s in curve.offsets_s.tolist()]
-    _write_csv(path, ["time_offset_s", "cost"], zip(offsets, _texts(curve.costs_m), strict=True))
+    write_csv(path, ["time_offset_s", "cost"], zip(offsets, _texts(curve.costs_m), strict=True))
 
 
 def _write_pose_covariance(survey: MetricSurvey, path: Path) -> None:
@@ -193,10 +193,10 @@ def _write_pose_covariance(survey: MetricSurvey, path: Path) -> None:
         return
     upper = np.triu_indices(3)
     rows = ([name, *(f"{entry:.9g}" for entry in of[upper].tolist())] for name, of in covariance_m2.items())
-    _write_csv(path, ["image_name", *COVARIANCE_COLUMNS], rows)
+    write_csv(path, ["image_name", *COVARIANCE_COLUMNS], rows)
 
 
-def _write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     with new_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(header)

@@ -33,6 +33,7 @@ def survey_result(survey: MetricSurvey) -> dict[str, Any]:
             "translation_m": similarity.translation,
         },
         "frame": survey.estimate.frame,
+        "map": {"num_photos": survey.final.num_reg_images(), "num_points3D": survey.final.num_points3D()},
         "anchors": {anchor.anchor_id: _anchor(anchor) for anchor in survey.anchors},
         "time_offset": _time_offset(survey),
         "ranges": _ranges(survey),

@@ -15,6 +15,7 @@ from rangesfm.progress import Progress
 
 COMMANDS = (
     "run",
+    "batch",
     "demo",
     "reconstruct",
     "scale",

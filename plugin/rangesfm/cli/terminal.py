@@ -36,7 +36,7 @@ class TerminalProgress:
         now = self._clock()
         if now - self._last_update >= (_TERMINAL_INTERVAL_S if self._is_terminal else _PLAIN_INTERVAL_S):
             self._last_update = now
-            line = f"{self._stage or ''} {_counts(num_done, num_total, now - self._stage_start)}".strip()
+            line = f"{self._stage or ''} {counts(num_done, num_total, now - self._stage_start)}".strip()
             self._write(line[: shutil.get_terminal_size().columns - 1] if self._is_terminal else f"{line}\n")
 
     def message(self, text: str) -> None:
@@ -46,7 +46,7 @@ class TerminalProgress:
         """The current stage, if any, has ended."""
         if self._stage is not None:
             ending = "stopped after " if failed else ""
-            self._write(f"{self._stage}: {ending}{_duration(self._clock() - self._stage_start)}\n")
+            self._write(f"{self._stage}: {ending}{duration(self._clock() - self._stage_start)}\n")
             self._stage = None
 
     def _write(self, text: str) -> None:
@@ -67,16 +67,18 @@ def terminal_progress(stream: TextIO, *, quiet: bool = False) -> Iterator[Termin
     progress.end_stage()
 
 
-def _counts(num_done: int, num_total: int | None, seconds: float) -> str:
+def counts(num_done: int, num_total: int | None, seconds: float = 0.0) -> str:
+    """How many of how many; with the seconds it took so far, how long the rest will take."""
     if num_total is None or num_total <= 0:
         return str(num_done)
     text = f"{num_done}/{num_total}, {100 * num_done // num_total} %"
-    if 0 < num_done < num_total:
-        text += f", {_duration(seconds * (num_total - num_done) / num_done)} left"
+    if seconds > 0 and 0 < num_done < num_total:
+        text += f", {duration(seconds * (num_total - num_done) / num_done)} left"
     return text
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """As hours, minutes and seconds, no finer than needed."""
     if seconds < 60:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)

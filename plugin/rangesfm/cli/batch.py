@@ -1,0 +1,105 @@
+"""``rangesfm batch``: many surveys, on the cores of this machine or on a cluster."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import re
+import sys
+from pathlib import Path
+
+from rangesfm.cli.arguments import Commands, Outcome
+from rangesfm.cli.batch_progress import BatchTerminal
+from rangesfm.cli.survey_flags import (
+    RANGE_FLAGS,
+    RECONSTRUCTION_FLAGS,
+    REFINE_FLAGS,
+    add_flags,
+    add_restart_argument,
+    overrides_from_arguments,
+)
+from rangesfm.errors import InputError
+from rangesfm.progress import Progress
+
+_BYTES_PER_UNIT = {"mb": 10**6, "gb": 10**9, "mib": 1 << 20, "gib": 1 << 30}
+
+
+def add_command(commands: Commands) -> None:
+    parser = commands.add(
+        "batch",
+        execute,
+        help="many surveys at once, on this machine or on a cluster",
+        description=(
+            "Run many surveys, each as rangesfm run would. One that fails does not stop the others. What became of\n"
+            "each is in batch.csv, batch.json and batch.html. Needs pip install 'rangesfm[batch]'.\n\n"
+            "Without --scheduler the workers are processes of this machine, which share its cores and memory. With\n"
+            "it they are those of a Dask scheduler; they must have this version of rangesfm installed and see the\n"
+            "surveys' files under the same paths. Each should do one survey at a time:\n"
+            "  dask scheduler --host HEAD\n"
+            "  dask worker tcp://HEAD:8786 --nthreads 1 --no-dashboard       # on each machine\n"
+            "On Slurm, PBS and the like dask-jobqueue starts them, on Kubernetes dask-kubernetes: see the README.\n\n"
+            "Exit status: 0 all done; otherwise the largest of the statuses that rangesfm run would have had."
+        ),
+        example=(
+            "rangesfm batch surveys/*.toml --output_path batch\n"
+            "  rangesfm batch surveys/*.toml --num_workers 2 --num_threads 4 --memory_limit 8GB\n"
+            "  rangesfm batch surveys/*.toml --scheduler tcp://head:8786 --num_threads 8"
+        ),
+    )
+    parser.add_argument(
+        "surveys", nargs="+", metavar="SURVEY.toml", help="survey files, each with its own [output] path"
+    )
+    parser.add_argument("--output_path", default="batch", metavar="FOLDER", help="of the table (default: batch)")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask scheduler, as tcp://head:8786")
+    parser.add_argument(
+        "--num_workers", type=_at_least_1, metavar="N", help="surveys at once (default: by cores and memory)"
+    )
+    parser.add_argument(
+        "--num_threads", type=_at_least_1, metavar="N", help="of each survey (default: the cores over the workers)"
+    )
+    parser.add_argument(
+        "--memory_limit", type=_bytes, metavar="SIZE", help="of each survey, as 8GB (default: its share)"
+    )
+    add_restart_argument(parser)
+    for group in (RECONSTRUCTION_FLAGS, RANGE_FLAGS, REFINE_FLAGS):
+        add_flags(parser, group)
+
+
+def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
+    if args.scheduler is not None and args.num_workers is not None:
+        raise InputError("--num_workers is of this machine: with --scheduler, those that run there count")
+    _require_dask()
+    from rangesfm.batch.jobs import read_jobs
+    from rangesfm.batch.results import PAGE_NAME, TABLE_NAME
+    from rangesfm.batch.rows import exit_status_of, format_rows
+    from rangesfm.batch.run import run_batch
+    from rangesfm.batch.shares import BatchOptions
+
+    output_path = Path(args.output_path)
+    jobs = read_jobs(args.surveys, overrides_from_arguments(args), output_path)
+    options = BatchOptions(args.scheduler, args.num_workers, args.num_threads, args.memory_limit, args.restart)
+    terminal = BatchTerminal(sys.stderr or io.StringIO(), quiet=args.quiet)
+    course = run_batch(jobs, options, output_path, terminal)
+    lines = [format_rows(course.rows), "", f"table: {output_path / TABLE_NAME}", f"page: {output_path / PAGE_NAME}"]
+    return Outcome(lines, exit_status_of(course.rows))
+
+
+def _require_dask() -> None:
+    try:
+        import distributed  # noqa: F401
+    except ImportError:
+        raise InputError("rangesfm batch needs Dask: python -m pip install 'rangesfm[batch]'") from None
+
+
+def _at_least_1(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value} is less than 1")
+    return value
+
+
+def _bytes(text: str) -> int:
+    found = re.fullmatch(r"(\d+(?:\.\d+)?) ?([MG]i?B)", text, re.IGNORECASE)
+    if found is None or float(found[1]) == 0:
+        raise argparse.ArgumentTypeError(f"'{text}' is no size, expected one as 8GB or 500MB")
+    return int(float(found[1]) * _BYTES_PER_UNIT[found[2].lower()])

@@ -1,0 +1,39 @@
+"""How a run that failed ends, whatever it failed of: one line for the user, and the exit status."""
+
+from __future__ import annotations
+
+import errno
+from dataclasses import dataclass
+
+from rangesfm.errors import RangesfmError
+
+INTERNAL_ERROR = 1
+"""Exit status of what nobody should ever see."""
+
+_BAD_INPUT, _FAILED = 2, 4
+_INTERRUPTED = 130  # as shells have it
+_UNUSABLE_PATH = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG)
+
+
+@dataclass(frozen=True)
+class Failure:
+    """One line for the user, and the exit status."""
+
+    message: str
+    exit_status: int
+
+
+def failure_of(error: BaseException) -> Failure:
+    """What to tell about any error at all; one that is not of our own classes may be a bug, and is called so."""
+    if isinstance(error, RangesfmError):
+        return Failure(" ".join(str(error).split()), error.exit_status)
+    if isinstance(error, KeyboardInterrupt):
+        return Failure("interrupted; stages that were done are kept", _INTERRUPTED)
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename is not None else ""
+        status = _BAD_INPUT if error.errno in _UNUSABLE_PATH else _FAILED
+        return Failure(" ".join(f"{where}{error.strerror or error}".split()), status)
+    if isinstance(error, MemoryError):
+        return Failure("out of memory", _FAILED)
+    what = " ".join(f"{type(error).__name__}: {error}".split())
+    return Failure(f"internal error, please report it (RANGESFM_DEBUG=1 shows where): {what}", INTERNAL_ERROR)

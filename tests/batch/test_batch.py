@@ -1,0 +1,198 @@
+"""A whole batch: a scheduler and worker processes of this machine, some of which are killed in mid-work."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import psutil
+import pytest
+from distributed import LocalCluster
+
+from rangesfm.cli import main
+from rangesfm.sole_writer import LOCK_NAME
+
+if TYPE_CHECKING:
+    from tests.conftest import Command, PhotoRun
+
+NAMES = ("north", "east")
+QUICK = """
+[scale]
+num_bootstrap = 5
+{scale}
+[refine]
+covariance = false
+"""
+
+
+@pytest.fixture
+def surveys(photo_run: PhotoRun, tmp_path: Path) -> Path:
+    """Two surveys whose photos are mapped already; the second wants to know more of the scale than there is to know."""
+    for name in NAMES:
+        folder = shutil.copytree(photo_run.survey.folder, tmp_path / name)
+        (folder / "out" / "result.json").unlink()
+        log = (folder / "uwb.csv").read_text().splitlines(keepends=True)
+        (folder / "uwb.csv").write_text("".join([log[0], *log[1::3]]))  # quicker
+        text = (folder / "survey.toml").read_text().replace('time_offset = "auto"', "time_offset = 2.35")
+        text = text.replace("[report]", "[report]\nenabled = false")
+        scale = "max_relative_stddev = 1e-6" if name == "east" else ""
+        (folder / "survey.toml").write_text(text + QUICK.format(scale=scale))
+    (tmp_path / "broken.toml").write_text("[images\n")
+    return tmp_path
+
+
+@contextmanager
+def batch(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, "-m", "rangesfm", "batch", *arguments]
+    # A session of its own, as from a terminal, whose Ctrl-C goes to all processes of the group.
+    process = subprocess.Popen(
+        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    with process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def survey_process(folder: Path, batch: subprocess.Popen[str]) -> psutil.Process:
+    """That of the first survey which writes to its folder, held still in mid-work."""
+    while batch.poll() is None:
+        for name in NAMES:
+            try:
+                found = psutil.Process(json.loads((folder / name / "out" / LOCK_NAME).read_text())["pid"])
+                found.suspend()
+                return found
+            except (OSError, ValueError, psutil.Error):  # there is none, it is being written, or it is over
+                pass
+        time.sleep(0.02)
+    pytest.fail(f"it has ended\n{batch.communicate()}")
+
+
+def rows_of(folder: Path) -> dict[str, dict[str, str]]:
+    with (folder / "batch" / "batch.csv").open(newline="") as file:
+        return {row["survey"]: row for row in csv.DictReader(file)}
+
+
+def left_over(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob(".*") if path.name != LOCK_NAME]
+
+
+def test_all_surveys_end_though_a_worker_is_killed_and_others_fail(surveys: Path, photo_run: PhotoRun) -> None:
+    files = [f"{name}/survey.toml" for name in NAMES]
+    with batch(surveys, "broken.toml", *files, "--num_workers", "2") as process:
+        survey = survey_process(surveys, process)
+        worker = survey.parent()
+        assert worker is not None
+        assert worker.ppid() == process.pid
+        worker.kill()
+        out, errors = process.communicate()
+    assert not survey.is_running()
+    assert process.returncode == 3, errors
+    rows = rows_of(surveys)
+    assert list(rows) == ["broken.toml", *files]
+    assert [row["status"] for row in rows.values()] == ["failed", "done", "failed"]
+    assert rows["broken.toml"]["reason"].startswith("broken.toml:1: ")
+    assert rows["east/survey.toml"]["reason"].startswith("the scale is only known to ")
+    assert sorted(row["num_attempts"] for row in rows.values()) == ["0", "1", "2"]
+    scale = json.loads((photo_run.output_path / "result.json").read_text())["scale"]["value"]
+    assert float(rows["north/survey.toml"]["scale"]) == pytest.approx(scale, rel=0.02)
+    assert (surveys / "north" / "out" / "result.json").is_file()
+    assert "Traceback" not in errors
+    assert "begins again, attempt 2" in errors
+    assert "3 of 3 surveys over, 2 of them failed" in errors
+    assert [line.split()[:2] for line in out.splitlines()[1:4]] == [
+        ["broken.toml", "failed"],
+        ["north/survey.toml", rows["north/survey.toml"]["verdict"]],
+        ["east/survey.toml", "failed"],
+    ]
+    assert left_over(surveys) == []
+
+
+def test_interrupted_it_stops_its_workers_and_says_how_far_it_came(surveys: Path) -> None:
+    with batch(surveys, "north/survey.toml", "east/survey.toml", "--num_workers", "1", "--restart") as process:
+        survey = survey_process(surveys, process)
+        processes = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
+        os.killpg(process.pid, signal.SIGINT)
+        survey.resume()
+        out, errors = process.communicate()
+    assert (process.returncode, out) == (130, "")
+    assert errors.splitlines()[-1] == "rangesfm: error: interrupted; stages that were done are kept"
+    assert psutil.wait_procs(processes, timeout=60)[1] == []
+    assert [row["status"] for row in rows_of(surveys).values()] == ["interrupted", "interrupted"]
+    assert left_over(surveys) == []
+
+
+def test_two_surveys_with_one_folder_are_refused_before_anything_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.toml", "b.toml"):
+        (tmp_path / name).touch()
+    assert main(["batch", "a.toml", "b.toml"]) == 2
+    assert capsys.readouterr().err == (
+        f"rangesfm: error: b.toml: writes to {tmp_path / 'out'}, and so does a.toml: "
+        "expected an [output] path of its own\n"
+    )
+    assert sorted(os.listdir(tmp_path)) == ["a.toml", "b.toml"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--num_workers", "0"], "argument --num_workers: 0 is less than 1"),
+        (["--memory_limit", "8"], "argument --memory_limit: '8' is no size, expected one as 8GB or 500MB"),
+        (["--scheduler", "tcp://head:8786", "--num_workers", "2"], "--num_workers is of this machine"),
+        (["--scheduler", "nowhere"], "no Dask scheduler answers at 'nowhere', as tcp://head:8786"),
+        (["--num_threads", "4096"], "1 workers with 4096 threads each, and this machine has "),
+    ],
+)
+def test_what_cannot_be_is_refused(
+    flags: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.toml").touch()
+    assert main(["batch", "a.toml", *flags]) == 2
+    assert capsys.readouterr().err.startswith(f"rangesfm: error: {said}")
+    assert not (tmp_path / "batch").exists()
+
+
+def test_the_workers_of_a_scheduler_do_what_they_are_given(surveys: Path, rangesfm_command: Command) -> None:
+    shutil.rmtree(surveys / "north" / "images")
+    with LocalCluster(
+        n_workers=1,
+        threads_per_worker=1,
+        processes=False,
+        protocol="tcp",
+        host="127.0.0.1",
+        dashboard_address=None,
+        local_directory=str(surveys / "scratch"),
+        scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
+    ) as cluster:
+        done = rangesfm_command(
+            "batch", "north/survey.toml", "--scheduler", cluster.scheduler_address, cwd=surveys, status=2
+        )
+    row = rows_of(surveys)["north/survey.toml"]
+    assert (row["status"], row["num_attempts"], row["host"]) == ("failed", "1", socket.gethostname())
+    assert row["reason"] == f"{surveys / 'north' / 'images'}: no such folder"
+    assert done.stderr.splitlines()[0] == "north/survey.toml: begins"
+
+
+def test_without_dask_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert main(["batch", str(tmp_path / "a.toml")]) == 2
+    said = "rangesfm: error: rangesfm batch needs Dask: python -m pip install 'rangesfm[batch]'\n"
+    assert capsys.readouterr().err == said

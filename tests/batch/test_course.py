@@ -1,0 +1,101 @@
+"""How far a batch is, by what its workers tell."""
+
+from __future__ import annotations
+
+import pytest
+
+from rangesfm.batch.course import Course
+from rangesfm.batch.jobs import Job
+from rangesfm.batch.rows import Figures, Status, SurveyRow, exit_status_of, figures_of, format_rows
+from rangesfm.config import Survey
+from rangesfm.failures import Failure
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def course(clock: Clock) -> Course:
+    return Course([Job(name, Survey()) for name in "abcd"], clock=clock)
+
+
+def test_an_attempt_begins_anew_where_a_worker_was_killed(course: Course, clock: Clock) -> None:
+    course.tell(0, {"began_on": "one"})
+    course.tell(0, {"stage": "mapping"})
+    course.tell(0, {"num_done": 3, "num_total": 9})
+    assert (course.states[0].stage, course.states[0].num_done, course.states[0].num_total) == ("mapping", 3, 9)
+    clock.now_s += 50
+    course.tell(0, {"began_on": "two"})
+    assert (course.states[0].stage, course.states[0].num_done) == ("", None)
+    clock.now_s += 8
+    course.done(0, Figures(verdict="good"), "")
+    row = course.rows[0]
+    assert (row.status, row.num_attempts, row.host, row.seconds) == (Status.DONE, 2, "two", 8)
+    course.tell(0, {"began_on": "late"})  # from a worker that was thought lost
+    assert course.rows[0] == row
+
+
+def test_time_left_is_that_of_those_that_are_done(course: Course, clock: Clock) -> None:
+    course.num_at_once = 2
+    for index in (0, 1):
+        course.tell(index, {"began_on": "here"})
+    clock.now_s += 30
+    assert course.seconds_left() is None
+    course.done(0, Figures(), "")
+    course.tell(2, {"began_on": "here"})
+    assert course.seconds_left() == pytest.approx((30 + 0 + 30) / 2)  # d waits, b is due, c has begun
+    clock.now_s += 20
+    assert course.seconds_left() == pytest.approx((30 + 0 + 10) / 2)
+
+
+def test_whatever_is_not_over_when_it_is_interrupted_says_so(course: Course) -> None:
+    course.tell(0, {"began_on": "here"})
+    course.done(1, Figures(), "")
+    course.interrupted()
+    assert course.is_over
+    assert [row.status.value for row in course.rows] == ["interrupted", "done", "interrupted", "interrupted"]
+
+
+def test_a_file_that_could_not_be_read_is_over_from_the_start() -> None:
+    course = Course([Job("x.toml", None, Failure("x.toml: no such file", 2))])
+    assert course.is_over
+    assert exit_status_of(course.rows) == 2
+
+
+@pytest.mark.parametrize(
+    ("statuses", "expected"), [((0, 0), 0), ((0, 2), 2), ((3, 2), 3), ((2, 4, 3), 4), ((1, 2), 4), ((), 0)]
+)
+def test_the_batch_ends_with_the_largest_of_the_statuses(statuses: tuple[int, ...], expected: int) -> None:
+    assert exit_status_of([SurveyRow("a", exit_status=status) for status in statuses]) == expected
+
+
+def test_the_table_of_the_terminal_says_why_below() -> None:
+    done = SurveyRow("a.toml", Status.DONE, "short", 0, figures=Figures(verdict="doubtful", scale=0.5, num_photos=3))
+    failed = SurveyRow("b.toml", Status.FAILED, "no such file", 2)
+    lines = format_rows([done, failed]).split("\n")
+    assert lines[1].split() == ["a.toml", "doubtful", "0.5", "3", "-", "-", "-", "-"]
+    assert lines[2].split()[:2] == ["b.toml", "failed"]
+    assert lines[3:] == ["", "b.toml: no such file"]
+
+
+def test_figures_are_those_of_the_result() -> None:
+    result = {
+        "scale": {"verdict": "good", "value": 0.7, "stddev_formal": 0.01, "stddev_empirical": 0.02},
+        "frame": "site",
+        "map": {"num_photos": 14, "num_points3D": 900},
+        "ranges": {"num": 10, "num_used": 8, "rms_m": 0.08},
+        "refine": None,
+        "comparison": [{"rmse_m": 2.0}, {"rmse_m": 0.1}],
+        "warnings": ["one"],
+    }
+    assert figures_of(result) == Figures("good", 0.7, 0.02, "site", 14, 10, 8, 0.08, None, 0.1, 1)

@@ -1,0 +1,61 @@
+"""Which surveys a batch has, and which it refuses before anything starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rangesfm.batch.jobs import read_jobs
+from rangesfm.errors import InputError
+
+
+def write_survey(path: Path, output: str | None) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("" if output is None else f'[output]\npath = "{output}"\n')
+    return path
+
+
+def test_each_survey_has_its_own_folder_and_the_overrides_of_all(tmp_path: Path) -> None:
+    paths = [write_survey(tmp_path / name / "survey.toml", None) for name in ("a", "b")]
+    jobs = read_jobs(paths, {"output.seed": 7}, tmp_path / "batch")
+    surveys = [job.survey for job in jobs if job.survey is not None]
+    assert [survey.output_path for survey in surveys] == [tmp_path / "a" / "out", tmp_path / "b" / "out"]
+    assert [survey.seed for survey in surveys] == [7, 7]
+
+
+@pytest.mark.parametrize("output", ["out_of_a", "../surveys/out_of_a", "./x/../out_of_a"])
+def test_two_surveys_that_write_to_one_folder_are_refused(output: str, tmp_path: Path) -> None:
+    first = write_survey(tmp_path / "surveys" / "a.toml", "out_of_a")
+    second = write_survey(tmp_path / "surveys" / "b.toml", output)
+    (tmp_path / "surveys" / "x").mkdir()
+    with pytest.raises(InputError) as caught:
+        read_jobs([first, second], {}, tmp_path / "batch")
+    folder = tmp_path / "surveys" / "out_of_a"
+    assert str(caught.value) == (
+        f"{second}: writes to {folder}, and so does {first}: expected an [output] path of its own"
+    )
+
+
+def test_one_survey_named_twice_is_refused(tmp_path: Path) -> None:
+    path = write_survey(tmp_path / "a.toml", None)
+    with pytest.raises(InputError, match="and so does"):
+        read_jobs([path, tmp_path / "." / "a.toml"], {}, tmp_path / "batch")
+
+
+def test_a_survey_must_not_write_where_the_table_goes(tmp_path: Path) -> None:
+    path = write_survey(tmp_path / "a.toml", "batch")
+    with pytest.raises(InputError, match="and so does the table of the batch"):
+        read_jobs([path], {}, tmp_path / "batch")
+
+
+def test_a_file_that_cannot_be_used_is_a_job_that_has_failed(tmp_path: Path) -> None:
+    wrong = write_survey(tmp_path / "wrong.toml", None)
+    wrong.write_text("[images]\nfolder = 3\n")
+    good = write_survey(tmp_path / "good.toml", None)
+    jobs = read_jobs([wrong, tmp_path / "none.toml", good], {}, tmp_path / "batch")
+    assert [job.survey is None for job in jobs] == [True, True, False]
+    failures = [job.failure for job in jobs[:2] if job.failure is not None]
+    assert [failure.exit_status for failure in failures] == [2, 2]
+    assert failures[0].message.startswith(f"{wrong}:2: unknown key 'folder'")
+    assert failures[1].message == f"{tmp_path / 'none.toml'}: no such file"

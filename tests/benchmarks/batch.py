@@ -1,0 +1,101 @@
+"""How long many demo surveys take on several workers, beside one after another.
+
+python tests/benchmarks/batch.py [--num_surveys 16] [--num_photos 40] [--width 960] [--num_workers 2] [--kill]
+
+Makes the surveys, runs each with ``rangesfm run`` one after another (all cores), then all with ``rangesfm batch`` from
+nothing, and prints the seconds of both (by the clock and of the processors), their ratio, the cores, and the machine's
+load before each. With ``--kill`` one worker is killed in mid-work, and the rows of the table are counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import psutil
+
+from rangesfm.simulate.survey import TIME_OFFSET_S, make_demo_survey
+
+_ASPECT = 2 / 3
+_FLAGS = ("--ranges_time_offset", str(TIME_OFFSET_S))  # short surveys leave it open
+
+
+def make_surveys(folder: Path, arguments: argparse.Namespace) -> list[Path]:
+    size = (arguments.width, round(arguments.width * _ASPECT))
+    return [
+        make_demo_survey(folder / f"yard{seed:02d}", num_photos=arguments.num_photos, seed=seed, image_size=size).folder
+        for seed in range(arguments.num_surveys)
+    ]
+
+
+def seconds_of(folder: Path, *arguments: str, kill_after_s: float | None = None) -> float:
+    """Wall-clock time of a command, of which one worker may be killed meanwhile."""
+    begin = time.monotonic()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rangesfm", *arguments], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    if kill_after_s is not None:
+        threading.Timer(kill_after_s, kill_a_worker, [process.pid]).start()
+    _, errors = process.communicate()
+    if process.returncode:
+        raise SystemExit(f"exit status {process.returncode} of {arguments}\n{errors.decode()}")
+    return time.monotonic() - begin
+
+
+def kill_a_worker(pid: int) -> None:
+    """One that has a survey: a child of the command with a child of its own."""
+    workers = [child for child in psutil.Process(pid).children() if child.children()]
+    print(f"killing worker {workers[0].pid}", flush=True)
+    workers[0].kill()
+
+
+def processor_seconds() -> float:
+    """Of all processes that have been waited for."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def say(what: str, seconds: float, processor_s: float, load: float) -> None:
+    print(f"{what:20} {seconds:8.1f} s, processors {processor_s:8.1f} s, load before {load:.1f}", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--num_surveys", type=int, default=16)
+    parser.add_argument("--num_photos", type=int, default=40)
+    parser.add_argument("--width", type=int, default=960)
+    parser.add_argument("--num_workers", type=int, default=2)
+    parser.add_argument("--kill", action="store_true")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        surveys = make_surveys(folder, arguments)
+        load, used_s = os.getloadavg()[0], processor_seconds()
+        one_by_one = sum(seconds_of(survey, "run", "survey.toml", *_FLAGS) for survey in surveys)
+        say("one after another", one_by_one, processor_seconds() - used_s, load)
+        for survey in surveys:
+            shutil.rmtree(survey / "out")
+        load, used_s = os.getloadavg()[0], processor_seconds()
+        files = [f"{survey.name}/survey.toml" for survey in surveys]
+        kill_after_s = 0.25 * one_by_one if arguments.kill else None
+        num_workers = str(arguments.num_workers)
+        together = seconds_of(folder, "batch", *files, *_FLAGS, "--num_workers", num_workers, kill_after_s=kill_after_s)
+        say(f"on {num_workers} workers", together, processor_seconds() - used_s, load)
+        with (folder / "batch" / "batch.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        print(f"ratio {together / one_by_one:.2f} on {os.cpu_count()} cores")
+        print(f"{len(rows)} rows, {sum(row['status'] == 'done' for row in rows)} done, attempts", end=" ")
+        print(*(row["num_attempts"] for row in rows))
+
+
+if __name__ == "__main__":
+    main()

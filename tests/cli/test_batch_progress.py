@@ -1,0 +1,86 @@
+"""What a user sees of a batch while it goes on."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+
+from rangesfm.batch.course import Course
+from rangesfm.batch.jobs import Job
+from rangesfm.batch.rows import Figures
+from rangesfm.cli.batch_progress import BatchTerminal
+from rangesfm.config import Survey
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def course(clock: Clock) -> Course:
+    return Course([Job(name, Survey()) for name in ("a.toml", "b.toml")], clock=clock)
+
+
+def go_on(course: Course, shown: BatchTerminal, clock: Clock) -> None:
+    """One is done and the other refused, shown at each step."""
+    shown.show(course)
+    for index in (0, 1):
+        course.tell(index, {"began_on": "here"})
+    shown.show(course)
+    course.tell(0, {"stage": "mapping"})
+    course.tell(0, {"num_done": 5, "num_total": 20})
+    clock.now_s = 10.0
+    shown.show(course)
+    course.tell(1, {"began_on": "there"})
+    shown.show(course)
+    course.done(0, Figures(verdict="good"), "")
+    clock.now_s = 14.0
+    shown.show(course)
+    course.failed(1, "the scale is not known", 3)
+    shown.show(course)
+
+
+def test_plain_lines_tell_each_stage_once(course: Course, clock: Clock) -> None:
+    stream = io.StringIO()
+    go_on(course, BatchTerminal(stream, clock=clock), clock)
+    assert stream.getvalue().splitlines() == [
+        "a.toml: begins",
+        "b.toml: begins",
+        "a.toml: mapping",
+        "b.toml: begins again, attempt 2",
+        "a.toml: good after 10.0 s",
+        "1 of 2 surveys over, 14.0 s, 6.0 s left",
+        "b.toml: failed after 4.0 s: the scale is not known",
+        "2 of 2 surveys over, 1 of them failed, 14.0 s",
+    ]
+
+
+def test_a_terminal_shows_a_line_for_each_at_work_and_draws_over_it(course: Course, clock: Clock) -> None:
+    stream = Terminal()
+    go_on(course, BatchTerminal(stream, clock=clock), clock)
+    drawn = stream.getvalue()
+    assert "  a.toml: mapping 5/20, 25 %, 10.0 s\n" in drawn
+    assert "\033[3F\033[J" in drawn  # two surveys and the sum
+    lines = drawn.split("\033[J")[-1].splitlines()  # what stays
+    assert lines == ["b.toml: failed after 4.0 s: the scale is not known"]
+
+
+def test_quiet_is_quiet(course: Course, clock: Clock) -> None:
+    stream = Terminal()
+    go_on(course, BatchTerminal(stream, quiet=True, clock=clock), clock)
+    assert stream.getvalue() == ""
