@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
-from rangesfm.batch.jobs import Job
+from rangesfm.batch.jobs import Job, shown
 from rangesfm.batch.rows import Figures, Status, SurveyRow
 
 
@@ -133,7 +133,7 @@ class Course:
 
 
 def _first_row(job: Job) -> SurveyRow:
-    output = "" if job.survey is None else str(job.survey.output_path)
+    output = "" if job.survey is None else shown(job.survey.output_path)
     if job.failure is None:
         return SurveyRow(job.name, output_path=output)
     return SurveyRow(

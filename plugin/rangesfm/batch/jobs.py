@@ -16,7 +16,7 @@ class Job:
     """One survey of a batch.
 
     Attributes:
-        name: its file, as the user wrote it.
+        name: its file, as the user wrote it; characters that cannot be printed are question marks.
         survey: None if the file cannot be used.
         failure: then why not.
     """
@@ -55,6 +55,11 @@ def read_jobs(paths: Sequence[str | Path], overrides: Mapping[str, object], outp
 
 def _read_job(path: str | Path, overrides: Mapping[str, object]) -> Job:
     try:
-        return Job(str(path), read_survey(path, overrides))
+        return Job(shown(path), read_survey(path, overrides))
     except (InputError, OSError) as error:
-        return Job(str(path), None, failure_of(error))
+        return Job(shown(path), None, failure_of(error))
+
+
+def shown(path: str | Path) -> str:
+    """A path for people and for tables: names of files may hold anything."""
+    return "".join(character if character.isprintable() else "?" for character in str(path))

@@ -80,7 +80,12 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     options = BatchOptions(args.scheduler, args.num_workers, args.num_threads, args.memory_limit, args.restart)
     terminal = BatchTerminal(sys.stderr or io.StringIO(), quiet=args.quiet)
     course = run_batch(jobs, options, output_path, terminal)
-    lines = [format_rows(course.rows), "", f"table: {output_path / TABLE_NAME}", f"page: {output_path / PAGE_NAME}"]
+    lines = [
+        *format_rows(course.rows).splitlines(),
+        "",
+        f"table: {output_path / TABLE_NAME}",
+        f"page: {output_path / PAGE_NAME}",
+    ]
     return Outcome(lines, exit_status_of(course.rows))
 
 
