@@ -19,12 +19,13 @@
 
 #include "gate.h"
 #include "rangesfm/distance_cost.h"
+#include "rangesfm/joint_prior_cost.h"
 #include "rangesfm/normal_prior_cost.h"
 #include "rangesfm/padded_manifold.h"
 #include "rangesfm/range_cost.h"
 #include "rangesfm/range_error_curve.h"
 #include "rangesfm/tag_place.h"
-#include "rangesfm/two_sided_cauchy.h"
+#include "rangesfm/two_sided_loss.h"
 #include "rangesfm/zero_tie_cost.h"
 
 namespace py = pybind11;
@@ -60,7 +61,7 @@ std::shared_ptr<const RangeErrorCurve> Tabulated(const Array& error_curve_m) {
 
 // What the three range costs have in common.
 RangeModel Model(bool has_common_bias, std::optional<double> short_range_length_m, const OptionalArray& error_curve_m,
-                 double loss_scale_too_long, double loss_scale_too_short) {
+                 double loss_scale_too_long, double loss_scale_too_short, bool loss_is_bounded) {
   RangeModel model;
   model.has_common_bias = has_common_bias;
   if (short_range_length_m && error_curve_m) {
@@ -71,8 +72,8 @@ RangeModel Model(bool has_common_bias, std::optional<double> short_range_length_
   } else if (error_curve_m) {
     model.error_curve = Tabulated(*error_curve_m);
   }
-  model.loss = TwoSidedCauchy(PositiveOrInfinite("loss_scale_too_long", loss_scale_too_long),
-                              PositiveOrInfinite("loss_scale_too_short", loss_scale_too_short));
+  model.loss = TwoSidedLoss(PositiveOrInfinite("loss_scale_too_long", loss_scale_too_long),
+                            PositiveOrInfinite("loss_scale_too_short", loss_scale_too_short), loss_is_bounded);
   return model;
 }
 
@@ -146,6 +147,18 @@ ceres::CostFunction* MakeNormalPriorCost(const Array& mean, const Array& stddev)
   return new NormalPriorCost(means, stddevs);
 }
 
+ceres::CostFunction* MakeJointPriorCost(const Array& mean, const Array& whitening) {
+  const Eigen::VectorXd means = FiniteVector("mean", mean);
+  const Eigen::Index size = means.size();
+  if (whitening.ndim() != 2 || whitening.shape(0) != size || whitening.shape(1) != size) {
+    FailOnShape("whitening", whitening, std::to_string(size) + " rows and columns");
+  }
+  // C order: what Eigen takes for columns are rows.
+  const Eigen::MatrixXd matrix = Eigen::Map<const Eigen::MatrixXd>(whitening.data(), size, size).transpose();
+  CheckEach("whitening", matrix.reshaped(), Finite);
+  return new JointPriorCost(means, matrix);
+}
+
 ceres::CostFunction* MakeZeroTieCost(int size_a, int size_b) {
   return new ZeroTieCost(BlockSize("size_a", size_a), BlockSize("size_b", size_b));
 }
@@ -171,16 +184,16 @@ void DefineRangeCost(py::module_& m, const char* name,
       name,
       [make](const Array& range_m, const Array& stddev_m, OfPlace... of_place, bool has_common_bias,
              std::optional<double> short_range_length_m, const OptionalArray& error_curve_m, double loss_scale_too_long,
-             double loss_scale_too_short) {
-        return make(
-            Measured(range_m, stddev_m),
-            Model(has_common_bias, short_range_length_m, error_curve_m, loss_scale_too_long, loss_scale_too_short),
-            of_place...);
+             double loss_scale_too_short, bool loss_is_bounded) {
+        return make(Measured(range_m, stddev_m),
+                    Model(has_common_bias, short_range_length_m, error_curve_m, loss_scale_too_long,
+                          loss_scale_too_short, loss_is_bounded),
+                    of_place...);
       },
       kOwn, py::kw_only(), py::arg("range_m"), py::arg("stddev_m"), place_arguments...,
       py::arg("has_common_bias") = false, py::arg("short_range_length_m") = py::none(),
       py::arg("error_curve_m") = py::none(), py::arg("loss_scale_too_long") = kLeastSquares,
-      py::arg("loss_scale_too_short") = kLeastSquares);
+      py::arg("loss_scale_too_short") = kLeastSquares, py::arg("loss_is_bounded") = false);
 }
 
 }  // namespace
@@ -203,6 +216,8 @@ PYBIND11_MODULE(_cpp, m) {
         py::arg("stddev_m"), py::arg("a_in_cam_m"), py::arg("b_in_cam_m"), py::arg("has_bias"));
   m.def("normal_prior_cost", &rangesfm::MakeNormalPriorCost, rangesfm::kOwn, py::kw_only(), py::arg("mean"),
         py::arg("stddev"));
+  m.def("joint_prior_cost", &rangesfm::MakeJointPriorCost, rangesfm::kOwn, py::kw_only(), py::arg("mean"),
+        py::arg("whitening"));
   m.def("zero_tie_cost", &rangesfm::MakeZeroTieCost, rangesfm::kOwn, py::kw_only(), py::arg("size_a"),
         py::arg("size_b"));
   m.def("padded_manifold", &rangesfm::MakePaddedManifold, rangesfm::kOwn, py::kw_only(), py::arg("size"),

@@ -14,7 +14,7 @@
 #include "rangesfm/range_cost.h"
 #include "rangesfm/range_error_curve.h"
 #include "rangesfm/tag_place.h"
-#include "rangesfm/two_sided_cauchy.h"
+#include "rangesfm/two_sided_loss.h"
 
 namespace rangesfm {
 namespace {
@@ -46,7 +46,7 @@ std::shared_ptr<const RangeErrorCurve> Table() {
 }
 
 // Everything free.
-RangeModel FullModel(std::shared_ptr<const RangeErrorCurve> curve, TwoSidedCauchy loss) {
+RangeModel FullModel(std::shared_ptr<const RangeErrorCurve> curve, TwoSidedLoss loss) {
   RangeModel model;
   model.tag_in_cam.reset();
   model.has_time_shift = true;
@@ -75,7 +75,7 @@ TEST(RangeModel, PredictionIsTheHandComputedOne) {
   InterpolatedPlace place(Eigen::VectorXd::Zero(1), Eigen::Vector3d(0.0, 0.0, 0.5), 2.0,
                           Eigen::Vector3d(0.0, 0.0, 0.2));
   const RangeCost<InterpolatedPlace> cost(std::move(place), OneRange(5.0, 0.1),
-                                          FullModel(std::make_shared<ExponentialCurve>(5.0), TwoSidedCauchy()));
+                                          FullModel(std::make_shared<ExponentialCurve>(5.0), TwoSidedLoss()));
   const std::vector<Block> blocks = {{0.0, 0.0, 0.0, 1.0, 0.0, -2.0, 0.0},
                                      {0.0, 0.0, 0.0, 1.0, -4.0, -2.0, 0.0},
                                      {5.0, 6.0, 0.6},
@@ -93,7 +93,8 @@ TEST(RangeModel, GradientsAreRightForEverythingFreeBetweenKeyframes) {
   for (int i = 0; i < 40; ++i) {
     const std::shared_ptr<const RangeErrorCurve> curve =
         i % 2 == 0 ? Table() : std::make_shared<ExponentialCurve>(random.Uniform(10.0, 50.0));
-    const TwoSidedCauchy loss(random.Uniform(1.0, 100.0), i % 3 == 0 ? kInfinity : random.Uniform(1.0, 100.0));
+    const TwoSidedLoss loss(random.Uniform(1.0, 100.0), i % 3 == 0 ? kInfinity : random.Uniform(1.0, 100.0),
+                            i % 2 == 0);
     const RangeCost<InterpolatedPlace> cost(Between(random, 5, random.Uniform(0.1, 3.0)), Measured(random, 5, 20.0),
                                             FullModel(curve, loss));
     ExpectGradientsAreRight(cost, FullBlocks(random, 10.0), 1e-7);
@@ -103,7 +104,7 @@ TEST(RangeModel, GradientsAreRightForEverythingFreeBetweenKeyframes) {
 TEST(RangeModel, GradientsAreRightForEverythingFreeAtAKeyframe) {
   Random random(2);
   for (int i = 0; i < 20; ++i) {
-    RangeModel model = FullModel(std::make_shared<ExponentialCurve>(20.0), TwoSidedCauchy(20.0, 5.0));
+    RangeModel model = FullModel(std::make_shared<ExponentialCurve>(20.0), TwoSidedLoss(20.0, 5.0));
     model.has_time_shift = false;
     const RangeCost<KeyframePlace> cost(KeyframePlace(), Measured(random, 4, 20.0), std::move(model));
     ExpectGradientsAreRight(cost,
@@ -122,7 +123,7 @@ TEST(RangeModel, GradientsAreRightFarBeyondTheKeyframesInTime) {
   std::vector<Block> blocks = FullBlocks(random, 5.0);
   blocks[5] = {30.0};
   const RangeCost<InterpolatedPlace> cost(Between(random, 3, 0.5), Measured(random, 3, 20.0),
-                                          FullModel(Table(), TwoSidedCauchy()));
+                                          FullModel(Table(), TwoSidedLoss()));
   ExpectGradientsAreRight(cost, blocks, 1e-7);
 }
 
@@ -130,7 +131,7 @@ TEST(RangeModel, AnswerIsFiniteForAnOutlierOfAMillionStddevs) {
   Random random(4);
   const std::vector<Block> blocks = FullBlocks(random, 5.0);
   const RangeCost<InterpolatedPlace> cost(Between(random, 1, 0.5), OneRange(1e6, 1e-3),
-                                          FullModel(Table(), TwoSidedCauchy(2.0, 2.0)));
+                                          FullModel(Table(), TwoSidedLoss(2.0, 2.0)));
   const Evaluation evaluation = Evaluate(cost, blocks);
   ExpectAllFinite(evaluation);
   EXPECT_NEAR(evaluation.residuals[0], -2.0 * std::sqrt(std::log1p(std::pow(1e9 / 2.0, 2))), 1e-3);
@@ -139,7 +140,7 @@ TEST(RangeModel, AnswerIsFiniteForAnOutlierOfAMillionStddevs) {
 TEST(RangeModel, AnswerIsFiniteWithTheTagOnTheAnchor) {
   RangeModel model = WithLeverArm(Eigen::Vector3d::Zero());
   model.error_curve = std::make_shared<ExponentialCurve>(1.0);
-  model.loss = TwoSidedCauchy(2.0, 2.0);
+  model.loss = TwoSidedLoss(2.0, 2.0);
   const RangeCost<KeyframePlace> cost(KeyframePlace(), OneRange(1.0, 1.0), std::move(model));
   const Evaluation evaluation = Evaluate(cost, {{0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0}, {0.0, 0.0, 0.0}, {0.0}, {1.0}});
   ExpectAllFinite(evaluation);
@@ -153,7 +154,7 @@ TEST(RangeModel, ManyRangesAreAsManyCostsOfOne) {
   const Eigen::Matrix3Xd offset = Vectors(random, kNumRanges, 0.3);
   const Eigen::Matrix3Xd velocity = Vectors(random, kNumRanges, 0.3);
   const MeasuredRanges measured = Measured(random, kNumRanges, 10.0);
-  const RangeModel model = FullModel(Table(), TwoSidedCauchy(10.0, 3.0));
+  const RangeModel model = FullModel(Table(), TwoSidedLoss(10.0, 3.0));
   const std::vector<Block> blocks = FullBlocks(random, 5.0);
   const Evaluation many =
       Evaluate(RangeCost<InterpolatedPlace>(InterpolatedPlace(weight, offset, 0.7, velocity), measured, model), blocks);
@@ -188,7 +189,7 @@ TEST(RangeModel, AFreeLeverArmIsTheConstantOneWithAGradient) {
 TEST(RangeModel, AnyJacobianMayBeLeftOut) {
   Random random(7);
   const RangeCost<InterpolatedPlace> cost(Between(random, 4, 0.5), Measured(random, 4, 10.0),
-                                          FullModel(Table(), TwoSidedCauchy(3.0, 2.0)));
+                                          FullModel(Table(), TwoSidedLoss(3.0, 2.0)));
   ExpectAnyJacobianMayBeLeftOut(cost, FullBlocks(random, 5.0));
 }
 

@@ -19,6 +19,7 @@ def range_cost(
     error_curve_m: npt.ArrayLike | None = ...,
     loss_scale_too_long: float = ...,
     loss_scale_too_short: float = ...,
+    loss_is_bounded: bool = ...,
 ) -> CostFunction: ...
 def fixed_pose_range_cost(
     *,
@@ -30,6 +31,7 @@ def fixed_pose_range_cost(
     error_curve_m: npt.ArrayLike | None = ...,
     loss_scale_too_long: float = ...,
     loss_scale_too_short: float = ...,
+    loss_is_bounded: bool = ...,
 ) -> CostFunction: ...
 def interpolated_range_cost(
     *,
@@ -45,6 +47,7 @@ def interpolated_range_cost(
     error_curve_m: npt.ArrayLike | None = ...,
     loss_scale_too_long: float = ...,
     loss_scale_too_short: float = ...,
+    loss_is_bounded: bool = ...,
 ) -> CostFunction: ...
 def distance_cost(
     *,
@@ -55,5 +58,6 @@ def distance_cost(
     has_bias: bool,
 ) -> CostFunction: ...
 def normal_prior_cost(*, mean: npt.ArrayLike, stddev: npt.ArrayLike) -> CostFunction: ...
+def joint_prior_cost(*, mean: npt.ArrayLike, whitening: npt.ArrayLike) -> CostFunction: ...
 def zero_tie_cost(*, size_a: int, size_b: int) -> CostFunction: ...
 def padded_manifold(*, size: int, tangent_size: int) -> Manifold: ...

@@ -151,7 +151,7 @@ class RefineOptions:
     Attributes:
         enabled: False leaves the map as scaled.
         max_num_iterations: of the solver.
-        range_loss_scale: residual in stddevs from which a range is down-weighted (Cauchy).
+        range_loss_scale: residual in stddevs from which a range is down-weighted (Geman-McClure).
         lever_arm_stddev_m: of each coordinate of the tags' places in the camera frame, which are estimated if this is
             more than 0.
         time_offset_stddev_s: of the clocks' offset, likewise.
@@ -163,7 +163,7 @@ class RefineOptions:
 
     enabled: bool = True
     max_num_iterations: int = 200
-    range_loss_scale: float = 2.4
+    range_loss_scale: float = 3.46
     lever_arm_stddev_m: float = 0.0
     time_offset_stddev_s: float = 0.0
     short_range_stddev_m: float = 0.0

@@ -43,7 +43,8 @@ from rangesfm.progress import Progress
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock import TimeOffset, estimate_time_offset
 from rangesfm.ranging.log import RangeKind, RangeLog
-from rangesfm.ranging.observations import RangeObservations, RangeStatus, hold_out, robust_weights
+from rangesfm.ranging.observations import RangeObservations, RangeStatus, hold_out
+from rangesfm.ranging.robust_loss import GEMAN_MCCLURE
 from rangesfm.reference import write_reference
 from rangesfm.refine import predicted_ranges, refine_with_ranges
 from rangesfm.report import write_report
@@ -344,7 +345,7 @@ def _scale(
         [anchor.position_m for anchor in estimate.anchors],
         [anchor.range_bias_m for anchor in estimate.anchors],
     )
-    weights = robust_weights((predicted - inputs.log.range_m) / estimate.range_stddev_m)
+    weights = GEMAN_MCCLURE.weights((predicted - inputs.log.range_m) / estimate.range_stddev_m)
     return MetricSurvey(trajectory, offset, offset_s, estimate, scaled, predicted, weights)
 
 

@@ -16,9 +16,10 @@ from rangesfm.distances.ends import LocatedDistances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry import Similarity
-from rangesfm.options import CameraOptions, RefineOptions
+from rangesfm.options import CameraOptions, RangeModelOptions, RefineOptions
 from rangesfm.ranging.anchors import AnchorEstimate
-from rangesfm.ranging.observations import RangeObservations, robust_weights, status_by_weight
+from rangesfm.ranging.observations import RangeObservations, status_by_weight
+from rangesfm.ranging.robust_loss import wider
 from rangesfm.refinement.antennas import antennas, predicted_ranges, tags_in_cam
 from rangesfm.refinement.bundle_adjustment import (
     BundleAdjustment,
@@ -114,7 +115,7 @@ def refine_with_ranges(
     range_stddev_m: Array,
     stddev_is_estimated: npt.NDArray[np.bool_] | None = None,
     correlation_inflation: float = 1.0,
-    common_bias_stddev_m: float = 0.0,
+    common_bias_stddev_m: float = RangeModelOptions.common_bias_stddev_m,
     first_pose_is_fixed: bool,
     camera: CameraOptions | None = None,
     options: RefineOptions | None = None,
@@ -134,7 +135,7 @@ def refine_with_ranges(
         stddev_is_estimated: (n,) which of these come from residuals of the scaled map, which drift makes too large:
             they are estimated anew, each anchor's for itself, and the inflation with them. None: all are known.
         correlation_inflation: how much the ranges' correlation in time reduces their say.
-        common_bias_stddev_m: of an error that all biases' priors share, as drift leaves one to the scale stage.
+        common_bias_stddev_m: of the bias that all anchors share (mean 0), of which their priors say nothing.
         first_pose_is_fixed: the gauge: True in the first camera's frame, False where
             surveyed anchors hold the map.
         tape: taped distances, of which the map keeps to the control ones; as it does to the ranges between anchors
@@ -163,7 +164,15 @@ def refine_with_ranges(
     placed = antennas(trajectory, observations, metric_from_sfm, tags_in_cam_m)
     ranges = RadioRanges(observations, trajectory, placed, np.flatnonzero(observations.has_place))
     survey = _Survey(
-        metric, ranges, tags_in_cam_m, distances, camera or CameraOptions(), options, first_pose_is_fixed, num_threads
+        metric,
+        ranges,
+        tags_in_cam_m,
+        common_bias_stddev_m,
+        distances,
+        camera or CameraOptions(),
+        options,
+        first_pose_is_fixed,
+        num_threads,
     )
     weights = range_weights(
         observations,
@@ -174,7 +183,7 @@ def refine_with_ranges(
         options.range_loss_scale,
         short_range_error_is_estimated=options.short_range_stddev_m > 0,
     )
-    summary = _refine(survey, weights, tuple(anchors), common_bias_stddev_m)
+    summary = _refine(survey, weights, tuple(anchors))
     remove_marker_points(metric, distances.marker_ids)
     return metric, summary
 
@@ -198,6 +207,7 @@ class _Survey:
     metric: pycolmap.Reconstruction
     ranges: RadioRanges
     tags_in_cam_m: Array
+    common_bias_stddev_m: float
     distances: MeasuredDistances
     camera: CameraOptions
     options: RefineOptions
@@ -221,9 +231,9 @@ class _Survey:
         blocks = RadioBlocks.at(radio, self.options)
         add_ranges(problem, self.ranges, weights, blocks, self.options)
         blocks.others.extend(
-            add_distances(problem, self.distances, radio.anchors, blocks.positions, weights.loss_scale)
+            add_distances(problem, self.distances, radio.anchors, blocks.positions, wider(weights.loss).width)
         )
-        add_radio_priors(problem, radio, self.tags_in_cam_m, blocks, self.options)
+        add_radio_priors(problem, radio, self.tags_in_cam_m, self.common_bias_stddev_m, blocks, self.options)
         return blocks
 
     def residuals_m(self, radio: RadioEstimate) -> Array:
@@ -249,9 +259,7 @@ class _Adjusted:
     reprojection_rms_px: float
 
 
-def _refine(
-    survey: _Survey, weights: RangeWeights, anchors: tuple[AnchorEstimate, ...], common_bias_stddev_m: float
-) -> RefineSummary:
+def _refine(survey: _Survey, weights: RangeWeights, anchors: tuple[AnchorEstimate, ...]) -> RefineSummary:
     """Unbend the map, then solve the full problem."""
     problem = survey.problem(survey.options.max_num_iterations)
     start = unbend(
@@ -262,7 +270,7 @@ def _refine(
         weights,
         anchors,
         pixel_stddev=problem.pixel_stddev,
-        common_bias_stddev_m=common_bias_stddev_m,
+        common_bias_stddev_m=survey.common_bias_stddev_m,
         first_pose_is_fixed=survey.first_pose_is_fixed,
     )
     adjusted = _adjust(survey, problem, start)
@@ -322,7 +330,7 @@ def _summary(survey: _Survey, start: Unbent, adjusted: _Adjusted) -> RefineSumma
     observations, rows, weights = survey.ranges.observations, survey.ranges.rows, adjusted.weights
     log, radio, options = observations.log, adjusted.radio, survey.options
     residuals_m = survey.residuals_m(radio)
-    robust = robust_weights(residuals_m / weights.stddev_m, weights.loss_scale)
+    robust = weights.loss.weights(residuals_m / weights.stddev_m)
     status = observations.status.copy()
     status[rows] = status_by_weight(robust[rows])
     times = observations.before + observations.weight if log.timestamp_s is None else log.timestamp_s

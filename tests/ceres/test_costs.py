@@ -20,6 +20,7 @@ from rangesfm._ceres import (
     distance_cost,
     fixed_pose_range_cost,
     interpolated_range_cost,
+    joint_prior_cost,
     normal_prior_cost,
     range_cost,
     zero_tie_cost,
@@ -111,7 +112,9 @@ COSTS: dict[str, Callable[[np.random.Generator], tuple[CostFunction, list[Array]
             tag_in_cam_m=None,
             stddev_m=0.2,
             has_common_bias=True,
-            error_model=RangeErrorModel(error_curve_m=[[0, -0.1], [4, 0.3], [30, -0.5]], loss_scale_too_long=5.0),
+            error_model=RangeErrorModel(
+                error_curve_m=[[0, -0.1], [4, 0.3], [30, -0.5]], loss_scale_too_long=5.0, loss_is_bounded=True
+            ),
         ),
         [random_pose(rng, 2.0), rng.normal(5, 1, 3), *(rng.normal(0, 0.3, size) for size in (1, 3, 1, 1))],
     ),
@@ -132,6 +135,10 @@ COSTS: dict[str, Callable[[np.random.Generator], tuple[CostFunction, list[Array]
     "normal_prior": lambda rng: (
         normal_prior_cost(mean=rng.normal(0, 1, 3), stddev=rng.uniform(0.1, 1.0, 3)),
         [rng.normal(0, 1, 3)],
+    ),
+    "joint_prior": lambda rng: (
+        joint_prior_cost(mean=rng.normal(0, 1, 4), whitening=rng.normal(0, 1, (4, 4))),
+        [rng.normal(0, 1, 1) for _ in range(4)],
     ),
     "zero_tie": lambda rng: (zero_tie_cost(size_a=3, size_b=1), [rng.normal(0, 1, 3), rng.normal(0, 1, 1)]),
 }
@@ -274,6 +281,23 @@ def test_a_range_that_is_too_long_is_judged_by_the_loss_for_those() -> None:
     assert residual(6.0) == pytest.approx(-np.sqrt(np.log1p(10.0**2)))
 
 
+def test_no_outlier_raises_a_bounded_loss_beyond_the_square_of_its_scale() -> None:
+    model = RangeErrorModel(loss_scale_too_long=2.0, loss_scale_too_short=3.0, loss_is_bounded=True)
+    cost = fixed_pose_range_cost(range_m=[1.0, 500.0], tag_in_world_m=[0, 0, 0], stddev_m=0.1, error_model=model)
+    residuals = cost.evaluate(np.array([100.0, 0, 0]), np.zeros(1))[0].ravel()
+    assert residuals == pytest.approx([3.0, -2.0], rel=1e-4)
+
+
+def test_a_joint_prior_knows_what_its_numbers_share() -> None:
+    own, common = 0.5, 2.0
+    covariance = own**2 * np.eye(3) + common**2
+    cost = joint_prior_cost(mean=[1.0, 2.0, 3.0], whitening=np.linalg.inv(np.linalg.cholesky(covariance)))
+    together, apart = np.array([1.0, 1.0, 1.0]), np.array([1.0, -1.0, 0.0])
+    for off in (together, apart):
+        residuals = cost.evaluate(*(np.array([1.0, 2.0, 3.0]) + off)[:, None])[0].ravel()
+        assert residuals @ residuals == pytest.approx(off @ np.linalg.solve(covariance, off))
+
+
 def test_a_curve_held_at_amplitude_one_is_added_as_it_is() -> None:
     model = RangeErrorModel(error_curve_m=[[0.0, -0.4], [4.0, -0.2], [8.0, 0.0]])
     cost = fixed_pose_range_cost(range_m=4.0, tag_in_world_m=[0, 0, 0], stddev_m=0.1, error_model=model)
@@ -288,6 +312,10 @@ def test_priors_and_ties_of_impossible_shape_are_refused() -> None:
         normal_prior_cost(mean=[], stddev=[])
     with pytest.raises(ValueError, match="more than 0"):
         normal_prior_cost(mean=[1.0, 2.0], stddev=[1.0, 0.0])
+    with pytest.raises(ValueError, match="2 rows and columns"):
+        joint_prior_cost(mean=[1.0, 2.0], whitening=np.eye(3))
+    with pytest.raises(ValueError, match="whitening is nan"):
+        joint_prior_cost(mean=[1.0], whitening=[[np.nan]])
     with pytest.raises(ValueError, match="size_b"):
         zero_tie_cost(size_a=3, size_b=0)
     with pytest.raises(ValueError, match="loss scale"):

@@ -12,6 +12,7 @@ from tests.refinement.conftest import bent, poses_and_rays
 
 from rangesfm.geometry import align_points, rmse
 from rangesfm.ranging.anchors import AnchorEstimate
+from rangesfm.ranging.robust_loss import GEMAN_MCCLURE
 from rangesfm.refinement import keyframe_graph
 from rangesfm.refinement.antennas import Antennas
 from rangesfm.refinement.keyframe_graph import KeyframeGraph, solve_graph
@@ -45,7 +46,7 @@ def make_graph(
         anchors=tuple(anchor(k, anchors_are_free) for k in range(m)),
         common_bias_stddev_m=0.1,
         held_frame=held_frame,
-        loss_scale=1e6,
+        loss=GEMAN_MCCLURE.scaled(1e6),
     )
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from rangesfm.ranging.robust_loss import CAUCHY
 from rangesfm.refinement.weights import RangeWeights, misfits
 
 Array = npt.NDArray[np.float64]
@@ -23,7 +24,7 @@ def make_weights(stddev_m: float = 1.0, *, is_estimated: bool = True) -> RangeWe
         is_estimated=np.full(n, is_estimated),
         anchor_index=np.arange(n) % 3,
         block=rounds // 20,
-        loss_scale=2.385,
+        loss=CAUCHY,
     )
 
 

@@ -280,7 +280,7 @@ def _summary(
             "anchors": {"path": "anchors.csv", "frame": "site"},
             "ranges": {"path": "uwb.csv", "time_offset": "auto"},
             "tag_in_cam_m": [-0.0012, -0.09, -0.0663],
-            "refine": {"enabled": is_refined, "max_num_iterations": 200, "range_loss_scale": 2.4},
+            "refine": {"enabled": is_refined, "max_num_iterations": 200, "range_loss_scale": 3.46},
         },
         "seconds": {"features": 31.2, "matching": 18.4, "mapping": 64.0, "scale": 3.1, "refine": 12.3, "output": 1.2},
         "warnings": ["12 ranges were taken before the first photo"],

@@ -11,7 +11,7 @@
 #include "rangesfm/range_error_curve.h"
 #include "rangesfm/range_geometry.h"
 #include "rangesfm/tag_place.h"
-#include "rangesfm/two_sided_cauchy.h"
+#include "rangesfm/two_sided_loss.h"
 
 namespace rangesfm {
 
@@ -27,7 +27,7 @@ struct RangeModel {
   bool has_time_shift = false;                                          // a block; of InterpolatedPlace
   bool has_common_bias = false;                                         // a block
   std::shared_ptr<const RangeErrorCurve> error_curve;                   // if there is one, its amplitude is a block
-  TwoSidedCauchy loss;
+  TwoSidedLoss loss;
 };
 
 // n-DoF error of the ranges between the tag at one place and one anchor, in stddevs; for each of them
@@ -67,7 +67,7 @@ class RangeCost final : public ceres::CostFunction {
       const RangeErrorCurve::Point curve = Curve(anchor_to_tag.Distance());
       const double amplitude = Number(parameters, amplitude_);
       const double predicted = anchor_to_tag.Distance() + bias + amplitude * curve.value;
-      const TwoSidedCauchy::Robust robust = model_.loss((predicted - range_[i]) * inv_stddev_[i]);
+      const TwoSidedLoss::Robust robust = model_.loss((predicted - range_[i]) * inv_stddev_[i]);
       residuals[i] = robust.value;
       if (jacobians != nullptr) {
         const double of_range = robust.slope * inv_stddev_[i];

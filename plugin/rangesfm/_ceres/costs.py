@@ -22,16 +22,19 @@ class RangeErrorModel:
         error_curve_m: (m, 2) given, ``amplitude`` times a curve through these (distance, error), distances
             increasing, is added, and the amplitude becomes a block; to take the curve as it is, hold that at 1.
             Its slope is continuous; beyond its ends it stays as it is. Not together with the length.
-        loss_scale_too_long: Cauchy's loss, ``scale^2 log(1 + r^2 / scale^2)``, of each range that is longer
-            than predicted; scale in stddevs, positive; infinite: least squares.
+        loss_scale_too_long: of the robust loss of each range that is longer than predicted, in stddevs, positive;
+            infinite: least squares.
         loss_scale_too_short: the same for those that are shorter. Reflections make long ranges likelier: a
             smaller scale for these than for short ones.
+        loss_is_bounded: whether that loss is Geman-McClure's, ``r^2 / (1 + r^2 / scale^2)``, which no outlier raises
+            beyond ``scale^2``; otherwise Cauchy's, ``scale^2 log(1 + r^2 / scale^2)``.
     """
 
     short_range_length_m: float | None = None
     error_curve_m: npt.ArrayLike | None = None
     loss_scale_too_long: float = math.inf
     loss_scale_too_short: float = math.inf
+    loss_is_bounded: bool = False
 
     @property
     def has_amplitude(self) -> bool:
@@ -198,6 +201,24 @@ def normal_prior_cost(*, mean: npt.ArrayLike, stddev: npt.ArrayLike) -> CostFunc
     from rangesfm import _cpp
 
     return _cpp.normal_prior_cost(mean=mean, stddev=stddev)
+
+
+def joint_prior_cost(*, mean: npt.ArrayLike, whitening: npt.ArrayLike) -> CostFunction:
+    """What was known beforehand of n numbers that are not independent: ``whitening (x - mean)``.
+
+    Blocks: each number for itself (1,), as the range biases of anchors, which share the tag's.
+
+    Args:
+        mean: (n,) in the blocks' unit.
+        whitening: (n, n) ``whitening^T whitening`` is the inverse of the numbers' covariance.
+
+    Raises:
+        ValueError, SolverError: as ``range_cost``.
+    """
+    check_compatibility()
+    from rangesfm import _cpp
+
+    return _cpp.joint_prior_cost(mean=mean, whitening=whitening)
 
 
 def zero_tie_cost(*, size_a: int, size_b: int) -> CostFunction:

@@ -80,11 +80,13 @@ class AddedRanges:
 
     Attributes:
         num_residual_blocks, num_residuals: of the problem; fewer residuals than ranges where some were combined.
+        rows: (num_residuals,) which range each residual is of, in the problem's order; of combined ones, the first.
         constant_cost: what the combined ranges would have added to the cost, whatever the parameters.
     """
 
     num_residual_blocks: int
     num_residuals: int
+    rows: Indices
     constant_cost: float
 
 
@@ -119,7 +121,7 @@ def add_ranges(
     if blocks.time_shift is not None and ranges.interval_s is None:
         raise ValueError("a time shift needs interval_s, the time between the keyframes of each range")
     adder = ResidualAdder(adjuster)
-    num_residuals = num_blocks = 0
+    residual_rows: list[Indices] = []
     constant_cost = 0.0
     for rows in _groups(ranges) if loss is None else np.arange(len(ranges.range_m))[:, None]:
         if ranges.before[rows[0]] == ranges.after[rows[0]]:
@@ -131,9 +133,9 @@ def add_ranges(
         else:
             cost = _cost_between_keyframes(ranges, rows, blocks, error_model)
         adder.add(cost, loss, _blocks_of_group(ranges, int(rows[0]), blocks))
-        num_blocks += 1
-        num_residuals += cost.num_residuals()
-    return AddedRanges(num_blocks, num_residuals, constant_cost)
+        residual_rows.append(rows[: cost.num_residuals()])
+    in_order = np.concatenate([np.zeros(0, dtype=np.int64), *residual_rows])
+    return AddedRanges(len(residual_rows), len(in_order), in_order, constant_cost)
 
 
 def combine_ranges(range_m: Array, stddev_m: Array) -> tuple[Array, Array, float]:

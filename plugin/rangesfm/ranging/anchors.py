@@ -36,7 +36,7 @@ class AnchorEstimate:
         position_stddev_m: of each coordinate, root of their mean variance; 0 for one that was held fixed.
         prior_position_m, prior_position_stddev_m: as surveyed, in the same frame; None and inf if unknown.
         range_bias_m: what its ranges read too long.
-        prior_bias_m, prior_bias_stddev_m: of the bias, once what all anchors share is known; stddev 0 fixes it.
+        prior_bias_m, prior_bias_stddev_m: of the bias, but for what all anchors share; stddev 0 fixes it.
         mirror_position_m: the other place that fits as well; None if there is none.
     """
 

@@ -13,7 +13,7 @@ from rangesfm.ranging.anchors import Anchor
 from rangesfm.ranging.error_curve import ErrorCurve
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.noise import correlation_inflation, robust_stddev
-from rangesfm.ranging.observations import robust_weights
+from rangesfm.ranging.robust_loss import CAUCHY
 
 Array = npt.NDArray[np.float64]
 
@@ -176,7 +176,7 @@ def _fit(problem: _Problem) -> tuple[Array, Array, float, float]:
     residuals = problem.error_m - np.median(problem.error_m)
     noise, inflation = robust_stddev(residuals), 1.0
     for _ in range(_NUM_ROUNDS):
-        weights = robust_weights(residuals / noise)
+        weights = CAUCHY.weights(residuals / noise)
         # Correlated errors are worth fewer ranges, so that the curve does not follow each of them.
         right = problem.design.T @ (weights * problem.error_m) / (noise * inflation) ** 2
         values = np.asarray(np.linalg.solve(_information(problem, weights, noise * inflation), right), np.float64)

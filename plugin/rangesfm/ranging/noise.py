@@ -34,6 +34,17 @@ def shared_stddev(log: RangeLog) -> Array:
     return short_range_stddev(log.range_m) if log.shared_stddev_m is None else log.shared_stddev_m
 
 
+def bias_whitening(own_stddev_m: Array, common_stddev_m: float) -> Array:
+    """(m, m) turns range biases, each of its own stddev and a part that all share, into independent ones of stddev 1.
+
+    Args:
+        own_stddev_m: (m,) more than 0.
+    """
+    covariance = np.diag(own_stddev_m**2) + common_stddev_m**2
+    whitening: Array = np.linalg.inv(np.linalg.cholesky(covariance)) if len(own_stddev_m) else np.zeros((0, 0))
+    return whitening
+
+
 def correlation_inflation(scaled_residuals: Array, weights: Array, groups: npt.NDArray[np.int64]) -> float:
     """How much larger the stddev of a mean is than independent errors would make it.
 

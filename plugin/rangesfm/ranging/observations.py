@@ -110,16 +110,6 @@ DOWN_WEIGHTED_BELOW = 0.5
 OUTLIER_BELOW = 0.1
 
 
-# A Cauchy loss of this width (in stddevs) keeps 95 % efficiency under Gaussian noise.
-CAUCHY_WIDTH = 2.385
-
-
-def robust_weights(scaled_residuals: npt.NDArray[np.float64], width: float = CAUCHY_WIDTH) -> npt.NDArray[np.float64]:
-    """(n,) weights of a Cauchy loss in (0, 1], for residuals in stddevs."""
-    weights: npt.NDArray[np.float64] = 1 / (1 + (scaled_residuals / width) ** 2)
-    return weights
-
-
 def status_by_weight(weights: npt.NDArray[np.float64]) -> npt.NDArray[np.int8]:
     """(n,) status of ranges that took part in an estimate, by their final robust weight in [0, 1]."""
     status = np.full(len(weights), RangeStatus.USED, dtype=np.int8)

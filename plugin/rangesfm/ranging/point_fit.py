@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.ranging.observations import CAUCHY_WIDTH, robust_weights
+from rangesfm.ranging.robust_loss import CAUCHY
 
 Array = npt.NDArray[np.float64]
 
@@ -63,7 +63,7 @@ class PointProblem:
     def cost(self, x: Array) -> Array:
         """(k,) half the robust sum of squares, the prior included."""
         squared = (self.residuals_m(x) / self.stddev_m) ** 2
-        cost: Array = CAUCHY_WIDTH**2 / 2 * np.sum(np.log1p(squared / CAUCHY_WIDTH**2), axis=1) + self._prior_cost(x)
+        cost: Array = np.sum(CAUCHY.rho(squared)[0], axis=1) / 2 + self._prior_cost(x)
         return cost
 
     def unlikelihood(self, x: Array) -> Array:
@@ -123,6 +123,6 @@ def improve(problem: PointProblem, x: Array, num_iterations: int = _NUM_ITERATIO
 def _normal_equations(problem: PointProblem, x: Array) -> tuple[Array, Array]:
     """(k, 4) gradient of the cost and (k, 4, 4) its Gauss-Newton information."""
     scaled, jacobian = problem.linearized(x)
-    weighted = jacobian * robust_weights(scaled)[..., None]
+    weighted = jacobian * CAUCHY.weights(scaled)[..., None]
     gradient = (scaled[:, None] @ weighted)[:, 0] + (x - problem.prior_mean) @ problem.prior_information
     return gradient, np.swapaxes(weighted, 1, 2) @ jacobian + problem.prior_information

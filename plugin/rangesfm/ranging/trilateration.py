@@ -13,9 +13,9 @@ import numpy.typing as npt
 from rangesfm.errors import GeometryError
 from rangesfm.geometry import PathShape, path_shape
 from rangesfm.ranging.noise import correlation_inflation, inflation_before_fit, short_range_stddev
-from rangesfm.ranging.observations import robust_weights
 from rangesfm.ranging.point_fit import PointProblem, improve
 from rangesfm.ranging.point_search import best_start, inlier_noise
+from rangesfm.ranging.robust_loss import CAUCHY
 
 Array = npt.NDArray[np.float64]
 
@@ -173,7 +173,7 @@ def trilaterate(
         range_bias_stddev_m=float(np.sqrt(covariance[3, 3])) if options.range_bias_stddev_m > 0 else 0.0,
         noise_stddev_m=fit.noise_m,
         residuals_m=fit.residuals_m,
-        weights=robust_weights(fit.scaled_residuals),
+        weights=CAUCHY.weights(fit.scaled_residuals),
     )
 
 
@@ -218,7 +218,7 @@ def _fit_with_own_noise(
 
 def _inflation(scaled: Array, groups: npt.NDArray[np.int64]) -> float:
     """Of every stddev by errors that go together."""
-    seen = correlation_inflation(scaled, robust_weights(scaled), groups)
+    seen = correlation_inflation(scaled, CAUCHY.weights(scaled), groups)
     return inflation_before_fit(seen, len(np.unique(groups)), _NUM_UNKNOWNS)
 
 
@@ -236,7 +236,7 @@ def _covariance(fit: _Fit) -> Array:
     the weighted Jacobian, scaled by the loss' mean squared slope over its squared mean curvature.
     """
     scaled, jacobian = (values[0] for values in fit.problem.linearized(fit.x[None]))
-    weights = robust_weights(scaled)
+    weights = CAUCHY.weights(scaled)
     curvature = max(float(np.mean(weights * (2 * weights - 1)) / np.mean(weights)), _MIN_CURVATURE)
     slope = float(np.mean((weights * scaled) ** 2) / np.mean(weights))
     shrinking = curvature**2 / max(slope, 1e-12) / fit.inflation**2

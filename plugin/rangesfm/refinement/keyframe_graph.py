@@ -17,7 +17,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial.transform import Rotation
 
 from rangesfm.ranging.anchors import AnchorEstimate
-from rangesfm.ranging.observations import robust_weights
+from rangesfm.ranging.robust_loss import RobustLoss
 from rangesfm.refinement.antennas import Antennas
 from rangesfm.refinement.vision_information import Poses, VisionInformation, cross_matrices
 
@@ -65,7 +65,7 @@ class KeyframeGraph:
         anchors: m, with priors as for ``refine_with_ranges``.
         common_bias_stddev_m: of what all free biases share beyond their priors' means; 0: nothing.
         held_frame: a keyframe that stays where it is; None: none does.
-        loss_scale: of the ranges' Cauchy loss, stddevs.
+        loss: of the ranges, in stddevs as weighted.
     """
 
     vision: VisionInformation
@@ -76,7 +76,7 @@ class KeyframeGraph:
     anchors: tuple[AnchorEstimate, ...]
     common_bias_stddev_m: float
     held_frame: int | None
-    loss_scale: float
+    loss: RobustLoss
 
     def start(self) -> GraphState:
         """The map as it was given."""
@@ -84,8 +84,8 @@ class KeyframeGraph:
         biases = np.array([anchor.range_bias_m for anchor in self.anchors])
         return GraphState(self.vision.origin, positions, biases, 0.0)
 
-    def with_weights(self, stddev_m: Array, loss_scale: float) -> KeyframeGraph:
-        return replace(self, stddev_m=stddev_m, loss_scale=loss_scale)
+    def with_weights(self, stddev_m: Array, loss: RobustLoss) -> KeyframeGraph:
+        return replace(self, stddev_m=stddev_m, loss=loss)
 
     def residuals_m(self, state: GraphState) -> Array:
         """(k,) predicted minus measured."""
@@ -193,9 +193,9 @@ class _Terms:
         hessian = jacobian.T @ (graph.vision.matrix @ jacobian)
 
         scaled, derivative = _range_rows(graph, layout, state)
-        weights = robust_weights(scaled, graph.loss_scale)
+        rho, weights, _ = graph.loss.rho(scaled**2)
         whitened = sparse.diags_array(np.sqrt(weights)) @ derivative
-        cost += 0.5 * graph.loss_scale**2 * float(np.sum(np.log1p((scaled / graph.loss_scale) ** 2)))
+        cost += 0.5 * float(rho.sum())
         gradient = gradient + derivative.T @ (weights * scaled)
 
         off, prior = _prior_rows(graph, layout, state)
@@ -328,13 +328,12 @@ def _num_absorbed(terms: _Terms, layout: _Layout) -> float:
 
 
 def moved_anchors(anchors: Sequence[AnchorEstimate], state: GraphState) -> tuple[AnchorEstimate, ...]:
-    """The anchors where the graph has them, their bias priors moved by what all share."""
+    """The anchors where the graph has them."""
     return tuple(
         replace(
             anchor,
             position_m=position,
             range_bias_m=float(bias),
-            prior_bias_m=anchor.prior_bias_m + state.common_bias_m * (anchor.prior_bias_stddev_m > 0),
         )
         for anchor, position, bias in zip(anchors, state.anchors_m, state.biases_m, strict=True)
     )

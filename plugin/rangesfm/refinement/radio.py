@@ -11,7 +11,7 @@ import pycolmap
 from rangesfm import _ceres
 from rangesfm.options import RefineOptions
 from rangesfm.ranging.anchors import AnchorEstimate
-from rangesfm.ranging.noise import SHORT_RANGE_LENGTH_M
+from rangesfm.ranging.noise import SHORT_RANGE_LENGTH_M, bias_whitening
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.refinement.antennas import Antennas, antenna_positions
 from rangesfm.refinement.bundle_adjustment import BundleAdjustment
@@ -19,10 +19,6 @@ from rangesfm.refinement.weights import RangeWeights
 from rangesfm.trajectory import Trajectory, pose_of
 
 Array = npt.NDArray[np.float64]
-
-# From so many ranges on the time to add them is felt. Those of one place then share a residual block, and the robust
-# loss of each is part of it: from a bad start that takes more iterations than a loss of Ceres' own.
-_MANY_RANGES = 5_000
 
 
 @dataclass(frozen=True)
@@ -147,29 +143,50 @@ def add_ranges(
         amplitude=blocks.short_range_error,
     )
     length = None if blocks.short_range_error is None else SHORT_RANGE_LENGTH_M
-    scale = weights.loss_scale * bundle.pixel_stddev / weights.inflation
-    if len(rows) < _MANY_RANGES:
-        model, loss = _ceres.RangeErrorModel(short_range_length_m=length), _ceres.cauchy_loss(scale)
-    else:
-        model, loss = _ceres.RangeErrorModel(length, None, scale, scale), None
-    _ceres.add_ranges(bundle.adjuster, placed, range_blocks, model, loss)
+    loss = weights.weighted_loss.scaled(bundle.pixel_stddev)
+    model = _ceres.RangeErrorModel(length, None, loss.width, loss.width, loss.is_bounded)
+    _ceres.add_ranges(bundle.adjuster, placed, range_blocks, model)
 
 
 def add_radio_priors(
-    bundle: BundleAdjustment, radio: RadioEstimate, tags_in_cam_m: Array, blocks: RadioBlocks, options: RefineOptions
+    bundle: BundleAdjustment,
+    radio: RadioEstimate,
+    tags_in_cam_m: Array,
+    common_bias_stddev_m: float,
+    blocks: RadioBlocks,
+    options: RefineOptions,
 ) -> None:
     """Hold, draw or free whatever has residuals; stddevs in the unit of pixels.
 
     Args:
         tags_in_cam_m: (num_tags, 3) as given, on which the prior is centred.
+        common_bias_stddev_m: of what all biases share.
     """
-    for anchor, position, bias in zip(radio.anchors, blocks.positions, blocks.biases, strict=True):
+    for anchor, position in zip(radio.anchors, blocks.positions, strict=True):
         _add_prior(bundle, position, anchor.prior_position_m, anchor.prior_position_stddev_m)
-        _add_prior(bundle, bias, np.array([anchor.prior_bias_m]), anchor.prior_bias_stddev_m)
+    _add_bias_priors(bundle, radio.anchors, blocks.biases, common_bias_stddev_m)
     for block, given in zip(blocks.tags_in_cam, tags_in_cam_m, strict=True):
         _add_prior(bundle, block, given, options.lever_arm_stddev_m)
     _add_prior(bundle, blocks.time_shift, np.zeros(1), options.time_offset_stddev_s)
     _add_prior(bundle, blocks.short_range_error, np.zeros(1), options.short_range_stddev_m)
+
+
+def _add_bias_priors(
+    bundle: BundleAdjustment, anchors: tuple[AnchorEstimate, ...], biases: list[Array], common_stddev_m: float
+) -> None:
+    """One of all biases that are estimated, as they share the tag's."""
+    drawn = []
+    for anchor, bias in zip(anchors, biases, strict=True):
+        _add_prior(bundle, bias, None, anchor.prior_bias_stddev_m)
+        if bundle.adjuster.problem.has_parameter_block(bias) and 0 < anchor.prior_bias_stddev_m < np.inf:
+            drawn.append((anchor, bias))
+    if drawn:
+        own_stddev_m = np.array([anchor.prior_bias_stddev_m for anchor, _ in drawn])
+        cost = _ceres.joint_prior_cost(
+            mean=np.array([anchor.prior_bias_m for anchor, _ in drawn]),
+            whitening=bundle.pixel_stddev * bias_whitening(own_stddev_m, common_stddev_m),
+        )
+        _ceres.add_residual_block(bundle.adjuster, cost, None, [bias for _, bias in drawn])
 
 
 def _add_prior(bundle: BundleAdjustment, block: Array | None, mean: Array | None, stddev: float) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +11,7 @@ import pycolmap
 from rangesfm.geometry import align_points, rmse
 from rangesfm.ranging.anchors import AnchorEstimate
 from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.robust_loss import wider
 from rangesfm.refinement.antennas import Antennas
 from rangesfm.refinement.carry import carry_model
 from rangesfm.refinement.keyframe_graph import GraphState, KeyframeGraph, local_scales, moved_anchors, solve_graph
@@ -35,7 +36,6 @@ class Unbent:
         weights: of all ranges. num_absorbed: degrees of freedom that the map takes from them.
         anchors: where they are now.
         bend_m: root mean square distance of keyframes from where one similarity would have put them.
-        was_bent: whether the model was moved.
         num_steps: of the keyframe graph's solver.
     """
 
@@ -43,7 +43,6 @@ class Unbent:
     num_absorbed: float
     anchors: tuple[AnchorEstimate, ...]
     bend_m: float
-    was_bent: bool
     num_steps: int
 
 
@@ -59,11 +58,11 @@ def unbend(
     common_bias_stddev_m: float,
     first_pose_is_fixed: bool,
 ) -> Unbent:
-    """Solve the keyframe graph and, where it bends the map by more than the ranges' noise, move the model, in place.
+    """Solve the keyframe graph and, where it moves the map by more than the ranges' noise, move the model, in place.
 
     The weights are estimated anew with every solution. While drift is large, so are residuals and with them the
     stddevs: the robust loss, which counts in stddevs, tightens as the map straightens and takes no drift for an
-    outlier.
+    outlier. From there a bounded loss, which is that of the scale and of the full problem, sets aside what is one.
     """
     others = np.setdiff1d(np.array(metric.reg_frame_ids(), dtype=np.int64), trajectory.frame_ids)
     frame_ids = np.concatenate([trajectory.frame_ids, others])
@@ -80,30 +79,31 @@ def unbend(
         anchors=anchors,
         common_bias_stddev_m=common_bias_stddev_m,
         held_frame=0 if first_pose_is_fixed else None,
-        loss_scale=placed.loss_scale / placed.inflation,
+        loss=placed.weighted_loss,
     )
     state, placed, num_absorbed, num_steps = _solve_with_own_weights(graph, placed)
-    bend_m = _bend(before.centers, state.poses.centers)
-    was_bent = bend_m > float(np.median(placed.stddev_m))
-    if was_bent:
+    if rmse(state.poses.centers - before.centers) > float(np.median(placed.stddev_m)):
         carry_model(metric, frame_ids, rays, before, state.poses, local_scales(graph.vision, state.poses))
         anchors = moved_anchors(anchors, state)
-    return Unbent(weights.with_rows(rows, placed), num_absorbed, anchors, bend_m, was_bent, num_steps)
+    bend_m = _bend(before.centers, state.poses.centers)
+    return Unbent(weights.with_rows(rows, placed), num_absorbed, anchors, bend_m, num_steps)
 
 
 def _solve_with_own_weights(graph: KeyframeGraph, weights: RangeWeights) -> tuple[GraphState, RangeWeights, float, int]:
-    """Alternate between the map and the weights that its residuals show."""
-    state, num_steps = graph.start(), 0
-    for _ in range(_MAX_NUM_ROUNDS):
-        solution = solve_graph(
-            graph.with_weights(weights.weighted_m, weights.loss_scale / weights.inflation),
-            state,
-            tolerance_m=_TOLERANCE * float(weights.stddev_m.min()),
-        )
-        state, num_steps = solution.state, num_steps + solution.num_steps
-        before, weights = weights, weights.estimated(graph.residuals_m(state), solution.num_absorbed)
-        if before.change(weights) < SAME_WEIGHTS:
-            break
+    """Alternate between the map and the weights that its residuals show: with the wide loss, then with the bounded."""
+    bounded_loss, state, num_steps = weights.loss, graph.start(), 0
+    for loss in (wider(bounded_loss), bounded_loss):
+        weights = replace(weights, loss=loss)
+        for _ in range(_MAX_NUM_ROUNDS):
+            solution = solve_graph(
+                graph.with_weights(weights.weighted_m, weights.weighted_loss),
+                state,
+                tolerance_m=_TOLERANCE * float(weights.stddev_m.min()),
+            )
+            state, num_steps = solution.state, num_steps + solution.num_steps
+            before, weights = weights, weights.estimated(graph.residuals_m(state), solution.num_absorbed)
+            if before.change(weights) < SAME_WEIGHTS:
+                break
     return state, weights, solution.num_absorbed, num_steps
 
 

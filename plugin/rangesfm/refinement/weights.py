@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.ranging.inlier_noise import inlier_stddev
 from rangesfm.ranging.noise import correlation_inflation, robust_stddev, shared_stddev
-from rangesfm.ranging.observations import RangeObservations, robust_weights
+from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.robust_loss import RobustLoss
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -32,7 +34,8 @@ class RangeWeights:
         fixed_m: (n,) the part that is not estimated: of a short range, of an interpolated place.
         is_estimated: (n,) whether the rest is.
         anchor_index: (n,). block: (n,) label of each range's stretch of time.
-        loss_scale: of the robust loss, stddevs.
+        loss: of single ranges, in their stddevs. With a wide one the noise is what all residuals show, so that what
+            drifts away is no outlier; with a bounded one that of the ranges that fit, as in the scale stage.
     """
 
     stddev_m: Array
@@ -41,12 +44,17 @@ class RangeWeights:
     is_estimated: Mask
     anchor_index: Indices
     block: Indices
-    loss_scale: float
+    loss: RobustLoss
 
     @property
     def weighted_m(self) -> Array:
         """(n,) stddev with which a range stands against the photos."""
         return self.inflation * self.stddev_m
+
+    @property
+    def weighted_loss(self) -> RobustLoss:
+        """Of residuals in stddevs as weighted."""
+        return self.loss.scaled(1 / self.inflation)
 
     def subset(self, rows: Indices) -> RangeWeights:
         """Of some of the ranges."""
@@ -57,7 +65,7 @@ class RangeWeights:
             self.is_estimated[rows],
             self.anchor_index[rows],
             self.block[rows],
-            self.loss_scale,
+            self.loss,
         )
 
     def with_rows(self, rows: Indices, part: RangeWeights) -> RangeWeights:
@@ -80,12 +88,13 @@ class RangeWeights:
         ordinary = np.flatnonzero(self.is_estimated & (self.fixed_m < noise))
         if len(ordinary) < _MIN_ORDINARY * np.count_nonzero(self.is_estimated):
             ordinary = np.flatnonzero(self.is_estimated)
-        common = max(widening * robust_stddev(residuals_m[ordinary]), _MIN_STDDEV_M)
+        bulk_stddev = inlier_stddev if self.loss.is_bounded else robust_stddev
+        common = max(widening * bulk_stddev(residuals_m[ordinary]), _MIN_STDDEV_M)
         ratios = self._noise_ratios(residuals_m, ordinary)[self.anchor_index]
         stddev = np.where(self.is_estimated, np.hypot(common * ratios, self.fixed_m), self.stddev_m)
         scaled = residuals_m / stddev
         groups = self.block * (self.anchor_index.max() + 1) + self.anchor_index
-        inflation = correlation_inflation(scaled, robust_weights(scaled, self.loss_scale), groups)
+        inflation = correlation_inflation(scaled, self.loss.weights(scaled), groups)
         return replace(self, stddev_m=stddev, inflation=inflation)
 
     def _noise_m(self) -> Array:
@@ -124,7 +133,7 @@ def range_weights(
     inflation: float,
     is_estimated: Mask | None,
     metres_per_unit: float,
-    loss_scale: float,
+    loss_width: float,
     *,
     short_range_error_is_estimated: bool = False,
 ) -> RangeWeights:
@@ -134,6 +143,7 @@ def range_weights(
         range_stddev_m: (n,) as known or first estimated, with what is shared by all ranges of a length.
         is_estimated: (n,) which of them are to be estimated; None: none.
         metres_per_unit: of the observations' world.
+        loss_width: of the bounded loss, stddevs.
         short_range_error_is_estimated: then the stddevs go without what is shared.
     """
     log = observations.log
@@ -146,7 +156,8 @@ def range_weights(
     times = observations.before if log.timestamp_s is None else log.timestamp_s
     length = 1.0 if log.timestamp_s is None else BLOCK_S
     block = np.floor((times - times.min()) / length).astype(np.int64)
-    return RangeWeights(range_stddev_m, inflation, fixed, estimated, log.anchor_index, block, loss_scale)
+    loss = RobustLoss(loss_width, is_bounded=True)
+    return RangeWeights(range_stddev_m, inflation, fixed, estimated, log.anchor_index, block, loss)
 
 
 # Median block residuals beyond this many stddevs are no noise.

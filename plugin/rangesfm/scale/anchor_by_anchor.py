@@ -9,9 +9,9 @@ import numpy.typing as npt
 
 from rangesfm.geometry import IDENTITY, Similarity
 from rangesfm.ranging.anchors import AnchorEstimate
+from rangesfm.ranging.robust_loss import GEMAN_MCCLURE
 from rangesfm.scale.problem import SurveyProblem
 from rangesfm.scale.range_equation import RangeProblem, RangeState, solve
-from rangesfm.scale.robust_loss import GEMAN_MCCLURE
 from rangesfm.scale.solution import MIN_COST_GAP, Solution
 from rangesfm.scale.starts import anchor_alone, choose_sides, mirrored, spread_subset
 
@@ -84,7 +84,7 @@ def anchor_estimates(
                 prior_position_m=problem.anchor_mean_m[k] if known else None,
                 prior_position_stddev_m=float(problem.anchor_stddev_m[k]),
                 range_bias_m=float(state.bias_m[k] if heard else problem.bias_mean_m[k] + common_bias_m),
-                prior_bias_m=float(problem.bias_mean_m[k]) + common_bias_m,
+                prior_bias_m=float(problem.bias_mean_m[k]),
                 prior_bias_stddev_m=float(problem.bias_stddev_m[k] * solution.inflation),
                 mirror_position_m=mirrors.get(k),
             )

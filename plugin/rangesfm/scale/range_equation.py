@@ -19,9 +19,10 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.geometry import Similarity
+from rangesfm.ranging.noise import bias_whitening
+from rangesfm.ranging.robust_loss import CAUCHY, RobustLoss
 from rangesfm.scale.distance_equation import distance_jacobian, distance_residuals
 from rangesfm.scale.gravity import Gravity
-from rangesfm.scale.robust_loss import CAUCHY, RobustLoss
 
 Array = npt.NDArray[np.float64]
 
@@ -354,10 +355,7 @@ def _prior_jacobian(problem: RangeProblem, columns: _Columns, start: RangeState,
 
 
 def _bias_whitening(problem: RangeProblem, biases: npt.NDArray[np.int64]) -> Array:
-    """Turns biases of covariance diag(own) + common into independent ones of stddev 1."""
-    covariance = np.diag(problem.bias_stddev_m[biases] ** 2) + problem.common_bias_stddev_m**2
-    whitening: Array = np.linalg.inv(np.linalg.cholesky(covariance)) if len(biases) else np.zeros((0, 0))
-    return whitening
+    return bias_whitening(problem.bias_stddev_m[biases], problem.common_bias_stddev_m)
 
 
 def _inverse(information: Array) -> Array:

@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry import NEARLY_STRAIGHT, path_kind, path_shape
+from rangesfm.ranging.inlier_noise import InlierNoise, inlier_noise
 from rangesfm.ranging.noise import correlation_inflation
+from rangesfm.ranging.robust_loss import GEMAN_MCCLURE
 from rangesfm.scale.anchor_plane import camera_side_of, mirrored_map, on_side
-from rangesfm.scale.inlier_noise import InlierNoise, inlier_noise
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, RangeState, predicted_ranges, prior_cost, solve
-from rangesfm.scale.robust_loss import GEMAN_MCCLURE
 from rangesfm.scale.starts import (
     complete_unknown_anchors,
     first_camera_starts,

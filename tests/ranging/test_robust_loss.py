@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rangesfm.scale.robust_loss import CAUCHY, GEMAN_MCCLURE, RobustLoss
+from rangesfm.ranging.robust_loss import CAUCHY, GEMAN_MCCLURE, RobustLoss
 
 BOTH = pytest.mark.parametrize("loss", [CAUCHY, GEMAN_MCCLURE], ids=["Cauchy", "Geman-McClure"])
 

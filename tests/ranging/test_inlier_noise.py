@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rangesfm.scale.inlier_noise import inlier_noise, inlier_stddev
+from rangesfm.ranging.inlier_noise import inlier_noise, inlier_stddev
 
 
 def spoilt(num: int, share: float, side: float, seed: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
