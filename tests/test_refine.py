@@ -393,7 +393,7 @@ class TestDistances:
         survey = make_survey("first_camera", pixel_stddev=0.5, radio=Radio(range_stddev_m=RANGE_STDDEV_M))
         points = sorted(survey.sfm.points3D.values(), key=lambda point: -point.track.length())[:2]
         length = survey.metric_from_sfm.scale * float(np.linalg.norm(points[0].xyz - points[1].xyz))
-        distance = TapedDistance(("door", "wall"), length, 0.005, "control", 2)
+        distance = TapedDistance(("door", "wall"), length, 0.002, "control", 2)
         tape = Tape((distance,), {"door": marker_of(survey.sfm, points[0]), "wall": marker_of(survey.sfm, points[1])})
         held, _ = survey.refine(survey.anchors(np.inf), 1.04, observations=with_long_ranges(survey), tape=tape)
         assert located_m(tape, held) == pytest.approx([length], abs=2 * distance.stddev_m)
