@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
+from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
 from rangesfm._ceres import (
@@ -23,7 +24,7 @@ from rangesfm._ceres import (
     range_cost,
     tangent_jacobian,
 )
-from rangesfm.covariance import joint_covariance
+from rangesfm.covariance import ResidualErrors, joint_covariance
 from rangesfm.errors import GeometryError
 from rangesfm.geometry import IDENTITY
 from rangesfm.simulate.model import synthetic_model
@@ -173,6 +174,27 @@ def test_it_is_the_inverse_of_all_normal_equations(hold_anchors: bool) -> None:
         start += 3 * len(ANCHORS_M)
     biases = [expected[start + k, start + k] for k in range(len(ANCHORS_M))]
     assert np.ravel(found.others) == pytest.approx(biases, rel=1e-5)
+
+
+def test_residuals_that_err_together_count_as_their_covariance_says() -> None:
+    survey = joint(model(), hold_first=True)
+    num_ranges = NUM_FRAMES * len(ANCHORS_M)
+    num = survey.problem.num_residuals()
+    rows = np.arange(num - len(survey.biases) - num_ranges, num - len(survey.biases))
+    errors = ResidualErrors(rows, 1.7, csr_matrix(np.random.default_rng(0).standard_normal((num_ranges, 3))))
+    found = joint_covariance(
+        survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases, errors=errors
+    )
+    jacobian = tangent_jacobian(survey.problem, variable(survey)).toarray()
+    of_residuals = np.eye(num)
+    of_residuals[np.ix_(rows, rows)] = 1.7 * np.eye(num_ranges) + (errors.modes @ errors.modes.T).toarray()
+    gain = covariance_of_all(survey.problem, variable(survey)) @ jacobian.T
+    expected = gain @ of_residuals @ gain.T
+    first = 6 * (NUM_FRAMES - 1)
+    np.testing.assert_allclose(found.anchors[0], expected[first : first + 3, first : first + 3], rtol=1e-5)
+    np.testing.assert_allclose(np.diag(found.rig_from_world[1])[3:], np.diag(expected)[3:6], rtol=1e-5)
+    alone = joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases)
+    assert found.relative_scale_stddev > 1.1 * alone.relative_scale_stddev
 
 
 def test_centers_err_as_their_poses_do() -> None:

@@ -615,18 +615,50 @@ class TestBesideTheMap:
         assert summary.short_range_error_m == pytest.approx(-0.3, abs=0.05)
 
 
+@pytest.fixture
+def radio_without_shared_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of which every range errs on its own, and which is known to do so."""
+    monkeypatch.setattr("rangesfm.ranging.shared_errors.ANTENNA_STDDEV_M", 0.0)
+    monkeypatch.setattr("rangesfm.refine.CURVE_STDDEV_M", 0.0)
+
+
+def with_shared_errors(survey: Survey, seed: int) -> RangeObservations:
+    """An error of each anchor's antenna that depends on the direction, and one of all with the distance."""
+    rng, log, metric = np.random.default_rng(seed), survey.observations.log, survey.metric_from_sfm
+    at = metric.apply(survey.observations.centers) + survey.observations.tag_from_center @ metric.rotation.T
+    from_anchor = at - np.array([survey.anchors_m[name] for name in log.anchor_ids])[log.anchor_index]
+    distance = np.linalg.norm(from_anchor, axis=1)
+    lobes = 0.05 * rng.standard_normal((len(log.anchor_ids), 3))
+    of_antenna = np.sum(lobes[log.anchor_index] * from_anchor, axis=1) / distance
+    of_radio = 0.07 * np.sqrt(2) * np.sin(np.log(distance) + rng.uniform(0, 2 * np.pi))
+    return replace(survey.observations, log=replace(log, range_m=log.range_m + of_antenna + of_radio))
+
+
 class TestCovariance:
-    def test_errors_of_centres_are_as_large_as_their_covariances_say(self) -> None:
+    def mean_square(self, *, has_shared_errors: bool) -> float:
+        """Of the centres' errors in their stddevs."""
         squares = []
-        for seed in range(4):
+        for seed in range(6 if has_shared_errors else 4):
             survey = make_survey(
                 num_keyframes=15, pixel_stddev=0.5, radio=Radio(range_stddev_m=0.1), num_epochs=2, seed=seed
             )
-            refined, summary = survey.refine(survey.anchors(0.0))
+            observations = with_shared_errors(survey, seed) if has_shared_errors else survey.observations
+            refined, summary = survey.refine(survey.anchors(0.0), observations=observations)
             assert summary.covariance is not None
             errors = survey.centers(refined) - survey.centers_m
             squares += [e @ np.linalg.solve(c, e) for e, c in zip(errors, summary.covariance.centers, strict=True)]
-        assert 0.5 < np.mean(squares) / 3 < 2.0
+        return float(np.mean(squares)) / 3
+
+    @pytest.mark.usefixtures("radio_without_shared_errors")
+    def test_errors_of_centres_are_as_large_as_their_covariances_say(self) -> None:
+        assert 0.5 < self.mean_square(has_shared_errors=False) < 2.0
+
+    def test_so_they_are_where_antennas_and_radio_err_with_direction_and_distance(self) -> None:
+        assert 0.4 < self.mean_square(has_shared_errors=True) < 2.0
+
+    @pytest.mark.usefixtures("radio_without_shared_errors")
+    def test_covariances_that_leave_these_out_are_too_small(self) -> None:
+        assert self.mean_square(has_shared_errors=True) > 2.5
 
     def test_anchors_have_the_stddevs_of_the_joint_problem(self) -> None:
         survey = make_survey("first_camera", pixel_stddev=0.5, radio=Radio(range_stddev_m=RANGE_STDDEV_M))
@@ -635,6 +667,7 @@ class TestCovariance:
         _, held = survey.refine(survey.anchors(0.0))
         assert all(anchor.position_stddev_m == 0.0 for anchor in held.anchors)
 
+    @pytest.mark.usefixtures("radio_without_shared_errors")
     def test_correlated_ranges_widen_it(self) -> None:
         survey = make_survey(pixel_stddev=0.5, radio=Radio(range_stddev_m=RANGE_STDDEV_M))
         scale_stddevs = []

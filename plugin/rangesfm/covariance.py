@@ -32,6 +32,21 @@ _BLOCKS_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
+class ResidualErrors:
+    """How some residuals err otherwise than each on its own with the problem's residual stddev.
+
+    Attributes:
+        rows: (k,) which residuals, in the order of the problem; 3-D points have no part in them.
+        variance: of each, in squares of the residual stddev.
+        modes: (k, m) sparse: what they do together, in residual stddevs for each of m independent errors of stddev 1.
+    """
+
+    rows: npt.NDArray[np.int64]
+    variance: float
+    modes: csr_matrix
+
+
+@dataclass(frozen=True)
 class JointCovariance:
     """Covariances from the joint normal equations, of everything that the problem estimates at once.
 
@@ -63,8 +78,11 @@ def joint_covariance(
     anchors: Sequence[Array] = (),
     others: Sequence[Array] = (),
     residual_stddev: float = 1.0,
+    errors: ResidualErrors | None = None,
 ) -> JointCovariance:
     """Covariances at a problem's present parameters, by first order: the inverse of J^T J.
+
+    Where errors S of the residuals are not independent of stddev 1 it is (J^T J)^-1 J^T S J (J^T J)^-1.
 
     3-D points are eliminated first (Schur complement), but for those that share a residual with another.
 
@@ -73,6 +91,7 @@ def joint_covariance(
         anchors: (3,) blocks that are points of the world.
         others: further blocks: biases, lever arms, a time shift.
         residual_stddev: of the residuals, which the covariances scale with: 1 if they are in stddevs.
+        errors: of residuals that err otherwise; None: none does.
 
     Raises:
         ValueError: the problem has blocks that are neither the reconstruction's nor given.
@@ -82,7 +101,7 @@ def joint_covariance(
     jacobian = tangent_jacobian(problem, columns.variable).tocsc()
     normal, kept = _schur_complement(jacobian, columns)
     free = _free_motions(jacobian, _world_motions(columns))[kept]
-    inverse = _Inverse(normal, free, columns)
+    inverse = _Inverse(normal, free, columns, _excess(jacobian[:, kept], errors))
     blocks = inverse.diagonal_blocks([columns.span(i) for i in range(columns.num_kept_blocks)])
     variance = residual_stddev**2
     frames = columns.frames
@@ -174,6 +193,26 @@ class _Columns:
         return f"{kind} number {self.kinds[:index].count(kind)}"
 
 
+class _Excess:
+    """J^T (S - 1) J, in the columns that are kept."""
+
+    def __init__(self, weighted: csc_matrix, modes: Array) -> None:
+        self._weighted, self._modes = weighted, modes
+
+    def between(self, left: Array, right: Array) -> Array:
+        """(a, b) left^T (...) right, of (size, a) and (size, b)."""
+        shared: Array = (left.T @ self._modes) @ (self._modes.T @ right)
+        shared += left.T @ (self._weighted @ right)
+        return shared
+
+
+def _excess(kept: csc_matrix, errors: ResidualErrors | None) -> _Excess:
+    if errors is None:
+        return _Excess(csc_matrix((kept.shape[1], kept.shape[1])), np.zeros((kept.shape[1], 0)))
+    rows = csr_matrix(kept)[errors.rows]
+    return _Excess(csc_matrix((errors.variance - 1) * (rows.T @ rows)), (rows.T @ errors.modes).toarray())
+
+
 def _address(block: Array) -> int:
     return int(block.__array_interface__["data"][0])
 
@@ -238,7 +277,8 @@ def _free_motions(jacobian: csc_matrix, motions: Array) -> Array:
 class _Inverse:
     """The pseudo-inverse of the normal equations, orthogonal to the free motions."""
 
-    def __init__(self, normal: csc_matrix, free: Array, columns: _Columns) -> None:
+    def __init__(self, normal: csc_matrix, free: Array, columns: _Columns, excess: _Excess) -> None:
+        self._excess = excess
         self._free = linalg.orth(free) if free.shape[1] else free
         scale = 1.0 / np.sqrt(np.maximum(normal.diagonal(), 1e-300))
         # Holding as many coordinates as there are free motions makes the rest regular; which ones makes no difference.
@@ -258,7 +298,7 @@ class _Inverse:
         return projected
 
     def diagonal_blocks(self, spans: Sequence[slice]) -> list[Array]:
-        """The blocks of the inverse at these rows and columns."""
+        """The blocks of the covariance at these rows and columns."""
         blocks: list[Array] = []
         for first in range(0, len(spans), _BLOCKS_AT_ONCE):
             some = spans[first : first + _BLOCKS_AT_ONCE]
@@ -266,8 +306,15 @@ class _Inverse:
             right = np.zeros((len(self._scale), stop - start))
             right[np.arange(start, stop), np.arange(stop - start)] = 1.0
             solution = self.solve(right)
-            blocks += [solution[span, span.start - start : span.stop - start] for span in some]
+            for span in some:
+                of_block = solution[:, span.start - start : span.stop - start]
+                blocks.append(of_block[span] + self._excess.between(of_block, of_block))
         return blocks
+
+    def variance(self, gradient: Array) -> float:
+        """Of the linear function with this (size, 1) gradient."""
+        solution = self.solve(gradient)
+        return float((gradient.T @ solution + self._excess.between(solution, solution)).item())
 
 
 def _dense_solver(normal: csc_matrix, columns: _Columns) -> Callable[[Array], Array]:
@@ -311,7 +358,7 @@ def _scale_stddev(columns: _Columns, inverse: _Inverse, num_rows: int) -> float:
         index = columns.index_of.get(_address(pose))
         if index is not None:
             gradient[columns.span(index), 0] = _center_from_step(pose).T @ ((center - middle) / spread)
-    return float(np.sqrt(max((gradient.T @ inverse.solve(gradient)).item(), 0.0)))
+    return float(np.sqrt(max(inverse.variance(gradient), 0.0)))
 
 
 def _center_from_step(pose: Array) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from rangesfm.covariance import JointCovariance, joint_covariance
+from rangesfm.covariance import JointCovariance, ResidualErrors, joint_covariance
 from rangesfm.distances.by_radio import distances_by_radio
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.distances.tape import Tape
@@ -20,6 +20,7 @@ from rangesfm.options import CameraOptions, RangeModelOptions, RefineOptions
 from rangesfm.ranging.anchors import AnchorEstimate
 from rangesfm.ranging.observations import RangeObservations, status_by_weight
 from rangesfm.ranging.robust_loss import wider
+from rangesfm.ranging.shared_errors import CURVE_STDDEV_M
 from rangesfm.refinement.antennas import antennas, predicted_ranges, tags_in_cam
 from rangesfm.refinement.bundle_adjustment import (
     BundleAdjustment,
@@ -35,6 +36,7 @@ from rangesfm.refinement.distances import (
     remove_marker_points,
 )
 from rangesfm.refinement.radio import RadioBlocks, RadioEstimate, RadioRanges, add_radio_priors, add_ranges
+from rangesfm.refinement.range_errors import range_errors
 from rangesfm.refinement.unbend import SAME_WEIGHTS, Unbent, unbend
 from rangesfm.refinement.weights import RangeWeights, misfits, range_weights
 from rangesfm.trajectory import Trajectory
@@ -165,6 +167,7 @@ def refine_with_ranges(
     ranges = RadioRanges(observations, trajectory, placed, np.flatnonzero(observations.has_place))
     survey = _Survey(
         metric,
+        tuple(anchors),
         ranges,
         tags_in_cam_m,
         common_bias_stddev_m,
@@ -183,7 +186,7 @@ def refine_with_ranges(
         options.range_loss_scale,
         short_range_error_is_estimated=options.short_range_stddev_m > 0,
     )
-    summary = _refine(survey, weights, tuple(anchors))
+    summary = _refine(survey, weights)
     remove_marker_points(metric, distances.marker_ids)
     return metric, summary
 
@@ -201,10 +204,19 @@ def _between_anchors(
 
 
 @dataclass(frozen=True)
+class _Added:
+    """What came into a problem of the photos: parameter blocks, and where the residuals of the ranges are."""
+
+    blocks: RadioBlocks
+    residual_rows: npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
 class _Survey:
     """What stays the same from one solution to the next; only the model changes, in place."""
 
     metric: pycolmap.Reconstruction
+    anchors: tuple[AnchorEstimate, ...]
     ranges: RadioRanges
     tags_in_cam_m: Array
     common_bias_stddev_m: float
@@ -226,15 +238,29 @@ class _Survey:
             marker_ids=self.distances.marker_ids.values(),
         )
 
-    def add_to(self, problem: BundleAdjustment, weights: RangeWeights, radio: RadioEstimate) -> RadioBlocks:
+    def add_to(self, problem: BundleAdjustment, weights: RangeWeights, radio: RadioEstimate) -> _Added:
         """All else that was measured."""
         blocks = RadioBlocks.at(radio, self.options)
-        add_ranges(problem, self.ranges, weights, blocks, self.options)
+        residual_rows = add_ranges(problem, self.ranges, weights, blocks, self.options)
         blocks.others.extend(
             add_distances(problem, self.distances, radio.anchors, blocks.positions, wider(weights.loss).width)
         )
         add_radio_priors(problem, radio, self.tags_in_cam_m, self.common_bias_stddev_m, blocks, self.options)
-        return blocks
+        return _Added(blocks, residual_rows)
+
+    def range_errors(self, added: _Added, weights: RangeWeights, num_absorbed: float) -> ResidualErrors:
+        """How the residuals of the ranges err."""
+        rows, log = self.ranges.rows, self.ranges.observations.log
+        radio = added.blocks.estimate(RadioEstimate(self.anchors, self.tags_in_cam_m))
+        curve = np.full(len(log), CURVE_STDDEV_M) if log.shared_stddev_m is None else log.shared_stddev_m
+        return range_errors(
+            weights.subset(rows),
+            added.residual_rows,
+            self.residuals_m(radio)[rows],
+            self.ranges.from_anchor_m(self.metric, radio)[rows],
+            curve[rows],
+            num_absorbed,
+        )
 
     def residuals_m(self, radio: RadioEstimate) -> Array:
         """(n,) predicted minus measured; NaN without a place."""
@@ -259,7 +285,7 @@ class _Adjusted:
     reprojection_rms_px: float
 
 
-def _refine(survey: _Survey, weights: RangeWeights, anchors: tuple[AnchorEstimate, ...]) -> RefineSummary:
+def _refine(survey: _Survey, weights: RangeWeights) -> RefineSummary:
     """Unbend the map, then solve the full problem."""
     problem = survey.problem(survey.options.max_num_iterations)
     start = unbend(
@@ -268,7 +294,7 @@ def _refine(survey: _Survey, weights: RangeWeights, anchors: tuple[AnchorEstimat
         survey.ranges.observations,
         survey.ranges.antennas,
         weights,
-        anchors,
+        survey.anchors,
         pixel_stddev=problem.pixel_stddev,
         common_bias_stddev_m=survey.common_bias_stddev_m,
         first_pose_is_fixed=survey.first_pose_is_fixed,
@@ -283,9 +309,9 @@ def _adjust(survey: _Survey, problem: BundleAdjustment, start: Unbent) -> _Adjus
     weights, radio = start.weights, RadioEstimate(start.anchors, survey.tags_in_cam_m)
     solutions: list[Solution] = []
     while True:
-        blocks = survey.add_to(problem, weights, radio)
+        added = survey.add_to(problem, weights, radio)
         solutions.append(solve(problem))
-        radio = blocks.estimate(radio)
+        radio = added.blocks.estimate(radio)
         better = _estimated(weights, survey.ranges, survey.residuals_m(radio), start.num_absorbed)
         num_left = survey.options.max_num_iterations - sum(solution.num_iterations for solution in solutions)
         is_last = weights.change(better) < SAME_WEIGHTS or len(solutions) == _MAX_NUM_ROUNDS
@@ -298,23 +324,26 @@ def _adjust(survey: _Survey, problem: BundleAdjustment, start: Unbent) -> _Adjus
         (*solutions, *more),
         is_still,
         weights,
-        blocks.estimate(radio),
-        _covariance(survey, problem, blocks),
+        added.blocks.estimate(radio),
+        _covariance(survey, problem, added, weights, start.num_absorbed),
         problem.pixel_stddev,
         problem.reprojection_rms_px,
     )
 
 
-def _covariance(survey: _Survey, problem: BundleAdjustment, blocks: RadioBlocks) -> JointCovariance | None:
+def _covariance(
+    survey: _Survey, problem: BundleAdjustment, added: _Added, weights: RangeWeights, num_absorbed: float
+) -> JointCovariance | None:
     if not survey.options.covariance or survey.metric.num_reg_frames() > _MAX_NUM_FRAMES_FOR_COVARIANCE:
         return None
     try:
         return joint_covariance(
             problem.adjuster.problem,
             survey.metric,
-            anchors=blocks.positions,
-            others=blocks.all_but_positions,
+            anchors=added.blocks.positions,
+            others=added.blocks.all_but_positions,
             residual_stddev=problem.pixel_stddev,
+            errors=survey.range_errors(added, weights, num_absorbed),
         )
     except GeometryError as error:
         logging.getLogger(__name__).info("%s", error)

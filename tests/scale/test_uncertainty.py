@@ -10,8 +10,8 @@ import numpy.typing as npt
 import pytest
 
 from rangesfm.options import RangeModelOptions, ScaleOptions
+from rangesfm.ranging.shared_errors import ANTENNA_STDDEV_M
 from rangesfm.scale.estimate import ScaleUncertainty
-from rangesfm.scale.uncertainty import ANTENNA_STDDEV_M
 from rangesfm.simulate.ranges import Radio
 
 if TYPE_CHECKING:

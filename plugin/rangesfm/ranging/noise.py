@@ -14,6 +14,8 @@ Array = npt.NDArray[np.float64]
 # not average out, so they are trusted far less than their scatter says.
 _SHORT_RANGE_STDDEV_M = 2.0
 SHORT_RANGE_LENGTH_M = 1.0
+# Of a range of which nothing is known yet. Ranges that may be off together by more say nothing on the noise of others.
+START_STDDEV_M = 0.1
 _MIN_STDDEV_M = 1e-9
 _MAX_INFLATION = 30.0
 

@@ -39,6 +39,13 @@ class RobustLoss:
         weights: Array = self.rho(scaled_residuals**2)[1]
         return weights
 
+    def slopes(self, scaled_residuals: Array) -> Array:
+        """(n,) derivative of the root of the loss by the residual: of residuals whose squares are the loss."""
+        rho, first, _ = self.rho(scaled_residuals**2)
+        root = np.sqrt(rho)
+        slopes: Array = np.where(root > 0, first * np.abs(scaled_residuals) / np.maximum(root, 1e-300), 1.0)
+        return slopes
+
     def curvatures(self, scaled_residuals: Array) -> Array:
         """(n,) second derivative of half the loss by the residual."""
         squared = scaled_residuals**2

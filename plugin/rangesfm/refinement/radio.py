@@ -19,6 +19,7 @@ from rangesfm.refinement.weights import RangeWeights
 from rangesfm.trajectory import Trajectory, pose_of
 
 Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -61,15 +62,21 @@ class RadioRanges:
             return np.zeros(len(self.antennas.before))
         return times[self.antennas.after] - times[self.antennas.before]
 
-    def predicted_m(self, metric: pycolmap.Reconstruction, radio: RadioEstimate) -> Array:
-        """(n,) ranges that a metric model predicts, as the residuals do; NaN without a place."""
+    def from_anchor_m(self, metric: pycolmap.Reconstruction, radio: RadioEstimate) -> Array:
+        """(n, 3) from the anchor to the tag in a metric model; without meaning where a range has no place."""
         index = self.observations.log.anchor_index
         weight, between = self.antennas.weight.copy(), self.antennas.before != self.antennas.after
         if radio.time_shift_s:
             weight[between] += radio.time_shift_s / self.interval_s[between]
         tags = radio.tags_in_cam_m[self.observations.log.tag_index]
         at = antenna_positions(metric, self.trajectory, replace(self.antennas, tag_in_cam_m=tags, weight=weight))
-        distance = np.linalg.norm(at - np.array([a.position_m for a in radio.anchors])[index], axis=1)
+        from_anchor: Array = at - np.array([a.position_m for a in radio.anchors])[index]
+        return from_anchor
+
+    def predicted_m(self, metric: pycolmap.Reconstruction, radio: RadioEstimate) -> Array:
+        """(n,) ranges that a metric model predicts, as the residuals do; NaN without a place."""
+        index = self.observations.log.anchor_index
+        distance = np.linalg.norm(self.from_anchor_m(metric, radio), axis=1)
         predicted = distance + np.array([a.range_bias_m for a in radio.anchors])[index]
         predicted += radio.short_range_error_m * np.exp(-distance / SHORT_RANGE_LENGTH_M)
         return np.where(self.observations.before >= 0, predicted, np.nan)
@@ -119,8 +126,12 @@ class RadioBlocks:
 
 def add_ranges(
     bundle: BundleAdjustment, ranges: RadioRanges, weights: RangeWeights, blocks: RadioBlocks, options: RefineOptions
-) -> None:
-    """Ranges in units of pixels: one stddev of either weighs the same."""
+) -> Indices:
+    """Ranges in units of pixels: one stddev of either weighs the same.
+
+    Returns:
+        (k,) where the residual of each range that takes part is among the problem's.
+    """
     log, rows, antennas = ranges.observations.log, ranges.rows, ranges.antennas
     placed = _ceres.PlacedRanges(
         range_m=log.range_m[rows],
@@ -145,7 +156,10 @@ def add_ranges(
     length = None if blocks.short_range_error is None else SHORT_RANGE_LENGTH_M
     loss = weights.weighted_loss.scaled(bundle.pixel_stddev)
     model = _ceres.RangeErrorModel(length, None, loss.width, loss.width, loss.is_bounded)
-    _ceres.add_ranges(bundle.adjuster, placed, range_blocks, model)
+    first = bundle.adjuster.problem.num_residuals()
+    added = _ceres.add_ranges(bundle.adjuster, placed, range_blocks, model)
+    rows_of_ranges: Indices = first + np.argsort(added.rows)
+    return rows_of_ranges
 
 
 def add_radio_priors(

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.ranging.inlier_noise import inlier_stddev
-from rangesfm.ranging.noise import correlation_inflation, robust_stddev, shared_stddev
+from rangesfm.ranging.noise import START_STDDEV_M, correlation_inflation, robust_stddev, shared_stddev
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.ranging.robust_loss import RobustLoss
 
@@ -52,6 +52,12 @@ class RangeWeights:
         return self.inflation * self.stddev_m
 
     @property
+    def group(self) -> Indices:
+        """(n,) label of the stretch of one anchor's ranges that err together."""
+        groups: Indices = self.block * (self.anchor_index.max() + 1) + self.anchor_index
+        return groups
+
+    @property
     def weighted_loss(self) -> RobustLoss:
         """Of residuals in stddevs as weighted."""
         return self.loss.scaled(1 / self.inflation)
@@ -82,10 +88,9 @@ class RangeWeights:
         """
         if not self.is_estimated.any():
             return self
-        noise = self._noise_m()
         n = len(residuals_m)
         widening = np.sqrt(n / max(n - num_absorbed, 0.1 * n))
-        ordinary = np.flatnonzero(self.is_estimated & (self.fixed_m < noise))
+        ordinary = np.flatnonzero(self.is_estimated & (self.fixed_m < START_STDDEV_M))
         if len(ordinary) < _MIN_ORDINARY * np.count_nonzero(self.is_estimated):
             ordinary = np.flatnonzero(self.is_estimated)
         bulk_stddev = inlier_stddev if self.loss.is_bounded else robust_stddev
@@ -93,13 +98,8 @@ class RangeWeights:
         ratios = self._noise_ratios(residuals_m, ordinary)[self.anchor_index]
         stddev = np.where(self.is_estimated, np.hypot(common * ratios, self.fixed_m), self.stddev_m)
         scaled = residuals_m / stddev
-        groups = self.block * (self.anchor_index.max() + 1) + self.anchor_index
-        inflation = correlation_inflation(scaled, self.loss.weights(scaled), groups)
+        inflation = correlation_inflation(scaled, self.loss.weights(scaled), self.group)
         return replace(self, stddev_m=stddev, inflation=inflation)
-
-    def _noise_m(self) -> Array:
-        """(n,) the part of the stddevs that may be estimated."""
-        return np.sqrt(np.maximum(self.stddev_m**2 - self.fixed_m**2, 0.0))
 
     def _noise_ratios(self, residuals_m: Array, rows: Indices) -> Array:
         """(m,) noise of each anchor over that of all; 1 where the difference may be chance.
@@ -179,8 +179,7 @@ def misfits(weights: RangeWeights, residuals_m: Array, time_order: Array) -> tup
     typical = robust_stddev(stated)
     if len(stated) >= _MIN_DIFFERENCES and typical > _MAX_BLOCK_STDDEVS:
         reasons.append(f"range residuals are typically {typical:.1f} times their stddev")
-    group = weights.block * (weights.anchor_index.max() + 1) + weights.anchor_index
-    off = [np.median(stated[rows]) for rows in _by_group(group) if len(rows) >= _MIN_BLOCK]
+    off = [np.median(stated[rows]) for rows in _by_group(weights.group) if len(rows) >= _MIN_BLOCK]
     num_off = int(np.sum(np.abs(off) > _MAX_BLOCK_STDDEVS))
     if num_off:
         reasons.append(f"in {num_off} of {len(off)} stretches of time the ranges to an anchor are off as a whole")

@@ -15,6 +15,7 @@ from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.ranging.anchors import Anchor
 from rangesfm.ranging.noise import shared_stddev
 from rangesfm.ranging.observations import RangeObservations, RangeStatus, status_by_weight
+from rangesfm.ranging.shared_errors import CURVE_STDDEV_M
 from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
 from rangesfm.scale.cutoff import cutoff_test
 from rangesfm.scale.estimate import ScaleEstimate
@@ -23,7 +24,7 @@ from rangesfm.scale.problem import SurveyProblem, survey_problem
 from rangesfm.scale.sensitivity import scale_sensitivity
 from rangesfm.scale.solution import Solution, solve_survey
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
-from rangesfm.scale.uncertainty import CURVE_STDDEV_M, resampled_log_scales, scale_uncertainty
+from rangesfm.scale.uncertainty import resampled_log_scales, scale_uncertainty
 from rangesfm.scale.verdict import judge
 from rangesfm.trajectory import Trajectory
 

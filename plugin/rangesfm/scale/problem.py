@@ -14,7 +14,7 @@ from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry import Similarity, path_shape
 from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.anchors import Anchor
-from rangesfm.ranging.noise import shared_stddev
+from rangesfm.ranging.noise import START_STDDEV_M, shared_stddev
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.anchor_plane import is_line, is_steep
 from rangesfm.scale.gravity import Gravity
@@ -23,7 +23,6 @@ from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 
-_START_STDDEV_M = 0.1
 _MIN_RANGES = 8
 _MIN_KEYFRAMES = 4
 # A place of its own takes three numbers, and one range more to see that they fit.
@@ -86,7 +85,7 @@ def survey_problem(
     placed = known | (given & known.any())
     left_out = tuple(a.anchor_id for a, k in zip(in_log, heard | placed, strict=True) if not k)
     first_camera_from_sfm = _first_camera_from_sfm(trajectory)
-    noise = range_model.range_stddev_m or _START_STDDEV_M
+    noise = range_model.range_stddev_m or START_STDDEV_M
     stddev = np.where(np.isfinite(log.range_stddev_m), log.range_stddev_m, noise)
     ranges = RangeProblem(
         centers=first_camera_from_sfm.apply(observations.centers[rows]),

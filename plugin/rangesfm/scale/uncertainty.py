@@ -10,24 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.ranging.noise import inflation_before_fit
+from rangesfm.ranging.shared_errors import antenna_modes, curve_modes
 from rangesfm.scale.estimate import ScaleUncertainty
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, directions_to_tag, predicted_ranges
 from rangesfm.scale.solution import Solution
 
 Array = npt.NDArray[np.float64]
 
-# How wrong a radio's range may be as a smooth function of distance, where no error curve was learnt: the DW1000's
-# own error changes by 0.05 to 0.1 m when the distance grows e-fold (Decawave application note APS011), in either
-# direction once antennas and cases have their say. Every anchor has it alike, so no resampling sees it.
-CURVE_STDDEV_M = 0.07
-_CURVE_LOG_LENGTH = 1.0
-_NUM_CURVE_KNOTS = 25
-_MIN_DISTANCE_M = 0.05
-# How wrong a range may be as a smooth function of the direction in which an anchor's antenna sees the tag: turning one
-# antenna changes ranges by 0.1 to 0.25 m from least to most (Pelka, Cimdins and Hellbrück, "Impact of the antenna
-# orientation for distance estimation", 2018), which is this stddev as for a uniform distribution. Each anchor has its
-# own, which leaving out one anchor in turn shows; the data of a single one do not.
-ANTENNA_STDDEV_M = 0.05
 # Where most ranges are outliers, so that the curvature says nothing.
 _MIN_CURVATURE = 0.3
 
@@ -141,23 +130,12 @@ def _jackknife(fit: RangeFit, anchor_blocks: npt.NDArray[np.int64]) -> float:
 
 def _range_model_stddev(problem: RangeProblem, fit: RangeFit, curve_stddev_m: Array) -> float:
     """What an error curve with this stddev, smooth in the logarithm of distance, does to the scale."""
-    place = np.log(np.maximum(predicted_ranges(problem, fit.state), _MIN_DISTANCE_M))
-    knots = np.linspace(place.min(), place.max() + 1e-6, _NUM_CURVE_KNOTS)
-    hats = np.column_stack([np.interp(place, knots, unit) for unit in np.eye(_NUM_CURVE_KNOTS)])
-    shifts: Array = hats.T @ (scale_influence(fit, problem) * curve_stddev_m)
-    correlation = np.exp(-0.5 * ((knots[:, None] - knots) / _CURVE_LOG_LENGTH) ** 2)
-    return float(np.sqrt(max(float(shifts @ correlation @ shifts), 0.0)))
+    modes = curve_modes(predicted_ranges(problem, fit.state), curve_stddev_m)
+    return float(np.linalg.norm(scale_influence(fit, problem) @ modes))
 
 
 def _antennas_stddev(problem: RangeProblem, fit: RangeFit) -> float:
-    """What antennas do to the scale whose error is a random polynomial of the direction, one for each anchor.
-
-    Half of its variance is linear, half quadratic in the unit vector; the constant part is the bias, which has its
-    own prior. The covariance depends on the angle alone: c / 2 + (3 c^2 - 1) / 4 with c its cosine.
-    """
-    direction = directions_to_tag(problem, fit.state)
-    quadratic = np.sqrt(1.5) * (direction[:, :, None] * direction[:, None, :] - np.eye(3) / 3)
-    lobes = np.sqrt(0.5) * np.column_stack([direction, quadratic.reshape(-1, 9)])
-    shifts = lobes * (ANTENNA_STDDEV_M * scale_influence(fit, problem))[:, np.newaxis]
-    of_anchors = [shifts[problem.anchor_index == k].sum(axis=0) for k in range(problem.num_anchors)]
+    """What antennas do to the scale, each anchor's for itself."""
+    modes, influence = antenna_modes(directions_to_tag(problem, fit.state)), scale_influence(fit, problem)
+    of_anchors = [(problem.anchor_index == k) * influence @ modes for k in range(problem.num_anchors)]
     return float(np.linalg.norm(of_anchors))
