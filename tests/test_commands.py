@@ -325,8 +325,8 @@ class TestModelWithoutSurveyedAnchors:
                 true = np.array([float(row[key]) for key in ("x_m", "y_m", "z_m")])
                 found = left.result["anchors"][row["anchor_id"]]
                 error_m = np.linalg.norm(np.array(found["position_m"]) - true)
-                # Of the refined ones the stddev counts a bias of 0.1 m that all anchors may share, too.
-                assert error_m <= 3 * np.sqrt(3) * found["stddev_m"] < 0.7
+                # A refined one's counts what bias, antenna and radio may err by, together more than 0.1 m.
+                assert error_m <= 3 * np.sqrt(3) * found["stddev_m"] < 1.0
 
     def test_may_be_a_path_without_points(
         self, own_survey: WalkedSurvey, rangesfm_command: Command, refined: Left, tmp_path: Path
