@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import fcntl
+import json
 import os
 
 # As the command line does; numpy reads it when it is imported.
@@ -10,7 +12,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -119,23 +122,40 @@ class PhotoRun:
         survey: its folder is where the command ran.
         flags: of that command, but for the output path.
         output_path: what it left.
-        done: what it printed.
+        stdout, stderr: what it printed.
     """
 
     survey: DemoSurvey
     flags: tuple[str, ...]
     output_path: Path
-    done: subprocess.CompletedProcess[str]
+    stdout: str
+    stderr: str
 
 
 @pytest.fixture(scope="session")
 def photo_run(rangesfm_command: Command, tmp_path_factory: pytest.TempPathFactory) -> PhotoRun:
     """14 small photos of the demo's yard, run once. Not to be written to."""
-    survey = make_demo_survey(tmp_path_factory.mktemp("yard") / "yard", num_photos=14, image_size=(360, 240))
     # With more threads COLMAP starts from the first pair that will do, whichever thread comes first.
     flags = ("survey.toml", "--ranges_time_offset", str(DEMO_TIME_OFFSET_S), "--num_threads", "1")
-    done = rangesfm_command("run", *flags, cwd=survey.folder)
-    return PhotoRun(survey, flags, survey.folder / "out", done)
+    with _shared_folder(tmp_path_factory, "photo_run") as folder:
+        survey = make_demo_survey(folder / "yard", num_photos=14, image_size=(360, 240))
+        printed = folder / "printed.json"
+        if not printed.exists():
+            done = rangesfm_command("run", *flags, cwd=survey.folder)
+            printed.write_text(json.dumps([done.stdout, done.stderr]))
+        stdout, stderr = json.loads(printed.read_text())
+    return PhotoRun(survey, flags, survey.folder / "out", stdout, stderr)
+
+
+@contextmanager
+def _shared_folder(factory: pytest.TempPathFactory, name: str) -> Iterator[Path]:
+    """A folder that all processes of one test run share, and that one at a time may write to, inside the block."""
+    base = factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    folder.mkdir(exist_ok=True)
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # the system lets go of it, however the block ends
+        yield folder
 
 
 def _write_anchors(path: Path, positions_m: Array) -> None:

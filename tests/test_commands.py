@@ -503,7 +503,7 @@ def test_doctor_finds_nothing_wrong(rangesfm_command: Command, tmp_path: Path) -
 
 @pytest.fixture(scope="module")
 def first_run(photo_run: PhotoRun) -> Left:
-    return Left(photo_run.output_path, photo_run.done.stdout, photo_run.done.stderr)
+    return Left(photo_run.output_path, photo_run.stdout, photo_run.stderr)
 
 
 class TestRunOnPhotos:
