@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -20,9 +21,11 @@ from rangesfm.simulate import survey as survey_module
 from rangesfm.simulate.courtyard import ANCHOR_POSITIONS_M
 from rangesfm.simulate.photos import PhotoCamera
 from rangesfm.simulate.survey import ANCHOR_STDDEV_M, DemoSurvey, make_demo_survey, photo_exif
+from rangesfm.sole_writer import sole_writer
 
 NUM_PHOTOS = 4
 IMAGE_SIZE = (120, 80)
+NO_PROCESS = 99999999  # above any that Linux gives
 
 
 @pytest.fixture(scope="module")
@@ -137,4 +140,20 @@ def test_folder_with_other_things_is_refused_and_left_alone(tmp_path: Path) -> N
 def test_interrupted_survey_leaves_no_photos(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         _make(tmp_path / "demo")
+    assert _files(tmp_path) == {}
+
+
+@pytest.mark.usefixtures("no_camera")
+def test_one_at_a_time_makes_a_survey_in_a_folder(tmp_path: Path) -> None:
+    with sole_writer(tmp_path), ThreadPoolExecutor(1) as other, pytest.raises(InputError, match="has been writing"):
+        other.submit(_make, tmp_path).result()
+
+
+@pytest.mark.usefixtures("no_camera")
+def test_what_a_killed_one_left_is_not_in_the_way_and_goes(tmp_path: Path) -> None:
+    left = tmp_path / f".images.{NO_PROCESS}.part"
+    left.mkdir()
+    (left / "IMG_0001.jpg").touch()
+    with pytest.raises(KeyboardInterrupt):
+        _make(tmp_path)
     assert _files(tmp_path) == {}

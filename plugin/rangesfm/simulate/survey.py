@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone, tzinfo
@@ -14,7 +16,7 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 
 from rangesfm.errors import InputError
-from rangesfm.files import make_output_folder, new_file, new_folder
+from rangesfm.files import LEFTOVER, new_file, new_folder
 from rangesfm.progress import Progress, SilentProgress
 from rangesfm.ranging.readers.canonical import write_ranges_csv
 from rangesfm.reference import Reference, write_reference
@@ -23,6 +25,7 @@ from rangesfm.simulate.path import CameraPath, loop_path
 from rangesfm.simulate.photos import PhotoCamera, develop, render
 from rangesfm.simulate.ranges import Radio, SimulatedRanges, simulate_ranges
 from rangesfm.simulate.scene import Scene
+from rangesfm.sole_writer import LOCK_NAME, sole_writer
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -105,16 +108,22 @@ def make_demo_survey(
     text = _survey_file(survey, seed)
     if _is_there(survey, text):
         return survey
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if folder.exists() and (not folder.is_dir() or any(_names_of_others(folder))):
         raise InputError("expected a new or an empty folder, or one that holds the same demo", folder)
-    make_output_folder(folder)
-    _take_photos(survey, seed, progress)
-    write_ranges_csv(survey.ranges.log, folder / "uwb.csv")
-    _write_text(folder / "anchors.csv", _anchor_file(survey, seed))
-    write_reference(Reference(survey.centers_m, image_names=survey.image_names), folder / "reference.csv")
-    # Last: where it is, all is.
-    _write_text(survey.survey_path, text)
+    with sole_writer(folder):
+        _take_photos(survey, seed, progress)
+        write_ranges_csv(survey.ranges.log, folder / "uwb.csv")
+        _write_text(folder / "anchors.csv", _anchor_file(survey, seed))
+        write_reference(Reference(survey.centers_m, image_names=survey.image_names), folder / "reference.csv")
+        # Last: where it is, all is.
+        _write_text(survey.survey_path, text)
     return survey
+
+
+def _names_of_others(folder: Path) -> Iterator[str]:
+    """What is in a folder but for what a demo that is being made, or was killed, has there."""
+    names = (path.name for path in folder.iterdir())
+    return (name for name in names if name != LOCK_NAME and not re.fullmatch(LEFTOVER, name))
 
 
 def _plan(folder: Path, num_photos: int, seed: int, image_size: tuple[int, int]) -> DemoSurvey:
@@ -166,8 +175,12 @@ def _take_photos(survey: DemoSurvey, seed: int, progress: Progress) -> None:
     with new_folder(survey.folder / "images") as images, ThreadPoolExecutor(num_threads) as pool:
         numbers = range(len(survey.image_names))
         taken = pool.map(lambda number: _take_photo(scene, survey, number, seed, images), numbers)
-        for num_done, _ in enumerate(taken, start=1):
-            progress.update(num_done, len(survey.image_names))
+        try:
+            for num_done, _ in enumerate(taken, start=1):
+                progress.update(num_done, len(survey.image_names))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)  # or a Ctrl-C would wait for all photos
+            raise
 
 
 def _take_photo(scene: Scene, survey: DemoSurvey, number: int, seed: int, images: Path) -> None:
