@@ -78,6 +78,27 @@ def test_an_interrupted_step_goes_on_without_preparation(run: Run) -> None:
     assert run() == []
 
 
+def test_what_an_interrupted_step_has_to_go_on_from_may_be_elsewhere(tmp_path: Path, listener: Listener) -> None:
+    steps, prepared = Steps(tmp_path / "steps.json", listener), []
+
+    def work() -> None:
+        (tmp_path / "unfinished").touch()
+        raise KeyboardInterrupt
+
+    for left_by_then in ([], ["unfinished"]):
+        assert [path.name for path in tmp_path.glob("unf*")] == left_by_then
+        with pytest.raises(KeyboardInterrupt):
+            steps.run(
+                "a",
+                "1",
+                tmp_path / "done",
+                lambda: prepared.append("once"),
+                work,
+                unfinished=tmp_path / "unfinished",
+            )
+    assert prepared == ["once"]
+
+
 def test_an_interrupted_step_with_other_inputs_is_prepared_again(run: Run) -> None:
     run(interrupted_in="work b")
     assert run(b="2") == ["prepare b", "work b"]

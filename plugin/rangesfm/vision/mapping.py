@@ -16,6 +16,7 @@ from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import num_matching_pairs
 from rangesfm.vision.photos import Photos
+from rangesfm.vision.snapshots import Snapshots, newest_snapshot, remove_snapshots
 
 
 def pipeline_options(camera: CameraOptions, mapper: MapperOptions, seed: int) -> pycolmap.IncrementalPipelineOptions:
@@ -33,25 +34,42 @@ def map_incrementally(
     database_path: Path,
     photos: Photos,
     models_path: Path,
+    snapshots_path: Path,
     options: pycolmap.IncrementalPipelineOptions,
     progress: Progress,
 ) -> None:
     """Write all models to ``models_path``/0, /1, ..., the one with the most photos first.
 
+    Goes on from the newest snapshot in ``snapshots_path``, if there is one, and has its own there until it is done.
+
     Raises:
         ReconstructionError: there is not a single one.
     """
-    counter = _Counter()
+    begun = newest_snapshot(snapshots_path)
+    counter = _Counter(begun)
+    if begun is not None:
+        progress.message(f"mapping: goes on from {counter.num_in_next_model} photos of an earlier run")
     # COLMAP writes models as it goes, in the order in which it began them.
     with scratch_folder(models_path.with_name("mapping")) as folder:
+        snapshots = Snapshots(snapshots_path, folder / "snapshots", options, len(photos.names))
+
+        def begin_model() -> None:
+            counter.begin_model()
+            snapshots.begin_model()
+
+        def add_photo() -> None:
+            counter.add_photo()
+            snapshots.add_photo()
+
         models = run_in_background(
             lambda token: pycolmap.incremental_mapping(
                 database_path,
                 photos.folder,
                 folder,
                 options=options,
-                initial_image_pair_callback=counter.add_pair,
-                next_image_callback=counter.add_one,
+                input_path=begun or "",
+                initial_image_pair_callback=begin_model,
+                next_image_callback=add_photo,
                 cancellation_token=token,
             ),
             progress,
@@ -69,6 +87,7 @@ def map_incrementally(
         for index, model in enumerate(sorted(models.values(), key=lambda model: -model.num_reg_images())):
             (temporary / str(index)).mkdir()
             model.write_binary(temporary / str(index))
+    remove_snapshots(snapshots_path)
 
 
 def read_models(models_path: Path) -> tuple[pycolmap.Reconstruction, ...]:
@@ -84,11 +103,13 @@ def remove_models(models_path: Path) -> None:
 class _Counter:
     """Photos registered so far; in more than one model they count more than once."""
 
-    def __init__(self) -> None:
+    def __init__(self, begun: Path | None):
         self.num_registered = 0
+        self.num_in_next_model = 2 if begun is None else pycolmap.Reconstruction(begun).num_reg_images()
 
-    def add_pair(self) -> None:
-        self.num_registered += 2
+    def begin_model(self) -> None:
+        self.num_registered += self.num_in_next_model
+        self.num_in_next_model = 2
 
-    def add_one(self) -> None:
+    def add_photo(self) -> None:
         self.num_registered += 1

@@ -20,6 +20,7 @@ from rangesfm.vision.features import extract_features, feature_options
 from rangesfm.vision.mapping import map_incrementally, pipeline_options, read_models, remove_models
 from rangesfm.vision.matching import match_features, matching_options
 from rangesfm.vision.photos import Photos, usable_photos
+from rangesfm.vision.snapshots import remove_snapshots
 from rangesfm.vision.steps import Steps, fingerprint
 
 
@@ -59,7 +60,7 @@ def reconstruct(
     Writes ``database.db``, the models ``sparse/0`` (the largest), ``sparse/1``, ..., ``mapper.log``
     and ``reconstruct.json`` to ``output_path``. Steps that an earlier run into the same folder did
     with the same photos (by their content) and options are taken over, and so are the features and matches that an
-    interrupted one had found.
+    interrupted one had found, and its newest snapshot of the mapping (``mapping_snapshot``).
 
     Args:
         image_path: folder of the photos.
@@ -86,6 +87,7 @@ def reconstruct(
     make_output_folder(output)
 
     database, models, log = output / "database.db", output / "sparse", output / "mapper.log"
+    snapshots = output / "mapping_snapshot"
     steps = Steps(output / "reconstruct.json", progress)
     if restart:
         steps.forget("features")
@@ -93,6 +95,7 @@ def reconstruct(
     def remove_old_models() -> None:
         before_change()
         remove_models(models)
+        remove_snapshots(snapshots)
 
     def prepare_features() -> None:
         remove_old_models()
@@ -128,7 +131,8 @@ def reconstruct(
             inputs,
             models / "0",
             remove_old_models,
-            lambda: map_incrementally(database, photos, models, for_mapping, progress),
+            lambda: map_incrementally(database, photos, models, snapshots, for_mapping, progress),
+            unfinished=snapshots,
         )
     found = read_models(models)
     _say_separate(found, progress)

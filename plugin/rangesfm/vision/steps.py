@@ -33,22 +33,32 @@ class Steps:
         self.notes = _read(record_path, "notes")
         self.seconds: dict[str, float] = {}
 
-    def run(self, name: str, inputs: str, output: Path, prepare: Callable[[], None], work: Callable[[], None]) -> None:
+    def run(
+        self,
+        name: str,
+        inputs: str,
+        output: Path,
+        prepare: Callable[[], None],
+        work: Callable[[], None],
+        *,
+        unfinished: Path | None = None,
+    ) -> None:
         """Do a step, unless it was done with the same inputs and its output is still there.
 
         Args:
             inputs: fingerprint of all that the step depends on.
             prepare: clears the ground; skipped where ``work`` was interrupted on the same inputs.
             work: goes on from whatever it left when it was interrupted.
+            unfinished: where it leaves that, if not in ``output``.
         """
         state = self._record.get(name, {})
-        is_begun = state.get("inputs") == inputs and output.exists()
-        if is_begun and state.get("done"):
+        is_same = state.get("inputs") == inputs
+        if is_same and state.get("done") and output.exists():
             self._progress.message(f"{name}: taken over from an earlier run")
             return
         self._progress.stage(name)
         start = time.perf_counter()
-        if not is_begun:
+        if not (is_same and (output.exists() or (unfinished is not None and unfinished.exists()))):
             self.forget(name)
             prepare()
         self._set_state(name, inputs, done=False)

@@ -1,0 +1,179 @@
+"""An interrupted mapping goes on from its newest snapshot, and ends as one that was not interrupted."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pycolmap
+import pytest
+
+from rangesfm.options import MapperOptions
+from rangesfm.vision import snapshots as snapshots_module
+from rangesfm.vision.reconstruct import reconstruct
+from rangesfm.vision.snapshots import Snapshots, newest_snapshot
+
+if TYPE_CHECKING:
+    from tests.vision.conftest import Listener, Room
+
+# One thread: with more, COLMAP starts from whichever pair is ready first.
+MAPPER = MapperOptions(features={"sift": {"max_num_features": 250}}, num_threads=1)
+NUM_PHOTOS = 13
+
+
+class Mapping:
+    """A room's photos with their matches, to be mapped again and again."""
+
+    def __init__(self, room: Room, output: Path):
+        self.room = room
+        self.output = output
+
+    def run(self, listener: Listener | None = None, **pipeline: Any) -> pycolmap.Reconstruction:
+        mapper = MapperOptions(features=MAPPER.features, pipeline=pipeline, num_threads=1)
+        names, camera = self.room.names, self.room.camera
+        found = reconstruct(self.room.folder, names, self.output, camera=camera, mapper=mapper, progress=listener)
+        return found.models[0]
+
+    @property
+    def snapshots(self) -> Path:
+        return self.output / "mapping_snapshot"
+
+
+@pytest.fixture(scope="module")
+def undisturbed(render_room: Callable[..., Room], tmp_path_factory: pytest.TempPathFactory) -> Mapping:
+    folder = tmp_path_factory.mktemp("mapping")
+    mapping = Mapping(render_room(folder / "room", NUM_PHOTOS), folder / "out")
+    mapping.run()
+    return mapping
+
+
+@pytest.fixture
+def mapping(undisturbed: Mapping, tmp_path: Path) -> Mapping:
+    """A copy that has its matches and no model yet."""
+    output = shutil.copytree(undisturbed.output, tmp_path / "out")
+    shutil.rmtree(output / "sparse")
+    return Mapping(undisturbed.room, output)
+
+
+@pytest.fixture
+def interrupted(mapping: Mapping, monkeypatch: pytest.MonkeyPatch) -> Callable[[int], Mapping]:
+    """A mapping that was interrupted when it had so many snapshots; it has the last of them."""
+
+    def interrupt(num_snapshots: int) -> Mapping:
+        kept: list[Path] = []
+
+        def keep_and_interrupt(model: Path, path: Path) -> None:
+            if len(kept) < num_snapshots:
+                keep(model, path)
+                kept.append(model)
+            if len(kept) == num_snapshots:
+                raise RuntimeError("killed")
+
+        keep = snapshots_module._keep
+        with monkeypatch.context() as patched:
+            patched.setattr(snapshots_module, "_keep", keep_and_interrupt)
+            with pytest.raises(Exception, match="killed"):
+                mapping.run()
+        return mapping
+
+    return interrupt
+
+
+def centers(model: pycolmap.Reconstruction) -> dict[str, Any]:
+    return {image.name: image.projection_center() for image in model.images.values()}
+
+
+def assert_as_undisturbed(model: pycolmap.Reconstruction, undisturbed: Mapping) -> None:
+    whole = pycolmap.Reconstruction(undisturbed.output / "sparse" / "0")
+    expected, found = centers(whole), centers(model)
+    assert found.keys() == expected.keys()
+    assert max(np.abs(found[name] - expected[name]).max() for name in expected) < 1e-9
+    assert model.num_points3D() == whole.num_points3D()
+
+
+@pytest.mark.parametrize("num_snapshots", [1, 8])
+def test_goes_on_from_the_photos_it_had_and_ends_as_if_nothing_had_been(
+    num_snapshots: int, interrupted: Callable[[int], Mapping], undisturbed: Mapping, listener: Listener
+) -> None:
+    mapping = interrupted(num_snapshots)
+    (snapshot,) = mapping.snapshots.iterdir()
+    num_photos = pycolmap.Reconstruction(snapshot).num_reg_images()
+    assert num_photos > num_snapshots
+    assert_as_undisturbed(mapping.run(listener), undisturbed)
+    assert f"mapping: goes on from {num_photos} photos of an earlier run" in listener.messages
+    assert listener.updates["mapping"][-1] == (NUM_PHOTOS, NUM_PHOTOS)
+    assert sorted(os.listdir(mapping.output)) == ["database.db", "mapper.log", "reconstruct.json", "sparse"]
+
+
+def test_with_other_options_begins_anew(interrupted: Callable[[int], Mapping], listener: Listener) -> None:
+    mapping = interrupted(4)
+    mapping.run(listener, min_model_size=4)
+    assert listener.messages[-1] == "matching: taken over from an earlier run"
+    assert not mapping.snapshots.exists()
+
+
+def test_with_a_snapshot_that_is_cut_off_begins_anew(
+    interrupted: Callable[[int], Mapping], undisturbed: Mapping, listener: Listener
+) -> None:
+    mapping = interrupted(4)
+    (snapshot,) = mapping.snapshots.iterdir()
+    points = snapshot / "points3D.bin"
+    points.write_bytes(points.read_bytes()[:-10])
+    assert_as_undisturbed(mapping.run(listener), undisturbed)
+    assert listener.messages[-1] == "matching: taken over from an earlier run"
+
+
+def test_a_snapshot_between_two_refinements_of_the_whole_is_not_kept(undisturbed: Mapping, tmp_path: Path) -> None:
+    """Or the mapping would go on otherwise than it would have."""
+    model = pycolmap.Reconstruction(undisturbed.output / "sparse" / "0")
+    options = pycolmap.IncrementalPipelineOptions()
+    snapshots = Snapshots(tmp_path / "kept", tmp_path / "scratch", options, NUM_PHOTOS)
+    assert options.snapshot_path == tmp_path / "scratch"
+    snapshots.begin_model()
+    rng = np.random.default_rng(0)
+
+    def add_photo(name: str) -> list[str]:
+        (tmp_path / "scratch" / name).mkdir()
+        model.write_binary(tmp_path / "scratch" / name)
+        snapshots.add_photo()
+        assert not os.listdir(tmp_path / "scratch")
+        return os.listdir(tmp_path / "kept") if (tmp_path / "kept").exists() else []
+
+    def move(num_frames: int) -> None:
+        for frame_id in sorted(model.frames)[:num_frames]:
+            place = np.append(rng.normal(size=2), frame_id)
+            model.frames[frame_id].rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(), place)
+
+    assert add_photo("1") == []  # nothing to compare it with
+    move(NUM_PHOTOS - 1)
+    assert add_photo("2") == []
+    move(NUM_PHOTOS)
+    assert add_photo("3") == ["3"]
+    move(6)
+    assert add_photo("4") == ["3"]
+    move(NUM_PHOTOS)
+    assert add_photo("5") == ["5"]
+    snapshots.begin_model()
+    move(NUM_PHOTOS)
+    assert add_photo("6") == ["5"]
+    newest = newest_snapshot(tmp_path / "kept")
+    assert newest is not None
+    assert newest.name == "5"
+
+
+def test_snapshots_of_the_user_are_left_alone(mapping: Mapping, tmp_path: Path) -> None:
+    theirs = tmp_path / "theirs"
+    theirs.mkdir()
+    mapping.run(snapshot_path=str(theirs), snapshot_frames_freq=5)
+    assert len(os.listdir(theirs)) == 2
+    assert not mapping.snapshots.exists()
+
+
+def test_many_photos_are_written_now_and_then(tmp_path: Path) -> None:
+    options = pycolmap.IncrementalPipelineOptions()
+    Snapshots(tmp_path / "kept", tmp_path / "scratch", options, 1000)
+    assert options.snapshot_frames_freq == 5
