@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,12 +15,15 @@ import pytest
 
 import rangesfm
 from rangesfm.options import MapperOptions
+from rangesfm.vision.database import num_photos_with_features
 from rangesfm.vision.reconstruct import reconstruct
 
 if TYPE_CHECKING:
     from tests.vision.conftest import Listener, Room
 
 MAPPER = MapperOptions(features={"sift": {"max_num_features": 400}})
+NUM_PHOTOS = 12
+ALL = {"features": NUM_PHOTOS, "matching": NUM_PHOTOS * (NUM_PHOTOS - 1) // 2}
 PROGRAM = """
 import sys
 from rangesfm.options import CameraOptions, MapperOptions
@@ -45,11 +47,11 @@ except KeyboardInterrupt:
 
 @pytest.fixture(scope="module")
 def many_photos(render_room: Callable[..., Room], tmp_path_factory: pytest.TempPathFactory) -> Room:
-    return render_room(tmp_path_factory.mktemp("room"), 12)
+    return render_room(tmp_path_factory.mktemp("room"), NUM_PHOTOS)
 
 
-def interrupt(room: Room, output: Path, step: str, min_num_done: int) -> float:
-    """Start a reconstruction, press Ctrl-C once the step is so far; the seconds until it ended."""
+def interrupt(room: Room, output: Path, step: str, min_num_done: int) -> None:
+    """Start a reconstruction, press Ctrl-C once the step is so far."""
     assert room.camera.params is not None
     arguments = [room.folder, output, *room.camera.params]
     command = [sys.executable, "-c", PROGRAM, *map(str, arguments)]
@@ -59,14 +61,18 @@ def interrupt(room: Room, output: Path, step: str, min_num_done: int) -> float:
     ) as process:
         assert process.stdout is not None
         for line in process.stdout:
-            name, num_done = line.split()
-            if name == step and int(num_done) >= min_num_done:
+            name, num = line.split()
+            if name == step and int(num) >= min_num_done:
                 break
         process.send_signal(signal.SIGINT)
-        start = time.monotonic()
-        _, errors = process.communicate(timeout=60)
+        _, errors = process.communicate()
     assert (process.returncode, errors) == (130, "")
-    return time.monotonic() - start
+
+
+def num_done(output: Path) -> dict[str, int]:
+    """Photos with features, and pairs of photos with matches."""
+    with pycolmap.Database.open(output / "database.db") as database:
+        return {"features": num_photos_with_features(database), "matching": database.num_verified_image_pairs()}
 
 
 @pytest.mark.parametrize(
@@ -80,8 +86,11 @@ def interrupt(room: Room, output: Path, step: str, min_num_done: int) -> float:
 def test_ends_soon_leaves_nothing_half_done_and_the_next_run_goes_on(
     many_photos: Room, tmp_path: Path, listener: Listener, step: str, min_num_done: int, steps_left: list[str]
 ) -> None:
-    assert interrupt(many_photos, tmp_path, step, min_num_done) < 10
-    assert sorted(os.listdir(tmp_path)) == ["database.db", "mapper.log", "reconstruct.json"]
+    interrupt(many_photos, tmp_path, step, min_num_done)
+    left = set(os.listdir(tmp_path)) - {"mapping_snapshot"}  # there is one, or it was too soon
+    assert left == {"database.db", "mapper.log", "reconstruct.json"}
+    if step in ALL:
+        assert min_num_done <= num_done(tmp_path)[step] < ALL[step]
     summary = reconstruct(
         many_photos.folder,
         many_photos.names,
@@ -91,12 +100,12 @@ def test_ends_soon_leaves_nothing_half_done_and_the_next_run_goes_on(
         progress=listener,
     )
     assert listener.stages == steps_left
-    assert summary.num_registered == 12
+    assert summary.num_registered == NUM_PHOTOS
     if step != "mapping":
         assert listener.updates[step][0][0] >= min_num_done  # it did not begin at nothing
     with pycolmap.Database.open(tmp_path / "database.db") as database:
         assert {image.name for image in database.read_all_images()} == set(many_photos.names)
-        assert database.num_verified_image_pairs() == 66
+    assert num_done(tmp_path) == ALL
 
 
 def test_an_error_of_the_listener_stops_colmap_and_comes_through(many_photos: Room, tmp_path: Path) -> None:
@@ -110,7 +119,6 @@ def test_an_error_of_the_listener_stops_colmap_and_comes_through(many_photos: Ro
         def message(self, text: str) -> None:
             pass
 
-    start = time.monotonic()
     with pytest.raises(ZeroDivisionError):
         reconstruct(
             many_photos.folder,
@@ -120,5 +128,5 @@ def test_an_error_of_the_listener_stops_colmap_and_comes_through(many_photos: Ro
             mapper=MAPPER,
             progress=Broken(),
         )
-    assert time.monotonic() - start < 10
+    assert num_done(tmp_path)["features"] < ALL["features"]
     assert pycolmap.logging.alsologtostderr
