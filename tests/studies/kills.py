@@ -103,6 +103,11 @@ def differences(whole: Path, other: Path) -> list[str]:
     return found
 
 
+def names_in(folder: Path) -> set[str]:
+    """Of all files and folders, however deep."""
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
+
+
 def _same_table(first: Path, second: Path) -> bool:
     rows = [list(csv.reader(path.read_text().splitlines())) for path in (first, second)]
     if [len(row) for row in rows[0]] != [len(row) for row in rows[1]]:
@@ -167,7 +172,7 @@ def main() -> int:
                 continue  # too late: another moment
             what = left_by_killed(output, whole)
             run(survey, output)
-            wrong = differences(whole.new, output) + [path.name for path in output.rglob(".*")]
+            wrong = differences(whole.new, output) + sorted(names_in(output) - names_in(whole.new))
             num_wrong += bool(wrong) or what.startswith("MIXED")
             left[what.partition(" ")[0]] += 1
             print(

@@ -4,6 +4,7 @@ import os
 import shutil
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -259,6 +260,93 @@ class TestEarlierRun:
         with pytest.raises(ReconstructionError, match="no model from 2 photos"):
             reconstruct(room.folder, [room.names[0], room.names[-1]], output, camera=room.camera, mapper=MAPPER)
         assert not (output / "sparse").exists()
+
+
+def content_of(database_path: Path) -> dict[Any, list[bytes]]:
+    """All that is found in photos and pairs of photos, by their ids."""
+    with pycolmap.Database.open(database_path) as database:
+        found: dict[Any, list[bytes]] = {}
+        for image in database.read_all_images():
+            descriptors = database.read_descriptors(image.image_id)
+            found[image.name, image.image_id] = [
+                database.read_keypoints(image.image_id).tobytes(),
+                descriptors.data.tobytes(),
+            ]
+        for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True):
+            pair = pycolmap.pair_id_to_image_pair(pair_id)
+            found[pair] = [
+                database.read_matches(*pair).tobytes(),
+                geometry.inlier_matches.tobytes(),
+                str((geometry.config, geometry.E, geometry.F, geometry.H, geometry.cam2_from_cam1)).encode(),
+            ]
+    return found
+
+
+class TestOtherPhotos:
+    """Of an earlier run on partly the same photos, what is known of those is taken over."""
+
+    @pytest.fixture
+    def changed(self, room: Room, tmp_path: Path) -> Room:
+        """The room with another photo in the place of the third."""
+        folder = shutil.copytree(room.folder, tmp_path / "changed")
+        with Image.open(folder / room.names[2]) as photo:
+            darker = Image.eval(photo, lambda value: value // 2)
+        darker.save(folder / room.names[2])
+        return replace(room, folder=folder)
+
+    def test_one_more_is_extracted_alone_and_only_its_pairs_are_matched(
+        self, room: Room, done: ReconstructionSummary, tmp_path: Path, listener: Listener
+    ) -> None:
+        for names in (room.names[:2] + room.names[3:], room.names):
+            summary = reconstruct(room.folder, names, tmp_path, camera=room.camera, mapper=MAPPER, progress=listener)
+        assert "features: those of 5 photos are taken over from an earlier run" in listener.messages
+        of_second_run = listener.updates["features"][listener.updates["features"].index((5, 5)) + 1 :]
+        assert min(of_second_run) >= (5, 6)
+        of_second_run = listener.updates["matching"][listener.updates["matching"].index((10, 10)) + 1 :]
+        assert min(of_second_run) >= (10, 15)
+        assert content_of(tmp_path / "database.db") == content_of(done.log_path.parent / "database.db")
+        assert summary.num_registered == 6
+
+    def test_one_changed_gives_what_a_run_on_these_photos_alone_gives(
+        self, room: Room, changed: Room, tmp_path: Path
+    ) -> None:
+        for photos, output in ((room, "out"), (changed, "out"), (changed, "alone")):
+            reconstruct(photos.folder, photos.names, tmp_path / output, camera=room.camera, mapper=MAPPER)
+        renewed, alone = (content_of(tmp_path / output / "database.db") for output in ("out", "alone"))
+        assert renewed == alone
+
+    def test_fewer_or_in_another_order_leave_no_pairs_that_would_not_be_matched(
+        self, room: Room, tmp_path: Path, listener: Listener
+    ) -> None:
+        mapper = MapperOptions("sequential", FEATURES, {"overlap": 2, "quadratic_overlap": False})
+        shorter = (room.names[1], room.names[0], *room.names[3:])
+        for names, output in ((room.names, "out"), (shorter, "out"), (shorter, "alone")):
+            reconstruct(room.folder, names, tmp_path / output, camera=room.camera, mapper=mapper, progress=listener)
+        assert "features: those of 5 photos are taken over from an earlier run" in listener.messages
+        renewed, alone = (content_of(tmp_path / output / "database.db") for output in ("out", "alone"))
+        assert renewed == alone
+
+    def test_with_other_options_start_from_nothing(
+        self, room: Room, output: Path, tmp_path: Path, listener: Listener
+    ) -> None:
+        mapper = MapperOptions(features={"sift": {"max_num_features": 200}})
+        reconstruct(room.folder, room.names[:4], output, camera=room.camera, mapper=mapper, progress=listener)
+        assert not listener.messages
+        assert listener.stages == ["features", "matching", "mapping"]
+
+    def test_start_from_nothing_after_a_run_that_was_killed_as_it_renewed_the_database(
+        self, room: Room, changed: Room, output: Path, monkeypatch: pytest.MonkeyPatch, listener: Listener
+    ) -> None:
+        def die(*_: Any) -> None:
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patched:
+            patched.setattr("rangesfm.vision.renewed_database.RenewedDatabase._write_note", die)
+            with pytest.raises(KeyboardInterrupt):
+                reconstruct(changed.folder, room.names, output, camera=room.camera, mapper=MAPPER)
+        reconstruct(room.folder, room.names, output, camera=room.camera, mapper=MAPPER, progress=listener)
+        assert not listener.messages
+        assert listener.stages == ["features", "matching", "mapping"]
 
 
 class TestBadPhotos:

@@ -41,9 +41,12 @@ def remove_database(path: Path) -> None:
         path.with_name(path.name + suffix).unlink(missing_ok=True)
 
 
-def clear_matches(path: Path, image_names: Sequence[str]) -> None:
-    """Forget all matches, and the names under which a process that was killed may have been matching."""
+def restore_names(path: Path, image_names: Sequence[str]) -> None:
+    """In the place of those under which a process that was killed may have been matching."""
     _rename(path, image_names)
+
+
+def clear_matches(path: Path) -> None:
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
         database.clear_matches()
         database.clear_two_view_geometries()

@@ -56,6 +56,20 @@ def matching_options(mapper: MapperOptions, num_photos: int, seed: int) -> Match
     return options
 
 
+def pairs_to_match(database_path: Path, photos: Photos, options: MatchingOptions) -> list[tuple[int, int]]:
+    """Ids of all pairs that will be compared, smaller first; none where only the photos' looks decide."""
+    pairing = options.pairing
+    if isinstance(pairing, pycolmap.SequentialPairingOptions):
+        if pairing.loop_detection:
+            return []
+        with named_by_place(database_path, photos.names), pycolmap.Database.open(database_path) as database:
+            pairs = pycolmap.SequentialPairGenerator(pairing, database).all_pairs()
+    else:
+        with pycolmap.Database.open(database_path) as database:
+            pairs = pycolmap.ExhaustivePairGenerator(pairing, database).all_pairs()
+    return sorted({(min(pair), max(pair)) for pair in pairs})
+
+
 def match_features(database_path: Path, photos: Photos, options: MatchingOptions, progress: Progress) -> None:
     """Match the pairs of photos that have not been matched yet.
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pycolmap
 
@@ -15,11 +16,11 @@ from rangesfm.files import make_output_folder
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import Progress, SilentProgress
 from rangesfm.vision.camera import camera_of_photos, check_camera
-from rangesfm.vision.database import clear_matches, create_database
 from rangesfm.vision.features import extract_features, feature_options
 from rangesfm.vision.mapping import map_incrementally, pipeline_options, read_models, remove_models
 from rangesfm.vision.matching import match_features, matching_options
 from rangesfm.vision.photos import Photos, usable_photos
+from rangesfm.vision.renewed_database import RenewedDatabase, forget_database
 from rangesfm.vision.snapshots import remove_snapshots
 from rangesfm.vision.steps import Steps, fingerprint
 
@@ -60,7 +61,8 @@ def reconstruct(
     Writes ``database.db``, the models ``sparse/0`` (the largest), ``sparse/1``, ..., ``mapper.log``
     and ``reconstruct.json`` to ``output_path``. Steps that an earlier run into the same folder did
     with the same photos (by their content) and options are taken over, and so are the features and matches that an
-    interrupted one had found, and its newest snapshot of the mapping (``mapping_snapshot``).
+    interrupted one had found, and its newest snapshot of the mapping (``mapping_snapshot``). Where only some photos
+    are other ones, so are the features of those that are the same, and the matches of pairs of them.
 
     Args:
         image_path: folder of the photos.
@@ -91,6 +93,7 @@ def reconstruct(
     steps = Steps(output / "reconstruct.json", progress)
     if restart:
         steps.forget("features")
+        forget_database(steps)
 
     def remove_old_models() -> None:
         before_change()
@@ -100,16 +103,21 @@ def reconstruct(
     def prepare_features() -> None:
         remove_old_models()
         log.unlink(missing_ok=True)
-        create_database(database, photos.names, its_camera)
+        renewed.begin(progress)
 
     def prepare_matching() -> None:
         remove_old_models()
-        clear_matches(database, photos.names)
+        renewed.begin_matching()
 
     with colmap_log(log), _pointing_to(log):
         steps.note("photos", photos.contents(steps.notes.get("photos", {})))
-        content = [(name, sha256) for name, (_, sha256) in steps.notes["photos"].items()]
-        inputs = fingerprint(pycolmap.__version__, content, camera.model, camera.params, mapper.features)
+        contents = {name: sha256 for name, (_, sha256) in steps.notes["photos"].items()}
+        of_features = fingerprint(
+            pycolmap.__version__, camera.model, camera.params, its_camera.todict(), mapper.features
+        )
+        of_matches = fingerprint(of_features, for_matching.is_sequential, mapper.pairing, mapper.matcher, seed)
+        renewed = RenewedDatabase(database, photos, contents, its_camera, for_matching, of_features, of_matches, steps)
+        inputs = fingerprint(of_features, list(contents.items()))
         steps.run(
             "features",
             inputs,
@@ -117,7 +125,7 @@ def reconstruct(
             prepare_features,
             lambda: extract_features(database, photos, for_features, progress),
         )
-        inputs = fingerprint(inputs, for_matching.is_sequential, mapper.pairing, mapper.matcher, seed)
+        inputs = fingerprint(inputs, of_matches)
         steps.run(
             "matching",
             inputs,
@@ -137,6 +145,10 @@ def reconstruct(
     found = read_models(models)
     _say_separate(found, progress)
     return ReconstructionSummary(found, len(image_names), found[0].num_reg_images(), steps.seconds, log)
+
+
+def _plain(camera: pycolmap.Camera) -> list[Any]:
+    return [camera.model_name, camera.params.tolist(), camera.width, camera.height, camera.has_prior_focal_length]
 
 
 @contextmanager

@@ -1,0 +1,125 @@
+"""COLMAP's database begun anew where photos or options are other ones; what still holds of an earlier one stays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+
+from rangesfm.files import new_file
+from rangesfm.progress import Progress
+from rangesfm.vision.database import clear_matches, create_database, remove_database, restore_names
+from rangesfm.vision.matching import MatchingOptions, pairs_to_match
+from rangesfm.vision.photos import Photos
+from rangesfm.vision.steps import Steps
+
+_NOTE = "database"
+
+
+@dataclass(frozen=True)
+class RenewedDatabase:
+    """The database of a reconstruction, with a note in the record of its steps of what it was made from.
+
+    Killed at any moment, it leaves a note that is true or none; without one nothing of the database is used.
+
+    Attributes:
+        path: of the database.
+        photos: in the order of their ids.
+        contents: SHA-256 of each photo, by name.
+        camera: that took them.
+        matching: how they will be matched.
+        feature_inputs: fingerprint of what features depend on beside the photo itself.
+        match_inputs: likewise, of matches beside the two photos.
+        steps: keep the note.
+    """
+
+    path: Path
+    photos: Photos
+    contents: Mapping[str, str]
+    camera: pycolmap.Camera
+    matching: MatchingOptions
+    feature_inputs: str
+    match_inputs: str
+    steps: Steps
+
+    def begin(self, progress: Progress) -> None:
+        """Put a new database in the place of the earlier one, with what that has of the same photos."""
+        earlier = self.steps.notes.get(_NOTE, {})
+        forget_database(self.steps)
+        with new_file(self.path) as fresh:
+            create_database(fresh, self.photos.names, self.camera)
+            ids = self._earlier_ids(earlier)
+            if ids and self.path.exists():
+                same_matches = earlier.get("matches") == self.match_inputs
+                pairs = pairs_to_match(fresh, self.photos, self.matching) if same_matches else []
+                num_taken = _take_over(self.path, fresh, ids, pairs)
+                progress.message(f"features: those of {num_taken} photos are taken over from an earlier run")
+            remove_database(self.path)  # also what SQLite keeps beside it, which would be taken for the new one's
+        self._write_note()
+
+    def begin_matching(self) -> None:
+        """Forget the matches, unless they were made with the same options."""
+        restore_names(self.path, self.photos.names)
+        if self.steps.notes.get(_NOTE, {}).get("matches") != self.match_inputs:
+            clear_matches(self.path)
+        self._write_note()
+
+    def _earlier_ids(self, earlier: Mapping[str, Any]) -> dict[int, int]:
+        """Id in the earlier database of each photo that has not changed, by its new one."""
+        if earlier.get("features") != self.feature_inputs:
+            return {}
+        ids = {(name, sha256): id_ for id_, (name, sha256) in enumerate(earlier["photos"].items(), 1)}
+        contents = enumerate(((name, self.contents[name]) for name in self.photos.names), 1)
+        return {new_id: ids[content] for new_id, content in contents if content in ids}
+
+    def _write_note(self) -> None:
+        note = {"features": self.feature_inputs, "matches": self.match_inputs, "photos": dict(self.contents)}
+        self.steps.note(_NOTE, note)
+
+
+def forget_database(steps: Steps) -> None:
+    """Take nothing over from the database."""
+    steps.note(_NOTE, {})
+
+
+def _take_over(earlier: Path, new: Path, earlier_ids: Mapping[int, int], pairs: Iterable[tuple[int, int]]) -> int:
+    """Copy features and matches into a new database; returns of how many photos there were features.
+
+    Args:
+        earlier_ids: id of a photo in the earlier database by its id in the new one.
+        pairs: of new ids, smaller first, whose matches are wanted; not those of photos that stood in the other order,
+            as COLMAP does not match two photos as it would the other way round.
+    """
+    with (
+        pycolmap.Database.open(earlier) as source,
+        pycolmap.Database.open(new) as target,
+        pycolmap.DatabaseTransaction(target),
+    ):
+        taken = {new_id: old_id for new_id, old_id in earlier_ids.items() if _has_features(source, old_id)}
+        for new_id, old_id in taken.items():
+            target.write_keypoints(new_id, source.read_keypoints(old_id))
+            target.write_descriptors(new_id, source.read_descriptors(old_id))
+        _copy_pose_priors(source, target, taken)
+        for first, second in pairs:
+            old_first, old_second = taken.get(first, 0), taken.get(second, 0)
+            if 0 < old_first < old_second and source.exists_two_view_geometry(old_first, old_second):
+                target.write_matches(first, second, source.read_matches(old_first, old_second))
+                target.write_two_view_geometry(first, second, source.read_two_view_geometry(old_first, old_second))
+    return len(taken)
+
+
+def _has_features(database: pycolmap.Database, image_id: int) -> bool:
+    return database.exists_keypoints(image_id) and database.exists_descriptors(image_id)
+
+
+def _copy_pose_priors(source: pycolmap.Database, target: pycolmap.Database, ids: Mapping[int, int]) -> None:
+    """What COLMAP read in the photos' EXIF data when it extracted their features."""
+    by_id = {prior.corr_data_id.id: prior for prior in source.read_all_pose_priors()}
+    for new_id, old_id in ids.items():
+        if old_id in by_id:
+            prior = by_id[old_id]
+            prior.corr_data_id = target.read_image(new_id).data_id
+            target.write_pose_prior(prior)

@@ -1,0 +1,101 @@
+"""Runs that are killed outright (SIGKILL), and what the next run makes of what they leave."""
+
+from __future__ import annotations
+
+import importlib
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from tests.conftest import Command, PhotoRun
+
+# Runs a command that is killed at a call of some function, after so many that it lives through.
+PROGRAM = """
+import importlib, os, signal, sys
+from rangesfm.cli import main
+
+module, name, num_calls, *argv = sys.argv[1:]
+module, left = importlib.import_module(module), int(num_calls)
+function = getattr(module, name)
+
+def function_or_death(*arguments, **options):
+    global left
+    if left == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    left -= 1
+    return function(*arguments, **options)
+
+setattr(module, name, function_or_death)
+sys.exit(main(argv))
+"""
+IN_FEATURES = ("pycolmap", "extract_features", 2)
+IN_MATCHING = ("rangesfm.vision.matching", "num_compared_pairs", 0)
+IN_MAPPING = ("rangesfm.vision.snapshots", "_keep", 3)
+BEFORE_MODELS_ARE_WRITTEN = ("rangesfm.vision.mapping", "new_folder", 0)
+AMONG_TABLES = ("rangesfm.outputs", "_write_ranges", 0)
+BEFORE_THE_RESULT = ("rangesfm.pipeline", "write_result", 0)
+BEFORE_THE_REPORT = ("rangesfm.pipeline", "write_report", 0)
+
+
+@pytest.fixture(scope="module")
+def study() -> Iterator[ModuleType]:
+    """The study of kills at random moments, which knows when two results are the same."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(Path(__file__).parents[1])
+        yield importlib.import_module("tests.studies.kills")
+
+
+def killed(moment: tuple[str, str, int], *arguments: str, cwd: Path) -> str:
+    """What a run said until it was killed."""
+    command = [sys.executable, "-c", PROGRAM, *map(str, moment), "run", *arguments]
+    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    return done.stderr
+
+
+def assert_whole(output: Path, whole: Path, study: ModuleType) -> None:
+    assert study.differences(whole, output) == []
+    assert study.names_in(output) == study.names_in(whole)
+
+
+def test_killed_in_step_after_step_it_ends_as_if_nothing_had_been(
+    photo_run: PhotoRun, rangesfm_command: Command, tmp_path: Path, study: ModuleType
+) -> None:
+    output, folder = tmp_path / "out", photo_run.survey.folder
+    flags = (*photo_run.flags, "--output_path", str(output))
+    said = []
+    for moment in (IN_FEATURES, IN_MATCHING, IN_MAPPING, BEFORE_MODELS_ARE_WRITTEN, BEFORE_THE_RESULT):
+        said.append(killed(moment, *flags, cwd=folder))
+        assert not (output / "result.json").exists()
+    assert "mapping: goes on from " in said[3]
+    said.append(rangesfm_command("run", *flags, cwd=folder).stderr)
+    for step, first_without in (("features", 2), ("matching", 3), ("mapping", 5)):
+        is_done = [f"{step}: taken over from an earlier run" in text for text in said]
+        assert is_done == [number >= first_without for number in range(len(said))]
+    assert_whole(output, photo_run.output_path, study)
+
+
+@pytest.mark.parametrize(("moment", "is_new"), [(AMONG_TABLES, False), (BEFORE_THE_REPORT, True)])
+def test_killed_while_it_replaces_a_result_it_leaves_none_or_the_new_one(
+    moment: tuple[str, str, int],
+    is_new: bool,
+    photo_run: PhotoRun,
+    rangesfm_command: Command,
+    tmp_path: Path,
+    study: ModuleType,
+) -> None:
+    output, folder = shutil.copytree(photo_run.output_path, tmp_path / "out"), photo_run.survey.folder
+    flags = (*photo_run.flags, "--output_path", str(output))
+    killed(moment, *flags, "--check_share", "0.2", cwd=folder)
+    assert (output / "result.json").exists() is is_new
+    assert not (output / "report.html").exists()
+    rangesfm_command("run", *flags, cwd=folder)
+    assert_whole(output, photo_run.output_path, study)
