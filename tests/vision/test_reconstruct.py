@@ -297,13 +297,12 @@ class TestOtherPhotos:
     def test_one_more_is_extracted_alone_and_only_its_pairs_are_matched(
         self, room: Room, done: ReconstructionSummary, tmp_path: Path, listener: Listener
     ) -> None:
-        for names in (room.names[:2] + room.names[3:], room.names):
-            summary = reconstruct(room.folder, names, tmp_path, camera=room.camera, mapper=MAPPER, progress=listener)
-        assert "features: those of 5 photos are taken over from an earlier run" in listener.messages
-        of_second_run = listener.updates["features"][listener.updates["features"].index((5, 5)) + 1 :]
-        assert min(of_second_run) >= (5, 6)
-        of_second_run = listener.updates["matching"][listener.updates["matching"].index((10, 10)) + 1 :]
-        assert min(of_second_run) >= (10, 15)
+        fewer = room.names[:2] + room.names[3:]
+        reconstruct(room.folder, fewer, tmp_path, camera=room.camera, mapper=MAPPER)
+        summary = reconstruct(room.folder, room.names, tmp_path, camera=room.camera, mapper=MAPPER, progress=listener)
+        assert listener.messages == ["features: those of 5 photos are taken over from an earlier run"]
+        assert min(listener.updates["features"]) >= (5, 6)
+        assert min(listener.updates["matching"]) >= (10, 15)
         assert content_of(tmp_path / "database.db") == content_of(done.log_path.parent / "database.db")
         assert summary.num_registered == 6
 
@@ -325,6 +324,16 @@ class TestOtherPhotos:
         assert "features: those of 5 photos are taken over from an earlier run" in listener.messages
         renewed, alone = (content_of(tmp_path / output / "database.db") for output in ("out", "alone"))
         assert renewed == alone
+
+    def test_with_another_camera_are_matched_again_and_not_extracted(
+        self, room: Room, output: Path, tmp_path: Path, listener: Listener
+    ) -> None:
+        camera = CameraOptions("SIMPLE_PINHOLE", (241.0, 128.0, 96.0))
+        for folder in (output, tmp_path / "alone"):
+            reconstruct(room.folder, room.names, folder, camera=camera, mapper=MAPPER, progress=listener)
+        assert listener.messages == ["features: those of 6 photos are taken over from an earlier run"]
+        assert listener.updates["features"][0] == (6, 6)
+        assert content_of(output / "database.db") == content_of(tmp_path / "alone" / "database.db")
 
     def test_with_other_options_start_from_nothing(
         self, room: Room, output: Path, tmp_path: Path, listener: Listener

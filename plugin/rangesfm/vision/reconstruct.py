@@ -112,12 +112,12 @@ def reconstruct(
     with colmap_log(log), _pointing_to(log):
         steps.note("photos", photos.contents(steps.notes.get("photos", {})))
         contents = {name: sha256 for name, (_, sha256) in steps.notes["photos"].items()}
-        of_features = fingerprint(
-            pycolmap.__version__, camera.model, camera.params, its_camera.todict(), mapper.features
+        of_features = fingerprint(pycolmap.__version__, mapper.features)
+        of_matches = fingerprint(
+            of_features, _plain(its_camera), for_matching.is_sequential, mapper.pairing, mapper.matcher, seed
         )
-        of_matches = fingerprint(of_features, for_matching.is_sequential, mapper.pairing, mapper.matcher, seed)
         renewed = RenewedDatabase(database, photos, contents, its_camera, for_matching, of_features, of_matches, steps)
-        inputs = fingerprint(of_features, list(contents.items()))
+        inputs = fingerprint(of_features, _plain(its_camera), list(contents.items()))
         steps.run(
             "features",
             inputs,
