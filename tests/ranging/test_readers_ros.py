@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -182,6 +183,17 @@ def test_broken_bags_are_refused_in_one_line(tmp_path: Path, name: str, content:
     with pytest.raises(InputError, match=r"cannot be read as a ROS bag") as caught:
         read_ranges(tmp_path / name, format="ros")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("has_package", [True, False])
+def test_a_database_of_another_kind_is_named_as_such(
+    has_package: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pycolmap.Database.open(tmp_path / "database.db").close()
+    if not has_package:
+        monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    with pytest.raises(InputError, match=r"no ROS 2 bag: it has tables cameras, .*, expected messages and topics"):
+        read_ranges(tmp_path / "database.db")
 
 
 def test_folder_with_broken_metadata_is_refused(tmp_path: Path) -> None:

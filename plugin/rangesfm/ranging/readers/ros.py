@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import sqlite3
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,8 +20,10 @@ from rangesfm.ranging.readers.ros_messages import RANGES_IN, MessageRange
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
-_BEGINS = ("#ROSBAG V", "SQLite format 3\0")
+_SQLITE = "SQLite format 3\0"
+_BEGINS = ("#ROSBAG V", _SQLITE)
 _MCAP = "MCAP0"
+_BAG_TABLES = {"topics", "messages"}
 
 
 def is_bag_folder(path: Path) -> bool:
@@ -35,6 +39,7 @@ def _read(path: Path, options: ReadOptions) -> RangeLog:
     check_only_time_is_described(path, options)
     if not path.exists():
         raise InputError("no such file", path)
+    _check_database(path)
     try:
         from rosbags.highlevel import AnyReader
     except ImportError:
@@ -53,6 +58,24 @@ def _read(path: Path, options: ReadOptions) -> RangeLog:
         text = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"cannot be read as a ROS bag ({text})", path) from error
     return _to_log(path, number, ranges)
+
+
+def _check_database(path: Path) -> None:
+    """Refuse SQLite databases that are no ROS 2 bag; there are many of other kinds, COLMAP's among them."""
+    if not path.is_file():
+        return
+    with path.open("rb") as file:
+        if file.read(len(_SQLITE)) != _SQLITE.encode():
+            return
+    try:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as database:
+            tables = {str(name) for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    except sqlite3.Error as error:
+        raise InputError(f"cannot be read as a ROS bag ({error})", path) from error
+    if not tables >= _BAG_TABLES:
+        found = ", ".join(sorted(tables)[:3]) or "none"
+        expected = " and ".join(sorted(_BAG_TABLES))
+        raise InputError(f"an SQLite database that is no ROS 2 bag: it has tables {found}, expected {expected}", path)
 
 
 def _ranges(bag: AnyReader, path: Path) -> Iterator[tuple[int, MessageRange]]:
