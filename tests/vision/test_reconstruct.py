@@ -343,6 +343,15 @@ class TestOtherPhotos:
         assert not listener.messages
         assert listener.stages == ["features", "matching", "mapping"]
 
+    def test_start_from_nothing_where_the_database_is_damaged(
+        self, room: Room, output: Path, listener: Listener
+    ) -> None:
+        data = (output / "database.db").read_bytes()
+        (output / "database.db").write_bytes(data[:4096] + bytes(len(data) - 4096))
+        reconstruct(room.folder, room.names[:4], output, camera=room.camera, mapper=MAPPER, progress=listener)
+        assert listener.messages == []
+        assert listener.stages == ["features", "matching", "mapping"]
+
     def test_start_from_nothing_after_a_run_that_was_killed_as_it_renewed_the_database(
         self, room: Room, changed: Room, output: Path, monkeypatch: pytest.MonkeyPatch, listener: Listener
     ) -> None:

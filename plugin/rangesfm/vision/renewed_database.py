@@ -51,11 +51,12 @@ class RenewedDatabase:
         forget_database(self.steps)
         with new_file(self.path) as fresh:
             create_database(fresh, self.photos.names, self.camera)
-            ids = self._earlier_ids(earlier)
-            if ids and self.path.exists():
-                same_matches = earlier.get("matches") == self.match_inputs
-                pairs = pairs_to_match(fresh, self.photos, self.matching) if same_matches else []
-                num_taken = _take_over(self.path, fresh, ids, pairs)
+            try:
+                num_taken = self._take_over(earlier, fresh)
+            except RuntimeError:  # somebody has damaged the earlier one
+                create_database(fresh, self.photos.names, self.camera)
+                num_taken = 0
+            if num_taken:
                 progress.message(f"features: those of {num_taken} photos are taken over from an earlier run")
             remove_database(self.path)  # also what SQLite keeps beside it, which would be taken for the new one's
         self._write_note()
@@ -67,11 +68,19 @@ class RenewedDatabase:
             clear_matches(self.path)
         self._write_note()
 
+    def _take_over(self, earlier: Mapping[str, Any], fresh: Path) -> int:
+        ids = self._earlier_ids(earlier)
+        if not ids or not self.path.exists():
+            return 0
+        same_matches = earlier.get("matches") == self.match_inputs
+        pairs = pairs_to_match(fresh, self.photos, self.matching) if same_matches else []
+        return _copy(self.path, fresh, ids, pairs)
+
     def _earlier_ids(self, earlier: Mapping[str, Any]) -> dict[int, int]:
         """Id in the earlier database of each photo that has not changed, by its new one."""
         if earlier.get("features") != self.feature_inputs:
             return {}
-        ids = {(name, sha256): id_ for id_, (name, sha256) in enumerate(earlier["photos"].items(), 1)}
+        ids = {(name, sha256): id_ for id_, (name, sha256) in enumerate(earlier.get("photos", {}).items(), 1)}
         contents = enumerate(((name, self.contents[name]) for name in self.photos.names), 1)
         return {new_id: ids[content] for new_id, content in contents if content in ids}
 
@@ -85,7 +94,7 @@ def forget_database(steps: Steps) -> None:
     steps.note(_NOTE, {})
 
 
-def _take_over(earlier: Path, new: Path, earlier_ids: Mapping[int, int], pairs: Iterable[tuple[int, int]]) -> int:
+def _copy(earlier: Path, new: Path, earlier_ids: Mapping[int, int], pairs: Iterable[tuple[int, int]]) -> int:
     """Copy features and matches into a new database; returns of how many photos there were features.
 
     Args:
