@@ -166,3 +166,16 @@ def test_what_nothing_determines_is_not_certain(rng: np.random.Generator) -> Non
     truth = replace(random_state(rng), metric_from_model=IDENTITY)
     problem = replace(random_problem(rng, truth), centers=np.zeros((NUM_RANGES, 3)), frame_is_free=False)
     assert solve(problem, truth).log_scale_stddev > 1e3
+
+
+def test_a_share_of_two_is_the_same_range_twice(rng: np.random.Generator) -> None:
+    truth = random_state(rng)
+    problem = replace(random_problem(rng, truth), anchor_mean_m=truth.anchors_m, anchor_stddev_m=np.zeros(NUM_ANCHORS))
+    problem = replace(problem, range_m=problem.range_m + problem.stddev_m * rng.standard_t(3, size=NUM_RANGES))
+    rows = np.arange(NUM_RANGES)
+    share = np.where(rows % 3 == 0, 2.0, 1.0)
+    weighted = solve(replace(problem, share=share), truth)
+    repeated = solve(problem.subset(np.repeat(rows, share.astype(np.int64))), truth)
+    assert weighted.cost == pytest.approx(repeated.cost, rel=1e-9)
+    assert weighted.state.metric_from_model.scale == pytest.approx(repeated.state.metric_from_model.scale, rel=1e-9)
+    np.testing.assert_allclose(weighted.information, repeated.information, rtol=1e-6, atol=1e-6)

@@ -47,7 +47,9 @@ def bias_whitening(own_stddev_m: Array, common_stddev_m: float) -> Array:
     return whitening
 
 
-def correlation_inflation(scaled_residuals: Array, weights: Array, groups: npt.NDArray[np.int64]) -> float:
+def correlation_inflation(
+    scaled_residuals: Array, weights: Array, groups: npt.NDArray[np.int64], shares: Array | None = None
+) -> float:
     """How much larger the stddev of a mean is than independent errors would make it.
 
     Residuals of one anchor and one stretch of time (a group) tend to err together. The
@@ -55,11 +57,14 @@ def correlation_inflation(scaled_residuals: Array, weights: Array, groups: npt.N
 
     Args:
         scaled_residuals: (n,) in stddevs. weights: (n,) robust. groups: (n,) int labels.
+        shares: (n,) by how much each counts besides, if not all alike: formally, one with half of it has twice the
+            variance.
     """
     influence = scaled_residuals * weights
+    shares = np.ones(len(influence)) if shares is None else shares
     _, index = np.unique(groups, return_inverse=True)
-    sums = np.bincount(index, influence)
-    squares = float(np.sum(influence**2))
+    sums = np.bincount(index, shares * influence)
+    squares = float(np.sum(shares * influence**2))
     if squares == 0 or len(sums) < 2:
         return 1.0
     return float(np.clip(np.sqrt(np.sum(sums**2) / squares), 1.0, _MAX_INFLATION))

@@ -46,6 +46,7 @@ class RangeProblem:
         frame_is_free: whether rotation and translation are estimated, or stay as started.
         gravity: the upward direction, where somebody told it and the frame is free; None otherwise.
         distances: taped ones that are to be kept to; their anchors are indices as ``anchor_index``.
+        share: (n,) by how much each range counts beside its noise, as ranges from one place err alike; None: 1.
     """
 
     centers: Array
@@ -61,6 +62,12 @@ class RangeProblem:
     frame_is_free: bool
     distances: LocatedDistances | None = None
     gravity: Gravity | None = None
+    share: Array | None = None
+
+    @property
+    def share_or_1(self) -> Array:
+        """(n,)"""
+        return np.ones(len(self.range_m)) if self.share is None else self.share
 
     @property
     def num_anchors(self) -> int:
@@ -75,6 +82,7 @@ class RangeProblem:
             anchor_index=self.anchor_index[rows],
             range_m=self.range_m[rows],
             stddev_m=self.stddev_m[rows],
+            share=None if self.share is None else self.share[rows],
         )
 
 
@@ -95,7 +103,8 @@ class RangeFit:
         state: the estimate.
         residuals_m: (n,) predicted minus measured.
         weights: (n,) of the robust loss, 1 for a range that fits.
-        curvatures: (n,) its second derivative; negative for outliers.
+        pulls: (n,) the same times the ranges' shares.
+        curvatures: (n,) its second derivative times the shares; negative for outliers.
         cost: half the robust sum of squares, priors included.
         information: (p, p) Gauss-Newton approximation with the robust weights, in ``free``'s parameters.
         gradients: (n, p) of each range's weighted residual, for resampling.
@@ -108,6 +117,7 @@ class RangeFit:
     state: RangeState
     residuals_m: Array
     weights: Array
+    pulls: Array
     curvatures: Array
     cost: float
     information: Array
@@ -200,7 +210,7 @@ def solve(
     def rho_with_derivatives(z: Array) -> Array:
         # Priors are believed as they are; only ranges have outliers.
         rho = np.stack([z, np.ones_like(z), np.zeros_like(z)])
-        rho[:, :num_ranges] = loss.rho(z[:num_ranges])
+        rho[:, :num_ranges] = problem.share_or_1 * loss.rho(z[:num_ranges])
         return rho
 
     def residuals(x: Array) -> Array:
@@ -235,6 +245,7 @@ def _fit(
     residuals_m = predicted_ranges(problem, state) - problem.range_m
     scaled = residuals_m / problem.stddev_m
     weights = loss.weights(scaled)
+    pulls = problem.share_or_1 * weights
     jacobian = _range_jacobian(problem, columns, start, state)
     prior_jacobian = _prior_jacobian(problem, columns, start, state)
     prior_information = prior_jacobian.T @ prior_jacobian
@@ -242,10 +253,11 @@ def _fit(
         state=state,
         residuals_m=residuals_m,
         weights=weights,
-        curvatures=loss.curvatures(scaled),
+        pulls=pulls,
+        curvatures=problem.share_or_1 * loss.curvatures(scaled),
         cost=cost,
-        information=(jacobian * weights[:, None]).T @ jacobian + prior_information,
-        gradients=jacobian * weights[:, None],
+        information=(jacobian * pulls[:, None]).T @ jacobian + prior_information,
+        gradients=jacobian * pulls[:, None],
         scaled_residuals=scaled,
         prior_information=prior_information,
         prior_gradient=prior_jacobian.T @ _prior_residuals(problem, columns, state),

@@ -13,9 +13,18 @@ from rangesfm.errors import GeometryError
 from rangesfm.geometry import NEARLY_STRAIGHT, path_kind, path_shape
 from rangesfm.ranging.inlier_noise import InlierNoise, inlier_noise
 from rangesfm.ranging.noise import correlation_inflation
+from rangesfm.ranging.place import correlation_in_place, place_labels, shares_of_places
 from rangesfm.ranging.robust_loss import GEMAN_MCCLURE
 from rangesfm.scale.anchor_plane import camera_side_of, mirrored_map, on_side
-from rangesfm.scale.range_equation import RangeFit, RangeProblem, RangeState, predicted_ranges, prior_cost, solve
+from rangesfm.scale.range_equation import (
+    RangeFit,
+    RangeProblem,
+    RangeState,
+    predicted_ranges,
+    prior_cost,
+    solve,
+    tag_positions,
+)
 from rangesfm.scale.starts import (
     complete_unknown_anchors,
     first_camera_starts,
@@ -213,7 +222,7 @@ def _with_own_noise(given: RangeProblem, errors: _ErrorModel, start: RangeState)
     for _ in range(_NUM_NOISE_ROUNDS):
         problem = _weighted(given, errors, state, likeliest.noise.stddev, inflation)
         fit = solve(problem, state, loss=GEMAN_MCCLURE)
-        inflation = correlation_inflation(fit.residuals_m / problem.stddev_m, fit.weights, errors.groups)
+        inflation = correlation_inflation(fit.scaled_residuals, fit.weights, errors.groups, problem.share_or_1)
         state = fit.state
         likeliest = min(likeliest, _view(given, errors, state), key=lambda view: view.unlikeliness)
     return Solution(problem, fit, inflation, likeliest.noise.stddev)
@@ -229,15 +238,24 @@ def _weighted(
     """
     base = np.where(np.isfinite(errors.noise_stddev_m), errors.noise_stddev_m, noise)
     interpolation = state.metric_from_model.scale * errors.center_stddev
+    stddev = np.sqrt(base**2 + interpolation**2 + errors.shared_stddev_m**2)
     distances, gravity = problem.distances, problem.gravity
     return replace(
         problem,
-        stddev_m=np.sqrt(base**2 + interpolation**2 + errors.shared_stddev_m**2),
+        stddev_m=stddev,
+        share=_shares(problem, state, stddev),
         bias_stddev_m=problem.bias_stddev_m / inflation,
         common_bias_stddev_m=problem.common_bias_stddev_m / inflation,
         distances=None if distances is None else replace(distances, stddev_m=distances.stddev_m / inflation),
         gravity=None if gravity is None else replace(gravity, stddev=gravity.stddev / inflation),
     )
+
+
+def _shares(problem: RangeProblem, state: RangeState, stddev_m: Array) -> Array:
+    """(n,) of the ranges, by how much those of one place err alike."""
+    places = place_labels(tag_positions(problem, state.metric_from_model), problem.anchor_index)
+    errors = (predicted_ranges(problem, state) - problem.range_m) / stddev_m
+    return shares_of_places(places, correlation_in_place(errors * GEMAN_MCCLURE.weights(errors), places))
 
 
 def _refuse_ambiguity(solution: Solution, rivals: list[RangeState], camera_side: str | None) -> None:

@@ -71,7 +71,7 @@ def _block_sums(fit: RangeFit, blocks: npt.NDArray[np.int64]) -> tuple[Array, Ar
     labels, index = np.unique(blocks, return_inverse=True)
     informations, gradients = [], []
     curvature = _relative_curvature(fit)
-    root_weights = np.sqrt(fit.weights)[:, None]
+    root_weights = np.sqrt(fit.pulls)[:, None]
     # gradients = weight * jacobian, so dividing by the root leaves what squares to the information.
     rows = fit.gradients / np.maximum(root_weights, 1e-12)
     for block in range(len(labels)):
@@ -87,7 +87,7 @@ def _relative_curvature(fit: RangeFit) -> float:
     The second derivative is less than the weight, and with the weight in its place the steps would be too short. The
     mean keeps all informations positive.
     """
-    return max(float(np.mean(fit.curvatures) / np.mean(fit.weights)), _MIN_CURVATURE)
+    return max(float(np.mean(fit.curvatures) / np.mean(fit.pulls)), _MIN_CURVATURE)
 
 
 def _steps(fit: RangeFit, informations: Array, gradients: Array, counts: Array) -> Array:
