@@ -107,8 +107,18 @@ def test_few_blocks_or_anchors_widen_the_interval_as_students_t_does() -> None:
     many = ScaleUncertainty(0.001, 0.002, None, 0.0, 0.001, 1000, 1)
     assert many.half_width_95 == pytest.approx(1.96 * 0.002, rel=0.01)
     assert replace(many, num_blocks=5).half_width_95 == pytest.approx(2.776 * 0.002, rel=0.01)
+    assert replace(many, correlated=0.002, correlated_dof=3.0).half_width_95 == pytest.approx(3.182 * 0.002, rel=0.01)
     assert replace(many, jackknife=0.002, num_anchors=3).half_width_95 == pytest.approx(4.303 * 0.002, rel=0.01)
     assert replace(many, range_model=0.03).half_width_95 == pytest.approx(1.96 * 0.03, rel=0.01)
+
+
+def test_what_is_fitted_leaves_less_to_see_the_errors_correlation_by(make_survey: MakeSurvey) -> None:
+    survey = make_survey(anchors_m={"A": FAR_ANCHORS_M["A"]}, radio=Radio(range_stddev_m=0.1))
+    known, unknown = (survey.scale(frame, "A").uncertainty for frame in ("first_camera", "unknown"))
+    assert known.num_blocks == unknown.num_blocks
+    assert known.num_blocks - 2.01 < known.correlated_dof <= known.num_blocks - 1
+    # The scale, the anchor's place, and a bias that has a prior.
+    assert unknown.num_blocks - 5.01 < unknown.correlated_dof <= unknown.num_blocks - 4
 
 
 def test_what_leaving_out_anchors_shows_of_their_antennas_is_not_counted_twice() -> None:

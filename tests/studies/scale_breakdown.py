@@ -12,7 +12,8 @@ The methods: the scale stage (consensus, then robust least squares), the paper's
 candidates, the median of that branch, random sampling (RANSAC: one range gives two scales, the best of 300 trials is
 refined on its inliers), and graduated non-convexity (GNC: truncated least squares of the range equation over the scale,
 Yang, Antonante, Tzoumas and Carlone, "Graduated Non-Convexity for Robust Spatial Perception", 2020). RANSAC and GNC are
-told the noise; the scale stage finds it. Its refusals are left out of its errors and counted.
+told the noise and that the radio has no bias; the scale stage finds both. Its refusals are left out of its errors and
+counted.
 
 Prints the median and the ninth decile of the absolute scale error in percent, for each method, kind and share.
 ``--plot`` draws the medians over the share (package matplotlib).

@@ -30,6 +30,8 @@ class ScaleUncertainty:
         correlated: the formal one, widened by how the residuals hang together in time.
         num_blocks, num_anchors: that bootstrap and jackknife rest on.
         antennas: what anchors' antennas would do that err with the direction.
+        correlated_dof: degrees of freedom that ``correlated`` rests on: stretches of ranges that err together, less
+            what was fitted to them.
     """
 
     formal: float
@@ -40,6 +42,7 @@ class ScaleUncertainty:
     num_blocks: int = 1000
     num_anchors: int = 1
     antennas: float = 0.0
+    correlated_dof: float = 1000.0
 
     @property
     def empirical(self) -> float:
@@ -53,14 +56,18 @@ class ScaleUncertainty:
     @property
     def half_width_95(self) -> float:
         """Of the 95 % interval of the scale's logarithm; few blocks or anchors widen it as Student's t does."""
-        in_time = max(NORMAL_95 * max(self.formal, self.correlated), _student_95(self.num_blocks - 1) * self.bootstrap)
+        in_time = max(
+            NORMAL_95 * self.formal,
+            _student_95(self.correlated_dof) * self.correlated,
+            _student_95(self.num_blocks - 1) * self.bootstrap,
+        )
         by_anchor = _student_95(self.num_anchors - 1) * (self.jackknife or 0.0)
         seen = max(np.hypot(in_time, NORMAL_95 * self.antennas), by_anchor)
         return float(np.hypot(seen, NORMAL_95 * self.range_model))
 
 
-def _student_95(degrees_of_freedom: int) -> float:
-    return float(stats.t.ppf(0.975, max(degrees_of_freedom, 1)))
+def _student_95(degrees_of_freedom: float) -> float:
+    return float(stats.t.ppf(0.975, max(degrees_of_freedom, 1.0)))
 
 
 @dataclass(frozen=True)

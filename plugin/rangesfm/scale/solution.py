@@ -47,6 +47,21 @@ _SAME_SHIFT = 0.05
 # Half of 3 stddevs squared: a rival this close in cost is not ruled out.
 MIN_COST_GAP = 4.5
 
+WHY_SCALE_IS_OPEN = {
+    "straight": ("the path is straight", "walk a bend"),
+    "circular": (
+        "the path is a flat circle, and its radius and the anchors' heights can make up for each other",
+        "walk another shape, or survey an anchor",
+    ),
+    "spherical": (
+        "the path lies on a sphere, and its radius and the anchor's distance from its centre can change places",
+        "walk another shape, or add an anchor",
+    ),
+    "flat": ("the path is flat", "go up and down too, or add an anchor"),
+    "general": ("the path is too short or runs round the anchor", "vary it, or add an anchor"),
+}
+"""By the kind of the path: what lets another scale fit, and what to do about it."""
+
 
 @dataclass(frozen=True)
 class Solution:
@@ -278,19 +293,8 @@ def _refuse_ambiguity(solution: Solution, rivals: list[RangeState], camera_side:
                 )
             raise GeometryError(
                 f"two scales fit the ranges equally well ({ours:.4g} and {theirs:.4g} m per unit): "
-                f"{_WHY_TWO_SCALES[path_kind(problem.centers)]}"
+                f"{'; '.join(WHY_SCALE_IS_OPEN[path_kind(problem.centers)])}"
             )
-
-
-_WHY_TWO_SCALES = {
-    "straight": "the path is straight; walk a bend",
-    "circular": "the path is a flat circle, and its radius and the anchors' heights can make up for each other; walk "
-    "another shape, or survey an anchor",
-    "spherical": "the path lies on a sphere, and its radius and the anchor's distance from its centre can change "
-    "places; walk another shape, or add an anchor",
-    "flat": "the path is flat; go up and down too, or add an anchor",
-    "general": "the path is too short or runs round the anchor; vary it, or add an anchor",
-}
 
 
 def _what_is_open(problem: RangeProblem) -> str:

@@ -38,25 +38,28 @@ def scale_uncertainty(
     problem, fit = solution.problem, solution.fit
     anchor_blocks = problem.anchor_index
     present = np.unique(anchor_blocks)
+    correlated, correlated_dof = _correlated(solution, blocks)
     return ScaleUncertainty(
         formal=fit.log_scale_stddev,
         bootstrap=_bootstrap(fit, blocks, num_bootstrap, seed),
         jackknife=_jackknife(fit, anchor_blocks) if len(present) >= 3 else None,
         range_model=_range_model_stddev(problem, fit, curve_stddev_m),
-        correlated=_correlated(solution, blocks),
+        correlated=correlated,
         num_blocks=len(np.unique(blocks)),
         num_anchors=len(present),
         antennas=_antennas_stddev(problem, fit),
+        correlated_dof=correlated_dof,
     )
 
 
-def _correlated(solution: Solution, blocks: npt.NDArray[np.int64]) -> float:
-    """Formal, widened by errors that go together."""
+def _correlated(solution: Solution, blocks: npt.NDArray[np.int64]) -> tuple[float, float]:
+    """Formal, widened by errors that go together, and the degrees of freedom that show how much they do."""
     problem, fit = solution.problem, solution.fit
     num_groups = len(np.unique(blocks * problem.num_anchors + problem.anchor_index))
     from_ranges = fit.information - fit.prior_information
     num_fitted = float(np.trace(np.linalg.lstsq(fit.information, from_ranges, rcond=1e-12)[0]))
-    return fit.log_scale_stddev * inflation_before_fit(solution.inflation, num_groups, num_fitted)
+    stddev = fit.log_scale_stddev * inflation_before_fit(solution.inflation, num_groups, num_fitted)
+    return stddev, num_groups - num_fitted
 
 
 def scale_influence(fit: RangeFit, problem: RangeProblem) -> Array:

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import NEARLY_FLAT, NEARLY_STRAIGHT, path_shape
+from rangesfm.geometry import NEARLY_FLAT, NEARLY_STRAIGHT, path_kind, path_shape
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.anchors import AnchorEstimate
 from rangesfm.scale.cutoff import scale_drift
 from rangesfm.scale.estimate import NORMAL_95, CutoffTest, ScaleUncertainty
 from rangesfm.scale.problem import SurveyProblem
 from rangesfm.scale.range_equation import RangeFit
-from rangesfm.scale.solution import Solution
+from rangesfm.scale.solution import WHY_SCALE_IS_OPEN, Solution
 
 # Half of the 95 % interval of the scale, relative, from which it is called doubtful.
 DOUBTFUL_ABOVE = 0.04
@@ -63,7 +63,10 @@ def judge(
         GeometryError: refused, as the scale is less certain than ``options.max_relative_stddev``.
     """
     half_width = uncertainty.half_width_95
+    symmetry = _symmetry_doubts(solution) if half_width > DOUBTFUL_ABOVE else []
+    narrower = symmetry[0].advice if symmetry else _what_narrows_it(solution, uncertainty)
     doubts = [
+        *symmetry,
         *(_Doubt(note, "survey three anchors or more that are not on one line") for note in survey.notes),
         *_left_out_doubts(survey.left_out),
         *_path_doubts(solution, anchors),
@@ -76,12 +79,11 @@ def judge(
         raise GeometryError(
             f"the scale is only known to {100 * half_width / NORMAL_95:.1f} % (1 stddev), "
             f"more than the {100 * options.max_relative_stddev:g} % allowed (max_relative_stddev): {why}"
-            f"next time: {_what_narrows_it(solution, uncertainty)}"
+            f"next time: {narrower}"
         )
     summary = f"the scale is known to {100 * half_width:.1f} % (95 % interval)"
     if half_width > DOUBTFUL_ABOVE:
-        worse = _Doubt(f"{summary}, worse than {100 * DOUBTFUL_ABOVE:g} %", _what_narrows_it(solution, uncertainty))
-        doubts.insert(0, worse)
+        doubts.insert(0, _Doubt(f"{summary}, worse than {100 * DOUBTFUL_ABOVE:g} %", narrower))
     if not doubts:
         return Verdict("good", (summary,), ())
     advice = dict.fromkeys(doubt.advice for doubt in doubts)
@@ -112,6 +114,16 @@ def _left_out_doubts(anchor_ids: tuple[str, ...]) -> list[_Doubt]:
     return [
         _Doubt(f"{which} too few ranges on the path to be placed: left out", "range more often, or survey them all")
     ]
+
+
+def _symmetry_doubts(solution: Solution) -> list[_Doubt]:
+    """A round path among unknown anchors: it makes the scale uncertain, and walked on, it still does."""
+    problem = solution.problem
+    kind, heard = path_kind(problem.centers), np.unique(problem.anchor_index)
+    if kind not in ("circular", "spherical") or np.isfinite(problem.anchor_stddev_m[heard]).any():
+        return []
+    reason, advice = WHY_SCALE_IS_OPEN[kind]
+    return [_Doubt(reason, advice)]
 
 
 def _path_doubts(solution: Solution, anchors: Sequence[AnchorEstimate]) -> list[_Doubt]:
