@@ -23,6 +23,8 @@ DOUBTFUL_ABOVE = 0.04
 _MIN_DRIFT_PERCENT = 1.0
 _MANY_OUTLIERS = 0.3
 _FEW_RANGES = 50
+# Relative stddev of a scale that may as well be nothing.
+_NOTHING_KNOWN = 1.0
 _MAX_ANCHOR_SPREAD = 0.03
 _CALIBRATE = "calibrate the radio at the distances of this survey (rangesfm ranges calibrate)"
 
@@ -63,10 +65,10 @@ def judge(
         GeometryError: refused, as the scale is less certain than ``options.max_relative_stddev``.
     """
     half_width = uncertainty.half_width_95
-    symmetry = _symmetry_doubts(solution) if half_width > DOUBTFUL_ABOVE else []
-    narrower = symmetry[0].advice if symmetry else _what_narrows_it(solution, uncertainty)
+    weak = _weakness_doubts(solution, half_width)
+    narrower = weak[0].advice if weak else _what_narrows_it(solution, uncertainty)
     doubts = [
-        *symmetry,
+        *weak,
         *(_Doubt(note, "survey three anchors or more that are not on one line") for note in survey.notes),
         *_left_out_doubts(survey.left_out),
         *_path_doubts(solution, anchors),
@@ -116,14 +118,17 @@ def _left_out_doubts(anchor_ids: tuple[str, ...]) -> list[_Doubt]:
     ]
 
 
-def _symmetry_doubts(solution: Solution) -> list[_Doubt]:
-    """A round path among unknown anchors: it makes the scale uncertain, and walked on, it still does."""
+def _weakness_doubts(solution: Solution, half_width: float) -> list[_Doubt]:
+    """Why the scale is uncertain, where a longer walk of the same shape would not help."""
     problem = solution.problem
     kind, heard = path_kind(problem.centers), np.unique(problem.anchor_index)
-    if kind not in ("circular", "spherical") or np.isfinite(problem.anchor_stddev_m[heard]).any():
-        return []
-    reason, advice = WHY_SCALE_IS_OPEN[kind]
-    return [_Doubt(reason, advice)]
+    is_round = kind in ("circular", "spherical") and not np.isfinite(problem.anchor_stddev_m[heard]).any()
+    if half_width > DOUBTFUL_ABOVE and is_round:
+        reason, advice = WHY_SCALE_IS_OPEN[kind]
+        return [_Doubt(reason, advice)]
+    if half_width > NORMAL_95 * _NOTHING_KNOWN:
+        return [_Doubt("the ranges do not show that the camera moved", "walk a loop of several metres")]
+    return []
 
 
 def _path_doubts(solution: Solution, anchors: Sequence[AnchorEstimate]) -> list[_Doubt]:
