@@ -34,6 +34,7 @@ TIMEOUT_S = 60
 _MEMORY_BYTES = 200 << 20
 _WHOLE_COMMAND_EVERY = 20
 _TEXT_EVERY = 8
+UNDAMAGED = 0
 _TAG_IN_CAM_M = (0.03, -0.12, -0.05)
 
 
@@ -45,8 +46,8 @@ def make_survey(folder: Path) -> None:
     from rangesfm.simulate.ranges import Radio, simulate_ranges
 
     anchors_m = {"A1": (-6.0, -5.0, 0.5), "A2": (6.0, -5.0, 2.5), "A3": (6.0, 5.0, 0.7), "A4": (-6.0, 5.0, 2.2)}
-    path = loop_path(20.0, start_s=0.0, seed=3)
-    times = np.linspace(0.5, 19.5, 10)
+    path = loop_path(15.0, start_s=0.0, seed=3)
+    times = np.linspace(0.5, 14.5, 10)
     made = synthetic_model(
         times, path.centers(times), path.world_from_cam(times), num_observations=15, pixel_stddev=0.5, seed=1
     )
@@ -106,7 +107,8 @@ def use(survey: Path, number: int, model_path: Path) -> str:
         return "refused" if str(refusal).isprintable() else "refused in more than one line"
     _do_what_is_done_with_models(model, model_path)
     if number % _WHOLE_COMMAND_EVERY == 0:
-        _refine(survey, model_path)
+        status = _refine(survey, model_path)
+        assert number != UNDAMAGED or status == 0, status
     return "accepted"
 
 
@@ -137,8 +139,8 @@ def _do_what_is_done_with_models(model: object, model_path: Path) -> None:
         solve(bundle_adjustment(metric, CameraOptions(), RefineOptions(), **options))  # type: ignore[arg-type]
 
 
-def _refine(survey: Path, model_path: Path) -> None:
-    """The whole command; an internal error is its status 1."""
+def _refine(survey: Path, model_path: Path) -> int:
+    """Status of the whole command; an internal error is 1."""
     from rangesfm.cli import main as rangesfm
 
     files = ("--ranges", "uwb.csv", "--anchors", "anchors.csv", "--images", "images.csv", "--output_path", "out")
@@ -148,6 +150,7 @@ def _refine(survey: Path, model_path: Path) -> None:
     with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
         status = rangesfm(["refine", "--input_path", str(model_path), *files, *flags])
     assert status in (0, 2, 3, 4), said.getvalue()
+    return status
 
 
 def _serve(pipe: Connection, survey: Path, model_path: Path) -> None:
@@ -207,6 +210,8 @@ def run(first: int, num: int, output_path: Path) -> Counter[str]:
         survey, model_path = Path(temporary), Path(temporary) / "model"
         make_survey(survey)
         worker = _Worker(survey, model_path)
+        shutil.copytree(survey / "binary", model_path)
+        assert worker.outcome(UNDAMAGED) == ("accepted", "")
         for number in range(first, first + num):
             change = damage(survey, number, model_path)
             outcome, text = worker.outcome(number)
@@ -220,7 +225,7 @@ def run(first: int, num: int, output_path: Path) -> Counter[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--num", type=int, default=500)
-    parser.add_argument("--first", type=int, default=0, help="number of the first one; it is also its seed")
+    parser.add_argument("--first", type=int, default=1, help="number of the first one; it is also its seed")
     parser.add_argument("--output_path", type=Path, required=True)
     args = parser.parse_args()
     args.output_path.mkdir(parents=True, exist_ok=True)
