@@ -236,6 +236,14 @@ def test_undistorted_photos_come_with_a_metric_model_in_sparse_0(tmp_path: Path)
             assert photo.size == (camera.width, camera.height)
 
 
+@pytest.mark.parametrize("name", ["../up.jpg", "/abs.jpg", "a/../../up.jpg"])
+def test_a_photo_is_not_written_outside_the_folder(name: str, tmp_path: Path) -> None:
+    model = made()
+    next(iter(model.images.values())).name = name
+    with pytest.raises(InputError, match="would be written outside"):
+        export(model, "undistorted", tmp_path / "out", tmp_path)
+
+
 def test_photos_that_have_no_room_are_not_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = made()
     for image in model.images.values():

@@ -27,6 +27,12 @@ def test_log_by_photos_is_drawn_by_number() -> None:
     assert np.asarray(axes.lines[0].get_xydata()).tolist() == [[0, 1], [1, 2]]
 
 
+def test_dollars_in_names_are_dollars(tmp_path: Path) -> None:
+    log = RangeLog.from_arrays(["$\\foo$", "b"], [1.0, 2.0], timestamp_s=[0.0, 1.0])
+    write_figure(plot_ranges(log), tmp_path / "out.png")
+    assert (tmp_path / "out.png").is_file()
+
+
 def test_figure_is_written_as_its_name_says(tmp_path: Path) -> None:
     write_figure(plot_ranges(LOG), tmp_path / "out.png")
     with Image.open(tmp_path / "out.png") as image:

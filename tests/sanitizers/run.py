@@ -27,7 +27,7 @@ RUNTIMES = {"address": "libasan.so", "undefined": "libubsan.so", "thread": "libt
 OPTIONS = {
     "ASAN_OPTIONS": "detect_leaks=0",  # Python leaks by design; the GoogleTest suite is searched for leaks
     "UBSAN_OPTIONS": "print_stacktrace=1",
-    "TSAN_OPTIONS": f"suppressions={Path(__file__).with_name('thread.supp')}:halt_on_error=1",
+    "TSAN_OPTIONS": "halt_on_error=1",
 }
 TESTS = ("tests/ceres", "tests/test_covariance.py")
 # It looks at what the extension is linked with, which is the sanitizer here.
