@@ -209,7 +209,8 @@ def _rotations(table: Table) -> Array | None:
             f"no column {missing[0]}; expected all of {', '.join(QUATERNION_COLUMNS)}, or none", table.path
         )
     quaternions = np.column_stack([table.numbers(column) for column in QUATERNION_COLUMNS])
-    lengths = np.linalg.norm(quaternions, axis=1)
+    with np.errstate(over="ignore"):
+        lengths = np.linalg.norm(quaternions, axis=1)
     wrong = np.flatnonzero(np.abs(lengths - 1.0) > QUATERNION_TOLERANCE)
     if len(wrong):
         message = f"the quaternion qx,qy,qz,qw has length {lengths[wrong[0]]:.4g}, expected 1"
