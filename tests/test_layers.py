@@ -17,6 +17,7 @@ ERRORS, DATA, STAGE, PIPELINE, COMMAND_LINE = range(5)
 LAYER_OF = {
     "__init__": ERRORS,
     "errors": ERRORS,
+    "failures": ERRORS,
     "progress": ERRORS,
     "files": ERRORS,
     "sole_writer": ERRORS,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 from dataclasses import dataclass
 
-from rangesfm.errors import RangesfmError
+from rangesfm.errors import RangesfmError, one_line
 
 INTERNAL_ERROR = 1
 """Exit status of what nobody should ever see."""
@@ -25,15 +25,19 @@ class Failure:
 
 def failure_of(error: BaseException) -> Failure:
     """What to tell about any error at all; one that is not of our own classes may be a bug, and is called so."""
+    message, status = _told(error)
+    return Failure(" ".join(one_line(message).split()), status)
+
+
+def _told(error: BaseException) -> tuple[str, int]:
     if isinstance(error, RangesfmError):
-        return Failure(" ".join(str(error).split()), error.exit_status)
+        return str(error), error.exit_status
     if isinstance(error, KeyboardInterrupt):
-        return Failure("interrupted; stages that were done are kept", _INTERRUPTED)
+        return "interrupted; stages that were done are kept", _INTERRUPTED
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename is not None else ""
-        status = _BAD_INPUT if error.errno in _UNUSABLE_PATH else _FAILED
-        return Failure(" ".join(f"{where}{error.strerror or error}".split()), status)
+        return f"{where}{error.strerror or error}", _BAD_INPUT if error.errno in _UNUSABLE_PATH else _FAILED
     if isinstance(error, MemoryError):
-        return Failure("out of memory", _FAILED)
-    what = " ".join(f"{type(error).__name__}: {error}".split())
-    return Failure(f"internal error, please report it (RANGESFM_DEBUG=1 shows where): {what}", INTERNAL_ERROR)
+        return "out of memory", _FAILED
+    what = f"{type(error).__name__}: {error}"
+    return f"internal error, please report it (RANGESFM_DEBUG=1 shows where): {what}", INTERNAL_ERROR

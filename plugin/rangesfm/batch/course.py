@@ -7,8 +7,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
-from rangesfm.batch.jobs import Job, shown
+from rangesfm.batch.jobs import Job
 from rangesfm.batch.rows import Figures, Status, SurveyRow
+from rangesfm.errors import one_line
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ class Course:
 
 
 def _first_row(job: Job) -> SurveyRow:
-    output = "" if job.survey is None else shown(job.survey.output_path)
+    output = "" if job.survey is None else one_line(str(job.survey.output_path))
     if job.failure is None:
         return SurveyRow(job.name, output_path=output)
     return SurveyRow(

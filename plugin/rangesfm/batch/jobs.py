@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rangesfm.config import Survey, read_survey
-from rangesfm.errors import InputError
+from rangesfm.errors import InputError, one_line
 from rangesfm.failures import Failure, failure_of
 
 
@@ -16,7 +16,7 @@ class Job:
     """One survey of a batch.
 
     Attributes:
-        name: its file, as the user wrote it; characters that cannot be printed are question marks.
+        name: its file, as the user wrote it; on one line, without what cannot be printed.
         survey: None if the file cannot be used.
         failure: then why not.
     """
@@ -55,11 +55,6 @@ def read_jobs(paths: Sequence[str | Path], overrides: Mapping[str, object], outp
 
 def _read_job(path: str | Path, overrides: Mapping[str, object]) -> Job:
     try:
-        return Job(shown(path), read_survey(path, overrides))
+        return Job(one_line(str(path)), read_survey(path, overrides))
     except (InputError, OSError) as error:
-        return Job(shown(path), None, failure_of(error))
-
-
-def shown(path: str | Path) -> str:
-    """A path for people and for tables: names of files may hold anything."""
-    return "".join(character if character.isprintable() else "?" for character in str(path))
+        return Job(one_line(str(path)), None, failure_of(error))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import io
 import os
 import sys
@@ -11,11 +10,10 @@ from collections.abc import Sequence
 
 from rangesfm.cli.arguments import Outcome, normalize, parse
 from rangesfm.cli.terminal import terminal_progress
-from rangesfm.errors import RangesfmError, one_line
+from rangesfm.errors import one_line
+from rangesfm.failures import INTERNAL_ERROR, failure_of
 
-_BAD_INPUT, _FAILED = 2, 4
-_INTERNAL_ERROR, _INTERRUPTED, _BROKEN_PIPE = 1, 130, 141  # as shells have it
-_UNUSABLE_PATH = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG)
+_BROKEN_PIPE = 141  # as shells have it
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -34,25 +32,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         return outcome.status
     except SystemExit as ended:  # --help and --version
         return int(ended.code or 0)
-    except RangesfmError as error:
-        return _fail(str(error), error.exit_status)
-    except KeyboardInterrupt:
-        return _fail("interrupted; stages that were done are kept", _INTERRUPTED)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it exits
         return _BROKEN_PIPE
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename is not None else ""
-        return _fail(f"{where}{error.strerror or error}", _BAD_INPUT if error.errno in _UNUSABLE_PATH else _FAILED)
-    except MemoryError:
-        return _fail("out of memory", _FAILED)
-    except Exception as error:
-        if os.environ.get("RANGESFM_DEBUG"):
+    except (Exception, KeyboardInterrupt) as error:
+        failure = failure_of(error)
+        if failure.exit_status == INTERNAL_ERROR and os.environ.get("RANGESFM_DEBUG"):
             traceback.print_exc()
-        message = f"internal error, please report it (RANGESFM_DEBUG=1 shows where): {type(error).__name__}: {error}"
-        return _fail(message, _INTERNAL_ERROR)
-
-
-def _fail(message: str, status: int) -> int:
-    print("rangesfm: error:", " ".join(one_line(message).split()), file=sys.stderr)
-    return status
+        print("rangesfm: error:", failure.message, file=sys.stderr)
+        return failure.exit_status

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, TextIO
 
 from rangesfm.cli.terminal import counts, duration
+from rangesfm.errors import one_line
 
 if TYPE_CHECKING:
     from rangesfm.batch.course import Course, SurveyState
@@ -40,6 +41,7 @@ class BatchTerminal:
             self._draw(new, [] if course.is_over else _going_on(course))
 
     def message(self, text: str) -> None:
+        text = one_line(text)
         self._draw([text], []) if self._is_terminal else self._write(f"{text}\n")
 
     def _news(self, course: Course) -> list[str]:
