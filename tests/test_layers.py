@@ -30,6 +30,7 @@ LAYER_OF = {
     "geometry": DATA,
     "georeference": DATA,
     "json_files": DATA,
+    "joined_model": DATA,
     "model_files": DATA,
     "model_records": DATA,
     "options": DATA,

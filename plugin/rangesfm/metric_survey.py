@@ -21,6 +21,25 @@ Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class ModelVerdict:
+    """One of the models that were to be joined.
+
+    Attributes:
+        name: for people, as "sparse/0".
+        num_images: photos in it.
+        estimate: of its scale by its own ranges; None if they do not determine it.
+        joined_from_sfm: its unscaled world to that of the joined unscaled model; None if it is left out.
+        reason: why it is left out; empty if it is not.
+    """
+
+    name: str
+    num_images: int
+    estimate: ScaleEstimate | None
+    joined_from_sfm: Similarity | None
+    reason: str
+
+
+@dataclass(frozen=True)
 class MetricSurvey:
     """A scaled and perhaps refined map with its ranges.
 
@@ -34,6 +53,7 @@ class MetricSurvey:
         scaled_weights: (n,) robust weights by it.
         refined: the model after refinement; None without.
         refinement: its summary; None without.
+        models: that were to be joined to what is one model here; empty where there was only one.
     """
 
     trajectory: Trajectory
@@ -45,6 +65,7 @@ class MetricSurvey:
     scaled_weights: Array
     refined: pycolmap.Reconstruction | None = None
     refinement: RefineSummary | None = None
+    models: tuple[ModelVerdict, ...] = ()
 
     @property
     def final(self) -> pycolmap.Reconstruction:

@@ -6,6 +6,7 @@ Scale Estimation and Drift Mitigation", 2018, with other means where real radios
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -20,13 +21,15 @@ from rangesfm.config import Survey
 from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.rows import disagreements, distance_rows
 from rangesfm.doctor import versions
-from rangesfm.errors import InputError
+from rangesfm.errors import GeometryError, InputError
 from rangesfm.export import COVARIANCE_FORMATS, check_formats
 from rangesfm.georeference import Georeference
 from rangesfm.input_hashes import input_hashes
 from rangesfm.inputs import RangingInputs, read_ranging_inputs, times_of_model
+from rangesfm.joined_model import without_photos
+from rangesfm.joining import PathOfModel, Ranging, join_models
 from rangesfm.journal import Journal
-from rangesfm.metric_survey import MetricSurvey
+from rangesfm.metric_survey import MetricSurvey, ModelVerdict
 from rangesfm.model_files import read_model
 from rangesfm.model_transform import rescale
 from rangesfm.outputs import (
@@ -82,8 +85,8 @@ def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> 
     keyframes, times = _keyframes(survey, journal, log_names_photos=inputs.log.image_name is not None)
     _check_times(survey, inputs, _path_without_places(keyframes, times))
     with sole_writer(survey.output_path):
-        sfm = _reconstruct(survey, keyframes, journal, restart)
-        return _to_metric(survey, inputs, sfm, times, journal, refine=survey.refine.enabled)
+        models = _reconstruct(survey, keyframes, journal, restart)
+        return _to_metric(survey, inputs, models, times, journal, refine=survey.refine.enabled)
 
 
 def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> RunResult:
@@ -91,7 +94,7 @@ def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = Fa
     journal = Journal(progress)
     keyframes, _ = _keyframes(survey, journal)
     with sole_writer(survey.output_path):
-        sfm = _reconstruct(survey, keyframes, journal, restart)
+        sfm = _reconstruct(survey, keyframes, journal, restart)[0]
     path = survey.output_path / "sparse" / "0"
     line = f"unscaled model: {sfm.num_reg_images()} photos, {sfm.num_points3D()} points, in {path}"
     return RunResult(survey.output_path, {"seconds": journal.all_seconds(), "warnings": journal.warnings}, (line,))
@@ -119,34 +122,54 @@ def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResul
     if inputs.log.image_name is None:
         times = _noted(times_of_model(survey, sfm, survey.model_path), journal)
     with sole_writer(survey.output_path):
-        return _to_metric(survey, inputs, sfm, times, journal, refine=refine)
+        return _to_metric(survey, inputs, [sfm], times, journal, refine=refine)
 
 
 def _to_metric(
     survey: Survey,
     inputs: RangingInputs,
-    sfm: pycolmap.Reconstruction,
+    models: Sequence[pycolmap.Reconstruction],
     times: ImageTimes | None,
     journal: Journal,
     *,
     refine: bool,
 ) -> RunResult:
-    """From the unscaled model on: the same for photos just mapped and for a model brought along."""
-    if times is None:
-        trajectory = trajectory_from_reconstruction(sfm)
-    else:
-        trajectory = trajectory_from_reconstruction(sfm, times.by_name(), time_resolution_s=times.resolution_s)
+    """From the unscaled models on: the same for photos just mapped and for a model brought along."""
+    trajectory = _path(models[0], times)
     if not len(trajectory):
-        first = min(image.name for image in sfm.images.values())
+        first = min(image.name for image in models[0].images.values())
         raise InputError(f"none of the model's photos has a time, the first is {first}", survey.image_times_path)
-    if num_without_time := sfm.num_reg_frames() - len(trajectory):
-        journal.warn(f"{num_without_time} of {sfm.num_reg_frames()} photos of the model have no time and are left out")
+    if num_without_time := models[0].num_reg_frames() - len(trajectory):
+        num = models[0].num_reg_frames()
+        journal.warn(f"{num_without_time} of {num} photos of the model have no time and are left out")
     _check_times(survey, inputs, trajectory)
     # Clocks: where on the path each range was taken.
     offset = _time_offset(survey, inputs, trajectory, journal)
+    paths = _paths(survey, inputs, models, trajectory, times, offset, journal)
+    return map_in_metres(survey, inputs, paths, offset, journal, refine=refine)
+
+
+def map_in_metres(
+    survey: Survey,
+    inputs: RangingInputs,
+    paths: Sequence[PathOfModel],
+    offset: TimeOffset | None,
+    journal: Journal,
+    *,
+    refine: bool,
+    must_join: bool = False,
+) -> RunResult:
+    """From the models and the ranges on their paths on: scale, refinement and results of all of them as one map.
+
+    Args:
+        paths: of the log in ``inputs``; to the first one the others are joined, or left out.
+        offset: of the clocks, if it was estimated.
+        must_join: whether it is an error if all others are left out.
+    """
     # Scale, and the metric map that follows from it.
     with journal.stage("scale"):
-        metric = _scale(survey, inputs, sfm, trajectory, offset)
+        path, verdicts = _joined(survey, inputs, paths, journal, must_join=must_join)
+        metric = replace(_scale(survey, inputs, path, offset), models=verdicts)
     for doubt in metric.estimate.reasons if metric.estimate.verdict != "good" else ():
         journal.warn(doubt)
     # Global refinement: photos and ranges together.
@@ -254,8 +277,8 @@ def _path_without_places(keyframes: tuple[str, ...], times: ImageTimes | None) -
 
 def _reconstruct(
     survey: Survey, keyframes: tuple[str, ...], journal: Journal, restart: bool
-) -> pycolmap.Reconstruction:
-    """Map the keyframes into ``sparse``; returns ``sparse/0``."""
+) -> tuple[pycolmap.Reconstruction, ...]:
+    """Map the keyframes into ``sparse``; returns ``sparse/0``, ``sparse/1``, ..."""
     with survey.naming_its_lines():
         summary = reconstruct(
             _images_path(survey),
@@ -270,8 +293,9 @@ def _reconstruct(
         )
     journal.seconds.update(summary.seconds)
     if summary.num_registered < summary.num_keyframes:
-        journal.warn(f"{summary.num_registered} of {summary.num_keyframes} keyframes are in the model")
-    return summary.models[0]
+        which = "the model" if len(summary.models) == 1 else f"the largest of {len(summary.models)} models"
+        journal.warn(f"{summary.num_registered} of {summary.num_keyframes} keyframes are in {which}")
+    return summary.models
 
 
 def _images_path(survey: Survey) -> Path:
@@ -311,17 +335,64 @@ def _time_offset(survey: Survey, inputs: RangingInputs, trajectory: Trajectory, 
     return offset
 
 
-def _scale(
+def _path(model: pycolmap.Reconstruction, times: ImageTimes | None) -> Trajectory:
+    if times is None:
+        return trajectory_from_reconstruction(model)
+    return trajectory_from_reconstruction(model, times.by_name(), time_resolution_s=times.resolution_s)
+
+
+def _paths(
     survey: Survey,
     inputs: RangingInputs,
-    sfm: pycolmap.Reconstruction,
+    models: Sequence[pycolmap.Reconstruction],
     trajectory: Trajectory,
+    times: ImageTimes | None,
     offset: TimeOffset | None,
-) -> MetricSurvey:
+    journal: Journal,
+) -> list[PathOfModel]:
+    """The models with the ranges on their paths; of photos in several of them the first model keeps them.
+
+    Args:
+        trajectory: of the first model.
+    """
     offset_s = offset.value_s if offset is not None else survey.ranges.time_offset_s
     radio_times_s = inputs.log.timestamp_s
     offsets_s = (offset_s or 0.0) if offset is None or radio_times_s is None else offset.at(radio_times_s)
-    observations = _observations(survey, inputs, trajectory, offsets_s)
+    paths = [PathOfModel("sparse/0", models[0], trajectory, _observations(survey, inputs, trajectory, offsets_s))]
+    names = set(trajectory.image_names)
+    for k, model in enumerate(models[1:], start=1):
+        rest = without_photos(model, names)
+        path = _path(rest, times)
+        if not len(path):
+            journal.warn(f"sparse/{k} is left out: its photos have no time, or are in other models too")
+            continue
+        names.update(path.image_names)
+        observations = hold_out(_on_path(survey, inputs, path, offsets_s), survey.ranges.checks, survey.seed)
+        paths.append(PathOfModel(f"sparse/{k}", rest, path, observations))
+    return paths
+
+
+def _joined(
+    survey: Survey, inputs: RangingInputs, paths: Sequence[PathOfModel], journal: Journal, *, must_join: bool
+) -> tuple[PathOfModel, tuple[ModelVerdict, ...]]:
+    """All models that can be, as one."""
+    if len(paths) == 1:
+        return paths[0], ()
+    ranging = Ranging(inputs.anchors, inputs.anchor_frame, survey.scale, survey.ranges.model, inputs.tape, survey.seed)
+    joined = join_models(paths, ranging)
+    left_out = [model for model in joined.verdicts if model.joined_from_sfm is None]
+    if must_join and len(left_out) == len(paths) - 1:
+        reasons = "; ".join(f"{model.name}: {model.reason}" for model in left_out)
+        raise GeometryError(f"nothing can be joined to {paths[0].name}: {reasons}")
+    for note in joined.notes:
+        journal.warn(note)
+    for model in left_out:
+        journal.warn(f"{model.name} ({model.num_images} photos) is left out: {model.reason}")
+    return joined.path, joined.verdicts
+
+
+def _scale(survey: Survey, inputs: RangingInputs, path: PathOfModel, offset: TimeOffset | None) -> MetricSurvey:
+    sfm, trajectory, observations = path.sfm, path.trajectory, path.observations
     distances = None
     if inputs.tape is not None:
         distances = locate_distances(inputs.tape, sfm, observations.log.anchor_ids)
@@ -346,6 +417,7 @@ def _scale(
         [anchor.range_bias_m for anchor in estimate.anchors],
     )
     weights = GEMAN_MCCLURE.weights((predicted - inputs.log.range_m) / estimate.range_stddev_m)
+    offset_s = offset.value_s if offset is not None else survey.ranges.time_offset_s
     return MetricSurvey(trajectory, offset, offset_s, estimate, scaled, predicted, weights)
 
 
@@ -353,13 +425,20 @@ def _observations(
     survey: Survey, inputs: RangingInputs, trajectory: Trajectory, offset_s: float | npt.NDArray[np.float64]
 ) -> RangeObservations:
     """Ranges on the path; refused where the clocks cannot be right."""
-    association = survey.ranges.association
-    observations = associate(inputs.log, trajectory, inputs.tag_in_cam_m, time_offset_s=offset_s, options=association)
+    observations = _on_path(survey, inputs, trajectory, offset_s)
     if not observations.has_place.any():
         raise InputError(
             _why_no_range_has_a_place(observations, trajectory, float(np.mean(offset_s))), survey.ranges.path
         )
     return hold_out(observations, survey.ranges.checks, survey.seed)
+
+
+def _on_path(
+    survey: Survey, inputs: RangingInputs, trajectory: Trajectory, offset_s: float | npt.NDArray[np.float64]
+) -> RangeObservations:
+    return associate(
+        inputs.log, trajectory, inputs.tag_in_cam_m, time_offset_s=offset_s, options=survey.ranges.association
+    )
 
 
 def _why_no_range_has_a_place(observations: RangeObservations, trajectory: Trajectory, offset_s: float) -> str:

@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from rangesfm.metric_survey import MetricSurvey
+from rangesfm.geometry import Similarity
+from rangesfm.metric_survey import MetricSurvey, ModelVerdict
 from rangesfm.ranging.anchors import AnchorEstimate
 from rangesfm.ranging.log import RangeKind
 from rangesfm.ranging.observations import RangeStatus
@@ -24,14 +25,9 @@ USED = (RangeStatus.USED, RangeStatus.DOWN_WEIGHTED)
 
 def survey_result(survey: MetricSurvey) -> dict[str, Any]:
     """All entries that follow from the stages' results."""
-    similarity = survey.estimate.metric_from_sfm
     return {
         "scale": _scale(survey.estimate),
-        "metric_from_sfm": {
-            "scale": similarity.scale,
-            "rotation_xyzw": Rotation.from_matrix(similarity.rotation).as_quat(),
-            "translation_m": similarity.translation,
-        },
+        "metric_from_sfm": _similarity(survey.estimate.metric_from_sfm),
         "frame": survey.estimate.frame,
         "map": {"num_photos": survey.final.num_reg_images(), "num_points3D": survey.final.num_points3D()},
         "anchors": {anchor.anchor_id: _anchor(anchor) for anchor in survey.anchors},
@@ -39,6 +35,7 @@ def survey_result(survey: MetricSurvey) -> dict[str, Any]:
         "ranges": _ranges(survey),
         "check_ranges": _check_ranges(survey),
         "refine": _refine(survey),
+        "models": [_model(model, survey.estimate.metric_from_sfm) for model in survey.models],
     }
 
 
@@ -59,6 +56,33 @@ def _scale(estimate: ScaleEstimate) -> dict[str, Any]:
         "range_noise_stddev_m": estimate.noise_stddev_m,
         "correlation_inflation": estimate.correlation_inflation,
         "two_candidate": _two_candidate(estimate.two_candidate),
+    }
+
+
+def _model(model: ModelVerdict, metric_from_joined: Similarity) -> dict[str, Any]:
+    """One of several models: its own scale, and its place in the joined map."""
+    own, joined = model.estimate, model.joined_from_sfm
+    return {
+        "name": model.name,
+        "num_images": model.num_images,
+        "joined": joined is not None,
+        "reason": model.reason or None,
+        "scale": {
+            "value": None if own is None else own.value,
+            "stddev_empirical": None if own is None else own.stddev_empirical,
+            "interval_95": None if own is None else own.interval_95,
+            "verdict": "refused" if own is None else own.verdict,
+            "reasons": [model.reason] if own is None else own.reasons,
+        },
+        "metric_from_sfm": None if joined is None else _similarity(metric_from_joined @ joined),
+    }
+
+
+def _similarity(similarity: Similarity) -> dict[str, Any]:
+    return {
+        "scale": similarity.scale,
+        "rotation_xyzw": Rotation.from_matrix(similarity.rotation).as_quat(),
+        "translation_m": similarity.translation,
     }
 
 

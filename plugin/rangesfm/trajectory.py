@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -108,6 +108,32 @@ def trajectory_from_reconstruction(
         world_from_cam=np.array([row[4] for row in rows], dtype=np.float64).reshape(-1, 3, 3),
         time_resolution_s=time_resolution_s,
     )
+
+
+def joined_trajectory(parts: Sequence[Trajectory]) -> tuple[Trajectory, list[npt.NDArray[np.int64]]]:
+    """One path of several parts in one world, in the order of ``trajectory_from_reconstruction``.
+
+    Args:
+        parts: all with times, or none.
+
+    Returns:
+        the path, and for each part where its keyframes are in it.
+    """
+    names = np.array([name for part in parts for name in part.image_names], dtype=object)
+    times = [part.timestamps_s for part in parts if part.timestamps_s is not None]
+    order = np.lexsort((names.astype(str), *([np.concatenate(times)] if times else [])))
+    place = np.empty(len(order), dtype=np.int64)
+    place[order] = np.arange(len(order))
+    ends = np.cumsum([len(part) for part in parts])
+    path = Trajectory(
+        np.concatenate([part.frame_ids for part in parts])[order],
+        tuple(names[order].tolist()),
+        np.concatenate(times)[order] if times else None,
+        np.concatenate([part.centers for part in parts])[order],
+        np.concatenate([part.world_from_cam for part in parts])[order],
+        max(part.time_resolution_s for part in parts),
+    )
+    return path, np.split(place, ends[:-1])
 
 
 def pose_of(frame: pycolmap.Frame) -> pycolmap.Rigid3d:

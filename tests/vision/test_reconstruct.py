@@ -175,7 +175,7 @@ def test_two_rooms_give_two_models_the_larger_first(
     assert sorted(os.listdir(tmp_path / "out" / "sparse")) == ["0", "1"]
     assert pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "1").num_reg_images() == 4
     assert summary.num_registered == 5
-    assert listener.messages == ["2 separate models of 5, 4 photos; the largest, sparse/0, is used"]
+    assert listener.messages == ["2 separate models of 5, 4 photos"]
 
 
 class TestEarlierRun:

@@ -20,6 +20,7 @@ COMMANDS = (
     "reconstruct",
     "scale",
     "refine",
+    "join",
     "export",
     "compare",
     "report",

@@ -174,6 +174,13 @@ RANGE_FLAGS = (
 )
 _OF_A_RUN = ("check_share", "check_anchors", "check_times_s", "scale_method", "reference")
 COMPARE_FLAGS = tuple(flag for flag in RANGE_FLAGS if flag.name not in _OF_A_RUN)
+# Of surveys that are finished: the rest is theirs.
+_JOINED_ANCHORS = "CSV anchor_id,x_m,y_m,z_m (default: as the surveys had them)"
+_OF_A_JOIN = ("range_stddev_m", "anchor_frame", "anchor_crs", "use_anchors", "camera_side", "scale_method", "reference")
+JOIN_FLAGS = (
+    Flag("anchors", "anchors.path", _JOINED_ANCHORS, metavar="CSV"),
+    *(flag for flag in RANGE_FLAGS if flag.name in _OF_A_JOIN),
+)
 REFINE_FLAGS = (
     Flag("max_num_iterations", "refine.max_num_iterations", "of the refinement's solver", int, metavar="N"),
     Flag(

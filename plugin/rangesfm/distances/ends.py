@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -95,6 +95,21 @@ def locate_distances(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Seq
         np.array([taped.stddev_m for taped in tape.distances], dtype=np.float64),
         np.array([taped.kind == CHECK for taped in tape.distances], dtype=bool),
     )
+
+
+def distances_within(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Sequence[str]) -> Tape:
+    """Those of the distances that one of several models can hold: both ends in its photos, or anchors."""
+    images = images_by_name(model)
+    marked = {
+        name
+        for name, marker in (tape.markers or {}).items()
+        if sum(image_name in images for image_name in marker.image_names) >= 2
+    }
+    points = images.keys() | marked
+    within = (
+        taped for taped in tape.distances if points.issuperset(taped.ends) or set(anchor_ids).issuperset(taped.ends)
+    )
+    return replace(tape, distances=tuple(within))
 
 
 def _what_is_wrong(taped: TapedDistance, points: dict[str, Array], anchor_ids: Sequence[str]) -> str:

@@ -38,6 +38,7 @@ class AnchorEstimate:
         range_bias_m: what its ranges read too long.
         prior_bias_m, prior_bias_stddev_m: of the bias, but for what all anchors share; stddev 0 fixes it.
         mirror_position_m: the other place that fits as well; None if there is none.
+        position_covariance_m2: (3, 3) by the ranges alone, before any refinement; None if not known.
     """
 
     anchor_id: str
@@ -49,3 +50,4 @@ class AnchorEstimate:
     prior_bias_m: float
     prior_bias_stddev_m: float
     mirror_position_m: npt.NDArray[np.float64] | None = None
+    position_covariance_m2: npt.NDArray[np.float64] | None = None

@@ -69,7 +69,8 @@ def anchor_estimates(
 ) -> tuple[AnchorEstimate, ...]:
     """All anchors of the log, with stddev widened by the errors' correlation, and mirror places."""
     problem, state = solution.problem, solution.fit.state
-    stddev = solution.fit.anchor_stddev_m() * solution.inflation
+    covariance = solution.fit.anchor_covariance_m2() * solution.inflation**2
+    stddev = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 3)
     mirrors = _mirror_places(solution)
     common_bias_m = _common_bias(problem, state)
     estimates = []
@@ -87,6 +88,7 @@ def anchor_estimates(
                 prior_bias_m=float(problem.bias_mean_m[k]),
                 prior_bias_stddev_m=float(problem.bias_stddev_m[k] * solution.inflation),
                 mirror_position_m=mirrors.get(k),
+                position_covariance_m2=covariance[k],
             )
         )
     return tuple(estimates)

@@ -125,7 +125,7 @@ class RangeFit:
     scaled_residuals: Array
     prior_information: Array
     prior_gradient: Array
-    columns: _Columns
+    columns: Columns
 
     @property
     def log_scale_stddev(self) -> float:
@@ -135,21 +135,24 @@ class RangeFit:
     @property
     def covariance(self) -> Array:
         """(p, p); directions that nothing determines count as infinitely uncertain, not as certain."""
-        return _inverse(self.information)
+        return invert_information(self.information)
 
-    def anchor_stddev_m(self) -> Array:
-        """(m,) formal stddev of each anchor: root of the mean variance of its coordinates."""
+    def anchor_covariance_m2(self) -> Array:
+        """(m, 3, 3) formal covariance of each anchor; 0 of one that is not estimated."""
         covariance, columns = self.covariance, self.columns
-        stddev = np.zeros(len(self.state.anchors_m))
+        of_anchors = np.zeros((len(self.state.anchors_m), 3, 3))
         for k, column in enumerate(columns.anchor):
             if column >= 0:
-                stddev[k] = np.sqrt(np.trace(covariance[column : column + 3, column : column + 3]) / 3)
-        return stddev
+                of_anchors[k] = covariance[column : column + 3, column : column + 3]
+        return of_anchors
 
 
 @dataclass(frozen=True)
-class _Columns:
-    """Where each unknown stands in the parameter vector; -1: not estimated."""
+class Columns:
+    """Where each unknown stands in the parameter vector; -1: not estimated.
+
+    First the logarithm of the scale, then the frame (6), the anchors (3 each), the biases.
+    """
 
     frame: int
     anchor: npt.NDArray[np.int64]
@@ -157,7 +160,8 @@ class _Columns:
     num: int
 
 
-def _columns(problem: RangeProblem) -> _Columns:
+def columns_of(problem: RangeProblem) -> Columns:
+    """Of all that a problem leaves open."""
     next_column = 1 + (6 if problem.frame_is_free else 0)
     anchor = np.full(problem.num_anchors, -1, dtype=np.int64)
     bias = np.full(problem.num_anchors, -1, dtype=np.int64)
@@ -167,7 +171,7 @@ def _columns(problem: RangeProblem) -> _Columns:
     for k in range(problem.num_anchors):
         if problem.bias_stddev_m[k] > 0:
             bias[k], next_column = next_column, next_column + 1
-    return _Columns(1 if problem.frame_is_free else -1, anchor, bias, next_column)
+    return Columns(1 if problem.frame_is_free else -1, anchor, bias, next_column)
 
 
 def tag_positions(problem: RangeProblem, metric_from_model: Similarity) -> Array:
@@ -204,7 +208,7 @@ def solve(
         loss: of the ranges.
         tolerance: relative change of cost and of parameters at which it stops.
     """
-    columns = _columns(problem)
+    columns = columns_of(problem)
     num_ranges = len(problem.range_m)
 
     def rho_with_derivatives(z: Array) -> Array:
@@ -214,14 +218,14 @@ def solve(
         return rho
 
     def residuals(x: Array) -> Array:
-        state = _state(problem, columns, start, x)
+        state = state_after(problem, columns, start, x)
         ranges = (predicted_ranges(problem, state) - problem.range_m) / problem.stddev_m
-        return np.concatenate([ranges, _prior_residuals(problem, columns, state)])
+        return np.concatenate([ranges, prior_residuals(problem, columns, state)])
 
     def jacobian(x: Array) -> Array:
-        state = _state(problem, columns, start, x)
+        state = state_after(problem, columns, start, x)
         return np.concatenate(
-            [_range_jacobian(problem, columns, start, state), _prior_jacobian(problem, columns, start, state)]
+            [range_jacobian(problem, columns, start, state), prior_jacobian(problem, columns, start, state)]
         )
 
     result = least_squares(
@@ -236,19 +240,19 @@ def solve(
         gtol=None,
         max_nfev=max_num_evaluations,
     )
-    return _fit(problem, columns, start, _state(problem, columns, start, result.x), float(result.cost), loss)
+    return _fit(problem, columns, start, state_after(problem, columns, start, result.x), float(result.cost), loss)
 
 
 def _fit(
-    problem: RangeProblem, columns: _Columns, start: RangeState, state: RangeState, cost: float, loss: RobustLoss
+    problem: RangeProblem, columns: Columns, start: RangeState, state: RangeState, cost: float, loss: RobustLoss
 ) -> RangeFit:
     residuals_m = predicted_ranges(problem, state) - problem.range_m
     scaled = residuals_m / problem.stddev_m
     weights = loss.weights(scaled)
     pulls = problem.share_or_1 * weights
-    jacobian = _range_jacobian(problem, columns, start, state)
-    prior_jacobian = _prior_jacobian(problem, columns, start, state)
-    prior_information = prior_jacobian.T @ prior_jacobian
+    jacobian = range_jacobian(problem, columns, start, state)
+    of_priors = prior_jacobian(problem, columns, start, state)
+    prior_information = of_priors.T @ of_priors
     return RangeFit(
         state=state,
         residuals_m=residuals_m,
@@ -260,12 +264,13 @@ def _fit(
         gradients=jacobian * pulls[:, None],
         scaled_residuals=scaled,
         prior_information=prior_information,
-        prior_gradient=prior_jacobian.T @ _prior_residuals(problem, columns, state),
+        prior_gradient=of_priors.T @ prior_residuals(problem, columns, state),
         columns=columns,
     )
 
 
-def _state(problem: RangeProblem, columns: _Columns, start: RangeState, x: Array) -> RangeState:
+def state_after(problem: RangeProblem, columns: Columns, start: RangeState, x: Array) -> RangeState:
+    """The start moved by a parameter vector (p,)."""
     similarity = start.metric_from_model
     scale = similarity.scale * float(np.exp(np.clip(x[0], -20, 20)))
     rotation, translation = similarity.rotation, similarity.translation
@@ -281,7 +286,8 @@ def _state(problem: RangeProblem, columns: _Columns, start: RangeState, x: Array
     return RangeState(Similarity(scale, rotation, translation), anchors, bias)
 
 
-def _range_jacobian(problem: RangeProblem, columns: _Columns, start: RangeState, state: RangeState) -> Array:
+def range_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, state: RangeState) -> Array:
+    """(n, p) of the ranges' residuals in stddevs."""
     similarity, index = state.metric_from_model, problem.anchor_index
     turned_centers = problem.centers @ similarity.rotation.T
     turned_levers = problem.tag_from_center @ similarity.rotation.T
@@ -322,13 +328,14 @@ def _left_jacobian(rotation: Rotation) -> Array:
     return closed
 
 
-def _prior_rows(problem: RangeProblem, columns: _Columns) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def _prior_rows(problem: RangeProblem, columns: Columns) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     anchors = np.flatnonzero((columns.anchor >= 0) & np.isfinite(problem.anchor_stddev_m))
     biases = np.flatnonzero((columns.bias >= 0) & np.isfinite(problem.bias_stddev_m))
     return anchors, biases
 
 
-def _prior_residuals(problem: RangeProblem, columns: _Columns, state: RangeState) -> Array:
+def prior_residuals(problem: RangeProblem, columns: Columns, state: RangeState) -> Array:
+    """(r,) of anchors, biases, distances and gravity, in stddevs."""
     anchors, biases = _prior_rows(problem, columns)
     off_anchor = (state.anchors_m - problem.anchor_mean_m)[anchors] / problem.anchor_stddev_m[anchors, None]
     off_bias = _bias_whitening(problem, biases) @ (state.bias_m - problem.bias_mean_m)[biases]
@@ -342,11 +349,12 @@ def _prior_residuals(problem: RangeProblem, columns: _Columns, state: RangeState
 
 def prior_cost(problem: RangeProblem, state: RangeState) -> float:
     """Half the sum of squares of what priors, distances and gravity have against a state."""
-    off = _prior_residuals(problem, _columns(problem), state)
+    off = prior_residuals(problem, columns_of(problem), state)
     return 0.5 * float(off @ off)
 
 
-def _prior_jacobian(problem: RangeProblem, columns: _Columns, start: RangeState, state: RangeState) -> Array:
+def prior_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, state: RangeState) -> Array:
+    """(r, p) of the same."""
     anchors, biases = _prior_rows(problem, columns)
     jacobian = np.zeros((3 * len(anchors) + len(biases), columns.num))
     for row, k in enumerate(anchors):
@@ -370,7 +378,7 @@ def _bias_whitening(problem: RangeProblem, biases: npt.NDArray[np.int64]) -> Arr
     return bias_whitening(problem.bias_stddev_m[biases], problem.common_bias_stddev_m)
 
 
-def _inverse(information: Array) -> Array:
+def invert_information(information: Array) -> Array:
     """Inverse with unit-free conditioning; an undetermined direction gets a huge variance."""
     diagonal = np.sqrt(np.maximum(np.diag(information), 1e-200))
     values, vectors = np.linalg.eigh(information / np.outer(diagonal, diagonal))

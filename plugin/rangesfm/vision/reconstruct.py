@@ -170,4 +170,4 @@ def _say_left_out(photos: Photos, progress: Progress) -> None:
 def _say_separate(models: tuple[pycolmap.Reconstruction, ...], progress: Progress) -> None:
     if len(models) > 1:
         sizes = ", ".join(str(model.num_reg_images()) for model in models)
-        progress.message(f"{len(models)} separate models of {sizes} photos; the largest, sparse/0, is used")
+        progress.message(f"{len(models)} separate models of {sizes} photos")

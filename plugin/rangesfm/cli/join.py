@@ -1,0 +1,42 @@
+"""``rangesfm join``: several surveys of one site to one map."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from rangesfm.cli.arguments import Commands, Outcome
+from rangesfm.cli.survey_flags import (
+    JOIN_FLAGS,
+    OUTPUT_FLAGS,
+    REFINE_FLAGS,
+    add_flags,
+    survey_from_arguments,
+)
+from rangesfm.progress import Progress
+
+
+def add_command(commands: Commands) -> None:
+    parser = commands.add(
+        "join",
+        execute,
+        help="several surveys of one site to one metric map, through the anchors that they share",
+        description=(
+            "Result folders of surveys that share anchors (other days, other cameras with their own tags) to one map\n"
+            "with one set of anchors; no common photo is needed. To the first one the others are joined. Anchors that\n"
+            "nobody surveyed join them too, if each has three or more with the others that are not on a line."
+        ),
+        example="rangesfm join monday/out tuesday/out --output_path site",
+    )
+    parser.add_argument("results", nargs="*", metavar="RESULT", help="output folders of runs, two or more")
+    for group in (JOIN_FLAGS, REFINE_FLAGS, OUTPUT_FLAGS):
+        add_flags(parser, group)
+
+
+def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
+    args.images = None
+    survey = survey_from_arguments(args)
+    from rangesfm.join_surveys import join_surveys
+
+    folders = [Path(result) for result in args.results]
+    return Outcome(join_surveys(survey, folders, progress=progress).summary_lines())

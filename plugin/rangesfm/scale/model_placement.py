@@ -1,0 +1,264 @@
+"""Several models, each scaled on its own, laid into one metric world through the anchors that they share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.errors import GeometryError
+from rangesfm.geometry import Similarity, path_shape, rmse
+from rangesfm.ranging.anchors import AnchorEstimate
+from rangesfm.scale.anchor_alignment import PlacedAnchor, align_by_anchors
+from rangesfm.scale.estimate import ScaleEstimate
+from rangesfm.scale.joint_models import JointFit, JointState, solve_together
+from rangesfm.scale.range_equation import RangeProblem
+from rangesfm.scale.solution import MIN_COST_GAP
+from rangesfm.scale.starts import spread_subset
+from rangesfm.trajectory import Trajectory
+
+Array = npt.NDArray[np.float64]
+
+# No range tells better where an anchor is: antennas err by as much.
+_MIN_STDDEV_M = 0.02
+_MAX_RANGES_PER_ANCHOR = 300
+# Places of a path that lie no further apart, in its extents, are the same.
+_SAME_SHARE = 0.1
+# Stddev of a path's places, in its extents, from which its place counts as open.
+_MAX_OPEN = 0.25
+
+
+@dataclass(frozen=True)
+class ScaledModel:
+    """A model and what its own ranges say of it.
+
+    Attributes:
+        trajectory: of the unscaled model.
+        estimate: of its scale, in a frame of its own or in the anchors' frame.
+        is_in_anchor_frame: whether that is the frame in which positions of anchors were given.
+        frame_is_given: whether it is the first camera's of this very model, in which they were given.
+    """
+
+    trajectory: Trajectory
+    estimate: ScaleEstimate
+    is_in_anchor_frame: bool
+    frame_is_given: bool = False
+
+
+@dataclass(frozen=True)
+class Placements:
+    """Where the models lie in the unscaled world of the first.
+
+    Attributes:
+        first_from_sfm: of each model; None where it has no place.
+        reasons: of each model, why it has none; empty if it has one.
+        notes: what does not fit.
+    """
+
+    first_from_sfm: tuple[Similarity | None, ...]
+    reasons: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def place_models(models: Sequence[ScaledModel], common_bias_stddev_m: float) -> Placements:
+    """Lay each model that the anchors hold into the world of the first, whichever models stand between.
+
+    Every model has a scale and a place of its own, all have one set of anchors; where the anchors would let a model
+    lie in several ways, all ranges together decide, or it is left out.
+
+    Args:
+        common_bias_stddev_m: of the bias that all anchors share (mean 0), of which their priors say nothing.
+    """
+    world = _World(models, common_bias_stddev_m)
+    reasons = [""] * len(models)
+    waiting, num_before = list(range(1, len(models))), len(models)
+    while len(waiting) < num_before:
+        num_before = len(waiting)
+        for k in tuple(waiting):
+            try:
+                world.add(k)
+            except GeometryError as error:
+                reasons[k] = str(error)
+            else:
+                reasons[k] = ""
+                waiting.remove(k)
+    metric_from_sfm = world.solved()
+    into_first = metric_from_sfm[0].inverse()
+    placed = tuple(into_first @ metric_from_sfm[k] if k in metric_from_sfm else None for k in range(len(models)))
+    return Placements(placed, tuple(reasons), tuple(world.notes))
+
+
+class _World:
+    """What is placed so far.
+
+    Attributes:
+        metric_from_sfm: of each placed model.
+        anchors: where they are, by id.
+        notes: of anchors that stand elsewhere for another model.
+    """
+
+    def __init__(self, models: Sequence[ScaledModel], common_bias_stddev_m: float):
+        self._models, self._common_bias_stddev_m = models, common_bias_stddev_m
+        self.metric_from_sfm = {0: models[0].estimate.metric_from_sfm}
+        self.anchors = _placed_anchors(models[0])
+        self.notes: list[str] = []
+
+    def add(self, k: int) -> None:
+        """Raises GeometryError where what is placed so far does not hold this model."""
+        model, anchors = self._models[k], _placed_anchors(self._models[k])
+        own = model.estimate.metric_from_sfm
+        path = model.trajectory.centers
+        if any(self._models[j].is_in_anchor_frame and model.is_in_anchor_frame for j in self.metric_from_sfm):
+            # Both stand in the frame in which the anchors were given.
+            starts, elsewhere_m = [(own, {**_chosen(anchors), **_chosen(self.anchors)})], {}
+        else:
+            found = align_by_anchors(self.anchors, anchors, own.apply(path))
+            starts = [
+                (
+                    alignment.target_from_source @ own,
+                    {
+                        **_chosen({i: a.moved(alignment.target_from_source) for i, a in anchors.items()}),
+                        **_chosen(self.anchors, {id_: side for id_, (side, _) in alignment.sides.items()}),
+                    },
+                )
+                for alignment in found
+            ]
+            elsewhere_m = found[0].elsewhere_m
+        fit = self._best(k, starts)
+        moved = fit.state.metric_from_model[-1] @ own.inverse()
+        rigid = replace(moved, scale=1.0)
+        self.metric_from_sfm = dict(zip((*self.metric_from_sfm, k), fit.state.metric_from_model, strict=True))
+        for id_, anchor in anchors.items():
+            known = self.anchors.get(id_)
+            if known is None or _rank(anchor) < _rank(known):
+                self.anchors[id_] = anchor.moved(rigid)
+        self.notes += [f"anchor {id_} is {off:.2g} m elsewhere by another model" for id_, off in elsewhere_m.items()]
+
+    def _best(self, k: int, starts: Sequence[tuple[Similarity, Mapping[str, Array]]]) -> JointFit:
+        """The ranges of all models decide between the ways to lay one more; GeometryError if they cannot."""
+        members = [*self.metric_from_sfm, k]
+        group = _Group([self._models[j] for j in members], self._common_bias_stddev_m, _MAX_RANGES_PER_ANCHOR)
+        fits = sorted(
+            (group.solve([*self.metric_from_sfm.values(), metric], at) for metric, at in starts),
+            key=lambda fit: fit.cost,
+        )
+        path, best = self._models[k].trajectory.centers, fits[0]
+        extent = float(np.linalg.norm(best.state.metric_from_model[-1].scale * path_shape(path).stddevs))
+        for rival in fits[1:]:
+            apart = best.state.metric_from_model[-1].apply(path) - rival.state.metric_from_model[-1].apply(path)
+            gap = (rival.cost - best.cost) / group.inflation**2
+            if rmse(apart) > _SAME_SHARE * extent and gap < MIN_COST_GAP:
+                raise GeometryError(f"it can be laid in two ways, {rmse(apart):.2g} m apart, that fit all ranges alike")
+        stddev = group.inflation * best.path_stddev_m(len(members) - 1, path)
+        if stddev > _MAX_OPEN * extent:
+            raise GeometryError(
+                f"the anchors place it only to {stddev:.2g} m, of an extent of {extent:.2g} m: those it shares are too "
+                "few, near a line, or badly placed"
+            )
+        return best
+
+    def solved(self) -> dict[int, Similarity]:
+        """metric_from_sfm of all placed models, by all their ranges."""
+        if len(self.metric_from_sfm) == 1:
+            return self.metric_from_sfm
+        group = _Group([self._models[k] for k in self.metric_from_sfm], self._common_bias_stddev_m, None)
+        fit = group.solve(list(self.metric_from_sfm.values()), _chosen(self.anchors))
+        return dict(zip(self.metric_from_sfm, fit.state.metric_from_model, strict=True))
+
+
+class _Group:
+    """The joint problem of some models, the first of which holds them all, unless given anchors do.
+
+    Attributes:
+        inflation: of formal stddevs, by the errors' correlation.
+    """
+
+    def __init__(self, models: Sequence[ScaledModel], common_bias_stddev_m: float, num_per_anchor: int | None):
+        self.inflation = max(model.estimate.correlation_inflation for model in models)
+        self._anchors = _common_anchors(models)
+        parts = [_problem(model, self._anchors, common_bias_stddev_m) for model in models]
+        if num_per_anchor is not None:
+            parts = [spread_subset(part, num_per_anchor) for part in parts]
+        frames_are_given = models[0].is_in_anchor_frame
+        held = [model.frame_is_given if frames_are_given else k == 0 for k, model in enumerate(models)]
+        self._parts = [replace(part, frame_is_free=not stays) for part, stays in zip(parts, held, strict=True)]
+
+    def solve(self, metric_from_sfm: Sequence[Similarity], anchors_m: Mapping[str, Array]) -> JointFit:
+        """From a start; anchors without a place in it take no part."""
+        start_m = np.array([anchors_m.get(a.anchor_id, np.full(3, np.nan)) for a in self._anchors]).reshape(-1, 3)
+        has_place = np.isfinite(start_m).all(axis=1)
+        parts = [part.subset(np.flatnonzero(has_place[part.anchor_index])) for part in self._parts]
+        return solve_together(parts, JointState(tuple(metric_from_sfm), start_m, parts[0].bias_mean_m))
+
+
+def _common_anchors(models: Sequence[ScaledModel]) -> list[AnchorEstimate]:
+    """The anchors with what is known of them beforehand, each by a model that hears it if there is one."""
+    in_frame = models[0].is_in_anchor_frame
+    anchors = []
+    for estimates in zip(*(model.estimate.anchors for model in models), strict=True):
+        heard = max(estimates, key=lambda anchor: anchor.prior_bias_stddev_m)
+        given = [a for a, model in zip(estimates, models, strict=True) if model.is_in_anchor_frame and in_frame]
+        known = [a for a in given if a.prior_position_m is not None]
+        anchors.append(
+            replace(
+                heard,
+                prior_position_m=known[0].prior_position_m if known else None,
+                prior_position_stddev_m=max(a.prior_position_stddev_m for a in known) if known else np.inf,
+            )
+        )
+    return anchors
+
+
+def _problem(model: ScaledModel, anchors: Sequence[AnchorEstimate], common_bias_stddev_m: float) -> RangeProblem:
+    """The ranges that its own estimate used, in the model's unit."""
+    estimate = model.estimate
+    observations, log = estimate.observations, estimate.observations.log
+    rows = np.flatnonzero(observations.has_place & np.isfinite(estimate.range_stddev_m))
+    no_place = np.full(3, np.nan)
+    return RangeProblem(
+        centers=observations.centers[rows],
+        tag_from_center=observations.tag_from_center[rows],
+        anchor_index=log.anchor_index[rows],
+        range_m=log.range_m[rows],
+        stddev_m=estimate.range_stddev_m[rows],
+        anchor_mean_m=np.array([no_place if a.prior_position_m is None else a.prior_position_m for a in anchors]),
+        anchor_stddev_m=np.array([anchor.prior_position_stddev_m for anchor in anchors]),
+        bias_mean_m=np.array([anchor.prior_bias_m for anchor in anchors]),
+        bias_stddev_m=np.array([anchor.prior_bias_stddev_m for anchor in anchors]) / estimate.correlation_inflation,
+        common_bias_stddev_m=common_bias_stddev_m / estimate.correlation_inflation,
+        frame_is_free=True,
+    )
+
+
+def _placed_anchors(model: ScaledModel) -> dict[str, PlacedAnchor]:
+    path_m = model.estimate.metric_from_sfm.apply(model.trajectory.centers)
+    relative = model.estimate.uncertainty.empirical
+    return {
+        anchor.anchor_id: _placed(anchor, relative * (anchor.position_m - path_m.mean(axis=0)))
+        for anchor in model.estimate.anchors
+        if np.isfinite(anchor.position_m).all()
+    }
+
+
+def _placed(anchor: AnchorEstimate, by_scale_m: Array) -> PlacedAnchor:
+    """An anchor that was not surveyed may be off along with the model's scale."""
+    covariance = _MIN_STDDEV_M**2 * np.eye(3)
+    if anchor.position_covariance_m2 is not None:
+        covariance = covariance + anchor.position_covariance_m2
+    if anchor.prior_position_m is None:
+        covariance = covariance + np.outer(by_scale_m, by_scale_m)
+    mirror = anchor.mirror_position_m
+    places = [anchor.position_m] if mirror is None else [anchor.position_m, mirror]
+    return PlacedAnchor(np.array(places), covariance)
+
+
+def _chosen(anchors: Mapping[str, PlacedAnchor], sides: Mapping[str, int] | None = None) -> dict[str, Array]:
+    """(3,) place of each, the first unless told otherwise."""
+    return {id_: anchor.places_m[(sides or {}).get(id_, 0)] for id_, anchor in anchors.items()}
+
+
+def _rank(anchor: PlacedAnchor) -> tuple[int, float]:
+    """Better placed anchors first: those without a mirror image, then by variance."""
+    return len(anchor.places_m), anchor.variance_m2
