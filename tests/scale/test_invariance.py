@@ -20,6 +20,8 @@ from rangesfm.simulate.ranges import Radio
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey
 
+    from rangesfm.ranging.log import RangeLog
+
 SAME = 1e-9
 NO_RESAMPLING = ScaleOptions(num_bootstrap=0)
 ANCHORS = ("A", "B", "C", "D", "E")
@@ -31,9 +33,9 @@ def survey(make_survey: MakeSurvey) -> Survey:
     return make_survey(radio=Radio(range_stddev_m=0.05), num_keyframes=20)
 
 
-def estimate(survey: Survey, frame: str = "first_camera", **changes: object) -> ScaleEstimate:
+def estimate(survey: Survey, frame: str = "first_camera", log: RangeLog | None = None) -> ScaleEstimate:
     known = () if frame == "unknown" else ANCHORS
-    return survey.scale(frame, known, options=NO_RESAMPLING, **changes)
+    return survey.scale(frame, known, options=NO_RESAMPLING, log=log)
 
 
 def assert_same(found: ScaleEstimate, expected: ScaleEstimate, factor: float = 1.0) -> None:

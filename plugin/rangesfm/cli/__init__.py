@@ -28,7 +28,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         # There is no sys.stderr where the shell closed it.
         with terminal_progress(sys.stderr or io.StringIO(), quiet=args.quiet) as progress:
             outcome: Outcome = args.execute(args, progress)
-        print("\n".join(map(one_line, outcome.lines)), flush=True)
+        # A table is one text of several lines.
+        print("\n".join(one_line(line) for text in outcome.lines for line in text.split("\n")), flush=True)
         return outcome.status
     except SystemExit as ended:  # --help and --version
         return int(ended.code or 0)
