@@ -159,11 +159,8 @@ def _consensus_states(problem: RangeProblem) -> list[RangeState]:
 
 def _likeliest_each_once(problem: RangeProblem, errors: _ErrorModel, states: list[RangeState]) -> list[RangeState]:
     """The likeliest states, best first, of each map one."""
-    distinct: list[RangeState] = []
-    for state in sorted(states, key=lambda state: _view(problem, errors, state).unlikeliness):
-        if all(_differ(problem, state, other) for other in distinct) and len(distinct) < _NUM_ALTERNATIVES:
-            distinct.append(state)
-    return distinct
+    ranked = sorted(states, key=lambda state: _view(problem, errors, state).unlikeliness)
+    return [ranked[i] for i in _first_of_each_map(problem, ranked)]
 
 
 def _distinct_fits(problem: RangeProblem, anchors_are_known: bool, seed: int) -> list[RangeFit]:
@@ -192,11 +189,17 @@ def _distinct_fits(problem: RangeProblem, anchors_are_known: bool, seed: int) ->
 
 def _each_once(problem: RangeProblem, fits: list[RangeFit]) -> list[RangeFit]:
     """The best fits, best first, of each map one."""
-    distinct: list[RangeFit] = []
-    for fit in sorted(fits, key=lambda f: f.cost):
-        if all(_differ(problem, fit.state, other.state) for other in distinct) and len(distinct) < _NUM_ALTERNATIVES:
-            distinct.append(fit)
-    return distinct
+    ranked = sorted(fits, key=lambda f: f.cost)
+    return [ranked[i] for i in _first_of_each_map(problem, [fit.state for fit in ranked])]
+
+
+def _first_of_each_map(problem: RangeProblem, states: list[RangeState]) -> list[int]:
+    """Where each different map comes first; of so many maps as are followed."""
+    firsts: list[int] = []
+    for i, state in enumerate(states):
+        if all(_differ(problem, state, states[first]) for first in firsts) and len(firsts) < _NUM_ALTERNATIVES:
+            firsts.append(i)
+    return firsts
 
 
 def _known_only(problem: RangeProblem) -> RangeProblem:
