@@ -14,10 +14,13 @@
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
+#include <limits>
 #include <random>
 #include <vector>
 
 namespace rangesfm {
+
+constexpr double kInfinity = std::numeric_limits<double>::infinity();
 
 using Block = std::vector<double>;
 

@@ -6,8 +6,6 @@
 namespace rangesfm {
 namespace {
 
-Eigen::Vector3d TagInCam() { return {-0.0012, -0.0900, -0.0663}; }
-
 std::vector<Block> RandomBlocks(Random& random, double extent) {
   return {PoseBlock(random.Rotation(), random.Vector(extent)),
           PoseBlock(random.Rotation(), random.Vector(extent)),

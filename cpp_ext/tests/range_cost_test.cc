@@ -10,8 +10,6 @@
 namespace rangesfm {
 namespace {
 
-Eigen::Vector3d TagInCam() { return {-0.0012, -0.0900, -0.0663}; }
-
 TEST(RangeCost, ResidualIsTheHandComputedOne) {
   // The camera at (1, 2.5, 0), turned by 90 degrees about z: its x axis is the world's -y. The tag, half a metre along
   // that axis, is at (1, 2, 0), 5 m from the anchor. Predicted 5.25 m, measured 5 m, in stddevs of 0.1 m: 2.5.

@@ -4,7 +4,6 @@
 
 #include <Eigen/Core>
 #include <cmath>
-#include <limits>
 #include <memory>
 #include <utility>
 #include <vector>
@@ -18,8 +17,6 @@
 
 namespace rangesfm {
 namespace {
-
-constexpr double kInfinity = std::numeric_limits<double>::infinity();
 
 Eigen::VectorXd Uniform(Random& random, int size, double min, double max) {
   return Eigen::VectorXd::NullaryExpr(size, [&] { return random.Uniform(min, max); });

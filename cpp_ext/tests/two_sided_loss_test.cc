@@ -5,12 +5,11 @@
 
 #include <array>
 #include <cmath>
-#include <limits>
+
+#include "cost_testing.h"
 
 namespace rangesfm {
 namespace {
-
-constexpr double kInfinity = std::numeric_limits<double>::infinity();
 
 class TwoSidedLossTest : public testing::TestWithParam<bool> {};
 
