@@ -514,13 +514,6 @@ class TestCtrlC:
         before = json.loads((photo_run.output_path / "result.json").read_text())["scale"]["value"]
         assert found == pytest.approx(before, rel=1e-9)
 
-    def test_while_the_demo_is_rendered_leaves_no_photos(
-        self, start: Callable[..., subprocess.Popen[str]], tmp_path: Path
-    ) -> None:
-        lines = interrupt_when(lambda: any(tmp_path.glob("yard/.images.*")), start("demo", "yard", cwd=tmp_path))
-        assert lines[-1] == "rangesfm: error: interrupted; stages that were done are kept"
-        assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
-
 
 @pytest.mark.parametrize(
     ("content", "said"),

@@ -36,10 +36,8 @@ def function_or_death(*arguments, **options):
 setattr(module, name, function_or_death)
 sys.exit(main(argv))
 """
-IN_FEATURES = ("pycolmap", "extract_features", 2)
 IN_MATCHING = ("rangesfm.vision.matching", "num_compared_pairs", 0)
 IN_MAPPING = ("rangesfm.vision.snapshots", "_keep", 3)
-BEFORE_MODELS_ARE_WRITTEN = ("rangesfm.vision.mapping", "new_folder", 0)
 AMONG_TABLES = ("rangesfm.outputs", "_write_ranges", 0)
 BEFORE_THE_RESULT = ("rangesfm.pipeline", "write_result", 0)
 BEFORE_THE_REPORT = ("rangesfm.pipeline", "write_report", 0)
@@ -72,12 +70,12 @@ def test_killed_in_step_after_step_it_ends_as_if_nothing_had_been(
     output, folder = tmp_path / "out", photo_run.survey.folder
     flags = (*photo_run.flags, "--output_path", str(output))
     said = []
-    for moment in (IN_FEATURES, IN_MATCHING, IN_MAPPING, BEFORE_MODELS_ARE_WRITTEN, BEFORE_THE_RESULT):
+    for moment in (IN_MATCHING, IN_MAPPING, BEFORE_THE_RESULT):
         said.append(killed(moment, *flags, cwd=folder))
         assert not (output / "result.json").exists()
-    assert "mapping: goes on from " in said[3]
+    assert "mapping: goes on from " in said[2]
     said.append(rangesfm_command("run", *flags, cwd=folder).stderr)
-    for step, first_without in (("features", 2), ("matching", 3), ("mapping", 5)):
+    for step, first_without in (("features", 1), ("matching", 2), ("mapping", 3)):
         is_done = [f"{step}: taken over from an earlier run" in text for text in said]
         assert is_done == [number >= first_without for number in range(len(said))]
     assert_whole(output, photo_run.output_path, study)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 STUDY = Path(__file__).parents[1] / "studies" / "clock_coverage.py"
-NUM_SEEDS = 12
+NUM_SEEDS = 6
 
 
 @pytest.fixture(scope="module")
@@ -33,9 +33,9 @@ def test_offset_of_a_short_log_with_errors_that_stay_is_as_certain_as_it_is_said
     study: ModuleType, num_anchors: int
 ) -> None:
     errors, stddevs = study.estimates(20.0, num_anchors, correlation_s=2.0, num_seeds=NUM_SEEDS)
-    assert len(errors) >= NUM_SEEDS - 2
+    assert len(errors) >= NUM_SEEDS - 1
     scaled = errors / stddevs
     # With residuals summed over blocks, without the jackknife's steps, both are 1.6 to 1.9.
     assert 0.4 < np.sqrt(np.mean(scaled**2)) < 1.4
-    assert np.mean(np.abs(scaled) < 1.96) >= 0.9
+    assert np.mean(np.abs(scaled) < 1.96) >= 0.8
     assert np.median(stddevs) < 0.03
