@@ -1,6 +1,6 @@
 """rangesfm: metric COLMAP models from photos and ultra-wideband ranges.
 
-The stages are plain functions, found here by name and imported when first asked for::
+The stages are plain functions, found here by name and imported when first asked for:
 
     import rangesfm
 

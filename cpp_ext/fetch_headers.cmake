@@ -1,0 +1,29 @@
+# The headers of Ceres and Eigen, downloaded: for machines without packages of them, as those that build the wheels.
+#
+# Gives the target Eigen3::Eigen and RANGESFM_CERES_INCLUDE_DIRS, as the packages would. Sources that are already there
+# are used instead with FETCHCONTENT_SOURCE_DIR_CERES and FETCHCONTENT_SOURCE_DIR_EIGEN.
+
+include(FetchContent)
+if(POLICY CMP0135)
+  cmake_policy(SET CMP0135 NEW) # files are as old as their download
+endif()
+
+# Nothing of either is built: neither has a CMakeLists.txt in a folder of this name.
+FetchContent_Declare(ceres
+  URL http://ceres-solver.org/ceres-solver-2.2.0.tar.gz
+  URL_HASH SHA256=48b2302a7986ece172898477c3bcd6deb8fb5cf19b3327bc49969aad4cede82d
+  SOURCE_SUBDIR headers_only)
+FetchContent_Declare(eigen
+  URL https://gitlab.com/libeigen/eigen/-/archive/3.4.0/eigen-3.4.0.tar.gz
+  URL_HASH SHA256=8586084f71f9bde545ee7fa6d00288b264a2b7ac3607b974e54d13e7162c1c72
+  SOURCE_SUBDIR headers_only)
+FetchContent_MakeAvailable(ceres eigen)
+
+# Ceres' own configuration for builds without CMake, and its stand-in for glog's header.
+set(RANGESFM_CERES_INCLUDE_DIRS
+  ${ceres_SOURCE_DIR}/include
+  ${ceres_SOURCE_DIR}/config
+  ${ceres_SOURCE_DIR}/internal/ceres/miniglog)
+
+add_library(Eigen3::Eigen INTERFACE IMPORTED)
+target_include_directories(Eigen3::Eigen SYSTEM INTERFACE ${eigen_SOURCE_DIR})
