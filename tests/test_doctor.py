@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from rangesfm import doctor
-from rangesfm._ceres import installed_version
 from rangesfm.doctor import Check, diagnose, versions
 from rangesfm.errors import SolverError
+from rangesfm.installed_versions import installed_version
 
 
 def check_named(name: str) -> Check:

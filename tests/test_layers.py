@@ -20,6 +20,7 @@ LAYER_OF = {
     "failures": ERRORS,
     "progress": ERRORS,
     "files": ERRORS,
+    "installed_versions": ERRORS,
     "sole_writer": ERRORS,
     "_ceres": DATA,
     "colmap_log": DATA,

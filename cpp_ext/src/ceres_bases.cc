@@ -1,7 +1,7 @@
 // What the two base classes of Ceres that the extension derives from have outside their headers.
 //
-// Defined here, the extension is built from Ceres' headers alone: no Ceres is linked, static or shared, none needs to be
-// on the system that it is installed on, and none meets the copies inside pycolmap and pyceres.
+// Defined here, the extension is built from Ceres' headers alone: no Ceres is linked, static or shared, none needs to
+// be on the system that it is installed on, and none meets the copies inside pycolmap and pyceres.
 
 #include <ceres/cost_function.h>
 #include <ceres/manifold.h>

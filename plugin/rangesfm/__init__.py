@@ -63,9 +63,14 @@ logging.getLogger(__name__).addHandler(logging.NullHandler())
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name from its module when it is first used: pycolmap and scipy are slow to load."""
+    """Import a public name from its module when it is first used: pycolmap and scipy are slow to load.
+
+    Whatever may need pycolmap or pyceres is refused with other versions of them than it was made for.
+    """
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if _HOME[name] != "rangesfm.errors":
+        importlib.import_module("rangesfm.installed_versions").check_versions()
     value = getattr(importlib.import_module(_HOME[name]), name)
     globals()[name] = value
     return value

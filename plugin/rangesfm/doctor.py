@@ -7,15 +7,9 @@ import platform
 import sys
 from dataclasses import dataclass
 
-from rangesfm._ceres import (
-    INSTALL_COMMAND,
-    NEEDED_VERSIONS,
-    check_compatibility,
-    compiled_part_version,
-    installed_version,
-    pyceres_ceres_version,
-)
+from rangesfm._ceres import check_compatibility, compiled_part_version, pyceres_ceres_version
 from rangesfm.errors import SolverError
+from rangesfm.installed_versions import INSTALL_COMMAND, NEEDED_VERSIONS, installed_version
 
 MIN_PYTHON = (3, 10)
 MAX_PYTHON = (3, 13)

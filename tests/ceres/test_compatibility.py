@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import re
 import subprocess
 from collections.abc import Iterator
@@ -15,8 +14,6 @@ from rangesfm import _cpp
 from rangesfm._ceres import (
     CostFunction,
     check_compatibility,
-    compatibility,
-    range_cost,
 )
 from rangesfm.errors import SolverError
 
@@ -35,24 +32,6 @@ def unchecked() -> Iterator[None]:
     check_compatibility.cache_clear()
     yield
     check_compatibility.cache_clear()
-
-
-@pytest.mark.usefixtures("unchecked")
-@pytest.mark.parametrize(("package", "version"), [("pycolmap", "4.3.0"), ("pyceres", "2.5"), ("pyceres", None)])
-def test_the_gate_names_what_is_installed_what_is_needed_and_what_to_run(
-    monkeypatch: pytest.MonkeyPatch, package: str, version: str | None
-) -> None:
-    installed_version = compatibility.installed_version
-    monkeypatch.setattr(
-        compatibility, "installed_version", lambda name: version if name == package else installed_version(name)
-    )
-    with pytest.raises(SolverError) as caught:
-        range_cost(range_m=4.0, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=0.1)
-    message = str(caught.value)
-    assert f"{package} {version or 'not'}" in message
-    assert f"needs {package} {compatibility.NEEDED_VERSIONS[package]}" in message
-    assert "pip install 'pycolmap>=4.2,<4.3' 'pyceres>=2.6,<2.7'" in message
-    assert "\n" not in message
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -85,13 +64,3 @@ def test_the_compiled_part_needs_no_library_that_pycolmap_does_not_need_too() ->
     readelf = subprocess.run(["readelf", "-dW", _cpp.__file__], capture_output=True, text=True, check=True)
     needed = set(re.findall(r"NEEDED.*\[(.+?)\.so", readelf.stdout))
     assert needed <= {"libstdc++", "libm", "libgcc_s", "libc", "ld-linux-x86-64", "ld-linux-aarch64"}
-
-
-def test_the_pins_checked_are_the_pins_of_the_package() -> None:
-    requirements = importlib.metadata.requires("rangesfm")
-    assert requirements is not None
-    for package, needed in compatibility.NEEDED_VERSIONS.items():
-        major, minor = map(int, needed.split("."))
-        (requirement,) = (r for r in requirements if re.match(rf"{package}\b", r))
-        assert set(re.findall(r"[<>=]+[\d.]+", requirement)) == {f">={needed}", f"<{major}.{minor + 1}"}
-        assert f"'{package}>={needed},<{major}.{minor + 1}'" in compatibility.INSTALL_COMMAND

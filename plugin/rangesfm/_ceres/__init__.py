@@ -17,11 +17,8 @@ pycolmap, pyceres and the compiled part exchange C++ objects, which works only b
 """
 
 from rangesfm._ceres.compatibility import (
-    INSTALL_COMMAND,
-    NEEDED_VERSIONS,
     check_compatibility,
     compiled_part_version,
-    installed_version,
     pyceres_ceres_version,
 )
 from rangesfm._ceres.costs import (
@@ -40,8 +37,6 @@ from rangesfm._ceres.problem import add_residual_block, cauchy_loss, keep_from_e
 from rangesfm._ceres.types import CostFunction, LossFunction
 
 __all__ = [
-    "INSTALL_COMMAND",
-    "NEEDED_VERSIONS",
     "AddedRanges",
     "CostFunction",
     "LossFunction",
@@ -56,7 +51,6 @@ __all__ = [
     "compiled_part_version",
     "distance_cost",
     "fixed_pose_range_cost",
-    "installed_version",
     "interpolated_range_cost",
     "joint_prior_cost",
     "keep_from_elimination",

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import functools
-import importlib.metadata
 import math
 from typing import cast
 
 import numpy as np
 
 from rangesfm.errors import SolverError
-
-NEEDED_VERSIONS = {"pycolmap": "4.2", "pyceres": "2.6"}
-INSTALL_COMMAND = "python -m pip install 'pycolmap>=4.2,<4.3' 'pyceres>=2.6,<2.7'"
+from rangesfm.installed_versions import INSTALL_COMMAND, NEEDED_VERSIONS, check_versions, installed_version
 
 
 @functools.cache
@@ -22,10 +19,7 @@ def check_compatibility() -> None:
     Raises:
         SolverError: they do not; it names what is installed, what is needed and what to run.
     """
-    for package, needed in NEEDED_VERSIONS.items():
-        found = installed_version(package)
-        if found is None or found.split(".")[:2] != needed.split("."):
-            raise _incompatible(f"needs {package} {needed}")
+    check_versions()
     try:
         costs = _costs_of_known_residual()
     except ImportError as error:
@@ -68,14 +62,6 @@ def _costs_of_known_residual() -> dict[str, float]:
     # Anchor and bias are free, so that a right Jacobian leaves nothing over.
     costs["less after pycolmap's solver"] = summary.initial_cost - summary.final_cost
     return costs
-
-
-def installed_version(package: str) -> str | None:
-    """Version of an installed package; None if it is not."""
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def compiled_part_version() -> str:

@@ -25,6 +25,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="backslashreplace")
     try:
         args = parse(normalize(sys.argv[1:] if argv is None else argv))
+        if args.command != "doctor":  # which says more
+            from rangesfm.installed_versions import check_versions
+
+            check_versions()
         # There is no sys.stderr where the shell closed it.
         with terminal_progress(sys.stderr or io.StringIO(), quiet=args.quiet) as progress:
             outcome: Outcome = args.execute(args, progress)
