@@ -1,10 +1,11 @@
-"""Carries a model into the metric world."""
+"""Carries a model into another world, or to what became of a copy of it."""
 
 from __future__ import annotations
 
 import pycolmap
 
 from rangesfm.geometry import Similarity
+from rangesfm.trajectory import pose_of
 
 
 def rescale(reconstruction: pycolmap.Reconstruction, metric_from_sfm: Similarity) -> pycolmap.Reconstruction:
@@ -19,3 +20,13 @@ def rescale(reconstruction: pycolmap.Reconstruction, metric_from_sfm: Similarity
         )
     )
     return metric
+
+
+def take_over(reconstruction: pycolmap.Reconstruction, adjusted: pycolmap.Reconstruction) -> None:
+    """Give a model, in place, the poses, points and intrinsics of a copy of it that was adjusted."""
+    for frame_id in reconstruction.reg_frame_ids():
+        pose_of(reconstruction.frame(frame_id)).params[:] = pose_of(adjusted.frame(frame_id)).params
+    for point_id, point in reconstruction.points3D.items():
+        point.xyz[:] = adjusted.point3D(point_id).xyz
+    for camera_id, camera in reconstruction.cameras.items():
+        camera.params[:] = adjusted.camera(camera_id).params

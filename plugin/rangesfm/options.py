@@ -62,6 +62,8 @@ class MapperOptions:
         features, pairing, matcher, pipeline: passed through to pycolmap's
             FeatureExtractionOptions, the pairing options of the chosen matching,
             FeatureMatchingOptions and IncrementalPipelineOptions.
+        ranges_in_mapping: whether each global bundle adjustment of the mapping carries the ranges, as soon as they
+            determine the scale. Takes much longer; the refinement at the end mostly comes to the same map.
         num_threads: -1 for all cores. Matching on the processor takes one thread all the same, as
             pycolmap 4.2 loses matches with more; ``matcher.num_threads`` overrides that.
     """
@@ -71,6 +73,7 @@ class MapperOptions:
     pairing: dict[str, Any] = field(default_factory=dict)
     matcher: dict[str, Any] = field(default_factory=dict)
     pipeline: dict[str, Any] = field(default_factory=dict)
+    ranges_in_mapping: bool = False
     num_threads: int = -1
 
 

@@ -43,6 +43,7 @@ from rangesfm.outputs import (
 )
 from rangesfm.passthrough import apply_options
 from rangesfm.progress import Progress
+from rangesfm.ranges_in_mapping import AdjustmentWithRanges
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock import TimeOffset, estimate_time_offset
 from rangesfm.ranging.log import RangeKind, RangeLog
@@ -57,6 +58,7 @@ from rangesfm.sole_writer import sole_writer
 from rangesfm.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images
 from rangesfm.vision.keyframes import select_keyframes
+from rangesfm.vision.mapping_loop import GlobalAdjustment
 from rangesfm.vision.reconstruct import reconstruct
 
 
@@ -85,13 +87,20 @@ def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> 
     keyframes, times = _keyframes(survey, journal, log_names_photos=inputs.log.image_name is not None)
     _check_times(survey, inputs, _path_without_places(keyframes, times))
     with sole_writer(survey.output_path):
-        models = _reconstruct(survey, keyframes, journal, restart)
+        adjustment = AdjustmentWithRanges(survey, inputs, keyframes[0], times)
+        models = _reconstruct(
+            survey, keyframes, journal, restart, adjustment if survey.mapper.ranges_in_mapping else None
+        )
+        if note := adjustment.note():
+            journal.warn(note)
         return _to_metric(survey, inputs, models, times, journal, refine=survey.refine.enabled)
 
 
 def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> RunResult:
     """Photos to an unscaled model."""
     journal = Journal(progress)
+    if survey.mapper.ranges_in_mapping:
+        journal.warn("ranges_in_mapping: nothing has been said of ranges here, they take part in a whole run")
     keyframes, _ = _keyframes(survey, journal)
     with sole_writer(survey.output_path):
         sfm = _reconstruct(survey, keyframes, journal, restart)[0]
@@ -276,7 +285,11 @@ def _path_without_places(keyframes: tuple[str, ...], times: ImageTimes | None) -
 
 
 def _reconstruct(
-    survey: Survey, keyframes: tuple[str, ...], journal: Journal, restart: bool
+    survey: Survey,
+    keyframes: tuple[str, ...],
+    journal: Journal,
+    restart: bool,
+    adjustment: GlobalAdjustment | None = None,
 ) -> tuple[pycolmap.Reconstruction, ...]:
     """Map the keyframes into ``sparse``; returns ``sparse/0``, ``sparse/1``, ..."""
     with survey.naming_its_lines():
@@ -290,6 +303,7 @@ def _reconstruct(
             progress=journal.progress,
             restart=restart,
             before_change=lambda: forget_result(survey.output_path),
+            adjustment=adjustment,
         )
     journal.seconds.update(summary.seconds)
     if summary.num_registered < summary.num_keyframes:

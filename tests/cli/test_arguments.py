@@ -32,6 +32,11 @@ def test_nothing_is_changed_after_two_dashes() -> None:
     assert normalize(["ranges", "--", "--odd-name", "-1"]) == ["ranges", "--", "--odd-name", "-1"]
 
 
+def test_a_switch_takes_no_value() -> None:
+    assert survey_of("run", "--ranges-in-mapping").mapper.ranges_in_mapping
+    assert not survey_of("run").mapper.ranges_in_mapping
+
+
 @pytest.mark.parametrize("spelling", ["--tag_in_cam", "--tag-in-cam"])
 @pytest.mark.parametrize("value", ["-0.0012,-0.09,-0.0663", "-.0012 -9e-2 -0.0663"])
 def test_value_may_begin_with_a_minus_sign(spelling: str, value: str) -> None:

@@ -25,6 +25,7 @@ class Flag:
         key: dotted key of the survey file.
         convert: from the text to the key's value.
         repeated: whether it may be given several times; its value is the list of all.
+        is_switch: it takes no value, and makes the key true.
     """
 
     name: str
@@ -34,6 +35,7 @@ class Flag:
     choices: tuple[str, ...] | None = None
     metavar: str | None = None
     repeated: bool = False
+    is_switch: bool = False
 
 
 def _numbers(text: str) -> list[float]:
@@ -205,6 +207,14 @@ REFINE_FLAGS = (
         metavar="METRES",
     ),
 )
+MAPPING_FLAGS = (
+    Flag(
+        "ranges_in_mapping",
+        "mapper.ranges_in_mapping",
+        "ranges take part while the map grows, not only at the end; takes much longer",
+        is_switch=True,
+    ),
+)
 OUTPUT_FLAGS = (
     Flag("output_path", "output.path", "folder of the results (default: out)", metavar="FOLDER"),
     Flag("num_threads", "mapper.num_threads", "-1 for all cores", int, metavar="N"),
@@ -226,6 +236,9 @@ def add_survey_arguments(parser: argparse.ArgumentParser, *groups: tuple[Flag, .
 def add_flags(parser: argparse.ArgumentParser, flags: tuple[Flag, ...]) -> None:
     """Flags whose values ``overrides_from_arguments`` finds again."""
     for flag in flags:
+        if flag.is_switch:
+            parser.add_argument(f"--{flag.name}", dest=flag.key, action="store_const", const=True, help=flag.help)
+            continue
         parser.add_argument(
             f"--{flag.name}",
             dest=flag.key,

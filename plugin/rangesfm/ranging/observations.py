@@ -86,9 +86,9 @@ def hold_out(observations: RangeObservations, checks: CheckOptions, seed: int) -
     if checks.check_times_s:
         chosen |= _in_time(log, checks.check_times_s)
     status[chosen & observations.has_place] = RangeStatus.CHECK
-    usable = np.flatnonzero(status <= RangeStatus.OUTLIER)
-    share = round(checks.check_share * len(usable))
-    status[np.random.default_rng(seed).permutation(usable)[:share]] = RangeStatus.CHECK
+    # Drawn from the whole log, so that the same ranges are checks whatever there is of the path.
+    drawn = np.random.default_rng(seed).permutation(len(log)) < round(checks.check_share * len(log))
+    status[drawn & (status <= RangeStatus.OUTLIER)] = RangeStatus.CHECK
     return replace(observations, status=status)
 
 

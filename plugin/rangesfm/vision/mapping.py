@@ -15,6 +15,7 @@ from rangesfm.passthrough import apply_options
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import num_matching_pairs
+from rangesfm.vision.mapping_loop import IncrementalMapping
 from rangesfm.vision.photos import Photos
 from rangesfm.vision.snapshots import Snapshots, newest_snapshot, remove_snapshots
 
@@ -37,6 +38,7 @@ def map_incrementally(
     snapshots_path: Path,
     options: pycolmap.IncrementalPipelineOptions,
     progress: Progress,
+    incremental_mapping: IncrementalMapping = pycolmap.incremental_mapping,
 ) -> None:
     """Write all models to ``models_path``/0, /1, ..., the one with the most photos first.
 
@@ -62,7 +64,7 @@ def map_incrementally(
             snapshots.add_photo()
 
         models = run_in_background(
-            lambda token: pycolmap.incremental_mapping(
+            lambda token: incremental_mapping(
                 database_path,
                 photos.folder,
                 folder,

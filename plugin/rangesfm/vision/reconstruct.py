@@ -18,6 +18,7 @@ from rangesfm.progress import Progress, SilentProgress
 from rangesfm.vision.camera import camera_of_photos, check_camera
 from rangesfm.vision.features import extract_features, feature_options
 from rangesfm.vision.mapping import map_incrementally, pipeline_options, read_models, remove_models
+from rangesfm.vision.mapping_loop import GlobalAdjustment, mapping_with
 from rangesfm.vision.matching import match_features, matching_options
 from rangesfm.vision.photos import Photos, usable_photos
 from rangesfm.vision.renewed_database import RenewedDatabase, forget_database
@@ -55,6 +56,7 @@ def reconstruct(
     progress: Progress | None = None,
     restart: bool = False,
     before_change: Callable[[], None] = lambda: None,
+    adjustment: GlobalAdjustment | None = None,
 ) -> ReconstructionSummary:
     """Reconstruct photos of one camera.
 
@@ -72,6 +74,7 @@ def reconstruct(
         seed: the same one gives the same models.
         restart: take nothing over.
         before_change: called before models of an earlier run are removed or replaced.
+        adjustment: takes the place of COLMAP's global bundle adjustment while the map grows.
 
     Raises:
         InputError: options that COLMAP does not take, or a folder that cannot be written to.
@@ -133,13 +136,16 @@ def reconstruct(
             prepare_matching,
             lambda: match_features(database, photos, for_matching, progress),
         )
-        inputs = fingerprint(inputs, mapper.pipeline, camera.mapping_refines_intrinsics)
+        own = () if adjustment is None else (adjustment.inputs,)
+        inputs = fingerprint(inputs, mapper.pipeline, camera.mapping_refines_intrinsics, *own)
         steps.run(
             "mapping",
             inputs,
             models / "0",
             remove_old_models,
-            lambda: map_incrementally(database, photos, models, snapshots, for_mapping, progress),
+            lambda: map_incrementally(
+                database, photos, models, snapshots, for_mapping, progress, mapping_with(adjustment)
+            ),
             unfinished=snapshots,
         )
     found = read_models(models)

@@ -1,0 +1,231 @@
+"""COLMAP's incremental mapping with a global bundle adjustment of one's own.
+
+The order of things is that of COLMAP's IncrementalPipeline, whose parts do all the work but the global adjustment: with
+COLMAP's own there, the models are the same.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol, TypeAlias
+
+import pycolmap
+
+IncrementalMapping: TypeAlias = Callable[..., dict[int, pycolmap.Reconstruction]]
+"""pycolmap.incremental_mapping, or a function that takes and returns the same."""
+
+
+class GlobalAdjustment(Protocol):
+    """A global bundle adjustment in place of COLMAP's."""
+
+    @property
+    def inputs(self) -> Any:
+        """Plain values; others whenever it would adjust otherwise."""
+
+    def adjust(self, model: pycolmap.Reconstruction) -> bool:
+        """Adjust all of a model, in place; False leaves it, as it was, to COLMAP."""
+
+
+# As in COLMAP: an initial pair that cannot be continued is given up after so many photos.
+_MAX_NUM_INITIAL_TRIALS = 30
+_NUM_RELAXATIONS = 2
+
+
+def mapping_with(adjustment: GlobalAdjustment | None) -> IncrementalMapping:
+    """With an adjustment of one's own; without, COLMAP's."""
+    return pycolmap.incremental_mapping if adjustment is None else partial(_incremental_mapping, adjustment)
+
+
+def _incremental_mapping(
+    adjustment: GlobalAdjustment,
+    database_path: Path,
+    image_path: Path,
+    output_path: Path,
+    *,
+    options: pycolmap.IncrementalPipelineOptions,
+    input_path: Path | str = "",
+    initial_image_pair_callback: Callable[[], None] = lambda: None,
+    next_image_callback: Callable[[], None] = lambda: None,
+    cancellation_token: pycolmap.CancellationToken | None = None,
+) -> dict[int, pycolmap.Reconstruction]:
+    """All models, in the order in which they were begun; also written to ``output_path``, as COLMAP does.
+
+    Args:
+        input_path: a model to go on from.
+    """
+    options.image_path = image_path
+    token = cancellation_token or pycolmap.CancellationToken()
+    manager = pycolmap.ReconstructionManager()
+    if input_path:
+        manager.read(input_path)
+    with pycolmap.Database.open(database_path) as database:
+        pipeline = pycolmap.IncrementalPipeline(options, database, manager)
+    pipeline.add_callback(
+        pycolmap.IncrementalPipelineCallback.INITIAL_IMAGE_PAIR_REG_CALLBACK, initial_image_pair_callback
+    )
+    pipeline.add_callback(pycolmap.IncrementalPipelineCallback.NEXT_IMAGE_REG_CALLBACK, next_image_callback)
+    if pipeline.database_cache.num_images():
+        mapper = pycolmap.IncrementalMapper(pipeline.database_cache)
+        _MappingLoop(pipeline, mapper, options.get_mapper(), adjustment, token).run()
+    manager.write(output_path)
+    return {index: manager.get(index) for index in range(manager.size())}
+
+
+@dataclass(frozen=True)
+class _MappingLoop:
+    """One run of the mapper over a database.
+
+    Attributes:
+        pipeline: COLMAP's, for its options and what it decides. mapper: over the same matches.
+        mapper_options: with the present demands on an initial pair.
+        adjustment: instead of COLMAP's, wherever it can. token: asked between photos whether to stop.
+    """
+
+    pipeline: pycolmap.IncrementalPipeline
+    mapper: pycolmap.IncrementalMapper
+    mapper_options: pycolmap.IncrementalMapperOptions
+    adjustment: GlobalAdjustment
+    token: pycolmap.CancellationToken
+
+    def run(self) -> None:
+        """Map until nothing is left to register, with lower and lower demands on the initial pair."""
+        goes_on = self.pipeline.reconstruction_manager.size() > 0
+        for loop in self._relaxed():
+            is_done = loop._map_models(goes_on)
+            goes_on = False
+            if is_done or self.mapper.num_total_reg_images() == self.pipeline.database_cache.num_images():
+                return
+
+    def _relaxed(self) -> Iterator[_MappingLoop]:
+        yield self
+        options = pycolmap.IncrementalMapperOptions(self.mapper_options.todict())
+        for _ in range(_NUM_RELAXATIONS):
+            options.init_min_num_inliers //= 2
+            self.mapper.reset_initialization_stats()
+            yield replace(self, mapper_options=options)
+            options.init_min_tri_angle /= 2
+            self.mapper.reset_initialization_stats()
+            yield replace(self, mapper_options=options)
+
+    def _map_models(self, goes_on: bool) -> bool:
+        """Model after model, each from another initial pair; whether that was all that is wanted.
+
+        Args:
+            goes_on: with the model that is there, at first.
+        """
+        options, manager = self.pipeline.options, self.pipeline.reconstruction_manager
+        for trial in range(options.init_num_trials):
+            index = 0 if goes_on and trial == 0 else manager.add()
+            model = manager.get(index)
+            status = self._map_model(model)
+            num_images, is_another = model.num_reg_images(), options.multiple_models and manager.size() > 1
+            is_kept = status == pycolmap.IncrementalPipelineStatus.SUCCESS and num_images > 0
+            is_kept = is_kept and not (is_another and num_images < options.min_model_size)
+            # Before the mapper forgets those of a model that is not kept: it has tried them.
+            num_tried = self.mapper.num_total_reg_images()
+            if is_kept:
+                model.update_point_3d_errors()
+            self.mapper.end_reconstruction(discard=not is_kept)
+            if not is_kept:
+                manager.delete(index)
+            if self.token.is_cancelled:
+                return True
+            if status == pycolmap.IncrementalPipelineStatus.NO_INITIAL_PAIR:
+                return False
+            if status == pycolmap.IncrementalPipelineStatus.SUCCESS and (
+                not options.multiple_models
+                or manager.size() >= options.max_num_models
+                or num_tried >= self.pipeline.database_cache.num_images() - 1
+            ):
+                return True
+        return False
+
+    def _map_model(self, model: pycolmap.Reconstruction) -> pycolmap.IncrementalPipelineStatus:
+        """An initial pair, and photo after photo from there."""
+        options, mapper = self.pipeline.options, self.mapper
+        mapper.begin_reconstruction(model)
+        if not model.num_reg_frames():
+            status = self.pipeline.initialize_reconstruction(mapper, self.mapper_options, model)
+            if status != pycolmap.IncrementalPipelineStatus.SUCCESS:
+                return status
+        self.pipeline.callback(pycolmap.IncrementalPipelineCallback.INITIAL_IMAGE_PAIR_REG_CALLBACK)
+        adjusted = model.num_reg_frames(), model.num_points3D()
+        num_in_snapshot, has_failed = model.num_reg_frames(), False
+        while mapper.num_shared_reg_images() < options.max_model_overlap and not self.token.is_cancelled:
+            image_id = self._register_next(model)
+            if image_id is None:
+                # Once more after an adjustment, which may bring photos into reach.
+                if has_failed:
+                    break
+                self._refine_all(model)
+            else:
+                self._refine_around(model, image_id)
+                if self.pipeline.check_run_global_refinement(model, *adjusted):
+                    self._refine_all(model)
+                    adjusted = model.num_reg_frames(), model.num_points3D()
+                if options.extract_colors:
+                    model.extract_colors_for_image(image_id, options.image_path)
+                if 0 < options.snapshot_frames_freq <= model.num_reg_frames() - num_in_snapshot:
+                    num_in_snapshot = model.num_reg_frames()
+                    _write_snapshot(model, Path(options.snapshot_path))
+                self.pipeline.callback(pycolmap.IncrementalPipelineCallback.NEXT_IMAGE_REG_CALLBACK)
+            has_failed = image_id is None
+        if model.num_reg_frames() != adjusted[0] and model.num_points3D() != adjusted[1]:
+            self._refine_all(model)
+        return pycolmap.IncrementalPipelineStatus.SUCCESS
+
+    def _register_next(self, model: pycolmap.Reconstruction) -> int | None:
+        """The photo that was registered, by its points or else by its matches; None: none could be."""
+        options, mapper = self.pipeline.options, self.mapper
+        without_points = [True] if options.structure_less_registration_only else [False]
+        if options.structure_less_registration_fallback and not options.structure_less_registration_only:
+            without_points.append(True)
+        for structure_less in without_points:
+            register = mapper.register_next_structure_less_image if structure_less else mapper.register_next_image
+            next_images = mapper.find_next_images(self.mapper_options, structure_less=structure_less)
+            for trial, image_id in enumerate(next_images):
+                if register(self.mapper_options, image_id):
+                    return image_id
+                if trial >= _MAX_NUM_INITIAL_TRIALS and model.num_reg_images() < options.min_model_size:
+                    break
+        return None
+
+    def _refine_around(self, model: pycolmap.Reconstruction, image_id: int) -> None:
+        options = self.pipeline.options
+        self.mapper.triangulate_image(options.get_triangulation(), image_id)
+        self.mapper.iterative_local_refinement(
+            options.ba_local_max_refinements,
+            options.ba_local_max_refinement_change,
+            self.mapper_options,
+            options.get_local_bundle_adjustment(),
+            options.get_triangulation(),
+            image_id,
+        )
+
+    def _refine_all(self, model: pycolmap.Reconstruction) -> None:
+        """Adjust the whole model, and its tracks to it, until they change no more."""
+        options, mapper = self.pipeline.options, self.mapper
+        triangulation = options.get_triangulation()
+        mapper.complete_and_merge_tracks(triangulation)
+        mapper.retriangulate(triangulation)
+        for _ in range(options.ba_global_max_refinements):
+            num_observations = model.compute_num_observations()
+            mapper.observation_manager.filter_observations_with_negative_depth()
+            if not self.adjustment.adjust(model):
+                mapper.adjust_global_bundle(self.mapper_options, options.get_global_bundle_adjustment())
+            model.normalize()
+            num_changed = mapper.complete_and_merge_tracks(triangulation) + mapper.filter_points(self.mapper_options)
+            if num_changed < options.ba_global_max_refinement_change * num_observations:
+                break
+        mapper.filter_frames(self.mapper_options)
+
+
+def _write_snapshot(model: pycolmap.Reconstruction, path: Path) -> None:
+    """Under the time in milliseconds, as COLMAP does."""
+    folder = path / f"{time.time_ns() // 1_000_000:010d}"
+    folder.mkdir()
+    model.write_binary(folder)

@@ -1,0 +1,155 @@
+"""The mapper's loop with another global adjustment: the same as COLMAP's where that adjustment is COLMAP's."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+import pytest
+from tests.studies.simulated_database import write_database
+
+from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.simulate.model import synthetic_model
+from rangesfm.simulate.path import loop_path
+from rangesfm.vision.mapping import pipeline_options
+from rangesfm.vision.mapping_loop import mapping_with
+
+NUM_PHOTOS = 16
+
+
+@pytest.fixture(scope="module")
+def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Matches of half a walk round a yard, and of the photos after a gap that none of them bridges."""
+    times = np.linspace(0.0, 20.0, NUM_PHOTOS)
+    path = loop_path(20.0, num_turns=0.4, seed=1)
+    model = synthetic_model(
+        times, path.centers(times), path.world_from_cam(times), num_observations=150, max_track_length=6
+    )
+    for point_id, point in list(model.reconstruction.points3D.items()):
+        seen = [element.image_id for element in point.track.elements]
+        if min(seen) <= 10 < max(seen):
+            model.reconstruction.delete_point3D(point_id)
+    num = sum(len(image.points2D) for image in model.reconstruction.images.values())
+    found = tmp_path_factory.mktemp("database") / "database.db"
+    write_database(found, model.reconstruction, 0.3 * np.random.default_rng(0).standard_normal((num, 2)))
+    return found
+
+
+@pytest.fixture
+def options() -> pycolmap.IncrementalPipelineOptions:
+    pipeline = {
+        "min_model_size": 3,
+        "extract_colors": False,
+        "mapper": {"init_min_num_inliers": 20, "abs_pose_min_num_inliers": 15},
+    }
+    camera = CameraOptions("PINHOLE", (750.0, 750.0, 480.0, 320.0))
+    return pipeline_options(camera, MapperOptions(num_threads=1, pipeline=pipeline), seed=0)
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    adjust: Callable[[pycolmap.Reconstruction], bool]
+    inputs: str = ""
+
+
+def mapped(
+    database: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+    adjust: Callable[[pycolmap.Reconstruction], bool],
+    **arguments: Any,
+) -> list[pycolmap.Reconstruction]:
+    output = database.with_name("models")
+    shutil.rmtree(output, ignore_errors=True)
+    output.mkdir()
+    models = mapping_with(Adjustment(adjust))(database, database.parent, output, options=options, **arguments)
+    return list(models.values())
+
+
+def centers(model: pycolmap.Reconstruction) -> npt.NDArray[np.float64]:
+    return np.array([model.image(image_id).projection_center() for image_id in sorted(model.reg_image_ids())])
+
+
+def test_what_is_left_to_colmap_gives_colmaps_models(
+    database: Path, options: pycolmap.IncrementalPipelineOptions, tmp_path: Path
+) -> None:
+    sizes: list[int] = []
+
+    def leave_it(model: pycolmap.Reconstruction) -> bool:
+        sizes.append(model.num_reg_images())
+        return False
+
+    expected = pycolmap.incremental_mapping(database, tmp_path, tmp_path / "models", options=options)
+    found = mapped(database, options, leave_it)
+    assert [model.num_reg_images() for model in expected.values()] == [10, 6]
+    for theirs, ours in zip(expected.values(), found, strict=True):
+        assert set(ours.reg_image_ids()) == set(theirs.reg_image_ids())
+        assert ours.num_points3D() == theirs.num_points3D()
+        assert np.abs(centers(ours) - centers(theirs)).max() < 1e-8
+    assert len(set(sizes)) > 3
+    assert max(sizes) == 10
+
+
+def test_the_adjustment_is_the_last_to_move_the_map(
+    database: Path, options: pycolmap.IncrementalPipelineOptions
+) -> None:
+    """One that bends the map beyond what COLMAP's own would leave it at."""
+    stretch = np.diag([1.0, 1.0, 1.02])
+
+    def bend(model: pycolmap.Reconstruction) -> bool:
+        assert model.num_reg_images() > 2
+        for frame_id in model.reg_frame_ids():
+            pose = model.frame(frame_id).rig_from_world
+            assert pose is not None
+            rotation = pose.rotation.matrix()
+            pose.params[4:] = rotation @ stretch @ rotation.T @ pose.translation
+        bent.append(centers(model))
+        return True
+
+    bent: list[npt.NDArray[np.float64]] = []
+    options.multiple_models = False
+    (model,) = mapped(database, options, bend)
+    last = centers(model)
+    assert len(bent) > 3
+    # COLMAP normalises the map in between: a similarity without rotation.
+    ratio = np.ptp(last, axis=0) / np.ptp(bent[-1], axis=0)
+    assert ratio == pytest.approx(np.full(3, ratio.mean()), rel=1e-9)
+
+
+def test_cancelled_mapping_ends_with_the_photo_at_hand(
+    database: Path, options: pycolmap.IncrementalPipelineOptions
+) -> None:
+    token, sizes = pycolmap.CancellationToken(), list[int]()
+
+    def cancel_the_second_time(model: pycolmap.Reconstruction) -> bool:
+        sizes.append(model.num_reg_images())
+        if len(sizes) == 2:
+            token.cancel()
+        return False
+
+    (model,) = mapped(database, options, cancel_the_second_time, cancellation_token=token)
+    assert 2 < model.num_reg_images() < 10
+
+
+def test_a_mapping_goes_on_from_a_snapshot_of_its_own(
+    database: Path, options: pycolmap.IncrementalPipelineOptions, tmp_path: Path
+) -> None:
+    options.snapshot_path, options.snapshot_frames_freq, options.multiple_models = tmp_path, 2, False
+    (whole,) = mapped(database, options, lambda model: False)
+    snapshots = [pycolmap.Reconstruction(folder) for folder in sorted(tmp_path.iterdir())]
+    assert [model.num_reg_images() for model in snapshots] == [4, 6, 8, 10]
+    options.snapshot_frames_freq, registered = 0, list[str]()
+    (continued,) = mapped(
+        database,
+        options,
+        lambda model: False,
+        input_path=sorted(tmp_path.iterdir())[1],
+        next_image_callback=lambda: registered.append(""),
+    )
+    assert len(registered) == 4
+    assert set(continued.reg_image_ids()) == set(whole.reg_image_ids())
