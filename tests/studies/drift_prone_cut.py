@@ -1,0 +1,169 @@
+"""A survey of yours, with true positions, cut into one that drifts: no photo knows any but its neighbours.
+
+Run: python tests/studies/drift_prone_cut.py SURVEY.toml --base_path DATA --output_path OUT [--first 0]
+     [--num_photos 120] [--overlap 2] [--max_num_features 1000] [--ranges_in_mapping]
+ or: python tests/studies/drift_prone_cut.py SURVEY.toml --base_path DATA --output_path OUT --input_path sparse/0
+     [--max_track_length 3] [--share_of_points 0.15] [--num_seeds 3]
+
+The first maps a stretch of successive photos (all of them, whatever the survey file thins out, so that neighbours
+overlap well), each matched with the ``--overlap`` ones before it and with no other: no place that is seen again closes
+a loop. What was matched and mapped before in OUT is used again.
+
+In a room even such a sequence hardly drifts, for features are seen many times over. The second therefore takes a model
+that is there and gives it the memory of a fast camera: of its points a random share, each track cut into pieces of
+successive photos, from a random one on, and all adjusted again from there, without ranges, until it is still. Features
+and their errors are as they were; the drift is what the photos then have no say against.
+
+Prints root mean square errors of the keyframes' centres, in metres, without alignment, after the best rigid motion and
+after the best similarity: of the unscaled model, at the true scale, at the estimated one and refined. The survey file
+names reference, anchors and ranges.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from rangesfm.comparison import ComparisonRow, compare, format_table
+from rangesfm.config import Survey, read_survey
+from rangesfm.errors import InputError
+from rangesfm.inputs import read_ranging_inputs, times_of_model
+from rangesfm.pipeline import refine_model
+from rangesfm.progress import SilentProgress
+from rangesfm.ranges_in_mapping import AdjustmentWithRanges
+from rangesfm.trajectory import trajectory_from_reconstruction
+from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images
+from rangesfm.vision.reconstruct import reconstruct
+
+# What differs little from the last steps of a solver that converges.
+_TOLERANCE = 1e-10
+_MAX_NUM_ITERATIONS = 200
+_NUM_ROUNDS = 3
+# As COLMAP's mapper filters: points of less parallax may go behind the horizon.
+_MAX_REPROJECTION_ERROR_PX = 4.0
+_MIN_TRI_ANGLE_DEG = 1.5
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("survey", type=Path)
+    parser.add_argument("--base_path", type=Path)
+    parser.add_argument("--output_path", type=Path, required=True)
+    parser.add_argument("--first", type=int, default=0, help="photo with which the stretch begins, from 0")
+    parser.add_argument("--num_photos", type=int, default=120)
+    parser.add_argument("--overlap", type=int, default=2)
+    parser.add_argument("--max_num_features", type=int, default=1000)
+    parser.add_argument("--ranges_in_mapping", action="store_true")
+    parser.add_argument("--input_path", type=Path, help="a model, instead of mapping")
+    parser.add_argument("--max_track_length", type=int, default=3, help="photos in a piece of a track of that model")
+    parser.add_argument("--share_of_points", type=float, default=0.15, help="of that model")
+    parser.add_argument("--num_seeds", type=int, default=3, help="choices of points and pieces")
+    args = parser.parse_args()
+    survey = read_survey(args.survey, {"output.path": str(args.output_path.absolute())}, args.base_path)
+    args.output_path.mkdir(parents=True, exist_ok=True)
+    if args.input_path is None:
+        times = times_of_stretch(survey, args.first, args.num_photos)
+        sfm = mapped(survey, times, args.overlap, args.max_num_features, ranges_in_mapping=args.ranges_in_mapping)
+        print_row(survey, sfm)
+    else:
+        whole = pycolmap.Reconstruction(args.input_path)
+        for seed in range(args.num_seeds):
+            print_row(survey, forgetful(whole, args.max_track_length, args.share_of_points, seed))
+
+
+def times_of_stretch(survey: Survey, first: int, num_photos: int) -> ImageTimes:
+    assert survey.images_path is not None
+    times = find_image_times(survey.images_path, list_images(survey.images_path), survey.image_times_path)
+    return times.of(times.image_names[first : first + num_photos])
+
+
+def mapped(
+    survey: Survey, times: ImageTimes, overlap: int, max_num_features: int, *, ranges_in_mapping: bool
+) -> pycolmap.Reconstruction:
+    """The largest model of the stretch."""
+    mapper = replace(
+        survey.mapper,
+        matching="sequential",
+        pairing={"overlap": overlap, "quadratic_overlap": False},
+        features={"sift": {"max_num_features": max_num_features}},
+    )
+    adjustment = AdjustmentWithRanges(survey, read_ranging_inputs(survey), times.image_names[0], times)
+    assert survey.images_path is not None
+    summary = reconstruct(
+        survey.images_path,
+        times.image_names,
+        survey.output_path,
+        camera=survey.camera,
+        mapper=mapper,
+        seed=survey.seed,
+        adjustment=adjustment if ranges_in_mapping else None,
+    )
+    if note := adjustment.note():
+        print(note)
+    return summary.models[0]
+
+
+def forgetful(
+    whole: pycolmap.Reconstruction, max_track_length: int, share_of_points: float, seed: int
+) -> pycolmap.Reconstruction:
+    """Some of the features in tracks of few successive photos, bundle-adjusted without ranges."""
+    model, rng = pycolmap.Reconstruction(whole), np.random.default_rng(seed)
+    for point_id, point in sorted(whole.points3D.items()):
+        model.delete_point3D(point_id)
+        if rng.random() > share_of_points:
+            continue
+        # Names of photos are in the order of time.
+        elements = sorted(point.track.elements, key=lambda element: whole.image(element.image_id).name)
+        begin = -int(rng.integers(max_track_length))
+        for start in range(begin, len(elements), max_track_length):
+            piece = elements[max(start, 0) : start + max_track_length]
+            if len({element.image_id for element in piece}) > 1:
+                model.add_point3D(point.xyz, pycolmap.Track(piece))
+    for _ in range(_NUM_ROUNDS):
+        pycolmap.ObservationManager(model).filter_all_points3D(_MAX_REPROJECTION_ERROR_PX, _MIN_TRI_ANGLE_DEG)
+        adjust_alone(model)
+    return model
+
+
+def adjust_alone(model: pycolmap.Reconstruction) -> None:
+    """Photos alone, in place."""
+    options = pycolmap.BundleAdjustmentOptions(
+        print_summary=False, refine_focal_length=False, refine_extra_params=False
+    )
+    solver = options.ceres.solver_options
+    solver.max_num_iterations = _MAX_NUM_ITERATIONS
+    solver.function_tolerance = solver.gradient_tolerance = solver.parameter_tolerance = _TOLERANCE
+    options.ceres.solver_options = solver
+    pycolmap.bundle_adjustment(model, options)
+
+
+def print_row(survey: Survey, sfm: pycolmap.Reconstruction) -> None:
+    """Unscaled, scaled and refined against the reference."""
+    lengths = [point.track.length() for point in sfm.points3D.values()]
+    print(f"{sfm.num_reg_images()} photos, {len(lengths)} points, seen {np.mean(lengths):.1f} times on average")
+    path = survey.output_path / "cut"
+    path.mkdir(exist_ok=True)
+    sfm.write_binary(path)
+    reference = read_ranging_inputs(survey).reference
+    if reference is None:
+        raise InputError("no true positions: give [report] reference in the survey file")
+    times = times_of_model(survey, sfm, path)
+    unscaled = compare({"unscaled": trajectory_from_reconstruction(sfm, times.by_name())}, reference, frame=None)
+    cut = replace(
+        survey,
+        model_path=path.absolute(),
+        output_path=survey.output_path / "result",
+        refine=replace(survey.refine, covariance=False),
+        report_enabled=False,
+    )
+    result = refine_model(cut, progress=SilentProgress()).result
+    print(format_table((*unscaled, *(ComparisonRow(**row) for row in result["comparison"]))))
+    print(f"{result['refine']['iterations']} iterations of the full problem\n", flush=True)
+
+
+if __name__ == "__main__":
+    main()
