@@ -33,6 +33,7 @@ metric, summary = rangesfm.refine_with_ranges(
     estimate.anchors,
     tag_in_cam_m=tag_in_cam_m,
     range_stddev_m=estimate.range_stddev_m,
+    range_share=estimate.range_share,
     correlation_inflation=estimate.correlation_inflation,
     first_pose_is_fixed=True,
 )

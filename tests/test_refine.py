@@ -514,12 +514,39 @@ class TestWithNoise:
             scale.anchors,
             observations=scale.observations,
             range_stddev_m=scale.range_stddev_m,
+            range_share=scale.range_share,
             stddev_is_estimated=np.ones(len(survey.observations.log), dtype=bool),
             correlation_inflation=scale.correlation_inflation,
         )
         before, after = scale.metric_from_sfm.apply(survey.trajectory.centers), survey.centers(refined)
         assert rmse(before - survey.centers_m) < 0.1
         assert rmse(after - before) < 0.01
+
+    def test_a_place_where_the_camera_lingered_draws_the_map_no_more_than_in_the_scale(self) -> None:
+        """Ranges of one place err alike; three of twenty places have most of them."""
+        survey = make_survey("first_camera", pixel_stddev=0.3, num_epochs=60, seed=1)
+        log, rng = survey.observations.log, np.random.default_rng(1)
+        place = 4 * survey.observations.before + log.anchor_index
+        errors = 0.1 * rng.standard_normal(80)[place] + 0.03 * rng.standard_normal(len(log))
+        observations = replace(survey.observations, log=replace(log, range_m=log.range_m + errors))
+        taken = np.isin(observations.before, [2, 3, 9]) | (np.arange(len(log)) % 15 == 0)
+        status = np.where(taken, observations.status, RangeStatus.UNKNOWN_ANCHOR).astype(np.int8)
+        surveyed = [Anchor(name, survey.anchors_m[name]) for name in log.anchor_ids]
+        scale = initialize_scale(
+            replace(observations, status=status), survey.trajectory, surveyed, anchor_frame="first_camera"
+        )
+        moved = {}
+        for name, share in (("weighed", scale.range_share), ("alike", None)):
+            refined, _ = replace(survey, metric_from_sfm=scale.metric_from_sfm).refine(
+                scale.anchors,
+                observations=scale.observations,
+                range_stddev_m=scale.range_stddev_m,
+                range_share=share,
+                correlation_inflation=scale.correlation_inflation,
+            )
+            moved[name] = rmse(survey.centers(refined) - scale.metric_from_sfm.apply(survey.trajectory.centers))
+        assert moved["weighed"] < 0.003
+        assert moved["alike"] > 0.01
 
     def test_drift_is_bent_back(self) -> None:
         """No similarity can do it: the refined centres are nearer to the truth than after the best one."""

@@ -35,13 +35,13 @@ namespace {
 
 using OptionalArray = std::optional<Array>;
 
-MeasuredRanges Measured(const Array& range_m, const Array& stddev_m) {
+MeasuredRanges Measured(const Array& range_m, const Array& stddev_m, const Array& share) {
   if (range_m.ndim() > 1 || range_m.size() == 0) {
     FailOnShape("range_m", range_m, "one number, or one dimension and one number or more");
   }
   const Eigen::Index num_ranges = range_m.size();
   return {ForEachRange("range_m", range_m, num_ranges, Positive),
-          ForEachRange("stddev_m", stddev_m, num_ranges, Positive)};
+          ForEachRange("stddev_m", stddev_m, num_ranges, Positive), ForEachRange("share", share, num_ranges, Positive)};
 }
 
 // Distance and error in the two columns.
@@ -182,16 +182,16 @@ void DefineRangeCost(py::module_& m, const char* name,
                      const PlaceArguments&... place_arguments) {
   m.def(
       name,
-      [make](const Array& range_m, const Array& stddev_m, OfPlace... of_place, bool has_common_bias,
+      [make](const Array& range_m, const Array& stddev_m, OfPlace... of_place, const Array& share, bool has_common_bias,
              std::optional<double> short_range_length_m, const OptionalArray& error_curve_m, double loss_scale_too_long,
              double loss_scale_too_short, bool loss_is_bounded) {
-        return make(Measured(range_m, stddev_m),
+        return make(Measured(range_m, stddev_m, share),
                     Model(has_common_bias, short_range_length_m, error_curve_m, loss_scale_too_long,
                           loss_scale_too_short, loss_is_bounded),
                     of_place...);
       },
       kOwn, py::kw_only(), py::arg("range_m"), py::arg("stddev_m"), place_arguments...,
-      py::arg("has_common_bias") = false, py::arg("short_range_length_m") = py::none(),
+      py::arg("share") = 1.0, py::arg("has_common_bias") = false, py::arg("short_range_length_m") = py::none(),
       py::arg("error_curve_m") = py::none(), py::arg("loss_scale_too_long") = kLeastSquares,
       py::arg("loss_scale_too_short") = kLeastSquares, py::arg("loss_is_bounded") = false);
 }

@@ -31,7 +31,7 @@ Eigen::Matrix3Xd Vectors(Random& random, int size, double stddev) {
 }
 
 MeasuredRanges Measured(Random& random, int size, double max_range) {
-  return {Uniform(random, size, 0.1, max_range), Uniform(random, size, 0.05, 1.0)};
+  return {Uniform(random, size, 0.1, max_range), Uniform(random, size, 0.05, 1.0), Uniform(random, size, 0.2, 2.0)};
 }
 
 InterpolatedPlace Between(Random& random, int size, double interval) {
@@ -158,7 +158,8 @@ TEST(RangeModel, ManyRangesAreAsManyCostsOfOne) {
   for (int i = 0; i < kNumRanges; ++i) {
     const RangeCost<InterpolatedPlace> cost(
         InterpolatedPlace(weight.segment(i, 1), offset.col(i), 0.7, velocity.col(i)),
-        OneRange(measured.range[i], measured.stddev[i]), model);
+        MeasuredRanges{measured.range.segment(i, 1), measured.stddev.segment(i, 1), measured.share.segment(i, 1)},
+        model);
     const Evaluation one = Evaluate(cost, blocks);
     EXPECT_EQ(many.residuals[i], one.residuals[0]);
     for (size_t block = 0; block < blocks.size(); ++block) {
@@ -167,6 +168,18 @@ TEST(RangeModel, ManyRangesAreAsManyCostsOfOne) {
                 one.jacobians[block]);
     }
   }
+}
+
+TEST(RangeModel, AShareMultipliesTheLossOfItsRange) {
+  RangeModel model = WithLeverArm(Eigen::Vector3d::Zero());
+  model.loss = TwoSidedLoss(2.0, 3.0, true);
+  const std::vector<Block> blocks = {{0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0}, {3.0, 4.0, 0.0}, {0.0}};
+  MeasuredRanges measured = OneRange(4.6, 0.1);
+  const double whole = Evaluate(RangeCost<KeyframePlace>(KeyframePlace(), measured, model), blocks).residuals[0];
+  EXPECT_NEAR(whole, 4.0 / std::sqrt(1.0 + 16.0 / 9.0), 1e-9);
+  measured.share[0] = 0.25;
+  const double part = Evaluate(RangeCost<KeyframePlace>(KeyframePlace(), measured, model), blocks).residuals[0];
+  EXPECT_DOUBLE_EQ(part * part, 0.25 * whole * whole);
 }
 
 TEST(RangeModel, AFreeLeverArmIsTheConstantOneWithAGradient) {

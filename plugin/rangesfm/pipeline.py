@@ -477,6 +477,7 @@ def _refine(survey: Survey, inputs: RangingInputs, metric: MetricSurvey) -> Metr
         estimate.anchors,
         tag_in_cam_m=inputs.tag_in_cam_m,
         range_stddev_m=estimate.range_stddev_m,
+        range_share=estimate.range_share,
         stddev_is_estimated=_noise_is_estimated(survey, estimate.observations.log),
         correlation_inflation=estimate.correlation_inflation,
         common_bias_stddev_m=survey.ranges.model.common_bias_stddev_m,

@@ -21,7 +21,7 @@ from rangesfm.ranging.anchors import AnchorEstimate
 from rangesfm.ranging.observations import RangeObservations, status_by_weight
 from rangesfm.ranging.robust_loss import wider
 from rangesfm.ranging.shared_errors import CURVE_STDDEV_M
-from rangesfm.refinement.antennas import antennas, predicted_ranges, tags_in_cam
+from rangesfm.refinement.antennas import antenna_positions, antennas, predicted_ranges, tags_in_cam
 from rangesfm.refinement.bundle_adjustment import (
     BundleAdjustment,
     Solution,
@@ -115,6 +115,7 @@ def refine_with_ranges(
     *,
     tag_in_cam_m: npt.ArrayLike,
     range_stddev_m: Array,
+    range_share: Array | None = None,
     stddev_is_estimated: npt.NDArray[np.bool_] | None = None,
     correlation_inflation: float = 1.0,
     common_bias_stddev_m: float = RangeModelOptions.common_bias_stddev_m,
@@ -134,8 +135,9 @@ def refine_with_ranges(
             held, one with a finite prior is drawn to it, others are free.
         tag_in_cam_m: (3,) antenna in the camera (rig) frame; or (num_tags, 3), in the order of the log's tags.
         range_stddev_m: (n,) of each range.
+        range_share: (n,) by how much each counts beside its stddev, as ranges from one place err alike; None: all 1.
         stddev_is_estimated: (n,) which of these come from residuals of the scaled map, which drift makes too large:
-            they are estimated anew, each anchor's for itself, and the inflation with them. None: all are known.
+            they are estimated anew, each anchor's for itself, and shares and inflation with them. None: all are known.
         correlation_inflation: how much the ranges' correlation in time reduces their say.
         common_bias_stddev_m: of the bias that all anchors share (mean 0), of which their priors say nothing.
         first_pose_is_fixed: the gauge: True in the first camera's frame, False where
@@ -179,7 +181,9 @@ def refine_with_ranges(
     )
     weights = range_weights(
         observations,
+        antenna_positions(metric, trajectory, placed),
         range_stddev_m,
+        range_share,
         correlation_inflation,
         stddev_is_estimated,
         metric_from_sfm.scale,

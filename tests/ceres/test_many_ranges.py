@@ -143,6 +143,23 @@ def test_ranges_at_one_keyframe_become_one_by_least_squares(
     assert gradient_norm(combined) == pytest.approx(gradient_norm(separate), rel=1e-9)
 
 
+@pytest.mark.parametrize("loss_scale", [np.inf, 2.0], ids=["least squares", "robust"])
+def test_a_range_counts_as_often_as_its_share_says(
+    reconstruction: pycolmap.Reconstruction,
+    ranges: PlacedRanges,
+    adjuster_of: AdjusterOf,
+    pose_block: PoseBlock,
+    loss_scale: float,
+) -> None:
+    blocks = blocks_of(reconstruction, pose_block)
+    model = RangeErrorModel(loss_scale_too_long=loss_scale, loss_scale_too_short=loss_scale)
+    thrice, shared = adjuster_of(reconstruction), adjuster_of(reconstruction)
+    lost = sum(add_ranges(thrice, ranges, blocks, model).constant_cost for _ in range(3))
+    added = add_ranges(shared, replace(ranges, share=np.full(NUM_RANGES, 3.0)), blocks, model)
+    assert gradient_norm(shared) == pytest.approx(gradient_norm(thrice), rel=1e-9)
+    assert cost_of(shared) + added.constant_cost == pytest.approx(cost_of(thrice) + lost, rel=1e-9)
+
+
 def test_everything_that_can_be_estimated_reaches_its_block(
     reconstruction: pycolmap.Reconstruction, ranges: PlacedRanges, adjuster_of: AdjusterOf, pose_block: PoseBlock
 ) -> None:

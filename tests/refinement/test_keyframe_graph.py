@@ -43,6 +43,7 @@ def make_graph(
         anchor_index=index,
         range_m=np.linalg.norm(at - ANCHORS_M[index], axis=1) + 0.05,
         stddev_m=np.full(len(index), stddev_m),
+        share=np.ones(len(index)),
         anchors=tuple(anchor(k, anchors_are_free) for k in range(m)),
         common_bias_stddev_m=0.1,
         held_frame=held_frame,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -24,6 +26,8 @@ def make_weights(stddev_m: float = 1.0, *, is_estimated: bool = True) -> RangeWe
         is_estimated=np.full(n, is_estimated),
         anchor_index=np.arange(n) % 3,
         block=rounds // 20,
+        place=np.arange(n),
+        place_share=np.ones(n),
         loss=CAUCHY,
     )
 
@@ -60,6 +64,24 @@ def test_what_the_map_takes_from_the_residuals_is_given_back() -> None:
 def test_slow_errors_weigh_less_than_their_size_says() -> None:
     slow = np.repeat(np.random.default_rng(1).standard_normal(20), 60) * 0.2
     assert make_weights().estimated(noise((0.1, 0.1, 0.1)) + slow, 0.0).inflation > 3
+
+
+def test_ranges_of_one_place_that_err_alike_count_for_less() -> None:
+    """A hundred places of two ranges to each anchor, and then one place for all the rest."""
+    num_places = 101
+    rounds = np.minimum(np.arange(3 * NUM_EACH) // 3 // 2, num_places - 1)
+    place = rounds + num_places * (np.arange(3 * NUM_EACH) % 3)
+    alike = 0.1 * np.random.default_rng(2).standard_normal(3 * num_places)[place]
+    weights = replace(make_weights(), place=place)
+    apart, together = (
+        weights.estimated(noise((0.1, 0.1, 0.1)), 0.0),
+        weights.estimated(noise((0.1, 0.1, 0.1)) + alike, 0.0),
+    )
+    lingered = rounds == num_places - 1
+    assert apart.place_share[lingered].mean() > 0.5 * apart.place_share[~lingered].mean()
+    assert together.place_share[lingered].mean() < 0.1 * together.place_share[~lingered].mean()
+    as_if_each_its_own = make_weights().estimated(noise((0.1, 0.1, 0.1)) + alike, 0.0)
+    assert together.inflation < 0.7 * as_if_each_its_own.inflation
 
 
 def test_known_noise_stays_as_it_is() -> None:

@@ -152,6 +152,7 @@ def scale_error(case: Case, model: SyntheticModel, seed: int) -> float:
         estimate.anchors,
         tag_in_cam_m=TAG_IN_CAM_M,
         range_stddev_m=estimate.range_stddev_m,
+        range_share=estimate.range_share,
         correlation_inflation=estimate.correlation_inflation,
         first_pose_is_fixed=estimate.frame != "site",
         camera=CameraOptions(refine_intrinsics=False),

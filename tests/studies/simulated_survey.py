@@ -229,6 +229,7 @@ def run_stages(
         estimate.anchors,
         tag_in_cam_m=TAG_IN_CAM_M,
         range_stddev_m=estimate.range_stddev_m if range_stddev_m is None else np.full(num, range_stddev_m),
+        range_share=estimate.range_share if is_estimated else None,
         stddev_is_estimated=np.full(num, is_estimated),
         correlation_inflation=estimate.correlation_inflation if is_estimated else 1.0,
         common_bias_stddev_m=RANGE_MODEL.common_bias_stddev_m,

@@ -18,7 +18,8 @@ namespace rangesfm {
 // Ranges as measured, n of them.
 struct MeasuredRanges {
   Eigen::VectorXd range;
-  Eigen::VectorXd stddev;
+  Eigen::VectorXd stddev;  // in which the loss counts
+  Eigen::VectorXd share;   // by how much each counts beside that: what its loss is multiplied by
 };
 
 // How a range follows from the two antennas, and what of that is estimated along with the map.
@@ -34,7 +35,7 @@ struct RangeModel {
 //
 //   (d + bias + common_bias + amplitude error_curve(d) - range) / stddev,  d = || tag_in_world - anchor_in_world ||,
 //
-// made robust one by one. Metres and seconds throughout. Needs the model to be metric already, or close to it.
+// made robust one by one, times the root of its share. Metres and seconds throughout. Needs the model to be metric already, or close to it.
 //
 // Blocks: those of the place's poses (7 each: qx qy qz qw tx ty tz), anchor_in_world (3), range bias (1: what the radio
 // reads too long), and, as far as the model has them, in this order: tag_in_cam (3), time shift (1), common bias (1),
@@ -46,6 +47,7 @@ class RangeCost final : public ceres::CostFunction {
       : place_(std::move(place)),
         range_(std::move(measured.range)),
         inv_stddev_(measured.stddev.cwiseInverse()),
+        root_share_(measured.share.cwiseSqrt()),
         model_(std::move(model)) {
     set_num_residuals(static_cast<int>(range_.size()));
     for (int pose = 0; pose < Place::kNumPoses; ++pose) {
@@ -68,9 +70,9 @@ class RangeCost final : public ceres::CostFunction {
       const double amplitude = Number(parameters, amplitude_);
       const double predicted = anchor_to_tag.Distance() + bias + amplitude * curve.value;
       const TwoSidedLoss::Robust robust = model_.loss((predicted - range_[i]) * inv_stddev_[i]);
-      residuals[i] = robust.value;
+      residuals[i] = root_share_[i] * robust.value;
       if (jacobians != nullptr) {
-        const double of_range = robust.slope * inv_stddev_[i];
+        const double of_range = root_share_[i] * robust.slope * inv_stddev_[i];
         const double of_distance = of_range * (1.0 + amplitude * curve.slope);
         WriteGeometry(i, place, of_distance * anchor_to_tag.Direction(), jacobians);
         WriteNumber(i, bias_, of_range, jacobians);
@@ -139,6 +141,7 @@ class RangeCost final : public ceres::CostFunction {
   const Place place_;
   const Eigen::VectorXd range_;
   const Eigen::VectorXd inv_stddev_;
+  const Eigen::VectorXd root_share_;
   const RangeModel model_;
   int anchor_ = kNone;
   int bias_ = kNone;

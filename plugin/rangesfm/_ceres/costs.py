@@ -52,13 +52,15 @@ def range_cost(
     range_m: npt.ArrayLike,
     tag_in_cam_m: npt.ArrayLike | None,
     stddev_m: npt.ArrayLike,
+    share: npt.ArrayLike = 1.0,
     has_common_bias: bool = False,
     error_model: RangeErrorModel | None = None,
 ) -> CostFunction:
     """Ranges measured at one keyframe to one anchor; each is a residual, ``(predicted - range) / stddev`` with
 
     ``predicted = d + bias + common_bias + amplitude * curve(d)``, ``d = ||R^T (tag_in_cam - t) - anchor||``,
-    made robust for itself (see ``RangeErrorModel``): half the sum of squares is the sum of the losses.
+    made robust for itself (see ``RangeErrorModel``): half the sum of squares is the sum of the losses, each times its
+    share.
 
     Blocks: rig_from_world (7,), anchor in the world (3,), range bias (1,): what the radio reads too long. Then,
     as far as they are asked for and in this order: tag_in_cam (3,), common bias (1,), amplitude (1,).
@@ -68,6 +70,7 @@ def range_cost(
         range_m: one, or (n,) ranges as measured, positive.
         tag_in_cam_m: (3,) lever arm, the tag's antenna in the rig frame; None makes it a block.
         stddev_m: noise of all ranges, or (n,) of each, positive.
+        share: by how much all ranges count beside their noise, or (n,) each, positive.
         has_common_bias: whether a second bias, shared with other anchors, is a block.
         error_model: None is that of least squares, without a curve.
 
@@ -82,6 +85,7 @@ def range_cost(
         range_m=range_m,
         stddev_m=stddev_m,
         tag_in_cam_m=tag_in_cam_m,
+        share=share,
         has_common_bias=has_common_bias,
         **_keywords(error_model),
     )
@@ -92,6 +96,7 @@ def fixed_pose_range_cost(
     range_m: npt.ArrayLike,
     tag_in_world_m: npt.ArrayLike,
     stddev_m: npt.ArrayLike,
+    share: npt.ArrayLike = 1.0,
     has_common_bias: bool = False,
     error_model: RangeErrorModel | None = None,
 ) -> CostFunction:
@@ -107,6 +112,7 @@ def fixed_pose_range_cost(
         range_m=range_m,
         stddev_m=stddev_m,
         tag_in_world_m=tag_in_world_m,
+        share=share,
         has_common_bias=has_common_bias,
         **_keywords(error_model),
     )
@@ -121,6 +127,7 @@ def interpolated_range_cost(
     stddev_m: npt.ArrayLike,
     interval_s: float | None = None,
     offset_velocity_in_world_m_per_s: npt.ArrayLike | None = None,
+    share: npt.ArrayLike = 1.0,
     has_common_bias: bool = False,
     error_model: RangeErrorModel | None = None,
 ) -> CostFunction:
@@ -151,6 +158,7 @@ def interpolated_range_cost(
         offset_in_world_m=offset_in_world_m,
         interval_s=interval_s,
         offset_velocity_in_world_m_per_s=offset_velocity_in_world_m_per_s,
+        share=share,
         has_common_bias=has_common_bias,
         **_keywords(error_model),
     )

@@ -34,6 +34,7 @@ class PlacedRanges:
         tag_index: (n,) in ``RangeBlocks.tags_in_cam``.
         interval_s: (n,) time from ``before`` to ``after``; needed only for a time shift.
         offset_velocity_in_world_m_per_s: (n, 3) how the offset changes with time; None: not at all.
+        share: (n,) by how much each counts beside its noise, positive; None: 1.
     """
 
     range_m: Array
@@ -46,6 +47,11 @@ class PlacedRanges:
     tag_index: Indices
     interval_s: Array | None = None
     offset_velocity_in_world_m_per_s: Array | None = None
+    share: Array | None = None
+
+    def shares(self, rows: Indices) -> Array:
+        """(k,) of some of the ranges."""
+        return np.ones(len(rows)) if self.share is None else self.share[rows]
 
 
 @dataclass(frozen=True)
@@ -125,11 +131,8 @@ def add_ranges(
     constant_cost = 0.0
     for rows in _groups(ranges) if loss is None else np.arange(len(ranges.range_m))[:, None]:
         if ranges.before[rows[0]] == ranges.after[rows[0]]:
-            range_m, stddev_m = ranges.range_m[rows], ranges.stddev_m[rows]
-            if error_model.is_least_squares:
-                range_m, stddev_m, lost = combine_ranges(range_m, stddev_m)
-                constant_cost += lost
-            cost = _cost_at_keyframe(range_m, stddev_m, blocks, int(ranges.tag_index[rows[0]]), error_model)
+            cost, lost = _cost_at_keyframe(ranges, rows, blocks, error_model)
+            constant_cost += lost
         else:
             cost = _cost_between_keyframes(ranges, rows, blocks, error_model)
         adder.add(cost, loss, _blocks_of_group(ranges, int(rows[0]), blocks))
@@ -168,15 +171,22 @@ def _groups(ranges: PlacedRanges) -> Iterator[Indices]:
 
 
 def _cost_at_keyframe(
-    range_m: Array, stddev_m: Array, blocks: RangeBlocks, tag: int, error_model: RangeErrorModel
-) -> CostFunction:
-    return range_cost(
+    ranges: PlacedRanges, rows: Indices, blocks: RangeBlocks, error_model: RangeErrorModel
+) -> tuple[CostFunction, float]:
+    """And what it lacks in the cost, of ranges that were combined."""
+    range_m, stddev_m, share, lost = ranges.range_m[rows], ranges.stddev_m[rows], ranges.shares(rows), 0.0
+    if error_model.is_least_squares:
+        range_m, stddev_m, lost = combine_ranges(range_m, stddev_m / np.sqrt(share))
+        share = np.ones(1)
+    cost = range_cost(
         range_m=range_m,
         stddev_m=stddev_m,
-        tag_in_cam_m=None if blocks.lever_arms_are_free else blocks.tags_in_cam[tag],
+        share=share,
+        tag_in_cam_m=None if blocks.lever_arms_are_free else blocks.tags_in_cam[ranges.tag_index[rows[0]]],
         has_common_bias=blocks.common_biases is not None,
         error_model=error_model,
     )
+    return cost, lost
 
 
 def _cost_between_keyframes(
@@ -187,6 +197,7 @@ def _cost_between_keyframes(
     return interpolated_range_cost(
         range_m=ranges.range_m[rows],
         stddev_m=ranges.stddev_m[rows],
+        share=ranges.shares(rows),
         tag_in_cam_m=None if blocks.lever_arms_are_free else blocks.tags_in_cam[ranges.tag_index[rows[0]]],
         weight=ranges.weight[rows],
         offset_in_world_m=ranges.offset_in_world_m[rows],

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.ranging.robust_loss import RobustLoss
+
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
@@ -27,6 +29,17 @@ def place_labels(tags_m: Array, anchor_index: Indices) -> Indices:
         cells, row = np.unique(axis, return_inverse=True)
         labels = np.unique(labels * len(cells) + row, return_inverse=True)[1]
     return np.asarray(labels, dtype=np.int64)
+
+
+def shares_by_residuals(labels: Indices, scaled_residuals: Array, loss: RobustLoss) -> Array:
+    """(n,) weight of each range beside its noise, by how much those of one place err alike.
+
+    Args:
+        labels: (n,) of places, counted from 0. scaled_residuals: (n,) in stddevs.
+        loss: that of the fit, which tones outliers down.
+    """
+    toned_down = scaled_residuals * loss.weights(scaled_residuals)
+    return shares_of_places(labels, correlation_in_place(toned_down, labels))
 
 
 def correlation_in_place(errors: Array, labels: Indices) -> float:

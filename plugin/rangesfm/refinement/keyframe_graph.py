@@ -20,6 +20,7 @@ from rangesfm.ranging.anchors import AnchorEstimate
 from rangesfm.ranging.robust_loss import RobustLoss
 from rangesfm.refinement.antennas import Antennas
 from rangesfm.refinement.vision_information import Poses, VisionInformation, cross_matrices
+from rangesfm.refinement.weights import RangeWeights
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -61,11 +62,12 @@ class KeyframeGraph:
     Attributes:
         vision: what the photos say.
         antennas: of the k ranges that take part, by indices of the graph's keyframes.
-        anchor_index: (k,). range_m: (k,). stddev_m: (k,) as weighted against the photos.
+        anchor_index: (k,). range_m: (k,). stddev_m: (k,).
+        share: (k,) by how much each range counts against the photos, beside its stddev.
         anchors: m, with priors as for ``refine_with_ranges``.
         common_bias_stddev_m: of what all free biases share beyond their priors' means; 0: nothing.
         held_frame: a keyframe that stays where it is; None: none does.
-        loss: of the ranges, in stddevs as weighted.
+        loss: of single ranges, in their stddevs.
     """
 
     vision: VisionInformation
@@ -73,6 +75,7 @@ class KeyframeGraph:
     anchor_index: Indices
     range_m: Array
     stddev_m: Array
+    share: Array
     anchors: tuple[AnchorEstimate, ...]
     common_bias_stddev_m: float
     held_frame: int | None
@@ -84,8 +87,8 @@ class KeyframeGraph:
         biases = np.array([anchor.range_bias_m for anchor in self.anchors])
         return GraphState(self.vision.origin, positions, biases, 0.0)
 
-    def with_weights(self, stddev_m: Array, loss: RobustLoss) -> KeyframeGraph:
-        return replace(self, stddev_m=stddev_m, loss=loss)
+    def with_weights(self, weights: RangeWeights) -> KeyframeGraph:
+        return replace(self, stddev_m=weights.stddev_m, share=weights.share, loss=weights.loss)
 
     def residuals_m(self, state: GraphState) -> Array:
         """(k,) predicted minus measured."""
@@ -193,7 +196,7 @@ class _Terms:
         hessian = jacobian.T @ (graph.vision.matrix @ jacobian)
 
         scaled, derivative = _range_rows(graph, layout, state)
-        rho, weights, _ = graph.loss.rho(scaled**2)
+        rho, weights, _ = graph.share * graph.loss.rho(scaled**2)
         whitened = sparse.diags_array(np.sqrt(weights)) @ derivative
         cost += 0.5 * float(rho.sum())
         gradient = gradient + derivative.T @ (weights * scaled)

@@ -135,7 +135,7 @@ def add_ranges(
     log, rows, antennas = ranges.observations.log, ranges.rows, ranges.antennas
     placed = _ceres.PlacedRanges(
         range_m=log.range_m[rows],
-        stddev_m=weights.weighted_m[rows] / bundle.pixel_stddev,
+        stddev_m=weights.stddev_m[rows],
         before=antennas.before[rows],
         after=antennas.after[rows],
         weight=antennas.weight[rows],
@@ -143,6 +143,7 @@ def add_ranges(
         anchor_index=log.anchor_index[rows],
         tag_index=log.tag_index[rows],
         interval_s=ranges.interval_s[rows],
+        share=bundle.pixel_stddev**2 * weights.share[rows],
     )
     range_blocks = _ceres.RangeBlocks(
         poses=[pose_of(bundle.metric.frame(int(frame_id))).params for frame_id in ranges.trajectory.frame_ids],
@@ -154,7 +155,7 @@ def add_ranges(
         amplitude=blocks.short_range_error,
     )
     length = None if blocks.short_range_error is None else SHORT_RANGE_LENGTH_M
-    loss = weights.weighted_loss.scaled(bundle.pixel_stddev)
+    loss = weights.loss
     model = _ceres.RangeErrorModel(length, None, loss.width, loss.width, loss.is_bounded)
     first = bundle.adjuster.problem.num_residuals()
     added = _ceres.add_ranges(bundle.adjuster, placed, range_blocks, model)

@@ -40,7 +40,7 @@ def range_errors(
     """
     distance = np.linalg.norm(from_anchor_m, axis=1)
     directions = from_anchor_m / np.maximum(distance, _TINY_DISTANCE_M)[:, None]
-    in_residuals = weights.loss.slopes(residuals_m / weights.stddev_m) / weights.weighted_m
+    in_residuals = np.sqrt(weights.share) * weights.loss.slopes(residuals_m / weights.stddev_m) / weights.stddev_m
     of_radio = csr_matrix(in_residuals[:, None] * curve_modes(distance, curve_stddev_m))
     of_antennas = _each_anchor_apart(in_residuals[:, None] * antenna_modes(directions), weights.anchor_index)
     return ResidualErrors(
@@ -61,7 +61,8 @@ def _variance(weights: RangeWeights, residuals_m: Array, num_absorbed: float) ->
     num = len(residuals_m)
     if weights.is_estimated.any():
         left = max(num - num_absorbed, 0.1 * num) / num
-        variance = _robust_variance(weights.loss, residuals_m / weights.stddev_m, np.full(num, 1 / num)) / left
+        shares = weights.place_share / weights.place_share.sum()
+        variance = _robust_variance(weights.loss, residuals_m / weights.stddev_m, shares) / left
     else:
         variance = _robust_variance(weights.loss, _NORMAL_POINTS, _NORMAL_SHARES / _NORMAL_SHARES.sum())
     before_fit = inflation_before_fit(weights.inflation, len(np.unique(weights.group)), num_absorbed)

@@ -75,11 +75,12 @@ def unbend(
         antennas=antennas.subset(rows),
         anchor_index=placed.anchor_index,
         range_m=observations.log.range_m[rows],
-        stddev_m=placed.weighted_m,
+        stddev_m=placed.stddev_m,
+        share=placed.share,
         anchors=anchors,
         common_bias_stddev_m=common_bias_stddev_m,
         held_frame=0 if first_pose_is_fixed else None,
-        loss=placed.weighted_loss,
+        loss=placed.loss,
     )
     state, placed, num_absorbed, num_steps = _solve_with_own_weights(graph, placed)
     if rmse(state.poses.centers - before.centers) > float(np.median(placed.stddev_m)):
@@ -96,9 +97,7 @@ def _solve_with_own_weights(graph: KeyframeGraph, weights: RangeWeights) -> tupl
         weights = replace(weights, loss=loss)
         for _ in range(_MAX_NUM_ROUNDS):
             solution = solve_graph(
-                graph.with_weights(weights.weighted_m, weights.weighted_loss),
-                state,
-                tolerance_m=_TOLERANCE * float(weights.stddev_m.min()),
+                graph.with_weights(weights), state, tolerance_m=_TOLERANCE * float(weights.stddev_m.min())
             )
             state, num_steps = solution.state, num_steps + solution.num_steps
             before, weights = weights, weights.estimated(graph.residuals_m(state), solution.num_absorbed)

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from rangesfm.ranging.inlier_noise import inlier_stddev
 from rangesfm.ranging.noise import START_STDDEV_M, correlation_inflation, robust_stddev, shared_stddev
 from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.place import place_labels, shares_by_residuals
 from rangesfm.ranging.robust_loss import RobustLoss
 
 Array = npt.NDArray[np.float64]
@@ -33,7 +34,8 @@ class RangeWeights:
         inflation: of the stddev, by the errors' correlation in time.
         fixed_m: (n,) the part that is not estimated: of a short range, of an interpolated place.
         is_estimated: (n,) whether the rest is.
-        anchor_index: (n,). block: (n,) label of each range's stretch of time.
+        anchor_index: (n,). block: (n,) label of each range's stretch of time. place: (n,) label of where it was taken.
+        place_share: (n,) by how much each counts beside its stddev, as ranges from one place err alike.
         loss: of single ranges, in their stddevs. With a wide one the noise is what all residuals show, so that what
             drifts away is no outlier; with a bounded one that of the ranges that fit, as in the scale stage.
     """
@@ -44,23 +46,20 @@ class RangeWeights:
     is_estimated: Mask
     anchor_index: Indices
     block: Indices
+    place: Indices
+    place_share: Array
     loss: RobustLoss
 
     @property
-    def weighted_m(self) -> Array:
-        """(n,) stddev with which a range stands against the photos."""
-        return self.inflation * self.stddev_m
+    def share(self) -> Array:
+        """(n,) by how much each counts against the photos, beside its stddev."""
+        return self.place_share / self.inflation**2
 
     @property
     def group(self) -> Indices:
         """(n,) label of the stretch of one anchor's ranges that err together."""
         groups: Indices = self.block * (self.anchor_index.max() + 1) + self.anchor_index
         return groups
-
-    @property
-    def weighted_loss(self) -> RobustLoss:
-        """Of residuals in stddevs as weighted."""
-        return self.loss.scaled(1 / self.inflation)
 
     def subset(self, rows: Indices) -> RangeWeights:
         """Of some of the ranges."""
@@ -71,14 +70,16 @@ class RangeWeights:
             self.is_estimated[rows],
             self.anchor_index[rows],
             self.block[rows],
+            np.unique(self.place[rows], return_inverse=True)[1],
+            self.place_share[rows],
             self.loss,
         )
 
     def with_rows(self, rows: Indices, part: RangeWeights) -> RangeWeights:
         """These, but some of the ranges as in a subset that was estimated anew."""
-        stddev = self.stddev_m.copy()
-        stddev[rows] = part.stddev_m
-        return replace(self, stddev_m=stddev, inflation=part.inflation)
+        stddev, share = self.stddev_m.copy(), self.place_share.copy()
+        stddev[rows], share[rows] = part.stddev_m, part.place_share
+        return replace(self, stddev_m=stddev, place_share=share, inflation=part.inflation)
 
     def estimated(self, residuals_m: Array, num_absorbed: float) -> RangeWeights:
         """As the residuals of a fit show them.
@@ -98,8 +99,10 @@ class RangeWeights:
         ratios = self._noise_ratios(residuals_m, ordinary)[self.anchor_index]
         stddev = np.where(self.is_estimated, np.hypot(common * ratios, self.fixed_m), self.stddev_m)
         scaled = residuals_m / stddev
-        inflation = correlation_inflation(scaled, self.loss.weights(scaled), self.group)
-        return replace(self, stddev_m=stddev, inflation=inflation)
+        share = shares_by_residuals(self.place, scaled, self.loss)
+        # What is left of the correlation once the places count for what they are worth.
+        inflation = correlation_inflation(scaled, self.loss.weights(scaled), self.group, share)
+        return replace(self, stddev_m=stddev, place_share=share, inflation=inflation)
 
     def _noise_ratios(self, residuals_m: Array, rows: Indices) -> Array:
         """(m,) noise of each anchor over that of all; 1 where the difference may be chance.
@@ -124,12 +127,15 @@ class RangeWeights:
 
     def change(self, other: RangeWeights) -> float:
         """Largest relative change of a weight from this one to another."""
-        return float(np.max(np.abs(np.log(other.weighted_m / self.weighted_m)), initial=0.0))
+        ratio = np.sqrt(self.share / other.share) * other.stddev_m / self.stddev_m
+        return float(np.max(np.abs(np.log(ratio)), initial=0.0))
 
 
 def range_weights(
     observations: RangeObservations,
+    tags_m: Array,
     range_stddev_m: Array,
+    range_share: Array | None,
     inflation: float,
     is_estimated: Mask | None,
     metres_per_unit: float,
@@ -140,7 +146,9 @@ def range_weights(
     """The weights to begin with.
 
     Args:
+        tags_m: (n, 3) antenna at each range, in the metric world; without meaning where a range has no place.
         range_stddev_m: (n,) as known or first estimated, with what is shared by all ranges of a length.
+        range_share: (n,) by how much each counts beside its stddev; None: all alike.
         is_estimated: (n,) which of them are to be estimated; None: none.
         metres_per_unit: of the observations' world.
         loss_width: of the bounded loss, stddevs.
@@ -157,7 +165,10 @@ def range_weights(
     length = 1.0 if log.timestamp_s is None else BLOCK_S
     block = np.floor((times - times.min()) / length).astype(np.int64)
     loss = RobustLoss(loss_width, is_bounded=True)
-    return RangeWeights(range_stddev_m, inflation, fixed, estimated, log.anchor_index, block, loss)
+    has_place, place = observations.has_place, np.zeros(len(log), dtype=np.int64)
+    place[has_place] = place_labels(tags_m[has_place], log.anchor_index[has_place])
+    share = np.ones(len(log)) if range_share is None else range_share
+    return RangeWeights(range_stddev_m, inflation, fixed, estimated, log.anchor_index, block, place, share, loss)
 
 
 # Median block residuals beyond this many stddevs are no noise.

@@ -123,6 +123,7 @@ class ScaleEstimate:
         anchors: in the order of the log.
         observations: all ranges, with status by their final weight.
         range_stddev_m: (n,) noise of each range as weighted; NaN without a place.
+        range_share: (n,) by how much each counts beside that, as ranges from one place err alike; 1 without a place.
         correlation_inflation: by how much the errors' correlation in time widens the formal stddev.
         noise_stddev_m: stddev of a range away from all special cases.
         resampled_scales: (k,) the robust scale from blocks of time drawn anew, metres per SfM unit.
@@ -142,6 +143,7 @@ class ScaleEstimate:
     anchors: tuple[AnchorEstimate, ...]
     observations: RangeObservations
     range_stddev_m: Array
+    range_share: Array
     correlation_inflation: float
     noise_stddev_m: float
     resampled_scales: Array

@@ -89,7 +89,8 @@ def initialize_scale(
     status, stddev = observations.status.copy(), np.full(len(observations.log), np.nan)
     status[observations.has_place] = RangeStatus.UNKNOWN_ANCHOR
     status[survey.rows] = status_by_weight(solution.fit.weights)
-    stddev[survey.rows] = solution.problem.stddev_m
+    stddev[survey.rows], share = solution.problem.stddev_m, np.ones(len(observations.log))
+    share[survey.rows] = solution.problem.share_or_1
     return ScaleEstimate(
         metric_from_sfm=_by_method(options.method, solution, table) @ survey.first_camera_from_sfm,
         frame=survey.frame,
@@ -107,6 +108,7 @@ def initialize_scale(
         anchors=found,
         observations=replace(observations, status=status),
         range_stddev_m=stddev,
+        range_share=share,
         correlation_inflation=solution.inflation,
         noise_stddev_m=solution.noise_stddev_m,
         resampled_scales=_resampled_scales(solution, blocks, options.num_bootstrap, seed),

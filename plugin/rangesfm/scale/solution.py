@@ -13,7 +13,7 @@ from rangesfm.errors import GeometryError
 from rangesfm.geometry import NEARLY_STRAIGHT, path_kind, path_shape
 from rangesfm.ranging.inlier_noise import InlierNoise, inlier_noise
 from rangesfm.ranging.noise import correlation_inflation
-from rangesfm.ranging.place import correlation_in_place, place_labels, shares_of_places
+from rangesfm.ranging.place import place_labels, shares_by_residuals
 from rangesfm.ranging.robust_loss import GEMAN_MCCLURE
 from rangesfm.scale.anchor_plane import camera_side_of, mirrored_map, on_side
 from rangesfm.scale.range_equation import (
@@ -272,8 +272,7 @@ def _weighted(
 def _shares(problem: RangeProblem, state: RangeState, stddev_m: Array) -> Array:
     """(n,) of the ranges, by how much those of one place err alike."""
     places = place_labels(tag_positions(problem, state.metric_from_model), problem.anchor_index)
-    errors = (predicted_ranges(problem, state) - problem.range_m) / stddev_m
-    return shares_of_places(places, correlation_in_place(errors * GEMAN_MCCLURE.weights(errors), places))
+    return shares_by_residuals(places, (predicted_ranges(problem, state) - problem.range_m) / stddev_m, GEMAN_MCCLURE)
 
 
 def _refuse_ambiguity(solution: Solution, rivals: list[RangeState], camera_side: str | None) -> None:
