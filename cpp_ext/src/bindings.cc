@@ -190,8 +190,8 @@ void DefineRangeCost(py::module_& m, const char* name,
                           loss_scale_too_short, loss_is_bounded),
                     of_place...);
       },
-      kOwn, py::kw_only(), py::arg("range_m"), py::arg("stddev_m"), place_arguments...,
-      py::arg("share") = 1.0, py::arg("has_common_bias") = false, py::arg("short_range_length_m") = py::none(),
+      kOwn, py::kw_only(), py::arg("range_m"), py::arg("stddev_m"), place_arguments..., py::arg("share") = 1.0,
+      py::arg("has_common_bias") = false, py::arg("short_range_length_m") = py::none(),
       py::arg("error_curve_m") = py::none(), py::arg("loss_scale_too_long") = kLeastSquares,
       py::arg("loss_scale_too_short") = kLeastSquares, py::arg("loss_is_bounded") = false);
 }

@@ -35,7 +35,8 @@ struct RangeModel {
 //
 //   (d + bias + common_bias + amplitude error_curve(d) - range) / stddev,  d = || tag_in_world - anchor_in_world ||,
 //
-// made robust one by one, times the root of its share. Metres and seconds throughout. Needs the model to be metric already, or close to it.
+// made robust one by one, times the root of its share. Metres and seconds throughout. Needs the model to be metric
+// already, or close to it.
 //
 // Blocks: those of the place's poses (7 each: qx qy qz qw tx ty tz), anchor_in_world (3), range bias (1: what the radio
 // reads too long), and, as far as the model has them, in this order: tag_in_cam (3), time shift (1), common bias (1),
