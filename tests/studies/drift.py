@@ -16,12 +16,14 @@ passed over:
   level and the next one more, or the other way round; in between lies the mixture that drifts as far as the level.
   The squared weights of a mixture sum to 1, so it is noise of the same stddev.
 - ``scaling``: the seed's errors are multiplied by what brings their drift to the level. A seed of small drift then
-  has far noisier features than another, and the ranges have less to hold on to.
+  has far noisier features than another, and the ranges have less to hold on to. One that would need features of more
+  than 4 pixels is refused: no survey has such.
 
 Prints, in the shape of the paper's table, the root mean square error of the keyframes in the first camera's frame,
 without alignment: at the true scale, at the estimated scale, and refined; then their ratio, the iterations of the
 full problem, the features' stddev, and what the Cramer-Rao bound leaves of the drift: no method can expect a smaller
-ratio. Exit status 1 if at some level the median ratio or a single run misses its limit.
+ratio. Seeds that are refused, by the study or by the scale stage, are named and counted; medians are of the others.
+Exit status 1 if at some level the median ratio or a single run misses its limit, or no run is left.
 """
 
 from __future__ import annotations
@@ -45,6 +47,7 @@ from tests.studies.simulated_survey import (
 )
 
 from rangesfm.comparison import papers_table
+from rangesfm.errors import GeometryError
 from rangesfm.geometry import align_points, rmse
 from rangesfm.reference import Reference
 from rangesfm.refine import RefineSummary
@@ -57,6 +60,11 @@ MAX_RATIO = 0.5
 MAX_NUM_ITERATIONS = 30
 _DRIFT_TOLERANCE = 0.02
 _MAX_NUM_TRIALS = 20
+_MAX_PIXEL_STDDEV = 4.0
+
+
+class NoSuchDriftError(Exception):
+    """A seed's noise cannot be brought to a level of drift."""
 
 
 @dataclass(frozen=True)
@@ -134,19 +142,30 @@ def study_run(lap: Lap, seed: int, *, level_by: str = "mixing", obstructed_share
 
 
 def scaled_to_level(lap: Lap, seed: int) -> tuple[Array, pycolmap.Reconstruction]:
-    """Pixel errors that are a multiple of the seed's, and the map that drifts as far as asked."""
+    """Pixel errors that are a multiple of the seed's, and the map that drifts as far as asked.
+
+    Raises:
+        NoSuchDriftError: only with features that no survey has, if at all.
+    """
     errors = lap.pixel_stddev * unit_pixel_errors(lap.survey, seed)
     for _ in range(_MAX_NUM_TRIALS):
         sfm = mapped(lap.survey, errors)
         excess = log_excess(lap, sfm)
         if abs(excess) < _DRIFT_TOLERANCE:
             return errors, sfm
-        errors = errors * np.exp(np.clip(-excess, -1.0, 1.0))
-    raise RuntimeError(f"seed {seed}: no multiple of its noise was found that drifts by {lap.level.drift_m} m")
+        most = _MAX_PIXEL_STDDEV / np.std(errors)
+        if excess < 0 and most < 1 + 1e-6:
+            raise NoSuchDriftError(f"a drift of {lap.level.drift_m} m needs more than {_MAX_PIXEL_STDDEV} px of noise")
+        errors = errors * min(np.exp(np.clip(-excess, -1.0, 1.0)), most)
+    raise NoSuchDriftError(f"no multiple of its noise was found that drifts by {lap.level.drift_m} m")
 
 
 def mixed_to_level(lap: Lap, seed: int) -> tuple[Array, pycolmap.Reconstruction]:
-    """Pixel errors between two of the seed's draws, and the map that drifts as far as asked."""
+    """Pixel errors between two of the seed's draws, and the map that drifts as far as asked.
+
+    Raises:
+        NoSuchDriftError: no mixture does.
+    """
     drawn: list[tuple[Array, float]] = []
     for k in itertools.count():
         draw = lap.pixel_stddev * unit_pixel_errors(lap.survey, 1000 * seed + k)
@@ -164,7 +183,7 @@ def mixed_to_level(lap: Lap, seed: int) -> tuple[Array, pycolmap.Reconstruction]
         if abs(excess) < _DRIFT_TOLERANCE:
             return errors, sfm
         low, high, below, above = (angle, high, excess, above) if excess < 0 else (low, angle, below, excess)
-    raise RuntimeError(f"seed {seed}: no mixture of its noise was found that drifts by {lap.level.drift_m} m")
+    raise NoSuchDriftError(f"no mixture of its noise was found that drifts by {lap.level.drift_m} m")
 
 
 def log_excess(lap: Lap, sfm: pycolmap.Reconstruction) -> float:
@@ -200,17 +219,32 @@ def main() -> int:
             anchor_frame=arguments.anchor_frame,
         )
         lap = Lap.of(survey, level)
-        runs: list[Drift] = []
-        for seed in range(arguments.num_seeds):
-            run = study_run(lap, seed, level_by=arguments.level_by, obstructed_share=arguments.obstructed_share)
-            runs.append(run)
-            note = "; ".join(run.summary.misfits) or ("" if run.summary.converged else "not converged")
-            print_row(f"{level.drift_m:g} m", str(seed), values_of([run])[0], note)
+        runs = runs_at_level(lap, arguments)
+        print(f"{level.drift_m:g} m  {arguments.num_seeds - len(runs)} of {arguments.num_seeds} seeds refused")
+        if not runs:
+            is_good = False
+            continue
         median, worst = np.median(values_of(runs), axis=0), np.max(values_of(runs), axis=0)
         is_good &= median[3] <= level.max_median_ratio and all(run.is_good for run in runs)
         print_row(f"{level.drift_m:g} m", "median", median, f"ratio at most {level.max_median_ratio}")
         print_row(f"{level.drift_m:g} m", "worst", worst, f"ratio below {MAX_RATIO}")
     return 0 if is_good else 1
+
+
+def runs_at_level(lap: Lap, arguments: argparse.Namespace) -> list[Drift]:
+    """Of the seeds that were not refused; prints them all."""
+    runs: list[Drift] = []
+    level = f"{lap.level.drift_m:g} m"
+    for seed in range(arguments.num_seeds):
+        try:
+            run = study_run(lap, seed, level_by=arguments.level_by, obstructed_share=arguments.obstructed_share)
+        except (NoSuchDriftError, GeometryError) as reason:
+            print(f"{level:6} {seed:>6} refused: {reason}", flush=True)
+            continue
+        runs.append(run)
+        note = "; ".join(run.summary.misfits) or ("" if run.summary.converged else "not converged")
+        print_row(level, str(seed), values_of([run])[0], note)
+    return runs
 
 
 def values_of(runs: list[Drift]) -> Array:
