@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
 import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 import pytest
+from tests.studies import kills
 
 if TYPE_CHECKING:
     from tests.conftest import Command, PhotoRun
@@ -43,14 +41,6 @@ BEFORE_THE_RESULT = ("rangesfm.pipeline", "write_result", 0)
 BEFORE_THE_REPORT = ("rangesfm.pipeline", "write_report", 0)
 
 
-@pytest.fixture(scope="module")
-def study() -> Iterator[ModuleType]:
-    """The study of kills at random moments, which knows when two results are the same."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(Path(__file__).parents[1])
-        yield importlib.import_module("tests.studies.kills")
-
-
 def killed(moment: tuple[str, str, int], *arguments: str, cwd: Path) -> str:
     """What a run said until it was killed."""
     command = [sys.executable, "-c", PROGRAM, *map(str, moment), "run", *arguments]
@@ -59,13 +49,13 @@ def killed(moment: tuple[str, str, int], *arguments: str, cwd: Path) -> str:
     return done.stderr
 
 
-def assert_whole(output: Path, whole: Path, study: ModuleType) -> None:
-    assert study.differences(whole, output) == []
-    assert study.names_in(output) == study.names_in(whole)
+def assert_whole(output: Path, whole: Path) -> None:
+    assert kills.differences(whole, output) == []
+    assert kills.names_in(output) == kills.names_in(whole)
 
 
 def test_killed_in_step_after_step_it_ends_as_if_nothing_had_been(
-    photo_run: PhotoRun, rangesfm_command: Command, tmp_path: Path, study: ModuleType
+    photo_run: PhotoRun, rangesfm_command: Command, tmp_path: Path
 ) -> None:
     output, folder = tmp_path / "out", photo_run.survey.folder
     flags = (*photo_run.flags, "--output_path", str(output))
@@ -78,7 +68,7 @@ def test_killed_in_step_after_step_it_ends_as_if_nothing_had_been(
     for step, first_without in (("features", 1), ("matching", 2), ("mapping", 3)):
         is_done = [f"{step}: taken over from an earlier run" in text for text in said]
         assert is_done == [number >= first_without for number in range(len(said))]
-    assert_whole(output, photo_run.output_path, study)
+    assert_whole(output, photo_run.output_path)
 
 
 @pytest.mark.parametrize(("moment", "is_new"), [(AMONG_TABLES, False), (BEFORE_THE_REPORT, True)])
@@ -88,7 +78,6 @@ def test_killed_while_it_replaces_a_result_it_leaves_none_or_the_new_one(
     photo_run: PhotoRun,
     rangesfm_command: Command,
     tmp_path: Path,
-    study: ModuleType,
 ) -> None:
     output, folder = shutil.copytree(photo_run.output_path, tmp_path / "out"), photo_run.survey.folder
     flags = (*photo_run.flags, "--output_path", str(output))
@@ -96,4 +85,4 @@ def test_killed_while_it_replaces_a_result_it_leaves_none_or_the_new_one(
     assert (output / "result.json").exists() is is_new
     assert not (output / "report.html").exists()
     rangesfm_command("run", *flags, cwd=folder)
-    assert_whole(output, photo_run.output_path, study)
+    assert_whole(output, photo_run.output_path)

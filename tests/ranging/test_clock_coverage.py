@@ -5,34 +5,16 @@ All of it: ``tests/studies/clock_coverage.py``.
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from pathlib import Path
-from types import ModuleType
-
 import numpy as np
 import pytest
+from tests.studies import clock_coverage
 
-STUDY = Path(__file__).parents[1] / "studies" / "clock_coverage.py"
 NUM_SEEDS = 6
 
 
-@pytest.fixture(scope="module")
-def study() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("clock_coverage", STUDY)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["clock_coverage"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.parametrize("num_anchors", [1, 4])
-def test_offset_of_a_short_log_with_errors_that_stay_is_as_certain_as_it_is_said_to_be(
-    study: ModuleType, num_anchors: int
-) -> None:
-    errors, stddevs = study.estimates(20.0, num_anchors, correlation_s=2.0, num_seeds=NUM_SEEDS)
+def test_offset_of_a_short_log_with_errors_that_stay_is_as_certain_as_it_is_said_to_be(num_anchors: int) -> None:
+    errors, stddevs = clock_coverage.estimates(20.0, num_anchors, correlation_s=2.0, num_seeds=NUM_SEEDS)
     assert len(errors) >= NUM_SEEDS - 1
     scaled = errors / stddevs
     # With residuals summed over blocks, without the jackknife's steps, both are 1.6 to 1.9.

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from pathlib import Path
-from types import ModuleType
-
 import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.stats import chi2
+from tests.studies import anchor_initialization
 
 from rangesfm.errors import GeometryError
 from rangesfm.ranging.anchor_survey import trilaterate_anchors
@@ -20,7 +16,6 @@ from rangesfm.simulate.path import loop_path
 
 Array = npt.NDArray[np.float64]
 
-STUDY = Path(__file__).parents[1] / "studies" / "anchor_initialization.py"
 ANCHOR_M = np.array([6.0, -4.0, 3.5])
 KNOWN_BIAS = TrilaterationOptions(range_bias_stddev_m=0.0)
 
@@ -216,23 +211,9 @@ def test_ranges_that_say_how_noisy_they_are_weigh_accordingly() -> None:
     assert np.median(errors[True]) < 0.7 * np.median(errors[False])
 
 
-@pytest.fixture(scope="module")
-def study() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("anchor_initialization", STUDY)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    # Its dataclasses look their module up there.
-    sys.modules["anchor_initialization"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.parametrize("options", [TrilaterationOptions(), KNOWN_BIAS], ids=["defaults", "bias known"])
-def test_study_in_small_finds_every_anchor_among_15_percent_outliers(
-    study: ModuleType, options: TrilaterationOptions
-) -> None:
-    summary = study.estimate(0.15, 40, options)
+def test_study_in_small_finds_every_anchor_among_15_percent_outliers(options: TrilaterationOptions) -> None:
+    summary = anchor_initialization.estimate(0.15, 40, options)
     assert summary.num_refused == 0
     assert np.median(summary.error_m) < 0.10
     assert np.max(summary.error_m) < 0.30
