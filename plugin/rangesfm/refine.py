@@ -314,7 +314,8 @@ def _adjust(survey: _Survey, problem: BundleAdjustment, start: Unbent) -> _Adjus
     solutions: list[Solution] = []
     while True:
         added = survey.add_to(problem, weights, radio)
-        solutions.append(solve(problem))
+        finest_m = float(np.min(weights.stddev_m[survey.ranges.rows]))
+        solutions.append(solve(problem, _MAX_LAST_MOVEMENT * finest_m))
         radio = added.blocks.estimate(radio)
         better = _estimated(weights, survey.ranges, survey.residuals_m(radio), start.num_absorbed)
         num_left = survey.options.max_num_iterations - sum(solution.num_iterations for solution in solutions)
@@ -322,8 +323,7 @@ def _adjust(survey: _Survey, problem: BundleAdjustment, start: Unbent) -> _Adjus
         if is_last or not solutions[-1].converged or num_left <= 0:
             break
         weights, problem = better, survey.problem(num_left)
-    finest_m = float(np.min(weights.stddev_m[survey.ranges.rows]))
-    more, is_still = solve_until_still(problem, _MAX_LAST_MOVEMENT * finest_m, num_left)
+    more, is_still = solve_until_still(problem, solutions[-1], _MAX_LAST_MOVEMENT * finest_m, num_left)
     return _Adjusted(
         (*solutions, *more),
         is_still,

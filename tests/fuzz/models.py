@@ -136,7 +136,8 @@ def _do_what_is_done_with_models(model: object, model_path: Path) -> None:
         write_points(metric, Path(folder) / "points.ply")
     with contextlib.suppress(RangesfmError):
         options = {"fixed_frame_id": None, "max_num_iterations": 2, "num_threads": 1}
-        solve(bundle_adjustment(metric, CameraOptions(), RefineOptions(), **options))  # type: ignore[arg-type]
+        problem = bundle_adjustment(metric, CameraOptions(), RefineOptions(), **options)  # type: ignore[arg-type]
+        solve(problem, tolerance_m=1e-3)
 
 
 def _refine(survey: Path, model_path: Path) -> int:

@@ -89,6 +89,14 @@ def test_known_noise_stays_as_it_is() -> None:
     assert weights.estimated(noise((1.0, 1.0, 1.0)), 0.0) is weights
 
 
+def test_a_change_is_that_of_the_ranges_that_have_a_place() -> None:
+    weights = make_weights(0.1)
+    stddev = np.where(np.arange(3 * NUM_EACH) < 3, np.nan, 0.1)
+    before = replace(weights, stddev_m=stddev)
+    assert before.change(replace(weights, stddev_m=1.5 * stddev)) == pytest.approx(np.log(1.5))
+    assert before.change(before) == 0.0
+
+
 def test_noise_is_no_misfit() -> None:
     assert misfits(make_weights(0.1), noise((0.1, 0.1, 0.1)), np.arange(3.0 * NUM_EACH)) == ()
 

@@ -34,6 +34,7 @@ from rangesfm._ceres.costs import (
 from rangesfm._ceres.jacobian import num_columns, tangent_jacobian
 from rangesfm._ceres.many_ranges import AddedRanges, PlacedRanges, RangeBlocks, add_ranges, combine_ranges
 from rangesfm._ceres.problem import add_residual_block, cauchy_loss, keep_from_elimination
+from rangesfm._ceres.solving import Step, solve
 from rangesfm._ceres.types import CostFunction, LossFunction
 
 __all__ = [
@@ -43,6 +44,7 @@ __all__ = [
     "PlacedRanges",
     "RangeBlocks",
     "RangeErrorModel",
+    "Step",
     "add_ranges",
     "add_residual_block",
     "cauchy_loss",
@@ -58,6 +60,7 @@ __all__ = [
     "num_columns",
     "pyceres_ceres_version",
     "range_cost",
+    "solve",
     "tangent_jacobian",
     "zero_tie_cost",
 ]

@@ -6,7 +6,6 @@ import itertools
 import time
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -16,14 +15,16 @@ from rangesfm import _ceres
 from rangesfm.errors import SolverError
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.passthrough import apply_options
+from rangesfm.refinement.progress import Progress, farthest, keyframe_centers
 from rangesfm.trajectory import pose_of
 
 Array = npt.NDArray[np.float64]
 
-# Ceres' default of 1e4 damps the scale, which all poses share, so strongly that it creeps
-# and is then taken for converged.
-_INITIAL_TRUST_REGION_RADIUS = 1e8
-_TOLERANCE = 1e-8
+# Ceres' default of 1e4 damps the scale, which all poses share, so strongly that it creeps and is then taken for
+# converged; 1e8 does the same to the bends of a path of 2000 keyframes.
+_INITIAL_TRUST_REGION_RADIUS = 1e10
+# Relative, of the cost: all that rounding leaves. When it is enough, the keyframes tell, not the cost.
+_FUNCTION_TOLERANCE = 1e-12
 # No feature is located better; weighed against a smaller one, ranges lose all say in a model without noise.
 _MIN_PIXEL_STDDEV = 0.05
 _MAX_NUM_TIE_POINTS = 500
@@ -37,6 +38,7 @@ class Solution:
         num_iterations: successful and not. initial_cost, final_cost: half the sum of squares, in pixels.
         seconds: of the solver.
         converged: whether it stopped because nothing was left to gain.
+        is_still: whether the keyframes had come to rest by then, in steps as free as the first.
         message: the solver's own words.
     """
 
@@ -45,6 +47,7 @@ class Solution:
     final_cost: float
     seconds: float
     converged: bool
+    is_still: bool
     message: str
 
 
@@ -116,14 +119,21 @@ def _tie_points(
     return itertools.cycle(itertools.islice(filter(adjuster.problem.has_parameter_block, own), _MAX_NUM_TIE_POINTS))
 
 
-def solve(problem: BundleAdjustment) -> Solution:
-    """Solve, in place.
+def solve(problem: BundleAdjustment, tolerance_m: float) -> Solution:
+    """Solve, in place, until keyframes stay where they are.
+
+    A cost of which a millionth part is left to gain may still move a map by metres, and points on the horizon may run
+    on forever without moving anything else.
+
+    Args:
+        tolerance_m: how far any keyframe would still go.
 
     Raises:
         SolverError: the solver failed.
     """
     start = time.monotonic()
-    summary = cast(pycolmap.CeresBundleAdjustmentSummary, problem.adjuster.solve()).ceres_summary
+    progress = Progress(problem.metric, problem.pixel_stddev, tolerance_m)
+    summary = _ceres.solve(problem.adjuster, progress.is_over)
     if not summary.IsSolutionUsable():
         raise SolverError(f"the bundle adjustment with ranges failed: {summary.message}")
     return Solution(
@@ -131,36 +141,54 @@ def solve(problem: BundleAdjustment) -> Solution:
         initial_cost=summary.initial_cost,
         final_cost=summary.final_cost,
         seconds=time.monotonic() - start,
-        converged=summary.termination_type.name == "CONVERGENCE",
-        message=summary.message,
+        converged=summary.termination_type.name in ("CONVERGENCE", "USER_SUCCESS"),
+        is_still=progress.is_still,
+        message=f"What is left to gain moves nothing that matters ({tolerance_m:.2g} m)."
+        if progress.is_still
+        else summary.message,
     )
 
 
-def solve_until_still(problem: BundleAdjustment, tolerance_m: float, num_left: int) -> tuple[list[Solution], bool]:
+def solve_until_still(
+    problem: BundleAdjustment, before: Solution, tolerance_m: float, num_left: int
+) -> tuple[list[Solution], bool]:
     """Solve again from where the solver stopped, with its trust region opened, until keyframes stay where they are.
 
-    A solver whose steps have become small says that it has converged; whether it has, a free step tells.
+    A solver whose steps have become small says that it has converged; whether it has, a free step tells. What often
+    keeps steps small is an unknown anchor far from where the ranges want it: it is put there first, the map held.
 
     Args:
-        num_left: iterations after which to give up.
+        before: the solution so far. num_left: iterations after which to give up.
 
     Returns:
         what was done, and whether the keyframes came to rest.
     """
     solutions: list[Solution] = []
-    centers = _centers(problem.metric)
-    while num_left > 0:
-        solutions.append(solve(problem))
+    is_still, centers = before.is_still, keyframe_centers(problem.metric)
+    while not is_still and num_left > 0:
+        _settle_radio(problem)
+        solutions.append(solve(problem, tolerance_m))
         num_left -= max(solutions[-1].num_iterations, 1)
-        before, centers = centers, _centers(problem.metric)
-        if np.linalg.norm(centers - before, axis=1).max() <= tolerance_m:
-            return solutions, True
-    return solutions, False
+        last, centers = centers, keyframe_centers(problem.metric)
+        is_still = solutions[-1].is_still or farthest(last, centers) <= tolerance_m
+    return solutions, is_still
 
 
-def _centers(metric: pycolmap.Reconstruction) -> Array:
-    poses = [pose_of(metric.frame(frame_id)) for frame_id in metric.reg_frame_ids()]
-    return np.array([-pose.rotation.matrix().T @ pose.translation for pose in poses])
+def _settle_radio(problem: BundleAdjustment) -> None:
+    """Solve for what is estimated beside the map alone."""
+    metric, ceres_problem = problem.metric, problem.adjuster.problem
+    blocks = [pose_of(metric.frame(frame_id)).params for frame_id in metric.reg_frame_ids()]
+    blocks += [rig.sensor_from_rig(sensor).params for rig in metric.rigs.values() for sensor in rig.non_ref_sensors]
+    blocks += [camera.params for camera in metric.cameras.values()]
+    blocks += [point.xyz for point in metric.points3D.values()]
+    held = [
+        b for b in blocks if ceres_problem.has_parameter_block(b) and not ceres_problem.is_parameter_block_constant(b)
+    ]
+    for block in held:
+        ceres_problem.set_parameter_block_constant(block)
+    _ceres.solve(problem.adjuster, lambda _: False)
+    for block in held:
+        ceres_problem.set_parameter_block_variable(block)
 
 
 def _bundle_adjuster(
@@ -175,7 +203,9 @@ def _bundle_adjuster(
     ba.refine_focal_length = ba.refine_extra_params = camera.refine_intrinsics is True
     solver = ba.ceres.solver_options
     solver.initial_trust_region_radius = _INITIAL_TRUST_REGION_RADIUS
-    solver.function_tolerance = solver.gradient_tolerance = solver.parameter_tolerance = _TOLERANCE
+    solver.function_tolerance = _FUNCTION_TOLERANCE
+    # Steps are compared with all parameters, of which points on the horizon may be millions of metres.
+    solver.gradient_tolerance = solver.parameter_tolerance = 0.0
     solver.max_num_iterations = max_num_iterations
     solver.num_threads = num_threads
     ba.ceres.solver_options = solver

@@ -126,9 +126,9 @@ class RangeWeights:
         return ratios
 
     def change(self, other: RangeWeights) -> float:
-        """Largest relative change of a weight from this one to another."""
+        """Largest relative change of a weight from this one to another; of ranges without a place nothing is known."""
         ratio = np.sqrt(self.share / other.share) * other.stddev_m / self.stddev_m
-        return float(np.max(np.abs(np.log(ratio)), initial=0.0))
+        return float(np.nanmax(np.abs(np.log(ratio)), initial=0.0))
 
 
 def range_weights(
