@@ -23,6 +23,8 @@ LAYER_OF = {
     "installed_versions": ERRORS,
     "sole_writer": ERRORS,
     "_ceres": DATA,
+    "child_process": ERRORS,
+    "supervision": ERRORS,
     "colmap_log": DATA,
     "config": DATA,
     "costs": DATA,

@@ -40,6 +40,8 @@ _INSTEAD_OF = {"tag.tag_in_cam_m": ("lever_arms_m",), "tag.lever_arms_m": ("tag_
 _MORE_THAN_0 = Rule("more than 0", lambda value: value > 0)
 _FROM_0 = Rule("0 or more", lambda value: value >= 0)
 _FROM_1 = Rule("1 or more", lambda value: value >= 1)
+_FROM_3 = Rule("3 or more", lambda value: value >= 3)
+_FROM_10 = Rule("10 or more", lambda value: value >= 10)
 
 
 def _one_of(choices: tuple[str, ...]) -> Rule:
@@ -64,6 +66,9 @@ _RULES = {
     "separator": Rule("one character", lambda value: len(value) == 1),
     "matching": _one_of(MATCHING_METHODS),
     "num_threads": Rule("1 or more, or -1 for all cores", lambda value: value == -1 or value >= 1),
+    "submap_size": _FROM_10,
+    "submap_overlap": _FROM_3,
+    "num_submaps_at_once": _FROM_1,
     "method": _one_of(SCALE_METHODS),
     "camera_side": _one_of(CAMERA_SIDES),
     "up_in_first_camera": Rule("a direction, not 0,0,0", lambda value: any(value)),

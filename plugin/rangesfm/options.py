@@ -66,6 +66,10 @@ class MapperOptions:
             determine the scale. Takes much longer; the refinement at the end mostly comes to the same map.
         num_threads: -1 for all cores. Matching on the processor takes one thread all the same, as
             pycolmap 4.2 loses matches with more; ``matcher.num_threads`` overrides that.
+        submap_size: photos of a submap: more photos than that are mapped in stretches of so many in their order, each
+            on its own, which are joined by the photos that they share; None: all in one piece.
+        submap_overlap: photos that a submap shares with the one before.
+        num_submaps_at_once: each is mapped by a process of its own; they share the threads.
     """
 
     matching: str = "auto"
@@ -75,6 +79,9 @@ class MapperOptions:
     pipeline: dict[str, Any] = field(default_factory=dict)
     ranges_in_mapping: bool = False
     num_threads: int = -1
+    submap_size: int | None = None
+    submap_overlap: int = 20
+    num_submaps_at_once: int = 1
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,12 @@ Scale Estimation and Drift Mitigation", 2018, with other means where real radios
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -59,7 +60,10 @@ from rangesfm.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images
 from rangesfm.vision.keyframes import select_keyframes
 from rangesfm.vision.mapping_loop import GlobalAdjustment
-from rangesfm.vision.reconstruct import reconstruct
+from rangesfm.vision.reconstruct import prepare_submaps, reconstruct
+from rangesfm.vision.submaps import Submap
+
+_Done = TypeVar("_Done")
 
 
 @dataclass(frozen=True)
@@ -83,9 +87,7 @@ class RunResult:
 def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> RunResult:
     """Photos and ranges to a metric model. Steps of the reconstruction that are done are reused."""
     journal = Journal(progress)
-    inputs = _read_inputs(survey, journal)
-    keyframes, times = _keyframes(survey, journal, log_names_photos=inputs.log.image_name is not None)
-    _check_times(survey, inputs, _path_without_places(keyframes, times))
+    inputs, keyframes, times = _checked_inputs(survey, journal)
     with sole_writer(survey.output_path):
         adjustment = AdjustmentWithRanges(survey, inputs, keyframes[0], times)
         models = _reconstruct(
@@ -94,6 +96,19 @@ def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> 
         if note := adjustment.note():
             journal.warn(note)
         return _to_metric(survey, inputs, models, times, journal, refine=survey.refine.enabled)
+
+
+def prepare_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> tuple[Submap, ...]:
+    """What ``run_survey`` does before it maps the photos.
+
+    Returns:
+        The submaps that are to be mapped yet; whoever has them mapped (``Submap.map``), wherever, in any order and at
+        once, saves ``run_survey`` doing it. None where the photos are mapped in one piece.
+    """
+    journal = Journal(progress)
+    _, keyframes, _ = _checked_inputs(survey, journal)
+    with sole_writer(survey.output_path):
+        return _with_photos(prepare_submaps, survey, keyframes, journal, restart)
 
 
 def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> RunResult:
@@ -249,6 +264,14 @@ def _read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
     return inputs
 
 
+def _checked_inputs(survey: Survey, journal: Journal) -> tuple[RangingInputs, tuple[str, ...], ImageTimes | None]:
+    """Ranges and photos that have to do with each other; the photos' times, where any are needed."""
+    inputs = _read_inputs(survey, journal)
+    keyframes, times = _keyframes(survey, journal, log_names_photos=inputs.log.image_name is not None)
+    _check_times(survey, inputs, _path_without_places(keyframes, times))
+    return inputs, keyframes, times
+
+
 def _keyframes(
     survey: Survey, journal: Journal, *, log_names_photos: bool | None = None
 ) -> tuple[tuple[str, ...], ImageTimes | None]:
@@ -292,8 +315,20 @@ def _reconstruct(
     adjustment: GlobalAdjustment | None = None,
 ) -> tuple[pycolmap.Reconstruction, ...]:
     """Map the keyframes into ``sparse``; returns ``sparse/0``, ``sparse/1``, ..."""
+    summary = _with_photos(partial(reconstruct, adjustment=adjustment), survey, keyframes, journal, restart)
+    journal.seconds.update(summary.seconds)
+    if summary.num_registered < summary.num_keyframes:
+        which = "the model" if len(summary.models) == 1 else f"the largest of {len(summary.models)} models"
+        journal.warn(f"{summary.num_registered} of {summary.num_keyframes} keyframes are in {which}")
+    return summary.models
+
+
+def _with_photos(
+    do: Callable[..., _Done], survey: Survey, keyframes: tuple[str, ...], journal: Journal, restart: bool
+) -> _Done:
+    """Call ``reconstruct``, or a part of it, for the keyframes of a survey."""
     with survey.naming_its_lines():
-        summary = reconstruct(
+        return do(
             _images_path(survey),
             keyframes,
             survey.output_path,
@@ -303,13 +338,7 @@ def _reconstruct(
             progress=journal.progress,
             restart=restart,
             before_change=lambda: forget_result(survey.output_path),
-            adjustment=adjustment,
         )
-    journal.seconds.update(summary.seconds)
-    if summary.num_registered < summary.num_keyframes:
-        which = "the model" if len(summary.models) == 1 else f"the largest of {len(summary.models)} models"
-        journal.warn(f"{summary.num_registered} of {summary.num_keyframes} keyframes are in {which}")
-    return summary.models
 
 
 def _images_path(survey: Survey) -> Path:

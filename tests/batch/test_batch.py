@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import psutil
+import pycolmap
 import pytest
 from distributed import LocalCluster
 
@@ -33,12 +34,21 @@ num_bootstrap = 5
 {scale}
 [refine]
 covariance = false
+{mapper}
+"""
+IN_SUBMAPS = """
+[mapper]
+submap_size = 10
+submap_overlap = 6
 """
 
 
 @pytest.fixture
 def surveys(photo_run: PhotoRun, tmp_path: Path) -> Path:
-    """Two surveys whose photos are mapped already; the second wants to know more of the scale than there is to know."""
+    """Two surveys, the first of which is mapped already.
+
+    The second is to be mapped in submaps, and wants to know more of the scale than there is to know.
+    """
     for name in NAMES:
         folder = shutil.copytree(photo_run.survey.folder, tmp_path / name)
         (folder / "out" / "result.json").unlink()
@@ -47,7 +57,9 @@ def surveys(photo_run: PhotoRun, tmp_path: Path) -> Path:
         text = (folder / "survey.toml").read_text().replace('time_offset = "auto"', "time_offset = 2.35")
         text = text.replace("[report]", "[report]\nenabled = false")
         scale = "max_relative_stddev = 1e-6" if name == "east" else ""
-        (folder / "survey.toml").write_text(text + QUICK.format(scale=scale))
+        (folder / "survey.toml").write_text(
+            text + QUICK.format(scale=scale, mapper=IN_SUBMAPS if name == "east" else "")
+        )
     (tmp_path / "broken.toml").write_text("[images\n")
     return tmp_path
 
@@ -109,6 +121,12 @@ def test_all_surveys_end_though_a_worker_is_killed_and_others_fail(surveys: Path
     scale = json.loads((photo_run.output_path / "result.json").read_text())["scale"]["value"]
     assert float(rows["north/survey.toml"]["scale"]) == pytest.approx(scale, rel=0.02)
     assert (surveys / "north" / "out" / "result.json").is_file()
+    assert pycolmap.Reconstruction(surveys / "east" / "out" / "sparse" / "0").num_reg_images() == 14
+    assert sorted(path.name for path in (surveys / "east" / "out" / "submaps").glob("*/*")) == sorted(
+        2 * ["mapper.log", "sparse", "submap.json"]
+    )
+    told = [line.removeprefix("east/survey.toml: ") for line in errors.splitlines()]
+    assert [line for line in told if line in ("submaps", "features", "scale")] == ["submaps", "scale"]
     assert "Traceback" not in errors
     assert "begins again, attempt 2" in errors
     assert "3 of 3 surveys over, 2 of them failed" in errors

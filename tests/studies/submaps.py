@@ -1,15 +1,14 @@
 """How the cost of mapping grows with the number of photos: in one piece, and in overlapping submaps.
 
-    python tests/studies/submaps.py [--num_photos 125 250 500] [--max_one_piece 2000] [--submap_size 100]
+    python -m tests.studies.submaps [--num_photos 125 250 500] [--max_one_piece 2000] [--submap_size 100]
         [--overlap 20]
 
 Simulated keyframes, half a metre apart on one wide round: features with noise, each seen in at most 8 photos in a row,
 go into a COLMAP database with their matches; nothing is rendered. They are mapped by pycolmap's incremental mapping
 
 - in one piece, and
-- in windows in the order of time, each sharing ``--overlap`` photos with the one before, each a process of its own. A
-  window is laid onto the one before by COLMAP's robust similarity of the photos that they share; tracks that hold the
-  same feature of a shared photo become one, and a bundle adjustment of all follows.
+- in submaps, as ``rangesfm run --submap_size`` does: stretches in the order of time, each sharing ``--overlap`` photos
+  with the one before and each a process of its own; joined by the photos that they share, and refined as a whole.
 
 Each process takes one thread; its processor seconds and its peak memory are its own account. Both maps then go through
 ``rangesfm refine`` with the same ranges to eight surveyed anchors (stddev 0.1 m, 2 Hz each): RMSE is of the keyframe
@@ -22,24 +21,30 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import pickle
 import resource
 import subprocess
 import sys
 import tempfile
 from collections import defaultdict
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pycolmap
+from tests.simulated_database import camera_options, matched_photos, write_database
 
+from rangesfm.options import MapperOptions
+from rangesfm.progress import SilentProgress
 from rangesfm.ranging.readers.canonical import write_ranges_csv
 from rangesfm.reference import Reference, write_reference
 from rangesfm.simulate.model import synthetic_model
 from rangesfm.simulate.path import loop_path
 from rangesfm.simulate.ranges import Radio, simulate_ranges
-from rangesfm.vision.database import create_database
+from rangesfm.vision.mapping import map_incrementally, pipeline_options, write_models
+from rangesfm.vision.submap_joining import join_submaps
+from rangesfm.vision.submap_refinement import refine_joined
+from rangesfm.vision.submaps import Submap, plan_submaps
 
 TAG_IN_CAM_M = (0.03, -0.12, -0.05)
 _STEP_M = 0.5
@@ -47,6 +52,7 @@ _CIRCUMFERENCE_PER_AXIS = 5.53  # of an ellipse whose axes are as 4 to 3
 _MAX_TRACK_LENGTH = 8
 _NUM_OBSERVATIONS = 80
 _NUM_ANCHORS = 8
+_SILENT = SilentProgress()
 
 
 @dataclass(frozen=True)
@@ -81,7 +87,7 @@ def simulate(folder: Path, num_photos: int, seed: int) -> None:
         pixel_stddev=0.7,
         seed=seed,
     )
-    _write_database(folder / "database.db", made.reconstruction)
+    write_database(folder / "database.db", made.reconstruction)
     angles = 2 * np.pi * np.arange(_NUM_ANCHORS) / _NUM_ANCHORS
     heights = np.where(np.arange(_NUM_ANCHORS) % 2, 0.5, 6.0 + 0.05 * axis)
     positions = np.column_stack([1.1 * axis * np.cos(angles), 0.85 * axis * np.sin(angles), heights])
@@ -95,105 +101,48 @@ def simulate(folder: Path, num_photos: int, seed: int) -> None:
     write_reference(Reference(made.centers_m, image_names=tuple(made.timestamps_s)), folder / "reference.csv")
 
 
-def _write_database(path: Path, truth: pycolmap.Reconstruction) -> None:
-    """The features of a model, and as matches what its tracks say."""
-    names = [image.name for _, image in sorted(truth.images.items())]
-    camera = pycolmap.Camera(next(iter(truth.cameras.values())).todict())
-    camera.has_prior_focal_length = True
-    create_database(path, names, camera)
-    matches: dict[tuple[int, int], list[tuple[int, int]]] = defaultdict(list)
-    for point in truth.points3D.values():
-        seen = sorted((element.image_id, element.point2D_idx) for element in point.track.elements)
-        for i, (first, at_first) in enumerate(seen):
-            for second, at_second in seen[i + 1 :]:
-                matches[first, second].append((at_first, at_second))
-    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
-        for image_id, image in truth.images.items():
-            database.write_keypoints(image_id, np.array([point.xy for point in image.points2D], dtype=np.float32))
-        for (first, second), pairs in sorted(matches.items()):
-            found = np.array(pairs, dtype=np.uint32)
-            database.write_matches(first, second, found)
-            geometry = pycolmap.TwoViewGeometry(
-                config=pycolmap.TwoViewGeometryConfiguration.CALIBRATED, inlier_matches=found
-            )
-            database.write_two_view_geometry(first, second, geometry)
+def map_in_one_piece(folder: Path, output: Path) -> None:
+    """All photos by pycolmap's incremental mapping."""
+    database = folder / "database.db"
+    options = pipeline_options(camera_options(database), _mapper(), seed=0)
+    map_incrementally(database, matched_photos(database).photos, output, folder / "snapshots", options, _SILENT)
 
 
-def map_photos(folder: Path, output: Path, first: int, last: int) -> None:
-    """The largest model of the photos from ``first`` to before ``last``."""
-    with pycolmap.Database.open(folder / "database.db") as database:
-        names = [image.name for image in sorted(database.read_all_images(), key=lambda image: image.name)]
-    options = pycolmap.IncrementalPipelineOptions(
-        num_threads=1, random_seed=0, extract_colors=False, ba_refine_focal_length=False, ba_refine_extra_params=False
-    )
-    options.image_names = names[first:last]
-    output.mkdir(parents=True)
-    with tempfile.TemporaryDirectory() as scratch:
-        models = pycolmap.incremental_mapping(folder / "database.db", folder, scratch, options)
-    if not models:
-        raise SystemExit(f"no model of photos {first} to {last}")
-    max(models.values(), key=lambda model: model.num_reg_images()).write(output)
+def plan(folder: Path, output: Path, size: int, overlap: int) -> None:
+    """Write the submaps, ready to be mapped, to ``output``."""
+    database = folder / "database.db"
+    mapper = replace(_mapper(), submap_size=size, submap_overlap=overlap)
+    submaps = plan_submaps(matched_photos(database), database, output, camera_options(database), mapper, seed=0)
+    (output / "submaps.pickle").write_bytes(pickle.dumps(submaps))
 
 
-def join(parts: Sequence[Path], output: Path) -> None:
-    """All windows in the world of the first, one track for each feature, adjusted together."""
-    joined = pycolmap.Reconstruction(parts[0])
-    for path in parts[1:]:
-        part = pycolmap.Reconstruction(path)
-        joined_from_part = pycolmap.align_reconstructions_via_reprojections(part, joined)
-        if joined_from_part is None:
-            raise SystemExit(f"{path} cannot be laid onto those before it")
-        part.transform(joined_from_part)
-        _add(joined, part)
-    options = pycolmap.BundleAdjustmentOptions(refine_focal_length=False, refine_extra_params=False)
-    options.ceres.solver_options.num_threads = 1
-    pycolmap.bundle_adjustment(joined, options)
-    joined.update_point_3d_errors()
-    output.mkdir(parents=True)
-    joined.write(output)
+def planned(output: Path) -> tuple[Submap, ...]:
+    submaps: tuple[Submap, ...] = pickle.loads((output / "submaps.pickle").read_bytes())
+    return submaps
 
 
-def _add(joined: pycolmap.Reconstruction, part: pycolmap.Reconstruction) -> None:
-    """Photos that both have keep the pose they had; a track with a feature of a known point becomes a part of it."""
-    for image_id in sorted(set(part.reg_image_ids()) - set(joined.reg_image_ids())):
-        image = part.image(image_id)
-        copy = pycolmap.Image(
-            name=image.name,
-            keypoints=np.array([point.xy for point in image.points2D]),
-            camera_id=image.camera_id,
-            image_id=image_id,
-        )
-        joined.add_image_with_trivial_frame(copy, image.cam_from_world())
-    for point in part.points3D.values():
-        elements = [(element.image_id, element.point2D_idx) for element in point.track.elements]
-        seen = [joined.image(image_id).points2D[index] for image_id, index in elements]
-        known = {feature.point3D_id for feature in seen if feature.has_point3D()}
-        new = [
-            pycolmap.TrackElement(*element)
-            for element, feature in zip(elements, seen, strict=True)
-            if not feature.has_point3D()
-        ]
-        if not known:
-            joined.add_point3D(point.xyz, pycolmap.Track(new))
-        elif len(known) == 1:
-            (point_id,) = known
-            for element in new:
-                joined.add_observation(point_id, element)
+def join(folder: Path, output: Path) -> None:
+    """The submaps that were mapped, as the end of a mapping in submaps."""
+    database = folder / "database.db"
+    models = join_submaps([model for submap in planned(output) for model in submap.models()], seed=0)
+    options = pipeline_options(camera_options(database), _mapper(), seed=0)
+    refine_joined(database, folder, models, options, _SILENT)
+    write_models(models, output / "sparse")
 
 
-def windows(num_photos: int, size: int, overlap: int) -> list[tuple[int, int]]:
-    """In the order of time; the last is no shorter than the others."""
-    starts = list(range(0, max(num_photos - size, 0) + 1, size - overlap))
-    if starts[-1] + size < num_photos:
-        starts.append(num_photos - size)
-    return [(start, min(start + size, num_photos)) for start in starts]
+def _mapper() -> MapperOptions:
+    return MapperOptions(pipeline={"extract_colors": False}, num_threads=1)
 
 
 def run(*arguments: object) -> Cost:
     """One step of this script in a process of its own, with one thread."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "GLOG_minloglevel": "2"}
     done = subprocess.run(
-        [sys.executable, __file__, *map(str, arguments)], env=environment, capture_output=True, text=True, check=False
+        [sys.executable, "-m", "tests.studies.submaps", *map(str, arguments)],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if done.returncode:
         raise SystemExit(f"{arguments} failed\n{done.stderr[-2000:]}")
@@ -221,22 +170,26 @@ def study(num_photos: int, size: int, overlap: int, *, one_piece: bool, seed: in
         folder = Path(name)
         simulate(folder, num_photos, seed)
         if one_piece:
-            costs["one piece"] = run("--map", folder, folder / "one", 0, num_photos)
-            _say(num_photos, "one piece", costs["one piece"], folder, folder / "one")
-        parts, mapping = [], Cost()
-        for first, last in windows(num_photos, size, overlap):
-            parts.append(folder / f"part_{first}")
-            mapping += run("--map", folder, parts[-1], first, last)
-        joining = run("--join", *parts, folder / "joined")
-        costs["submaps"] = mapping + joining
-        what = f"submaps ({len(parts)}; joining {joining.seconds:.1f} s)"
-        _say(num_photos, what, costs["submaps"], folder, folder / "joined")
+            costs["one piece"] = run("--map", folder, folder / "one")
+            _say(num_photos, "one piece", costs["one piece"], folder, folder / "one" / "0")
+        output = folder / "submaps"
+        output.mkdir()
+        planning = run("--plan", folder, output, size, overlap)
+        num_submaps, mapping = len(planned(output)), Cost()
+        for k in range(num_submaps):
+            mapping += run("--submap", output, k)
+        joining = run("--join", folder, output)
+        costs["submaps"] = planning + mapping + joining
+        what = f"{num_submaps} submaps"
+        _say(num_photos, what, costs["submaps"], folder, output / "sparse" / "0")
+        for step, cost in (("planning", planning), ("mapping", mapping), ("joining", joining)):
+            print(f"{'':7}{step:34} {cost.seconds:9.1f} s {cost.peak_mb:8.0f} MB", flush=True)
     return costs
 
 
 def _say(num_photos: int, what: str, cost: Cost, folder: Path, model: Path) -> None:
     num = pycolmap.Reconstruction(model).num_reg_images()
-    rmse = refined(folder, model, folder / f"refined_{model.name}")
+    rmse = refined(folder, model, folder / "refined")
     print(
         f"{num_photos:6} {what:34} {cost.seconds:9.1f} s {cost.peak_mb:8.0f} MB {num:6} registered   RMSE {rmse} m",
         flush=True,
@@ -272,17 +225,21 @@ def main() -> None:
 def step() -> None:
     """One process of the study; its last line is what it cost."""
     if sys.argv[1] == "--map":
-        folder, output, first, last = sys.argv[2:]
-        map_photos(Path(folder), Path(output), int(first), int(last))
+        map_in_one_piece(Path(sys.argv[2]), Path(sys.argv[3]))
+    elif sys.argv[1] == "--plan":
+        plan(Path(sys.argv[2]), Path(sys.argv[3]), int(sys.argv[4]), int(sys.argv[5]))
+    elif sys.argv[1] == "--submap":
+        planned(Path(sys.argv[2]))[int(sys.argv[3])].map(_SILENT)
     else:
-        paths = [Path(name) for name in sys.argv[2:]]
-        join(paths[:-1], paths[-1])
+        join(Path(sys.argv[2]), Path(sys.argv[3]))
     used = resource.getrusage(resource.RUSAGE_SELF)
     print(json.dumps([used.ru_utime + used.ru_stime, used.ru_maxrss / 1024]))
 
 
+_STEPS = ("--map", "--plan", "--submap", "--join")
+
 if __name__ == "__main__":
-    if sys.argv[1:2] in (["--map"], ["--join"]):
+    if sys.argv[1:2] and sys.argv[1] in _STEPS:
         step()
     else:
         main()

@@ -98,6 +98,21 @@ RECONSTRUCTION_FLAGS = (
     Flag("camera_model", "camera.model", "COLMAP camera model, as OPENCV", metavar="MODEL"),
     Flag("camera_params", "camera.params", "its parameters in COLMAP's order", _numbers, metavar="A,B,.."),
     Flag("matching", "mapper.matching", "which photos are matched", choices=MATCHING_METHODS),
+    Flag(
+        "submap_size",
+        "mapper.submap_size",
+        "map stretches of so many photos each on its own, and join them (default: all in one piece)",
+        int,
+        metavar="N",
+    ),
+    Flag("submap_overlap", "mapper.submap_overlap", "photos that two of them share (default: 20)", int, metavar="N"),
+    Flag(
+        "num_submaps_at_once",
+        "mapper.num_submaps_at_once",
+        "each in a process of its own; they share the threads (default: 1)",
+        int,
+        metavar="N",
+    ),
 )
 LOG_FLAGS = (
     Flag(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import combinations
 from pathlib import Path
 
 import pycolmap
@@ -39,6 +40,31 @@ def remove_database(path: Path) -> None:
     """Remove the file and those that SQLite keeps beside it."""
     for suffix in ("", "-wal", "-shm"):
         path.with_name(path.name + suffix).unlink(missing_ok=True)
+
+
+def copy_stretch(source_path: Path, path: Path, image_ids: Sequence[int]) -> None:
+    """A new database for mapping some of another one's photos, which keep their ids.
+
+    It has their features, without descriptors, and those of their matches that fit one geometry of two views.
+    """
+    remove_database(path)
+    with (
+        pycolmap.Database.open(source_path) as source,
+        pycolmap.Database.open(path) as target,
+        pycolmap.DatabaseTransaction(target),
+    ):
+        for camera in source.read_all_cameras():
+            target.write_camera(camera, use_camera_id=True)
+        for rig in source.read_all_rigs():
+            target.write_rig(rig, use_rig_id=True)
+        for image_id in image_ids:
+            image = source.read_image(image_id)
+            target.write_frame(source.read_frame(image.frame_id), use_frame_id=True)
+            target.write_image(image, use_image_id=True)
+            target.write_keypoints(image_id, source.read_keypoints(image_id))
+        for first, second in combinations(sorted(image_ids), 2):
+            if source.exists_two_view_geometry(first, second):
+                target.write_two_view_geometry(first, second, source.read_two_view_geometry(first, second))
 
 
 def restore_names(path: Path, image_names: Sequence[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 
 import pycolmap
@@ -18,6 +19,10 @@ from rangesfm.vision.database import num_matching_pairs
 from rangesfm.vision.mapping_loop import IncrementalMapping
 from rangesfm.vision.photos import Photos
 from rangesfm.vision.snapshots import Snapshots, newest_snapshot, remove_snapshots
+
+
+class NoModelError(ReconstructionError):
+    """Nothing failed; the photos just do not give a model."""
 
 
 def pipeline_options(camera: CameraOptions, mapper: MapperOptions, seed: int) -> pycolmap.IncrementalPipelineOptions:
@@ -45,7 +50,8 @@ def map_incrementally(
     Goes on from the newest snapshot in ``snapshots_path``, if there is one, and has its own there until it is done.
 
     Raises:
-        ReconstructionError: there is not a single one.
+        NoModelError: there is not a single one.
+        ReconstructionError: COLMAP failed.
     """
     begun = newest_snapshot(snapshots_path)
     counter = _Counter(begun)
@@ -81,15 +87,20 @@ def map_incrementally(
     if not models:
         with pycolmap.Database.open(database_path) as database:
             num_matching = num_matching_pairs(database)
-        raise ReconstructionError(
+        raise NoModelError(
             f"no model from {len(photos.names)} photos, of which {num_matching} pairs match: photos from"
             " more places sideways to the view, or known camera parameters, may help"
         )
+    write_models(models.values(), models_path)
+    remove_snapshots(snapshots_path)
+
+
+def write_models(models: Iterable[pycolmap.Reconstruction], models_path: Path) -> None:
+    """As ``models_path``/0, /1, ..., the one with the most photos first."""
     with new_folder(models_path) as temporary:
-        for index, model in enumerate(sorted(models.values(), key=lambda model: -model.num_reg_images())):
+        for index, model in enumerate(sorted(models, key=lambda model: -model.num_reg_images())):
             (temporary / str(index)).mkdir()
             model.write_binary(temporary / str(index))
-    remove_snapshots(snapshots_path)
 
 
 def read_models(models_path: Path) -> tuple[pycolmap.Reconstruction, ...]:

@@ -37,6 +37,11 @@ class MatchingOptions:
     def is_sequential(self) -> bool:
         return isinstance(self.pairing, pycolmap.SequentialPairingOptions)
 
+    @property
+    def is_by_place(self) -> bool:
+        """Whether it is the places of photos in the order that make a pair, and not what they look like."""
+        return not (isinstance(self.pairing, pycolmap.SequentialPairingOptions) and self.pairing.loop_detection)
+
 
 def matching_options(mapper: MapperOptions, num_photos: int, seed: int) -> MatchingOptions:
     """Raises InputError for a method that does not exist, and for keys or values that are not COLMAP's."""

@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pycolmap
 
-from rangesfm.colmap_log import colmap_log
 from rangesfm.errors import ReconstructionError
-from rangesfm.files import make_output_folder
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import Progress, SilentProgress
-from rangesfm.vision.camera import camera_of_photos, check_camera
-from rangesfm.vision.features import extract_features, feature_options
-from rangesfm.vision.mapping import map_incrementally, pipeline_options, read_models, remove_models
+from rangesfm.vision.mapping import map_incrementally, pipeline_options, read_models, write_models
 from rangesfm.vision.mapping_loop import GlobalAdjustment, mapping_with
-from rangesfm.vision.matching import match_features, matching_options
-from rangesfm.vision.photos import Photos, usable_photos
-from rangesfm.vision.renewed_database import RenewedDatabase, forget_database
-from rangesfm.vision.snapshots import remove_snapshots
-from rangesfm.vision.steps import Steps, fingerprint
+from rangesfm.vision.matched_photos import MatchedPhotos, Workspace, match_photos
+from rangesfm.vision.steps import fingerprint
+from rangesfm.vision.submap_joining import join_submaps
+from rangesfm.vision.submap_processes import map_submaps
+from rangesfm.vision.submap_refinement import refine_joined
+from rangesfm.vision.submaps import Submap, check_submap_options, plan_submaps
 
 
 @dataclass(frozen=True)
@@ -66,6 +61,10 @@ def reconstruct(
     interrupted one had found, and its newest snapshot of the mapping (``mapping_snapshot``). Where only some photos
     are other ones, so are the features of those that are the same, and the matches of pairs of them.
 
+    With ``mapper.submap_size``, stretches of so many photos are mapped in ``submaps``, each by a process of its own,
+    and joined by the photos that they share; those that cannot be are separate models. An earlier run's submaps of the
+    same photos are taken over.
+
     Args:
         image_path: folder of the photos.
         image_names: the keyframes, relative to it, in time order.
@@ -74,103 +73,126 @@ def reconstruct(
         seed: the same one gives the same models.
         restart: take nothing over.
         before_change: called before models of an earlier run are removed or replaced.
-        adjustment: takes the place of COLMAP's global bundle adjustment while the map grows.
+        adjustment: takes the place of COLMAP's global bundle adjustment while the map grows; not in submaps.
 
     Raises:
         InputError: options that COLMAP does not take, or a folder that cannot be written to.
         ReconstructionError: the photos cannot be read, or do not give a model.
         KeyboardInterrupt: as soon as COLMAP has stopped.
     """
-    progress, output = progress or SilentProgress(), Path(output_path)
-    check_camera(camera)
-    for_features = feature_options(mapper)
-    for_matching = matching_options(mapper, len(image_names), seed)
-    for_mapping = pipeline_options(camera, mapper, seed)
-    photos = usable_photos(Path(image_path), image_names)
-    its_camera = camera_of_photos(camera, photos.folder / photos.names[0], photos.width, photos.height)
-    _say_left_out(photos, progress)
-    make_output_folder(output)
-
-    database, models, log = output / "database.db", output / "sparse", output / "mapper.log"
-    snapshots = output / "mapping_snapshot"
-    steps = Steps(output / "reconstruct.json", progress)
-    if restart:
-        steps.forget("features")
-        forget_database(steps)
-
-    def remove_old_models() -> None:
-        before_change()
-        remove_models(models)
-        remove_snapshots(snapshots)
-
-    def prepare_features() -> None:
-        remove_old_models()
-        log.unlink(missing_ok=True)
-        renewed.begin(progress)
-
-    def prepare_matching() -> None:
-        remove_old_models()
-        renewed.begin_matching()
-
-    with colmap_log(log), _pointing_to(log):
-        steps.note("photos", photos.contents(steps.notes.get("photos", {})))
-        contents = {name: sha256 for name, (_, sha256) in steps.notes["photos"].items()}
-        of_features = fingerprint(pycolmap.__version__, mapper.features)
-        of_matches = fingerprint(
-            of_features, _plain(its_camera), for_matching.is_sequential, mapper.pairing, mapper.matcher, seed
-        )
-        renewed = RenewedDatabase(database, photos, contents, its_camera, for_matching, of_features, of_matches, steps)
-        inputs = fingerprint(of_features, _plain(its_camera), list(contents.items()))
-        steps.run(
-            "features",
-            inputs,
-            database,
-            prepare_features,
-            lambda: extract_features(database, photos, for_features, progress),
-        )
-        inputs = fingerprint(inputs, of_matches)
-        steps.run(
-            "matching",
-            inputs,
-            database,
-            prepare_matching,
-            lambda: match_features(database, photos, for_matching, progress),
-        )
-        own = () if adjustment is None else (adjustment.inputs,)
-        inputs = fingerprint(inputs, mapper.pipeline, camera.mapping_refines_intrinsics, *own)
-        steps.run(
-            "mapping",
-            inputs,
-            models / "0",
-            remove_old_models,
-            lambda: map_incrementally(
-                database, photos, models, snapshots, for_mapping, progress, mapping_with(adjustment)
-            ),
-            unfinished=snapshots,
-        )
-    found = read_models(models)
+    progress = progress or SilentProgress()
+    space = Workspace(Path(output_path), progress, before_change)
+    mapping = _Mapping(camera, mapper, seed, space, adjustment)
+    matched = mapping.match(Path(image_path), image_names, restart=restart)
+    mapping.map(matched)
+    found = read_models(space.models)
     _say_separate(found, progress)
-    return ReconstructionSummary(found, len(image_names), found[0].num_reg_images(), steps.seconds, log)
+    return ReconstructionSummary(found, len(image_names), found[0].num_reg_images(), space.steps.seconds, space.log)
 
 
-def _plain(camera: pycolmap.Camera) -> list[Any]:
-    return [camera.model_name, camera.params.tolist(), camera.width, camera.height, camera.has_prior_focal_length]
+def prepare_submaps(
+    image_path: str | Path,
+    image_names: Sequence[str],
+    output_path: str | Path,
+    *,
+    camera: CameraOptions,
+    mapper: MapperOptions,
+    seed: int = 0,
+    progress: Progress | None = None,
+    restart: bool = False,
+    before_change: Callable[[], None] = lambda: None,
+) -> tuple[Submap, ...]:
+    """What ``reconstruct`` does before it maps, for those who map submaps elsewhere: it takes over all that are mapped.
+
+    Arguments and errors as of ``reconstruct``.
+
+    Returns:
+        The submaps that are still to be mapped (``Submap.map``), each independent of the others; none where the photos
+        are mapped in one piece.
+    """
+    space = Workspace(Path(output_path), progress or SilentProgress(), before_change)
+    mapping = _Mapping(camera, mapper, seed, space)
+    matched = mapping.match(Path(image_path), image_names, restart=restart)
+    if mapping.is_done(matched) or not mapping.is_in_submaps(matched):
+        return ()
+    return tuple(submap for submap in mapping.submaps(matched) if not submap.is_mapped)
 
 
-@contextmanager
-def _pointing_to(log: Path) -> Iterator[None]:
-    """Say in a failure where COLMAP's own words are."""
-    try:
-        yield
-    except ReconstructionError as error:
-        raise ReconstructionError(f"{error} (COLMAP's log: {log})") from error
+@dataclass(frozen=True)
+class _Mapping:
+    """Step 3: of matched photos, in one piece or in submaps."""
 
+    camera: CameraOptions
+    mapper: MapperOptions
+    seed: int
+    space: Workspace
+    adjustment: GlobalAdjustment | None = None
 
-def _say_left_out(photos: Photos, progress: Progress) -> None:
-    if photos.left_out:
-        name, reason = next(iter(photos.left_out.items()))
-        num = len(photos.left_out)
-        progress.message(f"{num} of {num + len(photos.names)} photos are left out; the first, {name}, {reason}")
+    def match(self, image_path: Path, image_names: Sequence[str], *, restart: bool) -> MatchedPhotos:
+        """Steps 1 and 2; all options are looked at before."""
+        self._options()
+        check_submap_options(self.mapper)
+        return match_photos(image_path, image_names, self.camera, self.mapper, self.seed, self.space, restart=restart)
+
+    def map(self, matched: MatchedPhotos) -> None:
+        """Write the models, unless an earlier run has done so with the same inputs."""
+        in_submaps = self.is_in_submaps(matched)
+        with self.space.logged():
+            self.space.steps.run(
+                "mapping",
+                self._inputs(matched),
+                self._output,
+                self.space.remove_old_models,
+                lambda: self._in_submaps(matched) if in_submaps else self._in_one_piece(matched),
+                unfinished=self.space.submaps if in_submaps else self.space.snapshots,
+            )
+
+    def is_done(self, matched: MatchedPhotos) -> bool:
+        return self.space.steps.is_done("mapping", self._inputs(matched), self._output)
+
+    def is_in_submaps(self, matched: MatchedPhotos) -> bool:
+        return self.mapper.submap_size is not None and self.mapper.submap_size < len(matched.photos.names)
+
+    def submaps(self, matched: MatchedPhotos) -> tuple[Submap, ...]:
+        space = self.space
+        return plan_submaps(matched, space.database, space.submaps, self.camera, self.mapper, self.seed)
+
+    @property
+    def _output(self) -> Path:
+        return self.space.models / "0"
+
+    def _options(self) -> pycolmap.IncrementalPipelineOptions:
+        return pipeline_options(self.camera, self.mapper, self.seed)
+
+    def _inputs(self, matched: MatchedPhotos) -> str:
+        inputs = [matched.inputs, self.mapper.pipeline, self.camera.mapping_refines_intrinsics]
+        if self.adjustment is not None:
+            inputs.append(self.adjustment.inputs)
+        if self.is_in_submaps(matched):
+            inputs += [self.mapper.submap_size, self.mapper.submap_overlap]
+        return fingerprint(*inputs)
+
+    def _in_one_piece(self, matched: MatchedPhotos) -> None:
+        space = self.space
+        map_incrementally(
+            space.database,
+            matched.photos,
+            space.models,
+            space.snapshots,
+            self._options(),
+            space.progress,
+            mapping_with(self.adjustment),
+        )
+
+    def _in_submaps(self, matched: MatchedPhotos) -> None:
+        space, submaps = self.space, self.submaps(matched)
+        space.progress.message(f"mapping: {len(submaps)} submaps of {len(submaps[0].photos.names)} photos")
+        map_submaps(submaps, self.mapper.num_submaps_at_once, space.progress)
+        models = join_submaps([model for submap in submaps for model in submap.models()], self.seed)
+        if not models:
+            raise ReconstructionError(f"no model from any of {len(submaps)} submaps")
+        refine_joined(space.database, matched.photos.folder, models, self._options(), space.progress)
+        write_models(models, space.models)
 
 
 def _say_separate(models: tuple[pycolmap.Reconstruction, ...], progress: Progress) -> None:

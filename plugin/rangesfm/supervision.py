@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import queue
 import signal
 import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -13,8 +15,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import IO, Any
-
-import psutil
 
 _POLL_INTERVAL_S = 0.2
 _MAX_STOP_S = 20.0  # until a process that was interrupted is killed
@@ -41,19 +41,25 @@ class Ended:
     errors: str
 
 
+def child_command(module: str) -> list[str]:
+    """Of a module that works for its parent (``child_process``)."""
+    return [sys.executable, "-m", module, str(os.getpid())]
+
+
 def supervise(
     command: Sequence[str],
     given: bytes,
     listen: Callable[[dict[str, Any]], None],
     *,
     environment: Mapping[str, str],
-    memory_limit_bytes: int,
+    memory_limit_bytes: int | None,
     is_stopped: Callable[[], bool],
 ) -> Ended:
     """Run a process that reads ``given`` and writes JSON objects, one a line.
 
     Args:
         listen: called with each message.
+        memory_limit_bytes: it is killed if it takes more; None: there is no limit. Watching it needs psutil.
         is_stopped: asked several times a second; once it says so, the process is interrupted.
     """
     with tempfile.TemporaryFile() as errors:
@@ -78,7 +84,9 @@ def supervise(
 class _Watched:
     """Interrupts or kills a process where that is due."""
 
-    def __init__(self, process: subprocess.Popen[bytes], memory_limit_bytes: int, is_stopped: Callable[[], bool]):
+    def __init__(
+        self, process: subprocess.Popen[bytes], memory_limit_bytes: int | None, is_stopped: Callable[[], bool]
+    ):
         self._process = process
         self._limit = memory_limit_bytes
         self._is_stopped = is_stopped
@@ -86,17 +94,23 @@ class _Watched:
         self.stopped_at: float | None = None
 
     def look(self) -> None:
-        try:
-            used = psutil.Process(self._process.pid).memory_info().rss
-        except psutil.Error:  # it has ended
-            return
-        if used > self._limit and self.needed_bytes is None:
-            self.needed_bytes = used
-            self._process.kill()
+        if self._limit is not None and self.needed_bytes is None:
+            self._look_at_memory(self._limit)
         if self.stopped_at is None and self._is_stopped():
             self.stopped_at = time.monotonic()
             self._process.send_signal(signal.SIGINT)
         if self.stopped_at is not None and time.monotonic() - self.stopped_at > _MAX_STOP_S:
+            self._process.kill()
+
+    def _look_at_memory(self, limit_bytes: int) -> None:
+        import psutil
+
+        try:
+            used = psutil.Process(self._process.pid).memory_info().rss
+        except psutil.Error:  # it has ended
+            return
+        if used > limit_bytes:
+            self.needed_bytes = used
             self._process.kill()
 
 

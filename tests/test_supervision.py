@@ -11,7 +11,7 @@ from typing import Any
 import psutil
 import pytest
 
-from rangesfm.batch.supervision import Ended, supervise
+from rangesfm.supervision import Ended, supervise
 
 
 def run(

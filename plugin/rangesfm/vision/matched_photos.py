@@ -1,0 +1,156 @@
+"""Steps 1 and 2: photos to features and matches in a database, taken over where an earlier run has done them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+
+from rangesfm.colmap_log import colmap_log
+from rangesfm.errors import ReconstructionError
+from rangesfm.files import make_output_folder
+from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.progress import Progress
+from rangesfm.vision.camera import camera_of_photos, check_camera
+from rangesfm.vision.features import extract_features, feature_options
+from rangesfm.vision.mapping import remove_models
+from rangesfm.vision.matching import match_features, matching_options
+from rangesfm.vision.photos import Photos, usable_photos
+from rangesfm.vision.renewed_database import RenewedDatabase, forget_database
+from rangesfm.vision.snapshots import remove_snapshots
+from rangesfm.vision.steps import Steps, fingerprint
+
+
+class Workspace:
+    """The output folder of a reconstruction: what is where, and what of it an earlier run has done.
+
+    Attributes:
+        output: the folder, which ``begin`` makes.
+        database, models, snapshots, submaps, log: in it.
+        steps: the record of what is done.
+        progress: who listens.
+    """
+
+    def __init__(self, output: Path, progress: Progress, before_change: Callable[[], None]):
+        self.progress = progress
+        self.output = output
+        self.database = output / "database.db"
+        self.models = output / "sparse"
+        self.snapshots = output / "mapping_snapshot"
+        self.submaps = output / "submaps"
+        self.log = output / "mapper.log"
+        self.steps = Steps(output / "reconstruct.json", progress)
+        self._before_change = before_change
+
+    def begin(self, *, restart: bool) -> None:
+        """Make the folder; with ``restart`` nothing of an earlier run is taken over."""
+        make_output_folder(self.output)
+        if restart:
+            self.steps.forget("features")
+            forget_database(self.steps)
+            shutil.rmtree(self.submaps, ignore_errors=True)
+
+    def remove_old_models(self) -> None:
+        self._before_change()
+        remove_models(self.models)
+        remove_snapshots(self.snapshots)
+
+    @contextmanager
+    def logged(self) -> Iterator[None]:
+        """Have COLMAP's own words in the log, and say in a failure where they are."""
+        with colmap_log(self.log):
+            try:
+                yield
+            except ReconstructionError as error:
+                raise ReconstructionError(f"{error} (COLMAP's log: {self.log})") from error
+
+
+@dataclass(frozen=True)
+class MatchedPhotos:
+    """Photos with their matches in a database.
+
+    Attributes:
+        photos: in the order of their ids 1, 2, ...
+        contents: SHA-256 of each, by name.
+        inputs: fingerprint of the matches.
+        match_inputs: of what they depend on beside the photos.
+        only_by_place: whether a pair is matched for the places of its photos in the order, not for their looks.
+    """
+
+    photos: Photos
+    contents: dict[str, str]
+    inputs: str
+    match_inputs: str
+    only_by_place: bool
+
+
+def match_photos(
+    image_path: Path,
+    image_names: Sequence[str],
+    camera: CameraOptions,
+    mapper: MapperOptions,
+    seed: int,
+    space: Workspace,
+    *,
+    restart: bool,
+) -> MatchedPhotos:
+    """Features and matches of photos of one camera; arguments and errors as of ``reconstruct``."""
+    check_camera(camera)
+    for_features = feature_options(mapper)
+    for_matching = matching_options(mapper, len(image_names), seed)
+    photos = usable_photos(image_path, image_names)
+    its_camera = camera_of_photos(camera, photos.folder / photos.names[0], photos.width, photos.height)
+    space.begin(restart=restart)
+    steps, progress, database = space.steps, space.progress, space.database
+    _say_left_out(photos, progress)
+
+    def prepare_features() -> None:
+        space.remove_old_models()
+        space.log.unlink(missing_ok=True)
+        renewed.begin(progress)
+
+    def prepare_matching() -> None:
+        space.remove_old_models()
+        renewed.begin_matching()
+
+    with space.logged():
+        steps.note("photos", photos.contents(steps.notes.get("photos", {})))
+        contents = {name: sha256 for name, (_, sha256) in steps.notes["photos"].items()}
+        of_features = fingerprint(pycolmap.__version__, mapper.features)
+        of_matches = fingerprint(
+            of_features, _plain(its_camera), for_matching.is_sequential, mapper.pairing, mapper.matcher, seed
+        )
+        renewed = RenewedDatabase(database, photos, contents, its_camera, for_matching, of_features, of_matches, steps)
+        inputs = fingerprint(of_features, _plain(its_camera), list(contents.items()))
+        steps.run(
+            "features",
+            inputs,
+            database,
+            prepare_features,
+            lambda: extract_features(database, photos, for_features, progress),
+        )
+        inputs = fingerprint(inputs, of_matches)
+        steps.run(
+            "matching",
+            inputs,
+            database,
+            prepare_matching,
+            lambda: match_features(database, photos, for_matching, progress),
+        )
+    return MatchedPhotos(photos, contents, inputs, of_matches, for_matching.is_by_place)
+
+
+def _plain(camera: pycolmap.Camera) -> list[Any]:
+    return [camera.model_name, camera.params.tolist(), camera.width, camera.height, camera.has_prior_focal_length]
+
+
+def _say_left_out(photos: Photos, progress: Progress) -> None:
+    if photos.left_out:
+        name, reason = next(iter(photos.left_out.items()))
+        num = len(photos.left_out)
+        progress.message(f"{num} of {num + len(photos.names)} photos are left out; the first, {name}, {reason}")
