@@ -91,13 +91,12 @@ def test_gradient_and_hessian_are_those_of_the_cost(chain: SyntheticModel) -> No
 def test_photos_bind_neither_place_nor_turn_nor_scale_of_the_whole(chain: SyntheticModel) -> None:
     truth, _ = poses_and_rays(chain)
     graph = make_graph(chain, truth, stddev_m=1e6)
-    layout = keyframe_graph._Layout.of(graph)
     whole, _ = bent(truth, 0.0, 1.0)
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     moved = Poses(turn @ whole.world_from_rig, 1.7 * whole.centers @ turn.T + [3.0, -2.0, 5.0])
 
     def cost(poses: Poses) -> float:
-        residuals, _ = keyframe_graph._relative_poses(graph.vision, layout, poses)
+        residuals, _ = keyframe_graph._relative_poses(graph.vision, poses)
         return float(residuals @ (graph.vision.matrix @ residuals))
 
     sideways = Poses(truth.world_from_rig, truth.centers + 0.01 * np.arange(len(truth))[:, None] % 2 * [0.0, 1.0, 0.0])

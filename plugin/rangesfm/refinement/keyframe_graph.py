@@ -189,11 +189,13 @@ class _Terms:
 
     @classmethod
     def at(cls, graph: KeyframeGraph, layout: _Layout, state: GraphState) -> _Terms:
-        residuals, jacobian = _relative_poses(graph.vision, layout, state.poses)
+        residuals, jacobian = _relative_poses(graph.vision, state.poses)
         bound = graph.vision.matrix @ residuals
         cost = 0.5 * float(residuals @ bound)
-        gradient = jacobian.T @ bound
-        hessian = jacobian.T @ (graph.vision.matrix @ jacobian)
+        gradient = np.zeros(layout.num)
+        gradient[: layout.first_anchor] = jacobian.T @ bound
+        hessian = (jacobian.T @ (graph.vision.matrix @ jacobian)).tocsr()
+        hessian.resize(layout.num, layout.num)
 
         scaled, derivative = _range_rows(graph, layout, state)
         rho, weights, _ = graph.share * graph.loss.rho(scaled**2)
@@ -208,10 +210,11 @@ class _Terms:
         return cls(cost, gradient, hessian.tocsc(), whitened.tocsr())
 
 
-def _relative_poses(vision: VisionInformation, layout: _Layout, poses: Poses) -> tuple[Array, sparse.csr_array]:
+def _relative_poses(vision: VisionInformation, poses: Poses) -> tuple[Array, sparse.bsr_array]:
     """(6 u,) turn and shift of each relative pose from its origin, in the reference's frame, and their derivative.
 
-    Shifts are measured in the local scale of the map around the reference, which the photos do not see.
+    The derivative is by the n poses, in blocks of 6 by 6, whose products are several times faster than number by
+    number. Shifts are measured in the local scale of the map around the reference, which the photos do not see.
     """
     r, k = vision.reference, vision.frame
     turn, shift = _relative(poses, r, k)
@@ -227,11 +230,9 @@ def _relative_poses(vision: VisionInformation, layout: _Layout, poses: Poses) ->
     to_frame[:, 3:, 3:] = np.swapaxes(poses.world_from_rig[r], 1, 2) / scale[:, :, None]
     to_reference[:, 3:, 3:] = -to_frame[:, 3:, 3:]
     to_reference[:, 3:, :3] = cross_matrices(shift) / scale[:, :, None]
-    values = np.concatenate([to_reference, to_frame], axis=2)
-    columns = np.concatenate([6 * r[:, None] + np.arange(6), 6 * k[:, None] + np.arange(6)], axis=1)
-    indices = np.repeat(columns, 6, axis=0).ravel()
-    starts = np.arange(0, 72 * len(r) + 1, 12)
-    return residuals.ravel(), sparse.csr_array((values.ravel(), indices, starts), shape=(6 * len(r), layout.num))
+    blocks = np.stack([to_reference, to_frame], axis=1).reshape(-1, 6, 6)
+    columns, starts = np.stack([r, k], axis=1).ravel(), np.arange(0, 2 * len(r) + 1, 2)
+    return residuals.ravel(), sparse.bsr_array((blocks, columns, starts), shape=(6 * len(r), 6 * len(poses)))
 
 
 def _relative(poses: Poses, reference: Indices, frame: Indices) -> tuple[Array, Array]:

@@ -90,13 +90,13 @@ class VisionInformation:
     Attributes:
         origin: the poses at which the photos fit best.
         reference, frame: (u,) keyframe ``frame`` seen from keyframe ``reference``.
-        matrix: (6 u, 6 u) sparse information.
+        matrix: (6 u, 6 u) sparse information, in blocks of 6 by 6.
     """
 
     origin: Poses
     reference: Indices
     frame: Indices
-    matrix: sparse.csr_array
+    matrix: sparse.bsr_array
 
 
 def model_poses(metric: pycolmap.Reconstruction, frame_ids: Indices) -> Poses:
@@ -196,7 +196,7 @@ def vision_information(observations: Observations, poses: Poses) -> VisionInform
         ),
         shape=(6 * len(pairs), 6 * len(pairs)),
     )
-    return VisionInformation(poses, pairs // n, pairs % n, matrix.tocsr())
+    return VisionInformation(poses, pairs // n, pairs % n, matrix.tocsr().tobsr((6, 6)))
 
 
 def _pieces(point: Indices) -> dict[int, Indices]:
