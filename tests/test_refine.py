@@ -344,10 +344,10 @@ class TestWhatIsKnownStays:
         assert np.abs(freed.camera(1).params - survey.sfm.camera(1).params).max() > 1e-3
 
 
-def with_ranges_between_anchors(survey: Survey, error_m: float = 0.0) -> RangeObservations:
+def with_ranges_between_anchors(survey: Survey, error_m: float = 0.0, first_pair: int = 0) -> RangeObservations:
     """The survey's, and one range between any two anchors."""
     log, ids = survey.observations.log, list(survey.anchors_m)
-    pairs = list(itertools.combinations(ids, 2))
+    pairs = list(itertools.combinations(ids, 2))[first_pair:]
     lengths = [np.linalg.norm(survey.anchors_m[a] - survey.anchors_m[b]) + error_m for a, b in pairs]
     assert log.timestamp_s is not None
     both = RangeLog.from_arrays(
@@ -450,6 +450,25 @@ class TestDistances:
             lengths = [[np.linalg.norm(a - b) for a, b in itertools.combinations(at, 2)] for at in (places, truth)]
             errors[name] = rmse(np.diff(lengths, axis=0).T)
         assert errors["with"] < 0.5 * errors["without"]
+
+    def test_a_range_between_anchors_that_is_far_off_has_no_say(self) -> None:
+        survey = make_survey("first_camera", pixel_stddev=0.5, radio=Radio(range_stddev_m=RANGE_STDDEV_M))
+        observations = with_ranges_between_anchors(survey)
+        range_m = observations.log.range_m.copy()
+        range_m[np.flatnonzero(observations.status == RangeStatus.ANCHOR_ANCHOR)[0]] += 5.0
+        places = []
+        for taken in (
+            replace(observations, log=replace(observations.log, range_m=range_m)),
+            with_ranges_between_anchors(survey, first_pair=1),
+        ):
+            _, summary = survey.refine(
+                survey.anchors(np.inf),
+                observations=taken,
+                range_stddev_m=np.full(len(taken.log), RANGE_STDDEV_M),
+                common_bias_stddev_m=0.05,
+            )
+            places.append(np.array([anchor.position_m for anchor in summary.anchors]))
+        assert rmse(places[1] - places[0]) < 0.001
 
 
 def located_m(tape: Tape, model: pycolmap.Reconstruction) -> Array:

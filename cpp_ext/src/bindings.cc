@@ -114,26 +114,27 @@ ceres::CostFunction* MakeInterpolatedRangeCost(MeasuredRanges measured, RangeMod
 
 template <typename EndA, typename EndB>
 ceres::CostFunction* MakeDistanceCostBetween(double distance_m, const EndA& a, const EndB& b, double stddev_m,
-                                             bool has_bias) {
+                                             bool has_bias, double loss_scale) {
+  PositiveOrInfinite("loss_scale", loss_scale);
   return new DistanceCost<EndA, EndB>(Positive("distance_m", distance_m), a, b, Positive("stddev_m", stddev_m),
-                                      has_bias);
+                                      has_bias, TwoSidedLoss(loss_scale, loss_scale, true));
 }
 
 ceres::CostFunction* MakeDistanceCost(double distance_m, double stddev_m, const OptionalArray& a_in_cam_m,
-                                      const OptionalArray& b_in_cam_m, bool has_bias) {
+                                      const OptionalArray& b_in_cam_m, bool has_bias, double loss_scale) {
   if (a_in_cam_m && b_in_cam_m) {
     return MakeDistanceCostBetween(distance_m, CamEnd(FiniteVector3("a_in_cam_m", *a_in_cam_m)),
-                                   CamEnd(FiniteVector3("b_in_cam_m", *b_in_cam_m)), stddev_m, has_bias);
+                                   CamEnd(FiniteVector3("b_in_cam_m", *b_in_cam_m)), stddev_m, has_bias, loss_scale);
   }
   if (a_in_cam_m) {
     return MakeDistanceCostBetween(distance_m, CamEnd(FiniteVector3("a_in_cam_m", *a_in_cam_m)), PointEnd(), stddev_m,
-                                   has_bias);
+                                   has_bias, loss_scale);
   }
   if (b_in_cam_m) {
     return MakeDistanceCostBetween(distance_m, PointEnd(), CamEnd(FiniteVector3("b_in_cam_m", *b_in_cam_m)), stddev_m,
-                                   has_bias);
+                                   has_bias, loss_scale);
   }
-  return MakeDistanceCostBetween(distance_m, PointEnd(), PointEnd(), stddev_m, has_bias);
+  return MakeDistanceCostBetween(distance_m, PointEnd(), PointEnd(), stddev_m, has_bias, loss_scale);
 }
 
 ceres::CostFunction* MakeNormalPriorCost(const Array& mean, const Array& stddev) {
@@ -213,7 +214,7 @@ PYBIND11_MODULE(_cpp, m) {
                             py::arg("weight"), py::arg("offset_in_world_m"), py::arg("interval_s") = py::none(),
                             py::arg("offset_velocity_in_world_m_per_s") = py::none());
   m.def("distance_cost", &rangesfm::MakeDistanceCost, rangesfm::kOwn, py::kw_only(), py::arg("distance_m"),
-        py::arg("stddev_m"), py::arg("a_in_cam_m"), py::arg("b_in_cam_m"), py::arg("has_bias"));
+        py::arg("stddev_m"), py::arg("a_in_cam_m"), py::arg("b_in_cam_m"), py::arg("has_bias"), py::arg("loss_scale"));
   m.def("normal_prior_cost", &rangesfm::MakeNormalPriorCost, rangesfm::kOwn, py::kw_only(), py::arg("mean"),
         py::arg("stddev"));
   m.def("joint_prior_cost", &rangesfm::MakeJointPriorCost, rangesfm::kOwn, py::kw_only(), py::arg("mean"),

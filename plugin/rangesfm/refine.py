@@ -19,7 +19,6 @@ from rangesfm.geometry import Similarity
 from rangesfm.options import CameraOptions, RangeModelOptions, RefineOptions
 from rangesfm.ranging.anchors import AnchorEstimate
 from rangesfm.ranging.observations import RangeObservations, status_by_weight
-from rangesfm.ranging.robust_loss import wider
 from rangesfm.ranging.shared_errors import CURVE_STDDEV_M
 from rangesfm.refinement.antennas import antenna_positions, antennas, predicted_ranges, tags_in_cam
 from rangesfm.refinement.bundle_adjustment import (
@@ -247,7 +246,7 @@ class _Survey:
         blocks = RadioBlocks.at(radio, self.options)
         residual_rows = add_ranges(problem, self.ranges, weights, blocks, self.options)
         blocks.others.extend(
-            add_distances(problem, self.distances, radio.anchors, blocks.positions, wider(weights.loss).width)
+            add_distances(problem, self.distances, radio.anchors, blocks.positions, weights.loss.width)
         )
         add_radio_priors(problem, radio, self.tags_in_cam_m, self.common_bias_stddev_m, blocks, self.options)
         return _Added(blocks, residual_rows)

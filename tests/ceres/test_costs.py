@@ -129,7 +129,7 @@ COSTS: dict[str, Callable[[np.random.Generator], tuple[CostFunction, list[Array]
         [rng.normal(0, 5, 3), random_pose(rng, 5.0)],
     ),
     "distance between points": lambda rng: (
-        distance_cost(distance_m=3.0, stddev_m=0.01),
+        distance_cost(distance_m=3.0, stddev_m=1.0, loss_scale=20.0),
         [rng.normal(0, 5, 3), rng.normal(0, 5, 3)],
     ),
     "normal_prior": lambda rng: (
@@ -326,3 +326,5 @@ def test_priors_and_ties_of_impossible_shape_are_refused() -> None:
         distance_cost(distance_m=1.0, stddev_m=0.1, a_in_cam_m=[0.0, 0.0])
     with pytest.raises(ValueError, match="distance_m"):
         distance_cost(distance_m=0.0, stddev_m=0.1)
+    with pytest.raises(ValueError, match="loss_scale"):
+        distance_cost(distance_m=1.0, stddev_m=0.1, loss_scale=0.0)

@@ -6,6 +6,7 @@
 #include <Eigen/Core>
 
 #include "rangesfm/range_geometry.h"
+#include "rangesfm/two_sided_loss.h"
 
 namespace rangesfm {
 
@@ -50,15 +51,16 @@ class CamEnd {
 
 // 1-DoF error of a distance that was measured, by tape or by radio, in stddevs:
 //
-//   (|| a - b || + bias - distance) / stddev
+//   (|| a - b || + bias - distance) / stddev,
 //
-// Blocks: those of the two ends (rig_from_world, 7: qx qy qz qw tx ty tz; or a point in the world, 3), and the bias (1:
-// what is read too long) if it has one. Metres throughout.
+// made robust. Blocks: those of the two ends (rig_from_world, 7: qx qy qz qw tx ty tz; or a point in the world, 3), and
+// the bias (1: what is read too long) if it has one. Metres throughout.
 template <typename EndA, typename EndB>
 class DistanceCost final : public ceres::CostFunction {
  public:
-  DistanceCost(double distance, const EndA& a, const EndB& b, double stddev, bool has_bias)
-      : distance_(distance), a_(a), b_(b), inv_stddev_(1.0 / stddev), has_bias_(has_bias) {
+  DistanceCost(double distance, const EndA& a, const EndB& b, double stddev, bool has_bias,
+               TwoSidedLoss loss = TwoSidedLoss())
+      : distance_(distance), a_(a), b_(b), inv_stddev_(1.0 / stddev), has_bias_(has_bias), loss_(loss) {
     set_num_residuals(1);
     *mutable_parameter_block_sizes() = {EndA::kBlockSize, EndB::kBlockSize};
     if (has_bias_) {
@@ -72,11 +74,13 @@ class DistanceCost final : public ceres::CostFunction {
     const Eigen::Vector3d& b_in_world = b.InWorld();
     const AnchorToTag b_to_a(a.InWorld(), b_in_world.data());
     const double bias = has_bias_ ? *parameters[2] : 0.0;
-    residuals[0] = (b_to_a.Distance() + bias - distance_) * inv_stddev_;
+    const TwoSidedLoss::Robust robust = loss_((b_to_a.Distance() + bias - distance_) * inv_stddev_);
+    residuals[0] = robust.value;
     if (jacobians == nullptr) {
       return true;
     }
-    const Eigen::Vector3d direction = b_to_a.Direction() * inv_stddev_;
+    const double slope = robust.slope * inv_stddev_;
+    const Eigen::Vector3d direction = b_to_a.Direction() * slope;
     if (jacobians[0] != nullptr) {
       Eigen::Map<Eigen::Matrix<double, 1, EndA::kBlockSize>>{jacobians[0]} = a.Gradient(direction);
     }
@@ -84,7 +88,7 @@ class DistanceCost final : public ceres::CostFunction {
       Eigen::Map<Eigen::Matrix<double, 1, EndB::kBlockSize>>{jacobians[1]} = b.Gradient(-direction);
     }
     if (has_bias_ && jacobians[2] != nullptr) {
-      jacobians[2][0] = inv_stddev_;
+      jacobians[2][0] = slope;
     }
     return true;
   }
@@ -95,6 +99,7 @@ class DistanceCost final : public ceres::CostFunction {
   const EndB b_;
   const double inv_stddev_;
   const bool has_bias_;
+  const TwoSidedLoss loss_;
 };
 
 }  // namespace rangesfm

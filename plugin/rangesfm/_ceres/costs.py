@@ -171,6 +171,7 @@ def distance_cost(
     a_in_cam_m: npt.ArrayLike | None = None,
     b_in_cam_m: npt.ArrayLike | None = None,
     has_bias: bool = False,
+    loss_scale: float = math.inf,
 ) -> CostFunction:
     """A distance between two ends a and b, by tape or by radio: ``(||a - b|| + bias - distance) / stddev``.
 
@@ -183,6 +184,7 @@ def distance_cost(
         stddev_m: its noise, positive.
         a_in_cam_m, b_in_cam_m: (3,) the end in the rig frame; None for a point.
         has_bias: whether a bias is a block.
+        loss_scale: of a bounded loss (see ``RangeErrorModel``), in stddevs, positive; infinite: least squares.
 
     Raises:
         ValueError, SolverError: as ``range_cost``.
@@ -191,7 +193,12 @@ def distance_cost(
     from rangesfm import _cpp
 
     return _cpp.distance_cost(
-        distance_m=distance_m, stddev_m=stddev_m, a_in_cam_m=a_in_cam_m, b_in_cam_m=b_in_cam_m, has_bias=has_bias
+        distance_m=distance_m,
+        stddev_m=stddev_m,
+        a_in_cam_m=a_in_cam_m,
+        b_in_cam_m=b_in_cam_m,
+        has_bias=has_bias,
+        loss_scale=loss_scale,
     )
 
 

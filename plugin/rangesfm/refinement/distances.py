@@ -79,7 +79,7 @@ def add_distances(
 
     Args:
         anchors, anchor_blocks: in the order of the log; distances to one without a place are left out.
-        loss_scale: of the robust loss of distances by radio, stddevs.
+        loss_scale: of the bounded loss of distances by radio, stddevs.
 
     Returns:
         the parameter blocks that came with them.
@@ -133,7 +133,6 @@ def _add_by_radio(
     bundle: BundleAdjustment, distances: MeasuredDistances, anchor_blocks: Sequence[Array], loss_scale: float
 ) -> list[Array]:
     by_radio, bias = distances.by_radio, np.zeros(1)
-    loss = _ceres.cauchy_loss(loss_scale * bundle.pixel_stddev)
     rows = [
         row for row, pair in enumerate(by_radio.anchor_pair) if all(np.isfinite(anchor_blocks[k]).all() for k in pair)
     ]
@@ -141,10 +140,13 @@ def _add_by_radio(
         return []
     for row in rows:
         cost = _ceres.distance_cost(
-            distance_m=by_radio.distance_m[row], stddev_m=by_radio.stddev_m[row] / bundle.pixel_stddev, has_bias=True
+            distance_m=by_radio.distance_m[row],
+            stddev_m=by_radio.stddev_m[row] / bundle.pixel_stddev,
+            has_bias=True,
+            loss_scale=loss_scale * bundle.pixel_stddev,
         )
         pair = [anchor_blocks[k] for k in by_radio.anchor_pair[row]]
-        _ceres.add_residual_block(bundle.adjuster, cost, loss, [*pair, bias])
+        _ceres.add_residual_block(bundle.adjuster, cost, None, [*pair, bias])
     if distances.bias_stddev_m == 0:
         bundle.adjuster.problem.set_parameter_block_constant(bias)
     else:
