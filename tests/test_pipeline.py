@@ -308,6 +308,20 @@ def test_a_site_in_national_coordinates_loses_nothing(survey: Survey, tmp_path: 
         assert np.linalg.norm(apart) < 1e-6
 
 
+def test_two_surveyed_anchors_stay_as_far_apart_as_they_were_surveyed(survey: Survey, tmp_path: Path) -> None:
+    """They fix no frame, but a length, here one that the ranges contradict by 2 %: the refinement keeps to it."""
+    header, *rows = (survey.anchors_path or Path()).read_text().splitlines()
+    names = [row.split(",")[0] for row in rows]
+    places = 1.02 * np.array([row.split(",")[1:] for row in rows[:2]], dtype=np.float64)
+    known = [",".join([name, *map(repr, place.tolist())]) for name, place in zip(names[:2], places, strict=True)]
+    (tmp_path / "two.csv").write_text("\n".join([header, *known, *(f"{name},,," for name in names[2:])]) + "\n")
+    two = replace(survey, anchors_path=tmp_path / "two.csv", anchor_frame="site")
+    result = refine_model(two, progress=SilentProgress()).result
+    assert result["frame"] == "first_camera"
+    first, second = (np.array(result["anchors"][name]["position_m"]) for name in names[:2])
+    assert np.linalg.norm(first - second) == pytest.approx(np.linalg.norm(places[0] - places[1]), abs=0.01)
+
+
 def test_doubts_are_warnings_in_the_result_and_for_the_user(survey: Survey) -> None:
     listener = Listener()
     method = ScaleOptions(method="two-candidate", num_bootstrap=20)

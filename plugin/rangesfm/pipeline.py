@@ -21,6 +21,8 @@ from rangesfm.comparison import format_table, papers_table, reference_in_frame
 from rangesfm.config import Survey
 from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.rows import disagreements, distance_rows
+from rangesfm.distances.surveyed import surveyed_distances
+from rangesfm.distances.tape import Tape
 from rangesfm.doctor import versions
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.export import COVARIANCE_FORMATS, check_formats
@@ -513,10 +515,18 @@ def _refine(survey: Survey, inputs: RangingInputs, metric: MetricSurvey) -> Metr
         first_pose_is_fixed=estimate.frame != "site",
         camera=survey.camera,
         options=survey.refine,
-        tape=inputs.tape,
+        tape=_control(inputs, metric),
         num_threads=survey.mapper.num_threads,
     )
     return replace(metric, refined=refined, refinement=summary)
+
+
+def _control(inputs: RangingInputs, metric: MetricSurvey) -> Tape:
+    """What was taped, and the distances between surveyed anchors where their positions could not be used."""
+    tape = inputs.tape or Tape()
+    if inputs.anchor_frame != "site" or metric.estimate.frame == "site":
+        return tape
+    return replace(tape, distances=tape.distances + surveyed_distances(inputs.anchors))
 
 
 def _georeference(inputs: RangingInputs, metric: MetricSurvey) -> Georeference | None:

@@ -110,6 +110,7 @@ class AdjustmentWithRanges:
             estimate.anchors,
             tag_in_cam_m=inputs.tag_in_cam_m,
             range_stddev_m=estimate.range_stddev_m,
+            range_share=estimate.range_share,
             stddev_is_estimated=np.isnan(inputs.log.range_stddev_m) & (survey.ranges.model.range_stddev_m is None),
             correlation_inflation=estimate.correlation_inflation,
             common_bias_stddev_m=survey.ranges.model.common_bias_stddev_m,

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from rangesfm.distances.by_radio import distances_by_radio
 from rangesfm.distances.ends import LocatedDistances
+from rangesfm.distances.surveyed import surveyed_distances
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry import Similarity, path_shape
 from rangesfm.options import RangeModelOptions
@@ -27,8 +28,6 @@ _MIN_RANGES = 8
 _MIN_KEYFRAMES = 4
 # A place of its own takes three numbers, and one range more to see that they fit.
 _MIN_RANGES_OF_UNKNOWN = 5
-# Of a distance between surveyed anchors, so that it can be divided by.
-_MIN_DISTANCE_STDDEV_M = 1e-3
 
 
 @dataclass(frozen=True)
@@ -203,17 +202,15 @@ def _with_surveyed(
     distances: LocatedDistances | None, anchors: Sequence[Anchor], given: npt.NDArray[np.bool_]
 ) -> LocatedDistances | None:
     """The distances between anchors with given positions as well, which hold in any frame."""
-    pairs = np.array([(i, j) for i in np.flatnonzero(given) for j in np.flatnonzero(given) if i < j], dtype=np.int64)
-    if not len(pairs):
+    ids = [anchor.anchor_id for anchor in anchors]
+    pairs = surveyed_distances([anchor for anchor, k in zip(anchors, given, strict=True) if k])
+    if not pairs:
         return distances
-    positions = np.array([_position(a) for a in anchors])
-    stddevs = np.array([a.position_stddev_m for a in anchors])
-    first, second = pairs.T
     surveyed = LocatedDistances(
         model_length=np.full(len(pairs), np.nan),
-        anchor_pair=pairs,
-        distance_m=np.linalg.norm(positions[first] - positions[second], axis=1),
-        stddev_m=np.maximum(np.hypot(stddevs[first], stddevs[second]), _MIN_DISTANCE_STDDEV_M),
+        anchor_pair=np.array([[ids.index(end) for end in pair.ends] for pair in pairs]),
+        distance_m=np.array([pair.distance_m for pair in pairs]),
+        stddev_m=np.array([pair.stddev_m for pair in pairs]),
         is_check=np.zeros(len(pairs), dtype=bool),
     )
     return surveyed if distances is None else distances.joined(surveyed)
