@@ -165,7 +165,7 @@ def refine_with_ranges(
     )
     tags_in_cam_m = tags_in_cam(observations.log, tag_in_cam_m)
     placed = antennas(trajectory, observations, metric_from_sfm, tags_in_cam_m)
-    ranges = RadioRanges(observations, trajectory, placed, np.flatnonzero(observations.has_place))
+    ranges = RadioRanges(observations, trajectory, placed, observations.placed_rows)
     survey = _Survey(
         metric,
         tuple(anchors),

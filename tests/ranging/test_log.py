@@ -50,9 +50,12 @@ class TestWithAnchors:
         assert again.kind.tolist() == direct.kind.tolist()
         assert [set(ends) for ends in ends_of(again)] == [set(pair) for pair in pairs]
 
-    def test_ids_are_in_the_order_of_their_first_range(self) -> None:
-        log = log_of(("B", "t"), ("t", "A"), ("C", "t")).with_anchors({"A", "B", "C"})
-        assert log.anchor_ids == ("B", "A", "C")
+    def test_ids_are_in_the_order_that_people_count_in_whatever_the_logs(self) -> None:
+        ids = ("A1", "A02", "A2", "A10", "A10b", "B", "a", "\u00e9")
+        for order in (ids, ids[::-1]):
+            log = log_of(*((name, "t") for name in order)).with_anchors(set(ids))
+            assert log.anchor_ids == ids
+            assert [log.anchor_ids[k] for k in log.anchor_index] == list(order)
 
 
 class TestPeerRanges:
@@ -125,7 +128,8 @@ class TestRoles:
         log = log_of(("0", "0"), ("0", "1"), ("1", "0"))
         assert tell_roles(log, sides, known_anchor_ids={"0", "1"}) is log
         part = log.subset(np.array([1, 2]))
-        assert (part.tag_ids, part.anchor_ids) == (("0", "1"), ("1", "0"))
+        assert (part.tag_ids, part.anchor_ids) == (("0", "1"), ("0", "1"))
+        assert (part.tag_index.tolist(), part.anchor_index.tolist()) == ([0, 1], [1, 0])
         assert part.kind.tolist() == [0, 0]
 
     def test_id_known_as_both_is_that_of_two_nodes(self) -> None:

@@ -257,7 +257,7 @@ INROL = """\
 
 def test_inrols_text_is_recognised_by_its_comment(tmp_path: Path) -> None:
     log = read_ranges(write(tmp_path, INROL))
-    assert (log.format, log.anchor_ids, log.tag_ids) == ("inrol", ("6", "2", "1", "7"), ("tag",))
+    assert (log.format, log.anchor_ids, log.tag_ids) == ("inrol", ("1", "2", "6", "7"), ("tag",))
     np.testing.assert_array_equal(log.timestamp_s, [0.032284736633, 0.012478828430, 0.012478828430, 0.032284736633])
     np.testing.assert_array_equal(log.range_m, [2.410469089846, 1.746998299780, 1.003056942908, 3.113442167141])
     np.testing.assert_array_equal(log.line, [2, 3, 4, 5])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -49,13 +50,13 @@ class RangeLog:
     Either ``timestamp_s`` or ``image_name`` says when: the other is None.
 
     Attributes:
-        anchor_ids: the distinct anchors, in order of first appearance.
+        anchor_ids: the distinct anchors, as people count (A2 before A10), so that the log's order has no say.
         anchor_index: (n,) int, into ``anchor_ids``; -1 for a range between two tags.
         range_m: (n,) metres, finite and positive.
         timestamp_s: (n,) seconds on the radio's clock, in any order; or None.
         image_name: n names of the photos at which each range was taken; or None.
         range_stddev_m: (n,) metres, NaN where the log does not say.
-        tag_ids: the distinct tags, in order of first appearance.
+        tag_ids: the distinct tags, in the same order.
         tag_index: (n,) int, into ``tag_ids``; -1 for a range between two anchors.
         peer_index: (n,) int, the other end of a range between two anchors (into ``anchor_ids``) or two tags (into
             ``tag_ids``); -1 for one between a tag and an anchor.
@@ -110,6 +111,16 @@ class RangeLog:
         kind[self.anchor_index < 0] = RangeKind.TAG_TAG
         return kind
 
+    @property
+    def own_order(self) -> npt.NDArray[np.int64]:
+        """(n,) the rows by anchor, time, tag and range.
+
+        The order in which the log has them has no say in what is made of them then, not by random draws and not by how
+        sums are rounded.
+        """
+        when = np.unique(self.image_name, return_inverse=True)[1] if self.timestamp_s is None else self.timestamp_s
+        return np.lexsort((self.range_m, self.peer_index, self.tag_index, when, self.anchor_index))
+
     def anchor_anchor_ranges(self) -> PeerRanges:
         """The ranges between two anchors: distances that do not depend on the camera."""
         return self._peer_ranges(RangeKind.ANCHOR_ANCHOR, first_node=0)
@@ -157,11 +168,8 @@ class RangeLog:
         swapped = is_anchor[first] & ~is_anchor[second]
         first, second = np.where(swapped, second, first), np.where(swapped, first, second)
         peer = np.where(is_anchor[first], first, np.where(is_anchor[second], -1, second))
-        # Of several rows the last one to be written counts, so that this is the first in which a node appears.
-        row, first_row = np.arange(len(self))[::-1], np.full(len(ids), len(self))
-        first_row[second[::-1]] = row
-        first_row[first[::-1]] = np.minimum(first_row[first[::-1]], row)
-        in_order = [node for node in np.argsort(first_row, kind="stable").tolist() if first_row[node] < len(self)]
+        with_ranges = np.unique(np.concatenate([first, second])).tolist()
+        in_order = sorted(with_ranges, key=lambda node: _as_people_count(ids[node]))
         anchors = [node for node in in_order if is_anchor[node]]
         tags = [node for node in in_order if not is_anchor[node]]
         # The last entry stands for no node.
@@ -242,9 +250,15 @@ class RangeLog:
 
 
 def _categories(ids: Sequence[str] | npt.NDArray[np.str_] | Categories) -> Categories:
-    if isinstance(ids, Categories):
-        return ids
-    return Categories.of(ids if isinstance(ids, Sequence) else ids.tolist())
+    found = ids if isinstance(ids, Categories) else Categories.of(ids if isinstance(ids, Sequence) else ids.tolist())
+    order = sorted(range(len(found.names)), key=lambda k: _as_people_count(found.names[k]))
+    return Categories(tuple(found.names[k] for k in order), np.argsort(order)[found.index])
+
+
+def _as_people_count(name: str) -> tuple[list[tuple[str, int, str]], str]:
+    """A key that sorts A2 before A10."""
+    parts = [(text, digits.lstrip("0")) for text, digits in re.findall("([^0-9]*)([0-9]*)", name)]
+    return [(text, len(number), number) for text, number in parts], name
 
 
 def _only(id: str, num: int) -> Categories:

@@ -70,6 +70,12 @@ class RangeObservations:
         """(n,) ranges that estimates may use: on the path, of a wanted anchor, not held out."""
         return np.asarray(self.status <= RangeStatus.OUTLIER)
 
+    @property
+    def placed_rows(self) -> npt.NDArray[np.int64]:
+        """(k,) rows of those that have a place, in ``log.own_order``."""
+        order = self.log.own_order
+        return np.asarray(order[self.has_place[order]])
+
 
 def hold_out(observations: RangeObservations, checks: CheckOptions, seed: int) -> RangeObservations:
     """Set usable ranges aside as checks: of some anchors, of a stretch of time, and a random share of the rest.
@@ -87,7 +93,8 @@ def hold_out(observations: RangeObservations, checks: CheckOptions, seed: int) -
         chosen |= _in_time(log, checks.check_times_s)
     status[chosen & observations.has_place] = RangeStatus.CHECK
     # Drawn from the whole log, so that the same ranges are checks whatever there is of the path.
-    drawn = np.random.default_rng(seed).permutation(len(log)) < round(checks.check_share * len(log))
+    drawn = np.zeros(len(log), dtype=bool)
+    drawn[log.own_order] = np.random.default_rng(seed).permutation(len(log)) < round(checks.check_share * len(log))
     status[drawn & (status <= RangeStatus.OUTLIER)] = RangeStatus.CHECK
     return replace(observations, status=status)
 

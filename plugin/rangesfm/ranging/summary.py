@@ -66,7 +66,7 @@ class RangeSummary:
         start_s, end_s: first and last time on the radio's clock.
         rate_hz: ranges a second over the whole span.
         largest_gap_s: longest time without a range to any anchor.
-        anchors: those that tags range with, in the order of their first appearance.
+        anchors: those that tags range with, in the order of the log's ``anchor_ids``.
         pairs: of anchors and of tags.
     """
 

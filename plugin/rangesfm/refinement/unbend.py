@@ -68,7 +68,7 @@ def unbend(
     frame_ids = np.concatenate([trajectory.frame_ids, others])
     rays = model_observations(metric, frame_ids, pixel_stddev)
     before = model_poses(metric, frame_ids)
-    rows = np.flatnonzero(observations.has_place)
+    rows = observations.placed_rows
     placed = weights.subset(rows)
     graph = KeyframeGraph(
         vision=vision_information(rays, before),

@@ -151,15 +151,13 @@ def _usable_ranges(
     observations: RangeObservations, given: npt.NDArray[np.bool_]
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
     """Rows that take part, and (m,) anchors that have enough of them."""
-    rows = np.flatnonzero(observations.has_place)
+    rows = observations.placed_rows
     index = observations.log.anchor_index
     counts = np.bincount(index[rows], minlength=len(given))
     heard = counts >= np.where(given, 1, _MIN_RANGES_OF_UNKNOWN)
     rows = rows[heard[index[rows]]]
     _require_enough(observations, rows)
-    # In an order of their own, so that the log's has no say, not even by how sums are rounded.
-    keys = (observations.log.range_m, observations.weight, observations.before, index)
-    return rows[np.lexsort([key[rows] for key in keys])], heard
+    return rows, heard
 
 
 def _first_camera_from_sfm(trajectory: Trajectory) -> Similarity:
