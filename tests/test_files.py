@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -75,3 +78,12 @@ class TestNewFolder:
         with pytest.raises(KeyboardInterrupt), new_folder(tmp_path / "a") as folder:
             (folder / "new").write_text("")
         assert [path.name for path in tmp_path.rglob("*")] == ["a", "old"]
+
+
+@pytest.mark.parametrize(
+    "locale", [{"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}, {"PYTHONUTF8": "1"}]
+)
+def test_path_that_a_file_names_is_found_in_any_locale(locale: dict[str, str], tmp_path: Path) -> None:
+    (tmp_path / "bildär").touch()
+    found = "import os; from rangesfm.files import path_of; assert os.path.isfile(path_of('bild\\xe4r'))"
+    subprocess.run([sys.executable, "-c", found], cwd=tmp_path, env={**os.environ, **locale}, check=True)

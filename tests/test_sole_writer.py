@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rangesfm.cli import main
 from rangesfm.errors import InputError
 from rangesfm.files import new_file, new_folder
 from rangesfm.sole_writer import LOCK_NAME, sole_writer
@@ -48,6 +50,24 @@ def hold() -> Iterator[Callable[[Path], subprocess.Popen[str]]]:
     for process in started:
         process.kill()
         process.communicate()
+
+
+@pytest.mark.parametrize("command", ["report out", "report out --png", "export out", "export other --output_path out"])
+def test_what_is_written_into_a_result_waits_for_its_run(
+    command: str,
+    hold: Callable[[Path], subprocess.Popen[str]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("out", "other"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "result.json").write_text("{}")
+    process = hold(tmp_path / "out")
+    assert main(command.split()) == InputError.exit_status
+    assert re.fullmatch(rf"rangesfm: error: out: .*process {process.pid}.*\n", capsys.readouterr().err)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"result.json", LOCK_NAME}
 
 
 @pytest.mark.parametrize("command", ["refine", "scale", "run", "run --live"])

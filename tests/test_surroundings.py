@@ -127,7 +127,17 @@ def test_full_disk_is_one_line_and_leaves_nothing_half_written(
         [path.name for path in (own_survey.folder / "out").rglob("*")] if (own_survey.folder / "out").exists() else []
     )
     assert "result.json" not in left
+    assert "points3D.bin" not in left  # COLMAP would leave the part of it that fitted
     assert not [name for name in left if name.startswith(".")]
+
+
+def test_what_colmap_logs_goes_neither_to_the_terminal_nor_to_files_of_its_own(tmp_path: Path) -> None:
+    log = "from rangesfm.cli import main; main(['--version']); import pycolmap; pycolmap.logging.error('it failed')"
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("GLOG_")}
+    surroundings = {**environment, "TMPDIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", log], cwd=tmp_path, env=surroundings, capture_output=True, check=True)
+    assert done.stderr == b""
+    assert not list(tmp_path.iterdir())
 
 
 def test_full_device_for_a_file_is_one_line(command: Callable[..., subprocess.CompletedProcess[bytes]]) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesfm.files import make_output_folder, new_file
+from rangesfm.files import new_file
 from rangesfm.model_comparison import (
     SIMILARITY_HEADER,
     ModelRow,
@@ -27,6 +27,7 @@ from rangesfm.report.scene import Scene, ScenePath
 from rangesfm.report.sections import section
 from rangesfm.report.tables import table
 from rangesfm.report.view import view
+from rangesfm.sole_writer import sole_writer
 from rangesfm.trajectory import Trajectory
 
 COLORS = ("after", "before", "third", "fourth")
@@ -37,11 +38,10 @@ def write_comparison(comparison: ModelsComparison, folder: Path) -> Path:
     """Write ``comparison.html`` into a folder; returns its path.
 
     Raises:
-        InputError: the folder cannot be written to.
+        InputError: the folder cannot be written to, or a run is writing there.
     """
-    make_output_folder(folder)
     path = folder / PAGE_NAME
-    with new_file(path) as temporary:
+    with sole_writer(folder), new_file(path) as temporary:
         temporary.write_text(render_comparison(comparison), encoding="utf-8", errors="xmlcharrefreplace")
     return path
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rangesfm.errors import InputError, OptionError
+from rangesfm.files import path_of
 from rangesfm.options import (
     ANCHOR_FRAMES,
     CAMERA_SIDES,
@@ -328,7 +329,7 @@ class _SurveyReader:
         if not text:
             raise table.error(key, "a path")
         folder = Path.cwd() if f"{table_name}.{key}" in self._source.overridden else self._folder
-        path = folder / text
+        path = folder / path_of(text)
         if must_exist and not os.path.isfile(path):
             found = f"{path} is a folder, expected a file" if os.path.isdir(path) else f"there is no file {path}"
             raise self._source.error(f"[{table_name}] {key}: {found}", table_name, key)

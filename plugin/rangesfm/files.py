@@ -36,6 +36,15 @@ def stays_inside(name: str) -> bool:
     return not path.is_absolute() and ".." not in path.parts
 
 
+def path_of(text: str) -> Path:
+    """The path that text from a file stands for, also under a locale that cannot spell it: then it is UTF-8."""
+    try:
+        os.fsencode(text)
+    except UnicodeEncodeError:
+        text = os.fsdecode(text.encode("utf-8", errors="surrogateescape"))
+    return Path(text)
+
+
 def is_plain_name(name: str) -> bool:
     """Whether a photo's name can stand in tables and files: some UTF-8 text on one line."""
     return bool(name) and not any(unicodedata.category(character) in _NOT_IN_NAMES for character in name)

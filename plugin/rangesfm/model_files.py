@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import tempfile
 from collections import Counter
 from dataclasses import replace
@@ -44,6 +45,20 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
     else:
         _check_map_of_text(model, path)
     return model
+
+
+def write_binary_model(model: pycolmap.Reconstruction, folder: Path) -> None:
+    """Write a model's files into a folder that is there.
+
+    Raises:
+        OSError: a file ends before its records do, as on a full disk: COLMAP does not look.
+    """
+    model.write_binary(folder)
+    try:
+        for name in MODEL_FILES:
+            read_records(folder / name)
+    except InputError as error:
+        raise OSError(errno.ENOSPC, f"cannot write {name} to the end; is the disk full?", str(folder.parent)) from error
 
 
 def _check_names(model: pycolmap.Reconstruction, path: Path) -> None:
@@ -100,6 +115,6 @@ def _checked(pose: pycolmap.Rigid3d | None, what: str, path: Path) -> pycolmap.R
 
 def _check_map_of_text(model: pycolmap.Reconstruction, path: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        model.write_binary(folder)
+        write_binary_model(model, Path(folder))
         images, points = (read_records(Path(folder) / name) for name in ("images.bin", "points3D.bin"))
     check_map(replace(images, path=path), replace(points, path=path))

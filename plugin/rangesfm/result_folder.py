@@ -13,6 +13,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
+from rangesfm.files import path_of
 from rangesfm.geometry import Similarity
 from rangesfm.georeference import Georeference
 from rangesfm.json_files import read_json
@@ -146,7 +147,7 @@ class ResultFolder:
         """Folder of the photos, as the run was told; None if it had none."""
         with self._expecting("settings"):
             path = (self.summary.get("settings") or {}).get("images_path")
-            return None if path is None else Path(path)
+            return None if path is None else path_of(path)
 
     @property
     def georeference(self) -> Georeference | None:

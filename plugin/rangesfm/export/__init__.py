@@ -27,6 +27,7 @@ from rangesfm.export.undistorted import write_undistorted
 from rangesfm.files import make_output_folder
 from rangesfm.options import ExportOptions
 from rangesfm.result_folder import ResultFolder, read_result_folder
+from rangesfm.sole_writer import sole_writer
 
 if TYPE_CHECKING:
     import pycolmap
@@ -143,11 +144,14 @@ def export_result(
         images_path: folder of the photos; None: where the run found them.
 
     Raises:
-        InputError: as ``export_model``, or the folder is not a result with a metric model.
+        InputError: as ``export_model``, the folder is not a result with a metric model, or a run is writing to the
+            destination.
     """
     options = replace(options or ExportOptions(), formats=tuple(formats))
     check_formats(options.formats)
-    return export_map(_read_map(read_result_folder(output_path), images_path), destination, options)
+    result = read_result_folder(output_path)
+    with sole_writer(destination):
+        return export_map(_read_map(result, images_path), destination, options)
 
 
 def apply_result(
@@ -176,7 +180,8 @@ def apply_result(
     similarity_in_frame = in_frame(map_, options or ExportOptions()).metric_from_sfm
     if similarity_in_frame is None:
         raise InputError("the result does not say how its metric model follows from the unscaled one", output_path)
-    return apply_to(list(paths), similarity_in_frame, destination), residual_m
+    with sole_writer(destination):
+        return apply_to(list(paths), similarity_in_frame, destination), residual_m
 
 
 def _read_map(result: ResultFolder, images_path: Path | None) -> MetricMap:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pycolmap
 
 from rangesfm.files import new_folder
+from rangesfm.model_files import write_binary_model
 
 
 def write_model(reconstruction: pycolmap.Reconstruction, path: Path, *, as_text: bool = False) -> Path:
@@ -15,5 +16,5 @@ def write_model(reconstruction: pycolmap.Reconstruction, path: Path, *, as_text:
         if as_text:
             reconstruction.write_text(folder)
         else:
-            reconstruction.write_binary(folder)
+            write_binary_model(reconstruction, folder)
     return path

@@ -14,6 +14,7 @@ from rangesfm.colmap_log import colmap_log
 from rangesfm.errors import InputError
 from rangesfm.export.metric_map import MetricMap
 from rangesfm.files import new_folder, stays_inside
+from rangesfm.model_files import write_binary_model
 
 
 def write_undistorted(map_: MetricMap, folder: Path) -> Path:
@@ -33,7 +34,7 @@ def write_undistorted(map_: MetricMap, folder: Path) -> Path:
         if not os.path.isfile(images_path / name):
             raise InputError(f"there is no photo {name}, which the map needs, in this folder", images_path)
     with new_folder(folder) as temporary, tempfile.TemporaryDirectory() as model_path:
-        map_.reconstruction.write(model_path)
+        write_binary_model(map_.reconstruction, Path(model_path))
         _require_room(temporary, sum(os.path.getsize(images_path / name) for name in names))
         with colmap_log(temporary / "undistortion.log"):
             pycolmap.undistort_images(temporary, model_path, images_path)

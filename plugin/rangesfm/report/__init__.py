@@ -10,6 +10,7 @@ from rangesfm.report.figures import all_figures
 from rangesfm.report.page import render
 from rangesfm.report.pictures import write_pictures
 from rangesfm.result_folder import read_result_folder
+from rangesfm.sole_writer import sole_writer
 
 __all__ = ["write_report", "write_report_pictures"]
 
@@ -29,11 +30,12 @@ def write_report(result_folder: Path, *, images_path: Path | None = None) -> Pat
         The page's path.
 
     Raises:
-        InputError: the folder is not a result, or a file in it cannot be read.
+        InputError: the folder is not a result, a file in it cannot be read, or a run is writing there.
     """
-    page = render(gather(read_result_folder(result_folder), images_path=images_path))
+    result = read_result_folder(result_folder)
     path = result_folder / "report.html"
-    with new_file(path) as temporary:
+    with sole_writer(result_folder), new_file(path) as temporary:
+        page = render(gather(result, images_path=images_path))
         temporary.write_text(page, encoding="utf-8", errors="xmlcharrefreplace")
     return path
 
@@ -44,4 +46,6 @@ def write_report_pictures(result_folder: Path) -> list[Path]:
     Raises:
         InputError: as ``write_report``, or matplotlib is not installed.
     """
-    return write_pictures(all_figures(gather(read_result_folder(result_folder))), result_folder / PICTURES_FOLDER)
+    result = read_result_folder(result_folder)
+    with sole_writer(result_folder):
+        return write_pictures(all_figures(gather(result)), result_folder / PICTURES_FOLDER)

@@ -10,7 +10,7 @@ import pycolmap
 
 from rangesfm.errors import ReconstructionError
 from rangesfm.files import new_folder, scratch_folder
-from rangesfm.model_files import read_model
+from rangesfm.model_files import read_model, write_binary_model
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.passthrough import apply_options
 from rangesfm.progress import Progress
@@ -100,7 +100,7 @@ def write_models(models: Iterable[pycolmap.Reconstruction], models_path: Path) -
     with new_folder(models_path) as temporary:
         for index, model in enumerate(sorted(models, key=lambda model: -model.num_reg_images())):
             (temporary / str(index)).mkdir()
-            model.write_binary(temporary / str(index))
+            write_binary_model(model, temporary / str(index))
 
 
 def read_models(models_path: Path) -> tuple[pycolmap.Reconstruction, ...]:
