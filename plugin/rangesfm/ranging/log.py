@@ -118,7 +118,11 @@ class RangeLog:
         The order in which the log has them has no say in what is made of them then, not by random draws and not by how
         sums are rounded.
         """
-        when = np.unique(self.image_name, return_inverse=True)[1] if self.timestamp_s is None else self.timestamp_s
+        when = (
+            np.unique(np.array(self.image_name or (), dtype=str), return_inverse=True)[1]
+            if self.timestamp_s is None
+            else self.timestamp_s
+        )
         return np.lexsort((self.range_m, self.peer_index, self.tag_index, when, self.anchor_index))
 
     def anchor_anchor_ranges(self) -> PeerRanges:
