@@ -543,6 +543,18 @@ class TestWithNoise:
         assert rmse(before - survey.centers_m) < 0.1
         assert rmse(after - before) < 0.01
 
+    def test_where_most_ranges_are_long_the_map_does_not_follow_them(self) -> None:
+        radio = Radio(range_stddev_m=0.1, obstructed_share=0.7)
+        survey = make_survey("first_camera", pixel_stddev=0.3, radio=radio, num_epochs=8, seed=1)
+        num = len(survey.observations.log)
+        refined, _ = survey.refine(
+            survey.anchors(0.0, bias_stddev_m=0.01),
+            range_stddev_m=np.full(num, 0.1),
+            stddev_is_estimated=np.ones(num, dtype=bool),
+            common_bias_stddev_m=0.1,
+        )
+        assert rmse(survey.centers(refined) - survey.centers_m) < 0.07
+
     def test_a_place_where_the_camera_lingered_draws_the_map_no_more_than_in_the_scale(self) -> None:
         """Ranges of one place err alike; three of twenty places have most of them."""
         survey = make_survey("first_camera", pixel_stddev=0.3, num_epochs=60, seed=1)

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from rangesfm.ranging.robust_loss import CAUCHY
+from rangesfm.ranging.robust_loss import CAUCHY, GEMAN_MCCLURE
 from rangesfm.refinement.weights import RangeWeights, misfits
 
 Array = npt.NDArray[np.float64]
@@ -82,6 +82,20 @@ def test_ranges_of_one_place_that_err_alike_count_for_less() -> None:
     assert together.place_share[lingered].mean() < 0.1 * together.place_share[~lingered].mean()
     as_if_each_its_own = make_weights().estimated(noise((0.1, 0.1, 0.1)) + alike, 0.0)
     assert together.inflation < 0.7 * as_if_each_its_own.inflation
+
+
+def test_noise_stays_that_of_the_likeliest_residuals() -> None:
+    """Seven of ten ranges are long, and then a fit has gone half-way to meet them."""
+    rng = np.random.default_rng(3)
+    is_long = rng.random(3 * NUM_EACH) < 0.7
+    true = noise((0.1, 0.1, 0.1)) - is_long * rng.exponential(1.0, 3 * NUM_EACH)
+    followed = true + 0.8 + 0.4 * rng.standard_normal(3 * NUM_EACH)
+    fresh = replace(make_weights(), loss=GEMAN_MCCLURE)
+    seen = fresh.estimated(true, 0.0)
+    assert seen.stddev_m[0] < 0.25
+    assert fresh.estimated(followed, 0.0).stddev_m[0] > 2 * seen.stddev_m[0]
+    np.testing.assert_array_equal(seen.estimated(followed, 0.0).stddev_m, seen.stddev_m)
+    assert seen.estimated(noise((0.05, 0.05, 0.05)), 0.0).stddev_m[0] == pytest.approx(0.05, rel=0.15)
 
 
 def test_known_noise_stays_as_it_is() -> None:

@@ -36,11 +36,6 @@ class InlierNoise:
     log_likelihood: float
 
 
-def inlier_stddev(residuals: Array) -> float:
-    """Stddev of the Gaussian bulk about zero, metres; see ``inlier_noise``."""
-    return inlier_noise(residuals).stddev
-
-
 def inlier_noise(residuals: Array) -> InlierNoise:
     """The Gaussian bulk about zero, however small a share of the residuals it is.
 

@@ -16,7 +16,7 @@ from rangesfm.refinement.antennas import Antennas
 from rangesfm.refinement.carry import carry_model
 from rangesfm.refinement.keyframe_graph import GraphState, KeyframeGraph, local_scales, moved_anchors, solve_graph
 from rangesfm.refinement.vision_information import model_observations, model_poses, vision_information
-from rangesfm.refinement.weights import RangeWeights
+from rangesfm.refinement.weights import RangeWeights, likelier
 from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
@@ -82,28 +82,54 @@ def unbend(
         held_frame=0 if first_pose_is_fixed else None,
         loss=placed.loss,
     )
-    state, placed, num_absorbed, num_steps = _solve_with_own_weights(graph, placed)
-    if rmse(state.poses.centers - before.centers) > float(np.median(placed.stddev_m)):
+    fit = _solve_with_own_weights(graph, placed)
+    state = fit.state
+    if rmse(state.poses.centers - before.centers) > float(np.median(fit.weights.stddev_m)):
         carry_model(metric, frame_ids, rays, before, state.poses, local_scales(graph.vision, state.poses))
         anchors = moved_anchors(anchors, state)
     bend_m = _bend(before.centers, state.poses.centers)
-    return Unbent(weights.with_rows(rows, placed), num_absorbed, anchors, bend_m, num_steps)
+    return Unbent(weights.with_rows(rows, fit.weights), fit.num_absorbed, anchors, bend_m, fit.num_steps)
 
 
-def _solve_with_own_weights(graph: KeyframeGraph, weights: RangeWeights) -> tuple[GraphState, RangeWeights, float, int]:
-    """Alternate between the map and the weights that its residuals show: with the wide loss, then with the bounded."""
-    bounded_loss, state, num_steps = weights.loss, graph.start(), 0
-    for loss in (wider(bounded_loss), bounded_loss):
-        weights = replace(weights, loss=loss)
-        for _ in range(_MAX_NUM_ROUNDS):
-            solution = solve_graph(
-                graph.with_weights(weights), state, tolerance_m=_TOLERANCE * float(weights.stddev_m.min())
-            )
-            state, num_steps = solution.state, num_steps + solution.num_steps
-            before, weights = weights, weights.estimated(graph.residuals_m(state), solution.num_absorbed)
-            if before.change(weights) < SAME_WEIGHTS:
-                break
-    return state, weights, solution.num_absorbed, num_steps
+@dataclass(frozen=True)
+class _Fit:
+    """A map, the weights that its residuals show, and what it took to find them."""
+
+    state: GraphState
+    weights: RangeWeights
+    num_absorbed: float
+    num_steps: int
+
+
+def _solve_with_own_weights(graph: KeyframeGraph, weights: RangeWeights) -> _Fit:
+    """With the wide loss, then with the bounded.
+
+    Where so many ranges are wrong that the wide loss follows them, the map as it came is likelier, and the bounded one
+    starts from there.
+    """
+    start = graph.start()
+    wide = _alternate(graph, replace(weights, loss=wider(weights.loss)), start)
+    seen, reached = (weights.noise_in(graph.residuals_m(state)) for state in (start, wide.state))
+    if likelier(reached, seen) is reached:
+        state, weights = wide.state, replace(wide.weights, loss=weights.loss, likeliest=reached)
+    else:
+        state, weights = start, replace(weights, likeliest=seen)
+    bounded = _alternate(graph, weights.estimated(graph.residuals_m(state), wide.num_absorbed), state)
+    return replace(bounded, num_steps=wide.num_steps + bounded.num_steps)
+
+
+def _alternate(graph: KeyframeGraph, weights: RangeWeights, state: GraphState) -> _Fit:
+    """Between the map and the weights that its residuals show."""
+    num_steps = 0
+    for _ in range(_MAX_NUM_ROUNDS):
+        solution = solve_graph(
+            graph.with_weights(weights), state, tolerance_m=_TOLERANCE * float(weights.stddev_m.min())
+        )
+        state, num_steps = solution.state, num_steps + solution.num_steps
+        before, weights = weights, weights.estimated(graph.residuals_m(state), solution.num_absorbed)
+        if before.change(weights) < SAME_WEIGHTS:
+            break
+    return _Fit(state, weights, solution.num_absorbed, num_steps)
 
 
 def _bend(before: Array, after: Array) -> float:

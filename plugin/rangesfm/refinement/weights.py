@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.ranging.inlier_noise import inlier_stddev
+from rangesfm.ranging.inlier_noise import InlierNoise, inlier_noise
 from rangesfm.ranging.noise import START_STDDEV_M, correlation_inflation, robust_stddev, shared_stddev
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.ranging.place import place_labels, shares_by_residuals
@@ -38,6 +38,7 @@ class RangeWeights:
         place_share: (n,) by how much each counts beside its stddev, as ranges from one place err alike.
         loss: of single ranges, in their stddevs. With a wide one the noise is what all residuals show, so that what
             drifts away is no outlier; with a bounded one that of the ranges that fit, as in the scale stage.
+        likeliest: what the likeliest residuals so far showed; None: none were seen.
     """
 
     stddev_m: Array
@@ -49,6 +50,7 @@ class RangeWeights:
     place: Indices
     place_share: Array
     loss: RobustLoss
+    likeliest: InlierNoise | None = None
 
     @property
     def share(self) -> Array:
@@ -73,16 +75,32 @@ class RangeWeights:
             np.unique(self.place[rows], return_inverse=True)[1],
             self.place_share[rows],
             self.loss,
+            self.likeliest,
         )
 
     def with_rows(self, rows: Indices, part: RangeWeights) -> RangeWeights:
         """These, but some of the ranges as in a subset that was estimated anew."""
         stddev, share = self.stddev_m.copy(), self.place_share.copy()
         stddev[rows], share[rows] = part.stddev_m, part.place_share
-        return replace(self, stddev_m=stddev, place_share=share, inflation=part.inflation)
+        return replace(self, stddev_m=stddev, place_share=share, inflation=part.inflation, likeliest=part.likeliest)
+
+    def noise_in(self, residuals_m: Array) -> InlierNoise:
+        """Of the ranges without special cases."""
+        return inlier_noise(residuals_m[self._ordinary])
+
+    @property
+    def _ordinary(self) -> Indices:
+        """Ranges that may be off together by little, and so tell the noise of others."""
+        ordinary = np.flatnonzero(self.is_estimated & (self.fixed_m < START_STDDEV_M))
+        if len(ordinary) < _MIN_ORDINARY * np.count_nonzero(self.is_estimated) or not len(ordinary):
+            ordinary = np.flatnonzero(self.is_estimated)
+        return ordinary if len(ordinary) else np.arange(len(self.is_estimated))
 
     def estimated(self, residuals_m: Array, num_absorbed: float) -> RangeWeights:
         """As the residuals of a fit show them.
+
+        Where most ranges are wrong, a fit can follow them and find the noise larger, the next one more so. It is less
+        likely than the one before, whose noise then stays, as in the scale stage.
 
         Args:
             residuals_m: (n,). num_absorbed: degrees of freedom that the fit took from them.
@@ -91,18 +109,20 @@ class RangeWeights:
             return self
         n = len(residuals_m)
         widening = np.sqrt(n / max(n - num_absorbed, 0.1 * n))
-        ordinary = np.flatnonzero(self.is_estimated & (self.fixed_m < START_STDDEV_M))
-        if len(ordinary) < _MIN_ORDINARY * np.count_nonzero(self.is_estimated):
-            ordinary = np.flatnonzero(self.is_estimated)
-        bulk_stddev = inlier_stddev if self.loss.is_bounded else robust_stddev
-        common = max(widening * bulk_stddev(residuals_m[ordinary]), _MIN_STDDEV_M)
+        ordinary, likeliest = self._ordinary, self.likeliest
+        if self.loss.is_bounded:
+            likeliest = likelier(self.noise_in(residuals_m), likeliest)
+            bulk_stddev = likeliest.stddev
+        else:
+            bulk_stddev = robust_stddev(residuals_m[ordinary])
+        common = max(widening * bulk_stddev, _MIN_STDDEV_M)
         ratios = self._noise_ratios(residuals_m, ordinary)[self.anchor_index]
         stddev = np.where(self.is_estimated, np.hypot(common * ratios, self.fixed_m), self.stddev_m)
         scaled = residuals_m / stddev
         share = shares_by_residuals(self.place, scaled, self.loss)
         # What is left of the correlation once the places count for what they are worth.
         inflation = correlation_inflation(scaled, self.loss.weights(scaled), self.group, share)
-        return replace(self, stddev_m=stddev, place_share=share, inflation=inflation)
+        return replace(self, stddev_m=stddev, place_share=share, inflation=inflation, likeliest=likeliest)
 
     def _noise_ratios(self, residuals_m: Array, rows: Indices) -> Array:
         """(m,) noise of each anchor over that of all; 1 where the difference may be chance.
@@ -129,6 +149,11 @@ class RangeWeights:
         """Largest relative change of a weight from this one to another; of ranges without a place nothing is known."""
         ratio = np.sqrt(self.share / other.share) * other.stddev_m / self.stddev_m
         return float(np.nanmax(np.abs(np.log(ratio)), initial=0.0))
+
+
+def likelier(now: InlierNoise, before: InlierNoise | None) -> InlierNoise:
+    """Which of two views of the same ranges explains them better."""
+    return now if before is None or now.log_likelihood >= before.log_likelihood else before
 
 
 def range_weights(
