@@ -1,7 +1,7 @@
 """How the cost of mapping grows with the number of photos: in one piece, and in overlapping submaps.
 
-    python -m tests.studies.submaps [--num_photos 125 250 500] [--max_one_piece 2000] [--submap_size 100]
-        [--overlap 20]
+    python -m tests.studies.submaps [--num_photos 125 250 500] [--max_one_piece 2000]
+        [--max_refined 2000] [--submap_size 100] [--overlap 20]
 
 Simulated keyframes, half a metre apart on one wide round: features with noise, each seen in at most 8 photos in a row,
 go into a COLMAP database with their matches; nothing is rendered. They are mapped by pycolmap's incremental mapping
@@ -163,15 +163,19 @@ def refined(folder: Path, model: Path, output: Path) -> str:
     return " -> ".join(f"{row['rmse_m']:.3f}" for row in rows[1:])
 
 
-def study(num_photos: int, size: int, overlap: int, *, one_piece: bool, seed: int) -> dict[str, Cost]:
-    """Costs by way of mapping; prints a row for each."""
+def study(num_photos: int, size: int, overlap: int, *, one_piece: bool, refine: bool, seed: int) -> dict[str, Cost]:
+    """Costs by way of mapping; prints a row for each.
+
+    Args:
+        refine: whether the maps are refined with ranges, and compared with the truth.
+    """
     costs: dict[str, Cost] = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         simulate(folder, num_photos, seed)
         if one_piece:
             costs["one piece"] = run("--map", folder, folder / "one")
-            _say(num_photos, "one piece", costs["one piece"], folder, folder / "one" / "0")
+            _say(num_photos, "one piece", costs["one piece"], folder, folder / "one" / "0", refine=refine)
         output = folder / "submaps"
         output.mkdir()
         planning = run("--plan", folder, output, size, overlap)
@@ -181,25 +185,25 @@ def study(num_photos: int, size: int, overlap: int, *, one_piece: bool, seed: in
         joining = run("--join", folder, output)
         costs["submaps"] = planning + mapping + joining
         what = f"{num_submaps} submaps"
-        _say(num_photos, what, costs["submaps"], folder, output / "sparse" / "0")
+        _say(num_photos, what, costs["submaps"], folder, output / "sparse" / "0", refine=refine)
         for step, cost in (("planning", planning), ("mapping", mapping), ("joining", joining)):
             print(f"{'':7}{step:34} {cost.seconds:9.1f} s {cost.peak_mb:8.0f} MB", flush=True)
     return costs
 
 
-def _say(num_photos: int, what: str, cost: Cost, folder: Path, model: Path) -> None:
+def _say(num_photos: int, what: str, cost: Cost, folder: Path, model: Path, *, refine: bool) -> None:
     num = pycolmap.Reconstruction(model).num_reg_images()
-    rmse = refined(folder, model, folder / "refined")
-    print(
-        f"{num_photos:6} {what:34} {cost.seconds:9.1f} s {cost.peak_mb:8.0f} MB {num:6} registered   RMSE {rmse} m",
-        flush=True,
-    )
+    row = f"{num_photos:6} {what:34} {cost.seconds:9.1f} s {cost.peak_mb:8.0f} MB {num:6} registered"
+    print(row, end="   " if refine else "\n", flush=True)
+    if refine:
+        print(f"RMSE {refined(folder, model, folder / 'refined')} m", flush=True)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--num_photos", type=int, nargs="+", default=[125, 250, 500])
     parser.add_argument("--max_one_piece", type=int, default=10**9, help="more photos are mapped in submaps only")
+    parser.add_argument("--max_refined", type=int, default=10**9, help="more photos are mapped only")
     parser.add_argument("--submap_size", type=int, default=100)
     parser.add_argument("--overlap", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
@@ -211,6 +215,7 @@ def main() -> None:
             arguments.submap_size,
             arguments.overlap,
             one_piece=num_photos <= arguments.max_one_piece,
+            refine=num_photos <= arguments.max_refined,
             seed=arguments.seed,
         )
         for way, cost in found.items():
