@@ -115,7 +115,7 @@ def estimate_time_offset(
     association = association or AssociationOptions()
     tags = lever_arms(log, tag_in_cam_m)
     ranges = TimedRanges(log.timestamp_s, log.range_m, log.anchor_index, log.tag_index)
-    ranges = ranges.take(log.kind == RangeKind.TAG_ANCHOR)
+    ranges = ranges.take(log.own_order[log.kind[log.own_order] == RangeKind.TAG_ANCHOR])
     gap_s = float(np.median(np.diff(trajectory.timestamps_s)))
     if gap_s > association.max_interpolation_gap_s:
         bursts = find_bursts(ranges, trajectory.timestamps_s)
