@@ -9,7 +9,7 @@ from rangesfm.simulate.path import loop_path
 from rangesfm.simulate.ranges import Radio, SimulatedRanges, simulate_ranges, simulate_ranges_at
 
 PATH = loop_path(100.0, start_s=50.0)
-ANCHORS = {"north": (0.0, 8.0, 2.0), "east": (9.0, 1.0, 0.5), "up": (-3.0, -2.0, 4.0)}
+ANCHORS = {"east": (9.0, 1.0, 0.5), "north": (0.0, 8.0, 2.0), "up": (-3.0, -2.0, 4.0)}
 TAG = (0.02, -0.12, -0.05)
 
 
@@ -31,7 +31,7 @@ def test_perfect_radio_measures_the_distance_from_the_lever_arm_to_the_anchor() 
 def test_each_anchor_answers_at_the_rate_and_one_after_the_other() -> None:
     log = simulate_ranges(PATH, ANCHORS, TAG, Radio(rate_hz=5.0)).log
     assert log.timestamp_s is not None
-    assert log.anchor_ids == ("north", "east", "up")
+    assert log.anchor_ids == ("east", "north", "up")
     np.testing.assert_array_equal(np.bincount(log.anchor_index), [500, 500, 500])
     np.testing.assert_allclose(np.diff(log.timestamp_s), 1 / 15, atol=1e-9)
     assert log.timestamp_s[0] == 50.0
@@ -40,7 +40,7 @@ def test_each_anchor_answers_at_the_rate_and_one_after_the_other() -> None:
 def test_noise_has_the_given_stddev_and_each_anchor_its_bias() -> None:
     radio = Radio(rate_hz=50.0, range_stddev_m=0.08, range_bias_m={"east": 0.25})
     simulated = simulate_ranges(PATH, ANCHORS, TAG, radio, seed=1)
-    for index, bias in enumerate((0.0, 0.25, 0.0)):
+    for index, bias in enumerate((0.25, 0.0, 0.0)):
         errors = _errors(simulated)[simulated.log.anchor_index == index]
         assert errors.mean() == pytest.approx(bias, abs=4 * 0.08 / np.sqrt(len(errors)))
         assert errors.std() == pytest.approx(0.08, rel=0.05)
@@ -75,7 +75,7 @@ def test_ranges_at_given_poses_are_one_to_each_anchor() -> None:
     np.testing.assert_array_equal(simulated.log.timestamp_s, [60, 60, 60, 61, 61, 61])
     np.testing.assert_array_equal(simulated.log.anchor_index, [0, 1, 2, 0, 1, 2])
     tag = PATH.centers(times)[1] + PATH.world_from_cam(times)[1] @ np.array(TAG)
-    assert simulated.log.range_m[4] == pytest.approx(np.linalg.norm(tag - np.array(ANCHORS["east"])))
+    assert simulated.log.range_m[4] == pytest.approx(np.linalg.norm(tag - np.array(ANCHORS["north"])))
 
 
 def test_same_seed_same_log_and_another_seed_another() -> None:
