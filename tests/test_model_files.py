@@ -97,6 +97,7 @@ class TestContent:
         ("name", "field", "value", "said"),
         [
             ("cameras.bin", "param", math.nan, "the parameters of camera 1 are not those of a camera"),
+            ("cameras.bin", "param", 1e308, "the parameters of camera 1 are not those of a camera"),
             ("cameras.bin", "param", 0.0, "the parameters of camera 1 are not those of a camera"),
             ("cameras.bin", "width", 2**63, f"camera 1 has photos of {2**63} x 768 pixels"),
             ("cameras.bin", "height", 0, "camera 1 has photos of 1024 x 0 pixels"),

@@ -80,7 +80,8 @@ def _check_cameras(model: pycolmap.Reconstruction, path: Path) -> None:
     for camera_id, camera in model.cameras.items():
         if not (1 <= camera.width <= _MAX_IMAGE_SIZE and 1 <= camera.height <= _MAX_IMAGE_SIZE):
             raise InputError(f"camera {camera_id} has photos of {camera.width} x {camera.height} pixels", path)
-        if not (np.isfinite(camera.params).all() and np.all(camera.params[camera.focal_length_idxs()] > 0)):
+        params, focal_lengths = camera.params, camera.params[camera.focal_length_idxs()]
+        if not (np.all(np.abs(params) <= MAX_COORDINATE) and np.all(focal_lengths > 0)):
             raise InputError(f"the parameters of camera {camera_id} are not those of a camera", path)
 
 
