@@ -15,6 +15,7 @@ from rangesfm.json_files import read_json
     [
         ('{"a":\n', ":2: not JSON: "),
         ("[1e999]", ": not JSON: 1e999 is too large a number"),
+        ("9" * 400, f": not JSON: {'9' * 20}... is too large a number"),
         ("[" * 100_000, ": not JSON that can be read: nested too deeply"),
         ("1" * 10_000, ": not JSON: "),
         ("", ":1: not JSON: "),

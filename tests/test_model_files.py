@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 import shutil
@@ -106,6 +107,7 @@ class TestContent:
             ("images.bin", "name", b"", "image 1 has no name of printable text"),
             ("images.bin", "name", b"\xff.jpg", "image 1 has no name of printable text"),
             ("images.bin", "name", b"two\nlines.jpg", "image 1 has no name of printable text"),
+            ("images.bin", "y", 1e308, "a feature has no finite pixel coordinates"),
             ("points3D.bin", "x", math.inf, r"points3D.bin: point \d+ is at \(inf, .*\), expected finite coordinates"),
         ],
     )
@@ -113,7 +115,8 @@ class TestContent:
         self, name: str, field: str, value: float | bytes, said: str, refused: Callable[..., str]
     ) -> None:
         def change(file: ModelFile) -> None:
-            next(item for item in file.records[0] if item.name == field).value = value
+            fields = itertools.chain(file.records[0], *file.groups[0])
+            next(item for item in fields if item.name == field).value = value
 
         assert re.search(f"{said}$", refused(name, change))
 

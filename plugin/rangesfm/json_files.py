@@ -18,7 +18,7 @@ def read_json(path: Path) -> Any:
         InputError: it is not there or no JSON, with the line where there is one.
     """
     try:
-        return json.loads(read_text(path), parse_constant=lambda constant: None, parse_float=_finite)
+        return json.loads(read_text(path), parse_constant=lambda constant: None, parse_float=_finite, parse_int=_whole)
     except json.JSONDecodeError as error:
         raise InputError(f"not JSON: {error.msg}", path, error.lineno) from None
     except RecursionError:
@@ -27,8 +27,13 @@ def read_json(path: Path) -> Any:
         raise InputError(f"not JSON: {error}", path) from None
 
 
+def _whole(text: str) -> int:
+    _finite(text)  # whoever calculates with it takes a float
+    return int(text)
+
+
 def _finite(text: str) -> float:
     value = float(text)
     if math.isinf(value):
-        raise ValueError(f"{text} is too large a number")
+        raise ValueError(f"{text[:20]}{'...' * (len(text) > 20)} is too large a number")
     return value

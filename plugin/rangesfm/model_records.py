@@ -89,7 +89,7 @@ def check_map(images: Records, points: Records) -> None:
         first = heads[~usable][0]
         place = ", ".join(f"{value:g}" for value in first["xyz"].tolist())
         raise InputError(f"point {first['point_id']} is at ({place}), expected finite coordinates", points.path)
-    if not np.isfinite(features["xy"]).all():
+    if not np.all(np.abs(features["xy"]) <= MAX_COORDINATE):
         raise InputError("a feature has no finite pixel coordinates", images.path)
     if len(np.unique(heads["point_id"])) < len(heads):
         raise InputError("two points have one id", points.path)

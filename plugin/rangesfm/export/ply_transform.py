@@ -105,7 +105,7 @@ def _read_header(path: Path, content: bytes) -> _Header:
     if not {"x", "y", "z"} <= columns.keys():
         raise InputError("the vertices have no x, y and z", path)
     count = elements[0][1][2]
-    if not count.isdigit():
+    if not (count.isascii() and count.isdigit()):
         raise InputError(f"'{lines[first]}', expected a number of vertices", path, first + 1)
     return _Header(lines, newline + 1, encoding, int(count), columns)
 
