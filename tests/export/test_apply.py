@@ -172,6 +172,7 @@ def test_what_a_refinement_bent_is_said(sfm: pycolmap.Reconstruction) -> None:
         ("a.ply", b"ply\nformat ascii 1.0\nelement face 1\nend_header\n", "first element is vertex"),
         ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "no x, y and z"),
         ("a.ply", header("ascii").replace(b"vertex 5", "vertex ²".encode("latin-1")), "expected a number of vertices"),
+        ("a.ply", header("ascii").replace(b"vertex 5", b"vertex " + b"5" * 30), "expected a number of vertices"),
         ("a.ply", header("binary_little_endian") + b"short", "ends within its 5 vertices"),
         ("a.ply", header("ascii") + b"1 2 3\n" * 6, "a.ply:15: not a vertex of 7 numbers"),
         (

@@ -25,6 +25,7 @@ _CODES = {
     **dict.fromkeys(("float", "float32"), "f4"),
     **dict.fromkeys(("double", "float64"), "f8"),
 }
+_MAX_NUM_DIGITS = 18  # larger numbers are not for a machine's word
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _MAX_HEADER_BYTES = 1 << 16
 # Further from the origin, single precision is coarser than a millimetre.
@@ -105,7 +106,7 @@ def _read_header(path: Path, content: bytes) -> _Header:
     if not {"x", "y", "z"} <= columns.keys():
         raise InputError("the vertices have no x, y and z", path)
     count = elements[0][1][2]
-    if not (count.isascii() and count.isdigit()):
+    if not (count.isascii() and count.isdigit() and len(count) <= _MAX_NUM_DIGITS):
         raise InputError(f"'{lines[first]}', expected a number of vertices", path, first + 1)
     return _Header(lines, newline + 1, encoding, int(count), columns)
 
