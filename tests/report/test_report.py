@@ -174,7 +174,7 @@ def test_names_cannot_inject_markup(make_result: MakeResult) -> None:
     folder = make_result(
         anchor_ids=(evil, "a&b", "'\"><svg onload=alert(1)>"),
         changes={
-            "warnings": [evil],
+            "warnings": [f"{evil}!"],
             "settings": {evil: evil},
             "versions": {evil: evil},
             "scale": {"value": 1.0, "verdict": evil, "reasons": [evil], "per_anchor": {evil: 1.0, "a&b": 1.1}},
@@ -187,6 +187,15 @@ def test_names_cannot_inject_markup(make_result: MakeResult) -> None:
     assert not any(name.startswith("on") for name, _ in page.attributes)
     assert page.texts.count(evil) >= 6
     assert f"Anchor {evil}" in page.texts
+
+
+def test_a_warning_that_is_a_reason_of_the_verdict_is_shown_once(make_result: MakeResult) -> None:
+    reason, other = "eight anchors agree within 1.5 %", "the clocks were set during the survey"
+    page = page_of(make_result(changes={"warnings": [reason, other]}))
+    assert [text for text in page.texts if "agree within 1.5 %" in text or "clocks were set" in text] == [
+        f"E{reason[1:]}.",
+        f"T{other[1:]}.",
+    ]
 
 
 def test_the_same_result_gives_the_same_page(make_result: MakeResult) -> None:

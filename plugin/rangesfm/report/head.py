@@ -33,9 +33,10 @@ def _verdict(summary: Summary) -> Markup:
     unknown = ("off", verdict.capitalize(), "The run gave no verdict on the scale.")
     light, word, meaning = VERDICTS.get(verdict, unknown)
     text = element("div", element("h2", word), element("p", meaning))
-    reasons = [element("li", sentence(reason)) for reason in summary.texts("scale", "reasons")]
+    why = summary.texts("scale", "reasons")
+    reasons = [element("li", sentence(reason)) for reason in why]
     advice = _advice(summary)
-    warnings = [element("li", sentence(warning)) for warning in summary.texts("warnings")]
+    warnings = [element("li", sentence(warning)) for warning in summary.texts("warnings") if warning not in why]
     return element(
         "div",
         element("div", traffic_light(light), text, class_=f"verdict {light}"),
