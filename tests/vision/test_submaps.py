@@ -190,7 +190,11 @@ def test_a_process_that_fails_is_named_with_what_it_said(walk: Walk) -> None:
         map_submaps(submaps[1:2], 1, SilentProgress())
 
 
-def test_whoever_stops_listening_stops_the_processes(walk: Walk) -> None:
+def test_whoever_stops_listening_stops_the_processes(walk: Walk, monkeypatch: pytest.MonkeyPatch) -> None:
+    # At once: so small a submap is mapped before one would otherwise hear of it.
+    monkeypatch.setattr("rangesfm.vision.submap_processes._POLL_INTERVAL_S", 0.0)
+    monkeypatch.setattr("rangesfm.supervision._POLL_INTERVAL_S", 0.01)
+
     class Deaf(SilentProgress):
         def update(self, num_done: int, num_total: int | None = None) -> None:
             raise KeyboardInterrupt
