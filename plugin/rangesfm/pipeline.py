@@ -49,16 +49,17 @@ from rangesfm.progress import Progress
 from rangesfm.ranges_in_mapping import AdjustmentWithRanges
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock import TimeOffset, estimate_time_offset
-from rangesfm.ranging.log import RangeKind, RangeLog
+from rangesfm.ranging.log import RangeKind
 from rangesfm.ranging.observations import RangeObservations, RangeStatus, hold_out
 from rangesfm.ranging.robust_loss import GEMAN_MCCLURE
 from rangesfm.reference import write_reference
-from rangesfm.refine import predicted_ranges, refine_with_ranges
+from rangesfm.refine import predicted_ranges
 from rangesfm.report import write_report
 from rangesfm.results import survey_result
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.sole_writer import sole_writer
-from rangesfm.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.survey_stages import path_of_model, refine_by_survey
+from rangesfm.trajectory import Trajectory
 from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images
 from rangesfm.vision.keyframes import select_keyframes
 from rangesfm.vision.mapping_loop import GlobalAdjustment
@@ -161,7 +162,7 @@ def _to_metric(
     refine: bool,
 ) -> RunResult:
     """From the unscaled models on: the same for photos just mapped and for a model brought along."""
-    trajectory = _path(models[0], times)
+    trajectory = path_of_model(models[0], times)
     if not len(trajectory):
         first = min(image.name for image in models[0].images.values())
         raise InputError(f"none of the model's photos has a time, the first is {first}", survey.image_times_path)
@@ -380,12 +381,6 @@ def _time_offset(survey: Survey, inputs: RangingInputs, trajectory: Trajectory, 
     return offset
 
 
-def _path(model: pycolmap.Reconstruction, times: ImageTimes | None) -> Trajectory:
-    if times is None:
-        return trajectory_from_reconstruction(model)
-    return trajectory_from_reconstruction(model, times.by_name(), time_resolution_s=times.resolution_s)
-
-
 def _paths(
     survey: Survey,
     inputs: RangingInputs,
@@ -407,7 +402,7 @@ def _paths(
     names = set(trajectory.image_names)
     for k, model in enumerate(models[1:], start=1):
         rest = without_photos(model, names)
-        path = _path(rest, times)
+        path = path_of_model(rest, times)
         if not len(path):
             journal.warn(f"sparse/{k} is left out: its photos have no time, or are in other models too")
             continue
@@ -499,24 +494,8 @@ def _why_no_range_has_a_place(observations: RangeObservations, trajectory: Traje
 
 
 def _refine(survey: Survey, inputs: RangingInputs, metric: MetricSurvey) -> MetricSurvey:
-    estimate = metric.estimate
-    refined, summary = refine_with_ranges(
-        metric.scaled,
-        metric.trajectory,
-        estimate.observations,
-        estimate.metric_from_sfm,
-        estimate.anchors,
-        tag_in_cam_m=inputs.tag_in_cam_m,
-        range_stddev_m=estimate.range_stddev_m,
-        range_share=estimate.range_share,
-        stddev_is_estimated=_noise_is_estimated(survey, estimate.observations.log),
-        correlation_inflation=estimate.correlation_inflation,
-        common_bias_stddev_m=survey.ranges.model.common_bias_stddev_m,
-        first_pose_is_fixed=estimate.frame != "site",
-        camera=survey.camera,
-        options=survey.refine,
-        tape=_control(inputs, metric),
-        num_threads=survey.mapper.num_threads,
+    refined, summary = refine_by_survey(
+        survey, inputs, metric.scaled, metric.trajectory, metric.estimate, _control(inputs, metric)
     )
     return replace(metric, refined=refined, refinement=summary)
 
@@ -532,11 +511,6 @@ def _control(inputs: RangingInputs, metric: MetricSurvey) -> Tape:
 def _georeference(inputs: RangingInputs, metric: MetricSurvey) -> Georeference | None:
     """Of the final map: that of the anchors, if the map could be carried to them."""
     return inputs.site.georeference if metric.estimate.frame == "site" else None
-
-
-def _noise_is_estimated(survey: Survey, log: RangeLog) -> npt.NDArray[np.bool_]:
-    """(n,) ranges of which neither the log nor the survey says how noisy they are."""
-    return np.isnan(log.range_stddev_m) & (survey.ranges.model.range_stddev_m is None)
 
 
 def _distances(inputs: RangingInputs, metric: MetricSurvey) -> list[dict[str, Any]]:

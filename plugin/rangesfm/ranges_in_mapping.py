@@ -6,7 +6,6 @@ import logging
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pycolmap
 
 from rangesfm.config import Survey
@@ -17,9 +16,9 @@ from rangesfm.model_transform import rescale, take_over
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock import estimate_time_offset
 from rangesfm.ranging.observations import RangeObservations, hold_out
-from rangesfm.refine import refine_with_ranges
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.survey_stages import path_of_model, refine_by_survey
+from rangesfm.trajectory import Trajectory
 from rangesfm.vision.image_times import ImageTimes
 
 # Fewer have no shape by which ranges could tell a scale.
@@ -65,7 +64,7 @@ class AdjustmentWithRanges:
 
     def adjust(self, model: pycolmap.Reconstruction) -> bool:
         """Adjust a model in place; False, and it is as it was, while the ranges do not determine its scale."""
-        path = self._path(model)
+        path = path_of_model(model, self._times)
         try:
             if len(path) < _MIN_NUM_KEYFRAMES:
                 raise GeometryError(f"{_MIN_NUM_KEYFRAMES} or more are needed")
@@ -84,12 +83,6 @@ class AdjustmentWithRanges:
             return None
         return f"ranges took part in {self.num_with_ranges} of {num} global adjustments of the map while it grew"
 
-    def _path(self, model: pycolmap.Reconstruction) -> Trajectory:
-        if self._times is None:
-            return trajectory_from_reconstruction(model)
-        resolution_s = self._times.resolution_s
-        return trajectory_from_reconstruction(model, self._times.by_name(), time_resolution_s=resolution_s)
-
     def _adjusted(self, model: pycolmap.Reconstruction, path: Trajectory) -> pycolmap.Reconstruction:
         survey, inputs = self._survey, self._inputs
         observations = self._observations(path)
@@ -102,23 +95,13 @@ class AdjustmentWithRanges:
             range_model=survey.ranges.model,
             seed=survey.seed,
         )
-        refined, _ = refine_with_ranges(
-            rescale(model, estimate.metric_from_sfm),
-            path,
-            estimate.observations,
-            estimate.metric_from_sfm,
-            estimate.anchors,
-            tag_in_cam_m=inputs.tag_in_cam_m,
-            range_stddev_m=estimate.range_stddev_m,
-            range_share=estimate.range_share,
-            stddev_is_estimated=np.isnan(inputs.log.range_stddev_m) & (survey.ranges.model.range_stddev_m is None),
-            correlation_inflation=estimate.correlation_inflation,
-            common_bias_stddev_m=survey.ranges.model.common_bias_stddev_m,
-            first_pose_is_fixed=estimate.frame != "site",
+        asked = replace(
+            survey,
             camera=replace(survey.camera, refine_intrinsics=survey.camera.mapping_refines_intrinsics),
-            options=replace(survey.refine, covariance=False),
-            num_threads=survey.mapper.num_threads,
+            refine=replace(survey.refine, covariance=False),
         )
+        scaled = rescale(model, estimate.metric_from_sfm)
+        refined, _ = refine_by_survey(asked, inputs, scaled, path, estimate, tape=None)
         return refined
 
     def _observations(self, path: Trajectory) -> RangeObservations:
