@@ -18,13 +18,14 @@ def run(
     code: str,
     listen: Callable[[dict[str, Any]], None] = lambda _: None,
     *,
+    given: bytes = b"given",
     memory_limit_bytes: int = 1 << 40,
     is_stopped: Callable[[], bool] = lambda: False,
 ) -> Ended:
     code = "import json, os, signal, sys, time\nsay = lambda **m: print(json.dumps(m), flush=True)\n" + code
     return supervise(
         [sys.executable, "-S", "-c", code],
-        b"given",
+        given,
         listen,
         environment=os.environ,
         memory_limit_bytes=memory_limit_bytes,
@@ -57,6 +58,11 @@ def test_a_crash_is_named(number: signal.Signals) -> None:
 def test_half_a_message_counts_for_nothing() -> None:
     ended = run("say(n=1)\nprint('{\"n\": ', end='', flush=True)\nos.kill(os.getpid(), 9)")
     assert ended.last == {"n": 1}
+
+
+def test_what_it_said_counts_also_if_it_died_before_it_heard() -> None:
+    ended = run("say(n=1)\nos.kill(os.getpid(), 9)", given=b"more than a pipe holds" * 100_000)
+    assert (ended.last, ended.signal) == ({"n": 1}, signal.SIGKILL)
 
 
 def test_one_that_is_stopped_may_tidy_up() -> None:

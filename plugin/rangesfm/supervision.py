@@ -122,22 +122,32 @@ def _talk(
     assert process.stdout is not None
     lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
     threading.Thread(target=_read_lines, args=(process.stdout, lines), daemon=True).start()
-    last = None
-    with suppress(BrokenPipeError), process.stdin as stdin:  # open until the end: that it is, says that we live
-        stdin.write(given)
-        stdin.flush()
-        while True:
-            watched.look()
-            try:
-                line = lines.get(timeout=_POLL_INTERVAL_S)
-            except queue.Empty:
-                continue
-            if line is None:
-                break
-            last = json.loads(line)
-            listen(last)
+    try:
+        with suppress(BrokenPipeError):  # it died; what it said before counts
+            process.stdin.write(given)
+            process.stdin.flush()
+        last = _hear(lines, listen, watched)
+    finally:
+        with suppress(BrokenPipeError):
+            process.stdin.close()  # not sooner: that it is open says that we live
     process.wait()
     return last
+
+
+def _hear(
+    lines: queue.SimpleQueue[bytes | None], listen: Callable[[dict[str, Any]], None], watched: _Watched
+) -> dict[str, Any] | None:
+    last = None
+    while True:
+        watched.look()
+        try:
+            line = lines.get(timeout=_POLL_INTERVAL_S)
+        except queue.Empty:
+            continue
+        if line is None:
+            return last
+        last = json.loads(line)
+        listen(last)
 
 
 def _read_lines(stream: IO[bytes], lines: queue.SimpleQueue[bytes | None]) -> None:
