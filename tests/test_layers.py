@@ -34,6 +34,7 @@ LAYER_OF = {
     "georeference": DATA,
     "json_files": DATA,
     "joined_model": DATA,
+    "linear_solver": DATA,
     "model_files": DATA,
     "model_records": DATA,
     "options": DATA,

@@ -13,6 +13,7 @@ import pycolmap
 
 from rangesfm import _ceres
 from rangesfm.errors import SolverError
+from rangesfm.linear_solver import max_num_images_direct, overlaps_in
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.passthrough import apply_options
 from rangesfm.refinement.progress import Progress, farthest, keyframe_centers
@@ -209,6 +210,9 @@ def _bundle_adjuster(
     solver.max_num_iterations = max_num_iterations
     solver.num_threads = num_threads
     ba.ceres.solver_options = solver
+    limit = ba.ceres.max_num_images_direct_sparse_cpu_solver
+    if metric.num_reg_images() > limit:
+        ba.ceres.max_num_images_direct_sparse_cpu_solver = max_num_images_direct(overlaps_in(metric), limit)
     apply_options(ba, options.bundle_adjustment, "refine.bundle_adjustment")
 
     config = pycolmap.BundleAdjustmentConfig()

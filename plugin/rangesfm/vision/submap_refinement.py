@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pycolmap
+from scipy.sparse import csr_array
 
+from rangesfm.linear_solver import max_num_images_direct, overlaps_of
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
-
-# A direct solver takes time and memory as the number of photos where each sees what few others see, as along a path.
-# The iterative one, which COLMAP takes from a thousand photos on, creeps there: six times the time at five thousand.
-_MAX_NUM_NEIGHBOURS = 50
 
 
 def refine_joined(
@@ -56,10 +55,11 @@ def _refine(
             ),
         )
     adjustment = options.get_global_bundle_adjustment()
-    if cache.correspondence_graph.num_image_pairs() <= _MAX_NUM_NEIGHBOURS * model.num_reg_images():
-        adjustment.ceres.max_num_images_direct_sparse_cpu_solver = max(
-            adjustment.ceres.max_num_images_direct_sparse_cpu_solver, model.num_reg_images()
-        )
+    ceres = adjustment.ceres
+    ceres.max_num_images_direct_sparse_cpu_solver = max_num_images_direct(
+        _matched(cache.correspondence_graph, model), ceres.max_num_images_direct_sparse_cpu_solver
+    )
+    adjustment.ceres = ceres
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(model)
     mapper.iterative_global_refinement(
@@ -73,3 +73,11 @@ def _refine(
     if options.extract_colors:
         model.extract_colors_for_all_images(image_path, options.num_threads)
     model.update_point_3d_errors()
+
+
+def _matched(graph: pycolmap.CorrespondenceGraph, model: pycolmap.Reconstruction) -> csr_array:
+    """Which photos of a model may come to share points, by their matches."""
+    index = {image_id: k for k, image_id in enumerate(model.reg_image_ids())}
+    ids = [pycolmap.pair_id_to_image_pair(pair_id) for pair_id in graph.image_pairs()]
+    pairs = [(index[a], index[b]) for a, b in ids if a in index and b in index]
+    return overlaps_of(np.array(pairs, dtype=np.int64).reshape(-1, 2), len(index))

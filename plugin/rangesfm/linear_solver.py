@@ -1,0 +1,62 @@
+"""Which linear solver a bundle adjustment takes: direct, wherever that is cheap."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+Indices = npt.NDArray[np.int64]
+
+
+def max_num_images_direct(overlaps: csr_array, limit: int) -> int:
+    """How many photos COLMAP's direct solver may take: ``limit``, or all where it costs no more than at the limit.
+
+    COLMAP takes an iterative solver beyond a number of photos, whatever they see. Along a path, where each photo sees
+    what few others see, it creeps, and the direct one takes time as the number of photos. What that costs at most, the
+    envelope tells: a row of the Cholesky factor reaches no further to the left than its matrix (George and Liu,
+    "Computer Solution of Large Sparse Positive Definite Systems", 1981). It is compared with that of ``limit`` photos
+    that all see the same.
+
+    Args:
+        overlaps: (n, n), symmetric; not zero where two photos see a common point.
+        limit: COLMAP's ``max_num_images_direct_sparse_cpu_solver``.
+    """
+    num = overlaps.shape[0]
+    return num if num > limit and _cost(_envelope_widths(overlaps)) <= _cost(np.arange(limit)) else limit
+
+
+def overlaps_in(model: pycolmap.Reconstruction) -> csr_array:
+    """(n, n) number of points that two of the n photos of a model have in common."""
+    index = {image_id: k for k, image_id in enumerate(model.reg_image_ids())}
+    seen = [
+        (index[element.image_id], row)
+        for row, point in enumerate(model.points3D.values())
+        for element in point.track.elements
+    ]
+    photo, point = np.array(seen, dtype=np.int64).reshape(-1, 2).T
+    sees = csr_array((np.ones(len(seen)), (photo, point)), shape=(len(index), len(model.points3D)))
+    return csr_array(sees @ sees.T)
+
+
+def overlaps_of(pairs: Indices, num: int) -> csr_array:
+    """(n, n) of (k, 2) pairs of photos, each pair once."""
+    ones = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(num, num))
+    return csr_array(ones + ones.T)
+
+
+def _envelope_widths(overlaps: csr_array) -> Indices:
+    """(n,) how far each row reaches to the left of its diagonal, in an order that keeps neighbours together."""
+    order = reverse_cuthill_mckee(overlaps, symmetric_mode=True)
+    ordered = overlaps[order][:, order].tocoo()
+    leftmost = np.arange(overlaps.shape[0])
+    np.minimum.at(leftmost, ordered.row, ordered.col)
+    widths: Indices = np.arange(overlaps.shape[0]) - leftmost
+    return widths
+
+
+def _cost(widths: Indices) -> float:
+    """Multiplications of a Cholesky factorisation, but for a factor."""
+    return float(np.sum(widths.astype(np.float64) ** 2))
