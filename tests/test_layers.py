@@ -32,6 +32,7 @@ LAYER_OF = {
     "distances": DATA,
     "geometry": DATA,
     "georeference": DATA,
+    "gravity": DATA,
     "json_files": DATA,
     "joined_model": DATA,
     "linear_solver": DATA,

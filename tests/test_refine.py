@@ -11,12 +11,14 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
 from rangesfm import _ceres
 from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.tape import Marker, Tape, TapedDistance
 from rangesfm.errors import InputError
 from rangesfm.geometry import IDENTITY, Similarity, align_points, rmse
+from rangesfm.gravity import UP_IN_SITE, Gravity
 from rangesfm.model_transform import rescale
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.anchors import Anchor, AnchorEstimate
@@ -295,6 +297,22 @@ class TestWhatIsKnownStays:
         first, last = survey.trajectory.frame_ids[[0, -1]]
         np.testing.assert_array_equal(pose_of(refined.frame(first)).params, pose_of(start.frame(first)).params)
         assert np.abs(pose_of(refined.frame(last)).params - pose_of(start.frame(last)).params).max() > 1e-3
+
+    def test_the_vertical_where_two_anchors_leave_a_turn_open(self) -> None:
+        survey = make_survey(anchors_m={name: ANCHORS_M[name] for name in "AB"})
+        truth = survey.metric_from_sfm
+        along = survey.anchors_m["B"] - survey.anchors_m["A"]
+        turn = Rotation.from_rotvec(np.deg2rad(3.0) * along / np.linalg.norm(along)).as_matrix()
+        at = survey.anchors_m["A"]
+        turned = replace(survey, metric_from_sfm=Similarity(1.0, turn, at - turn @ at) @ truth)
+        from_first_camera = truth.rotation @ survey.trajectory.world_from_cam[0]
+        gravity = Gravity(from_first_camera.T @ UP_IN_SITE, 0.05)
+        _, loose = turned.refine(survey.anchors(0.0))
+        refined, summary = turned.refine(survey.anchors(0.0), gravity=gravity)
+        assert loose.covariance is not None
+        assert summary.covariance is not None
+        assert (loose.covariance.num_free_directions, summary.covariance.num_free_directions) == (1, 0)
+        np.testing.assert_allclose(survey.centers(refined), survey.centers_m, atol=1e-5)
 
     def test_a_first_keyframe_without_ranges(self) -> None:
         survey = make_survey("first_camera", pixel_stddev=0.5)

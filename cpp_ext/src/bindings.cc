@@ -18,6 +18,7 @@
 #include <utility>
 
 #include "gate.h"
+#include "rangesfm/direction_cost.h"
 #include "rangesfm/distance_cost.h"
 #include "rangesfm/joint_prior_cost.h"
 #include "rangesfm/normal_prior_cost.h"
@@ -137,6 +138,12 @@ ceres::CostFunction* MakeDistanceCost(double distance_m, double stddev_m, const 
   return MakeDistanceCostBetween(distance_m, PointEnd(), PointEnd(), stddev_m, has_bias, loss_scale);
 }
 
+ceres::CostFunction* MakeDirectionCost(const Array& direction_in_world, const Array& direction_in_cam,
+                                       double stddev_rad) {
+  return new DirectionCost(Direction3("direction_in_world", direction_in_world),
+                           Direction3("direction_in_cam", direction_in_cam), Positive("stddev_rad", stddev_rad));
+}
+
 ceres::CostFunction* MakeNormalPriorCost(const Array& mean, const Array& stddev) {
   const Eigen::VectorXd means = FiniteVector("mean", mean);
   const Eigen::VectorXd stddevs = FiniteVector("stddev", stddev);
@@ -215,6 +222,8 @@ PYBIND11_MODULE(_cpp, m) {
                             py::arg("offset_velocity_in_world_m_per_s") = py::none());
   m.def("distance_cost", &rangesfm::MakeDistanceCost, rangesfm::kOwn, py::kw_only(), py::arg("distance_m"),
         py::arg("stddev_m"), py::arg("a_in_cam_m"), py::arg("b_in_cam_m"), py::arg("has_bias"), py::arg("loss_scale"));
+  m.def("direction_cost", &rangesfm::MakeDirectionCost, rangesfm::kOwn, py::kw_only(), py::arg("direction_in_world"),
+        py::arg("direction_in_cam"), py::arg("stddev_rad"));
   m.def("normal_prior_cost", &rangesfm::MakeNormalPriorCost, rangesfm::kOwn, py::kw_only(), py::arg("mean"),
         py::arg("stddev"));
   m.def("joint_prior_cost", &rangesfm::MakeJointPriorCost, rangesfm::kOwn, py::kw_only(), py::arg("mean"),

@@ -76,6 +76,15 @@ inline Eigen::Vector3d FiniteVector3(const std::string& name, const Array& array
   return FiniteVector(name, array);
 }
 
+// Of length 1.
+inline Eigen::Vector3d Direction3(const std::string& name, const Array& array) {
+  const Eigen::Vector3d vector = FiniteVector3(name, array);
+  if (vector.stableNorm() == 0.0) {
+    throw pybind11::value_error(name + " is zero, expected a direction");
+  }
+  return vector.stableNormalized();
+}
+
 // (n,): one number for each of n ranges, or one for all.
 template <typename Check>
 Eigen::VectorXd ForEachRange(const std::string& name, const Array& array, Eigen::Index num_ranges, const Check& check) {

@@ -38,7 +38,7 @@ InterpolatedPlace Between(Random& random, int size, double interval) {
   return {Uniform(random, size, 0.0, 1.0), Vectors(random, size, 0.3), interval, Vectors(random, size, 0.2)};
 }
 
-std::shared_ptr<const RangeErrorCurve> Table() {
+std::shared_ptr<const RangeErrorCurve> CurveTable() {
   return std::make_shared<TabulatedCurve>(Eigen::Vector4d(0.5, 2.0, 6.0, 20.0), Eigen::Vector4d(-0.2, 0.1, 0.0, 0.3));
 }
 
@@ -89,7 +89,7 @@ TEST(RangeModel, GradientsAreRightForEverythingFreeBetweenKeyframes) {
   Random random(1);
   for (int i = 0; i < 40; ++i) {
     const std::shared_ptr<const RangeErrorCurve> curve =
-        i % 2 == 0 ? Table() : std::make_shared<ExponentialCurve>(random.Uniform(10.0, 50.0));
+        i % 2 == 0 ? CurveTable() : std::make_shared<ExponentialCurve>(random.Uniform(10.0, 50.0));
     const TwoSidedLoss loss(random.Uniform(1.0, 100.0), i % 3 == 0 ? kInfinity : random.Uniform(1.0, 100.0),
                             i % 2 == 0);
     const RangeCost<InterpolatedPlace> cost(Between(random, 5, random.Uniform(0.1, 3.0)), Measured(random, 5, 20.0),
@@ -120,7 +120,7 @@ TEST(RangeModel, GradientsAreRightFarBeyondTheKeyframesInTime) {
   std::vector<Block> blocks = FullBlocks(random, 5.0);
   blocks[5] = {30.0};
   const RangeCost<InterpolatedPlace> cost(Between(random, 3, 0.5), Measured(random, 3, 20.0),
-                                          FullModel(Table(), TwoSidedLoss()));
+                                          FullModel(CurveTable(), TwoSidedLoss()));
   ExpectGradientsAreRight(cost, blocks, 1e-7);
 }
 
@@ -128,7 +128,7 @@ TEST(RangeModel, AnswerIsFiniteForAnOutlierOfAMillionStddevs) {
   Random random(4);
   const std::vector<Block> blocks = FullBlocks(random, 5.0);
   const RangeCost<InterpolatedPlace> cost(Between(random, 1, 0.5), OneRange(1e6, 1e-3),
-                                          FullModel(Table(), TwoSidedLoss(2.0, 2.0)));
+                                          FullModel(CurveTable(), TwoSidedLoss(2.0, 2.0)));
   const Evaluation evaluation = Evaluate(cost, blocks);
   ExpectAllFinite(evaluation);
   EXPECT_NEAR(evaluation.residuals[0], -2.0 * std::sqrt(std::log1p(std::pow(1e9 / 2.0, 2))), 1e-3);
@@ -151,7 +151,7 @@ TEST(RangeModel, ManyRangesAreAsManyCostsOfOne) {
   const Eigen::Matrix3Xd offset = Vectors(random, kNumRanges, 0.3);
   const Eigen::Matrix3Xd velocity = Vectors(random, kNumRanges, 0.3);
   const MeasuredRanges measured = Measured(random, kNumRanges, 10.0);
-  const RangeModel model = FullModel(Table(), TwoSidedLoss(10.0, 3.0));
+  const RangeModel model = FullModel(CurveTable(), TwoSidedLoss(10.0, 3.0));
   const std::vector<Block> blocks = FullBlocks(random, 5.0);
   const Evaluation many =
       Evaluate(RangeCost<InterpolatedPlace>(InterpolatedPlace(weight, offset, 0.7, velocity), measured, model), blocks);
@@ -199,7 +199,7 @@ TEST(RangeModel, AFreeLeverArmIsTheConstantOneWithAGradient) {
 TEST(RangeModel, AnyJacobianMayBeLeftOut) {
   Random random(7);
   const RangeCost<InterpolatedPlace> cost(Between(random, 4, 0.5), Measured(random, 4, 10.0),
-                                          FullModel(Table(), TwoSidedLoss(3.0, 2.0)));
+                                          FullModel(CurveTable(), TwoSidedLoss(3.0, 2.0)));
   ExpectAnyJacobianMayBeLeftOut(cost, FullBlocks(random, 5.0));
 }
 

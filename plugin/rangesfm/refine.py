@@ -16,6 +16,7 @@ from rangesfm.distances.ends import LocatedDistances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry import Similarity
+from rangesfm.gravity import Gravity
 from rangesfm.options import CameraOptions, RangeModelOptions, RefineOptions
 from rangesfm.ranging.anchors import AnchorEstimate
 from rangesfm.ranging.observations import RangeObservations, status_by_weight
@@ -37,6 +38,7 @@ from rangesfm.refinement.distances import (
 from rangesfm.refinement.radio import RadioBlocks, RadioEstimate, RadioRanges, add_radio_priors, add_ranges
 from rangesfm.refinement.range_errors import range_errors
 from rangesfm.refinement.unbend import SAME_WEIGHTS, Unbent, unbend
+from rangesfm.refinement.upright import add_gravity
 from rangesfm.refinement.weights import RangeWeights, misfits, range_weights
 from rangesfm.trajectory import Trajectory
 
@@ -119,6 +121,7 @@ def refine_with_ranges(
     correlation_inflation: float = 1.0,
     common_bias_stddev_m: float = RangeModelOptions.common_bias_stddev_m,
     first_pose_is_fixed: bool,
+    gravity: Gravity | None = None,
     camera: CameraOptions | None = None,
     options: RefineOptions | None = None,
     tape: Tape | None = None,
@@ -141,6 +144,7 @@ def refine_with_ranges(
         common_bias_stddev_m: of the bias that all anchors share (mean 0), of which their priors say nothing.
         first_pose_is_fixed: the gauge: True in the first camera's frame, False where
             surveyed anchors hold the map.
+        gravity: which way is up in the first camera; counts where its pose is not fixed.
         tape: taped distances, of which the map keeps to the control ones; as it does to the ranges between anchors
             that the log holds.
 
@@ -176,6 +180,7 @@ def refine_with_ranges(
         camera or CameraOptions(),
         options,
         first_pose_is_fixed,
+        None if first_pose_is_fixed else gravity,
         num_threads,
     )
     weights = range_weights(
@@ -227,7 +232,12 @@ class _Survey:
     camera: CameraOptions
     options: RefineOptions
     first_pose_is_fixed: bool
+    gravity: Gravity | None
     num_threads: int
+
+    @property
+    def first_frame_id(self) -> int:
+        return int(self.ranges.trajectory.frame_ids[0])
 
     def problem(self, max_num_iterations: int) -> BundleAdjustment:
         """Of the photos alone."""
@@ -235,7 +245,7 @@ class _Survey:
             self.metric,
             self.camera,
             self.options,
-            fixed_frame_id=int(self.ranges.trajectory.frame_ids[0]) if self.first_pose_is_fixed else None,
+            fixed_frame_id=self.first_frame_id if self.first_pose_is_fixed else None,
             max_num_iterations=max_num_iterations,
             num_threads=self.num_threads,
             marker_ids=self.distances.marker_ids.values(),
@@ -249,6 +259,8 @@ class _Survey:
             add_distances(problem, self.distances, radio.anchors, blocks.positions, weights.loss.width)
         )
         add_radio_priors(problem, radio, self.tags_in_cam_m, self.common_bias_stddev_m, blocks, self.options)
+        if self.gravity is not None:
+            add_gravity(problem, self.gravity, self.first_frame_id)
         return _Added(blocks, residual_rows)
 
     def range_errors(self, added: _Added, weights: RangeWeights, num_absorbed: float) -> ResidualErrors:
@@ -301,6 +313,7 @@ def _refine(survey: _Survey, weights: RangeWeights) -> RefineSummary:
         pixel_stddev=problem.pixel_stddev,
         common_bias_stddev_m=survey.common_bias_stddev_m,
         first_pose_is_fixed=survey.first_pose_is_fixed,
+        gravity=survey.gravity,
     )
     adjusted = _adjust(survey, problem, start)
     survey.metric.update_point_3d_errors()

@@ -7,6 +7,7 @@ import pycolmap
 
 from rangesfm.config import Survey
 from rangesfm.distances.tape import Tape
+from rangesfm.gravity import gravity_of
 from rangesfm.inputs import RangingInputs
 from rangesfm.refine import RefineSummary, refine_with_ranges
 from rangesfm.scale.estimate import ScaleEstimate
@@ -51,6 +52,7 @@ def refine_by_survey(
         correlation_inflation=estimate.correlation_inflation,
         common_bias_stddev_m=ranges.common_bias_stddev_m,
         first_pose_is_fixed=estimate.frame != "site",
+        gravity=gravity_of(survey.scale.up_in_first_camera),
         camera=survey.camera,
         options=survey.refine,
         tape=tape,

@@ -17,6 +17,7 @@ from rangesfm._ceres import (
     RangeErrorModel,
     add_residual_block,
     cauchy_loss,
+    direction_cost,
     distance_cost,
     fixed_pose_range_cost,
     interpolated_range_cost,
@@ -131,6 +132,14 @@ COSTS: dict[str, Callable[[np.random.Generator], tuple[CostFunction, list[Array]
     "distance between points": lambda rng: (
         distance_cost(distance_m=3.0, stddev_m=1.0, loss_scale=20.0),
         [rng.normal(0, 5, 3), rng.normal(0, 5, 3)],
+    ),
+    "direction": lambda rng: (
+        direction_cost(
+            direction_in_world=rng.normal(0, 1, 3),
+            direction_in_cam=rng.normal(0, 1, 3),
+            stddev_rad=rng.uniform(0.01, 1),
+        ),
+        [random_pose(rng, 5.0)],
     ),
     "normal_prior": lambda rng: (
         normal_prior_cost(mean=rng.normal(0, 1, 3), stddev=rng.uniform(0.1, 1.0, 3)),
@@ -314,6 +323,10 @@ def test_priors_and_ties_of_impossible_shape_are_refused() -> None:
         normal_prior_cost(mean=[], stddev=[])
     with pytest.raises(ValueError, match="more than 0"):
         normal_prior_cost(mean=[1.0, 2.0], stddev=[1.0, 0.0])
+    with pytest.raises(ValueError, match="direction_in_cam is zero"):
+        direction_cost(direction_in_world=[0, 0, 1], direction_in_cam=[0, 0, 0], stddev_rad=0.1)
+    with pytest.raises(ValueError, match="more than 0"):
+        direction_cost(direction_in_world=[0, 0, 1], direction_in_cam=[0, 0, 1], stddev_rad=0.0)
     with pytest.raises(ValueError, match="2 rows and columns"):
         joint_prior_cost(mean=[1.0, 2.0], whitening=np.eye(3))
     with pytest.raises(ValueError, match="whitening is nan"):

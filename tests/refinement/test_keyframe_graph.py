@@ -11,6 +11,7 @@ from scipy.optimize import approx_fprime
 from tests.refinement.conftest import bent, poses_and_rays
 
 from rangesfm.geometry import align_points, rmse
+from rangesfm.gravity import UP_IN_SITE, Gravity
 from rangesfm.ranging.anchors import AnchorEstimate
 from rangesfm.ranging.robust_loss import GEMAN_MCCLURE
 from rangesfm.refinement import keyframe_graph
@@ -46,6 +47,7 @@ def make_graph(
         share=np.ones(len(index)),
         anchors=tuple(anchor(k, anchors_are_free) for k in range(m)),
         common_bias_stddev_m=0.1,
+        gravity=None,
         held_frame=held_frame,
         loss=GEMAN_MCCLURE.scaled(1e6),
     )
@@ -67,6 +69,7 @@ def anchor(k: int, is_free: bool) -> AnchorEstimate:
 def test_gradient_and_hessian_are_those_of_the_cost(chain: SyntheticModel) -> None:
     truth, _ = poses_and_rays(chain)
     graph = make_graph(chain, truth, stddev_m=0.1, anchors_are_free=True, held_frame=None)
+    graph = replace(graph, gravity=Gravity(truth.world_from_rig[0].T @ UP_IN_SITE, 0.05))
     layout = keyframe_graph._Layout.of(graph)
     rng = np.random.default_rng(0)
     state = keyframe_graph._moved(graph.start(), layout, 1e-3 * rng.standard_normal(len(layout.free)))

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.geometry import IDENTITY, Similarity
+from rangesfm.gravity import gravity_of
 from rangesfm.scale import range_equation
-from rangesfm.scale.gravity import gravity_of
 from rangesfm.scale.range_equation import RangeProblem, RangeState, predicted_ranges, solve
 
 Array = npt.NDArray[np.float64]

@@ -23,6 +23,7 @@ from rangesfm._ceres.compatibility import (
 )
 from rangesfm._ceres.costs import (
     RangeErrorModel,
+    direction_cost,
     distance_cost,
     fixed_pose_range_cost,
     interpolated_range_cost,
@@ -51,6 +52,7 @@ __all__ = [
     "check_compatibility",
     "combine_ranges",
     "compiled_part_version",
+    "direction_cost",
     "distance_cost",
     "fixed_pose_range_cost",
     "interpolated_range_cost",

@@ -202,6 +202,28 @@ def distance_cost(
     )
 
 
+def direction_cost(
+    *, direction_in_world: npt.ArrayLike, direction_in_cam: npt.ArrayLike, stddev_rad: float
+) -> CostFunction:
+    """A direction of the world that was seen from a camera, such as the vertical: 3 residuals, in stddevs.
+
+    Block: ``rig_from_world`` (7,).
+
+    Args:
+        direction_in_world, direction_in_cam: (3,) of any length ("cam" is the rig frame).
+        stddev_rad: of the direction, as an angle.
+
+    Raises:
+        ValueError, SolverError: as ``range_cost``.
+    """
+    check_compatibility()
+    from rangesfm import _cpp
+
+    return _cpp.direction_cost(
+        direction_in_world=direction_in_world, direction_in_cam=direction_in_cam, stddev_rad=stddev_rad
+    )
+
+
 def normal_prior_cost(*, mean: npt.ArrayLike, stddev: npt.ArrayLike) -> CostFunction:
     """What was known of a block of n numbers beforehand, each for itself: ``(x - mean) / stddev``.
 

@@ -16,6 +16,7 @@ from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial.transform import Rotation
 
+from rangesfm.gravity import Gravity
 from rangesfm.ranging.anchors import AnchorEstimate
 from rangesfm.ranging.robust_loss import RobustLoss
 from rangesfm.refinement.antennas import Antennas
@@ -67,6 +68,7 @@ class KeyframeGraph:
         anchors: m, with priors as for ``refine_with_ranges``.
         common_bias_stddev_m: of what all free biases share beyond their priors' means; 0: nothing.
         held_frame: a keyframe that stays where it is; None: none does.
+        gravity: which way is up in the first keyframe; None: nobody knows.
         loss: of single ranges, in their stddevs.
     """
 
@@ -79,6 +81,7 @@ class KeyframeGraph:
     anchors: tuple[AnchorEstimate, ...]
     common_bias_stddev_m: float
     held_frame: int | None
+    gravity: Gravity | None
     loss: RobustLoss
 
     def start(self) -> GraphState:
@@ -298,6 +301,11 @@ def _prior_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tup
     if layout.num - 1 in free:
         entries.append((len(residuals), layout.num - 1, 1 / graph.common_bias_stddev_m))
         residuals.append(state.common_bias_m / graph.common_bias_stddev_m)
+    if graph.gravity is not None:
+        rotation = state.poses.world_from_rig[0]
+        slopes = graph.gravity.jacobian(rotation, rotation)
+        entries += [(len(residuals) + row, column, float(slopes[row, column])) for row, column in np.ndindex(3, 3)]
+        residuals += graph.gravity.residuals(rotation).tolist()
     rows, columns, values = zip(*entries, strict=True) if entries else ((), (), ())
     shape = (len(residuals), layout.num)
     return np.array(residuals), sparse.coo_array((values, (rows, columns)), shape=shape).tocsr()

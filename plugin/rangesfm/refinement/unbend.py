@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pycolmap
 
 from rangesfm.geometry import align_points, rmse
+from rangesfm.gravity import Gravity
 from rangesfm.ranging.anchors import AnchorEstimate
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.ranging.robust_loss import wider
@@ -57,6 +58,7 @@ def unbend(
     pixel_stddev: float,
     common_bias_stddev_m: float,
     first_pose_is_fixed: bool,
+    gravity: Gravity | None,
 ) -> Unbent:
     """Solve the keyframe graph and, where it moves the map by more than the ranges' noise, move the model, in place.
 
@@ -80,6 +82,7 @@ def unbend(
         anchors=anchors,
         common_bias_stddev_m=common_bias_stddev_m,
         held_frame=0 if first_pose_is_fixed else None,
+        gravity=gravity,
         loss=placed.loss,
     )
     fit = _solve_with_own_weights(graph, placed)

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from rangesfm.errors import GeometryError
 from rangesfm.geometry import PathShape, Similarity, path_shape
-from rangesfm.scale.gravity import UP_IN_SITE
+from rangesfm.gravity import UP_IN_SITE
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, RangeState
 
 Array = npt.NDArray[np.float64]

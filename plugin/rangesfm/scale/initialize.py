@@ -11,6 +11,7 @@ import numpy.typing as npt
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry import Similarity
+from rangesfm.gravity import gravity_of
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.ranging.anchors import Anchor
 from rangesfm.ranging.noise import shared_stddev
@@ -19,7 +20,7 @@ from rangesfm.ranging.shared_errors import CURVE_STDDEV_M
 from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
 from rangesfm.scale.cutoff import cutoff_test
 from rangesfm.scale.estimate import ScaleEstimate
-from rangesfm.scale.gravity import gravity_of, levelled_places
+from rangesfm.scale.levelled_places import levelled_places
 from rangesfm.scale.problem import SurveyProblem, survey_problem
 from rangesfm.scale.sensitivity import scale_sensitivity
 from rangesfm.scale.solution import Solution, solve_survey

@@ -13,12 +13,12 @@ from rangesfm.distances.ends import LocatedDistances
 from rangesfm.distances.surveyed import surveyed_distances
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry import Similarity, path_shape
+from rangesfm.gravity import Gravity
 from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.anchors import Anchor
 from rangesfm.ranging.noise import START_STDDEV_M, shared_stddev
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.anchor_plane import is_line, is_steep
-from rangesfm.scale.gravity import Gravity
 from rangesfm.scale.range_equation import RangeProblem
 from rangesfm.trajectory import Trajectory
 

@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.geometry import Similarity
+from rangesfm.gravity import Gravity
 from rangesfm.ranging.noise import bias_whitening
 from rangesfm.ranging.robust_loss import CAUCHY, RobustLoss
 from rangesfm.scale.distance_equation import distance_jacobian, distance_residuals
-from rangesfm.scale.gravity import Gravity
 
 Array = npt.NDArray[np.float64]
 

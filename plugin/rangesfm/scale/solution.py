@@ -265,7 +265,7 @@ def _weighted(
         bias_stddev_m=problem.bias_stddev_m / inflation,
         common_bias_stddev_m=problem.common_bias_stddev_m / inflation,
         distances=None if distances is None else replace(distances, stddev_m=distances.stddev_m / inflation),
-        gravity=None if gravity is None else replace(gravity, stddev=gravity.stddev / inflation),
+        gravity=None if gravity is None else replace(gravity, stddev_rad=gravity.stddev_rad / inflation),
     )
 
 
