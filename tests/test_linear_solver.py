@@ -7,7 +7,7 @@ import numpy.typing as npt
 from scipy.sparse import csr_array
 
 from rangesfm.geometry import IDENTITY
-from rangesfm.linear_solver import max_num_images_direct, overlaps_in, overlaps_of
+from rangesfm.linear_solver import inverse_is_affordable, max_num_images_direct, overlaps_in, overlaps_of
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.refinement.bundle_adjustment import bundle_adjustment
 from rangesfm.simulate.model import SyntheticModel, synthetic_model
@@ -55,6 +55,12 @@ def test_photos_that_see_others_here_and_there_keep_colmaps_limit() -> None:
 
 def test_below_the_limit_nothing_changes() -> None:
     assert max_num_images_direct(each_with_the_next(50, 3), 100) == 100
+
+
+def test_the_inverse_is_affordable_along_a_path_but_not_of_photos_that_all_see_the_same() -> None:
+    assert inverse_is_affordable(each_with_the_next(1000, 5), 500)
+    assert inverse_is_affordable(csr_array(np.ones((100, 100))), 100)
+    assert not inverse_is_affordable(csr_array(np.ones((101, 101))), 100)
 
 
 def test_photos_overlap_by_the_points_they_have_in_common() -> None:

@@ -1,4 +1,4 @@
-"""Which linear solver a bundle adjustment takes: direct, wherever that is cheap."""
+"""What solving for all photos at once costs: cheap wherever each sees what few others see."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 Indices = npt.NDArray[np.int64]
+
+# Of an entry of a sparse factor, in time, against one of a dense factor.
+_SPARSE_SLOWDOWN = 8
 
 
 def max_num_images_direct(overlaps: csr_array, limit: int) -> int:
@@ -26,6 +29,19 @@ def max_num_images_direct(overlaps: csr_array, limit: int) -> int:
     """
     num = overlaps.shape[0]
     return num if num > limit and _cost(_envelope_widths(overlaps)) <= _cost(np.arange(limit)) else limit
+
+
+def inverse_is_affordable(overlaps: csr_array, limit: int) -> bool:
+    """Whether each photo's columns of the inverse take no longer than those of ``limit`` photos that all see the same.
+
+    A column takes as long as the factor has entries.
+
+    Args:
+        overlaps: as for ``max_num_images_direct``.
+    """
+    num = int(overlaps.shape[0])
+    num_entries = _SPARSE_SLOWDOWN * int(np.sum(_envelope_widths(overlaps) + 1))
+    return num <= limit or num * num_entries <= limit * limit * (limit + 1) // 2
 
 
 def overlaps_in(model: pycolmap.Reconstruction) -> csr_array:

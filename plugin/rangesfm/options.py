@@ -167,7 +167,8 @@ class RefineOptions:
         time_offset_stddev_s: of the clocks' offset, likewise.
         short_range_stddev_m: of an error of short ranges that all share and that dies out with a length of 1 m,
             likewise.
-        covariance: whether to find that of poses, anchors and scale; of more than 1500 keyframes it is not found.
+        covariance: whether to find that of poses, anchors and scale; not found of more than 1500 photos that
+            see much of the same; along a path, of some thousands.
         bundle_adjustment: passed through to pycolmap's BundleAdjustmentOptions.
     """
 

@@ -17,6 +17,7 @@ from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry import Similarity
 from rangesfm.gravity import Gravity
+from rangesfm.linear_solver import inverse_is_affordable, overlaps_in
 from rangesfm.options import CameraOptions, RangeModelOptions, RefineOptions
 from rangesfm.ranging.anchors import AnchorEstimate
 from rangesfm.ranging.observations import RangeObservations, status_by_weight
@@ -50,8 +51,8 @@ Array = npt.NDArray[np.float64]
 _MAX_NUM_ROUNDS = 3
 # What is still to be gained at the end, as a share of the smallest range stddev.
 _MAX_LAST_MOVEMENT = 0.01
-# The covariance of all poses takes time and memory by their square, and more where they hang together.
-_MAX_NUM_FRAMES_FOR_COVARIANCE = 1500
+# Covariances of so many photos that all see the same take a minute, of twice as many ten.
+_MAX_NUM_IMAGES_FOR_COVARIANCE = 1500
 
 
 @dataclass(frozen=True)
@@ -350,7 +351,9 @@ def _adjust(survey: _Survey, problem: BundleAdjustment, start: Unbent) -> _Adjus
 def _covariance(
     survey: _Survey, problem: BundleAdjustment, added: _Added, weights: RangeWeights, num_absorbed: float
 ) -> JointCovariance | None:
-    if not survey.options.covariance or survey.metric.num_reg_frames() > _MAX_NUM_FRAMES_FOR_COVARIANCE:
+    if not survey.options.covariance:
+        return None
+    if not inverse_is_affordable(overlaps_in(survey.metric), _MAX_NUM_IMAGES_FOR_COVARIANCE):
         return None
     try:
         return joint_covariance(
