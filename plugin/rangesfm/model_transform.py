@@ -14,12 +14,14 @@ def rescale(reconstruction: pycolmap.Reconstruction, metric_from_sfm: Similarity
     In a rig the distances between its cameras scale along, as COLMAP has them in model units.
     """
     metric = pycolmap.Reconstruction(reconstruction)
-    metric.transform(
-        pycolmap.Sim3d(
-            metric_from_sfm.scale, pycolmap.Rotation3d(metric_from_sfm.rotation), metric_from_sfm.translation
-        )
-    )
+    transform(metric, metric_from_sfm)
     return metric
+
+
+def transform(reconstruction: pycolmap.Reconstruction, new_from_old: Similarity) -> None:
+    """As ``rescale``, in place: a solver that works on the model's arrays sees it."""
+    rotation = pycolmap.Rotation3d(new_from_old.rotation)
+    reconstruction.transform(pycolmap.Sim3d(new_from_old.scale, rotation, new_from_old.translation))
 
 
 def take_over(reconstruction: pycolmap.Reconstruction, adjusted: pycolmap.Reconstruction) -> None:

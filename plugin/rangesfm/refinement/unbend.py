@@ -7,26 +7,29 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 import pycolmap
+from scipy.spatial.transform import Rotation
 
-from rangesfm.geometry import align_points, rmse
+from rangesfm.geometry import Similarity, align_points, rmse
 from rangesfm.gravity import Gravity
+from rangesfm.model_transform import transform
 from rangesfm.ranging.anchors import AnchorEstimate
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.ranging.robust_loss import wider
 from rangesfm.refinement.antennas import Antennas
 from rangesfm.refinement.carry import carry_model
 from rangesfm.refinement.keyframe_graph import GraphState, KeyframeGraph, local_scales, moved_anchors, solve_graph
-from rangesfm.refinement.vision_information import model_observations, model_poses, vision_information
+from rangesfm.refinement.vision_information import Poses, model_observations, model_poses, vision_information
 from rangesfm.refinement.weights import RangeWeights, likelier
-from rangesfm.trajectory import Trajectory
+from rangesfm.trajectory import Trajectory, pose_of
 
 Array = npt.NDArray[np.float64]
 
 _MAX_NUM_ROUNDS = 12
 # Relative; the noise itself is not known better from some hundred ranges.
 SAME_WEIGHTS = 0.05
-# Of the ranges' stddev: far less than what the full problem has to put right anyway.
-_TOLERANCE = 0.1
+# Of the ranges' stddev. A turn of the whole world by centimetres takes the full problem, of which all points have to
+# follow it, tens of iterations; here it takes one step.
+_TOLERANCE = 0.001
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,8 @@ def unbend(
     first_pose_is_fixed: bool,
     gravity: Gravity | None,
 ) -> Unbent:
-    """Solve the keyframe graph and, where it moves the map by more than the ranges' noise, move the model, in place.
+    """Solve the keyframe graph and move the model after it, in place: as a whole, to which the photos are indifferent,
+    or, where it bends by more than the ranges' noise, keyframe by keyframe.
 
     The weights are estimated anew with every solution. While drift is large, so are residuals and with them the
     stddevs: the robust loss, which counts in stddevs, tightens as the map straightens and takes no drift for an
@@ -86,12 +90,32 @@ def unbend(
         loss=placed.loss,
     )
     fit = _solve_with_own_weights(graph, placed)
-    state = fit.state
-    if rmse(state.poses.centers - before.centers) > float(np.median(fit.weights.stddev_m)):
-        carry_model(metric, frame_ids, rays, before, state.poses, local_scales(graph.vision, state.poses))
-        anchors = moved_anchors(anchors, state)
-    bend_m = _bend(before.centers, state.poses.centers)
-    return Unbent(weights.with_rows(rows, fit.weights), fit.num_absorbed, anchors, bend_m, fit.num_steps)
+    after = fit.state.poses
+    whole = _as_a_whole(before, after, graph.held_frame)
+    if rmse(after.centers - whole.apply(before.centers)) > float(np.median(fit.weights.stddev_m)):
+        carry_model(metric, frame_ids, rays, before, after, local_scales(graph.vision, after))
+    else:
+        _move(metric, whole, None if graph.held_frame is None else int(frame_ids[graph.held_frame]))
+    return Unbent(
+        weights=weights.with_rows(rows, fit.weights),
+        num_absorbed=fit.num_absorbed,
+        anchors=moved_anchors(anchors, fit.state),
+        bend_m=_bend(before.centers, after.centers),
+        num_steps=fit.num_steps,
+    )
+
+
+def _as_a_whole(before: Poses, after: Poses, held_frame: int | None) -> Similarity:
+    """Most of the way that the keyframes went: turned as they are in the mean; one that is held stays."""
+    if held_frame is None:
+        turn = Rotation.from_matrix(after.world_from_rig @ np.swapaxes(before.world_from_rig, 1, 2)).mean().as_matrix()
+        start, end = before.centers.mean(axis=0), after.centers.mean(axis=0)
+    else:
+        turn, start, end = np.eye(3), before.centers[held_frame], after.centers[held_frame]
+    turned = (before.centers - start) @ turn.T
+    spread = np.sum(turned**2)
+    scale = float(np.sum(turned * (after.centers - end)) / spread) if spread > 0 else 1.0
+    return Similarity(scale, turn, end - scale * turn @ start)
 
 
 @dataclass(frozen=True)
@@ -133,6 +157,14 @@ def _alternate(graph: KeyframeGraph, weights: RangeWeights, state: GraphState) -
         if before.change(weights) < SAME_WEIGHTS:
             break
     return _Fit(state, weights, solution.num_absorbed, num_steps)
+
+
+def _move(metric: pycolmap.Reconstruction, whole: Similarity, held_frame_id: int | None) -> None:
+    held = None if held_frame_id is None else pose_of(metric.frame(held_frame_id)).params
+    kept = None if held is None else held.copy()
+    transform(metric, whole)
+    if held is not None:
+        held[:] = kept  # which rounding may have changed
 
 
 def _bend(before: Array, after: Array) -> float:
