@@ -84,6 +84,19 @@ def test_ranges_of_one_place_that_err_alike_count_for_less() -> None:
     assert together.inflation < 0.7 * as_if_each_its_own.inflation
 
 
+def test_independent_errors_keep_their_say() -> None:
+    """Chance makes some of them look alike; on average it takes little, of one place as of one stretch of time."""
+    rounds, anchors = np.divmod(np.arange(3 * NUM_EACH), 3)
+    crowded = replace(make_weights(), place=np.unique(3 * (rounds // 5) + anchors, return_inverse=True)[1])
+    says = []
+    for seed in range(20):
+        residuals = 0.1 * np.random.default_rng(seed).standard_normal(3 * NUM_EACH)
+        found = crowded.estimated(residuals, 0.0)
+        says.append(np.mean(found.share / found.stddev_m**2) * 0.1**2)
+    assert 0.85 < np.mean(says) < 1.1
+    assert np.min(says) > 0.6
+
+
 def test_noise_stays_that_of_the_likeliest_residuals() -> None:
     """Seven of ten ranges are long, and then a fit has gone half-way to meet them."""
     rng = np.random.default_rng(3)

@@ -9,8 +9,12 @@ Trees' Bayesian form of the bound). COLMAP adjusts the model, as a mapper leaves
 with their defaults; they estimate the noise of features and ranges themselves.
 
 The error is the root mean square distance of all keyframes of all seeds from the truth, without alignment. The bound
-is that of ``simulated_survey.rmse_bound_m``. Exit status 1 if the error exceeds 1.15 times the bound, or is so far
-below that the bound itself must be wrong.
+is that of ``simulated_survey.rmse_bound_m``. These errors are those of a few slow modes of the whole map, so 40 seeds
+know their size to some 10 %. Therefore the same seeds are also solved by who knows all noise and starts from the truth
+("likeliest"): what it is off the bound by is the luck of the draw, and what the refinement is off from it is its own.
+
+Exit status 1 if the error exceeds 1.15 times the bound or the likeliest map's, or is so far below the bound that that
+itself must be wrong.
 """
 
 from __future__ import annotations
@@ -25,6 +29,7 @@ from tests.studies.simulated_survey import (
     Survey,
     drawn_biases,
     lap_survey,
+    likeliest_path,
     mapped,
     path_error_m,
     range_log,
@@ -37,9 +42,7 @@ from tests.studies.simulated_survey import (
 Array = npt.NDArray[np.float64]
 
 MAX_RATIO = 1.15
-# Errors are those of a few slow modes of the whole map: 40 seeds know their size to some 10 %.
 MIN_RATIO = 0.75
-
 
 CASES = (
     Case("yard, four site anchors", yard_survey, 0.5),
@@ -49,13 +52,15 @@ CASES = (
 )
 
 
-def refined_errors(survey: Survey, pixel_stddev: float, num_seeds: int) -> Array:
-    """(num_seeds,) root mean square error of each run, metres."""
+def path_errors(case: Case, survey: Survey, num_seeds: int) -> Array:
+    """(num_seeds, 2) root mean square error of each run, metres: refined, and likeliest."""
     errors = []
     for seed in range(num_seeds):
-        sfm = mapped(survey, pixel_stddev * unit_pixel_errors(survey, seed))
-        result = run_stages(survey, sfm, range_log(survey, seed, biases_m=drawn_biases(survey, seed)))
-        errors.append(path_error_m(survey, result.refined))
+        pixel_errors = case.pixel_stddev * unit_pixel_errors(survey, seed)
+        log = range_log(survey, seed, biases_m=drawn_biases(survey, seed))
+        refined = run_stages(survey, mapped(survey, pixel_errors), log).refined
+        likeliest = likeliest_path(survey, pixel_errors, log, pixel_stddev=case.pixel_stddev)
+        errors.append([path_error_m(survey, refined), path_error_m(survey, likeliest)])
     return np.array(errors)
 
 
@@ -64,17 +69,18 @@ def main() -> int:
     parser.add_argument("--num_seeds", type=int, default=40)
     num_seeds = parser.parse_args().num_seeds
     print(f"{num_seeds} seeds; errors in metres")
-    print(f"{'case':46} {'bound':>7} {'RMSE':>7} {'ratio':>6} {'worst':>7}")
+    print(f"{'case':46} {'bound':>7} {'RMSE':>7} {'ratio':>6} {'worst':>7} {'likeliest':>9} {'ratio':>6}")
     is_good = True
     for case in CASES:
         survey = case.survey()
-        errors = refined_errors(survey, case.pixel_stddev, num_seeds)
-        bound, rmse = rmse_bound_m(survey, case.pixel_stddev), float(np.sqrt(np.mean(errors**2)))
-        is_inside = MIN_RATIO <= rmse / bound <= MAX_RATIO
+        errors = path_errors(case, survey, num_seeds)
+        bound = rmse_bound_m(survey, case.pixel_stddev)
+        refined, likeliest = np.sqrt(np.mean(errors**2, axis=0))
+        is_inside = MIN_RATIO <= refined / bound <= MAX_RATIO and refined / likeliest <= MAX_RATIO
         is_good &= is_inside
         print(
-            f"{case.name:46} {bound:7.4f} {rmse:7.4f} {rmse / bound:6.3f} {errors.max():7.4f}"
-            f"  {'' if is_inside else 'OUTSIDE'}",
+            f"{case.name:46} {bound:7.4f} {refined:7.4f} {refined / bound:6.3f} {errors[:, 0].max():7.4f}"
+            f" {likeliest:9.4f} {refined / likeliest:6.3f}  {'' if is_inside else 'OUTSIDE'}",
             flush=True,
         )
     return 0 if is_good else 1

@@ -138,27 +138,32 @@ def unit_pixel_errors(survey: Survey, seed: int) -> Array:
 
 def mapped(survey: Survey, pixel_errors: Array) -> pycolmap.Reconstruction:
     """The model as a mapper leaves it: COLMAP's bundle adjustment, without ranges, of features with these errors."""
-    sfm = pycolmap.Reconstruction(survey.model.reconstruction)
+    sfm = _with_noisy_features(survey, pixel_errors)
     config = pycolmap.BundleAdjustmentConfig()
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    remaining = iter(pixel_errors)
     for image_id in _image_ids(survey):
         config.add_image(image_id)
-        for point, error in zip(sfm.image(image_id).points2D, remaining, strict=False):
-            point.xy = point.xy + error
-    options = _adjustment_options()
-    solver = options.ceres.solver_options
-    solver.max_num_iterations, solver.initial_trust_region_radius = 200, 1e8
-    solver.function_tolerance = solver.gradient_tolerance = solver.parameter_tolerance = 1e-10
-    pycolmap.create_default_ceres_bundle_adjuster(options, config, sfm).solve()
+    pycolmap.create_default_ceres_bundle_adjuster(_adjustment_options(), config, sfm).solve()
     return sfm
+
+
+def _with_noisy_features(survey: Survey, pixel_errors: Array) -> pycolmap.Reconstruction:
+    """The true model, but for its features."""
+    model = pycolmap.Reconstruction(survey.model.reconstruction)
+    remaining = iter(pixel_errors)
+    for image_id in _image_ids(survey):
+        for point, error in zip(model.image(image_id).points2D, remaining, strict=False):
+            point.xy = point.xy + error
+    return model
 
 
 def _adjustment_options() -> pycolmap.BundleAdjustmentOptions:
     options = pycolmap.BundleAdjustmentOptions(
         print_summary=False, refine_focal_length=False, refine_extra_params=False
     )
-    options.ceres.solver_options.num_threads = 1
+    solver = options.ceres.solver_options
+    solver.num_threads, solver.max_num_iterations, solver.initial_trust_region_radius = 1, 200, 1e8
+    solver.function_tolerance = solver.gradient_tolerance = solver.parameter_tolerance = 1e-10
     return options
 
 
@@ -253,37 +258,76 @@ def rmse_bound_m(survey: Survey, pixel_stddev: float, *, with_ranges: bool = Tru
     are unknown, anchors, at the truth. Without ranges: of the map that moves least, which has about the true scale.
     """
     truth = pycolmap.Reconstruction(survey.model.reconstruction)
+    adjuster, anchors, biases = _adjuster(survey, truth), _anchor_blocks(survey), _bias_blocks(survey)
+    if with_ranges:
+        _add_ranges(adjuster, truth, survey, true_ranges_m(survey), anchors, biases, pixel_stddev)
+    covariance = joint_covariance(adjuster.problem, truth, anchors=anchors, others=biases, residual_stddev=pixel_stddev)
+    return float(np.sqrt(np.mean(np.trace(covariance.centers, axis1=1, axis2=2))))
+
+
+def likeliest_path(survey: Survey, pixel_errors: Array, log: RangeLog, *, pixel_stddev: float) -> Trajectory:
+    """What who knows the stddev of all noise, and that it is Gaussian, finds from the truth by least squares.
+
+    Where noise is small enough for the problem to be linear, its error's mean square is that of the bound. That of
+    the same seeds has the luck of their draw, which the bound knows nothing of.
+
+    Args:
+        log: of ``range_log``, in the order of time.
+    """
+    model = _with_noisy_features(survey, pixel_errors)
+    adjuster = _adjuster(survey, model)
+    ranges_m = {name: log.range_m[log.anchor_index == k] for k, name in enumerate(log.anchor_ids)}
+    _add_ranges(adjuster, model, survey, ranges_m, _anchor_blocks(survey), _bias_blocks(survey), pixel_stddev)
+    adjuster.solve()
+    return trajectory_from_reconstruction(model, survey.model.timestamps_s)
+
+
+def true_ranges_m(survey: Survey) -> dict[str, Array]:
+    """(num_keyframes,) without noise, by anchor."""
+    model = survey.model
+    antenna = model.centers_m + model.world_from_cam @ TAG_IN_CAM_M
+    return {name: np.linalg.norm(antenna - anchor, axis=1) for name, anchor in survey.anchors_m.items()}
+
+
+def _adjuster(survey: Survey, model: pycolmap.Reconstruction) -> pycolmap.CeresBundleAdjuster:
+    """Of the features, with a gauge that leaves the rest to the ranges."""
     config = pycolmap.BundleAdjustmentConfig()
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.UNSPECIFIED)
     for image_id in _image_ids(survey):
         config.add_image(image_id)
     if survey.is_in_first_camera:
-        config.set_constant_rig_from_world_pose(min(truth.reg_frame_ids()))
-    adjuster = pycolmap.create_default_ceres_bundle_adjuster(_adjustment_options(), config, truth)
-    anchors = [position.copy() for position in survey.anchors_m.values()]
-    biases = [np.zeros(1) for _ in range(len(anchors) + 1)]
-    if with_ranges:
-        _add_ranges(adjuster, truth, survey, anchors, biases, pixel_stddev)
-    covariance = joint_covariance(adjuster.problem, truth, anchors=anchors, others=biases, residual_stddev=pixel_stddev)
-    return float(np.sqrt(np.mean(np.trace(covariance.centers, axis1=1, axis2=2))))
+        config.set_constant_rig_from_world_pose(min(model.reg_frame_ids()))
+    return pycolmap.create_default_ceres_bundle_adjuster(_adjustment_options(), config, model)
+
+
+def _anchor_blocks(survey: Survey) -> list[Array]:
+    return [position.copy() for position in survey.anchors_m.values()]
+
+
+def _bias_blocks(survey: Survey) -> list[Array]:
+    """Each anchor's and, last, the one that all share."""
+    return [np.zeros(1) for _ in range(len(survey.anchors_m) + 1)]
 
 
 def _add_ranges(
     adjuster: pycolmap.CeresBundleAdjuster,
-    truth: pycolmap.Reconstruction,
+    model: pycolmap.Reconstruction,
     survey: Survey,
+    ranges_m: dict[str, Array],
     anchors: list[Array],
     biases: list[Array],
     pixel_stddev: float,
 ) -> None:
-    """In pixels, as the features are; biases are each anchor's and, last, the one that all share."""
-    model = survey.model
-    antenna = model.centers_m + model.world_from_cam @ TAG_IN_CAM_M
-    poses = [pose_of(truth.frame(frame_id)).params for frame_id in sorted(truth.reg_frame_ids())]
+    """In pixels, as the features are.
+
+    Args:
+        ranges_m: (num_keyframes,) by anchor.
+    """
+    poses = [pose_of(model.frame(frame_id)).params for frame_id in sorted(model.reg_frame_ids())]
     stddev = survey.range_stddev_m / pixel_stddev
-    for anchor, bias in zip(anchors, biases, strict=False):
-        for pose, distance in zip(poses, np.linalg.norm(antenna - anchor, axis=1), strict=True):
-            cost = range_cost(range_m=distance, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=stddev, has_common_bias=True)
+    for name, anchor, bias in zip(survey.anchors_m, anchors, biases, strict=False):
+        for pose, range_m in zip(poses, ranges_m[name], strict=True):
+            cost = range_cost(range_m=range_m, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=stddev, has_common_bias=True)
             add_residual_block(adjuster, cost, None, [pose, anchor, bias, biases[-1]])
         if survey.anchor_frame != "unknown":
             adjuster.problem.set_parameter_block_constant(anchor)
