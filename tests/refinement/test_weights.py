@@ -8,14 +8,14 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from rangesfm.ranging.robust_loss import CAUCHY, GEMAN_MCCLURE
+from rangesfm.ranging.robust_loss import CAUCHY, GEMAN_MCCLURE, RobustLoss
 from rangesfm.refinement.weights import RangeWeights, misfits
 
 Array = npt.NDArray[np.float64]
 NUM_EACH = 400
 
 
-def make_weights(stddev_m: float = 1.0, *, is_estimated: bool = True) -> RangeWeights:
+def make_weights(stddev_m: float = 1.0, *, is_estimated: bool = True, loss: RobustLoss = GEMAN_MCCLURE) -> RangeWeights:
     """Three anchors in turn for 400 rounds of half a second."""
     n = 3 * NUM_EACH
     rounds = np.arange(n) // 3
@@ -28,7 +28,7 @@ def make_weights(stddev_m: float = 1.0, *, is_estimated: bool = True) -> RangeWe
         block=rounds // 20,
         place=np.arange(n),
         place_share=np.ones(n),
-        loss=CAUCHY,
+        loss=loss,
     )
 
 
@@ -111,6 +111,32 @@ def test_noise_stays_that_of_the_likeliest_residuals() -> None:
     assert seen.estimated(noise((0.05, 0.05, 0.05)), 0.0).stddev_m[0] == pytest.approx(0.05, rel=0.15)
 
 
+def test_an_anchors_noise_is_that_of_its_ranges_that_fit() -> None:
+    """One anchor has most of its ranges short, the others few."""
+    rng = np.random.default_rng(4)
+    is_short = rng.random(3 * NUM_EACH) < np.tile([0.7, 0.2, 0.2], NUM_EACH)
+    residuals = noise((0.1, 0.1, 0.1)) + is_short * rng.exponential(5.0, 3 * NUM_EACH)
+    found = make_weights().estimated(residuals, 0.0)
+    np.testing.assert_array_equal(found.stddev_m, found.stddev_m[0])
+    assert found.stddev_m[0] == pytest.approx(0.1, rel=0.15)
+
+
+def test_a_map_that_may_bend_shows_no_more_noise_than_one_that_may_not() -> None:
+    held = replace(make_weights(), max_noise_m=0.07).estimated(noise((0.1, 0.1, 0.1)), 0.0)
+    np.testing.assert_allclose(held.stddev_m, 0.07)
+    free = replace(make_weights(), max_noise_m=0.2).estimated(noise((0.1, 0.1, 0.1)), 0.0)
+    assert free.stddev_m[0] == pytest.approx(0.1, rel=0.07)
+
+
+def test_what_drifts_away_is_noise_to_the_wide_loss_alone() -> None:
+    """Six of ten ranges are off by metres: outliers, or drift."""
+    residuals = noise((0.1, 0.1, 0.1))
+    residuals[: 3 * NUM_EACH * 6 // 10] += 3.0
+    wide, bounded = (make_weights(loss=loss).estimated(residuals, 0.0).stddev_m[0] for loss in (CAUCHY, GEMAN_MCCLURE))
+    assert wide > 3.0
+    assert bounded == pytest.approx(0.1, rel=0.2)
+
+
 def test_known_noise_stays_as_it_is() -> None:
     weights = make_weights(0.2, is_estimated=False)
     assert weights.estimated(noise((1.0, 1.0, 1.0)), 0.0) is weights
@@ -142,6 +168,6 @@ def test_a_stretch_that_is_off_is_told() -> None:
 
 def test_drift_that_is_left_is_told_even_where_the_noise_was_estimated_with_it() -> None:
     drift = 3.0 * np.sin(np.arange(3 * NUM_EACH) / 150)
-    weights = make_weights().estimated(noise((0.1, 0.1, 0.1)) + drift, 0.0)
+    weights = make_weights(loss=CAUCHY).estimated(noise((0.1, 0.1, 0.1)) + drift, 0.0)
     reasons = misfits(weights, noise((0.1, 0.1, 0.1)) + drift, np.arange(3.0 * NUM_EACH))
     assert any("far larger than the ranges' scatter" in reason for reason in reasons)

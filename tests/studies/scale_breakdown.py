@@ -97,13 +97,15 @@ def make_case(kind: str, share: float, seed: int) -> Case:
 
 def spoilt(ranges: Array, kind: str, share: float, rng: np.random.Generator) -> Array:
     """Exactly a share of the ranges is wrong (of the stretches, where it is those)."""
+    num = len(ranges)
     if kind == "clustered":
-        excess = rng.exponential(MEAN_EXCESS_M, NUM_RANGES // STRETCH) * chosen(NUM_RANGES // STRETCH, share, rng)
-        return ranges + np.repeat(excess, STRETCH)
-    wrong = chosen(NUM_RANGES, share, rng)
+        num_stretches = -(-num // STRETCH)
+        excess = rng.exponential(MEAN_EXCESS_M, num_stretches) * chosen(num_stretches, share, rng)
+        return ranges + np.repeat(excess, STRETCH)[:num]
+    wrong = chosen(num, share, rng)
     if kind == "long":
-        return ranges + wrong * rng.exponential(MEAN_EXCESS_M, NUM_RANGES)
-    return np.where(wrong, ranges * rng.uniform(0.1, 0.9, NUM_RANGES), ranges)
+        return ranges + wrong * rng.exponential(MEAN_EXCESS_M, num)
+    return np.where(wrong, ranges * rng.uniform(0.1, 0.9, num), ranges)
 
 
 def chosen(num: int, share: float, rng: np.random.Generator) -> npt.NDArray[np.bool_]:

@@ -171,19 +171,23 @@ def _image_ids(survey: Survey) -> list[int]:
     return sorted(survey.model.reconstruction.reg_image_ids())
 
 
-def range_log(survey: Survey, seed: int, *, biases_m: Array | None = None, obstructed_share: float = 0.0) -> RangeLog:
-    """One range to each anchor at each keyframe.
+def range_log(
+    survey: Survey, seed: int, *, biases_m: Array | None = None, obstructed_share: float = 0.0, num_each: int = 1
+) -> RangeLog:
+    """Ranges to each anchor at each keyframe.
 
     Args:
         biases_m: of the anchors, in their order; None: none have any.
         obstructed_share: of the ranges, which read 1 m long on average.
+        num_each: to an anchor at a keyframe.
     """
     biases = {} if biases_m is None else dict(zip(survey.anchors_m, biases_m.tolist(), strict=True))
     model = survey.model
     radio = Radio(range_stddev_m=survey.range_stddev_m, range_bias_m=biases, obstructed_share=obstructed_share)
     times = np.array(list(model.timestamps_s.values()))
+    at = np.repeat(np.arange(len(times)), num_each)
     return simulate_ranges_at(
-        times, model.centers_m, model.world_from_cam, survey.anchors_m, TAG_IN_CAM_M, radio, seed
+        times[at], model.centers_m[at], model.world_from_cam[at], survey.anchors_m, TAG_IN_CAM_M, radio, seed
     ).log
 
 

@@ -29,10 +29,12 @@ class InlierNoise:
 
     Attributes:
         stddev: of the Gaussian bulk about zero, metres.
+        num: how many residuals belong to it, in the mean.
         log_likelihood: of all residuals; of two ways to explain the same ranges, the higher one is the likelier.
     """
 
     stddev: float
+    num: float
     log_likelihood: float
 
 
@@ -64,7 +66,7 @@ def inlier_noise(residuals: Array) -> InlierNoise:
         means = (belongs[1:] @ np.abs(thinned)) / counts[1:]
     means = np.maximum(means, _MIN_OUTLIER_STDDEVS * stddev)
     densities = np.maximum(_densities(thinned, stddev, means, shares).sum(axis=0), _MIN_DENSITY)
-    return InlierNoise(stddev, float(np.mean(np.log(densities))) * len(residuals))
+    return InlierNoise(stddev, float(shares[0]) * len(residuals), float(np.mean(np.log(densities))) * len(residuals))
 
 
 def _densities(residuals: Array, stddev: float, means: Array, shares: Array) -> Array:
@@ -80,7 +82,7 @@ def _gaussian(residuals: Array) -> InlierNoise:
     stddev = robust_stddev(residuals)
     scaled = residuals / stddev
     normalization = len(residuals) * float(np.log(stddev * np.sqrt(2 * np.pi)))
-    return InlierNoise(stddev, -0.5 * float(scaled @ scaled) - normalization)
+    return InlierNoise(stddev, len(residuals), -0.5 * float(scaled @ scaled) - normalization)
 
 
 def _mean_or_zero(values: Array) -> float:

@@ -18,6 +18,8 @@ SHORT_RANGE_LENGTH_M = 1.0
 START_STDDEV_M = 0.1
 _MIN_STDDEV_M = 1e-9
 _MAX_INFLATION = 30.0
+# Of fewer there is nothing to resample.
+_MIN_NUM_STRETCHES = 8
 
 
 def robust_stddev(residuals: Array) -> float:
@@ -45,6 +47,14 @@ def bias_whitening(own_stddev_m: Array, common_stddev_m: float) -> Array:
     covariance = np.diag(own_stddev_m**2) + common_stddev_m**2
     whitening: Array = np.linalg.inv(np.linalg.cholesky(covariance)) if len(own_stddev_m) else np.zeros((0, 0))
     return whitening
+
+
+def stretch_labels(times_s: Array, length_s: float) -> npt.NDArray[np.int64]:
+    """(n,) labels of stretches of time, in which errors may go together: at least eight."""
+    since = times_s - times_s.min()
+    length_s = max(min(length_s, float(since.max()) / _MIN_NUM_STRETCHES), 1e-9)
+    labels: npt.NDArray[np.int64] = np.floor(since / length_s).astype(np.int64)
+    return labels
 
 
 def correlation_inflation(

@@ -19,7 +19,7 @@ from rangesfm.refinement.antennas import Antennas
 from rangesfm.refinement.carry import carry_model
 from rangesfm.refinement.keyframe_graph import GraphState, KeyframeGraph, local_scales, moved_anchors, solve_graph
 from rangesfm.refinement.vision_information import Poses, model_observations, model_poses, vision_information
-from rangesfm.refinement.weights import RangeWeights, likelier
+from rangesfm.refinement.weights import RangeWeights
 from rangesfm.trajectory import Trajectory, pose_of
 
 Array = npt.NDArray[np.float64]
@@ -132,16 +132,17 @@ def _solve_with_own_weights(graph: KeyframeGraph, weights: RangeWeights) -> _Fit
     """With the wide loss, then with the bounded.
 
     Where so many ranges are wrong that the wide loss follows them, the map as it came is likelier, and the bounded one
-    starts from there.
+    starts from there, with the weights as they came.
     """
     start = graph.start()
     wide = _alternate(graph, replace(weights, loss=wider(weights.loss)), start)
-    seen, reached = (weights.noise_in(graph.residuals_m(state)) for state in (start, wide.state))
-    if likelier(reached, seen) is reached:
-        state, weights = wide.state, replace(wide.weights, loss=weights.loss, likeliest=reached)
+    seen, reached = (weights.noise_in(graph.residuals_m(state)).log_likelihood for state in (start, wide.state))
+    if reached >= seen:
+        state, residuals_m = wide.state, graph.residuals_m(wide.state)
+        weights = replace(wide.weights, loss=weights.loss).estimated(residuals_m, wide.num_absorbed)
     else:
-        state, weights = start, replace(weights, likeliest=seen)
-    bounded = _alternate(graph, weights.estimated(graph.residuals_m(state), wide.num_absorbed), state)
+        state, weights = start, replace(weights, log_likelihood=seen)
+    bounded = _alternate(graph, weights, state)
     return replace(bounded, num_steps=wide.num_steps + bounded.num_steps)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.ranging.inlier_noise import InlierNoise, inlier_noise
-from rangesfm.ranging.noise import START_STDDEV_M, correlation_inflation, robust_stddev, shared_stddev
+from rangesfm.ranging.noise import START_STDDEV_M, correlation_inflation, robust_stddev, shared_stddev, stretch_labels
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.ranging.place import place_labels, shares_by_residuals
 from rangesfm.ranging.robust_loss import RobustLoss
@@ -21,6 +21,9 @@ BLOCK_S = 10.0
 _MIN_STDDEV_M = 1e-3
 # In stddevs: an anchor whose noise differs less from that of all has the noise of all.
 _SIGNIFICANT = 3.0
+# Of fewer ranges of one anchor its noise is not told from outliers.
+_MIN_NUM_OF_ANCHOR = 20
+_NUM_MEAN_ROUNDS = 10
 _MIN_ORDINARY = 0.3
 _MIN_BLOCK = 5
 
@@ -38,7 +41,9 @@ class RangeWeights:
         place_share: (n,) by how much each counts beside its stddev, as ranges from one place err alike.
         loss: of single ranges, in their stddevs. With a wide one the noise is what all residuals show, so that what
             drifts away is no outlier; with a bounded one that of the ranges that fit, as in the scale stage.
-        likeliest: what the likeliest residuals so far showed; None: none were seen.
+        max_noise_m: the scale stage's, of a range without special cases: a map that may bend explains the ranges no
+            worse than one that could only grow.
+        log_likelihood: of the likeliest residuals that the bounded loss has seen of these ranges.
     """
 
     stddev_m: Array
@@ -50,7 +55,8 @@ class RangeWeights:
     place: Indices
     place_share: Array
     loss: RobustLoss
-    likeliest: InlierNoise | None = None
+    max_noise_m: float = np.inf
+    log_likelihood: float = -np.inf
 
     @property
     def share(self) -> Array:
@@ -75,14 +81,21 @@ class RangeWeights:
             np.unique(self.place[rows], return_inverse=True)[1],
             self.place_share[rows],
             self.loss,
-            self.likeliest,
+            self.max_noise_m,
+            self.log_likelihood,
         )
 
     def with_rows(self, rows: Indices, part: RangeWeights) -> RangeWeights:
         """These, but some of the ranges as in a subset that was estimated anew."""
         stddev, share = self.stddev_m.copy(), self.place_share.copy()
         stddev[rows], share[rows] = part.stddev_m, part.place_share
-        return replace(self, stddev_m=stddev, place_share=share, inflation=part.inflation, likeliest=part.likeliest)
+        return replace(
+            self,
+            stddev_m=stddev,
+            place_share=share,
+            inflation=part.inflation,
+            log_likelihood=part.log_likelihood,
+        )
 
     def noise_in(self, residuals_m: Array) -> InlierNoise:
         """Of the ranges without special cases."""
@@ -99,61 +112,73 @@ class RangeWeights:
     def estimated(self, residuals_m: Array, num_absorbed: float) -> RangeWeights:
         """As the residuals of a fit show them.
 
-        Where most ranges are wrong, a fit can follow them and find the noise larger, the next one more so. It is less
-        likely than the one before, whose noise then stays, as in the scale stage.
+        While drift is large, so are residuals, and with the wide loss the noise is what all of them show. With the
+        bounded loss it is that of the bulk. Where most ranges are wrong, a fit can follow them, find the noise larger,
+        follow more of them, and so on: such a fit is less likely than the one before, and then the weights stay.
 
         Args:
             residuals_m: (n,). num_absorbed: degrees of freedom that the fit took from them.
         """
         if not self.is_estimated.any():
             return self
+        if not self.loss.is_bounded:
+            noise_m = np.full(len(residuals_m), robust_stddev(residuals_m[self._ordinary]))
+            return self._with_noise(noise_m, residuals_m, num_absorbed)
+        seen = self.noise_in(residuals_m)
+        if seen.log_likelihood < self.log_likelihood:
+            return self
+        of_all_m = min(seen.stddev, self.max_noise_m)
+        noise_m = of_all_m * self._noise_ratios(residuals_m, of_all_m)[self.anchor_index]
+        return replace(
+            self._with_noise(noise_m, residuals_m, num_absorbed),
+            log_likelihood=seen.log_likelihood,
+        )
+
+    def _with_noise(self, noise_m: Array, residuals_m: Array, num_absorbed: float) -> RangeWeights:
+        """With this noise (n,) of the residuals, and the correlation that it leaves in them."""
         n = len(residuals_m)
         widening = np.sqrt(n / max(n - num_absorbed, 0.1 * n))
-        ordinary, likeliest = self._ordinary, self.likeliest
-        if self.loss.is_bounded:
-            likeliest = likelier(self.noise_in(residuals_m), likeliest)
-            bulk_stddev = likeliest.stddev
-        else:
-            bulk_stddev = robust_stddev(residuals_m[ordinary])
-        common = max(widening * bulk_stddev, _MIN_STDDEV_M)
-        ratios = self._noise_ratios(residuals_m, ordinary)[self.anchor_index]
-        stddev = np.where(self.is_estimated, np.hypot(common * ratios, self.fixed_m), self.stddev_m)
+        noise_m = np.maximum(widening * noise_m, _MIN_STDDEV_M)
+        stddev = np.where(self.is_estimated, np.hypot(noise_m, self.fixed_m), self.stddev_m)
         scaled = residuals_m / stddev
         share = shares_by_residuals(self.place, scaled, self.loss)
         # What is left of the correlation once the places count for what they are worth.
         inflation = correlation_inflation(scaled, self.loss.weights(scaled), self.group, share)
-        return replace(self, stddev_m=stddev, place_share=share, inflation=inflation, likeliest=likeliest)
+        return replace(self, stddev_m=stddev, place_share=share, inflation=inflation)
 
-    def _noise_ratios(self, residuals_m: Array, rows: Indices) -> Array:
+    def _noise_ratios(self, residuals_m: Array, noise_m: float) -> Array:
         """(m,) noise of each anchor over that of all; 1 where the difference may be chance.
 
-        Noise is what scatters about the anchor's own median: what its ranges have in common is no noise, and taken for
+        Noise is what scatters about the anchor's own mean: what its ranges have in common is no noise, and taken for
         it would silence whoever disagrees.
         """
-        num_anchors = self.anchor_index.max() + 1
+        rows = self._ordinary
         index, own = self.anchor_index[rows], residuals_m[rows].copy()
-        ratios = np.ones(num_anchors)
-        for k in range(num_anchors):
-            own[index == k] -= np.median(own[index == k]) if np.any(index == k) else 0.0
-        together = robust_stddev(own)
-        for k in range(num_anchors):
-            # The median deviation takes 2.7 times as many values as the variance to be as certain.
-            num_independent = np.count_nonzero(index == k) / self.inflation**2
-            if num_independent > 2:
-                chance = np.sqrt(2.7 / (2 * num_independent))
-                ratio = robust_stddev(own[index == k]) / together
-                ratios[k] = ratio if abs(np.log(ratio)) > _SIGNIFICANT * chance else 1.0
+        ratios = np.ones(self.anchor_index.max() + 1)
+        for k in range(len(ratios)):
+            own[index == k] -= self._bulk_mean(own[index == k], noise_m)
+        together = inlier_noise(own)
+        for k in range(len(ratios)):
+            if np.count_nonzero(index == k) < _MIN_NUM_OF_ANCHOR:
+                continue
+            alone = inlier_noise(own[index == k])
+            # What tells outliers from noise takes some 2.7 times as many values as the variance to be as certain.
+            chance = self.inflation * np.sqrt(2.7 / (2 * max(alone.num, 1.0)))
+            ratio = alone.stddev / together.stddev
+            ratios[k] = ratio if abs(np.log(ratio)) > _SIGNIFICANT * chance else 1.0
         return ratios
+
+    def _bulk_mean(self, residuals_m: Array, noise_m: float) -> float:
+        """Of the residuals that fit, found from zero."""
+        mean = 0.0
+        for _ in range(_NUM_MEAN_ROUNDS if len(residuals_m) else 0):
+            mean = float(np.average(residuals_m, weights=self.loss.weights((residuals_m - mean) / noise_m)))
+        return mean
 
     def change(self, other: RangeWeights) -> float:
         """Largest relative change of a weight from this one to another; of ranges without a place nothing is known."""
         ratio = np.sqrt(self.share / other.share) * other.stddev_m / self.stddev_m
         return float(np.nanmax(np.abs(np.log(ratio)), initial=0.0))
-
-
-def likelier(now: InlierNoise, before: InlierNoise | None) -> InlierNoise:
-    """Which of two views of the same ranges explains them better."""
-    return now if before is None or now.log_likelihood >= before.log_likelihood else before
 
 
 def range_weights(
@@ -186,14 +211,31 @@ def range_weights(
     else:
         fixed = np.hypot(shared, fixed)
     estimated = np.zeros(len(log), dtype=bool) if is_estimated is None else is_estimated
-    times = observations.before if log.timestamp_s is None else log.timestamp_s
-    length = 1.0 if log.timestamp_s is None else BLOCK_S
-    block = np.floor((times - times.min()) / length).astype(np.int64)
-    loss = RobustLoss(loss_width, is_bounded=True)
-    has_place, place = observations.has_place, np.zeros(len(log), dtype=np.int64)
-    place[has_place] = place_labels(tags_m[has_place], log.anchor_index[has_place])
-    share = np.ones(len(log)) if range_share is None else range_share
-    return RangeWeights(range_stddev_m, inflation, fixed, estimated, log.anchor_index, block, place, share, loss)
+    rows = observations.placed_rows
+    place, block = np.zeros((2, len(log)), dtype=np.int64)
+    place[rows] = place_labels(tags_m[rows], log.anchor_index[rows])
+    block[rows] = (
+        observations.before[rows] if log.timestamp_s is None else stretch_labels(log.timestamp_s[rows], BLOCK_S)
+    )
+    return RangeWeights(
+        stddev_m=range_stddev_m,
+        inflation=inflation,
+        fixed_m=fixed,
+        is_estimated=estimated,
+        anchor_index=log.anchor_index,
+        block=block,
+        place=place,
+        place_share=np.ones(len(log)) if range_share is None else range_share,
+        loss=RobustLoss(loss_width, is_bounded=True),
+        max_noise_m=_noise_without(fixed, range_stddev_m, rows[estimated[rows]]),
+    )
+
+
+def _noise_without(fixed_m: Array, range_stddev_m: Array, rows: Indices) -> float:
+    """What is left of stddevs without the part that is not estimated; infinite if there are none."""
+    if not len(rows):
+        return np.inf
+    return float(np.sqrt(max(np.median(range_stddev_m[rows] ** 2 - fixed_m[rows] ** 2), _MIN_STDDEV_M**2)))
 
 
 # Median block residuals beyond this many stddevs are no noise.

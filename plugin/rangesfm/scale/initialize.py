@@ -14,7 +14,7 @@ from rangesfm.geometry import Similarity
 from rangesfm.gravity import gravity_of
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.ranging.anchors import Anchor
-from rangesfm.ranging.noise import shared_stddev
+from rangesfm.ranging.noise import shared_stddev, stretch_labels
 from rangesfm.ranging.observations import RangeObservations, RangeStatus, status_by_weight
 from rangesfm.ranging.shared_errors import CURVE_STDDEV_M
 from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
@@ -133,11 +133,7 @@ def _time_blocks(observations: RangeObservations, rows: npt.NDArray[np.int64], b
     times = observations.log.timestamp_s
     if times is None:
         return observations.before[rows]
-    since = times[rows] - times[rows].min()
-    # At least eight blocks, or there is nothing to resample in a short log.
-    length = max(min(block_s, float(since.max()) / 8), 1e-9)
-    blocks: npt.NDArray[np.int64] = np.floor(since / length).astype(np.int64)
-    return blocks
+    return stretch_labels(times[rows], block_s)
 
 
 def _given_noise(observations: RangeObservations, rows: npt.NDArray[np.int64], range_model: RangeModelOptions) -> Array:
