@@ -1,6 +1,6 @@
 """Solvers of one and the same problem, side by side: time, memory and error of bundle adjustment with ranges.
 
-    python tests/benchmarks/solvers.py [--num_keyframes 50 200 600 2000] [--num_ranges 1 10 100] [--num_rounds 3]
+    python -m tests.benchmarks.solvers [--num_keyframes 50 200 600 2000] [--num_ranges 1 10 100] [--num_rounds 3]
 
 (GTSAM: ``pip install '.[benchmark]'``; left out where it is missing.) Keyframes in sequence with 200 observations
 each, features in at most 8 photos, stddev 0.5 px; ranges (stddev 0.1 m) from each keyframe to four anchors, Cauchy's
@@ -27,7 +27,6 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
-import resource
 import subprocess
 import sys
 import tempfile
@@ -41,6 +40,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 from scipy.spatial.transform import Rotation
+from tests.peak_memory import peak_bytes
 
 from rangesfm import _ceres
 from rangesfm.geometry import IDENTITY
@@ -185,11 +185,10 @@ Solve = Callable[[int], tuple[int, float, float, float, Array]]
 
 
 def ceres_solver(case: Case, folder: Path, arrays: Any) -> Solve:
-    loaded = pycolmap.Reconstruction(folder / "model")
     _ceres.check_compatibility()
 
     def solve(max_num_iterations: int) -> tuple[int, float, float, float, Array]:
-        reconstruction = pycolmap.Reconstruction(loaded)
+        reconstruction = pycolmap.Reconstruction(folder / "model")  # not a copy of one: memory is measured
         start = time.process_time()
         adjuster = bundle_adjuster(reconstruction, case, max_num_iterations)
         blocks = add_ranges(adjuster, reconstruction, case, arrays)
@@ -434,7 +433,7 @@ def centers_of(poses: Array) -> Array:
 def measure(case: Case, folder: Path) -> Outcome:
     if case.solver == "gtsam":
         import gtsam  # noqa: F401
-    imports_mb = peak_mb()
+    before = peak_bytes()
     with np.load(folder / "survey.npz") as archive:
         arrays = dict(archive)
     make = {"gtsam": gtsam_solver, "scipy": scipy_solver}.get(case.solver, ceres_solver)
@@ -446,7 +445,7 @@ def measure(case: Case, folder: Path) -> Outcome:
         build=build,
         total=build + seconds,
         num_iterations=num,
-        memory_mb=peak_mb() - imports_mb,
+        memory_mb=(peak_bytes() - before) / 1e6,
         rmse_m=float(np.sqrt(np.mean(np.sum((centers - arrays["centers"]) ** 2, axis=1)))),
         final_cost=cost,
     )
@@ -462,10 +461,6 @@ def iteration_seconds(solve: Solve) -> float:
     return float(np.median(trials))
 
 
-def peak_mb() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-
-
 def cases(num_keyframes: int, num_ranges: int) -> list[Case]:
     left_out = set()
     if num_keyframes > MAX_SCIPY_KEYFRAMES:
@@ -478,8 +473,16 @@ def cases(num_keyframes: int, num_ranges: int) -> list[Case]:
 
 
 def run(case: Case, folder: Path) -> Outcome:
-    command = [sys.executable, __file__, "--case", json.dumps(asdict(case)), "--folder", str(folder)]
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    command = [
+        sys.executable,
+        "-m",
+        "tests.benchmarks.solvers",
+        "--case",
+        json.dumps(asdict(case)),
+        "--folder",
+        str(folder),
+    ]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, cwd=Path(__file__).parents[2])
     return Outcome(**json.loads(done.stdout.splitlines()[-1]))
 
 

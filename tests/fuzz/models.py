@@ -14,7 +14,6 @@ import io
 import multiprocessing
 import os
 import random
-import resource
 import shutil
 import sys
 import tempfile
@@ -27,6 +26,7 @@ from pathlib import Path
 import numpy as np
 from tests.fuzz.model_bytes import parse, spoil
 from tests.fuzz.mutation import mutated
+from tests.peak_memory import peak_bytes
 
 FILES = ("cameras.bin", "rigs.bin", "frames.bin", "images.bin", "points3D.bin")
 TEXT_FILES = tuple(name.replace(".bin", ".txt") for name in FILES)
@@ -162,12 +162,12 @@ def _serve(pipe: Connection, survey: Path, model_path: Path) -> None:
     os.dup2(silent, sys.stderr.fileno())
     while True:
         number = pipe.recv()
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
+        before = peak_bytes()
         try:
             outcome, text = use(survey, number, model_path), ""
         except BaseException:
             outcome, text = "failed", traceback.format_exc()
-        taken = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10) - before
+        taken = peak_bytes() - before
         if taken > _MEMORY_BYTES and outcome != "failed":
             outcome, text = "failed", f"{taken >> 20} MB of memory"
         pipe.send((outcome, text))

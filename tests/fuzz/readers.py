@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import random
-import resource
 import subprocess
 import sys
 import tempfile
@@ -24,6 +23,7 @@ from collections import Counter
 from pathlib import Path
 
 from tests.fuzz.mutation import mutated
+from tests.peak_memory import peak_bytes
 
 CORPUS = Path(__file__).parent / "corpus"
 PLUGIN = Path(__file__).parents[2] / "plugin"
@@ -53,10 +53,10 @@ class Campaign:
     def run(self, data: bytes) -> None:
         """One input; a failure is written down, and the campaign goes on."""
         self._counts["runs"] += 1
-        before, start_s = _peak_bytes(), time.process_time()
+        before, start_s = peak_bytes(), time.process_time()
         try:
             self._counts["accepted"] += self._target.run(data, Path(self._folder.name))
-            taken_bytes, taken_s = _peak_bytes() - before, time.process_time() - start_s
+            taken_bytes, taken_s = peak_bytes() - before, time.process_time() - start_s
             if self._counts["runs"] > 1 and (taken_bytes > _MEMORY_BYTES or taken_s > MAX_PROCESSOR_TIME_S):
                 raise BoundError(f"{taken_bytes >> 20} MB and {taken_s:.1f} s for {len(data)} bytes")
         except Exception as error:
@@ -76,10 +76,6 @@ class Campaign:
             (self._output_path / f"{key}.input").write_bytes(data)
             (self._output_path / f"{key}.txt").write_text("".join(traceback.format_exception(error)))
             self.save()
-
-
-def _peak_bytes() -> int:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
 
 
 def fuzz_one(name: str, runs: int, seed: int, output_path: Path) -> None:

@@ -52,6 +52,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from tests.peak_memory import peak_bytes
 from tests.simulated_database import camera_options, matched_photos, write_database
 
 from rangesfm.options import MapperOptions
@@ -258,13 +259,7 @@ def step() -> None:
     else:
         join(Path(sys.argv[2]), Path(sys.argv[3]))
     used = resource.getrusage(resource.RUSAGE_SELF)
-    print(json.dumps([used.ru_utime + used.ru_stime, _peak_mb()]))
-
-
-def _peak_mb() -> float:
-    """Of this process, as Linux has it; ``ru_maxrss`` has its parent's too."""
-    (line,) = (line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM:"))
-    return int(line.split()[1]) / 1024
+    print(json.dumps([used.ru_utime + used.ru_stime, peak_bytes() / 1e6]))
 
 
 _STEPS = ("--map", "--plan", "--submap", "--join")
