@@ -113,8 +113,8 @@ def _as_a_whole(before: Poses, after: Poses, held_frame: int | None) -> Similari
     else:
         turn, start, end = np.eye(3), before.centers[held_frame], after.centers[held_frame]
     turned = (before.centers - start) @ turn.T
-    spread = np.sum(turned**2)
-    scale = float(np.sum(turned * (after.centers - end)) / spread) if spread > 0 else 1.0
+    likeness = float(np.sum(turned * (after.centers - end)))
+    scale = likeness / float(np.sum(turned**2)) if likeness > 0 else 1.0  # of a point, or turned inside out: none
     return Similarity(scale, turn, end - scale * turn @ start)
 
 
