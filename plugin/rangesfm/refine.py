@@ -351,14 +351,15 @@ def _adjust(survey: _Survey, problem: BundleAdjustment, start: Unbent) -> _Adjus
 def _covariance(
     survey: _Survey, problem: BundleAdjustment, added: _Added, weights: RangeWeights, num_absorbed: float
 ) -> JointCovariance | None:
+    metric, limit = survey.metric, _MAX_NUM_IMAGES_FOR_COVARIANCE
     if not survey.options.covariance:
         return None
-    if not inverse_is_affordable(overlaps_in(survey.metric), _MAX_NUM_IMAGES_FOR_COVARIANCE):
+    if metric.num_reg_images() > limit and not inverse_is_affordable(overlaps_in(metric), limit):
         return None
     try:
         return joint_covariance(
             problem.adjuster.problem,
-            survey.metric,
+            metric,
             anchors=added.blocks.positions,
             others=added.blocks.all_but_positions,
             residual_stddev=problem.pixel_stddev,
