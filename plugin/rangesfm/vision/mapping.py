@@ -16,7 +16,7 @@ from rangesfm.passthrough import apply_options
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import num_matching_pairs
-from rangesfm.vision.mapping_loop import IncrementalMapping
+from rangesfm.vision.mapping_loop import GlobalAdjustment, incremental_mapping
 from rangesfm.vision.photos import Photos
 from rangesfm.vision.snapshots import Snapshots, newest_snapshot, remove_snapshots
 
@@ -43,7 +43,7 @@ def map_incrementally(
     snapshots_path: Path,
     options: pycolmap.IncrementalPipelineOptions,
     progress: Progress,
-    incremental_mapping: IncrementalMapping = pycolmap.incremental_mapping,
+    adjustment: GlobalAdjustment | None = None,
 ) -> None:
     """Write all models to ``models_path``/0, /1, ..., the one with the most photos first.
 
@@ -75,6 +75,7 @@ def map_incrementally(
                 photos.folder,
                 folder,
                 options=options,
+                adjustment=adjustment,
                 input_path=begun or "",
                 initial_image_pair_callback=begin_model,
                 next_image_callback=add_photo,

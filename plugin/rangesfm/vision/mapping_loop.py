@@ -1,22 +1,23 @@
-"""COLMAP's incremental mapping with a global bundle adjustment of one's own.
+"""COLMAP's incremental mapping, the same in every run, and with a global bundle adjustment of one's own if wanted.
 
-The order of things is that of COLMAP's IncrementalPipeline, whose parts do all the work but the global adjustment: with
-COLMAP's own there, the models are the same.
+pycolmap.incremental_mapping searches for an initial pair in several threads. Now and then one of them finds a pair that
+comes late in the order, and ends the search of another for an earlier one; so the search is left to one thread here.
+
+With an adjustment of one's own, the order of things is that of COLMAP's IncrementalPipeline, whose parts do all the
+work but the global adjustment: with COLMAP's own there, the models are the same.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol
 
 import pycolmap
-
-IncrementalMapping: TypeAlias = Callable[..., dict[int, pycolmap.Reconstruction]]
-"""pycolmap.incremental_mapping, or a function that takes and returns the same."""
 
 
 class GlobalAdjustment(Protocol):
@@ -35,18 +36,17 @@ _MAX_NUM_INITIAL_TRIALS = 30
 _NUM_RELAXATIONS = 2
 
 
-def mapping_with(adjustment: GlobalAdjustment | None) -> IncrementalMapping:
-    """With an adjustment of one's own; without, COLMAP's."""
-    return pycolmap.incremental_mapping if adjustment is None else partial(_incremental_mapping, adjustment)
+class _CancelledError(Exception):
+    """Goes through COLMAP's mapping, which hears of a cancellation only so."""
 
 
-def _incremental_mapping(
-    adjustment: GlobalAdjustment,
+def incremental_mapping(
     database_path: Path,
     image_path: Path,
     output_path: Path,
     *,
     options: pycolmap.IncrementalPipelineOptions,
+    adjustment: GlobalAdjustment | None = None,
     input_path: Path | str = "",
     initial_image_pair_callback: Callable[[], None] = lambda: None,
     next_image_callback: Callable[[], None] = lambda: None,
@@ -54,25 +54,64 @@ def _incremental_mapping(
 ) -> dict[int, pycolmap.Reconstruction]:
     """All models, in the order in which they were begun; also written to ``output_path``, as COLMAP does.
 
+    Python's lock is held but for the callbacks: COLMAP's parts do not release it.
+
     Args:
+        adjustment: takes the place of COLMAP's global bundle adjustment.
         input_path: a model to go on from.
+        cancellation_token: ends the mapping with the photo at hand.
     """
     options.image_path = image_path
-    token = cancellation_token or pycolmap.CancellationToken()
     manager = pycolmap.ReconstructionManager()
     if input_path:
         manager.read(input_path)
     with pycolmap.Database.open(database_path) as database:
         pipeline = pycolmap.IncrementalPipeline(options, database, manager)
-    pipeline.add_callback(
-        pycolmap.IncrementalPipelineCallback.INITIAL_IMAGE_PAIR_REG_CALLBACK, initial_image_pair_callback
-    )
-    pipeline.add_callback(pycolmap.IncrementalPipelineCallback.NEXT_IMAGE_REG_CALLBACK, next_image_callback)
+    token = cancellation_token or pycolmap.CancellationToken()
+    for when, callback in {
+        pycolmap.IncrementalPipelineCallback.INITIAL_IMAGE_PAIR_REG_CALLBACK: initial_image_pair_callback,
+        pycolmap.IncrementalPipelineCallback.NEXT_IMAGE_REG_CALLBACK: next_image_callback,
+    }.items():
+        pipeline.add_callback(when, partial(_call_unless_cancelled, callback, token))
     if pipeline.database_cache.num_images():
-        mapper = pycolmap.IncrementalMapper(pipeline.database_cache)
-        _MappingLoop(pipeline, mapper, options.get_mapper(), adjustment, token).run()
+        with suppress(_CancelledError):
+            _map_with_relaxed_demands(pipeline, adjustment)
     manager.write(output_path)
     return {index: manager.get(index) for index in range(manager.size())}
+
+
+def _call_unless_cancelled(callback: Callable[[], None], token: pycolmap.CancellationToken) -> None:
+    callback()
+    if token.is_cancelled:
+        raise _CancelledError
+
+
+def _map_with_relaxed_demands(pipeline: pycolmap.IncrementalPipeline, adjustment: GlobalAdjustment | None) -> None:
+    """Map until nothing is left to register, with lower and lower demands on the initial pair."""
+    mapper = pycolmap.IncrementalMapper(pipeline.database_cache)
+    goes_on = pipeline.reconstruction_manager.size() > 0
+    for options in _relaxed(pipeline.options.get_mapper(), mapper):
+        if adjustment is None:
+            is_done = pipeline.reconstruct(mapper, options, goes_on) != pycolmap.IncrementalPipelineStatus.CONTINUE
+        else:
+            is_done = _MappingLoop(pipeline, mapper, options, adjustment).map_models(goes_on)
+        goes_on = False
+        if is_done or mapper.num_total_reg_images() == pipeline.database_cache.num_images():
+            return
+
+
+def _relaxed(
+    options: pycolmap.IncrementalMapperOptions, mapper: pycolmap.IncrementalMapper
+) -> Iterator[pycolmap.IncrementalMapperOptions]:
+    options.num_threads = 1  # for nothing but the search for an initial pair
+    yield options
+    for _ in range(_NUM_RELAXATIONS):
+        options.init_min_num_inliers //= 2
+        mapper.reset_initialization_stats()
+        yield options
+        options.init_min_tri_angle /= 2
+        mapper.reset_initialization_stats()
+        yield options
 
 
 @dataclass(frozen=True)
@@ -82,36 +121,15 @@ class _MappingLoop:
     Attributes:
         pipeline: COLMAP's, for its options and what it decides. mapper: over the same matches.
         mapper_options: with the present demands on an initial pair.
-        adjustment: instead of COLMAP's, wherever it can. token: asked between photos whether to stop.
+        adjustment: instead of COLMAP's, wherever it can.
     """
 
     pipeline: pycolmap.IncrementalPipeline
     mapper: pycolmap.IncrementalMapper
     mapper_options: pycolmap.IncrementalMapperOptions
     adjustment: GlobalAdjustment
-    token: pycolmap.CancellationToken
 
-    def run(self) -> None:
-        """Map until nothing is left to register, with lower and lower demands on the initial pair."""
-        goes_on = self.pipeline.reconstruction_manager.size() > 0
-        for loop in self._relaxed():
-            is_done = loop._map_models(goes_on)
-            goes_on = False
-            if is_done or self.mapper.num_total_reg_images() == self.pipeline.database_cache.num_images():
-                return
-
-    def _relaxed(self) -> Iterator[_MappingLoop]:
-        yield self
-        options = pycolmap.IncrementalMapperOptions(self.mapper_options.todict())
-        for _ in range(_NUM_RELAXATIONS):
-            options.init_min_num_inliers //= 2
-            self.mapper.reset_initialization_stats()
-            yield replace(self, mapper_options=options)
-            options.init_min_tri_angle /= 2
-            self.mapper.reset_initialization_stats()
-            yield replace(self, mapper_options=options)
-
-    def _map_models(self, goes_on: bool) -> bool:
+    def map_models(self, goes_on: bool) -> bool:
         """Model after model, each from another initial pair; whether that was all that is wanted.
 
         Args:
@@ -132,8 +150,6 @@ class _MappingLoop:
             self.mapper.end_reconstruction(discard=not is_kept)
             if not is_kept:
                 manager.delete(index)
-            if self.token.is_cancelled:
-                return True
             if status == pycolmap.IncrementalPipelineStatus.NO_INITIAL_PAIR:
                 return False
             if status == pycolmap.IncrementalPipelineStatus.SUCCESS and (
@@ -155,7 +171,7 @@ class _MappingLoop:
         self.pipeline.callback(pycolmap.IncrementalPipelineCallback.INITIAL_IMAGE_PAIR_REG_CALLBACK)
         adjusted = model.num_reg_frames(), model.num_points3D()
         num_in_snapshot, has_failed = model.num_reg_frames(), False
-        while mapper.num_shared_reg_images() < options.max_model_overlap and not self.token.is_cancelled:
+        while mapper.num_shared_reg_images() < options.max_model_overlap:
             image_id = self._register_next(model)
             if image_id is None:
                 # Once more after an adjustment, which may bring photos into reach.

@@ -12,7 +12,7 @@ from rangesfm.errors import ReconstructionError
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import Progress, SilentProgress
 from rangesfm.vision.mapping import map_incrementally, pipeline_options, read_models, write_models
-from rangesfm.vision.mapping_loop import GlobalAdjustment, mapping_with
+from rangesfm.vision.mapping_loop import GlobalAdjustment
 from rangesfm.vision.matched_photos import MatchedPhotos, Workspace, match_photos
 from rangesfm.vision.steps import fingerprint
 from rangesfm.vision.submap_joining import join_submaps
@@ -181,7 +181,7 @@ class _Mapping:
             space.snapshots,
             self._options(),
             space.progress,
-            mapping_with(self.adjustment),
+            self.adjustment,
         )
 
     def _in_submaps(self, matched: MatchedPhotos) -> None:
