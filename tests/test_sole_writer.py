@@ -170,6 +170,18 @@ def test_what_a_killed_process_had_in_the_making_is_cleared_away(tmp_path: Path)
     assert {path.name for path in tmp_path.rglob("*")} == {"models", ".mine.part"}
 
 
+def test_a_killed_process_is_over_before_its_parent_asks_for_it(tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        leftover = tmp_path / f".points.{process.pid}.part.ply"
+        leftover.touch()
+        with sole_writer(tmp_path):
+            assert leftover.exists()
+        process.kill()
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)  # it has ended, and stays to be asked for
+        with sole_writer(tmp_path):
+            assert not leftover.exists()
+
+
 def test_what_a_living_process_has_in_the_making_stays(tmp_path: Path) -> None:
     being_made = tmp_path / f".table.{os.getppid()}.part.csv"
     being_made.touch()

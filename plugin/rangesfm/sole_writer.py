@@ -19,6 +19,11 @@ from rangesfm.files import LEFTOVER, make_output_folder
 
 LOCK_NAME = ".rangesfm.lock"
 
+# Of /proc/PID/stat (proc(5)): its third field, the first one after the name, is the state, the ninth are the flags.
+_ENDED_STATES = (b"Z", b"X")
+_FLAGS_FIELD = 5  # after the state
+_IS_EXITING = 0x4  # PF_EXITING
+
 # Folders that this thread holds: what it calls meanwhile may ask for them again.
 _held: ContextVar[frozenset[Path]] = ContextVar("held", default=frozenset())
 
@@ -139,4 +144,15 @@ def _is_alive(pid: int) -> bool:
         return False
     except PermissionError:
         pass
-    return True
+    return not _is_ending(pid)
+
+
+def _is_ending(pid: int) -> bool:
+    """Whether a process has ended but for its entry, which stays until its parent asks for it."""
+    if sys.platform != "linux":
+        return False
+    try:
+        state, *numbers = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()
+    except OSError:  # asked for in this moment
+        return True
+    return state in _ENDED_STATES or bool(int(numbers[_FLAGS_FIELD]) & _IS_EXITING)

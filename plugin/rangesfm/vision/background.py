@@ -29,7 +29,8 @@ def run_in_background(
     goes on once the work has ended.
 
     Args:
-        work: hands the token on to COLMAP (whose calls release Python's lock).
+        work: hands the token on to COLMAP. Where its calls do not release Python's lock, the waiting hears of Ctrl-C
+            and says how far the work is whenever they call back.
         count: how many of ``num_total`` (None: unknown) items are done.
 
     Raises:
