@@ -30,7 +30,7 @@ from rangesfm.ranging.observations import RangeObservations, RangeStatus
 from rangesfm.refine import RefineSummary, predicted_ranges, refine_with_ranges
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.simulate.model import synthetic_model
-from rangesfm.simulate.path import CameraPath, loop_path, sequence_path
+from rangesfm.simulate.path import CameraPath, lap_path, loop_path, sequence_path
 from rangesfm.simulate.ranges import Radio, simulate_ranges, simulate_ranges_at
 from rangesfm.trajectory import Trajectory, pose_of, trajectory_from_reconstruction
 
@@ -170,6 +170,32 @@ def adjusters(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[pycolmap.CeresBu
     monkeypatch.setattr(pycolmap, "create_default_ceres_bundle_adjuster", make_and_keep)
     yield made
     made.clear()
+
+
+def leave_few_links(model: pycolmap.Reconstruction, *, first: int, num_links: int) -> None:
+    """Delete all but a few of the points that are seen both before some photo and from there on."""
+    image_ids = sorted(model.reg_image_ids(), key=lambda image_id: model.image(image_id).name)
+    place = {image_id: k for k, image_id in enumerate(image_ids)}
+    links = []
+    for point_id, point in sorted(model.points3D.items()):
+        seen = [place[element.image_id] for element in point.track.elements]
+        if min(seen) < first <= max(seen):
+            links.append(point_id)
+    for point_id in links[num_links:]:
+        model.delete_point3D(point_id)
+
+
+def add_point_in_camera(model: pycolmap.Reconstruction, depth: float) -> int:
+    """A point right before one photo's camera, which the photo behind it sees too."""
+    behind, image = sorted(model.images.values(), key=lambda image: image.name)[10:12]
+    xyz = image.cam_from_world().inverse() * np.array([0.1 * depth, -0.05 * depth, depth])
+    track = pycolmap.Track()
+    for seeing in (behind, image):
+        pixel = model.camera(seeing.camera_id).img_from_cam(seeing.cam_from_world() * xyz)
+        assert pixel is not None
+        seeing.points2D.append(pycolmap.Point2D(np.ravel(pixel)))
+        track.add_element(seeing.image_id, len(seeing.points2D) - 1)
+    return int(model.add_point3D(xyz, track, np.zeros(3, dtype=np.uint8)))
 
 
 class TestWithoutNoise:
@@ -625,6 +651,44 @@ class TestWithNoise:
         # To Ceres' steps a turn of the whole world is no straight line: each gains less than it promised.
         assert summary.num_iterations <= 5
         np.testing.assert_allclose(survey.centers(refined), survey.centers(straight), atol=2e-3)
+
+    def test_parts_that_hang_together_by_few_points_are_turned_at_once(self) -> None:
+        """By less than the ranges' noise, which is no straight line to Ceres' steps either."""
+        stddev_m = 0.5
+        survey = make_survey(
+            path=sequence_path(59.0, seed=2),
+            num_keyframes=60,
+            pixel_stddev=1.0,
+            radio=Radio(range_stddev_m=stddev_m),
+            num_epochs=4,
+            max_track_length=6,
+            num_observations=100,
+        )
+        leave_few_links(survey.sfm, first=30, num_links=8)
+        adjust_by_colmap(survey.sfm)
+        trajectory = trajectory_from_reconstruction(survey.sfm, survey.timestamps_s)
+        hinged = replace(
+            survey,
+            trajectory=trajectory,
+            observations=associate(survey.observations.log, trajectory, TAG_IN_CAM_M),
+            metric_from_sfm=align_points(trajectory.centers, survey.centers_m),
+        )
+        _, summary = hinged.refine(survey.anchors(0.0), range_stddev_m=np.full(len(survey.observations.log), stddev_m))
+        assert 0.1 < summary.bend_m < stddev_m
+        assert summary.num_iterations <= 5
+
+    @pytest.mark.parametrize("depth_m", [1e-5, 1e-6, 1e-10])
+    def test_a_point_in_a_camera_changes_nothing(self, depth_m: float) -> None:
+        """Nor does it keep the solver from free steps, or the covariance from being found."""
+        path, radio = lap_path(60.0, share=0.1), Radio(range_stddev_m=RANGE_STDDEV_M)
+        survey = make_survey(path=path, num_keyframes=30, pixel_stddev=0.5, radio=radio, max_track_length=6)
+        without, summary_without = survey.refine(survey.anchors(0.0))
+        point_id = add_point_in_camera(survey.sfm, depth_m / survey.metric_from_sfm.scale)
+        refined, summary = survey.refine(survey.anchors(0.0))
+        np.testing.assert_allclose(survey.centers(refined), survey.centers(without), atol=1e-9)
+        assert summary.num_iterations == summary_without.num_iterations
+        assert summary.covariance is not None
+        assert point_id in refined.points3D
 
     def test_drift_is_bent_back(self) -> None:
         """No similarity can do it: the refined centres are nearer to the truth than after the best one."""

@@ -36,10 +36,12 @@ from rangesfm.refinement.distances import (
     add_marker_points,
     remove_marker_points,
 )
+from rangesfm.refinement.points_in_cameras import points_in_cameras
 from rangesfm.refinement.radio import RadioBlocks, RadioEstimate, RadioRanges, add_radio_priors, add_ranges
 from rangesfm.refinement.range_errors import range_errors
 from rangesfm.refinement.unbend import SAME_WEIGHTS, Unbent, unbend
 from rangesfm.refinement.upright import add_gravity
+from rangesfm.refinement.vision_information import model_observations, model_poses
 from rangesfm.refinement.weights import RangeWeights, misfits, range_weights
 from rangesfm.trajectory import Trajectory
 
@@ -235,6 +237,13 @@ class _Survey:
     first_pose_is_fixed: bool
     gravity: Gravity | None
     num_threads: int
+    left_out_ids: frozenset[int] = frozenset()
+
+    @property
+    def frame_ids(self) -> npt.NDArray[np.int64]:
+        """Those of the trajectory, then those without a time."""
+        timed = self.ranges.trajectory.frame_ids
+        return np.concatenate([timed, np.setdiff1d(np.array(self.metric.reg_frame_ids(), dtype=np.int64), timed)])
 
     @property
     def first_frame_id(self) -> int:
@@ -250,6 +259,7 @@ class _Survey:
             max_num_iterations=max_num_iterations,
             num_threads=self.num_threads,
             marker_ids=self.distances.marker_ids.values(),
+            left_out_ids=self.left_out_ids - set(self.distances.marker_ids.values()),
         )
 
     def add_to(self, problem: BundleAdjustment, weights: RangeWeights, radio: RadioEstimate) -> _Added:
@@ -302,16 +312,21 @@ class _Adjusted:
 
 
 def _refine(survey: _Survey, weights: RangeWeights) -> RefineSummary:
-    """Unbend the map, then solve the full problem."""
+    """Unbend the map, then solve the full problem, both without the points that lie in a camera."""
+    frame_ids = survey.frame_ids
+    rays = model_observations(survey.metric, frame_ids)
+    in_camera = points_in_cameras(rays, model_poses(survey.metric, frame_ids))
+    survey = replace(survey, left_out_ids=frozenset(rays.point_ids[in_camera].tolist()))
     problem = survey.problem(survey.options.max_num_iterations)
     start = unbend(
         survey.metric,
-        survey.ranges.trajectory,
+        frame_ids,
+        rays.with_pixel_stddev(problem.pixel_stddev),
+        in_camera,
         survey.ranges.observations,
         survey.ranges.antennas,
         weights,
         survey.anchors,
-        pixel_stddev=problem.pixel_stddev,
         common_bias_stddev_m=survey.common_bias_stddev_m,
         first_pose_is_fixed=survey.first_pose_is_fixed,
         gravity=survey.gravity,

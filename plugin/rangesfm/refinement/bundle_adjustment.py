@@ -92,17 +92,22 @@ def bundle_adjustment(
     max_num_iterations: int,
     num_threads: int,
     marker_ids: Collection[int] = (),
+    left_out_ids: Collection[int] = (),
 ) -> BundleAdjustment:
     """Set it up, with a gauge that leaves the scale to the ranges.
 
     Args:
         marker_ids: 3-D points that will have other residuals than their reprojections.
+        left_out_ids: 3-D points that take no part, and stay where they are.
 
     Raises:
         SolverError: nothing takes part.
         InputError: an unknown key among the options passed through.
     """
     adjuster = _bundle_adjuster(metric, camera, options, fixed_frame_id, max_num_iterations, num_threads)
+    for point_id in left_out_ids:
+        if adjuster.problem.has_parameter_block(xyz := metric.point3D(point_id).xyz):
+            adjuster.problem.remove_parameter_block(xyz)
     num_reprojections = adjuster.problem.num_residuals()
     if num_reprojections == 0:
         raise SolverError("no point of the model takes part in the bundle adjustment")

@@ -18,11 +18,12 @@ from rangesfm.ranging.robust_loss import wider
 from rangesfm.refinement.antennas import Antennas
 from rangesfm.refinement.carry import carry_model
 from rangesfm.refinement.keyframe_graph import GraphState, KeyframeGraph, local_scales, moved_anchors, solve_graph
-from rangesfm.refinement.vision_information import Poses, model_observations, model_poses, vision_information
+from rangesfm.refinement.vision_information import Observations, Poses, model_poses, vision_information
 from rangesfm.refinement.weights import RangeWeights
-from rangesfm.trajectory import Trajectory, pose_of
+from rangesfm.trajectory import pose_of
 
 Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
 
 _MAX_NUM_ROUNDS = 12
 # Relative; the noise itself is not known better from some hundred ranges.
@@ -30,6 +31,8 @@ SAME_WEIGHTS = 0.05
 # Of the ranges' stddev. A turn of the whole world by centimetres takes the full problem, of which all points have to
 # follow it, tens of iterations; here it takes one step.
 _TOLERANCE = 0.001
+# Likewise. The same goes for a part of the map that turns about a weak link.
+_MIN_BEND = 0.05
 
 
 @dataclass(frozen=True)
@@ -52,32 +55,34 @@ class Unbent:
 
 def unbend(
     metric: pycolmap.Reconstruction,
-    trajectory: Trajectory,
+    frame_ids: Indices,
+    rays: Observations,
+    in_camera: npt.NDArray[np.bool_],
     observations: RangeObservations,
     antennas: Antennas,
     weights: RangeWeights,
     anchors: tuple[AnchorEstimate, ...],
     *,
-    pixel_stddev: float,
     common_bias_stddev_m: float,
     first_pose_is_fixed: bool,
     gravity: Gravity | None,
 ) -> Unbent:
     """Solve the keyframe graph and move the model after it, in place: as a whole, to which the photos are indifferent,
-    or, where it bends by more than the ranges' noise, keyframe by keyframe.
+    or, where it bends, keyframe by keyframe.
 
     The weights are estimated anew with every solution. While drift is large, so are residuals and with them the
     stddevs: the robust loss, which counts in stddevs, tightens as the map straightens and takes no drift for an
     outlier. From there a bounded loss, which is that of the scale and of the full problem, sets aside what is one.
+
+    Args:
+        frame_ids: of the model, in the order of the antennas' frames, as the rays have them.
+        rays: all that the photos see. in_camera: the points that lie in one, which hold nothing together.
     """
-    others = np.setdiff1d(np.array(metric.reg_frame_ids(), dtype=np.int64), trajectory.frame_ids)
-    frame_ids = np.concatenate([trajectory.frame_ids, others])
-    rays = model_observations(metric, frame_ids, pixel_stddev)
     before = model_poses(metric, frame_ids)
     rows = observations.placed_rows
     placed = weights.subset(rows)
     graph = KeyframeGraph(
-        vision=vision_information(rays, before),
+        vision=vision_information(rays.of_points(~in_camera), before),
         antennas=antennas.subset(rows),
         anchor_index=placed.anchor_index,
         range_m=observations.log.range_m[rows],
@@ -92,7 +97,7 @@ def unbend(
     fit = _solve_with_own_weights(graph, placed)
     after = fit.state.poses
     whole = _as_a_whole(before, after, graph.held_frame)
-    if rmse(after.centers - whole.apply(before.centers)) > float(np.median(fit.weights.stddev_m)):
+    if rmse(after.centers - whole.apply(before.centers)) > _MIN_BEND * float(np.median(fit.weights.stddev_m)):
         carry_model(metric, frame_ids, rays, before, after, local_scales(graph.vision, after))
     else:
         _move(metric, whole, None if graph.held_frame is None else int(frame_ids[graph.held_frame]))

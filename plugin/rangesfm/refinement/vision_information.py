@@ -8,7 +8,7 @@ and shifts that all of them share cost nothing, nor does a common scale, which t
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -69,6 +69,14 @@ class Observations:
     points: Array
     point_ids: Indices
 
+    def of_points(self, taken: npt.NDArray[np.bool_]) -> Observations:
+        """Those of some of the points; the others are there still, seen by nobody."""
+        return self.subset(np.flatnonzero(taken[self.point]))
+
+    def with_pixel_stddev(self, pixel_stddev: float) -> Observations:
+        """The same features, whose coordinates were taken to be known to a pixel."""
+        return replace(self, weight=self.weight / pixel_stddev)
+
     def subset(self, rows: Indices) -> Observations:
         """Some of the observations, of all points."""
         return Observations(
@@ -107,7 +115,7 @@ def model_poses(metric: pycolmap.Reconstruction, frame_ids: Indices) -> Poses:
     return Poses(world_from_rig, -np.einsum("nij,nj->ni", world_from_rig, translations))
 
 
-def model_observations(metric: pycolmap.Reconstruction, frame_ids: Indices, pixel_stddev: float) -> Observations:
+def model_observations(metric: pycolmap.Reconstruction, frame_ids: Indices, pixel_stddev: float = 1.0) -> Observations:
     """All observations of 3-D points in these frames."""
     index_of_frame = {int(frame_id): index for index, frame_id in enumerate(frame_ids)}
     point_ids = np.array(sorted(metric.points3D.keys()), dtype=np.int64)
