@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -167,6 +168,18 @@ def test_cancelled_mapping_ends_with_the_photo_at_hand(
 
     (model,) = mapped(database, options, adjust, next_image_callback=cancel_the_second_time, cancellation_token=token)
     assert model.num_reg_images() == 4
+
+
+@pytest.mark.parametrize("adjust", [None, lambda model: False])
+def test_a_mapping_ends_when_its_time_is_over(
+    database: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+    adjust: Callable[[pycolmap.Reconstruction], bool] | None,
+) -> None:
+    options.max_runtime_seconds = 1
+    (model,) = mapped(database, options, adjust, next_image_callback=lambda: time.sleep(0.6))
+    assert 3 <= model.num_reg_images() <= 4
+    assert all(point.error >= 0 for point in model.points3D.values())
 
 
 def test_a_mapping_goes_on_from_a_snapshot_of_its_own(

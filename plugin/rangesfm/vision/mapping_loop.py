@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -36,8 +35,8 @@ _MAX_NUM_INITIAL_TRIALS = 30
 _NUM_RELAXATIONS = 2
 
 
-class _CancelledError(Exception):
-    """Goes through COLMAP's mapping, which hears of a cancellation only so."""
+class _StoppedError(Exception):
+    """Goes through COLMAP's mapping, whose parts hear of a cancellation and of the time only so."""
 
 
 def incremental_mapping(
@@ -59,7 +58,7 @@ def incremental_mapping(
     Args:
         adjustment: takes the place of COLMAP's global bundle adjustment.
         input_path: a model to go on from.
-        cancellation_token: ends the mapping with the photo at hand.
+        cancellation_token: ends the mapping with the photo at hand, as the time does that the options allow.
     """
     options.image_path = image_path
     manager = pycolmap.ReconstructionManager()
@@ -67,23 +66,22 @@ def incremental_mapping(
         manager.read(input_path)
     with pycolmap.Database.open(database_path) as database:
         pipeline = pycolmap.IncrementalPipeline(options, database, manager)
-    token = cancellation_token or pycolmap.CancellationToken()
+    token, begin_s = cancellation_token or pycolmap.CancellationToken(), time.monotonic()
+
+    def call(callback: Callable[[], None]) -> None:
+        callback()
+        if token.is_cancelled or 0 < options.max_runtime_seconds <= time.monotonic() - begin_s:
+            raise _StoppedError
+
     for when, callback in {
         pycolmap.IncrementalPipelineCallback.INITIAL_IMAGE_PAIR_REG_CALLBACK: initial_image_pair_callback,
         pycolmap.IncrementalPipelineCallback.NEXT_IMAGE_REG_CALLBACK: next_image_callback,
     }.items():
-        pipeline.add_callback(when, partial(_call_unless_cancelled, callback, token))
+        pipeline.add_callback(when, partial(call, callback))
     if pipeline.database_cache.num_images():
-        with suppress(_CancelledError):
-            _map_with_relaxed_demands(pipeline, adjustment)
+        _map_with_relaxed_demands(pipeline, adjustment)
     manager.write(output_path)
     return {index: manager.get(index) for index in range(manager.size())}
-
-
-def _call_unless_cancelled(callback: Callable[[], None], token: pycolmap.CancellationToken) -> None:
-    callback()
-    if token.is_cancelled:
-        raise _CancelledError
 
 
 def _map_with_relaxed_demands(pipeline: pycolmap.IncrementalPipeline, adjustment: GlobalAdjustment | None) -> None:
@@ -91,10 +89,15 @@ def _map_with_relaxed_demands(pipeline: pycolmap.IncrementalPipeline, adjustment
     mapper = pycolmap.IncrementalMapper(pipeline.database_cache)
     goes_on = pipeline.reconstruction_manager.size() > 0
     for options in _relaxed(pipeline.options.get_mapper(), mapper):
-        if adjustment is None:
-            is_done = pipeline.reconstruct(mapper, options, goes_on) != pycolmap.IncrementalPipelineStatus.CONTINUE
-        else:
-            is_done = _MappingLoop(pipeline, mapper, options, adjustment).map_models(goes_on)
+        try:
+            if adjustment is None:
+                is_done = pipeline.reconstruct(mapper, options, goes_on) != pycolmap.IncrementalPipelineStatus.CONTINUE
+            else:
+                is_done = _MappingLoop(pipeline, mapper, options, adjustment).map_models(goes_on)
+        except _StoppedError:
+            mapper.reconstruction.update_point_3d_errors()
+            mapper.end_reconstruction(discard=False)
+            return
         goes_on = False
         if is_done or mapper.num_total_reg_images() == pipeline.database_cache.num_images():
             return
