@@ -12,12 +12,13 @@ import numpy.typing as npt
 import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.few_links import leave_few_links
 from tests.studies.scale_breakdown import spoilt
 
 from rangesfm import _ceres
 from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.tape import Marker, Tape, TapedDistance
-from rangesfm.errors import InputError
+from rangesfm.errors import InputError, SolverError
 from rangesfm.geometry import IDENTITY, Similarity, align_points, rmse
 from rangesfm.gravity import UP_IN_SITE, Gravity
 from rangesfm.model_transform import rescale
@@ -170,19 +171,6 @@ def adjusters(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[pycolmap.CeresBu
     monkeypatch.setattr(pycolmap, "create_default_ceres_bundle_adjuster", make_and_keep)
     yield made
     made.clear()
-
-
-def leave_few_links(model: pycolmap.Reconstruction, *, first: int, num_links: int) -> None:
-    """Delete all but a few of the points that are seen both before some photo and from there on."""
-    image_ids = sorted(model.reg_image_ids(), key=lambda image_id: model.image(image_id).name)
-    place = {image_id: k for k, image_id in enumerate(image_ids)}
-    links = []
-    for point_id, point in sorted(model.points3D.items()):
-        seen = [place[element.image_id] for element in point.track.elements]
-        if min(seen) < first <= max(seen):
-            links.append(point_id)
-    for point_id in links[num_links:]:
-        model.delete_point3D(point_id)
 
 
 def add_point_in_camera(model: pycolmap.Reconstruction, depth: float) -> int:
@@ -664,7 +652,7 @@ class TestWithNoise:
             max_track_length=6,
             num_observations=100,
         )
-        leave_few_links(survey.sfm, first=30, num_links=8)
+        leave_few_links(survey.sfm, 30, num_links=8)
         adjust_by_colmap(survey.sfm)
         trajectory = trajectory_from_reconstruction(survey.sfm, survey.timestamps_s)
         hinged = replace(
@@ -925,6 +913,13 @@ class TestProblem:
         assert refined.camera(1).params[0] != survey.sfm.camera(1).params[0]
         with pytest.raises(InputError, match=r"refine_focal_lenght.*refine\.bundle_adjustment.*refine_focal_length"):
             survey.refine(anchors, options=RefineOptions(bundle_adjustment={"refine_focal_lenght": True}))
+
+    def test_a_model_whose_points_nobody_sees_is_refused(self) -> None:
+        survey = make_survey()
+        for point_id in list(survey.sfm.points3D):
+            survey.sfm.delete_point3D(point_id)
+        with pytest.raises(SolverError, match="no photo of the model sees any of its points"):
+            survey.refine(survey.anchors(0.0))
 
     def test_too_few_iterations_are_told(self) -> None:
         survey = make_survey(pixel_stddev=0.5)

@@ -132,6 +132,8 @@ def refine_with_ranges(
 ) -> tuple[pycolmap.Reconstruction, RefineSummary]:
     """Bundle adjustment of a scaled model with range residuals.
 
+    Points that lie in a camera which sees them take no part.
+
     Args:
         reconstruction: in the metric world; it is copied, not changed.
         trajectory, observations: of the unscaled model, as the scale stage had them.

@@ -36,7 +36,7 @@ def chain() -> SyntheticModel:
 
 def poses_and_rays(model: SyntheticModel) -> tuple[Poses, Observations]:
     frame_ids = trajectory_from_reconstruction(model.reconstruction, model.timestamps_s).frame_ids
-    return model_poses(model.reconstruction, frame_ids), model_observations(model.reconstruction, frame_ids, 1.0)
+    return model_poses(model.reconstruction, frame_ids), model_observations(model.reconstruction, frame_ids)
 
 
 def bent(poses: Poses, turn_deg: float, growth: float) -> tuple[Poses, Array]:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
+from tests.few_links import leave_few_links
 from tests.studies.simulated_database import write_database
 
 from rangesfm.options import CameraOptions, MapperOptions
@@ -42,10 +43,7 @@ def write_matches(path: Path, model: pycolmap.Reconstruction) -> Path:
 def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Matches of half a walk round a yard, and of the photos after a gap that none of them bridges."""
     model = walk(16, max_track_length=6)
-    for point_id, point in list(model.points3D.items()):
-        seen = [element.image_id for element in point.track.elements]
-        if min(seen) <= 10 < max(seen):
-            model.delete_point3D(point_id)
+    leave_few_links(model, 10, num_links=0)
     return write_matches(tmp_path_factory.mktemp("database") / "database.db", model)
 
 
@@ -78,6 +76,12 @@ def mapped(
     adjustment = None if adjust is None else Adjustment(adjust)
     models = incremental_mapping(database, database.parent, output, options=options, adjustment=adjustment, **arguments)
     return list(models.values())
+
+
+@pytest.fixture(params=["colmaps loop", "own loop"])
+def adjust(request: pytest.FixtureRequest) -> Callable[[pycolmap.Reconstruction], bool] | None:
+    """None, or an adjustment that leaves everything to COLMAP."""
+    return None if request.param == "colmaps loop" else lambda model: False
 
 
 def centers(model: pycolmap.Reconstruction) -> npt.NDArray[np.float64]:
@@ -153,7 +157,6 @@ def test_the_adjustment_is_the_last_to_move_the_map(
     assert ratio == pytest.approx(np.full(3, ratio.mean()), rel=1e-9)
 
 
-@pytest.mark.parametrize("adjust", [None, lambda model: False])
 def test_cancelled_mapping_ends_with_the_photo_at_hand(
     database: Path,
     options: pycolmap.IncrementalPipelineOptions,
@@ -170,7 +173,6 @@ def test_cancelled_mapping_ends_with_the_photo_at_hand(
     assert model.num_reg_images() == 4
 
 
-@pytest.mark.parametrize("adjust", [None, lambda model: False])
 def test_a_mapping_ends_when_its_time_is_over(
     database: Path,
     options: pycolmap.IncrementalPipelineOptions,

@@ -16,6 +16,7 @@ import numpy.typing as npt
 import pycolmap
 from scipy import sparse
 
+from rangesfm.errors import SolverError
 from rangesfm.trajectory import pose_of
 
 Array = npt.NDArray[np.float64]
@@ -74,7 +75,7 @@ class Observations:
         return self.subset(np.flatnonzero(taken[self.point]))
 
     def with_pixel_stddev(self, pixel_stddev: float) -> Observations:
-        """The same features, whose coordinates were taken to be known to a pixel."""
+        """Of features whose coordinates are known to so many of what they were taken to be known to."""
         return replace(self, weight=self.weight / pixel_stddev)
 
     def subset(self, rows: Indices) -> Observations:
@@ -115,8 +116,12 @@ def model_poses(metric: pycolmap.Reconstruction, frame_ids: Indices) -> Poses:
     return Poses(world_from_rig, -np.einsum("nij,nj->ni", world_from_rig, translations))
 
 
-def model_observations(metric: pycolmap.Reconstruction, frame_ids: Indices, pixel_stddev: float = 1.0) -> Observations:
-    """All observations of 3-D points in these frames."""
+def model_observations(metric: pycolmap.Reconstruction, frame_ids: Indices) -> Observations:
+    """All observations of 3-D points in these frames, each coordinate taken to be known to a pixel.
+
+    Raises:
+        SolverError: there is none.
+    """
     index_of_frame = {int(frame_id): index for index, frame_id in enumerate(frame_ids)}
     point_ids = np.array(sorted(metric.points3D.keys()), dtype=np.int64)
     columns: list[tuple[npt.NDArray[Any], ...]] = []
@@ -134,11 +139,13 @@ def model_observations(metric: pycolmap.Reconstruction, frame_ids: Indices, pixe
                 np.full(n, index_of_frame[image.frame_id]),
                 np.searchsorted(point_ids, [point_id for point_id, _ in seen]),
                 rays,
-                np.full(n, camera.mean_focal_length() / pixel_stddev),
+                np.full(n, camera.mean_focal_length()),
                 np.tile(cam_from_rig.rotation.matrix(), (n, 1, 1)),
                 np.tile(cam_from_rig.translation, (n, 1)),
             )
         )
+    if not columns:
+        raise SolverError("no photo of the model sees any of its points")
     frame, point, ray, weight, rotation, translation = (np.concatenate(column) for column in zip(*columns, strict=True))
     points = np.array([metric.point3D(int(point_id)).xyz for point_id in point_ids])
     all_of_them = Observations(frame, point, ray, weight, rotation, translation, points, point_ids)
