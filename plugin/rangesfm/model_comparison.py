@@ -15,7 +15,7 @@ from rangesfm.comparison import MIN_NUM_ALIGNED, align_rows, reprojection_rms_px
 from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
-from rangesfm.geometry import Similarity, align_points, rmse
+from rangesfm.geometry import Similarity, rmse, similarity_between
 from rangesfm.model_files import read_model
 from rangesfm.model_ranges import ModelRanges, ranges_of_result
 from rangesfm.reference import read_reference
@@ -216,10 +216,7 @@ def _common(first: Trajectory, second: Trajectory) -> tuple[tuple[str, ...], Arr
 
 
 def _similarity(source: Array, target: Array) -> Similarity | None:
-    if len(source) < MIN_NUM_ALIGNED or np.ptp(source, axis=0).max() == 0 or np.ptp(target, axis=0).max() == 0:
-        return None
-    found = align_points(source, target)
-    return found if found.scale > 0 else None
+    return similarity_between(source, target) if len(source) >= MIN_NUM_ALIGNED else None
 
 
 def _onto_ranges(ranges: ModelRanges, path: Trajectory) -> Similarity | None:

@@ -17,6 +17,9 @@ SHORT_RANGE_LENGTH_M = 1.0
 # Of a range of which nothing is known yet. Ranges that may be off together by more say nothing on the noise of others.
 START_STDDEV_M = 0.1
 _MIN_STDDEV_M = 1e-9
+# In stddevs, root mean square: where residuals are no larger, rounding and the solver's last step are all that they
+# have in common.
+NO_ERROR = 1e-3
 _MAX_INFLATION = 30.0
 # Of fewer there is nothing to resample.
 _MIN_NUM_STRETCHES = 8
@@ -75,7 +78,7 @@ def correlation_inflation(
     _, index = np.unique(groups, return_inverse=True)
     sums = np.bincount(index, shares * influence)
     squares = float(np.sum(shares * influence**2))
-    if squares == 0 or len(sums) < 2:
+    if squares <= NO_ERROR**2 * np.sum(shares) or len(sums) < 2:
         return 1.0
     return float(np.clip(np.sqrt(np.sum(sums**2) / squares), 1.0, _MAX_INFLATION))
 

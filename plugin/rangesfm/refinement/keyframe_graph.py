@@ -16,6 +16,7 @@ from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial.transform import Rotation
 
+from rangesfm.geometry import rounding_of
 from rangesfm.gravity import Gravity
 from rangesfm.ranging.anchors import AnchorEstimate
 from rangesfm.ranging.robust_loss import RobustLoss
@@ -250,7 +251,8 @@ def _local_scale(vision: VisionInformation, shift: Array, shift_before: Array) -
     n = len(vision.origin)
     now = np.bincount(vision.reference, np.sum(shift**2, axis=1), minlength=n)
     before = np.bincount(vision.reference, np.sum(shift_before**2, axis=1), minlength=n)
-    known = (now > 0) & (before > 0)
+    least = rounding_of(vision.origin.centers) ** 2  # all of one place have no scale
+    known = (now > least) & (before > least)
     return np.sqrt(np.divide(now, before, where=known, out=np.ones(n)))
 
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from rangesfm.geometry import Similarity, align_points, rmse
+from rangesfm.geometry import Similarity, align_points, are_apart, rmse
 from rangesfm.gravity import Gravity
 from rangesfm.model_transform import transform
 from rangesfm.ranging.anchors import AnchorEstimate
@@ -119,7 +119,8 @@ def _as_a_whole(before: Poses, after: Poses, held_frame: int | None) -> Similari
         turn, start, end = np.eye(3), before.centers[held_frame], after.centers[held_frame]
     turned = (before.centers - start) @ turn.T
     likeness = float(np.sum(turned * (after.centers - end)))
-    scale = likeness / float(np.sum(turned**2)) if likeness > 0 else 1.0  # of a point, or turned inside out: none
+    # Of a point, or turned inside out, there is none.
+    scale = likeness / float(np.sum(turned**2)) if likeness > 0 and are_apart(before.centers) else 1.0
     return Similarity(scale, turn, end - scale * turn @ start)
 
 
