@@ -22,9 +22,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from rangesfm.geometry import Similarity
+from rangesfm.geometry.reference import Reference, write_reference
+from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.readers.canonical import write_ranges_csv
-from rangesfm.reference import Reference, write_reference
 from rangesfm.simulate.model import synthetic_model
 from rangesfm.simulate.path import loop_path
 from rangesfm.simulate.ranges import Radio, simulate_ranges

@@ -20,13 +20,13 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from rangesfm.geometry import Similarity
-from rangesfm.model_files import read_model
+from rangesfm.colmap.model_files import read_model
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers import read_ranges, write_ranges_csv
 from rangesfm.simulate.ranges import Radio, simulate_ranges_at
 from rangesfm.simulate.survey import TAG_IN_CAM_M
-from rangesfm.trajectory import trajectory_from_reconstruction
 
 if TYPE_CHECKING:
     from tests.conftest import Command, PhotoRun, WalkedSurvey

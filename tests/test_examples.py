@@ -13,8 +13,8 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from rangesfm.config import read_survey
-from rangesfm.strict_tables import parse_toml
+from rangesfm.survey.settings import read_survey
+from rangesfm.survey.strict_tables import parse_toml
 
 if TYPE_CHECKING:
     from tests.conftest import PhotoRun, WalkedSurvey

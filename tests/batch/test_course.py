@@ -7,8 +7,8 @@ import pytest
 from rangesfm.batch.course import Course
 from rangesfm.batch.jobs import Job
 from rangesfm.batch.rows import Figures, Status, SurveyRow, exit_status_of, figures_of, format_rows
-from rangesfm.config import Survey
 from rangesfm.failures import Failure
+from rangesfm.survey.settings import Survey
 
 
 class Clock:

@@ -13,8 +13,8 @@ from rangesfm.batch.course import Course
 from rangesfm.batch.jobs import Job
 from rangesfm.batch.results import write_results
 from rangesfm.batch.rows import Figures
-from rangesfm.config import Survey
 from rangesfm.failures import Failure
+from rangesfm.survey.settings import Survey
 
 BAD_NAME = '</td><script>alert(1)</script>&".toml'
 

@@ -17,10 +17,10 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
 from rangesfm.simulate.path import loop_path
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

@@ -23,16 +23,16 @@ import numpy.typing as npt
 import pycolmap
 
 from rangesfm import _ceres
-from rangesfm.geometry import IDENTITY
+from rangesfm.geometry.similarity import IDENTITY
+from rangesfm.geometry.trajectory import Trajectory, pose_of, trajectory_from_reconstruction
 from rangesfm.options import CameraOptions
-from rangesfm.ranging.anchors import AnchorEstimate
+from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.observations import RangeObservations
-from rangesfm.refine import refine_with_ranges
+from rangesfm.refine.with_ranges import refine_with_ranges
 from rangesfm.simulate.model import SyntheticModel, synthetic_model
 from rangesfm.simulate.path import CameraPath, sequence_path
 from rangesfm.simulate.ranges import Radio, simulate_ranges
-from rangesfm.trajectory import Trajectory, pose_of, trajectory_from_reconstruction
 
 Array = npt.NDArray[np.float64]
 

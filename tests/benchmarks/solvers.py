@@ -44,10 +44,10 @@ from scipy.spatial.transform import Rotation
 from tests.peak_memory import peak_bytes
 
 from rangesfm import _ceres
-from rangesfm.geometry import IDENTITY
+from rangesfm.geometry.similarity import IDENTITY
+from rangesfm.geometry.trajectory import pose_of
 from rangesfm.simulate.model import synthetic_model
 from rangesfm.simulate.path import sequence_path
-from rangesfm.trajectory import pose_of
 
 Array = npt.NDArray[np.float64]
 

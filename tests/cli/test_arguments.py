@@ -8,8 +8,8 @@ import pytest
 
 from rangesfm.cli.arguments import normalize, parse
 from rangesfm.cli.survey_flags import survey_from_arguments
-from rangesfm.config import Survey
 from rangesfm.errors import InputError
+from rangesfm.survey.settings import Survey
 
 
 def survey_of(*argv: str) -> Survey:

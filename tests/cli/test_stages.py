@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
+from rangesfm.ceres.doctor import Check
 from rangesfm.cli import main
-from rangesfm.config import Survey
-from rangesfm.doctor import Check
+from rangesfm.survey.settings import Survey
 
 
 @dataclass
@@ -33,10 +33,10 @@ class Calls:
 @pytest.fixture
 def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calls:
     calls = Calls()
-    pipeline = ModuleType("rangesfm.pipeline")
+    pipeline = ModuleType("rangesfm.workflows.run")
     for name in ("run_survey", "reconstruct_survey", "scale_model", "refine_model"):
         setattr(pipeline, name, calls.stage(name))
-    monkeypatch.setitem(sys.modules, "rangesfm.pipeline", pipeline)
+    monkeypatch.setitem(sys.modules, "rangesfm.workflows.run", pipeline)
     (tmp_path / "photos").mkdir()
     (tmp_path / "model").mkdir()
     (tmp_path / "uwb.csv").touch()
@@ -97,7 +97,7 @@ def test_doctor_fails_where_a_part_does_not_fit(
         Check("numpy", "2.0", "any", True),
         Check("pyceres", "1.0", "2.6", ok, "" if ok else "pip install pyceres==2.6"),
     ]
-    monkeypatch.setattr("rangesfm.doctor.diagnose", lambda: checks)
+    monkeypatch.setattr("rangesfm.ceres.doctor.diagnose", lambda: checks)
     assert main(["doctor"]) == status
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == (2 if ok else 3)

@@ -13,8 +13,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
-from rangesfm.export import COVARIANCE_FORMATS, EXPORTERS, export_model, export_result, write_model, write_positions
-from rangesfm.geometry import Similarity
+from rangesfm.export import COVARIANCE_FORMATS, EXPORTERS, export_model, write_model, write_positions
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.workflows.export_result import export_result
 
 Array = npt.NDArray[np.float64]
 

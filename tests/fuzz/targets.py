@@ -12,19 +12,19 @@ from typing import Any
 
 import numpy as np
 
-from rangesfm.config import Survey, read_survey
 from rangesfm.distances.tape import Tape, read_tape
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.export.apply import apply_to
-from rangesfm.geometry import Similarity
-from rangesfm.ranging.anchor_file import read_anchors
-from rangesfm.ranging.anchors import Anchor
-from rangesfm.ranging.error_curve import ErrorCurve, read_error_curve
+from rangesfm.geometry.reference import Reference, read_reference
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.anchor_file import read_anchors
+from rangesfm.ranging.errors.error_curve import ErrorCurve, read_error_curve
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges, write_ranges_csv
 from rangesfm.ranging.summary import summarize_ranges
-from rangesfm.reference import Reference, read_reference
-from rangesfm.result_folder import ResultFolder, read_result_folder
+from rangesfm.result.folder import ResultFolder, read_result_folder
+from rangesfm.survey.settings import Survey, read_survey
 from rangesfm.vision.image_times import ImageTimes, read_image_times_csv
 
 CORPUS = Path(__file__).parent / "corpus"

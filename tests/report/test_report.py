@@ -20,7 +20,7 @@ from rangesfm.report import write_report
 from rangesfm.report.content import gather
 from rangesfm.report.result_scene import scene_of
 from rangesfm.report.scene import scene_data
-from rangesfm.result_folder import read_result_folder
+from rangesfm.result.folder import read_result_folder
 
 MakeResult = Callable[..., Path]
 SECTIONS = ["verdict", "checks", "view-section", "path", "scale", "ranges", "anchors", "run"]

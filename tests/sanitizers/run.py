@@ -29,7 +29,7 @@ OPTIONS = {
     "UBSAN_OPTIONS": "print_stacktrace=1",
     "TSAN_OPTIONS": "halt_on_error=1",
 }
-TESTS = ("tests/ceres", "tests/test_covariance.py")
+TESTS = ("tests/ceres", "tests/ceres/test_covariance.py")
 # It looks at what the extension is linked with, which is the sanitizer here.
 NOT_MEANT = "tests/ceres/test_compatibility.py::test_the_compiled_part_needs_no_library_that_pycolmap_does_not_need_too"
 _SITE = "import sys\nsys.meta_path = [finder for finder in sys.meta_path if isinstance(finder, type)]\n"

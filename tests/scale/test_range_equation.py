@@ -11,8 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rangesfm.distances.ends import LocatedDistances
-from rangesfm.geometry import IDENTITY, Similarity
-from rangesfm.gravity import gravity_of
+from rangesfm.geometry.gravity import gravity_of
+from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.scale import range_equation
 from rangesfm.scale.range_equation import RangeProblem, RangeState, predicted_ranges, solve
 

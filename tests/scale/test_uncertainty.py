@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from rangesfm.options import RangeModelOptions, ScaleOptions
-from rangesfm.ranging.shared_errors import ANTENNA_STDDEV_M
+from rangesfm.ranging.errors.shared_errors import ANTENNA_STDDEV_M
 from rangesfm.scale.estimate import ScaleUncertainty
 from rangesfm.simulate.ranges import Radio
 

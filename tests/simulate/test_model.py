@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.simulate.model import SyntheticModel, synthetic_model
 from rangesfm.simulate.path import CameraPath, orbit_path, sequence_path
-from rangesfm.trajectory import trajectory_from_reconstruction
 
 
 def _model(path: CameraPath, num_frames: int, **options: object) -> SyntheticModel:

@@ -12,16 +12,16 @@ import pytest
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 
-from rangesfm.config import read_survey
 from rangesfm.errors import InputError
-from rangesfm.ranging.anchor_file import read_anchors
+from rangesfm.files.sole_writer import sole_writer
+from rangesfm.geometry.reference import read_reference
+from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.readers import read_ranges
-from rangesfm.reference import read_reference
 from rangesfm.simulate import survey as survey_module
 from rangesfm.simulate.courtyard import ANCHOR_POSITIONS_M
 from rangesfm.simulate.photos import PhotoCamera
 from rangesfm.simulate.survey import ANCHOR_STDDEV_M, DemoSurvey, make_demo_survey, photo_exif
-from rangesfm.sole_writer import sole_writer
+from rangesfm.survey.settings import read_survey
 
 NUM_PHOTOS = 4
 IMAGE_SIZE = (120, 80)

@@ -30,7 +30,7 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from rangesfm.errors import GeometryError
-from rangesfm.ranging.trilateration import TrilaterationOptions, trilaterate
+from rangesfm.ranging.anchors.trilateration import TrilaterationOptions, trilaterate
 from rangesfm.simulate.path import loop_path
 
 Array = npt.NDArray[np.float64]

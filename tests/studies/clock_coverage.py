@@ -21,11 +21,11 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import GeometryError
-from rangesfm.ranging.clock import estimate_time_offset
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.ranging.clock.estimate import estimate_time_offset
 from rangesfm.ranging.log import RangeLog
 from rangesfm.simulate.path import CameraPath
 from rangesfm.simulate.ranges import Radio, simulate_ranges
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

@@ -28,16 +28,16 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from rangesfm.comparison import ComparisonRow, compare, format_table
-from rangesfm.config import Survey, read_survey
+from rangesfm.compare.with_reference import ComparisonRow, compare, format_table
 from rangesfm.errors import InputError
-from rangesfm.inputs import read_ranging_inputs, times_of_model
-from rangesfm.pipeline import refine_model
+from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.progress import SilentProgress
-from rangesfm.ranges_in_mapping import AdjustmentWithRanges
-from rangesfm.trajectory import trajectory_from_reconstruction
+from rangesfm.survey.inputs import read_ranging_inputs, times_of_model
+from rangesfm.survey.settings import Survey, read_survey
 from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images
 from rangesfm.vision.reconstruct import reconstruct
+from rangesfm.workflows.ranges_in_mapping import AdjustmentWithRanges
+from rangesfm.workflows.run import refine_model
 
 # What differs little from the last steps of a solver that converges.
 _TOLERANCE = 1e-10

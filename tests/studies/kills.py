@@ -28,9 +28,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesfm.model_files import read_model
+from rangesfm.colmap.model_files import read_model
+from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.simulate.survey import TIME_OFFSET_S, make_demo_survey
-from rangesfm.trajectory import trajectory_from_reconstruction
 
 TOLERANCE = 1e-9
 # All steps depend on it; the demo's has a focal length of 280.8 pixels.

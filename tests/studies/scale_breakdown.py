@@ -30,15 +30,15 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import ScaleOptions
-from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.two_candidate import two_candidate
 from rangesfm.simulate.path import loop_path
 from rangesfm.simulate.ranges import Radio, simulate_ranges_at
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

@@ -26,17 +26,17 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from rangesfm.geometry import Similarity, align_points
-from rangesfm.model_transform import rescale
+from rangesfm.colmap.transform import rescale
+from rangesfm.geometry.similarity import Similarity, align_points
+from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.options import CameraOptions, RangeModelOptions
-from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
-from rangesfm.refine import refine_with_ranges
+from rangesfm.refine.with_ranges import refine_with_ranges
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.simulate.model import SyntheticModel, synthetic_model
 from rangesfm.simulate.path import loop_path
 from rangesfm.simulate.ranges import Radio, simulate_ranges_at
-from rangesfm.trajectory import trajectory_from_reconstruction
 
 Array = npt.NDArray[np.float64]
 

@@ -9,22 +9,22 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from rangesfm.ceres.covariance import joint_covariance
+from rangesfm.colmap.transform import rescale
 from rangesfm.costs import add_residual_block, normal_prior_cost, range_cost
-from rangesfm.covariance import joint_covariance
-from rangesfm.geometry import IDENTITY, rmse
-from rangesfm.model_transform import rescale
+from rangesfm.geometry.similarity import IDENTITY, rmse
+from rangesfm.geometry.trajectory import Trajectory, pose_of, trajectory_from_reconstruction
 from rangesfm.options import CameraOptions, RangeModelOptions
-from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeObservations
-from rangesfm.refine import RefineSummary, refine_with_ranges
+from rangesfm.refine.with_ranges import RefineSummary, refine_with_ranges
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.simulate.model import SyntheticModel, synthetic_model
 from rangesfm.simulate.path import CameraPath, lap_path, loop_path
 from rangesfm.simulate.ranges import Radio, simulate_ranges_at
-from rangesfm.trajectory import Trajectory, pose_of, trajectory_from_reconstruction
 
 Array = npt.NDArray[np.float64]
 

@@ -55,10 +55,10 @@ import pycolmap
 from tests.peak_memory import peak_bytes
 from tests.simulated_database import camera_options, matched_photos, write_database
 
+from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.options import MapperOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.readers.canonical import write_ranges_csv
-from rangesfm.reference import Reference, write_reference
 from rangesfm.simulate.model import synthetic_model
 from rangesfm.simulate.path import loop_path
 from rangesfm.simulate.ranges import Radio, simulate_ranges

@@ -20,14 +20,14 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import Similarity
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import ScaleOptions
-from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.simulate.path import loop_path, orbit_path
 from rangesfm.simulate.ranges import Radio, simulate_ranges_at
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rangesfm.config import Survey, read_survey
 from rangesfm.errors import InputError, one_line
 from rangesfm.failures import Failure, failure_of
+from rangesfm.survey.settings import Survey, read_survey
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from distributed import get_worker
 from distributed.system import MEMORY_LIMIT
 
 from rangesfm.batch.shares import Share
-from rangesfm.config import Survey
-from rangesfm.supervision import Ended, child_command, supervise
+from rangesfm.processes.supervision import Ended, child_command, supervise
+from rangesfm.survey.settings import Survey
 from rangesfm.vision.submaps import Submap
 
 # By the system for want of memory, or by somebody from outside: then it is worth another try.

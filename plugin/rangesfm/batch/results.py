@@ -8,9 +8,9 @@ from pathlib import Path
 from rangesfm.batch.course import Course
 from rangesfm.batch.page import render
 from rangesfm.batch.rows import Status, SurveyRow
-from rangesfm.doctor import versions
-from rangesfm.files import new_file
-from rangesfm.outputs import write_csv, write_result
+from rangesfm.ceres.doctor import versions
+from rangesfm.files.atomic import new_file
+from rangesfm.result.outputs import write_csv, write_result
 
 TABLE_NAME, JSON_NAME, PAGE_NAME = "batch.csv", "batch.json", "batch.html"
 

@@ -12,10 +12,10 @@ from rangesfm.errors import InputError
 from rangesfm.progress import Progress
 
 if TYPE_CHECKING:
-    from rangesfm.config import Survey
+    from rangesfm.compare.models import NamedModel
+    from rangesfm.compare.ranges import ModelRanges
     from rangesfm.distances.tape import Tape
-    from rangesfm.model_comparison import NamedModel
-    from rangesfm.model_ranges import ModelRanges
+    from rangesfm.survey.settings import Survey
 
 
 _WITHOUT_LOG = ("--distances", "--markers")
@@ -53,7 +53,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     reference = None if args.reference is None else Path(args.reference)
     if len(paths) == 1:
         _check_more_than_one_is_not_asked_for(args, paths[0])
-        from rangesfm.comparison import compare_folder
+        from rangesfm.compare.with_reference import compare_folder
 
         return Outcome([str(compare_folder(paths[0], reference))])
     return _compare_many(args, paths, reference)
@@ -67,9 +67,9 @@ def _check_more_than_one_is_not_asked_for(args: argparse.Namespace, path: Path) 
 
 
 def _compare_many(args: argparse.Namespace, paths: list[Path], reference_path: Path | None) -> Outcome:
-    from rangesfm.comparison import compare, format_table
-    from rangesfm.model_comparison import compare_many, read_models
-    from rangesfm.reference import read_reference
+    from rangesfm.compare.models import compare_many, read_models
+    from rangesfm.compare.with_reference import compare, format_table
+    from rangesfm.geometry.reference import read_reference
 
     survey = _survey(args)
     models = read_models(paths)
@@ -79,7 +79,7 @@ def _compare_many(args: argparse.Namespace, paths: list[Path], reference_path: P
         trajectories = {model.name: model.path for model in comparison.models}
         lines += ["", format_table(compare(trajectories, read_reference(reference_path), frame=None))]
     if args.output_path is not None:
-        from rangesfm.comparison_page import write_comparison
+        from rangesfm.compare.page import write_comparison
 
         lines += ["", f"page: {write_comparison(comparison, Path(args.output_path))}"]
     return Outcome(lines)
@@ -95,8 +95,8 @@ def _survey(args: argparse.Namespace) -> Survey:
 
 
 def _ranges(survey: Survey, first: NamedModel, path: Path) -> ModelRanges | None:
-    from rangesfm.inputs import read_ranging_inputs
-    from rangesfm.model_ranges import ranges_of_survey
+    from rangesfm.compare.ranges import ranges_of_survey
+    from rangesfm.survey.inputs import read_ranging_inputs
 
     if survey.ranges.path is None or first.model is None:
         return None

@@ -51,8 +51,8 @@ def add_command(commands: Commands) -> None:
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
-    from rangesfm.export import export_result
     from rangesfm.options import ExportOptions
+    from rangesfm.workflows.export_result import export_result
 
     source = result_path(args)
     formats = DEFAULT_FORMATS if args.formats is None else args.formats.replace(",", " ").split()
@@ -73,7 +73,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _apply(source: Path, args: argparse.Namespace, options: ExportOptions) -> Outcome:
-    from rangesfm.export import apply_result
+    from rangesfm.workflows.export_result import apply_result
 
     if args.formats is not None:
         raise InputError("--apply_to writes files in their own formats: leave out --formats")
@@ -84,7 +84,7 @@ def _apply(source: Path, args: argparse.Namespace, options: ExportOptions) -> Ou
 
 
 def _is_site(source: Path) -> bool:
-    from rangesfm.result_folder import read_result_folder
+    from rangesfm.result.folder import read_result_folder
 
     return read_result_folder(source).frame == "site"
 

@@ -36,7 +36,7 @@ def add_command(commands: Commands) -> None:
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     args.images = None
     survey = survey_from_arguments(args)
-    from rangesfm.join_surveys import join_surveys
+    from rangesfm.workflows.join_surveys import join_surveys
 
     folders = [Path(result) for result in args.results]
     return Outcome(join_surveys(survey, folders, progress=progress).summary_lines())

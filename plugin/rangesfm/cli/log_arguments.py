@@ -24,8 +24,8 @@ def add_log_arguments(parser: argparse.ArgumentParser) -> None:
 
 def read_log(args: argparse.Namespace, anchor_ids: Sequence[str] = ()) -> RangeLog:
     """The log that the arguments name; ``anchor_ids`` as for ``read_ranges``."""
-    from rangesfm import inputs
-    from rangesfm.config import survey_from_tables
+    from rangesfm.survey import inputs
+    from rangesfm.survey.settings import survey_from_tables
 
     config = survey_from_tables({}, Path.cwd(), overrides_from_arguments(args)).ranges
     return inputs.read_log(replace(config, path=Path(args.log), format=args.format), anchor_ids)

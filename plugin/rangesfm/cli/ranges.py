@@ -12,7 +12,7 @@ from rangesfm.progress import Progress
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rangesfm.ranging.anchors import Anchor
+    from rangesfm.ranging.anchors.anchor import Anchor
     from rangesfm.ranging.summary import RangeSummary
 
 
@@ -37,7 +37,7 @@ def add_command(commands: Commands) -> None:
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
-    from rangesfm.ranging.anchor_file import read_anchors
+    from rangesfm.ranging.anchors.anchor_file import read_anchors
     from rangesfm.ranging.readers import read_anchors_in_log, write_ranges_csv
     from rangesfm.ranging.summary import summarize_ranges
 

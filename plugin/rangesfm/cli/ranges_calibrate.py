@@ -14,7 +14,7 @@ from rangesfm.progress import Progress
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rangesfm.ranging.calibration import Calibration
+    from rangesfm.ranging.errors.calibration import Calibration
 
 
 def add_command(commands: Commands) -> None:
@@ -40,10 +40,10 @@ def add_command(commands: Commands) -> None:
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
-    from rangesfm.inputs import of_one_tag
-    from rangesfm.ranging.anchor_file import read_anchors
-    from rangesfm.ranging.calibration import calibrate_ranges
-    from rangesfm.ranging.error_curve import write_error_curve
+    from rangesfm.ranging.anchors.anchor_file import read_anchors
+    from rangesfm.ranging.errors.calibration import calibrate_ranges
+    from rangesfm.ranging.errors.error_curve import write_error_curve
+    from rangesfm.survey.inputs import of_one_tag
 
     anchors = read_anchors(args.anchors)
     log = of_one_tag(read_log(args), args.tag_id)

@@ -30,7 +30,7 @@ def add_command(commands: Commands) -> None:
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     survey = survey_from_arguments(args)
     require_images(survey)
-    from rangesfm.pipeline import reconstruct_survey
+    from rangesfm.workflows.run import reconstruct_survey
 
     result = reconstruct_survey(survey, progress=progress, restart=args.restart)
     return Outcome(result.summary_lines())

@@ -36,7 +36,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     survey = survey_from_arguments(args)
     require_model(survey)
     require_ranges(survey)
-    from rangesfm.pipeline import refine_model
+    from rangesfm.workflows.run import refine_model
 
     result = refine_model(survey, progress=progress)
     return Outcome(result.summary_lines())

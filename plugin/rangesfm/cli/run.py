@@ -22,8 +22,8 @@ from rangesfm.cli.survey_flags import (
 from rangesfm.progress import Progress
 
 if TYPE_CHECKING:
-    from rangesfm.config import Survey
-    from rangesfm.pipeline import RunResult
+    from rangesfm.survey.settings import Survey
+    from rangesfm.workflows.run import RunResult
 
 
 def add_command(commands: Commands) -> None:
@@ -49,8 +49,8 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     require_ranges(survey)
     if not args.live:
         return Outcome(_run(survey, progress, args.restart).summary_lines())
+    from rangesfm.files.sole_writer import sole_writer
     from rangesfm.report.live import live_page
-    from rangesfm.sole_writer import sole_writer
 
     with sole_writer(survey.output_path), live_page(progress, survey.output_path) as page:
         page.message(f"this run can be watched in {page.path}")
@@ -60,7 +60,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _run(survey: Survey, progress: Progress, restart: bool) -> RunResult:
-    from rangesfm.pipeline import refine_model, run_survey
+    from rangesfm.workflows.run import refine_model, run_survey
 
     if survey.model_path is None:
         return run_survey(survey, progress=progress, restart=restart)

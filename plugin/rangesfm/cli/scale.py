@@ -32,7 +32,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     survey = survey_from_arguments(args)
     require_model(survey)
     require_ranges(survey)
-    from rangesfm.pipeline import scale_model
+    from rangesfm.workflows.run import scale_model
 
     result = scale_model(survey, progress=progress)
     return Outcome(result.summary_lines())

@@ -13,7 +13,7 @@ from rangesfm.errors import InputError
 from rangesfm.options import ANCHOR_FRAMES, CAMERA_SIDES, MATCHING_METHODS, SCALE_METHODS, STAMP_UNITS
 
 if TYPE_CHECKING:
-    from rangesfm.config import Survey
+    from rangesfm.survey.settings import Survey
 
 
 @dataclass(frozen=True)
@@ -288,7 +288,7 @@ def add_restart_argument(parser: argparse.ArgumentParser) -> None:
 
 def survey_from_arguments(args: argparse.Namespace) -> Survey:
     """The survey file, if any, with the flags in place of its keys."""
-    from rangesfm.config import read_survey, survey_from_tables
+    from rangesfm.survey.settings import read_survey, survey_from_tables
 
     overrides = overrides_from_arguments(args)
     if args.images is not None:

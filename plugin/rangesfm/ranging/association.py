@@ -10,11 +10,11 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import AssociationOptions
+from rangesfm.ranging.clock.time_resolution import time_resolution_s
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
-from rangesfm.ranging.time_resolution import time_resolution_s
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.geometry import Similarity
+from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
 
 Indices = npt.NDArray[np.int64]

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rangesfm.errors import InputError
-from rangesfm.files import new_file
-from rangesfm.ranging.calibration import Calibration
+from rangesfm.files.atomic import new_file
+from rangesfm.ranging.errors.calibration import Calibration
 from rangesfm.ranging.log import RangeLog
 
 if TYPE_CHECKING:

@@ -6,9 +6,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import InputError
+from rangesfm.files.tables import printable
+from rangesfm.geometry.reference import Reference
 from rangesfm.ranging.log import RangeLog
-from rangesfm.reference import Reference
-from rangesfm.tables import printable
 
 Array = npt.NDArray[np.float64]
 

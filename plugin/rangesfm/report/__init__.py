@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rangesfm.files import new_file
+from rangesfm.files.atomic import new_file
+from rangesfm.files.sole_writer import sole_writer
 from rangesfm.report.content import gather
 from rangesfm.report.figures import all_figures
 from rangesfm.report.page import render
 from rangesfm.report.pictures import write_pictures
-from rangesfm.result_folder import read_result_folder
-from rangesfm.sole_writer import sole_writer
+from rangesfm.result.folder import read_result_folder
 
 __all__ = ["write_report", "write_report_pictures"]
 

@@ -14,10 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import InputError
-from rangesfm.reference import read_reference
+from rangesfm.geometry.reference import read_reference
+from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.report.true_ranges import true_ranges_m
-from rangesfm.result_folder import RangesAsUsed, ResultFolder
-from rangesfm.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.result.folder import RangesAsUsed, ResultFolder
 
 if TYPE_CHECKING:
     import pycolmap

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.geometry import align_points
+from rangesfm.geometry.similarity import align_points
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.report.content import Content
 from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Panel, Picture, Series
 from rangesfm.report.svg import equal_chart
 from rangesfm.report.text import count
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from rangesfm.files import make_output_folder, new_file
+from rangesfm.files.atomic import make_output_folder, new_file
 from rangesfm.progress import Progress
 from rangesfm.report.markup import Child, Markup, element
 from rangesfm.report.page import document

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rangesfm.errors import InputError
-from rangesfm.files import make_output_folder, new_file
+from rangesfm.files.atomic import make_output_folder, new_file
 from rangesfm.report.plot import Figure, Panel, Series
 
 if TYPE_CHECKING:

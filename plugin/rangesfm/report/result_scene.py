@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.report.content import Content, Summary, as_number, is_position
 from rangesfm.report.head import scale_interval
 from rangesfm.report.scene import Scene, SceneAnchor, ScenePath
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.report.packing import pack
 from rangesfm.report.thumbnails import thumbnails
-from rangesfm.result_folder import RangesAsUsed
-from rangesfm.trajectory import Trajectory
+from rangesfm.result.folder import RangesAsUsed
 
 Array = npt.NDArray[np.float64]
 

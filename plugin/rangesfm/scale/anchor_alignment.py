@@ -11,8 +11,8 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import Similarity, align_points, path_shape, rmse
-from rangesfm.ranging.robust_loss import CAUCHY
+from rangesfm.geometry.similarity import Similarity, align_points, path_shape, rmse
+from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.scale.anchor_plane import is_line
 
 Array = npt.NDArray[np.float64]

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.geometry import IDENTITY, Similarity
-from rangesfm.ranging.anchors import AnchorEstimate
-from rangesfm.ranging.robust_loss import GEMAN_MCCLURE
-from rangesfm.scale.problem import SurveyProblem
+from rangesfm.geometry.similarity import IDENTITY, Similarity
+from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE
+from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import RangeProblem, RangeState, solve
 from rangesfm.scale.solution import MIN_COST_GAP, Solution
 from rangesfm.scale.starts import anchor_alone, choose_sides, mirrored, spread_subset
@@ -65,7 +65,7 @@ def _one_anchor(solution: Solution, k: int) -> tuple[RangeProblem, RangeState]:
 
 
 def anchor_estimates(
-    survey: SurveyProblem, solution: Solution, anchor_ids: tuple[str, ...]
+    survey: ScaleProblem, solution: Solution, anchor_ids: tuple[str, ...]
 ) -> tuple[AnchorEstimate, ...]:
     """All anchors of the log, with stddev widened by the errors' correlation, and mirror places."""
     problem, state = solution.problem, solution.fit.state

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.scale.consensus import TOLERANCE_STDDEVS, agreeing_intervals
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.two_candidate import two_candidate
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from rangesfm.geometry import Similarity
-from rangesfm.ranging.anchors import AnchorEstimate
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.two_candidate import TwoCandidate
 

@@ -10,24 +10,24 @@ import numpy.typing as npt
 
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import Similarity
-from rangesfm.gravity import gravity_of
+from rangesfm.geometry.gravity import gravity_of
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import RangeModelOptions, ScaleOptions
-from rangesfm.ranging.anchors import Anchor
-from rangesfm.ranging.noise import shared_stddev, stretch_labels
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.errors.noise import shared_stddev, stretch_labels
+from rangesfm.ranging.errors.shared_errors import CURVE_STDDEV_M
 from rangesfm.ranging.observations import RangeObservations, RangeStatus, status_by_weight
-from rangesfm.ranging.shared_errors import CURVE_STDDEV_M
 from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
 from rangesfm.scale.cutoff import cutoff_test
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.levelled_places import levelled_places
-from rangesfm.scale.problem import SurveyProblem, survey_problem
+from rangesfm.scale.problem import ScaleProblem, scale_problem
 from rangesfm.scale.sensitivity import scale_sensitivity
-from rangesfm.scale.solution import Solution, solve_survey
+from rangesfm.scale.solution import Solution, solve_scale
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
 from rangesfm.scale.uncertainty import resampled_log_scales, scale_uncertainty
 from rangesfm.scale.verdict import judge
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 
@@ -60,10 +60,10 @@ def initialize_scale(
     """
     options, range_model = options or ScaleOptions(), range_model or RangeModelOptions()
     gravity = gravity_of(options.up_in_first_camera)
-    survey = survey_problem(observations, trajectory, anchors, anchor_frame, range_model, distances, gravity)
+    survey = scale_problem(observations, trajectory, anchors, anchor_frame, range_model, distances, gravity)
     blocks = _time_blocks(observations, survey.rows, options.bootstrap_block_s)
     shared = shared_stddev(observations.log)[survey.rows]
-    solution = solve_survey(
+    solution = solve_scale(
         survey.ranges,
         anchors_are_known=survey.anchors_are_known,
         center_stddev=observations.center_stddev[survey.rows],
@@ -121,7 +121,7 @@ def _resampled_scales(solution: Solution, blocks: npt.NDArray[np.int64], num: in
     return np.asarray(solution.fit.state.metric_from_model.scale * np.exp(steps))
 
 
-def _model_from_cam(observations: RangeObservations, trajectory: Trajectory, survey: SurveyProblem) -> Array:
+def _model_from_cam(observations: RangeObservations, trajectory: Trajectory, survey: ScaleProblem) -> Array:
     """(k, 3, 3) rotation at the keyframe nearest to each range, into the first camera's frame."""
     nearest = np.where(observations.weight < 0.5, observations.before, observations.after)[survey.rows]
     turned: Array = survey.first_camera_from_sfm.rotation @ trajectory.world_from_cam[nearest]

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
 
-from rangesfm.geometry import Similarity
-from rangesfm.ranging.robust_loss import CAUCHY
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.scale.range_equation import (
     Columns,
     RangeProblem,

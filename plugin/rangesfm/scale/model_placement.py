@@ -9,15 +9,15 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import Similarity, path_shape, rmse
-from rangesfm.ranging.anchors import AnchorEstimate
+from rangesfm.geometry.similarity import Similarity, path_shape, rmse
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.scale.anchor_alignment import PlacedAnchor, align_by_anchors
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.joint_models import JointFit, JointState, solve_together
 from rangesfm.scale.range_equation import RangeProblem
 from rangesfm.scale.solution import MIN_COST_GAP
 from rangesfm.scale.starts import spread_subset
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

@@ -12,15 +12,15 @@ from rangesfm.distances.by_radio import distances_by_radio
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.distances.surveyed import surveyed_distances
 from rangesfm.errors import GeometryError, InputError
-from rangesfm.geometry import Similarity, path_shape
-from rangesfm.gravity import Gravity
+from rangesfm.geometry.gravity import Gravity
+from rangesfm.geometry.similarity import Similarity, path_shape
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import RangeModelOptions
-from rangesfm.ranging.anchors import Anchor
-from rangesfm.ranging.noise import START_STDDEV_M, shared_stddev
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.errors.noise import START_STDDEV_M, shared_stddev
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.anchor_plane import is_line, is_steep
 from rangesfm.scale.range_equation import RangeProblem
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 
@@ -31,7 +31,7 @@ _MIN_RANGES_OF_UNKNOWN = 5
 
 
 @dataclass(frozen=True)
-class SurveyProblem:
+class ScaleProblem:
     """A RangeProblem and how it hangs on the survey.
 
     Attributes:
@@ -53,7 +53,7 @@ class SurveyProblem:
     left_out: tuple[str, ...]
 
 
-def survey_problem(
+def scale_problem(
     observations: RangeObservations,
     trajectory: Trajectory,
     anchors: Sequence[Anchor],
@@ -61,7 +61,7 @@ def survey_problem(
     range_model: RangeModelOptions,
     distances: LocatedDistances | None = None,
     gravity: Gravity | None = None,
-) -> SurveyProblem:
+) -> ScaleProblem:
     """Set up the estimation.
 
     Args:
@@ -104,7 +104,7 @@ def survey_problem(
         gravity=gravity if anchor_frame == "site" and bool(known.any()) else None,
     )
     frame = "site" if ranges.frame_is_free else "first_camera"
-    return SurveyProblem(ranges, rows, first_camera_from_sfm, frame, bool(known.any()), tuple(notes), left_out)
+    return ScaleProblem(ranges, rows, first_camera_from_sfm, frame, bool(known.any()), tuple(notes), left_out)
 
 
 def _all_distances(

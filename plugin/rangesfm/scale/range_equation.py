@@ -18,10 +18,10 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from rangesfm.distances.ends import LocatedDistances
-from rangesfm.geometry import Similarity
-from rangesfm.gravity import Gravity
-from rangesfm.ranging.noise import bias_whitening
-from rangesfm.ranging.robust_loss import CAUCHY, RobustLoss
+from rangesfm.geometry.gravity import Gravity
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.ranging.errors.noise import bias_whitening
+from rangesfm.ranging.errors.robust_loss import CAUCHY, RobustLoss
 from rangesfm.scale.distance_equation import distance_jacobian, distance_residuals
 
 Array = npt.NDArray[np.float64]

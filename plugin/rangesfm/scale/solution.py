@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import NEARLY_STRAIGHT, path_kind, path_shape
-from rangesfm.ranging.inlier_noise import InlierNoise, inlier_noise
-from rangesfm.ranging.noise import correlation_inflation
-from rangesfm.ranging.place import place_labels, shares_by_residuals
-from rangesfm.ranging.robust_loss import GEMAN_MCCLURE
+from rangesfm.geometry.similarity import NEARLY_STRAIGHT, path_kind, path_shape
+from rangesfm.ranging.errors.inlier_noise import InlierNoise, inlier_noise
+from rangesfm.ranging.errors.noise import correlation_inflation
+from rangesfm.ranging.errors.place import place_labels, shares_by_residuals
+from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE
 from rangesfm.scale.anchor_plane import camera_side_of, mirrored_map, on_side
 from rangesfm.scale.range_equation import (
     RangeFit,
@@ -80,7 +80,7 @@ class Solution:
     noise_stddev_m: float
 
 
-def solve_survey(
+def solve_scale(
     problem: RangeProblem,
     *,
     anchors_are_known: bool,
@@ -120,7 +120,7 @@ def solve_survey(
 
 @dataclass(frozen=True)
 class _ErrorModel:
-    """What is known of the ranges' errors; the arrays are those of ``solve_survey``."""
+    """What is known of the ranges' errors; the arrays are those of ``solve_scale``."""
 
     center_stddev: Array
     noise_stddev_m: Array

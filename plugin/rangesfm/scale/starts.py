@@ -14,8 +14,8 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import IDENTITY, Similarity, path_shape, round_middle
-from rangesfm.ranging.multilateration import multilaterate
+from rangesfm.geometry.similarity import IDENTITY, Similarity, path_shape, round_middle
+from rangesfm.ranging.anchors.multilateration import multilaterate
 from rangesfm.scale.consensus import consensus_scales
 from rangesfm.scale.range_equation import RangeProblem, RangeState, solve
 

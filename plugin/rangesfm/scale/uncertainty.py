@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.ranging.noise import inflation_before_fit
-from rangesfm.ranging.shared_errors import antenna_modes, curve_modes
+from rangesfm.ranging.errors.noise import inflation_before_fit
+from rangesfm.ranging.errors.shared_errors import antenna_modes, curve_modes
 from rangesfm.scale.estimate import ScaleUncertainty
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, directions_to_tag, predicted_ranges
 from rangesfm.scale.solution import Solution

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import NEARLY_FLAT, NEARLY_STRAIGHT, path_kind, path_shape
+from rangesfm.geometry.similarity import NEARLY_FLAT, NEARLY_STRAIGHT, path_kind, path_shape
 from rangesfm.options import ScaleOptions
-from rangesfm.ranging.anchors import AnchorEstimate
+from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.scale.cutoff import scale_drift
 from rangesfm.scale.estimate import NORMAL_95, CutoffTest, ScaleUncertainty
-from rangesfm.scale.problem import SurveyProblem
+from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import RangeFit
 from rangesfm.scale.solution import WHY_SCALE_IS_OPEN, Solution
 
@@ -51,7 +51,7 @@ class _Doubt:
 
 
 def judge(
-    survey: SurveyProblem,
+    survey: ScaleProblem,
     solution: Solution,
     uncertainty: ScaleUncertainty,
     per_anchor: dict[str, float],

@@ -16,16 +16,16 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 
 from rangesfm.errors import InputError
-from rangesfm.files import LEFTOVER, new_file, new_folder
+from rangesfm.files.atomic import LEFTOVER, new_file, new_folder
+from rangesfm.files.sole_writer import LOCK_NAME, sole_writer
+from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.progress import Progress, SilentProgress
 from rangesfm.ranging.readers.canonical import write_ranges_csv
-from rangesfm.reference import Reference, write_reference
 from rangesfm.simulate.courtyard import ANCHOR_POSITIONS_M, DEPTH_M, WIDTH_M, courtyard
 from rangesfm.simulate.path import CameraPath, loop_path
 from rangesfm.simulate.photos import PhotoCamera, develop, render
 from rangesfm.simulate.ranges import Radio, SimulatedRanges, simulate_ranges
 from rangesfm.simulate.scene import Scene
-from rangesfm.sole_writer import LOCK_NAME, sole_writer
 
 FloatArray = npt.NDArray[np.float64]
 

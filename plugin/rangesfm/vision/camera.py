@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pycolmap
 
+from rangesfm.colmap.passthrough import nearest_known
 from rangesfm.errors import InputError
 from rangesfm.options import CameraOptions
-from rangesfm.passthrough import nearest_known
 
 _MODELS = {name: model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pycolmap
 
+from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import InputError, ReconstructionError
 from rangesfm.options import MATCHING_METHODS, MapperOptions
-from rangesfm.passthrough import apply_options
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import named_by_place, num_compared_pairs, num_matching_pairs

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pycolmap
 
-from rangesfm.colmap_log import colmap_log
+from rangesfm.colmap.log import colmap_log
 from rangesfm.errors import OptionError
-from rangesfm.files import new_file
+from rangesfm.files.atomic import new_file
+from rangesfm.files.sole_writer import sole_writer
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import Progress, SilentProgress
-from rangesfm.sole_writer import sole_writer
 from rangesfm.vision.database import copy_stretch, remove_database
 from rangesfm.vision.mapping import NoModelError, map_incrementally, pipeline_options, read_models, remove_models
 from rangesfm.vision.matched_photos import MatchedPhotos

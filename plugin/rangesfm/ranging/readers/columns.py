@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import InputError
+from rangesfm.files.tables import Table, read_table
 from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.time_units import SECONDS_PER_UNIT, seconds_from_iso
 from rangesfm.ranging.twr import StampOptions, double_sided_range, single_sided_range
-from rangesfm.tables import Table, read_table
 
 UNITS_PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 STAMPS = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
