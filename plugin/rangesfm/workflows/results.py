@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rangesfm.ceres.doctor import versions
-from rangesfm.compare.with_reference import format_table, papers_table, reference_in_frame
+from rangesfm.comparison.with_reference import format_table, papers_table, reference_in_frame
 from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.rows import disagreements, distance_rows
 from rangesfm.export import COVARIANCE_FORMATS
