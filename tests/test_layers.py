@@ -22,7 +22,7 @@ LAYER_OF = {
     "files": ERRORS,
     "installed_versions": ERRORS,
     "sole_writer": ERRORS,
-    "_ceres": DATA,
+    "ceres": DATA,
     "child_process": ERRORS,
     "supervision": ERRORS,
     "colmap_log": DATA,
@@ -124,7 +124,7 @@ def test_only_one_package_touches_the_compiled_part_and_pyceres() -> None:
         if any(f"{name}.".startswith(("rangesfm._cpp.", "pyceres.")) for name in imports(path))
     ]
     assert touching, "not even the package that is there for it"
-    assert all(module.split(".")[0] == "_ceres" for module in touching)
+    assert all(module.split(".")[0] == "ceres" for module in touching)
 
 
 def test_the_layers_name_no_module_that_is_gone() -> None:
