@@ -59,14 +59,19 @@ def blocks_of(reconstruction: pycolmap.Reconstruction, pose_block: PoseBlock) ->
     )
 
 
-def add_one_by_one(adjuster: pycolmap.CeresBundleAdjuster, ranges: PlacedRanges, blocks: RangeBlocks) -> None:
+def add_one_by_one(
+    adjuster: pycolmap.CeresBundleAdjuster,
+    ranges: PlacedRanges,
+    blocks: RangeBlocks,
+    loss: pyceres.LossFunction | None = None,
+) -> None:
     for i in range(NUM_RANGES):
         ends = [blocks.anchors[ranges.anchor_index[i]], blocks.biases[ranges.anchor_index[i]]]
         tag = blocks.tags_in_cam[ranges.tag_index[i]]
         before, after = blocks.poses[ranges.before[i]], blocks.poses[ranges.after[i]]
         if before is after:
             cost = range_cost(range_m=ranges.range_m[i], tag_in_cam_m=tag, stddev_m=ranges.stddev_m[i])
-            add_residual_block(adjuster, cost, pyceres.CauchyLoss(LOSS_SCALE), [before, *ends])
+            add_residual_block(adjuster, cost, loss, [before, *ends])
         else:
             cost = interpolated_range_cost(
                 range_m=ranges.range_m[i],
@@ -75,7 +80,7 @@ def add_one_by_one(adjuster: pycolmap.CeresBundleAdjuster, ranges: PlacedRanges,
                 offset_in_world_m=ranges.offset_in_world_m[i],
                 stddev_m=ranges.stddev_m[i],
             )
-            add_residual_block(adjuster, cost, pyceres.CauchyLoss(LOSS_SCALE), [before, after, *ends])
+            add_residual_block(adjuster, cost, loss, [before, after, *ends])
 
 
 def cost_of(adjuster: pycolmap.CeresBundleAdjuster) -> float:
@@ -105,13 +110,24 @@ def test_cost_and_gradient_are_those_of_the_ranges_one_by_one(
     blocks = blocks_of(reconstruction, pose_block)
     one_by_one, together = adjuster_of(reconstruction), adjuster_of(reconstruction)
     before = together.problem.num_residual_blocks()
-    add_one_by_one(one_by_one, ranges, blocks)
-    rows = add_ranges(together, ranges, blocks, loss_scale=LOSS_SCALE)
+    add_one_by_one(one_by_one, ranges, blocks, pyceres.CauchyLoss(LOSS_SCALE))
+    add_ranges(together, ranges, blocks, loss_scale=LOSS_SCALE)
     assert gradient_norm(together) == pytest.approx(gradient_norm(one_by_one), rel=1e-9)
     # With one of Ceres' losses, half the squares of what the problem calls residuals are not the cost.
     assert cost_of(together) == pytest.approx(initial_cost(one_by_one), rel=1e-9)
-    assert len(set(rows)) == NUM_RANGES
     assert 0 < together.problem.num_residual_blocks() - before < NUM_RANGES / 2
+
+
+def test_each_range_has_its_residual_where_it_is_said_to_be(
+    reconstruction: pycolmap.Reconstruction, ranges: PlacedRanges, adjuster_of: AdjusterOf, pose_block: PoseBlock
+) -> None:
+    blocks = blocks_of(reconstruction, pose_block)
+    one_by_one, together = adjuster_of(reconstruction), adjuster_of(reconstruction)
+    add_one_by_one(one_by_one, ranges, blocks)
+    rows = add_ranges(together, ranges, blocks)
+    assert len(set(rows)) == NUM_RANGES
+    expected = np.asarray(one_by_one.problem.evaluate_residuals())[-NUM_RANGES:]
+    np.testing.assert_allclose(np.asarray(together.problem.evaluate_residuals())[rows], expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("loss_scale", [np.inf, 2.0], ids=["least squares", "robust"])
