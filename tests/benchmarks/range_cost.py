@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from rangesfm import _ceres
+from rangesfm import ceres
 from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.geometry.trajectory import Trajectory, pose_of, trajectory_from_reconstruction
 from rangesfm.options import CameraOptions
@@ -191,7 +191,7 @@ def main() -> None:
     parser.add_argument("--num_rounds", type=int, default=9)
     num_rounds = parser.parse_args().num_rounds
     survey = make_survey()
-    _ceres.check_compatibility()
+    ceres.check_compatibility()
     seconds: dict[Variant, list[float]] = {variant: [] for variant in VARIANTS}
     last: dict[Variant, Solve] = {}
     for _ in range(num_rounds):

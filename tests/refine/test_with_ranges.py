@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from tests.few_links import leave_few_links
 from tests.studies.scale_breakdown import spoilt
 
-from rangesfm import _ceres
+from rangesfm import ceres
 from rangesfm.colmap.transform import rescale
 from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.tape import Marker, Tape, TapedDistance
@@ -161,7 +161,7 @@ def adjust_by_colmap(sfm: pycolmap.Reconstruction) -> None:
 @pytest.fixture
 def adjusters(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[pycolmap.CeresBundleAdjuster]]:
     """The bundle adjusters that the refinement makes, to look into their problems."""
-    _ceres.check_compatibility()
+    ceres.check_compatibility()
     make, made = pycolmap.create_default_ceres_bundle_adjuster, []
 
     def make_and_keep(*arguments: Any) -> pycolmap.CeresBundleAdjuster:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from rangesfm._ceres.compatibility import check_compatibility
+from rangesfm.ceres.compatibility import check_compatibility
 
 if TYPE_CHECKING:
     import pycolmap

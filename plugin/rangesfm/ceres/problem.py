@@ -1,8 +1,7 @@
-"""Residuals into a bundle adjuster's problem, and robust losses for them."""
+"""Residuals into a bundle adjuster's problem."""
 
 from __future__ import annotations
 
-import math
 import weakref
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -10,32 +9,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm._ceres.compatibility import check_compatibility
-from rangesfm._ceres.costs import zero_tie_cost
-from rangesfm._ceres.types import CostFunction, LossFunction
+from rangesfm.ceres.compatibility import check_compatibility
 
 if TYPE_CHECKING:
+    import pyceres
     import pycolmap
+
+Array = npt.NDArray[np.float64]
 
 _NUM_POSE_PARAMS = 7
 _NUM_POSE_COLUMNS = 6
 
 
-def cauchy_loss(scale: float) -> LossFunction:
-    """Cauchy's robust loss ``scale^2 log(1 + r^2 / scale^2)``; scale in stddevs, positive."""
-    if not (math.isfinite(scale) and scale > 0):
-        raise ValueError(f"loss scale is {scale}, expected a finite number greater than 0")
-    import pyceres
-
-    loss: LossFunction = pyceres.CauchyLoss(scale)
-    return loss
-
-
 def add_residual_block(
     adjuster: pycolmap.CeresBundleAdjuster,
-    cost: CostFunction,
-    loss: LossFunction | None,
-    blocks: Sequence[npt.NDArray[np.float64]],
+    cost: pyceres.CostFunction,
+    loss: pyceres.LossFunction | None,
+    blocks: Sequence[Array],
 ) -> None:
     """Add a residual to a bundle adjuster's problem, so that nothing it needs can go missing or astray.
 
@@ -57,9 +47,35 @@ def add_residual_block(
     ResidualAdder(adjuster).add(cost, loss, blocks)
 
 
-def keep_from_elimination(
-    adjuster: pycolmap.CeresBundleAdjuster, block: npt.NDArray[np.float64], point: npt.NDArray[np.float64]
+def add_normal_prior(
+    adjuster: pycolmap.CeresBundleAdjuster, block: Array, mean: npt.ArrayLike, stddev: npt.ArrayLike
 ) -> None:
+    """Add what was known of a block of n numbers beforehand, each for itself: ``(x - mean) / stddev``.
+
+    Args:
+        adjuster: as in ``add_residual_block``.
+        block: (n,) without a manifold, such as an anchor, a range bias or a lever arm.
+        mean: (n,) in the block's unit.
+        stddev: of all, or (n,) likewise, positive.
+
+    Raises:
+        ValueError: a value is not finite, or a stddev not positive, or not of its shape.
+    """
+    means, stddevs = np.asarray(mean, dtype=np.float64), np.broadcast_to(stddev, block.shape)
+    variances = np.square(stddevs)
+    is_right = np.isfinite(means) & (stddevs > 0) & (variances > 0) & np.isfinite(variances)
+    if means.shape != block.shape or not is_right.all():
+        raise ValueError(
+            f"a prior of mean {mean!r} and stddev {stddev!r}, expected finite and positive for each number"
+        )
+    check_compatibility()
+    import pyceres
+
+    cost = pyceres.factors.NormalPrior(means, np.diag(variances))
+    add_residual_block(adjuster, cost, None, [block])
+
+
+def keep_from_elimination(adjuster: pycolmap.CeresBundleAdjuster, block: Array, point: Array) -> None:
     """Have Ceres eliminate the 3-D points alone, with its fastest kernels; for each free anchor, bias and the like.
 
     Ceres eliminates a set of blocks no two of which share a residual, first those of few neighbours, and has kernels
@@ -75,7 +91,7 @@ def keep_from_elimination(
     check_compatibility()
     from rangesfm import _cpp
 
-    add_residual_block(adjuster, zero_tie_cost(size_a=len(block), size_b=len(point)), None, [block, point])
+    add_residual_block(adjuster, _cpp.zero_tie_cost(size_a=len(block), size_b=len(point)), None, [block, point])
     if not adjuster.problem.has_manifold(block):
         manifold = _cpp.padded_manifold(size=len(block), tangent_size=_NUM_POSE_COLUMNS)
         adjuster.problem.set_manifold(block, manifold)
@@ -89,7 +105,7 @@ class ResidualAdder:
         self._problem = adjuster.problem
         self._used = _used_by_adjuster.setdefault(adjuster, [])
 
-    def add(self, cost: CostFunction, loss: LossFunction | None, blocks: Sequence[npt.NDArray[np.float64]]) -> None:
+    def add(self, cost: pyceres.CostFunction, loss: pyceres.LossFunction | None, blocks: Sequence[Array]) -> None:
         """See ``add_residual_block``."""
         for block in blocks:
             if block.dtype != np.float64 or not block.flags.carray:

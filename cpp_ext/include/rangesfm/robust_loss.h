@@ -1,5 +1,5 @@
-#ifndef RANGESFM_TWO_SIDED_LOSS_H_
-#define RANGESFM_TWO_SIDED_LOSS_H_
+#ifndef RANGESFM_ROBUST_LOSS_H_
+#define RANGESFM_ROBUST_LOSS_H_
 
 #include <cmath>
 
@@ -10,27 +10,22 @@ namespace rangesfm {
 //
 // Half the square of the value below is the loss of the residual r: Cauchy's, c^2 / 2 log(1 + r^2 / c^2), which grows
 // on and so leads to a minimum from further away, or Geman and McClure's, 1/2 r^2 / (1 + r^2 / c^2), which no outlier
-// raises beyond c^2 / 2. The scale c may be one of its own for ranges that are too long (predicted less than measured:
-// r < 0), which reflections make likelier, and for those that are too short. An infinite scale is least squares. Value
-// and slope are continuous also where the sides meet. With x = r^2 / c^2:
+// raises beyond c^2 / 2. An infinite scale c is least squares. With x = r^2 / c^2:
 //
 //   Cauchy          value = r g,              slope = 1 / ((1 + x) g),  g = sqrt(log(1 + x) / x), which is 1 at 0
 //   Geman-McClure   value = r / sqrt(1 + x),  slope = (1 + x)^-3/2
-class TwoSidedLoss {
+class RobustLoss {
  public:
   struct Robust {
     double value;
     double slope;  // derivative of the value with respect to the residual
   };
 
-  TwoSidedLoss() = default;
-  TwoSidedLoss(double scale_too_long, double scale_too_short, bool is_bounded = false)
-      : inv_scale_too_long_(1.0 / scale_too_long),
-        inv_scale_too_short_(1.0 / scale_too_short),
-        is_bounded_(is_bounded) {}
+  RobustLoss() = default;
+  RobustLoss(double scale, bool is_bounded) : inv_scale_(1.0 / scale), is_bounded_(is_bounded) {}
 
   Robust operator()(double residual) const {
-    const double in_scales = residual * (residual < 0.0 ? inv_scale_too_long_ : inv_scale_too_short_);
+    const double in_scales = residual * inv_scale_;
     const double x = in_scales * in_scales;
     if (x < kTiny) {
       return {residual, 1.0};
@@ -47,11 +42,10 @@ class TwoSidedLoss {
   // Below it, value and slope are those of least squares to the last digit.
   static constexpr double kTiny = 1e-17;
 
-  double inv_scale_too_long_ = 0.0;
-  double inv_scale_too_short_ = 0.0;
+  double inv_scale_ = 0.0;
   bool is_bounded_ = false;
 };
 
 }  // namespace rangesfm
 
-#endif  // RANGESFM_TWO_SIDED_LOSS_H_
+#endif  // RANGESFM_ROBUST_LOSS_H_
