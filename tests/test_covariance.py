@@ -12,6 +12,8 @@ import pycolmap
 import pytest
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
+from tests.simulated.model import synthetic_model
+from tests.simulated.path import orbit_path
 
 from rangesfm._ceres import (
     PlacedRanges,
@@ -27,8 +29,6 @@ from rangesfm._ceres import (
 from rangesfm.covariance import ResidualErrors, joint_covariance
 from rangesfm.errors import GeometryError
 from rangesfm.geometry import IDENTITY
-from rangesfm.simulate.model import synthetic_model
-from rangesfm.simulate.path import orbit_path
 from rangesfm.trajectory import pose_of
 
 Array = npt.NDArray[np.float64]

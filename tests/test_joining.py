@@ -12,10 +12,15 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.simulated.model import random_similarity, synthetic_model
+from tests.simulated.path import loop_path
+from tests.simulated.ranges import simulate_ranges_at
 
 from rangesfm import pipeline
 from rangesfm.cli import main
 from rangesfm.config import RangesConfig, Survey
+from rangesfm.demo.path import CameraPath
+from rangesfm.demo.ranges import Radio
 from rangesfm.errors import GeometryError
 from rangesfm.geometry import align_points
 from rangesfm.joined_model import without_photos
@@ -28,9 +33,6 @@ from rangesfm.ranging.anchors import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers.canonical import write_ranges_csv
-from rangesfm.simulate.model import random_similarity, synthetic_model
-from rangesfm.simulate.path import CameraPath, loop_path
-from rangesfm.simulate.ranges import Radio, simulate_ranges_at
 from rangesfm.trajectory import trajectory_from_reconstruction
 from rangesfm.vision.reconstruct import ReconstructionSummary
 

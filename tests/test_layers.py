@@ -29,6 +29,7 @@ LAYER_OF = {
     "config": DATA,
     "costs": DATA,
     "covariance": DATA,
+    "demo": DATA,
     "distances": DATA,
     "geometry": DATA,
     "georeference": DATA,
@@ -46,7 +47,6 @@ LAYER_OF = {
     # What the stage ``refine`` is made of.
     "refinement": DATA,
     "result_folder": DATA,
-    "simulate": DATA,
     "site": DATA,
     "strict_tables": DATA,
     "plain_tables": DATA,

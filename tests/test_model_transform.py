@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.path import orbit_path
 
 from rangesfm.model_transform import rescale
-from rangesfm.simulate.model import SyntheticModel, synthetic_model
-from rangesfm.simulate.path import orbit_path
 from rangesfm.trajectory import trajectory_from_reconstruction
 
 

@@ -15,6 +15,8 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
+from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.path import loop_path
 
 from rangesfm.config import RangesConfig, Survey
 from rangesfm.errors import GeometryError, InputError
@@ -26,8 +28,6 @@ from rangesfm.outputs import forget_result, refuse_to_overwrite, replacing_resul
 from rangesfm.pipeline import refine_model, scale_model
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.readers import read_ranges
-from rangesfm.simulate.model import SyntheticModel, synthetic_model
-from rangesfm.simulate.path import loop_path
 from rangesfm.tables import read_table
 from rangesfm.trajectory import trajectory_from_reconstruction
 

@@ -14,6 +14,7 @@ import pycolmap
 import pytest
 
 from rangesfm.config import RangesConfig, Survey, read_survey
+from rangesfm.demo.survey import TIME_OFFSET_S
 from rangesfm.geometry import align_points, rmse
 from rangesfm.inputs import read_ranging_inputs
 from rangesfm.options import CheckOptions, RefineOptions, ScaleOptions
@@ -168,7 +169,7 @@ def test_a_run_maps_with_ranges_where_it_is_asked_to(photo_run: PhotoRun, tmp_pa
     output = shutil.copytree(photo_run.output_path, tmp_path / "out")
     asked = {
         "output.path": str(output),
-        "ranges.time_offset": photo_run.survey.time_offset_s,
+        "ranges.time_offset": TIME_OFFSET_S,
         "mapper.num_threads": 1,
         # Fewer global adjustments than usual, which is quicker.
         "mapper.ba_global_max_refinements": 1,

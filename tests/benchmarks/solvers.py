@@ -42,11 +42,11 @@ import numpy.typing as npt
 import pycolmap
 from scipy.spatial.transform import Rotation
 from tests.peak_memory import peak_bytes
+from tests.simulated.model import synthetic_model
+from tests.simulated.path import sequence_path
 
 from rangesfm import _ceres
 from rangesfm.geometry import IDENTITY
-from rangesfm.simulate.model import synthetic_model
-from rangesfm.simulate.path import sequence_path
 from rangesfm.trajectory import pose_of
 
 Array = npt.NDArray[np.float64]

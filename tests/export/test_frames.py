@@ -16,6 +16,8 @@ import pycolmap
 import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.simulated.model import synthetic_model
+from tests.simulated.path import loop_path
 
 from rangesfm.errors import InputError
 from rangesfm.export import MetricMap, export_map
@@ -24,8 +26,6 @@ from rangesfm.geometry import Similarity
 from rangesfm.georeference import Georeference, georeference_at
 from rangesfm.model_transform import rescale
 from rangesfm.options import ExportOptions
-from rangesfm.simulate.model import synthetic_model
-from rangesfm.simulate.path import loop_path
 
 Array = npt.NDArray[np.float64]
 

@@ -6,11 +6,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.path import lap_path
 
 from rangesfm.geometry import IDENTITY
 from rangesfm.refinement.vision_information import Observations, Poses, model_observations, model_poses
-from rangesfm.simulate.model import SyntheticModel, synthetic_model
-from rangesfm.simulate.path import lap_path
 from rangesfm.trajectory import trajectory_from_reconstruction
 
 Array = npt.NDArray[np.float64]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from tests.refinement.conftest import bent, poses_and_rays
+from tests.simulated.model import SyntheticModel
 
 from rangesfm.refinement.carry import carry_model
 from rangesfm.refinement.vision_information import model_poses, project, ray_residuals
-from rangesfm.simulate.model import SyntheticModel
 from rangesfm.trajectory import trajectory_from_reconstruction
 
 

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pytest
 from scipy.optimize import approx_fprime
 from tests.refinement.conftest import bent, poses_and_rays
+from tests.simulated.model import SyntheticModel
 
 from rangesfm.geometry import align_points, rmse
 from rangesfm.gravity import UP_IN_SITE, Gravity
@@ -18,7 +19,6 @@ from rangesfm.refinement import keyframe_graph
 from rangesfm.refinement.antennas import Antennas
 from rangesfm.refinement.keyframe_graph import KeyframeGraph, solve_graph
 from rangesfm.refinement.vision_information import Poses, vision_information
-from rangesfm.simulate.model import SyntheticModel
 
 Array = npt.NDArray[np.float64]
 ANCHORS_M = np.array([[-40.0, -28.0, 12.0], [-15.0, -28.0, 0.0], [-28.0, -42.0, 9.0], [-30.0, -20.0, 15.0]])

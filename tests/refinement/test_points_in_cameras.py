@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pycolmap
 import pytest
+from tests.simulated.model import SyntheticModel
 
 from rangesfm.geometry import Similarity
 from rangesfm.model_transform import rescale
 from rangesfm.refinement.points_in_cameras import points_in_cameras
 from rangesfm.refinement.vision_information import model_observations, model_poses
-from rangesfm.simulate.model import SyntheticModel
 
 
 def ids_in_cameras(model: pycolmap.Reconstruction) -> list[int]:

@@ -8,9 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import pycolmap
+from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.path import lap_path, loop_path
+from tests.simulated.ranges import simulate_ranges_at
 
 from rangesfm.costs import add_residual_block, normal_prior_cost, range_cost
 from rangesfm.covariance import joint_covariance
+from rangesfm.demo.path import CameraPath
+from rangesfm.demo.ranges import Radio
 from rangesfm.geometry import IDENTITY, rmse
 from rangesfm.model_transform import rescale
 from rangesfm.options import CameraOptions, RangeModelOptions
@@ -21,9 +26,6 @@ from rangesfm.ranging.observations import RangeObservations
 from rangesfm.refine import RefineSummary, refine_with_ranges
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.simulate.model import SyntheticModel, synthetic_model
-from rangesfm.simulate.path import CameraPath, lap_path, loop_path
-from rangesfm.simulate.ranges import Radio, simulate_ranges_at
 from rangesfm.trajectory import Trajectory, pose_of, trajectory_from_reconstruction
 
 Array = npt.NDArray[np.float64]
