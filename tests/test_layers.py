@@ -28,7 +28,7 @@ LAYERS = (
     "comparison",
     "workflows",
     "batch",
-    "simulate",
+    "demo",
     "cli",
 )
 LAYER_OF = {folder: number for number, folders in enumerate(LAYERS) for folder in folders.split()}

@@ -42,12 +42,12 @@ import numpy.typing as npt
 import pycolmap
 from scipy.spatial.transform import Rotation
 from tests.peak_memory import peak_bytes
+from tests.simulated.model import synthetic_model
+from tests.simulated.path import sequence_path
 
 from rangesfm import ceres
 from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.geometry.trajectory import pose_of
-from rangesfm.simulate.model import synthetic_model
-from rangesfm.simulate.path import sequence_path
 
 Array = npt.NDArray[np.float64]
 

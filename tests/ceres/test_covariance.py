@@ -12,6 +12,8 @@ import pycolmap
 import pytest
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
+from tests.simulated.model import synthetic_model
+from tests.simulated.path import orbit_path
 
 from rangesfm.ceres import (
     PlacedRanges,
@@ -28,8 +30,6 @@ from rangesfm.ceres.covariance import ResidualErrors, joint_covariance
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.geometry.trajectory import pose_of
-from rangesfm.simulate.model import synthetic_model
-from rangesfm.simulate.path import orbit_path
 
 Array = npt.NDArray[np.float64]
 

@@ -8,10 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import pycolmap
+from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.path import lap_path, loop_path
+from tests.simulated.ranges import simulate_ranges_at
 
 from rangesfm.ceres.covariance import joint_covariance
 from rangesfm.colmap.transform import rescale
 from rangesfm.costs import add_residual_block, joint_prior_cost, range_cost
+from rangesfm.demo.path import CameraPath
+from rangesfm.demo.ranges import Radio
 from rangesfm.geometry.similarity import IDENTITY, rmse
 from rangesfm.geometry.trajectory import Trajectory, pose_of, trajectory_from_reconstruction
 from rangesfm.options import CameraOptions, RangeModelOptions
@@ -23,9 +28,6 @@ from rangesfm.ranging.observations import RangeObservations
 from rangesfm.refine.with_ranges import RefineSummary, refine_with_ranges
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.simulate.model import SyntheticModel, synthetic_model
-from rangesfm.simulate.path import CameraPath, lap_path, loop_path
-from rangesfm.simulate.ranges import Radio, simulate_ranges_at
 
 Array = npt.NDArray[np.float64]
 
