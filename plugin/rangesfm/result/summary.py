@@ -8,9 +8,10 @@ prints its JSON schema.
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from rangesfm.distances.rows import DistanceRow
 from rangesfm.files.records import NumberOrNull, Record, Text
@@ -41,7 +42,7 @@ class ResultSummary(Record):
 
     Attributes:
         metric_from_sfm: world of ``sparse/0`` to world of ``sparse_scaled/0``.
-        frame: "site" or "first_camera": the world of the metric models.
+        frame: the world of the metric models.
         anchors: by id.
         refine: null without a refinement.
         models: that were to be joined to what is one model here; empty where there was only one.
@@ -56,7 +57,7 @@ class ResultSummary(Record):
 
     scale: ScaleEntry
     metric_from_sfm: SimilarityEntry
-    frame: Text
+    frame: Literal["site", "first_camera"]
     map: MapEntry
     anchors: dict[Text, AnchorEntry]
     time_offset: TimeOffsetEntry
@@ -80,7 +81,7 @@ class ResultSummary(Record):
         return cls(
             scale=ScaleEntry.model_validate(estimate),
             metric_from_sfm=SimilarityEntry.of(estimate.metric_from_sfm),
-            frame=estimate.frame,
+            frame="site" if estimate.frame == "site" else "first_camera",
             map=MapEntry(num_photos=found.final.num_reg_images(), num_points3D=found.final.num_points3D()),
             anchors={anchor.anchor_id: AnchorEntry.model_validate(anchor) for anchor in found.anchors},
             time_offset=TimeOffsetEntry.of(found),
@@ -91,7 +92,7 @@ class ResultSummary(Record):
             **others,
         )
 
-    def lines(self, table: str | None, folder: Path) -> Iterator[str]:
+    def lines(self, folder: Path, table: str | None) -> Iterator[str]:
         """What a user wants to know at the end of a run, with the comparison's table, if there is one."""
         scale, ranges, offset = self.scale, self.ranges, self.time_offset
         low, high = (_text(end, ".6g") for end in scale.interval_95)
@@ -138,4 +139,4 @@ def schema() -> str:
 
 
 if __name__ == "__main__":
-    print(schema(), end="")
+    sys.stdout.write(schema())

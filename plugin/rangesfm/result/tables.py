@@ -11,7 +11,6 @@ import numpy as np
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.table_file import Array, Column, Numbers, NumbersOrEmpty, Rounded, RoundedOrEmpty, TableFile, Texts
 
-
 _Covariance = Annotated[Array, Column(".9g")]
 
 
