@@ -27,7 +27,6 @@ def _run(given: tuple[Survey, bool, bool], worker: MessagesToParent) -> dict[str
         submaps = prepare_survey(survey, progress=worker, restart=restart)
         return {"submaps": base64.b64encode(pickle.dumps(submaps)).decode()}
     summary = run_survey(survey, progress=worker, restart=restart).summary
-    assert summary is not None
     reasons = summary.scale.reasons if summary.scale.verdict != "good" else ()
     return {"figures": asdict(figures_of(summary)), "reason": "; ".join(reasons)}
 

@@ -21,6 +21,7 @@ _EXPECTED = {
     "model_type": "a JSON object",
     "model_attributes_type": "a JSON object",
     "tuple_type": "a JSON array",
+    "too_long": "{max_length} items",
     "is_instance_of": "text",
 }
 
@@ -83,8 +84,11 @@ def _what_is_wrong(error: ValidationError) -> str:
     first = error.errors(include_url=False)[0]
     key = ".".join(map(str, first["loc"]))
     if first["type"] == "missing":
-        return f"'{key}' is missing, expected it as a run writes it"
-    expected = _EXPECTED.get(first["type"]) or first["msg"].removeprefix("Input should be ")
+        return f"'{key}' is missing"
+    ours = _EXPECTED.get(first["type"])
+    expected = first["msg"] if ours is None else ours.format(**first.get("ctx", {}))
+    for prefix in ("Input should be ", "Value error, "):
+        expected = expected.removeprefix(prefix)
     found = one_line(json.dumps(first["input"]))
     return f"'{key}' is {found[:_MAX_SHOWN]}{'...' * (len(found) > _MAX_SHOWN)}, expected {expected}"
 

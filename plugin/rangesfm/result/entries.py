@@ -24,7 +24,7 @@ Mask = npt.NDArray[np.bool_]
 
 def _unit(quaternion: tuple[float, ...]) -> tuple[float, ...]:
     if not abs(np.linalg.norm(quaternion) - 1.0) < 1e-6:
-        raise ValueError
+        raise ValueError("a unit quaternion")
     return quaternion
 
 

@@ -32,12 +32,12 @@ class RunResult:
 
     Attributes:
         output_path: its folder.
-        summary: ``result.json``; None after a reconstruction alone.
+        summary: ``result.json``.
         lines: a summary for people.
     """
 
     output_path: Path
-    summary: ResultSummary | None
+    summary: ResultSummary
     lines: tuple[str, ...]
 
     def summary_lines(self) -> list[str]:
