@@ -14,6 +14,8 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
+from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.path import loop_path
 
 from rangesfm.colmap.model_files import read_model
 from rangesfm.errors import GeometryError, InputError
@@ -23,8 +25,6 @@ from rangesfm.progress import SilentProgress
 from rangesfm.ranging.readers import read_ranges
 from rangesfm.result.summary import ResultSummary
 from rangesfm.result.tables import ScaleBootstrap, ScaleCandidates, ScaleConsensus
-from rangesfm.simulate.model import SyntheticModel, synthetic_model
-from rangesfm.simulate.path import loop_path
 from rangesfm.survey.settings import RangesConfig, Survey
 from rangesfm.workflows.export_result import export_result
 from rangesfm.workflows.journal import Journal

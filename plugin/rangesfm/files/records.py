@@ -94,10 +94,16 @@ def _what_is_wrong(error: ValidationError) -> str:
 
 
 def write_json(value: Any, path: Path) -> None:
-    """Write plain values.
+    """Write values by key; numbers that are not finite become null.
 
     Of paths that are no UTF-8, what is none becomes JSON's own escapes, by which they are read as they were.
     """
     with new_file(path) as temporary:
-        text = json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False)
+        text = json.dumps(_finite(value), indent=2, ensure_ascii=False, allow_nan=False)
         temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    return [_finite(item) for item in value] if isinstance(value, (list, tuple)) else _plain(value)

@@ -17,6 +17,8 @@ from rangesfm.options import AssociationOptions
 from rangesfm.ranging.log import RangeKind
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.result.metric_result import USED, MetricResult
+from rangesfm.scale.estimate import CutoffTest, ScaleSensitivity, ScaleUncertainty
+from rangesfm.scale.two_candidate import Branch
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -54,50 +56,11 @@ class SimilarityEntry(Record):
         )
 
 
-class RelativeStddevs(Record):
-    """Relative stddevs of the scale, by where they come from; see ScaleUncertainty."""
-
-    formal: NumberOrNull
-    bootstrap: NumberOrNull
-    jackknife: NumberOrNull
-    range_model: NumberOrNull
-    correlated: NumberOrNull
-    num_blocks: Count
-    num_anchors: Count
-    antennas: NumberOrNull
-    correlated_dof: NumberOrNull
-
-
-class CutoffEntry(Record):
-    """The scale from ranges of at least ``min_range_m``; see CutoffTest."""
-
-    min_range_m: NumberOrNull
-    scale: NumberOrNull
-    stddev: NumberOrNull
-
-
-class SensitivityEntry(Record):
-    """By how many percent the scale would change; see ScaleSensitivity."""
-
-    common_bias_per_cm: NumberOrNull
-    short_range_per_cm: NumberOrNull
-    anchor_bias_per_cm: dict[Text, NumberOrNull]
-    range_slope_per_percent: NumberOrNull
-    lever_arm_per_cm: tuple[NumberOrNull, NumberOrNull, NumberOrNull]
-
-
-class BranchEntry(Record):
-    """One of the paper's two roots over time."""
-
-    mean: NumberOrNull
-    std: NumberOrNull
-
-
 class TwoCandidateEntry(Record):
     """The paper's table; see TwoCandidate."""
 
-    alpha0: BranchEntry
-    alpha1: BranchEntry
+    alpha0: Branch
+    alpha1: Branch
     chosen: Text
     num_without_root: Count
 
@@ -109,13 +72,13 @@ class ScaleEntry(Record):
     stddev_formal: NumberOrNull
     stddev_empirical: NumberOrNull
     interval_95: Interval
-    relative_stddev: RelativeStddevs = Field(validation_alias=AliasChoices("relative_stddev", "uncertainty"))
+    relative_stddev: ScaleUncertainty = Field(validation_alias=AliasChoices("relative_stddev", "uncertainty"))
     method: Text
     verdict: Literal["good", "doubtful"]
     reasons: tuple[Text, ...]
     advice: tuple[Text, ...]
-    cutoff_test: tuple[CutoffEntry, ...]
-    sensitivity: SensitivityEntry
+    cutoff_test: tuple[CutoffTest, ...]
+    sensitivity: ScaleSensitivity
     per_anchor: dict[Text, NumberOrNull]
     range_noise_stddev_m: NumberOrNull = Field(validation_alias=AliasChoices("range_noise_stddev_m", "noise_stddev_m"))
     correlation_inflation: NumberOrNull
@@ -155,16 +118,14 @@ class ModelEntry(Record):
 
     @classmethod
     def of(cls, model: ModelVerdict, metric_from_joined: Similarity) -> ModelEntry:
-        own, joined = model.estimate, model.joined_from_sfm
-        refused = ModelScaleEntry(
-            value=None, stddev_empirical=None, interval_95=None, verdict="refused", reasons=(model.reason,)
-        )
+        refused = {"value": None, "stddev_empirical": None, "interval_95": None, "verdict": "refused"}
+        joined = model.joined_from_sfm
         return cls(
             name=model.name,
             num_images=model.num_images,
             joined=joined is not None,
             reason=model.reason or None,
-            scale=refused if own is None else ModelScaleEntry.model_validate(own),
+            scale=ModelScaleEntry.model_validate(model.estimate or {**refused, "reasons": [model.reason]}),
             metric_from_sfm=None if joined is None else SimilarityEntry.of(metric_from_joined @ joined),
         )
 
@@ -203,16 +164,8 @@ class TimeOffsetEntry(Record):
         offset, given_s = found.time_offset, found.time_offset_s
         if offset is None:
             return cls(value_s=given_s, stddev_s=None if given_s is None else 0.0, estimated=False, note=None)
-        return cls(
-            value_s=offset.value_s,
-            stddev_s=offset.stddev_s,
-            estimated=True,
-            offset_matters=offset.offset_matters,
-            drift_ppm=1e6 * offset.drift,
-            drift_stddev_ppm=1e6 * offset.drift_stddev,
-            drift_is_followed=offset.drift_is_followed,
-            note=offset.note,
-        )
+        in_ppm = {"drift_ppm": 1e6 * offset.drift, "drift_stddev_ppm": 1e6 * offset.drift_stddev}
+        return cls.model_validate({**vars(offset), **in_ppm, "estimated": True})
 
 
 class ResidualEntry(Record):
@@ -224,17 +177,6 @@ class ResidualEntry(Record):
     rms_m: NumberOrNull
     median_abs_m: NumberOrNull
 
-    @staticmethod
-    def values(residuals_m: Array, used: Mask, of: Mask) -> dict[str, Any]:
-        chosen = residuals_m[used & of]
-        return {
-            "num": of.sum(),
-            "num_used": (used & of).sum(),
-            "num_rejected": (~used & of).sum(),
-            "rms_m": _rms(chosen),
-            "median_abs_m": np.median(np.abs(chosen)) if len(chosen) else None,
-        }
-
 
 class RangesEntry(ResidualEntry):
     """All ranges; those between two anchors or two tags are only counted."""
@@ -245,18 +187,22 @@ class RangesEntry(ResidualEntry):
 
     @classmethod
     def of(cls, found: MetricResult) -> RangesEntry:
-        log, residuals_m = found.observations.log, found.residuals_m
-        used, is_of_camera = np.isin(found.observations.status, USED), log.kind == RangeKind.TAG_ANCHOR
-        return cls(
-            **ResidualEntry.values(residuals_m, used, is_of_camera),
-            num_anchor_anchor=int(np.count_nonzero(log.kind == RangeKind.ANCHOR_ANCHOR)),
-            num_tag_tag=int(np.count_nonzero(log.kind == RangeKind.TAG_TAG)),
-            per_anchor={
-                anchor_id: ResidualEntry(
-                    **ResidualEntry.values(residuals_m, used, is_of_camera & (log.anchor_index == k))
-                )
-                for k, anchor_id in enumerate(log.anchor_ids)
-            },
+        log, used = found.observations.log, np.isin(found.observations.status, USED)
+
+        def residuals(of: Mask) -> dict[str, Any]:
+            chosen = found.residuals_m[used & of]
+            nums = {"num": of.sum(), "num_used": (used & of).sum(), "num_rejected": (~used & of).sum()}
+            return {**nums, "rms_m": _rms(chosen), "median_abs_m": _median(np.abs(chosen))}
+
+        is_of_camera = log.kind == RangeKind.TAG_ANCHOR
+        by_anchor = {id_: is_of_camera & (log.anchor_index == k) for k, id_ in enumerate(log.anchor_ids)}
+        return cls.model_validate(
+            {
+                **residuals(is_of_camera),
+                "num_anchor_anchor": np.count_nonzero(log.kind == RangeKind.ANCHOR_ANCHOR),
+                "num_tag_tag": np.count_nonzero(log.kind == RangeKind.TAG_TAG),
+                "per_anchor": {id_: residuals(of) for id_, of in by_anchor.items()},
+            }
         )
 
 
@@ -267,12 +213,6 @@ class CheckEntry(Record):
     rms_m: NumberOrNull
     median_m: NumberOrNull
 
-    @staticmethod
-    def values(residuals_m: Array) -> dict[str, Any]:
-        residuals_m = residuals_m[np.isfinite(residuals_m)]
-        median_m = np.median(residuals_m) if len(residuals_m) else None
-        return {"num": len(residuals_m), "rms_m": _rms(residuals_m), "median_m": median_m}
-
 
 class CheckRangesEntry(CheckEntry):
     """All of them, and by anchor."""
@@ -282,19 +222,22 @@ class CheckRangesEntry(CheckEntry):
     @classmethod
     def of(cls, found: MetricResult) -> CheckRangesEntry:
         log, held_out = found.observations.log, found.observations.status == RangeStatus.CHECK
-        anchors = {anchor_id: held_out & (log.anchor_index == k) for k, anchor_id in enumerate(log.anchor_ids)}
-        return cls(
-            **CheckEntry.values(found.residuals_m[held_out]),
-            per_anchor={
-                anchor_id: CheckEntry(**CheckEntry.values(found.residuals_m[of]))
-                for anchor_id, of in anchors.items()
-                if of.any()
-            },
-        )
+
+        def residuals(of: Mask) -> dict[str, Any]:
+            chosen = found.residuals_m[of & np.isfinite(found.residuals_m)]
+            return {"num": len(chosen), "rms_m": _rms(chosen), "median_m": _median(chosen)}
+
+        by_anchor = {id_: held_out & (log.anchor_index == k) for k, id_ in enumerate(log.anchor_ids)}
+        per_anchor = {id_: residuals(of) for id_, of in by_anchor.items() if of.any()}
+        return cls.model_validate({**residuals(held_out), "per_anchor": per_anchor})
 
 
 def _rms(residuals_m: Array) -> float | None:
     return float(np.sqrt(np.mean(residuals_m**2))) if len(residuals_m) else None
+
+
+def _median(residuals_m: Array) -> float | None:
+    return float(np.median(residuals_m)) if len(residuals_m) else None
 
 
 class RefineEntry(Record):
@@ -322,24 +265,18 @@ class RefineEntry(Record):
         summary = found.refinement
         if summary is None:
             return None
-        return cls(
-            iterations=summary.num_iterations,
-            keyframe_graph_steps=summary.num_graph_steps,
-            bend_m=summary.bend_m,
-            initial_cost=summary.initial_cost,
-            final_cost=summary.final_cost,
-            reprojection_rms_px=summary.reprojection_rms_px,
-            pixel_stddev=summary.pixel_stddev,
-            correlation_inflation=summary.correlation_inflation,
-            seconds=summary.seconds,
-            converged=summary.converged and not summary.misfits,
-            message="; ".join(summary.misfits) or summary.message,
-            scale_value=found.refined_scale,
-            relative_scale_stddev=None if summary.covariance is None else summary.covariance.relative_scale_stddev,
-            tag_in_cam_m=dict(zip(found.observations.log.tag_ids, summary.tags_in_cam_m.tolist(), strict=True)),
-            time_offset_change_s=summary.time_shift_s,
-            short_range_error_m=summary.short_range_error_m,
-        )
+        tag_ids, covariance = found.observations.log.tag_ids, summary.covariance
+        others = {
+            "iterations": summary.num_iterations,
+            "keyframe_graph_steps": summary.num_graph_steps,
+            "converged": summary.converged and not summary.misfits,
+            "message": "; ".join(summary.misfits) or summary.message,
+            "scale_value": found.refined_scale,
+            "relative_scale_stddev": None if covariance is None else covariance.relative_scale_stddev,
+            "tag_in_cam_m": dict(zip(tag_ids, summary.tags_in_cam_m, strict=True)),
+            "time_offset_change_s": summary.time_shift_s,
+        }
+        return cls.model_validate({**vars(summary), **others})
 
 
 class ComparisonRow(Record):

@@ -26,12 +26,12 @@ from rangesfm.result.entries import (
     RangesEntry,
     RefineEntry,
     ScaleEntry,
-    SensitivityEntry,
     Settings,
     SimilarityEntry,
     TimeOffsetEntry,
 )
 from rangesfm.result.metric_result import MetricResult
+from rangesfm.scale.estimate import ScaleSensitivity
 
 # Percents of the scale for a centimetre that the summary mentions.
 _NOTABLE_PERCENT = 0.5
@@ -117,14 +117,14 @@ class ResultSummary(Record):
         yield f"all results: {folder / self.NAME}"
 
 
-def _notable(sensitivity: SensitivityEntry) -> Iterator[str]:
+def _notable(sensitivity: ScaleSensitivity) -> Iterator[str]:
     """What to measure to the centimetre: where one is worth much of the scale."""
     values = {
         "of bias in short ranges": sensitivity.short_range_per_cm,
         "of bias in all ranges": sensitivity.common_bias_per_cm,
         **{f"of lever arm in {axis}": value for axis, value in zip("xyz", sensitivity.lever_arm_per_cm)},
     }
-    notable = [f"{v:+.2f} % per cm {what}" for what, v in values.items() if v and abs(v) > _NOTABLE_PERCENT]
+    notable = [f"{v:+.2f} % per cm {what}" for what, v in values.items() if abs(v) > _NOTABLE_PERCENT]
     if notable:
         yield f"the scale is sensitive: {', '.join(notable)}"
 
