@@ -63,7 +63,7 @@ _RESULT = {
         "ranges": {"association": {"max_interpolation_gap_s": 2.0, "max_time_difference_s": 0.02}},
     },
     "inputs": [],
-    "seconds": {"scale": 1.0, "total": 1.5},
+    "seconds": {},
     "warnings": [],
 }
 REFINE = {
