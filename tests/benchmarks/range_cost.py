@@ -1,6 +1,6 @@
 """What ranges cost in COLMAP's bundle adjustment: processor time of a solver iteration with them, against without.
 
-    python tests/benchmarks/range_cost.py [--num_rounds 9]
+    python -m tests.benchmarks.range_cost [--num_rounds 9]
 
 600 keyframes in sequence with 200 observations each, one thread. Every round solves each variant twice, with few and
 with more iterations from the same perturbed start; the difference is what iterations cost, without the set-up. Rounds
@@ -21,6 +21,7 @@ from unittest import mock
 import numpy as np
 import numpy.typing as npt
 import pycolmap
+from tests.known_errors import known_errors
 
 from rangesfm import _ceres
 from rangesfm.geometry.similarity import IDENTITY
@@ -163,8 +164,8 @@ def solve(survey: Survey, variant: Variant, num_iterations: int) -> Solve:
             observations,
             IDENTITY,
             [anchor(name, variant.anchors_are_free) for name in observations.log.anchor_ids],
+            known_errors(observations, RANGE_STDDEV_M),
             tag_in_cam_m=TAG_IN_CAM_M,
-            range_stddev_m=np.full(len(observations.log), RANGE_STDDEV_M),
             first_pose_is_fixed=True,
             camera=CameraOptions(refine_intrinsics=False),
             num_threads=1,

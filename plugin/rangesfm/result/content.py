@@ -54,7 +54,7 @@ def _scale(estimate: ScaleEstimate) -> dict[str, Any]:
         "sensitivity": asdict(estimate.sensitivity),
         "per_anchor": estimate.per_anchor,
         "range_noise_stddev_m": estimate.noise_stddev_m,
-        "correlation_inflation": estimate.correlation_inflation,
+        "correlation_inflation": estimate.errors.inflation,
         "two_candidate": _two_candidate(estimate.two_candidate),
     }
 
@@ -185,7 +185,7 @@ def _refine(survey: MetricResult) -> dict[str, Any] | None:
         "final_cost": summary.final_cost,
         "reprojection_rms_px": summary.reprojection_rms_px,
         "pixel_stddev": summary.pixel_stddev,
-        "correlation_inflation": summary.correlation_inflation,
+        "correlation_inflation": summary.errors.inflation,
         "seconds": summary.seconds,
         "converged": summary.converged and not summary.misfits,
         "message": "; ".join(summary.misfits) or summary.message,

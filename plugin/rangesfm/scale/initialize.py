@@ -15,8 +15,7 @@ from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.errors.noise import shared_stddev, stretch_labels
-from rangesfm.ranging.errors.shared_errors import CURVE_STDDEV_M
+from rangesfm.ranging.errors.shared_errors import curve_stddev
 from rangesfm.ranging.observations import RangeObservations, RangeStatus, status_by_weight
 from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
 from rangesfm.scale.cutoff import cutoff_test
@@ -60,25 +59,23 @@ def initialize_scale(
     """
     options, range_model = options or ScaleOptions(), range_model or RangeModelOptions()
     gravity = gravity_of(options.up_in_first_camera)
-    survey = scale_problem(observations, trajectory, anchors, anchor_frame, range_model, distances, gravity)
-    blocks = _time_blocks(observations, survey.rows, options.bootstrap_block_s)
-    shared = shared_stddev(observations.log)[survey.rows]
+    block_s = options.bootstrap_block_s
+    survey = scale_problem(observations, trajectory, anchors, anchor_frame, range_model, block_s, distances, gravity)
     solution = solve_scale(
         survey.ranges,
+        survey.errors,
         anchors_are_known=survey.anchors_are_known,
         center_stddev=observations.center_stddev[survey.rows],
-        noise_stddev_m=_given_noise(observations, survey.rows, range_model),
-        shared_stddev_m=shared,
-        groups=blocks * survey.ranges.num_anchors + survey.ranges.anchor_index,
         camera_side=options.camera_side,
         seed=seed,
     )
     table = _paper_table(solution)
-    curve_stddev = shared if observations.log.shared_stddev_m is not None else np.full(len(shared), CURVE_STDDEV_M)
-    uncertainty = scale_uncertainty(solution, blocks, curve_stddev, num_bootstrap=options.num_bootstrap, seed=seed)
+    uncertainty = scale_uncertainty(
+        solution, curve_stddev(observations.log)[survey.rows], num_bootstrap=options.num_bootstrap, seed=seed
+    )
     per_anchor = scale_per_anchor(solution, observations.log.anchor_ids)
     found = anchor_estimates(survey, solution, observations.log.anchor_ids)
-    tests = cutoff_test(solution, shared)
+    tests = cutoff_test(solution)
     judged = judge(survey, solution, uncertainty, per_anchor, found, tests, options)
     verdict, reasons = judged.verdict, judged.reasons
     if gravity is not None and survey.frame == "first_camera" and anchor_frame == "site":
@@ -87,11 +84,9 @@ def initialize_scale(
         robust = solution.fit.state.metric_from_model.scale
         verdict = "doubtful"
         reasons = (f"two-candidate, as asked for; the stddevs are of the robust scale, {robust:.6g}", *reasons)
-    status, stddev = observations.status.copy(), np.full(len(observations.log), np.nan)
+    status = observations.status.copy()
     status[observations.has_place] = RangeStatus.UNKNOWN_ANCHOR
     status[survey.rows] = status_by_weight(solution.fit.weights)
-    stddev[survey.rows], share = solution.problem.stddev_m, np.ones(len(observations.log))
-    share[survey.rows] = solution.problem.share_or_1
     return ScaleEstimate(
         metric_from_sfm=_by_method(options.method, solution, table) @ survey.first_camera_from_sfm,
         frame=survey.frame,
@@ -108,16 +103,14 @@ def initialize_scale(
         two_candidate=table,
         anchors=found,
         observations=replace(observations, status=status),
-        range_stddev_m=stddev,
-        range_share=share,
-        correlation_inflation=solution.inflation,
+        errors=solution.errors.spread(survey.rows, len(observations.log)),
         noise_stddev_m=solution.noise_stddev_m,
-        resampled_scales=_resampled_scales(solution, blocks, options.num_bootstrap, seed),
+        resampled_scales=_resampled_scales(solution, options.num_bootstrap, seed),
     )
 
 
-def _resampled_scales(solution: Solution, blocks: npt.NDArray[np.int64], num: int, seed: int) -> Array:
-    steps = resampled_log_scales(solution.fit, blocks, num=num, seed=seed)
+def _resampled_scales(solution: Solution, num: int, seed: int) -> Array:
+    steps = resampled_log_scales(solution.fit, solution.errors.block, num=num, seed=seed)
     return np.asarray(solution.fit.state.metric_from_model.scale * np.exp(steps))
 
 
@@ -126,21 +119,6 @@ def _model_from_cam(observations: RangeObservations, trajectory: Trajectory, sur
     nearest = np.where(observations.weight < 0.5, observations.before, observations.after)[survey.rows]
     turned: Array = survey.first_camera_from_sfm.rotation @ trajectory.world_from_cam[nearest]
     return turned
-
-
-def _time_blocks(observations: RangeObservations, rows: npt.NDArray[np.int64], block_s: float) -> npt.NDArray[np.int64]:
-    """(k,) labels of stretches of time; photos, where ranges are tied to photos by name."""
-    times = observations.log.timestamp_s
-    if times is None:
-        return observations.before[rows]
-    return stretch_labels(times[rows], block_s)
-
-
-def _given_noise(observations: RangeObservations, rows: npt.NDArray[np.int64], range_model: RangeModelOptions) -> Array:
-    """(k,) stddev from the log, else from the options, else NaN: to be estimated."""
-    given = observations.log.range_stddev_m[rows]
-    default = np.nan if range_model.range_stddev_m is None else range_model.range_stddev_m
-    return np.where(np.isfinite(given), given, default)
 
 
 def _paper_table(solution: Solution) -> TwoCandidate | None:

@@ -37,10 +37,9 @@ from rangesfm.join.models import PathOfModel, Ranging, join_models
 from rangesfm.progress import Progress
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock.estimate import TimeOffset, estimate_time_offset
-from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE
 from rangesfm.ranging.log import RangeKind
 from rangesfm.ranging.observations import RangeObservations, RangeStatus, hold_out
-from rangesfm.refine.with_ranges import predicted_ranges
+from rangesfm.refine.radio import predicted_ranges
 from rangesfm.report import write_report
 from rangesfm.result.content import survey_result
 from rangesfm.result.metric_result import MetricResult, ModelVerdict
@@ -453,10 +452,9 @@ def _scale(survey: Survey, inputs: RangingInputs, path: PathOfModel, offset: Tim
         estimate.observations,
         estimate.metric_from_sfm,
         inputs.tag_in_cam_m,
-        [anchor.position_m for anchor in estimate.anchors],
-        [anchor.range_bias_m for anchor in estimate.anchors],
+        estimate.anchors,
     )
-    weights = GEMAN_MCCLURE.weights((predicted - inputs.log.range_m) / estimate.range_stddev_m)
+    weights = estimate.errors.robust_weights(predicted - inputs.log.range_m)
     offset_s = offset.value_s if offset is not None else survey.ranges.time_offset_s
     return MetricResult(trajectory, offset, offset_s, estimate, scaled, predicted, weights)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pycolmap
 
 from rangesfm.distances.tape import Tape
@@ -36,21 +35,14 @@ def refine_by_survey(
         scaled: in the metric world. trajectory: of the unscaled model, as the scale stage had it.
         tape: distances to keep to.
     """
-    ranges = survey.ranges.model
-    # Those of which neither the log nor the survey says how noisy they are.
-    stddev_is_estimated = np.isnan(estimate.observations.log.range_stddev_m) & (ranges.range_stddev_m is None)
     return refine_with_ranges(
         scaled,
         trajectory,
         estimate.observations,
         estimate.metric_from_sfm,
         estimate.anchors,
+        estimate.errors,
         tag_in_cam_m=inputs.tag_in_cam_m,
-        range_stddev_m=estimate.range_stddev_m,
-        range_share=estimate.range_share,
-        stddev_is_estimated=stddev_is_estimated,
-        correlation_inflation=estimate.correlation_inflation,
-        common_bias_stddev_m=ranges.common_bias_stddev_m,
         first_pose_is_fixed=estimate.frame != "site",
         gravity=gravity_of(survey.scale.up_in_first_camera),
         camera=survey.camera,
