@@ -26,7 +26,7 @@ LAYERS = (
     "join",
     "result",
     "report",
-    "compare",
+    "comparison",
     "workflows",
     "batch",
     "simulate",

@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from rangesfm.compare.with_reference import ComparisonRow, compare, format_table
+from rangesfm.comparison.with_reference import ComparisonRow, compare, format_table
 from rangesfm.errors import InputError
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.progress import SilentProgress

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from enum import Enum
 from typing import Any
 
-from rangesfm.compare.with_reference import align_rows
+from rangesfm.comparison.with_reference import align_rows
 from rangesfm.failures import INTERNAL_ERROR
 
 _FAILED = 4

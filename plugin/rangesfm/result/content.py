@@ -10,10 +10,11 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from rangesfm.geometry.similarity import Similarity
+from rangesfm.join.models import ModelVerdict
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.log import RangeKind
 from rangesfm.ranging.observations import RangeStatus
-from rangesfm.result.metric_result import MetricResult, ModelVerdict
+from rangesfm.result.metric_result import MetricResult
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.two_candidate import TwoCandidate
 

@@ -21,7 +21,8 @@ from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.workflows.finished_runs import FinishedRun, joined_log, paths_of_surveys, read_finished_runs
 from rangesfm.workflows.journal import Journal
-from rangesfm.workflows.run import RunResult, map_in_metres
+from rangesfm.workflows.results import RunResult
+from rangesfm.workflows.run import map_in_metres
 
 # Two surveys' files may give a place with other digits.
 _SAME_PLACE_M = 1e-3

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import pycolmap
 
+from rangesfm.distances.ends import LocatedDistances
 from rangesfm.distances.tape import Tape
 from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.ranging.observations import RangeObservations
 from rangesfm.refine.with_ranges import RefineSummary, refine_with_ranges
 from rangesfm.scale.estimate import ScaleEstimate
+from rangesfm.scale.initialize import initialize_scale
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes
@@ -19,6 +22,27 @@ def path_of_model(model: pycolmap.Reconstruction, times: ImageTimes | None) -> T
     if times is None:
         return trajectory_from_reconstruction(model)
     return trajectory_from_reconstruction(model, times.by_name(), time_resolution_s=times.resolution_s)
+
+
+def estimate_scale(
+    survey: Survey,
+    inputs: RangingInputs,
+    observations: RangeObservations,
+    trajectory: Trajectory,
+    anchor_frame: str,
+    distances: LocatedDistances | None,
+) -> ScaleEstimate:
+    """``initialize_scale`` by a survey's options; its arguments."""
+    return initialize_scale(
+        observations,
+        trajectory,
+        inputs.anchors,
+        anchor_frame=anchor_frame,
+        options=survey.scale,
+        range_model=survey.ranges.model,
+        distances=distances,
+        seed=survey.seed,
+    )
 
 
 def refine_by_survey(

@@ -12,8 +12,8 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 from rangesfm.colmap.model_files import read_model
-from rangesfm.compare.ranges import ModelRanges, ranges_of_result
-from rangesfm.compare.with_reference import MIN_NUM_ALIGNED, align_rows, reprojection_rms_px
+from rangesfm.comparison.ranges import ModelRanges, ranges_of_result
+from rangesfm.comparison.with_reference import MIN_NUM_ALIGNED, align_rows, reprojection_rms_px
 from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError

@@ -12,9 +12,9 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rangesfm.compare.models import ModelsComparison, compare_many, read_models
-from rangesfm.compare.page import write_comparison
-from rangesfm.compare.ranges import ranges_of_survey
+from rangesfm.comparison.models import ModelsComparison, compare_many, read_models
+from rangesfm.comparison.page import write_comparison
+from rangesfm.comparison.ranges import ranges_of_survey
 from rangesfm.distances.tape import read_tape
 from rangesfm.errors import InputError
 from rangesfm.options import ScaleOptions

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesfm.compare.models import (
+from rangesfm.comparison.models import (
     SIMILARITY_HEADER,
     ModelRow,
     ModelsComparison,

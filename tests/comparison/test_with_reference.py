@@ -11,7 +11,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rangesfm.compare.with_reference import (
+from rangesfm.comparison.with_reference import (
     compare,
     compare_folder,
     compare_models,
