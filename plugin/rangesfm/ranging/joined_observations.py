@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -45,7 +46,7 @@ def joined_observations(
         keyframes: where the keyframes of each path are in the joined one.
     """
     number = path_of_each(parts)
-    joined = {"status": np.min([part.status for part in parts], axis=0)}
+    joined: dict[str, npt.NDArray[Any]] = {"status": np.min([part.status for part in parts], axis=0)}
     for k, (part, similarity, keyframe) in enumerate(zip(parts, joined_from_part, keyframes, strict=True)):
         rows = number == k
         moved = {

@@ -10,13 +10,11 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 from rangesfm.colmap.transform import transform
-from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.similarity import Similarity, align_points, rmse
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors
 from rangesfm.ranging.errors.robust_loss import wider
-from rangesfm.refine.antennas import Antennas
 from rangesfm.refine.carry import carry_model
 from rangesfm.refine.keyframe_graph import (
     GraphSolution,
@@ -26,6 +24,7 @@ from rangesfm.refine.keyframe_graph import (
     moved_anchors,
     solve_graph,
 )
+from rangesfm.refine.problem import RefinementProblem
 from rangesfm.refine.vision_information import Observations, Poses, model_poses, vision_information
 
 Array = npt.NDArray[np.float64]
@@ -60,17 +59,7 @@ class Unbent:
 
 
 def unbend(
-    metric: pycolmap.Reconstruction,
-    frame_ids: Indices,
-    rays: Observations,
-    in_camera: npt.NDArray[np.bool_],
-    range_m: Array,
-    antennas: Antennas,
-    errors: RangeErrors,
-    anchors: tuple[AnchorEstimate, ...],
-    *,
-    first_pose_is_fixed: bool,
-    gravity: Gravity | None,
+    problem: RefinementProblem, rays: Observations, in_camera: npt.NDArray[np.bool_], errors: RangeErrors
 ) -> Unbent:
     """Solve the keyframe graph and move the model after it, in place: as a whole, to which the photos are indifferent,
     or, where it bends, keyframe by keyframe.
@@ -80,19 +69,20 @@ def unbend(
     outlier. From there a bounded loss, which is that of the scale and of the full problem, sets aside what is one.
 
     Args:
-        frame_ids: of the model, in the order of the antennas' frames, as the rays have them.
-        rays: all that the photos see. in_camera: the points that lie in one, which hold nothing together.
-        range_m, antennas, errors: of the ranges that take part.
+        rays: all that the photos see, in the problem's frames. in_camera: the points that lie in one, which hold
+            nothing together.
+        errors: of the ranges that take part.
     """
+    metric, frame_ids, ranges = problem.metric, problem.frame_ids, problem.ranges
     before = model_poses(metric, frame_ids)
     graph = KeyframeGraph(
         vision=vision_information(rays.of_points(~in_camera), before),
-        antennas=antennas,
-        range_m=range_m,
+        antennas=ranges.antennas.subset(ranges.rows),
+        range_m=ranges.observations.log.range_m[ranges.rows],
         errors=errors,
-        anchors=anchors,
-        held_frame=0 if first_pose_is_fixed else None,
-        gravity=gravity,
+        anchors=problem.anchors,
+        held_frame=0 if problem.first_pose_is_fixed else None,
+        gravity=problem.gravity,
     )
     fit = _solve_with_own_errors(graph)
     after = fit.state.poses
@@ -104,7 +94,7 @@ def unbend(
     return Unbent(
         errors=fit.errors,
         num_absorbed=fit.num_absorbed,
-        anchors=moved_anchors(anchors, fit.state),
+        anchors=moved_anchors(problem.anchors, fit.state),
         bend_m=_bend(before.centers, after.centers),
         num_steps=fit.num_steps,
     )

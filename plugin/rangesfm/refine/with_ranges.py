@@ -120,9 +120,9 @@ def refine_with_ranges(
         metric_from_sfm: from the world of ``observations`` to that of ``reconstruction``.
         anchors: in the order of the log, in the metric world. One with a prior stddev of 0 is
             held, one with a finite prior is drawn to it, others are free.
-        tag_in_cam_m: (3,) antenna in the camera (rig) frame; or (num_tags, 3), in the order of the log's tags.
         errors: of all ranges of the log, as the scale stage found them. Where they do not state their noise it is
             estimated anew, each anchor's for itself, and shares and inflation with it.
+        tag_in_cam_m: (3,) antenna in the camera (rig) frame; or (num_tags, 3), in the order of the log's tags.
         first_pose_is_fixed: the gauge: True in the first camera's frame, False where
             surveyed anchors hold the map.
         gravity: which way is up in the first camera; counts where its pose is not fixed.
@@ -188,23 +188,12 @@ def _between_anchors(
 
 def _refine(problem: RefinementProblem, errors: RangeErrors) -> RefineSummary:
     """Unbend the map, then solve the full problem, both without the points that lie in a camera."""
-    frame_ids, ranges = problem.frame_ids, problem.ranges
+    frame_ids = problem.frame_ids
     rays = model_observations(problem.metric, frame_ids)
     in_camera = points_in_cameras(rays, model_poses(problem.metric, frame_ids))
     problem = replace(problem, left_out_ids=frozenset(rays.point_ids[in_camera].tolist()))
     bundle = problem.of_photos(problem.options.max_num_iterations)
-    start = unbend(
-        problem.metric,
-        frame_ids,
-        rays.with_pixel_stddev(bundle.pixel_stddev),
-        in_camera,
-        ranges.observations.log.range_m[ranges.rows],
-        ranges.antennas.subset(ranges.rows),
-        errors,
-        problem.anchors,
-        first_pose_is_fixed=problem.first_pose_is_fixed,
-        gravity=problem.gravity,
-    )
+    start = unbend(problem, rays.with_pixel_stddev(bundle.pixel_stddev), in_camera, errors)
     return _adjust(problem, bundle, start)
 
 

@@ -10,7 +10,6 @@ import numpy.typing as npt
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE
-from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import RangeProblem, RangeState, solve
 from rangesfm.scale.solution import MIN_COST_GAP, Solution
 from rangesfm.scale.starts import anchor_alone, choose_sides, mirrored, spread_subset
@@ -54,9 +53,7 @@ def _one_anchor(solution: Solution, k: int) -> tuple[RangeProblem, RangeState]:
     return spread_subset(alone, _MAX_RANGES_ALONE), start
 
 
-def anchor_estimates(
-    survey: ScaleProblem, solution: Solution, anchor_ids: tuple[str, ...]
-) -> tuple[AnchorEstimate, ...]:
+def anchor_estimates(solution: Solution, anchor_ids: tuple[str, ...]) -> tuple[AnchorEstimate, ...]:
     """All anchors of the log, with stddev widened by the errors' correlation, and mirror places."""
     problem, state = solution.problem, solution.fit.state
     covariance = solution.fit.anchor_covariance_m2() * solution.errors.inflation**2

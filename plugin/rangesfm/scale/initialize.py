@@ -60,25 +60,18 @@ def initialize_scale(
     options, range_model = options or ScaleOptions(), range_model or RangeModelOptions()
     gravity = gravity_of(options.up_in_first_camera)
     block_s = options.bootstrap_block_s
-    survey = scale_problem(observations, trajectory, anchors, anchor_frame, range_model, block_s, distances, gravity)
-    solution = solve_scale(
-        survey.ranges,
-        survey.errors,
-        anchors_are_known=survey.anchors_are_known,
-        center_stddev=observations.center_stddev[survey.rows],
-        camera_side=options.camera_side,
-        seed=seed,
-    )
+    problem = scale_problem(observations, trajectory, anchors, anchor_frame, range_model, block_s, distances, gravity)
+    solution = solve_scale(problem, camera_side=options.camera_side, seed=seed)
     table = _paper_table(solution)
     uncertainty = scale_uncertainty(
-        solution, curve_stddev(observations.log)[survey.rows], num_bootstrap=options.num_bootstrap, seed=seed
+        solution, curve_stddev(observations.log)[problem.rows], num_bootstrap=options.num_bootstrap, seed=seed
     )
     per_anchor = scale_per_anchor(solution, observations.log.anchor_ids)
-    found = anchor_estimates(survey, solution, observations.log.anchor_ids)
+    found = anchor_estimates(solution, observations.log.anchor_ids)
     tests = cutoff_test(solution)
-    judged = judge(survey, solution, uncertainty, per_anchor, found, tests, options)
+    judged = judge(problem, solution, uncertainty, per_anchor, found, tests, options)
     verdict, reasons = judged.verdict, judged.reasons
-    if gravity is not None and survey.frame == "first_camera" and anchor_frame == "site":
+    if gravity is not None and problem.frame == "first_camera" and anchor_frame == "site":
         reasons = (*reasons, *levelled_places(gravity, anchors, found))
     if options.method == "two-candidate":
         robust = solution.fit.state.metric_from_model.scale
@@ -86,10 +79,10 @@ def initialize_scale(
         reasons = (f"two-candidate, as asked for; the stddevs are of the robust scale, {robust:.6g}", *reasons)
     status = observations.status.copy()
     status[observations.has_place] = RangeStatus.UNKNOWN_ANCHOR
-    status[survey.rows] = status_by_weight(solution.fit.weights)
+    status[problem.rows] = status_by_weight(solution.fit.weights)
     return ScaleEstimate(
-        metric_from_sfm=_by_method(options.method, solution, table) @ survey.first_camera_from_sfm,
-        frame=survey.frame,
+        metric_from_sfm=_by_method(options.method, solution, table) @ problem.first_camera_from_sfm,
+        frame=problem.frame,
         method=options.method,
         uncertainty=uncertainty,
         verdict=verdict,
@@ -97,13 +90,13 @@ def initialize_scale(
         advice=judged.advice,
         cutoff_test=tests,
         sensitivity=scale_sensitivity(
-            solution, _model_from_cam(observations, trajectory, survey), observations.log.anchor_ids
+            solution, _model_from_cam(observations, trajectory, problem), observations.log.anchor_ids
         ),
         per_anchor=per_anchor,
         two_candidate=table,
         anchors=found,
         observations=replace(observations, status=status),
-        errors=solution.errors.spread(survey.rows, len(observations.log)),
+        errors=solution.errors.spread(problem.rows, len(observations.log)),
         noise_stddev_m=solution.noise_stddev_m,
         resampled_scales=_resampled_scales(solution, options.num_bootstrap, seed),
     )
@@ -114,10 +107,10 @@ def _resampled_scales(solution: Solution, num: int, seed: int) -> Array:
     return np.asarray(solution.fit.state.metric_from_model.scale * np.exp(steps))
 
 
-def _model_from_cam(observations: RangeObservations, trajectory: Trajectory, survey: ScaleProblem) -> Array:
+def _model_from_cam(observations: RangeObservations, trajectory: Trajectory, problem: ScaleProblem) -> Array:
     """(k, 3, 3) rotation at the keyframe nearest to each range, into the first camera's frame."""
-    nearest = np.where(observations.weight < 0.5, observations.before, observations.after)[survey.rows]
-    turned: Array = survey.first_camera_from_sfm.rotation @ trajectory.world_from_cam[nearest]
+    nearest = np.where(observations.weight < 0.5, observations.before, observations.after)[problem.rows]
+    turned: Array = problem.first_camera_from_sfm.rotation @ trajectory.world_from_cam[nearest]
     return turned
 
 

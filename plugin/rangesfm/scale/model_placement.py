@@ -126,9 +126,9 @@ class _World:
             ]
             elsewhere_m = found[0].elsewhere_m
         fit = self._best(k, starts)
-        moved = _last(fit) @ own.inverse()
+        moved = fit.state.similarities[-1] @ own.inverse()
         rigid = replace(moved, scale=1.0)
-        self.metric_from_sfm = dict(zip((*self.metric_from_sfm, k), _similarities(fit), strict=True))
+        self.metric_from_sfm = dict(zip((*self.metric_from_sfm, k), fit.state.similarities, strict=True))
         for id_, anchor in anchors.items():
             known = self.anchors.get(id_)
             if known is None or _rank(anchor) < _rank(known):
@@ -144,9 +144,10 @@ class _World:
             key=lambda fit: fit.cost,
         )
         path, best = self._models[k].trajectory.centers, fits[0]
-        extent = float(np.linalg.norm(_last(best).scale * path_shape(path).stddevs))
+        placed = best.state.similarities[-1]
+        extent = float(np.linalg.norm(placed.scale * path_shape(path).stddevs))
         for rival in fits[1:]:
-            apart = _last(best).apply(path) - _last(rival).apply(path)
+            apart = placed.apply(path) - rival.state.similarities[-1].apply(path)
             if rmse(apart) > _SAME_SHARE * extent and rival.cost - best.cost < MIN_COST_GAP:
                 raise GeometryError(f"it can be laid in two ways, {rmse(apart):.2g} m apart, that fit all ranges alike")
         stddev = _path_stddev_m(best, path)
@@ -163,7 +164,7 @@ class _World:
             return self.metric_from_sfm
         group = _Group([self._models[k] for k in self.metric_from_sfm], None)
         fit = group.solve(list(self.metric_from_sfm.values()), _chosen(self.anchors))
-        return dict(zip(self.metric_from_sfm, _similarities(fit), strict=True))
+        return dict(zip(self.metric_from_sfm, fit.state.similarities, strict=True))
 
 
 class _Group:
@@ -192,18 +193,9 @@ class _Group:
         return fit
 
 
-def _similarities(fit: RangeFit) -> list[Similarity]:
-    """metric_from_sfm of each model."""
-    return [state.metric_from_model for state in fit.state.of_models]
-
-
-def _last(fit: RangeFit) -> Similarity:
-    return _similarities(fit)[-1]
-
-
 def _path_stddev_m(fit: RangeFit, centers: Array) -> float:
     """Formal, root mean square, of the places (n, 3; in the model's unit) of the last model, whose frame is free."""
-    similarity, first = _last(fit), fit.columns[-1].scale
+    similarity, first = fit.state.similarities[-1], fit.columns[-1].scale
     grown = similarity.scale * centers @ similarity.rotation.T
     identity = np.broadcast_to(np.eye(3), (len(centers), 3, 3))
     jacobian = np.concatenate([grown[:, :, None], -cross_matrices(grown), identity], axis=2)

@@ -38,6 +38,7 @@ class ScaleProblem:
     Attributes:
         ranges: the problem; its model world is the first camera's frame, unscaled.
         errors: of its ranges, before anything is estimated.
+        center_stddev: (k,) of their interpolated centres, each coordinate, model units.
         rows: (k,) which observations its ranges are.
         first_camera_from_sfm: rigid motion from the world of the unscaled model.
         frame: "site" or "first_camera": the metric world of the solution.
@@ -48,6 +49,7 @@ class ScaleProblem:
 
     ranges: RangeProblem
     errors: RangeErrors
+    center_stddev: Array
     rows: npt.NDArray[np.int64]
     first_camera_from_sfm: Similarity
     frame: str
@@ -109,7 +111,17 @@ def scale_problem(
         gravity=gravity if anchor_frame == "site" and bool(known.any()) else None,
     )
     frame = "site" if ranges.frame_is_free else "first_camera"
-    return ScaleProblem(ranges, errors, rows, first_camera_from_sfm, frame, bool(known.any()), tuple(notes), left_out)
+    return ScaleProblem(
+        ranges,
+        errors,
+        observations.center_stddev[rows],
+        rows,
+        first_camera_from_sfm,
+        frame,
+        bool(known.any()),
+        tuple(notes),
+        left_out,
+    )
 
 
 def _all_distances(

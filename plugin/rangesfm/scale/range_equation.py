@@ -112,9 +112,14 @@ class RangeState:
     others: tuple[Similarity, ...] = ()
 
     @property
+    def similarities(self) -> tuple[Similarity, ...]:
+        """metric_from_model of each."""
+        return self.metric_from_model, *self.others
+
+    @property
     def of_models(self) -> tuple[RangeState, ...]:
         """As each model has it."""
-        return tuple(RangeState(each, self.anchors_m, self.bias_m) for each in (self.metric_from_model, *self.others))
+        return tuple(RangeState(each, self.anchors_m, self.bias_m) for each in self.similarities)
 
 
 @dataclass(frozen=True)
@@ -128,7 +133,7 @@ class RangeFit:
         pulls: (n,) the same times the ranges' shares.
         curvatures: (n,) its second derivative times the shares; negative for outliers.
         cost: half the robust sum of squares, priors included.
-        information: (p, p) Gauss-Newton approximation with the robust weights, in ``free``'s parameters.
+        information: (p, p) Gauss-Newton approximation with the robust weights, in the parameters of ``columns``.
         gradients: (n, p) of each range's weighted residual, for resampling.
         prior_information: (p, p) the part of ``information`` that comes from priors.
         scaled_residuals: (n,) residuals in stddevs.

@@ -13,6 +13,7 @@ from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import NEARLY_STRAIGHT, path_kind, path_shape
 from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors
 from rangesfm.scale.anchor_plane import camera_side_of, mirrored_map, on_side
+from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import (
     RangeFit,
     RangeProblem,
@@ -76,35 +77,22 @@ class Solution:
     noise_stddev_m: float
 
 
-def solve_scale(
-    problem: RangeProblem,
-    errors: RangeErrors,
-    *,
-    anchors_are_known: bool,
-    center_stddev: Array,
-    camera_side: str | None,
-    seed: int,
-) -> Solution:
+def solve_scale(posed: ScaleProblem, *, camera_side: str | None, seed: int) -> Solution:
     """Solve from all starts, estimate the noise, and refuse where two answers fit alike.
 
     Args:
-        problem, errors: as set up.
-        anchors_are_known: whether starts may lean on given positions.
-        center_stddev: (n,) of interpolated centres, model units.
         camera_side: as of the scale options.
 
     Raises:
         GeometryError: nothing fits, or two different maps do.
     """
+    problem, errors = posed.ranges, posed.errors
     camera_side = camera_side if problem.frame_is_free else None
-    fits = on_side(problem, _distinct_fits(problem, anchors_are_known, seed), camera_side)
+    fits = on_side(problem, _distinct_fits(problem, posed.anchors_are_known, seed), camera_side)
     starts = [fit.state for fit in fits]
-    if anchors_are_known and not problem.frame_is_free:
+    if posed.anchors_are_known and not problem.frame_is_free:
         starts += _consensus_states(problem)
-    solutions = [
-        _with_own_errors(problem, errors, center_stddev, start)
-        for start in _likeliest_each_once(problem, errors, starts)
-    ]
+    solutions = [_with_own_errors(posed, start) for start in _likeliest_each_once(problem, errors, starts)]
     solutions.sort(key=lambda solution: _unlikeliness(problem, errors, solution.fit.state))
     on_side(problem, [solutions[0].fit], camera_side)
     _refuse_ambiguity(solutions[0], [solution.fit.state for solution in solutions[1:]], camera_side)
@@ -198,12 +186,13 @@ def _differ(problem: RangeProblem, first: RangeState, second: RangeState) -> boo
     return bool(turn > _SAME_ROTATION_DEG or shift > _SAME_SHIFT)
 
 
-def _with_own_errors(given: RangeProblem, errors: RangeErrors, center_stddev: Array, start: RangeState) -> Solution:
+def _with_own_errors(posed: ScaleProblem, start: RangeState) -> Solution:
     """Alternate between the fit and the errors it shows."""
+    given = posed.ranges
 
     def seen(errors: RangeErrors, state: RangeState) -> RangeErrors:
         placed = state.metric_from_model
-        errors = errors.at(tag_positions(given, placed), placed.scale * center_stddev)
+        errors = errors.at(tag_positions(given, placed), placed.scale * posed.center_stddev)
         return errors.seen_by_rigid_map(predicted_ranges(given, state) - given.range_m, prior_cost(given, state))
 
     def fit(errors: RangeErrors, before: RangeFit | None) -> RangeFit:
@@ -213,7 +202,7 @@ def _with_own_errors(given: RangeProblem, errors: RangeErrors, center_stddev: Ar
     fitted, used, shown = fit_with_own_errors(
         fit,
         lambda errors, fitted: seen(errors.inflated(fitted.residuals_m), fitted.state),
-        seen(errors, start),
+        seen(posed.errors, start),
         max_num_rounds=_NUM_NOISE_ROUNDS,
     )
     errors = replace(used, inflation=shown.inflation)

@@ -198,8 +198,13 @@ def anchor_alone(problem: RangeProblem, k: int, metric_from_model: Similarity) -
     """The problem of one anchor with the path given: centres already metric, scale practically fixed."""
     part = problem.of_anchor(k)
     tags = tag_positions(part, metric_from_model)
-    held = {"bias_stddev_m": np.zeros(1), "common_bias_stddev_m": 0.0}
-    return replace(part, centers=np.zeros_like(tags), tag_from_center=tags, **held)
+    return replace(
+        part,
+        centers=np.zeros_like(tags),
+        tag_from_center=tags,
+        bias_stddev_m=np.zeros(1),
+        common_bias_stddev_m=0.0,
+    )
 
 
 def _at_scale(problem: RangeProblem, scale: float) -> RangeState:
