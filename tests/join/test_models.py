@@ -12,11 +12,16 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.simulated.model import random_similarity, synthetic_model
+from tests.simulated.path import loop_path
+from tests.simulated.ranges import simulate_ranges_at
 
 from rangesfm.cli import main
 from rangesfm.colmap.merge import without_photos
 from rangesfm.colmap.model_files import read_model
 from rangesfm.colmap.transform import rescale
+from rangesfm.demo.path import CameraPath
+from rangesfm.demo.ranges import Radio
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import align_points
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
@@ -27,9 +32,6 @@ from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers.canonical import write_ranges_csv
-from rangesfm.simulate.model import random_similarity, synthetic_model
-from rangesfm.simulate.path import CameraPath, loop_path
-from rangesfm.simulate.ranges import Radio, simulate_ranges_at
 from rangesfm.survey.settings import RangesConfig, Survey
 from rangesfm.vision.reconstruct import ReconstructionSummary
 from rangesfm.workflows.run import run_survey, scale_model

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from tests.scale.conftest import MakeSurvey
 
+from rangesfm.demo.ranges import Radio
 from rangesfm.options import ScaleOptions
 from rangesfm.scale import model_placement
 from rangesfm.scale.model_placement import ScaledModel
 from rangesfm.scale.range_equation import solve
-from rangesfm.simulate.ranges import Radio
 
 NO_RESAMPLING = ScaleOptions(num_bootstrap=0)
 

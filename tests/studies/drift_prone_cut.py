@@ -1,8 +1,8 @@
 """A survey of yours, with true positions, cut into one that drifts: no photo knows any but its neighbours.
 
-Run: python tests/studies/drift_prone_cut.py SURVEY.toml --base_path DATA --output_path OUT [--first 0]
+Run: python -m tests.studies.drift_prone_cut SURVEY.toml --base_path DATA --output_path OUT [--first 0]
      [--num_photos 120] [--overlap 2] [--max_num_features 1000] [--ranges_in_mapping]
- or: python tests/studies/drift_prone_cut.py SURVEY.toml --base_path DATA --output_path OUT --input_path sparse/0
+ or: python -m tests.studies.drift_prone_cut SURVEY.toml --base_path DATA --output_path OUT --input_path sparse/0
      [--max_track_length 3] [--share_of_points 0.15] [--num_seeds 3]
 
 The first maps a stretch of successive photos (all of them, whatever the survey file thins out, so that neighbours

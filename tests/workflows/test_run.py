@@ -15,6 +15,8 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
+from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.path import loop_path
 
 from rangesfm.colmap.model_files import read_model
 from rangesfm.errors import GeometryError, InputError
@@ -24,8 +26,6 @@ from rangesfm.options import CheckOptions, ExportOptions, RefineOptions, ScaleOp
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.readers import read_ranges
 from rangesfm.result.outputs import forget_result, refuse_to_overwrite, replacing_result, write_result
-from rangesfm.simulate.model import SyntheticModel, synthetic_model
-from rangesfm.simulate.path import loop_path
 from rangesfm.survey.settings import RangesConfig, Survey
 from rangesfm.workflows.export_result import export_result
 from rangesfm.workflows.journal import Journal

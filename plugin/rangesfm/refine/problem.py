@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from rangesfm import _ceres
+from rangesfm import ceres
 from rangesfm.ceres.covariance import ResidualErrors
 from rangesfm.geometry.gravity import UP_IN_SITE, Gravity
 from rangesfm.geometry.trajectory import pose_of
@@ -91,13 +91,13 @@ class RefinementProblem:
 
     def _add_gravity(self, bundle: BundleAdjustment, gravity: Gravity) -> None:
         """What the first camera saw of the vertical; the stddev in the unit of pixels."""
-        cost = _ceres.direction_cost(
+        cost = ceres.direction_cost(
             direction_in_world=UP_IN_SITE,
             direction_in_cam=gravity.up_in_first_camera,
             stddev_rad=gravity.stddev_rad / bundle.pixel_stddev,
         )
         pose = pose_of(bundle.metric.frame(self.first_frame_id)).params
-        _ceres.add_residual_block(bundle.adjuster, cost, None, [pose])
+        ceres.add_residual_block(bundle.adjuster, cost, None, [pose])
 
     def residual_errors(self, added: AddedBlocks, errors: RangeErrors, num_absorbed: float) -> ResidualErrors:
         """How the residuals of the ranges err."""
