@@ -21,7 +21,7 @@ from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import align_points
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.join.models import JoinedModels, PathOfModel, Ranging, join_models
-from rangesfm.options import ExportOptions, RangeModelOptions, RefineOptions, ScaleOptions
+from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
@@ -30,7 +30,7 @@ from rangesfm.ranging.readers.canonical import write_ranges_csv
 from rangesfm.simulate.model import random_similarity, synthetic_model
 from rangesfm.simulate.path import CameraPath, loop_path
 from rangesfm.simulate.ranges import Radio, simulate_ranges_at
-from rangesfm.survey.settings import RangesConfig, Survey
+from rangesfm.survey.settings import Survey
 from rangesfm.vision.reconstruct import ReconstructionSummary
 from rangesfm.workflows import run as pipeline
 
@@ -87,16 +87,20 @@ class Halves:
             assert path.timestamps_s is not None
             rows += [f"{name},{time!r}\n" for name, time in zip(path.image_names, path.timestamps_s.tolist())]
         (folder / "images.csv").write_text("".join(rows))
-        return Survey(
-            image_times_path=folder / "images.csv",
-            ranges=RangesConfig(path=folder / "uwb.csv", time_offset_s=0.0),
-            anchor_frame="unknown",
-            tag_in_cam_m=TAG_IN_CAM_M,
-            scale=ScaleOptions(num_bootstrap=0, max_relative_stddev=0.2),
-            refine=RefineOptions(enabled=False),
-            export=ExportOptions(formats=()),
-            report_enabled=False,
-            output_path=folder / "out",
+        return Survey().changed(
+            {
+                "images.times": folder / "images.csv",
+                "ranges.path": folder / "uwb.csv",
+                "ranges.time_offset": 0.0,
+                "anchors.frame": "unknown",
+                "tag.tag_in_cam_m": TAG_IN_CAM_M,
+                "scale.num_bootstrap": 0,
+                "scale.max_relative_stddev": 0.2,
+                "refine.enabled": False,
+                "export.formats": (),
+                "report.enabled": False,
+                "output.path": folder / "out",
+            }
         )
 
 

@@ -72,7 +72,7 @@ def write_result(
     _write_scale_tables(folder, rows)
     summary = _summary(rows, anchor_ids, is_refined, has_reference)
     if has_photos:
-        summary["settings"]["images_path"] = str(_write_photos(folder / "photos", num_keyframes))
+        summary["settings"]["images"]["path"] = str(_write_photos(folder / "photos", num_keyframes))
     for key, value in (changes or {}).items():
         summary[key] = value
     (folder / "result.json").write_text(json.dumps({k: v for k, v in summary.items() if v is not None}))
@@ -279,7 +279,7 @@ def _summary(
             "images": {"path": "images", "every_nth": 3},
             "anchors": {"path": "anchors.csv", "frame": "site"},
             "ranges": {"path": "uwb.csv", "time_offset": "auto"},
-            "tag_in_cam_m": [-0.0012, -0.09, -0.0663],
+            "tag": {"tag_in_cam_m": [-0.0012, -0.09, -0.0663]},
             "refine": {"enabled": is_refined, "max_num_iterations": 200, "range_loss_scale": 3.46},
         },
         "seconds": {"features": 31.2, "matching": 18.4, "mapping": 64.0, "scale": 3.1, "refine": 12.3, "output": 1.2},

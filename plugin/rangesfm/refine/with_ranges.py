@@ -122,7 +122,7 @@ def refine_with_ranges(
     range_share: Array | None = None,
     stddev_is_estimated: npt.NDArray[np.bool_] | None = None,
     correlation_inflation: float = 1.0,
-    common_bias_stddev_m: float = RangeModelOptions.common_bias_stddev_m,
+    common_bias_stddev_m: float = RangeModelOptions().common_bias_stddev_m,
     first_pose_is_fixed: bool,
     gravity: Gravity | None = None,
     camera: CameraOptions | None = None,

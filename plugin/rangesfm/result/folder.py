@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -146,7 +146,7 @@ class ResultFolder:
     def images_path(self) -> Path | None:
         """Folder of the photos, as the run was told; None if it had none."""
         with self._expecting("settings"):
-            path = (self.summary.get("settings") or {}).get("images_path")
+            path = ((self.summary.get("settings") or {}).get("images") or {}).get("path")
             return None if path is None else path_of(path)
 
     @property
@@ -214,7 +214,7 @@ class ResultFolder:
             InputError: the settings are not what a run writes.
         """
         with self._expecting("settings"):
-            settings = self.summary.get("settings") or {}
+            settings = (self.summary.get("settings") or {}).get("tag") or {}
             common = np.array(settings.get("tag_in_cam_m") or (0.0, 0.0, 0.0), dtype=np.float64).reshape(3)
             given = settings.get("lever_arms_m") or {}
             arms = {str(id_): np.array(arm, dtype=np.float64).reshape(3) for id_, arm in given.items()}
@@ -224,8 +224,8 @@ class ResultFolder:
     def association(self) -> AssociationOptions:
         """How the run put ranges on the path."""
         with self._expecting("settings"):
-            given = ((self.summary.get("settings") or {}).get("ranges") or {}).get("association") or {}
-            known = (field.name for field in fields(AssociationOptions) if field.name in given)
+            given = (self.summary.get("settings") or {}).get("ranges") or {}
+            known = (name for name in AssociationOptions.model_fields if name in given)
             return AssociationOptions(**{name: float(given[name]) for name in known})
 
     def read_numbers(self, name: str, columns: Sequence[str]) -> dict[str, Array] | None:

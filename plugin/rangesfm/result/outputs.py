@@ -9,7 +9,6 @@ import os
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -126,7 +125,7 @@ def write_outputs(
     impossible = [] if survey.final.num_points3D() else ["ply"]
     impossible += [] if survey.center_covariance_m2 else COVARIANCE_FORMATS
     formats = tuple(name for name in export.formats if name not in impossible)
-    export_map(map_, folder, replace(export, formats=formats))
+    export_map(map_, folder, export.changed(formats=formats))
 
 
 def write_scale_tables(survey: MetricResult, folder: Path) -> None:

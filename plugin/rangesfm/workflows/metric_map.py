@@ -28,7 +28,7 @@ def join_by_survey(
     """All models that can be, as one."""
     if len(paths) == 1:
         return paths[0], ()
-    ranging = Ranging(inputs.anchors, inputs.anchor_frame, survey.scale, survey.ranges.model, inputs.tape, survey.seed)
+    ranging = Ranging(inputs.anchors, inputs.anchor_frame, survey.scale, survey.ranges, inputs.tape, survey.output.seed)
     joined = join_models(paths, ranging)
     left_out = [model for model in joined.verdicts if model.joined_from_sfm is None]
     if must_join and len(left_out) == len(paths) - 1:
@@ -55,9 +55,9 @@ def scale_by_survey(
         inputs.anchors,
         anchor_frame=inputs.anchor_frame,
         options=survey.scale,
-        range_model=survey.ranges.model,
+        range_model=survey.ranges,
         distances=distances,
-        seed=survey.seed,
+        seed=survey.output.seed,
     )
     for doubt in estimate.reasons if estimate.verdict != "good" else ():
         journal.warn(doubt)

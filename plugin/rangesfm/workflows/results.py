@@ -61,24 +61,24 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
         journal.warn(note)
     metric = metric.doubted(disagreeing)
     result = survey_result(metric)
-    with replacing_result(survey.output_path):
+    with replacing_result(survey.output.path):
         with journal.stage("results"):
             result["distances"] = distances
             table = _compare(survey, inputs, metric, result)
             georeference = _georeference(inputs, metric)
             result["georeference"] = georeference and georeference.to_dict()
             write_outputs(
-                metric, survey.export, survey.output_path, images_path=survey.images_path, georeference=georeference
+                metric, survey.export, survey.output.path, images_path=survey.images.path, georeference=georeference
             )
-            write_scale_tables(metric, survey.output_path)
+            write_scale_tables(metric, survey.output.path)
         result["versions"], result["settings"] = versions(), survey.to_dict()
         result["inputs"] = input_hashes(survey)
         result["seconds"], result["warnings"] = journal.all_seconds(), journal.warnings
-        write_result(result, survey.output_path / "result.json")
-    lines = [*summary_lines(metric, result, table, survey.output_path)]
-    if survey.report_enabled:
-        lines.append(f"report: {write_report(survey.output_path)}")
-    return RunResult(survey.output_path, result, tuple(lines))
+        write_result(result, survey.output.path / "result.json")
+    lines = [*summary_lines(metric, result, table, survey.output.path)]
+    if survey.report.enabled:
+        lines.append(f"report: {write_report(survey.output.path)}")
+    return RunResult(survey.output.path, result, tuple(lines))
 
 
 def _georeference(inputs: RangingInputs, metric: MetricResult) -> Georeference | None:
@@ -106,5 +106,5 @@ def _compare(survey: Survey, inputs: RangingInputs, metric: MetricResult, result
     result["comparison"] = [asdict(row) for row in rows]
     in_frame = reference_in_frame(refined or scaled, inputs.reference, frame=frame)
     if in_frame is not None:
-        write_reference(in_frame, survey.output_path / "reference.csv")
+        write_reference(in_frame, survey.output.path / "reference.csv")
     return format_table(rows)

@@ -36,7 +36,7 @@ def refine_by_survey(
         scaled: in the metric world. trajectory: of the unscaled model, as the scale stage had it.
         tape: distances to keep to.
     """
-    ranges = survey.ranges.model
+    ranges = survey.ranges
     # Those of which neither the log nor the survey says how noisy they are.
     stddev_is_estimated = np.isnan(estimate.observations.log.range_stddev_m) & (ranges.range_stddev_m is None)
     return refine_with_ranges(
