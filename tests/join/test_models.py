@@ -32,7 +32,7 @@ from rangesfm.simulate.path import CameraPath, loop_path
 from rangesfm.simulate.ranges import Radio, simulate_ranges_at
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.reconstruct import ReconstructionSummary
-from rangesfm.workflows import run as pipeline
+from rangesfm.workflows.run import run_survey, scale_model
 
 Array = npt.NDArray[np.float64]
 
@@ -183,9 +183,9 @@ def test_a_run_joins_what_the_mapper_left_in_pieces(
     def reconstruct(*_: Any, **__: Any) -> ReconstructionSummary:
         return ReconstructionSummary(models, len(names), HALF, {}, tmp_path / "mapper.log")
 
-    monkeypatch.setattr(pipeline, "reconstruct", reconstruct)
+    monkeypatch.setattr("rangesfm.workflows.photos.reconstruct", reconstruct)
     survey = replace(exact.write(tmp_path), images_path=tmp_path / "photos")
-    result = pipeline.run_survey(survey, progress=SilentProgress()).result
+    result = run_survey(survey, progress=SilentProgress()).result
     path = trajectory_from_reconstruction(read_model(tmp_path / "out" / "sparse_scaled" / "0"))
     assert path.image_names == tuple(names)
     assert exact.off_m(path.centers, with_scale=False) < 1e-6
@@ -211,7 +211,7 @@ def finished(exact: Halves, tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / day).mkdir()
         part.sfm.write(folder / day)
         survey = replace(exact.write(folder), model_path=folder / day, output_path=folder / day / "out")
-        pipeline.scale_model(survey, progress=SilentProgress())
+        scale_model(survey, progress=SilentProgress())
     return folder
 
 
