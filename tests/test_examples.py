@@ -36,9 +36,14 @@ def test_every_program_is_tested_here() -> None:
         "compare_two_surveys.py",
         "floor_plan.py",
         "gaussian_splatting.py",
+        "keys.py",
         "own_problem.py",
         "scale_existing_model.py",
     }
+
+
+def test_the_reference_of_keys_is_up_to_date() -> None:
+    assert run_example("keys.py", cwd=EXAMPLES) == (EXAMPLES / "keys.md").read_text(encoding="utf-8")
 
 
 def test_own_problem_converges_on_a_model_that_fits_its_ranges(walked_survey: WalkedSurvey) -> None:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import difflib
 import types
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic.fields import FieldInfo
 
 from rangesfm.errors import OptionError, nearest_known, printable, shown
@@ -21,29 +22,44 @@ _TABLE_OF = "a table in which each value is "
 _UNITS = {"m": "metres", "s": "seconds", "deg": "degrees"}
 
 
-def key(
-    default: Any,
-    meaning: str,
-    *,
-    flag: str | None = None,
-    metavar: str | None = None,
-    expected: str | None = None,
-    role: PathRole | None = None,
-) -> Any:
-    """A key of a table.
+@dataclass(frozen=True)
+class Told:
+    """What a key is told by its annotation, where its name and type do not say it.
 
-    Args:
-        meaning: for the help and the reference.
-        flag: its name on the command line; None: the key's own.
+    Attributes:
+        flag: its name on the command line, without dashes; None: the key's own.
         metavar: how its value is shown there; None: by its type.
         expected: what it may be, for messages; None: by its type and bounds.
-        role: of a path, what stands there: a file to read, the folder of the photos, or the results.
+        role: of a path, what stands there.
     """
-    return Field(
-        default,
-        description=meaning,
-        json_schema_extra={"flag": flag, "metavar": metavar, "expected": expected, "role": role},
-    )
+
+    flag: str | None = None
+    metavar: str | None = None
+    expected: str | None = None
+    role: PathRole | None = None
+
+
+@dataclass(frozen=True)
+class Key:
+    """A key of a survey file: where it stands, what its annotation says, and what its docstring says.
+
+    Attributes:
+        type: of its value, without None for one that is not given.
+        meaning: with its default.
+    """
+
+    table: str
+    name: str
+    flag: str
+    metavar: str | None
+    type: Any
+    expected: str
+    meaning: str
+    role: PathRole | None
+
+    @property
+    def dotted(self) -> str:
+        return f"{self.table}.{self.name}"
 
 
 class Options(BaseModel):
@@ -53,10 +69,11 @@ class Options(BaseModel):
         OptionError: an unknown key (names the nearest known one), or a value of another type or out of bounds.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
-    table: ClassVar[str]
-    """Its name in a survey file."""
+    table: ClassVar[str]  # its name in a survey file
 
     def __init__(self, /, **values: Any):
         try:
@@ -70,19 +87,19 @@ class Options(BaseModel):
         return type(self)(**{**given, **values})
 
     @classmethod
-    def about(cls, name: str) -> dict[str, Any]:
-        """What is known of a key: ``flag``, ``metavar``, ``type``, ``expected``, ``meaning`` and ``role``."""
-        field = cls.model_fields[name]
-        told: Any = field.json_schema_extra
-        hint = _hints(cls, True)[name]
-        return {
-            "flag": told["flag"] or name,
-            "metavar": told["metavar"],
-            "type": _without_none(_hints(cls, False)[name]),
-            "expected": told["expected"] or _described(hint, _UNITS.get(name.rpartition("_")[2])),
-            "meaning": f"{field.description}{_default(field.default)}",
-            "role": told["role"],
-        }
+    @cache
+    def keys(cls) -> Mapping[str, Key]:
+        """All keys by their names."""
+        bare, hints = get_type_hints(cls), get_type_hints(cls, include_extras=True)
+        keys = {}
+        for name, field in cls.model_fields.items():
+            told = next((item for item in field.metadata if isinstance(item, Told)), Told())
+            expected = told.expected or _described(hints[name], _UNITS.get(name.rpartition("_")[2]))
+            meaning = " ".join((field.description or "").split()).removesuffix(".")
+            meaning += _default(field.get_default(call_default_factory=True))
+            type_ = _without_none(bare[name])
+            keys[name] = Key(cls.table, name, told.flag or name, told.metavar, type_, expected, meaning, told.role)
+        return keys
 
     @classmethod
     def _error(cls, where: tuple[int | str, ...], values: Mapping[str, Any]) -> OptionError:
@@ -92,15 +109,10 @@ class Options(BaseModel):
             return OptionError(
                 f"unknown key {shown(name)} in [{cls.table}]; the nearest known one is '{nearest}'", cls.table, name
             )
-        value, expected = values[name], cls.about(name)["expected"]
+        value, expected = values[name], cls.keys()[name].expected
         if len(where) > 1 and isinstance(value, Mapping) and where[1] in value:
             name, value, expected = f"{name}.{where[1]}", value[where[1]], expected.removeprefix(_TABLE_OF)
         return OptionError(f"[{cls.table}] {printable(name)} is {shown(value)}, expected {expected}", cls.table, name)
-
-
-@cache
-def _hints(cls: type[Options], with_bounds: bool) -> dict[str, Any]:
-    return get_type_hints(cls, include_extras=with_bounds)
 
 
 def looks_like(name: str, known: Iterable[str], min_likeness: float) -> bool:
@@ -110,7 +122,7 @@ def looks_like(name: str, known: Iterable[str], min_likeness: float) -> bool:
 
 def _default(value: Any) -> str:
     """What a key is if it is not given, where the meaning does not say it."""
-    if value is None or value is False or value in ((), {}):
+    if value is None or value in ((), {}):
         return ""
     parts = value if isinstance(value, tuple) else (value,)
     words = (f"{part:g}" if isinstance(part, float) else str(part).lower() for part in parts)
@@ -118,7 +130,6 @@ def _default(value: Any) -> str:
 
 
 def _without_none(hint: Any) -> Any:
-    """The type of a value that is given."""
     if get_origin(hint) not in (Union, types.UnionType):
         return hint
     return Union[tuple(arg for arg in get_args(hint) if arg is not types.NoneType)]  # noqa: UP007 (a tuple of types)

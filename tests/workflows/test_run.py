@@ -25,7 +25,7 @@ from rangesfm.ranging.readers import read_ranges
 from rangesfm.result.outputs import forget_result, refuse_to_overwrite, replacing_result, write_result
 from rangesfm.simulate.model import SyntheticModel, synthetic_model
 from rangesfm.simulate.path import loop_path
-from rangesfm.survey.settings import Survey
+from rangesfm.survey.settings import KEYS, Survey
 from rangesfm.workflows.export_result import export_result
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.run import refine_model, scale_model
@@ -328,6 +328,18 @@ def test_doubts_are_warnings_in_the_result_and_for_the_user(survey: Survey) -> N
     assert result["scale"]["method"] == "two-candidate"
     assert result["scale"]["verdict"] == "doubtful"
     assert result["warnings"] == listener.messages != []
+
+
+@pytest.mark.parametrize("key", [item.dotted for item in KEYS if item.role == "file"])
+def test_no_file_that_a_survey_reads_is_overwritten(key: str, survey: Survey) -> None:
+    path = survey.output.path / "ranges.csv"
+    path.parent.mkdir()
+    path.write_text("an input\n")
+    taped = {"scale.distances": survey.ranges.path} if key == "scale.markers" else {}
+    with pytest.raises(InputError, match="the results would overwrite this input") as caught:
+        scale_model(survey.changed({**taped, key: path}), progress=SilentProgress())
+    assert caught.value.path == path
+    assert path.read_text() == "an input\n"
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,8 @@ from rangesfm.cli.arguments import Parser
 from rangesfm.errors import InputError
 
 if TYPE_CHECKING:
-    from rangesfm.survey.settings import Key, Survey
+    from rangesfm.option_model import Key
+    from rangesfm.survey.settings import Survey
 
 ALL_TABLES = ("images", "camera", "ranges", "anchors", "tag", "mapper", "scale", "refine", "export", "report", "output")
 LOG_KEYS = (

@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation, Slerp
 
-from rangesfm.errors import InputError
+from rangesfm.errors import InputError, printable
 from rangesfm.files.atomic import new_file
-from rangesfm.files.tables import Table, header_names, printable, read_head, read_table, read_text
+from rangesfm.files.tables import Table, header_names, read_head, read_table, read_text
 from rangesfm.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]

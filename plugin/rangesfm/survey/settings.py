@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from rangesfm.errors import OptionError, nearest_known, printable, shown
 from rangesfm.files.atomic import path_of
-from rangesfm.option_model import Options, PathRole
+from rangesfm.option_model import Key, Options, PathRole
 from rangesfm.options import (
     AnchorOptions,
     CameraOptions,
@@ -88,46 +88,14 @@ class InputPath:
     path: Path
 
 
-@dataclass(frozen=True)
-class Key:
-    """A key of a survey file.
-
-    Attributes:
-        table, name: where it stands in the file.
-        flag: that overrides it, without dashes.
-        metavar: how its value is shown there; None: by its type.
-        type: of its value, without None for one that is not given.
-        expected: what it may be, in words.
-        meaning: for the help, with its default.
-        role: of a path, what stands there.
-    """
-
-    table: str
-    name: str
-    flag: str
-    metavar: str | None
-    type: Any
-    expected: str
-    meaning: str
-    role: PathRole | None
-
-    @property
-    def dotted(self) -> str:
-        return f"{self.table}.{self.name}"
-
-
 TABLES: dict[str, type[Options]] = {
     name: field.annotation
     for name, field in Survey.model_fields.items()
     if isinstance(field.annotation, type) and issubclass(field.annotation, Options)
 }
+# Paths first: keys that a table takes over from a stage's options stand before its own.
 KEYS = tuple(
-    item
-    for table, model in TABLES.items()
-    # Paths first: keys that a table takes over from a stage's options stand before its own.
-    for item in sorted(
-        (Key(table, name, **model.about(name)) for name in model.model_fields), key=lambda it: not it.role
-    )
+    item for model in TABLES.values() for item in sorted(model.keys().values(), key=lambda item: item.role is None)
 )
 _ROLE_OF_PATH: dict[str, PathRole] = {item.dotted: item.role for item in KEYS if item.role is not None}
 
