@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.path import loop_path
 
 from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.rows import disagreements, distance_rows
 from rangesfm.distances.tape import Marker, Tape, TapedDistance
 from rangesfm.errors import InputError
-from rangesfm.simulate.model import SyntheticModel, synthetic_model
-from rangesfm.simulate.path import loop_path
 
 
 @pytest.fixture(scope="module")

@@ -107,11 +107,13 @@ def _scene(comparison: ModelsComparison, aligned: list[Trajectory]) -> Scene:
         for i, (model, path) in enumerate(zip(comparison.models, aligned))
     ]
     return Scene(
-        frame="first_camera" if base.result is None else base.result.frame,
+        frame="first_camera" if base.result is None else base.result.summary.frame,
         paths=(*paths[1:], paths[0]),
         points_m=points_m,
         points_rgb=points_rgb,
-        anchors=() if base.result is None else anchors_in_scene(base.result.summary, base.result.anchor_positions_m),
+        anchors=()
+        if base.result is None
+        else anchors_in_scene(base.result.summary.to_json(), base.result.anchor_positions_m),
     )
 
 
@@ -142,7 +144,7 @@ def _moved_figure(comparison: ModelsComparison) -> Figure | None:
 def _path_figure(comparison: ModelsComparison, aligned: list[Trajectory]) -> Figure:
     views = []
     base = comparison.models[0]
-    is_site = base.result is not None and base.result.frame == "site"
+    is_site = base.result is not None and base.result.summary.frame == "site"
     for name, axes in (("Plan", (0, 1) if is_site else (0, 2)), ("Elevation", (0, 2) if is_site else (0, 1))):
         signs = np.array([1.0, 1.0 if is_site or name == "Plan" else -1.0])
         lines = [

@@ -9,7 +9,7 @@ from rangesfm.ranging.observations import RangeStatus
 from rangesfm.report.content import Content, in_natural_order
 from rangesfm.report.plot import WIDE_SIZE, Figure, Panel, Series
 from rangesfm.report.svg import running_median
-from rangesfm.result.folder import RangesAsUsed
+from rangesfm.result.ranges_as_used import RangesAsUsed
 
 Array = npt.NDArray[np.float64]
 
