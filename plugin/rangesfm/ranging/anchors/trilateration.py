@@ -11,11 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import GeometryError
-from rangesfm.geometry.similarity import PathShape, path_shape
+from rangesfm.geometry.similarity import PathShape, oriented, path_shape
 from rangesfm.ranging.anchors.point_fit import PointProblem, improve
 from rangesfm.ranging.anchors.point_search import best_start, inlier_noise
 from rangesfm.ranging.errors.noise import correlation_inflation, inflation_before_fit, short_range_stddev
-from rangesfm.ranging.errors.robust_loss import CAUCHY
+from rangesfm.ranging.errors.robust_loss import CAUCHY, SAME_COST
 
 Array = npt.NDArray[np.float64]
 
@@ -38,6 +38,8 @@ _NEARLY_STRAIGHT = 0.1
 _ACROSS = 0.9
 _MIN_BLOCKS = 16
 _NUM_UNKNOWNS = 4
+# Sine of the angle between a plane and a direction that is along it, but for rounding.
+_ALONG_PLANE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -127,7 +129,8 @@ def trilaterate(
     """Find an anchor from its ranges to known positions of the tag.
 
     Up to about half of the ranges may be wrong by any amount. If the positions lie in a plane, the anchor's
-    mirror image in it fits as well: then both are returned, unless ``toward`` says which it is.
+    mirror image in it fits as well: then both are returned, unless ``toward`` says which it is; the upper one first if
+    no range tells.
 
     Args:
         tag_positions_m: (n, 3) positions of the tag's antenna, metres.
@@ -160,11 +163,13 @@ def trilaterate(
     covariance, shape = _covariance(fit), path_shape(positions)
     _refuse_uncertain(covariance, shape, options)
     mirror = _mirror(fit, covariance, shape)
-    if mirror is not None and toward is not None:
-        if (mirror - fit.x)[:3] @ np.asarray(toward, dtype=np.float64) > 0:
-            fit = replace(fit, x=mirror)
+    if mirror is not None:
+        across = (mirror - fit.x)[:3]
+        told = None if toward is None else _unless_along_plane(np.asarray(toward, dtype=np.float64), across)
+        if (told is not None or _fit_alike(fit, mirror)) and across @ (shape.axes[:, 2] if told is None else told) > 0:
+            fit, mirror = replace(fit, x=mirror), fit.x
             covariance = _covariance(fit)
-        mirror = None
+        mirror = mirror if told is None else None
     return Trilateration(
         position_m=fit.x[:3],
         covariance_m2=covariance[:3, :3],
@@ -247,8 +252,11 @@ def _covariance(fit: _Fit) -> Array:
 
 
 def _inverse(information: Array) -> Array:
-    values, vectors = np.linalg.eigh(information)
-    inverse: Array = (vectors / np.maximum(values, 1e-12 * values[-1])) @ vectors.T
+    # Position and bias each in a unit of its own: beside a bias that is known, in metres, no place counts at all.
+    strongest = np.diag(information)
+    unit = 1 / np.sqrt(np.append(np.full(3, strongest[:3].max()), strongest[3]))
+    values, vectors = np.linalg.eigh(unit[:, None] * information * unit)
+    inverse: Array = unit[:, None] * ((vectors / np.maximum(values, 1e-12)) @ vectors.T) * unit
     return inverse
 
 
@@ -292,7 +300,8 @@ def _refuse_uncertain(covariance: Array, shape: PathShape, options: Trilateratio
         why = "the anchor stands near the plane in which the tag's positions lie, and how far off it is not seen"
     else:
         why = f"the tag's positions extend over {length:.3g} by {width:.3g} m, too little or too far away"
-    direction = ", ".join(f"{component:.2f}" for component in axes[:, 2])
+    # No minus sign by rounding, neither of all three nor of a zero.
+    direction = ", ".join(f"{component:.2f}" for component in np.round(oriented(axes)[:, 2], 2) + 0.0)
     raise GeometryError(
         f"the position is not determined: {why} (stddev {min(stddev, _PROFILE_STEPS_M[-1]):.2g} m along {direction})"
     )
@@ -308,3 +317,14 @@ def _mirror(fit: _Fit, covariance: Array, shape: PathShape) -> Array | None:
     stddev = float(np.sqrt(apart @ covariance[:3, :3] @ apart)) / max(distance, 1e-12)
     gap = float(np.diff(fit.problem.unlikelihood(np.stack([fit.x, found[0]])))[0]) / fit.inflation**2
     return found[0] if distance > 2 * stddev and gap < _MIN_COST_GAP else None
+
+
+def _unless_along_plane(direction: Array, across: Array) -> Array | None:
+    """A direction that tells two places apart; of one along the plane between them, rounding would choose the sign."""
+    least = _ALONG_PLANE * float(np.linalg.norm(direction) * np.linalg.norm(across))
+    return direction if abs(direction @ across) > least else None
+
+
+def _fit_alike(fit: _Fit, mirror: Array) -> bool:
+    """Whether no range tells two places apart, so that rounding would choose."""
+    return bool(np.ptp(fit.problem.unlikelihood(np.stack([fit.x, mirror]))) < SAME_COST)
