@@ -14,6 +14,7 @@ from tests.simulated.model import SyntheticModel
 from rangesfm.geometry.gravity import UP_IN_SITE, Gravity
 from rangesfm.geometry.similarity import align_points, rmse
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE
 from rangesfm.refine import keyframe_graph
 from rangesfm.refine.antennas import Antennas
@@ -41,15 +42,30 @@ def make_graph(
     return KeyframeGraph(
         vision=replace(vision_information(rays, truth), origin=origin),
         antennas=antennas,
-        anchor_index=index,
         range_m=np.linalg.norm(at - ANCHORS_M[index], axis=1) + 0.05,
-        stddev_m=np.full(len(index), stddev_m),
-        share=np.ones(len(index)),
+        errors=errors_of(index, stddev_m),
         anchors=tuple(anchor(k, anchors_are_free) for k in range(m)),
-        common_bias_stddev_m=0.1,
         gravity=None,
         held_frame=held_frame,
+    )
+
+
+def errors_of(anchor_index: npt.NDArray[np.int64], stddev_m: float) -> RangeErrors:
+    """Independent ones, under no loss to speak of."""
+    n = len(anchor_index)
+    known, label = np.full(n, stddev_m), np.arange(n)
+    return RangeErrors(
+        stddev_m=known,
+        share=np.ones(n),
+        inflation=1.0,
+        given_m=known,
+        shared_m=np.zeros(n),
+        placing_m=np.zeros(n),
+        anchor_index=anchor_index,
+        block=label,
+        place=label,
         loss=GEMAN_MCCLURE.scaled(1e6),
+        common_bias_stddev_m=0.1,
     )
 
 
