@@ -104,11 +104,11 @@ def test_similarity_is_that_of_its_keys() -> None:
 
 
 def test_lines_for_people_tell_what_is_known() -> None:
-    sensitive = {"sensitivity": {"short_range_per_cm": -0.6, "common_bias_per_cm": 0.5}, "interval_95": [1.4, None]}
+    sensitive = {"sensitivity": {"short_range_per_cm": -0.6, "common_bias_per_cm": 0.5}, "interval_95": None}
     document = result_document(scale=sensitive, refine=REFINE, ranges={"num": 9, "num_used": 7, "rms_m": 0.0512})
     lines = list(ResultSummary.model_validate(document).lines(Path("out"), "a  b\nc  d"))
     assert lines == [
-        "scale: 1.5 m per SfM unit, 95 % interval 1.4 to unknown",
+        "scale: 1.5 m per SfM unit, 95 % interval unknown to unknown",
         "verdict: good: the scale is known to 2 % (95 % interval)",
         "the scale is sensitive: -0.60 % per cm of bias in short ranges",
         "refined: 1.501 m per SfM unit after 23 iterations",

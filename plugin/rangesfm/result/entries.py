@@ -9,7 +9,7 @@ import numpy.typing as npt
 from pydantic import AfterValidator, AliasChoices, AliasPath, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
-from rangesfm.files.records import Count, Flag, Number, NumberOrNull, Record, Text, Vector, VectorOrNull
+from rangesfm.files.records import Count, Flag, IntervalOrNull, Number, NumberOrNull, Record, Text, Vector, VectorOrNull
 from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.join.models import ModelVerdict
@@ -31,7 +31,6 @@ def _unit(quaternion: tuple[float, ...]) -> tuple[float, ...]:
 
 
 Quaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_unit)]
-Interval = tuple[NumberOrNull, NumberOrNull]
 
 
 class SimilarityEntry(Record):
@@ -71,7 +70,7 @@ class ScaleEntry(Record):
     value: Number
     stddev_formal: NumberOrNull
     stddev_empirical: NumberOrNull
-    interval_95: Interval
+    interval_95: IntervalOrNull
     relative_stddev: ScaleUncertainty = Field(validation_alias=AliasChoices("relative_stddev", "uncertainty"))
     method: Text
     verdict: Literal["good", "doubtful"]
@@ -103,7 +102,7 @@ class ModelScaleEntry(Record):
 
     value: NumberOrNull
     stddev_empirical: NumberOrNull
-    interval_95: Interval | None
+    interval_95: IntervalOrNull
     verdict: Literal["good", "doubtful", "refused"]
     reasons: tuple[Text, ...]
 

@@ -67,6 +67,7 @@ def test_an_error_on_the_console_and_a_request_are_noticed(browser: Browser, tmp
 
 def test_it_opens_with_all_figures_a_silent_console_and_no_request(browser: Browser, page: Path) -> None:
     browser.open(page)
+    browser.draw_figures()
     assert browser.console() == []
     assert {url for url in browser.requests() if not url.startswith("data:")} == {page.as_uri()}
     assert browser.run("return document.querySelectorAll('.chart svg').length") == NUM_CHARTS
@@ -80,6 +81,7 @@ def test_it_draws_in_the_readers_theme(browser: Browser, page: Path) -> None:
     }
     for theme, other in (("light", "dark"), ("dark", "light")):
         browser.open(page, theme=theme)
+        browser.draw_figures()
         picture = browser.picture("#trajectory")
         assert all(num_pixels(picture, color) > 50 for color in colors[theme])
         assert not any(num_pixels(picture, color) > 10 for color in colors[other])
@@ -94,6 +96,7 @@ def num_pixels(picture: Pixels, color: tuple[int, int, int]) -> int:
 @pytest.mark.parametrize("theme", ["light", "dark"])
 def test_every_text_is_readable(browser: Browser, page: Path, theme: str) -> None:
     browser.open(page, theme=theme)
+    browser.draw_figures()
     assert browser.run(CONTRASTS) == []
 
 
@@ -107,6 +110,7 @@ def test_unreadable_text_is_noticed(browser: Browser, tmp_path: Path) -> None:
 @pytest.mark.parametrize("width", WIDTHS_PX)
 def test_it_never_scrolls_sideways(browser: Browser, page: Path, width: int) -> None:
     browser.open(page, width=width)
+    browser.draw_figures()
     assert browser.run("return [innerWidth, document.documentElement.scrollWidth]") == [width, width]
 
 
@@ -125,6 +129,7 @@ def test_names_from_files_cannot_break_out(browser: Browser, make_result: MakeRe
     for table in ("ranges.csv", "scale_candidates.csv"):
         assert EVIL in (folder / table).read_text()
     browser.open(write_report(folder))
+    browser.draw_figures()
     assert browser.console() == []
     assert "broken out" not in browser.run("return document.title")
     assert browser.run("return [...document.querySelectorAll('.label.anchor')].map(x => x.textContent)")[0] == EVIL
@@ -170,6 +175,7 @@ def test_a_figures_data_are_those_of_the_result(browser: Browser, page: Path) ->
 def place_in(browser: Browser, chart: str, x: float, y: float) -> tuple[float, float]:
     """Where in the window a place of a chart is."""
     browser.run(f"{chart}.node.scrollIntoView({{block: 'center'}})")
+    browser.wait_for(f"{chart}.view")
     left, top = browser.run(
         f"const {{node, view}} = {chart}, box = node.getBoundingClientRect(), [left, top] = view.origin();"
         "return [box.x + left + view.scale('x')(arguments[0]), box.y + top + view.scale('y')(arguments[1])]",
@@ -200,6 +206,7 @@ def test_a_wheel_with_a_key_zooms_a_drag_moves_and_a_double_click_goes_back(brow
         low, high = browser.run(f"return {chart}.view.scale('x').domain()")
         return [low, high]
 
+    browser.draw_figures()
     whole = domain()
     x, y = place_in(browser, chart, 95.0, 1.0)
     wheel = {"type": "mouseWheel", "x": x, "y": y, "deltaX": 0, "deltaY": -240}
@@ -225,6 +232,7 @@ def test_on_paper_a_picture_stands_for_the_view(browser: Browser, page: Path) ->
     pdf = base64.b64decode(browser.command("Page.printToPDF", printBackground=True)["data"])
     assert len(re.findall(rb"/Type */Page\b", pdf)) >= 3
     assert browser.run("return document.querySelector('.printed').naturalWidth") > 300
+    assert browser.run("return document.querySelectorAll('.chart svg').length") == NUM_CHARTS
     browser.command("Emulation.setEmulatedMedia", media="print")
     hidden: Any = browser.run("return getComputedStyle(document.querySelector('.stage canvas')).display")
     browser.command("Emulation.setEmulatedMedia", media="")
@@ -233,6 +241,7 @@ def test_on_paper_a_picture_stands_for_the_view(browser: Browser, page: Path) ->
 
 def test_without_webgl_the_page_says_so_and_the_rest_works(browser_without_webgl: Browser, page: Path) -> None:
     browser_without_webgl.open(page)
+    browser_without_webgl.draw_figures()
     assert browser_without_webgl.console() == []
     shown = "return document.querySelector('.without-webgl').checkVisibility()"
     assert browser_without_webgl.run(shown)
