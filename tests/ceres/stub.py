@@ -25,7 +25,7 @@ def compiled_part_stub() -> str:
             node.value = None
             if ast.unparse(node.target) == "__all__":
                 stub.body.remove(node)
-    command = [sys.executable, "-m", "ruff", "format", "--stdin-filename", STUB, "-"]
+    command = [sys.executable, "-m", "ruff", "format", "--stdin-filename", str(STUB), "-"]
     return subprocess.run(command, input=ast.unparse(stub), capture_output=True, text=True, check=True).stdout
 
 

@@ -22,10 +22,11 @@ class Calls:
     made: list[tuple[str, Survey, dict[str, Any]]] = field(default_factory=list)
 
     def stage(self, name: str) -> Any:
-        def run(survey: Survey, **options: Any) -> SimpleNamespace:
+        def run(survey: Survey, **options: Any) -> SimpleNamespace | list[str]:
             options.pop("progress").message("working")
             self.made.append((name, survey, options))
-            return SimpleNamespace(summary_lines=lambda: [f"{name} is done", "scale 2.5"])
+            lines = [f"{name} is done", "scale 2.5"]
+            return lines if name == "reconstruct_survey" else SimpleNamespace(summary_lines=lambda: lines)
 
         return run
 

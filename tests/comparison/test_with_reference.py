@@ -10,6 +10,7 @@ import numpy.typing as npt
 import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.result_document import result_document
 
 from rangesfm.comparison.with_reference import (
     compare,
@@ -25,6 +26,7 @@ from rangesfm.comparison.with_reference import (
 from rangesfm.errors import InputError
 from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.result.ranges_as_used import RangesAsUsed
 
 Array = npt.NDArray[np.float64]
 
@@ -255,10 +257,11 @@ def write_folder(folder: Path, model: pycolmap.Reconstruction, *, is_refined: bo
         if name == "sparse_scaled" or is_refined:
             (folder / name / "0").mkdir(parents=True)
             part.write_binary(folder / name / "0")
-    (folder / "result.json").write_text(json.dumps({"frame": "site"}))
+    (folder / "result.json").write_text(json.dumps(result_document()))
     (folder / "ranges.csv").write_text(
-        "timestamp_s,image_name,anchor_id,range_m,predicted_scaled_m,predicted_refined_m,status\n"
-        "0,,A,2,2.3,2.1,used\n1,,A,2,1.6,1.9,down-weighted\n2,,A,2,9,9,outlier\n3,,A,2,,,outside-path\n"
+        f"{','.join(RangesAsUsed.columns())}\n"
+        "0,,A,T,2,,,,,2.3,2.1,,,used\n1,,A,T,2,,,,,1.6,1.9,,,down-weighted\n"
+        "2,,A,T,2,,,,,9,9,,,outlier\n3,,A,T,2,,,,,,,,,outside-path\n"
     )
     return folder
 
@@ -293,16 +296,18 @@ def test_a_scale_only_result_needs_a_reference(tmp_path: Path, model: pycolmap.R
     assert len(compare_folder(folder, reference_path).rows) == 2
 
 
+RESULT = json.dumps(result_document())
+
+
 @pytest.mark.parametrize(
     ("files", "message"),
     [
         ({}, "not a result folder: it has no result.json"),
         ({"result.json": "{\n,"}, r"result\.json:2: not JSON"),
-        ({"result.json": "[]"}, "expected a JSON object"),
-        ({"result.json": "{}"}, "no scaled model"),
-        ({"result.json": "{}", "sparse_scaled/0/cameras.bin": ""}, r"cameras\.bin: is damaged or cut off"),
+        ({"result.json": RESULT}, "no scaled model"),
+        ({"result.json": RESULT, "sparse_scaled/0/cameras.bin": ""}, r"cameras\.bin: is damaged or cut off"),
         (
-            {"result.json": "{}", "images.csv": "image_name,timestamp_s\na.jpg,x\n"},
+            {"result.json": RESULT, "images.csv": "image_name,timestamp_s\na.jpg,x\n"},
             r"images\.csv:2: timestamp_s is 'x'",
         ),
     ],

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from rangesfm.errors import InputError
-from rangesfm.files.tables import header_names, read_table, read_text
+from rangesfm.files.tables import Table, header_names, read_table, read_text
 
 
 def write(folder: Path, content: str | bytes) -> Path:
@@ -158,3 +162,61 @@ def test_header_names_of_no_table_at_all_are_empty() -> None:
 
 def test_text_of_any_line_ending_is_the_same(tmp_path: Path) -> None:
     assert read_text(write(tmp_path, b"\xef\xbb\xbfa\r\nb\rc\n")) == "a\nb\nc\n"
+
+
+class TestFastWay:
+    """Plain tables are read all at once; a comment, which is nothing to a table, leads around that."""
+
+    NUMBERS = (st.floats() | st.integers() | st.decimals(-1e7, 1e7, places=6)).map(str)
+    CELLS = NUMBERS | st.text("019.-+eE_ nainfx\u0661\u00e9\t\x0b\x85\0", max_size=5)
+
+    def said(self, table: Callable[[], Table]) -> list[object]:
+        """All that can be had of columns a (numbers) and b (text), or the errors."""
+        asked: list[Callable[[Table], object]] = [
+            lambda table: table.numbers("a").tobytes(),
+            lambda table: table.numbers("a", empty=7.0).tobytes(),
+            lambda table: table.text("a"),
+            lambda table: table.text("b", empty="none"),
+            lambda table: (table.categories("b").names, table.categories("b").index.tolist()),
+            lambda table: table.categories("a", empty="none").names,
+            lambda table: str(table.error(0, "a", "something else")),
+            lambda table: table.line.tolist(),
+        ]
+        answers: list[object] = []
+        for ask in asked:
+            try:
+                answers.append(ask(table()))
+            except InputError as error:
+                answers.append(str(error))
+        return answers
+
+    @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+    @given(st.lists(st.lists(CELLS, min_size=3, max_size=3), min_size=1), st.sampled_from(",;\t"), st.data())
+    def test_is_that_of_all_tables(
+        self, tmp_path: Path, rows: list[list[str]], separator: str, data: st.DataObject
+    ) -> None:
+        if data.draw(st.integers(0, 9)) == 0:
+            rows[data.draw(st.integers(0, len(rows) - 1))].pop()
+        text = "\n".join(separator.join(row) for row in [["a", "other", "b"], *rows])
+        read = partial(read_table, required=["a", "b"], text=["b"], separator=separator)
+        fast = self.said(lambda: read(write(tmp_path, text)))
+        assert fast == self.said(lambda: read(write(tmp_path, text + "\n#")))
+
+    def test_it_is_taken(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        path = write(tmp_path, "a,other,b\r\n-1.5,x,7\r\n2e3,,8\r\n")
+        monkeypatch.setattr("rangesfm.files.tables._table_of_texts", lambda *_: pytest.fail("it is not"))
+        table = read_table(path, ["a", "b"], text=["b"])
+        np.testing.assert_array_equal(table.numbers("a"), [-1.5, 2000])
+        assert table.text("b") == ["7", "8"]
+
+    def test_a_name_does_not_make_a_packed_file(self, tmp_path: Path) -> None:
+        path = write(tmp_path, "a,b\n1,2\n").rename(tmp_path / "table.gz")
+        assert read_table(path, ["a"]).numbers("a").tolist() == [1.0]
+
+
+@pytest.mark.parametrize("num_names", [1, 7, 400])
+def test_categories_are_the_texts_told_apart(num_names: int, tmp_path: Path) -> None:
+    texts = [f"n{k}" for k in np.random.default_rng(num_names).integers(0, num_names, 3000)]
+    found = read_table(write(tmp_path, "a,b\n" + "".join(f"{text} ,1\n" for text in texts)), ["a"]).categories("a")
+    assert [found.names[k] for k in found.index] == texts
+    assert list(found.names) == list(dict.fromkeys(texts))

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from scipy.spatial.transform import Rotation
 from tests.simulated.model import random_similarity, synthetic_model
 from tests.simulated.path import loop_path
 from tests.simulated.ranges import simulate_ranges_at
@@ -183,22 +182,21 @@ def test_a_run_joins_what_the_mapper_left_in_pieces(
 
     monkeypatch.setattr("rangesfm.workflows.photos.reconstruct", reconstruct)
     survey = replace(exact.write(tmp_path), images_path=tmp_path / "photos")
-    result = run_survey(survey, progress=SilentProgress()).result
+    result = run_survey(survey, progress=SilentProgress()).summary
     path = trajectory_from_reconstruction(read_model(tmp_path / "out" / "sparse_scaled" / "0"))
     assert path.image_names == tuple(names)
     assert exact.off_m(path.centers, with_scale=False) < 1e-6
-    assert [(model["name"], model["joined"], model["num_images"]) for model in result["models"]] == [
+    assert [(model.name, model.joined, model.num_images) for model in result.models] == [
         ("sparse/0", True, HALF),
         ("sparse/1", True, HALF),
     ]
-    for part, model, first in zip(exact.parts, result["models"], (0, HALF), strict=True):
-        own, motion = model["scale"], model["metric_from_sfm"]
-        assert own["interval_95"][0] < own["value"] < own["interval_95"][1]
-        assert own["verdict"] in ("good", "doubtful")
-        turned = Rotation.from_quat(motion["rotation_xyzw"]).apply(part.trajectory.centers[0])
-        at = motion["scale"] * turned + motion["translation_m"]
+    for part, model, first in zip(exact.parts, result.models, (0, HALF), strict=True):
+        own, motion = model.scale, model.metric_from_sfm
+        assert own.interval_95[0] < own.value < own.interval_95[1]
+        assert own.verdict in ("good", "doubtful")
+        at = motion.similarity.apply(part.trajectory.centers[0])
         assert at == pytest.approx(path.centers[first], abs=1e-6)
-    assert result["metric_from_sfm"]["scale"] == pytest.approx(result["models"][0]["metric_from_sfm"]["scale"])
+    assert result.metric_from_sfm.scale == pytest.approx(result.models[0].metric_from_sfm.scale)
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from rangesfm.comparison.with_reference import ComparisonRow, compare, format_table
+from rangesfm.comparison.with_reference import compare, format_table
 from rangesfm.errors import InputError
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.progress import SilentProgress
@@ -160,8 +160,8 @@ def print_row(survey: Survey, sfm: pycolmap.Reconstruction) -> None:
         refine=replace(survey.refine, covariance=False),
         report_enabled=False,
     )
-    result = refine_model(cut, progress=SilentProgress()).result
-    print(format_table((*unscaled, *(ComparisonRow(**row) for row in result["comparison"]))))
+    result = refine_model(cut, progress=SilentProgress()).summary
+    print(format_table((*unscaled, *result.comparison)))
     print(f"{result['refine']['iterations']} iterations of the full problem\n", flush=True)
 
 

@@ -180,10 +180,10 @@ def test_a_run_maps_with_ranges_where_it_is_asked_to(photo_run: PhotoRun, tmp_pa
         "refine.covariance": False,
         "scale.num_bootstrap": 20,
     }
-    result = run_survey(read_survey(photo_run.survey.survey_path, asked), progress=SilentProgress()).result
-    assert set(result["seconds"]) >= {"mapping", "scale", "refinement"}
-    assert "matching" not in result["seconds"]
-    (note,) = [warning for warning in result["warnings"] if warning.startswith("ranges took part in")]
+    result = run_survey(read_survey(photo_run.survey.survey_path, asked), progress=SilentProgress()).summary
+    assert set(result.seconds) >= {"mapping", "scale", "refinement"}
+    assert "matching" not in result.seconds
+    (note,) = [warning for warning in result.warnings if warning.startswith("ranges took part in")]
     num_with, num = (int(word) for word in note.split() if word.isdigit())
     assert 0 < num_with < num
-    assert result["comparison"][-1]["rmse_m"] < 1.2 * before["comparison"][-1]["rmse_m"]
+    assert result.comparison[-1].rmse_m < 1.2 * before["comparison"][-1]["rmse_m"]

@@ -21,6 +21,7 @@ from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.similarity import Similarity, align_points, rmse
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.result.folder import ResultFolder, read_result_folder
+from rangesfm.result.summary import ResultSummary
 
 Array = npt.NDArray[np.float64]
 
@@ -158,9 +159,9 @@ def _ranges_of_first_result(models: Sequence[NamedModel]) -> ModelRanges | None:
 
 
 def _read_model(path: Path) -> NamedModel:
-    if (path / "result.json").is_file():
+    if (path / ResultSummary.NAME).is_file():
         result = read_result_folder(path)
-        model = result.read_model("sparse_metric") or result.read_model("sparse_scaled")
+        model = result.read_metric_model()
         if model is None:
             raise InputError("the result holds no metric model", path)
         return NamedModel(str(path), trajectory_from_reconstruction(model, result.timestamps_s), model, result)

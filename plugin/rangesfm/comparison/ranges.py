@@ -17,8 +17,9 @@ from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock.estimate import estimate_time_offset
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeObservations
-from rangesfm.result.content import USED
 from rangesfm.result.folder import ResultFolder
+from rangesfm.result.metric_result import USED
+from rangesfm.result.ranges_as_used import RangesAsUsed
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.survey.inputs import RangingInputs, times_of_model
 from rangesfm.survey.settings import Survey
@@ -68,7 +69,7 @@ def ranges_of_result(result: ResultFolder, metric_path: Trajectory) -> ModelRang
     Args:
         metric_path: of the run's final model.
     """
-    ranges, anchors = result.read_ranges(), result.anchors
+    ranges, anchors = result.read(RangesAsUsed), result.anchor_positions_m
     if ranges is None:
         return None
     index = {name: i for i, name in enumerate(metric_path.image_names)}
@@ -86,16 +87,16 @@ def ranges_of_result(result: ResultFolder, metric_path: Trajectory) -> ModelRang
         timestamp_s=times,
         image_name=names,
         tag_id=tag_ids,
-        source=result.path / "ranges.csv",
+        source=result.path / RangesAsUsed.NAME,
     )
     return ModelRanges(
         log=log,
         tags_in_cam_m=dict(zip(tag_ids, result.lever_arms_m(tag_ids), strict=True)),
-        anchors_m={id_: anchor.position_m for id_, anchor in anchors.items()},
-        biases_m={id_: anchor.range_bias_m for id_, anchor in anchors.items()},
+        anchors_m=anchors,
+        biases_m={id_: result.summary.anchors[id_].range_bias_m or 0.0 for id_ in anchors},
         image_times_s=result.timestamps_s,
         metric_path=metric_path,
-        association=result.association,
+        association=result.summary.settings.ranges.association,
     )
 
 

@@ -14,35 +14,14 @@ from rangesfm.errors import InputError
 from rangesfm.geometry.reference import Reference, read_reference
 from rangesfm.geometry.similarity import align_points, path_shape, rmse
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.result.entries import ComparisonRow
 from rangesfm.result.folder import ResultFolder, read_result_folder
+from rangesfm.result.ranges_as_used import RangesAsUsed
 
 Array = npt.NDArray[np.float64]
 
 MIN_NUM_ALIGNED = 3
 """Poses from which an alignment says something: two points always fit after Sim(3)."""
-
-
-@dataclass(frozen=True)
-class ComparisonRow:
-    """One path against the reference: a row of the paper's table.
-
-    Attributes:
-        name: what the path is.
-        num_keyframes: keyframes whose reference position is known; the numbers are over these.
-        rmse_m: of keyframe centres, without any alignment; None where the path's
-            frame is not the reference's and cannot be tied to it.
-        rmse_se3_m: after the best rigid motion; None below three keyframes.
-        rmse_sim3_m: after the best similarity; None below three keyframes.
-        scale_error_percent: scale of the path relative to the reference, minus one:
-            positive when the map is too large; None below three keyframes or without motion.
-    """
-
-    name: str
-    num_keyframes: int
-    rmse_m: float | None
-    rmse_se3_m: float | None
-    rmse_sim3_m: float | None
-    scale_error_percent: float | None
 
 
 def compare(
@@ -334,7 +313,7 @@ def compare_folder(
             trajectory_from_reconstruction(scaled, result.timestamps_s),
             path_of_refined,
             read_reference(reference_path),
-            frame=result.frame,
+            frame=result.summary.frame,
             max_gap_s=max_gap_s,
         )
     models = None
@@ -344,7 +323,7 @@ def compare_folder(
 
 
 def _used_residuals(result: ResultFolder) -> tuple[Array, Array] | None:
-    ranges = result.read_ranges()
+    ranges = result.read(RangesAsUsed)
     if ranges is None:
         return None
     before, after = ranges.residual_scaled_m[ranges.is_used], ranges.residual_refined_m[ranges.is_used]

@@ -13,16 +13,18 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from datetime import datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import LEFTOVER, make_output_folder
 
+if TYPE_CHECKING:
+    from filelock import BaseFileLock
+
 LOCK_NAME = ".rangesfm.lock"
 
-# Of /proc/PID/stat (proc(5)): its third field, the first one after the name, is the state, the ninth are the flags.
-_ENDED_STATES = (b"Z", b"X")
-_FLAGS_FIELD = 5  # after the state
-_IS_EXITING = 0x4  # PF_EXITING
+# For a holder that ends, and removes the file, between two tries.
+_MAX_WAIT_S = 0.2
 
 # Folders that this thread holds: what it calls meanwhile may ask for them again.
 _held: ContextVar[frozenset[Path]] = ContextVar("held", default=frozenset())
@@ -45,52 +47,37 @@ def sole_writer(folder: Path) -> Iterator[None]:
         return
     made = [path for path in (key, *key.parents) if not path.exists()]
     make_output_folder(folder)
-    lock = folder / LOCK_NAME
-    descriptor = _lock(lock)
+    lock = _lock(folder)
     token = _held.set(_held.get() | {key})
     try:
         remove_leftovers(folder)
         yield
     finally:
         _held.reset(token)
-        if descriptor is not None:
-            lock.unlink(missing_ok=True)  # before it is let go, or it might already be another's
-            os.close(descriptor)
+        with suppress(OSError):  # Windows removes no open file
+            (folder / LOCK_NAME).unlink()  # before it is let go, or it might already be another's
+        lock.release()
         for path in made:
             with suppress(OSError):  # not empty
                 path.rmdir()
 
 
-def _lock(path: Path) -> int | None:
-    """The open lock file; None where there are no locks."""
-    if sys.platform == "win32":
-        return None
-    import fcntl
+def _lock(folder: Path) -> BaseFileLock:
+    """The lock of a folder, held unless the file system knows none."""
+    from filelock import FileLock, Timeout
 
-    while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            text = os.read(descriptor, 1 << 16).decode(errors="replace")
-            os.close(descriptor)
-            raise InputError(f"{_whose(text)}: wait for it to end, or give another output path", path.parent) from None
-        except OSError:
-            os.close(descriptor)
-            path.unlink(missing_ok=True)
-            return None
-        if _is_file_at(descriptor, path):
-            os.ftruncate(descriptor, 0)
-            os.write(descriptor, _own_name().encode())
-            return descriptor
-        os.close(descriptor)  # its holder ended, and removed it, between the two calls
-
-
-def _is_file_at(descriptor: int, path: Path) -> bool:
+    path = folder / LOCK_NAME
+    lock = FileLock(path)
     try:
-        return os.path.samestat(os.fstat(descriptor), path.stat())
-    except FileNotFoundError:
-        return False
+        lock.acquire(timeout=_MAX_WAIT_S, poll_interval=_MAX_WAIT_S / 4)
+    except Timeout:
+        raise InputError(f"{_holder(path)}: wait for it to end, or give another output path", folder) from None
+    except OSError:
+        path.unlink(missing_ok=True)
+        return lock
+    with suppress(OSError):  # on Windows nobody can write there now: then others are not told whose it is
+        path.write_text(_own_name(), encoding="utf-8")
+    return lock
 
 
 def _own_name() -> str:
@@ -101,21 +88,19 @@ def _own_name() -> str:
     return json.dumps({"pid": os.getpid(), "host": socket.gethostname(), "command": command, "since": since})
 
 
-def _whose(text: str) -> str:
-    """Who writes to the folder, by the text of the lock file."""
+def _holder(lock: Path) -> str:
+    """Who writes to the folder, by what the lock file says."""
     try:
-        holder = json.loads(text)
+        holder = json.loads(lock.read_text(encoding="utf-8", errors="replace"))
         host = "" if holder["host"] == socket.gethostname() else f" on {holder['host']}"
         who, since = f"process {holder['pid']}{host} ({holder['command']})", holder["since"]
         return f"{who} has been writing to this folder since {since}"
-    except (ValueError, TypeError, KeyError, RecursionError):  # it has only just begun
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):  # it has only just begun
         return "another process is writing to this folder"
 
 
 def remove_leftovers(folder: Path) -> None:
     """Remove what killed processes left half-written in ``folder`` and in the folders in it."""
-    if sys.platform == "win32":  # nobody can be asked there whether a process still lives
-        return
     inside = [path for path in folder.iterdir() if path.is_dir() and not path.is_symlink()]
     for path in [path for parent in (folder, *inside) for path in _entries(parent)]:
         found = re.fullmatch(LEFTOVER, path.name)
@@ -136,23 +121,11 @@ def _entries(folder: Path) -> list[Path]:
 
 def _is_alive(pid: int) -> bool:
     """Whether another process has this number: our own leftovers are those of one before us that had it."""
-    if pid == os.getpid():
-        return False
-    try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        pass
-    return not _is_ending(pid)
+    import psutil
 
-
-def _is_ending(pid: int) -> bool:
-    """Whether a process has ended but for its entry, which stays until its parent asks for it."""
-    if sys.platform != "linux":
-        return False
-    try:
-        state, *numbers = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()
-    except OSError:  # asked for in this moment
+    try:  # one that has ended stays until its parent asks for it
+        return pid != os.getpid() and psutil.Process(pid).status() not in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
+    except psutil.AccessDenied:
         return True
-    return state in _ENDED_STATES or bool(int(numbers[_FLAGS_FIELD]) & _IS_EXITING)
+    except (psutil.NoSuchProcess, OverflowError):
+        return False

@@ -1,4 +1,4 @@
-"""Tables in text files: the one place that reads CSV and its relatives.
+"""Tables in text files: the one place that reads CSV and its relatives, and writes it.
 
 A table has a header row; ``#`` comments and blank lines may stand anywhere; a byte order mark, any
 line ending and quoted cells are understood. Whatever is wrong is an InputError with its line.
@@ -10,20 +10,22 @@ import csv
 import itertools
 import os
 import stat
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import InputError, one_line
-from rangesfm.files.plain_tables import PlainColumn, find_columns
+from rangesfm.files.atomic import new_file
 
 _HEAD_BYTES = 1 << 16
 _CHUNK_ROWS = 20_000  # split at once: wide tables would otherwise hold every cell in memory
 _UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 _MAX_SHOWN = 100
+_UNPACKED = (".gz", ".bz2", ".xz")  # by numpy, whatever such a file holds
 
 
 @dataclass(frozen=True)
@@ -63,13 +65,15 @@ class Table:
         path: the file.
         columns: all names of the header row, in order.
         line: (n,) 1-based line of each row.
-        cells: of each asked-for column that the file has.
+        cells: of each asked-for column that the file has; a column that was read as numbers has these instead.
+        reread: gives this table with all cells as text; None where they are.
     """
 
     path: Path
     columns: tuple[str, ...]
     line: npt.NDArray[np.int64]
-    cells: Mapping[str, list[str] | PlainColumn]
+    cells: Mapping[str, list[str] | npt.NDArray[np.float64]]
+    reread: Callable[[], Table] | None = None
 
     def __len__(self) -> int:
         return len(self.line)
@@ -88,15 +92,12 @@ class Table:
 
     def categories(self, column: str, *, empty: str | None = None) -> Categories:
         """The cells as ``text`` has them, told apart: fast where they are few."""
-        cells = self.cells[column]
-        if not isinstance(cells, PlainColumn):
-            return Categories.of(self.text(column, empty=empty))
-        raw, index = cells.categories()
-        names = [name.strip() for name in raw]
+        raw = Categories.of(self._raw(column))
+        names = [name.strip() for name in raw.names]
         if "" in names and empty is None:
-            raise self.error(int(np.argmax(index == names.index(""))), column, "some text")
+            raise self.error(int(np.argmax(raw.index == names.index(""))), column, "some text")
         kinds = Categories.of([name or str(empty) for name in names])
-        return Categories(kinds.names, kinds.index[index])
+        return Categories(kinds.names, kinds.index[raw.index])
 
     def numbers(
         self, column: str, *, empty: float | None = None, expected: str = "a number"
@@ -107,35 +108,26 @@ class Table:
             empty: stands for empty cells, which are refused if it is None.
             expected: what the message calls a good cell.
         """
-        given = self.cells[column]
-        if isinstance(given, PlainColumn):
-            plain = given.numbers()
-            if plain is not None:
-                return plain
-        cells = self._raw(column)
-        try:
-            if empty is None:
-                convert = _number if "_" in "".join(cells) else float
-                values = np.fromiter(map(convert, cells), np.float64, len(cells))
-            else:
-                values = np.array([_number(cell) if cell.strip() else empty for cell in cells], np.float64)
-        except ValueError:
-            row = next(row for row, cell in enumerate(cells) if not _is_number(cell, empty_is_number=empty is not None))
-            raise self.error(row, column, expected) from None
+        cells = self.cells[column]
+        values = np.array(list(map(_number, cells)), np.float64) if isinstance(cells, list) else cells
         for row in np.flatnonzero(~np.isfinite(values)).tolist():
-            if empty is None or cells[row].strip():
+            if empty is None or self._raw(column)[row].strip():
                 raise self.error(row, column, expected)
+            values[row] = empty
         return values
 
     def error(self, row: int, column: str, expected: str) -> InputError:
         """The error that says what stands in ``column`` of the 0-based ``row`` instead of ``expected``."""
         cell = self._raw(column)[row].strip()
-        found = "empty" if not cell else cell if _is_number(cell) else f"'{printable(cell)}'"
+        found = "empty" if not cell else cell if _number(cell) is not None else f"'{printable(cell)}'"
         return InputError(f"{column} is {found}, expected {expected}", self.path, int(self.line[row]))
 
     def _raw(self, column: str) -> list[str]:
         cells = self.cells[column]
-        return cells.texts() if isinstance(cells, PlainColumn) else cells
+        if isinstance(cells, list):
+            return cells
+        assert self.reread is not None
+        return self.reread()._raw(column)
 
 
 def read_table(
@@ -143,6 +135,7 @@ def read_table(
     required: Sequence[str],
     optional: Sequence[str] = (),
     *,
+    text: Sequence[str] = (),
     aliases: Mapping[str, str] | None = None,
     separator: str | None = ",",
     header: Sequence[str] | None = None,
@@ -152,6 +145,7 @@ def read_table(
     Args:
         required: columns that the file must have.
         optional: columns that it may have.
+        text: those of them that are not numbers. Any column can be had as either; this way it is fast.
         aliases: other names by which a file may call them, ``{name in the file: name}``.
         separator: one character; a blank means any run of blanks; None: told from the header row.
         header: names of all columns, of a file that has no header row, or one that is a comment.
@@ -161,10 +155,10 @@ def read_table(
             few or too many cells.
     """
     path = Path(path)
-    text = read_text(path)
-    header_row, header_line, body = _split_header(text)
+    content = read_text(path)
+    header_row, header_line, body = _split_header(content)
     if header is not None and separator is not None:
-        header_row, header_line, body = separator.join(header), 0, text
+        header_row, header_line, body = separator.join(header), 0, content
     if not header_row:
         raise InputError(f"the file is empty, expected a header row with {_listed(required)}", path)
     if separator is None:
@@ -175,10 +169,33 @@ def read_table(
     names = _canonical_names(header, [*required, *optional], aliases or {})
     _check_header(names, required, optional, path, header_line)
     wanted = {name: names.index(name) for name in (*required, *optional) if name in names}
-    plain = find_columns(body, len(names), separator)
-    if plain is not None:
-        line = header_line + 1 + np.arange(len(plain[0]))
-        return Table(path, tuple(names), line, {name: plain[index] for name, index in wanted.items()})
+    reread = partial(_table_of_texts, path, names, wanted, header_line, body, separator)
+    rows = None
+    if body and not body.isspace() and separator != " " and not any(character in body for character in '"#'):
+        # Of the columns that nobody asked for only their number matters.
+        types = ["U1" if name not in wanted else "O" if name in text else "f8" for name in names]
+        rows = _plain_rows(path, header_line, types, separator)
+    if rows is None or len(rows) != body.count("\n") + (not body.endswith("\n")):
+        return reread()
+    cells = {name: rows[f"f{k}"].tolist() if name in text else rows[f"f{k}"].copy() for name, k in wanted.items()}
+    return Table(path, tuple(names), header_line + 1 + np.arange(len(rows)), cells, reread)
+
+
+def _plain_rows(path: Path, num_skipped: int, types: list[str], separator: str) -> npt.NDArray[np.void] | None:
+    """All rows, fast: fields f0, f1 ... of the given types; None if any cell is of another, or too much or missing."""
+    if path.suffix in _UNPACKED:
+        return None
+    try:
+        fields = [(f"f{k}", type) for k, type in enumerate(types)]
+        return np.loadtxt(path, fields, None, separator, skiprows=num_skipped, ndmin=1, encoding="utf-8-sig")
+    except ValueError:  # the reader of all tables knows what to say
+        return None
+
+
+def _table_of_texts(
+    path: Path, names: list[str], wanted: Mapping[str, int], header_line: int, body: str, separator: str
+) -> Table:
+    """Whatever the rows hold: quoted cells, comments, blank lines."""
     lines = body.split("\n")
     keep = list(map(_has_content, lines))
     rows = list(itertools.compress(lines, keep))
@@ -188,6 +205,14 @@ def read_table(
         for name, index in wanted.items():
             cells[name] += chunk[index :: len(names)]
     return Table(path, tuple(names), line, cells)
+
+
+def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Write a CSV file, whole or not at all."""
+    with new_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows(rows)
 
 
 def read_text(path: str | Path, *, errors: str = "strict") -> str:
@@ -303,7 +328,7 @@ def _canonical_names(header: list[str], known: Sequence[str], aliases: Mapping[s
 
 def _check_header(names: list[str], required: Sequence[str], optional: Sequence[str], path: Path, line: int) -> None:
     expected = _listed(required) + (f" (and possibly {_listed(optional)})" if optional else "")
-    if all(map(_is_number, names)):
+    if all(_number(name) is not None for name in names):
         raise InputError(f"no header row, expected {expected}", path, line)
     for name in required:
         if name not in names:
@@ -313,19 +338,12 @@ def _check_header(names: list[str], required: Sequence[str], optional: Sequence[
             raise InputError(f"{names.count(name)} columns are {name}, expected one", path, line)
 
 
-def _number(cell: str) -> float:
-    """float(), without Python's own ``1_000``."""
-    if "_" in cell:
-        raise ValueError(cell)
-    return float(cell)
-
-
-def _is_number(cell: str, *, empty_is_number: bool = False) -> bool:
+def _number(cell: str) -> float | None:
+    """float(), without Python's own ``1_000``; None if it is no number."""
     try:
-        _number(cell)
+        return None if "_" in cell else float(cell)
     except ValueError:
-        return empty_is_number and not cell.strip()
-    return True
+        return None
 
 
 def _listed(names: Iterable[str]) -> str:

@@ -16,6 +16,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import IO, Any
 
+import psutil
+
 _POLL_INTERVAL_S = 0.2
 _MAX_STOP_S = 20.0  # until a process that was interrupted is killed
 _MAX_LINE = 200
@@ -59,7 +61,7 @@ def supervise(
 
     Args:
         listen: called with each message.
-        memory_limit_bytes: it is killed if it takes more; None: there is no limit. Watching it needs psutil.
+        memory_limit_bytes: it is killed if it takes more; None: there is no limit.
         is_stopped: asked several times a second; once it says so, the process is interrupted.
     """
     with tempfile.TemporaryFile() as errors:
@@ -103,8 +105,6 @@ class _Watched:
             self._process.kill()
 
     def _look_at_memory(self, limit_bytes: int) -> None:
-        import psutil
-
         try:
             used = psutil.Process(self._process.pid).memory_info().rss
         except psutil.Error:  # it has ended

@@ -12,9 +12,7 @@ from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import InputError
 from rangesfm.export import check_formats
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.result.outputs import (
-    refuse_to_overwrite,
-)
+from rangesfm.result.folder import refuse_to_overwrite
 from rangesfm.survey.inputs import RangingInputs, read_ranging_inputs
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes

@@ -11,9 +11,7 @@ from typing import TypeVar
 import pycolmap
 
 from rangesfm.errors import InputError
-from rangesfm.result.outputs import (
-    forget_result,
-)
+from rangesfm.result.folder import forget_result
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images
 from rangesfm.vision.keyframes import select_keyframes

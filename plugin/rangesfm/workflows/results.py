@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from rangesfm.ceres.doctor import versions
 from rangesfm.comparison.with_reference import format_table, papers_table, reference_in_frame
 from rangesfm.distances.ends import locate_distances
-from rangesfm.distances.rows import disagreements, distance_rows
+from rangesfm.distances.rows import DistanceRow, disagreements, distance_rows
 from rangesfm.export import COVARIANCE_FORMATS
 from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.reference import write_reference
 from rangesfm.report import write_report
-from rangesfm.result.content import survey_result
+from rangesfm.result.entries import ComparisonRow
+from rangesfm.result.folder import REFERENCE_NAME, replacing_result
 from rangesfm.result.metric_result import MetricResult
-from rangesfm.result.outputs import (
-    replacing_result,
-    summary_lines,
-    write_outputs,
-    write_result,
-    write_scale_tables,
-)
+from rangesfm.result.summary import ResultSummary
+from rangesfm.result.write import write_models_and_tables
 from rangesfm.survey.input_hashes import input_hashes
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
@@ -33,16 +28,16 @@ from rangesfm.workflows.journal import Journal
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run left.
+    """What a run hands back; ``read_result_folder`` reads what it left.
 
     Attributes:
         output_path: its folder.
-        result: the content of ``result.json``; after a reconstruction alone, seconds and warnings.
+        summary: ``result.json``.
         lines: a summary for people.
     """
 
     output_path: Path
-    result: dict[str, Any]
+    summary: ResultSummary
     lines: tuple[str, ...]
 
     def summary_lines(self) -> list[str]:
@@ -60,25 +55,30 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
     for note in disagreeing:
         journal.warn(note)
     metric = metric.doubted(disagreeing)
-    result = survey_result(metric)
-    with replacing_result(survey.output_path):
+    folder = survey.output_path
+    with replacing_result(folder):
         with journal.stage("results"):
-            result["distances"] = distances
-            table = _compare(survey, inputs, metric, result)
+            comparison = _comparison(survey, inputs, metric)
             georeference = _georeference(inputs, metric)
-            result["georeference"] = georeference and georeference.to_dict()
-            write_outputs(
-                metric, survey.export, survey.output_path, images_path=survey.images_path, georeference=georeference
+            write_models_and_tables(
+                metric, survey.export, folder, images_path=survey.images_path, georeference=georeference
             )
-            write_scale_tables(metric, survey.output_path)
-        result["versions"], result["settings"] = versions(), survey.to_dict()
-        result["inputs"] = input_hashes(survey)
-        result["seconds"], result["warnings"] = journal.all_seconds(), journal.warnings
-        write_result(result, survey.output_path / "result.json")
-    lines = [*summary_lines(metric, result, table, survey.output_path)]
+        summary = ResultSummary.of(
+            metric,
+            distances=distances,
+            **({"comparison": comparison} if comparison else {}),
+            georeference=georeference,
+            versions=versions(),
+            settings=survey.to_dict(),
+            inputs=input_hashes(survey),
+            seconds=journal.all_seconds(),
+            warnings=journal.warnings,
+        )
+        summary.write(folder / summary.NAME)
+    lines = [*summary.lines(folder, format_table(comparison) if comparison else None)]
     if survey.report_enabled:
-        lines.append(f"report: {write_report(survey.output_path)}")
-    return RunResult(survey.output_path, result, tuple(lines))
+        lines.append(f"report: {write_report(folder)}")
+    return RunResult(folder, summary, tuple(lines))
 
 
 def _georeference(inputs: RangingInputs, metric: MetricResult) -> Georeference | None:
@@ -86,7 +86,7 @@ def _georeference(inputs: RangingInputs, metric: MetricResult) -> Georeference |
     return inputs.site.georeference if metric.estimate.frame == "site" else None
 
 
-def _distances(inputs: RangingInputs, metric: MetricResult) -> list[dict[str, Any]]:
+def _distances(inputs: RangingInputs, metric: MetricResult) -> list[DistanceRow]:
     """The table of control and check distances in the final map."""
     if inputs.tape is None:
         return []
@@ -95,16 +95,15 @@ def _distances(inputs: RangingInputs, metric: MetricResult) -> list[dict[str, An
     return distance_rows(inputs.tape, located.lengths_m(1.0, anchors_m))
 
 
-def _compare(survey: Survey, inputs: RangingInputs, metric: MetricResult, result: dict[str, Any]) -> str | None:
-    """Add the paper's table to the result where there is a reference; returns it as text."""
+def _comparison(survey: Survey, inputs: RangingInputs, metric: MetricResult) -> tuple[ComparisonRow, ...]:
+    """The paper's table; empty without a reference, which is left beside the result in its frame."""
     if inputs.reference is None:
-        return None
+        return ()
     frame = metric.estimate.frame
     scaled = metric.path_of(metric.scaled)
     refined = None if metric.refined is None else metric.path_of(metric.refined)
     rows = papers_table(scaled, refined, inputs.reference, frame=frame)
-    result["comparison"] = [asdict(row) for row in rows]
     in_frame = reference_in_frame(refined or scaled, inputs.reference, frame=frame)
     if in_frame is not None:
-        write_reference(in_frame, survey.output_path / "reference.csv")
-    return format_table(rows)
+        write_reference(in_frame, survey.output_path / REFERENCE_NAME)
+    return rows

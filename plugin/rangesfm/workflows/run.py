@@ -57,8 +57,8 @@ def prepare_survey(survey: Survey, *, progress: Progress, restart: bool = False)
         return with_photos(prepare_submaps, survey, keyframes, journal, restart)
 
 
-def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> RunResult:
-    """Photos to an unscaled model."""
+def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> list[str]:
+    """Photos to an unscaled model; returns a summary for people."""
     journal = Journal(progress)
     if survey.mapper.ranges_in_mapping:
         journal.warn("ranges_in_mapping: nothing has been said of ranges here, they take part in a whole run")
@@ -66,8 +66,7 @@ def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = Fa
     with sole_writer(survey.output_path):
         sfm = map_keyframes(survey, keyframes, journal, restart)[0]
     path = survey.output_path / "sparse" / "0"
-    line = f"unscaled model: {sfm.num_reg_images()} photos, {sfm.num_points3D()} points, in {path}"
-    return RunResult(survey.output_path, {"seconds": journal.all_seconds(), "warnings": journal.warnings}, (line,))
+    return [f"unscaled model: {sfm.num_reg_images()} photos, {sfm.num_points3D()} points, in {path}"]
 
 
 def refine_model(survey: Survey, *, progress: Progress) -> RunResult:
