@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import AfterValidator, AliasChoices, ConfigDict, Field
+from pydantic import AfterValidator, AliasChoices, AliasPath, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
 from rangesfm.files.records import Count, Flag, Number, NumberOrNull, Record, Text, Vector, VectorOrNull
