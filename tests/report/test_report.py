@@ -285,7 +285,7 @@ def test_each_range_begins_at_its_own_tag(make_result: MakeResult) -> None:
     arms = {"tag": [0.0, -0.1, 0.0], "other": [0.4, 0.0, 0.2]}
     folder = make_result(num_keyframes=20, num_ranges_per_anchor=10)
     summary = json.loads((folder / "result.json").read_text())
-    summary["settings"]["lever_arms_m"] = arms
+    summary["settings"]["tag"]["lever_arms_m"] = arms
     (folder / "result.json").write_text(json.dumps(summary))
     lines = (folder / "ranges.csv").read_text().splitlines()
     changed = [line.replace(",tag,", ",other,") if number % 2 else line for number, line in enumerate(lines)]

@@ -42,7 +42,7 @@ def test_a_run_leaves_what_the_schema_says(photo_run: PhotoRun) -> None:
                 "A2": anchor_entry(None),
             }
         },
-        {"settings": {"seed": 0, "mapper": {"matching": "auto"}, "images_path": "caf\udce9"}},
+        {"settings": {"output": {"seed": 0}, "mapper": {"matching": "auto"}, "images": {"path": "caf\udce9"}}},
         {"time_offset": {"value_s": None, "stddev_s": None}},
     ],
 )
@@ -81,8 +81,8 @@ def test_a_key_of_a_later_version_is_passed_over(tmp_path: Path) -> None:
         ({"warnings": [3]}, "'warnings.0' is 3, expected text"),
         ({"warnings": [[1234567] * 9]}, f"'warnings.0' is [{6 * '1234567, '}12345..., expected text"),
         (
-            {"settings": {"lever_arms_m": {"T": [1, 2, 3, 4]}}},
-            "'settings.lever_arms_m.T' is [1, 2, 3, 4], expected 3 items",
+            {"settings": {"tag": {"lever_arms_m": {"T": [1, 2, 3, 4]}}}},
+            "'settings.tag.lever_arms_m.T' is [1, 2, 3, 4], expected 3 items",
         ),
     ],
 )

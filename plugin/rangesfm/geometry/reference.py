@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation, Slerp
 
-from rangesfm.errors import InputError
-from rangesfm.files.tables import Table, header_names, printable, read_head, read_table, read_text, write_table
+from rangesfm.errors import InputError, printable
+from rangesfm.files.tables import Table, header_names, read_head, read_table, read_text, write_table
 from rangesfm.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]

@@ -151,7 +151,7 @@ def _alone(part: PathOfModel, ranging: Ranging, *, has_first_camera: bool) -> Sc
     frame, options = ranging.anchor_frame, ranging.scale
     if not has_first_camera:
         frame = "site" if frame == "first_camera" else frame
-        options = replace(options, up_in_first_camera=None)
+        options = options.changed(up_in_first_camera=None)
     anchor_ids = part.observations.log.anchor_ids
     distances = None
     if ranging.tape is not None:

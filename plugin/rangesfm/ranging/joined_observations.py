@@ -49,7 +49,7 @@ def joined_observations(
     joined: dict[str, npt.NDArray[Any]] = {"status": np.min([part.status for part in parts], axis=0)}
     for k, (part, similarity, keyframe) in enumerate(zip(parts, joined_from_part, keyframes, strict=True)):
         rows = number == k
-        moved = {
+        moved: dict[str, npt.NDArray[Any]] = {
             "status": part.status,
             "before": keyframe[part.before],
             "after": keyframe[part.after],

@@ -151,7 +151,7 @@ def gather(result: ResultFolder, *, images_path: Path | None = None) -> Content:
     reference_path = result.path / "reference.csv"
     reference = read_reference(reference_path) if reference_path.is_file() else None
     summary = Summary(result.summary.to_json())
-    known = summary.get("settings", "images_path")
+    known = summary.get("settings", "images", "path")
     return Content(
         title=_title(result.path.resolve()),
         summary=summary,

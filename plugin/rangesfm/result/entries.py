@@ -317,26 +317,43 @@ class GeoreferenceEntry(Record):
         return Georeference(self.lat_deg, self.lon_deg, self.height_m, self.crs)
 
 
-class RangesSettings(Record):
-    """Of ``[ranges]``, what is read again."""
+class _Table(Record):
+    """A table of a survey; named are the keys that are read again."""
 
     model_config = ConfigDict(extra="allow")
 
-    association: AssociationOptions
+
+class ImageSettings(_Table):
+    path: Text | None
 
 
-class Settings(Record):
-    """All settings of the run, as ``Survey.to_dict`` has them; named here are those that are read again."""
+class RangesSettings(_Table):
+    max_interpolation_gap_s: Number
+    max_time_difference_s: Number
 
-    model_config = ConfigDict(extra="allow")
+    @property
+    def association(self) -> AssociationOptions:
+        return AssociationOptions(**{name: getattr(self, name) for name in AssociationOptions.model_fields})
 
-    images_path: Text | None
-    anchors_path: Text | None
-    anchor_frame: Text | None
-    anchor_crs: Text | None
+
+class AnchorSettings(_Table):
+    path: Text | None
+    frame: Text | None
+    crs: Text | None
+
+
+class TagSettings(_Table):
     tag_in_cam_m: Vector
     lever_arms_m: dict[Text, Vector]
+
+
+class Settings(_Table):
+    """The survey as the run had it, by tables and keys."""
+
+    images: ImageSettings
     ranges: RangesSettings
+    anchors: AnchorSettings
+    tag: TagSettings
 
 
 class InputEntry(Record):

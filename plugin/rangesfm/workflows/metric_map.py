@@ -26,7 +26,7 @@ def join_by_survey(
     """All models that can be, as one."""
     if len(paths) == 1:
         return paths[0], ()
-    ranging = Ranging(inputs.anchors, inputs.anchor_frame, survey.scale, survey.ranges.model, inputs.tape, survey.seed)
+    ranging = Ranging(inputs.anchors, inputs.anchor_frame, survey.scale, survey.ranges, inputs.tape, survey.output.seed)
     joined = join_models(paths, ranging)
     left_out = [model for model in joined.verdicts if model.joined_from_sfm is None]
     if must_join and len(left_out) == len(paths) - 1:

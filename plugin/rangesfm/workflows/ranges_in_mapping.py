@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 from typing import Any
 
 import pycolmap
@@ -54,12 +53,14 @@ class AdjustmentWithRanges:
     def inputs(self) -> list[Any]:
         """All settings that it may look at, and its files by their content."""
         survey = self._survey
-        settings = survey.to_dict()
-        ranges = {key: value for key, value in settings["ranges"].items() if key not in ("path", "error_curve_path")}
-        others = ("camera", "scale", "refine", "anchor_crs", "tag_in_cam_m", "lever_arms_m", "tag_id", "use_anchors")
-        files = (survey.ranges.path, survey.ranges.error_curve_path, survey.anchors_path, survey.image_times_path)
+        settings = survey.model_dump(
+            mode="json",
+            include={"camera", "ranges", "anchors", "tag", "scale", "refine"},
+            exclude={"ranges": {"path", "error_curve"}, "anchors": {"path"}, "scale": {"distances", "markers"}},
+        )
+        files = (survey.ranges.path, survey.ranges.error_curve, survey.anchors.path, survey.images.times)
         contents = [None if path is None else sha256_of(path) for path in files]
-        return [ranges, *(settings[key] for key in others), self._inputs.anchor_frame, self._first_keyframe, contents]
+        return [settings, self._inputs.anchor_frame, self._first_keyframe, contents]
 
     def adjust(self, model: pycolmap.Reconstruction) -> bool:
         """Adjust a model in place; False, and it is as it was, while the ranges do not determine its scale."""
@@ -86,11 +87,8 @@ class AdjustmentWithRanges:
         survey, inputs = self._survey, self._inputs
         observations = self._observations(path)
         estimate = estimate_scale(survey, inputs, observations, path, self._anchor_frame(path), distances=None)
-        asked = replace(
-            survey,
-            camera=replace(survey.camera, refine_intrinsics=survey.camera.mapping_refines_intrinsics),
-            refine=replace(survey.refine, covariance=False),
-        )
+        refine_intrinsics = survey.camera.mapping_refines_intrinsics
+        asked = survey.changed({"camera.refine_intrinsics": refine_intrinsics, "refine.covariance": False})
         scaled = rescale(model, estimate.metric_from_sfm)
         refined, _ = refine_by_survey(asked, inputs, scaled, path, estimate, tape=None)
         return refined
@@ -99,7 +97,7 @@ class AdjustmentWithRanges:
         survey, inputs = self._survey, self._inputs
         if self._is_to_look_for_offset(path):
             found = estimate_time_offset(
-                inputs.log, path, inputs.tag_in_cam_m, association=survey.ranges.association, seed=survey.seed
+                inputs.log, path, inputs.tag_in_cam_m, association=survey.ranges, seed=survey.output.seed
             )
             self._offset_s, self._num_with_offset = found.value_s, len(path)
         return ranges_on_path(survey, inputs, path, self._offset_s or 0.0)

@@ -39,9 +39,9 @@ def estimate_scale(
         inputs.anchors,
         anchor_frame=anchor_frame,
         options=survey.scale,
-        range_model=survey.ranges.model,
+        range_model=survey.ranges,
         distances=distances,
-        seed=survey.seed,
+        seed=survey.output.seed,
     )
 
 

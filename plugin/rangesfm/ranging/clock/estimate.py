@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -123,7 +123,7 @@ def estimate_time_offset(
             found = _offset_of_bursts(bursts, log, trajectory, tags, association)
             if found is not None:
                 return found
-        association = replace(association, max_interpolation_gap_s=_MAX_GAPS * gap_s)
+        association = association.model_copy(update={"max_interpolation_gap_s": _MAX_GAPS * gap_s})
     return _offset_of_motion(ranges, trajectory, tags, association, seed, progress or SilentProgress())
 
 
