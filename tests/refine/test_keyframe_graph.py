@@ -14,11 +14,12 @@ from tests.simulated.model import SyntheticModel
 from rangesfm.geometry.gravity import UP_IN_SITE, Gravity
 from rangesfm.geometry.similarity import align_points, rmse
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE
+from rangesfm.refine import keyframe_graph
 from rangesfm.refine.antennas import Antennas
 from rangesfm.refine.keyframe_graph import KeyframeGraph, solve_graph
 from rangesfm.refine.vision_information import Poses, vision_information
-from rangesfm.refine.with_ranges import keyframe_graph
 
 Array = npt.NDArray[np.float64]
 ANCHORS_M = np.array([[-40.0, -28.0, 12.0], [-15.0, -28.0, 0.0], [-28.0, -42.0, 9.0], [-30.0, -20.0, 15.0]])
@@ -41,15 +42,30 @@ def make_graph(
     return KeyframeGraph(
         vision=replace(vision_information(rays, truth), origin=origin),
         antennas=antennas,
-        anchor_index=index,
         range_m=np.linalg.norm(at - ANCHORS_M[index], axis=1) + 0.05,
-        stddev_m=np.full(len(index), stddev_m),
-        share=np.ones(len(index)),
+        errors=errors_of(index, stddev_m),
         anchors=tuple(anchor(k, anchors_are_free) for k in range(m)),
-        common_bias_stddev_m=0.1,
         gravity=None,
         held_frame=held_frame,
+    )
+
+
+def errors_of(anchor_index: npt.NDArray[np.int64], stddev_m: float) -> RangeErrors:
+    """Independent ones, under no loss to speak of."""
+    n = len(anchor_index)
+    known, label = np.full(n, stddev_m), np.arange(n)
+    return RangeErrors(
+        stddev_m=known,
+        share=np.ones(n),
+        inflation=1.0,
+        given_m=known,
+        shared_m=np.zeros(n),
+        placing_m=np.zeros(n),
+        anchor_index=anchor_index,
+        block=label,
+        place=label,
         loss=GEMAN_MCCLURE.scaled(1e6),
+        common_bias_stddev_m=0.1,
     )
 
 

@@ -337,7 +337,7 @@ def test_ranges_set_aside_as_checks_have_no_say(make_survey: MakeSurvey) -> None
     )
     assert first.value == second.value
     assert np.all(second.observations.status[is_check] == RangeStatus.CHECK)
-    assert np.all(np.isnan(second.range_stddev_m[is_check]))
+    assert np.all(np.isnan(second.errors.stddev_m[is_check]))
 
 
 def between_cameras(survey: Survey, *, factor: float = 1.0, stddev_m: float = 0.005) -> LocatedDistances:
@@ -429,5 +429,5 @@ def test_noise_that_the_log_states_is_believed(make_survey: MakeSurvey) -> None:
         range_stddev_m=np.full(len(log), 0.3),
     )
     far = log.range_m > 5.0
-    stddev = survey.scale("first_camera", "ABCDE", stated).range_stddev_m
+    stddev = survey.scale("first_camera", "ABCDE", stated).errors.stddev_m
     np.testing.assert_allclose(stddev[far], 0.3, rtol=0.01)

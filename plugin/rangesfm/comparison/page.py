@@ -18,20 +18,26 @@ from rangesfm.comparison.models import (
 from rangesfm.files.atomic import new_file
 from rangesfm.files.sole_writer import sole_writer
 from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.report.chart import page_charts
 from rangesfm.report.content import points_of
-from rangesfm.report.drawing import draw
-from rangesfm.report.figures_path import VIEW_SIZE
-from rangesfm.report.markup import Markup
-from rangesfm.report.page import document
-from rangesfm.report.plot import WIDE_SIZE, Figure, Panel, Series
+from rangesfm.report.page import render
+from rangesfm.report.plot import WIDE_SIZE, Figure, Panel, Series, equal_view
 from rangesfm.report.result_scene import anchors_in_scene
 from rangesfm.report.scene import Scene, ScenePath
-from rangesfm.report.sections import section
-from rangesfm.report.tables import table
-from rangesfm.report.view import view
+from rangesfm.report.tables import Table
+from rangesfm.report.view import view_of
 
 COLORS = ("after", "before", "third", "fourth")
 PAGE_NAME = "comparison.html"
+_SIMILARITY_NOTE = (
+    "Scale and turn carry a model onto the first. Moved: RMS distance of the cameras from where the first has "
+    "them, as they are and after that similarity, in the first's unit. Range RMS: of the ranges used, with the "
+    "cameras as they are, and carried onto the path that the ranges themselves have placed."
+)
+_TAPED_NOTE = (
+    "Each model's length in its own unit; after Sim(3): with the scale that carries its cameras onto those of the "
+    "first model that the ranges have placed."
+)
 
 
 def write_comparison(comparison: ModelsComparison, folder: Path) -> Path:
@@ -50,40 +56,35 @@ def render_comparison(comparison: ModelsComparison) -> str:
     """The page; everything drawn is carried onto the first model, in its unit."""
     base = comparison.models[0]
     aligned = [_aligned(model, row) for model, row in zip(comparison.models, comparison.rows)]
-    similarity = table(
-        "Each model against the first",
-        SIMILARITY_HEADER,
-        [[row.name, *similarity_cells(row)] for row in comparison.rows],
-        "Scale and turn carry a model onto the first. Moved: RMS distance of the cameras from where the first has "
-        "them, as they are and after that similarity, in the first's unit. Range RMS: of the ranges used, with the "
-        "cameras as they are, and carried onto the path that the ranges themselves have placed.",
-    )
-    distances = table(
-        "Distances between photos, in each model's unit",
-        ["from and to", *(model.name for model in comparison.models)],
-        [[f"{a} to {b}", *(f"{length:.4f}" for length in lengths)] for a, b, lengths in comparison.distances],
-    )
-    figures = [_moved_figure(comparison), _path_figure(comparison, aligned)]
     title = f"{len(comparison.models)} models of {len(base.path)} photos"
-    return document(
-        f"{title} – rangesfm comparison",
-        title,
-        section("models", "Models", similarity),
-        section("view-section", "All of them in 3-D", view(_scene(comparison, aligned))),
-        section("moved", "What moved where", [draw(figure) for figure in figures if figure is not None]),
-        section("distances", "Distances", distances, *_taped(comparison)),
+    figures = [*_moved_figure(comparison), _path_figure(comparison, aligned)]
+    return render(
+        "comparison.html",
+        title=f"{title} – rangesfm comparison",
+        heading=title,
+        view=view_of(_scene(comparison, aligned)),
+        figures=figures,
+        charts=page_charts(figures),
+        tables={
+            "similarity": Table(
+                "Each model against the first",
+                SIMILARITY_HEADER,
+                [[row.name, *similarity_cells(row)] for row in comparison.rows],
+                _SIMILARITY_NOTE,
+            ),
+            "distances": Table(
+                "Distances between photos, in each model's unit",
+                ["from and to", *(model.name for model in comparison.models)],
+                [[f"{a} to {b}", *(f"{length:.4f}" for length in lengths)] for a, b, lengths in comparison.distances],
+            ),
+            "taped": Table(
+                "Taped distances",
+                taped_header(comparison) if comparison.taped else [],
+                [taped_cells(row) for row in comparison.taped],
+                _TAPED_NOTE,
+            ),
+        },
     )
-
-
-def _taped(comparison: ModelsComparison) -> list[Markup | None]:
-    if not comparison.taped:
-        return []
-    rows = [taped_cells(row) for row in comparison.taped]
-    note = (
-        "Each model's length in its own unit; after Sim(3): with the scale that carries its cameras onto those of the "
-        "first model that the ranges have placed."
-    )
-    return [table("Taped distances", taped_header(comparison), rows, note)]
 
 
 def _aligned(model: NamedModel, row: ModelRow) -> Trajectory:
@@ -117,7 +118,7 @@ def _scene(comparison: ModelsComparison, aligned: list[Trajectory]) -> Scene:
     )
 
 
-def _moved_figure(comparison: ModelsComparison) -> Figure | None:
+def _moved_figure(comparison: ModelsComparison) -> list[Figure]:
     """How far each camera is from where the first model has it, along the path."""
     number = {name: i for i, name in enumerate(comparison.models[0].path.image_names)}
     series = []
@@ -126,7 +127,7 @@ def _moved_figure(comparison: ModelsComparison) -> Figure | None:
             points = np.column_stack([[number[name] + 1 for name in row.common_names], row.moved_aligned])
             series.append(Series(row.name, _color(i), points, "line"))
     if not series:
-        return None
+        return []
     highest = max(float(one.points[:, 1].max()) for one in series)
     panel = Panel(
         "",
@@ -138,7 +139,7 @@ def _moved_figure(comparison: ModelsComparison) -> Figure | None:
         size=WIDE_SIZE,
     )
     caption = "How far each camera is from where the first model has it, after the similarity, in the first's unit."
-    return Figure("moved", caption, (panel,))
+    return [Figure("moved", caption, (panel,))]
 
 
 def _path_figure(comparison: ModelsComparison, aligned: list[Trajectory]) -> Figure:
@@ -152,6 +153,7 @@ def _path_figure(comparison: ModelsComparison, aligned: list[Trajectory]) -> Fig
             for i, (model, path) in enumerate(zip(comparison.models, aligned))
         ]
         labels = ("x", f"{'−' if signs[1] < 0 else ''}{'xyz'[axes[1]]}")
-        views.append(Panel(name, f"{name} of all paths", *labels, tuple(lines), is_equal=True, size=VIEW_SIZE))
+        ranges = equal_view(np.concatenate([line.points for line in lines]))
+        views.append(Panel(name, f"{name} of all paths", *labels, tuple(lines), (), *ranges, keeps_shape=True))
     caption = "All paths, carried onto the first, in its frame and unit."
     return Figure("paths", caption, tuple(views), layout="views")

@@ -32,6 +32,12 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def _as_json(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _as_json(item) for key, item in value.items()}
+    return [_as_json(item) for item in value] if isinstance(value, (list, tuple)) else _plain(value)
+
+
 def _vector(value: Any) -> Any:
     value = _plain(value)
     return None if isinstance(value, list) and None in map(_plain, value) else value
@@ -57,8 +63,9 @@ class Record(BaseModel):
     model_config = ConfigDict(frozen=True, from_attributes=True)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values by key, in the order of the fields."""
-        return self.model_dump(by_alias=True, exclude_unset=True)
+        """What ``json.loads`` makes of the file, in the order of the fields."""
+        values: dict[str, Any] = _as_json(self.model_dump(by_alias=True, exclude_unset=True))
+        return values
 
     def write(self, path: Path) -> None:
         """Write the file, whole or not at all."""
@@ -94,16 +101,10 @@ def _what_is_wrong(error: ValidationError) -> str:
 
 
 def write_json(value: Any, path: Path) -> None:
-    """Write values by key; numbers that are not finite become null.
+    """Write plain values.
 
     Of paths that are no UTF-8, what is none becomes JSON's own escapes, by which they are read as they were.
     """
     with new_file(path) as temporary:
-        text = json.dumps(_finite(value), indent=2, ensure_ascii=False, allow_nan=False)
+        text = json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False)
         temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    return [_finite(item) for item in value] if isinstance(value, (list, tuple)) else _plain(value)

@@ -51,6 +51,12 @@ class Trajectory:
             self.time_resolution_s,
         )
 
+    def as_in(self, model: pycolmap.Reconstruction) -> Trajectory:
+        """The same keyframes as another model has them."""
+        times = self.timestamps_s
+        by_name = None if times is None else dict(zip(self.image_names, times.tolist(), strict=True))
+        return trajectory_from_reconstruction(model, by_name)
+
     def timed(self, timestamps_s: Mapping[str, float]) -> Trajectory:
         """The keyframes whose photo has a time by its name, in the order of these times."""
         known = [row for row, name in enumerate(self.image_names) if name in timestamps_s]

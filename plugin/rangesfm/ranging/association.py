@@ -13,6 +13,7 @@ from rangesfm.errors import InputError
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import AssociationOptions
 from rangesfm.ranging.clock.time_resolution import time_resolution_s
+from rangesfm.ranging.errors.noise import robust_stddev
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
 
@@ -170,13 +171,13 @@ def _camera_is_still(
     for burst in np.split(log.range_m[order], starts[1:]):
         if len(burst) >= 6:
             early, late = np.array_split(burst, 2)
-            noise = 1.4826 * float(np.median(np.concatenate([_deviations(early), _deviations(late)])))
+            noise = robust_stddev(np.concatenate([_deviations(early), _deviations(late)]))
             drifts.append((np.median(late) - np.median(early)) * np.sqrt(len(burst) / 4))
             noises.append(noise)
     if not drifts:
         return still
     # 1.25 is the price of a median over a mean.
-    drift_stddev = 1.4826 * float(np.median(np.abs(drifts)))
+    drift_stddev = robust_stddev(drifts)
     noise_stddev = 1.25 * max(float(np.median(noises)), 1e-3)
     still[near] = drift_stddev <= _MAX_STILL_DRIFT_STDDEVS * noise_stddev
     return still

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import AfterValidator, AliasChoices, ConfigDict, Field
+from pydantic import AfterValidator, AliasChoices, AliasPath, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
 from rangesfm.files.records import Count, Flag, Number, NumberOrNull, Record, Text, Vector, VectorOrNull
@@ -81,7 +81,9 @@ class ScaleEntry(Record):
     sensitivity: ScaleSensitivity
     per_anchor: dict[Text, NumberOrNull]
     range_noise_stddev_m: NumberOrNull = Field(validation_alias=AliasChoices("range_noise_stddev_m", "noise_stddev_m"))
-    correlation_inflation: NumberOrNull
+    correlation_inflation: NumberOrNull = Field(
+        validation_alias=AliasChoices("correlation_inflation", AliasPath("errors", "inflation"))
+    )
     two_candidate: TwoCandidateEntry | None
 
     @property
@@ -269,6 +271,7 @@ class RefineEntry(Record):
         others = {
             "iterations": summary.num_iterations,
             "keyframe_graph_steps": summary.num_graph_steps,
+            "correlation_inflation": summary.errors.inflation,
             "converged": summary.converged and not summary.misfits,
             "message": "; ".join(summary.misfits) or summary.message,
             "scale_value": found.refined_scale,

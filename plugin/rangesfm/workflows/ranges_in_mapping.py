@@ -11,14 +11,13 @@ from rangesfm.colmap.transform import rescale, take_over
 from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.files.atomic import sha256_of
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock.estimate import estimate_time_offset
-from rangesfm.ranging.observations import RangeObservations, hold_out
-from rangesfm.scale.initialize import initialize_scale
+from rangesfm.ranging.observations import RangeObservations
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes
-from rangesfm.workflows.survey_stages import path_of_model, refine_by_survey
+from rangesfm.workflows.placed_ranges import ranges_on_path
+from rangesfm.workflows.survey_stages import estimate_scale, path_of_model, refine_by_survey
 
 # Fewer have no shape by which ranges could tell a scale.
 _MIN_NUM_KEYFRAMES = 5
@@ -87,15 +86,7 @@ class AdjustmentWithRanges:
     def _adjusted(self, model: pycolmap.Reconstruction, path: Trajectory) -> pycolmap.Reconstruction:
         survey, inputs = self._survey, self._inputs
         observations = self._observations(path)
-        estimate = initialize_scale(
-            observations,
-            path,
-            inputs.anchors,
-            anchor_frame=self._anchor_frame(path),
-            options=survey.scale,
-            range_model=survey.ranges,
-            seed=survey.output.seed,
-        )
+        estimate = estimate_scale(survey, inputs, observations, path, self._anchor_frame(path), distances=None)
         refine_intrinsics = survey.camera.mapping_refines_intrinsics
         asked = survey.changed({"camera.refine_intrinsics": refine_intrinsics, "refine.covariance": False})
         scaled = rescale(model, estimate.metric_from_sfm)
@@ -104,18 +95,12 @@ class AdjustmentWithRanges:
 
     def _observations(self, path: Trajectory) -> RangeObservations:
         survey, inputs = self._survey, self._inputs
-        association = survey.ranges
         if self._is_to_look_for_offset(path):
             found = estimate_time_offset(
-                inputs.log, path, inputs.tag_in_cam_m, association=association, seed=survey.output.seed
+                inputs.log, path, inputs.tag_in_cam_m, association=survey.ranges, seed=survey.output.seed
             )
             self._offset_s, self._num_with_offset = found.value_s, len(path)
-        placed = associate(
-            inputs.log, path, inputs.tag_in_cam_m, time_offset_s=self._offset_s or 0.0, options=association
-        )
-        if not placed.has_place.any():
-            raise InputError("no range is near enough to a keyframe in time")
-        return hold_out(placed, survey.ranges, survey.output.seed)
+        return ranges_on_path(survey, inputs, path, self._offset_s or 0.0)
 
     def _is_to_look_for_offset(self, path: Trajectory) -> bool:
         if self._inputs.log.timestamp_s is None or self._survey.ranges.time_offset_s is not None:
