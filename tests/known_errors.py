@@ -21,7 +21,7 @@ def known_errors(
     *,
     is_estimated: bool = False,
     inflation: float = 1.0,
-    common_bias_stddev_m: float = RangeModelOptions.common_bias_stddev_m,
+    common_bias_stddev_m: float = RangeModelOptions().common_bias_stddev_m,
 ) -> RangeErrors:
     """Of all ranges of the log.
 
