@@ -28,9 +28,9 @@ from tests.simulated.small_demo import make_small_demo
 from rangesfm.demo.ranges import Radio, simulate_ranges
 from rangesfm.demo.survey import TIME_OFFSET_S as DEMO_TIME_OFFSET_S
 from rangesfm.demo.survey import DemoSurvey
-from rangesfm.geometry import Similarity
+from rangesfm.geometry.reference import Reference, write_reference
+from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.readers.canonical import write_ranges_csv
-from rangesfm.reference import Reference, write_reference
 
 Array = npt.NDArray[np.float64]
 Command = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -42,6 +42,18 @@ ANCHORS_M = {"A1": (-6.0, -5.0, 0.5), "A2": (6.0, -5.0, 2.5), "A3": (6.0, 5.0, 0
 
 # A shell's background jobs ignore Ctrl-C, and so would every command that a test starts from there.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_report_header() -> str:
+    return f"BLAS kernels: {', '.join(blas_kernels())}"
+
+
+def blas_kernels() -> list[str]:
+    """Those that numpy and scipy compute with, each with its own: as the processor or OPENBLAS_CORETYPE says."""
+    import scipy.linalg  # noqa: F401 (loads scipy's)
+    from threadpoolctl import threadpool_info
+
+    return [str(library.get("architecture")) for library in threadpool_info() if library["user_api"] == "blas"]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

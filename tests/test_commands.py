@@ -21,13 +21,13 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from tests.simulated.ranges import simulate_ranges_at
 
+from rangesfm.colmap.model_files import read_model
 from rangesfm.demo.ranges import Radio
 from rangesfm.demo.survey import ANCHORS_M, CAMERA_MODEL, TAG_IN_CAM_M
-from rangesfm.geometry import Similarity
-from rangesfm.model_files import read_model
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers import read_ranges, write_ranges_csv
-from rangesfm.trajectory import trajectory_from_reconstruction
 
 if TYPE_CHECKING:
     from tests.conftest import Command, PhotoRun, WalkedSurvey
@@ -109,7 +109,7 @@ class Left:
     def without_seconds(self) -> dict[str, Any]:
         """A copy of result.json but for how long things took and where it lies."""
         result = copy.deepcopy(self.result)
-        del result["seconds"], result["settings"]["output_path"]
+        del result["seconds"], result["settings"]["output"]["path"]
         if result["refine"] is not None:
             del result["refine"]["seconds"]
         return result

@@ -18,9 +18,9 @@ import numpy as np
 import numpy.typing as npt
 from tests.simulated.path import loop_path
 
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from rangesfm.batch.course import Course
 from rangesfm.batch.jobs import Job
 from rangesfm.batch.rows import Figures
 from rangesfm.cli.batch_progress import BatchTerminal
-from rangesfm.config import Survey
+from rangesfm.survey.settings import Survey
 
 
 class Terminal(io.StringIO):

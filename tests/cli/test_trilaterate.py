@@ -14,11 +14,11 @@ from tests.simulated.path import loop_path
 
 from rangesfm.cli import main
 from rangesfm.demo.ranges import Radio, simulate_ranges
-from rangesfm.ranging.anchor_file import read_anchors
+from rangesfm.geometry.reference import Reference, write_reference
+from rangesfm.geometry.trajectory import trajectory_from_reconstruction
+from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers import write_ranges_csv
-from rangesfm.reference import Reference, write_reference
-from rangesfm.trajectory import trajectory_from_reconstruction
 from rangesfm.vision.image_times import read_image_times_csv
 
 if TYPE_CHECKING:

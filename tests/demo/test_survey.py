@@ -12,7 +12,6 @@ import pytest
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 
-from rangesfm.config import read_survey
 from rangesfm.demo.survey import (
     ANCHOR_STDDEV_M,
     ANCHORS_M,
@@ -23,10 +22,11 @@ from rangesfm.demo.survey import (
     make_demo_survey,
 )
 from rangesfm.errors import InputError
-from rangesfm.ranging.anchor_file import read_anchors
+from rangesfm.files.sole_writer import sole_writer
+from rangesfm.geometry.reference import read_reference
+from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.readers import read_ranges
-from rangesfm.reference import read_reference
-from rangesfm.sole_writer import sole_writer
+from rangesfm.survey.settings import read_survey
 
 NUM_PHOTOS = 4
 NO_PROCESS = 99999999  # above any that Linux gives
@@ -54,9 +54,9 @@ def test_survey_file_is_valid_and_names_the_camera_that_took_the_photos(made: De
     survey = read_survey(made.survey_path, {})
     assert survey.camera.model == "SIMPLE_RADIAL"
     assert survey.camera.params == pytest.approx(CAMERA_PARAMS)
-    assert survey.anchor_frame == "site"
+    assert survey.anchors.frame == "site"
     assert survey.ranges.time_offset_s is None
-    assert survey.reference_path == made.folder / "reference.csv"
+    assert survey.report.reference == made.folder / "reference.csv"
 
 
 def test_exif_tells_the_time_of_each_photo_to_the_millisecond(made: DemoSurvey) -> None:

@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 from tests.simulated.model import synthetic_model
 from tests.simulated.path import loop_path
 
+from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
 from rangesfm.export import COVARIANCE_FORMATS, MetricMap, export_map
 from rangesfm.export.frames import moved
-from rangesfm.geometry import Similarity
-from rangesfm.model_transform import rescale
+from rangesfm.geometry.similarity import Similarity
 from rangesfm.options import ExportOptions
 
 Array = npt.NDArray[np.float64]

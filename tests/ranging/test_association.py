@@ -12,11 +12,11 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import AssociationOptions
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 TAG_IN_CAM_M = np.array([0.1, -0.2, 0.05])
@@ -235,6 +235,14 @@ class TestLongGaps:
         first = self.TIMES[self.TIMES < 12.0]
         alone = associate(log_at(range_times), trajectory_of(first, curved(first)), TAG_IN_CAM_M)
         np.testing.assert_allclose(whole.centers, alone.centers, atol=1e-12)
+
+    def test_a_gap_of_the_limit_is_none_whatever_the_date(self) -> None:
+        """Seconds since 1970 are 2.4e-7 s apart: photos every 2 s are now less, now more."""
+        times = 1.7e9 + 0.1 + 2.0 * np.arange(20) + 1e-7 * np.arange(20)
+        assert np.ptp(np.diff(times)) > 0
+        found = associate(log_at(times[:-1] + 1.0), trajectory_of(times, straight(times - times[0])), TAG_IN_CAM_M)
+        assert statuses(found) == ["used"] * 19
+        np.testing.assert_allclose(found.weight, 0.5, atol=1e-6)
 
     def test_the_limit_is_an_option(self) -> None:
         path = trajectory_of(self.TIMES, straight(self.TIMES))

@@ -14,14 +14,14 @@ from tests.simulated.path import loop_path
 from tests.simulated.ranges import simulate_ranges_at
 
 from rangesfm.demo.ranges import Radio, SimulatedRanges
-from rangesfm.geometry import IDENTITY, Similarity
-from rangesfm.ranging.anchors import Anchor
+from rangesfm.geometry.similarity import IDENTITY, Similarity
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import orbit_path, sequence_path
 
 from rangesfm.demo.path import CameraPath
-from rangesfm.trajectory import trajectory_from_reconstruction
+from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 
 
 def _model(path: CameraPath, num_frames: int, **options: object) -> SyntheticModel:

@@ -31,7 +31,7 @@ from scipy.stats import chi2
 from tests.simulated.path import loop_path
 
 from rangesfm.errors import GeometryError
-from rangesfm.ranging.trilateration import TrilaterationOptions, trilaterate
+from rangesfm.ranging.anchors.trilateration import TrilaterationOptions, trilaterate
 
 Array = npt.NDArray[np.float64]
 

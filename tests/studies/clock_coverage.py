@@ -23,9 +23,9 @@ from scipy.spatial.transform import Rotation
 from rangesfm.demo.path import CameraPath
 from rangesfm.demo.ranges import Radio, simulate_ranges
 from rangesfm.errors import GeometryError
-from rangesfm.ranging.clock import estimate_time_offset
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.ranging.clock.estimate import estimate_time_offset
 from rangesfm.ranging.log import RangeLog
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

@@ -29,9 +29,9 @@ from pathlib import Path
 import numpy as np
 from tests.simulated.small_demo import make_small_demo
 
+from rangesfm.colmap.model_files import read_model
 from rangesfm.demo.survey import TIME_OFFSET_S
-from rangesfm.model_files import read_model
-from rangesfm.trajectory import trajectory_from_reconstruction
+from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 
 TOLERANCE = 1e-9
 # All steps depend on it; the demo's has a focal length of 280.8 pixels.

@@ -33,13 +33,13 @@ from tests.simulated.ranges import simulate_ranges_at
 
 from rangesfm.demo.ranges import Radio
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import ScaleOptions
-from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.two_candidate import two_candidate
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

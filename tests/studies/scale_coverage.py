@@ -22,13 +22,13 @@ from tests.simulated.path import loop_path
 from rangesfm.demo.path import CameraPath
 from rangesfm.demo.ranges import Radio, SimulatedRanges, simulate_ranges
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import Similarity
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import ScaleOptions
-from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

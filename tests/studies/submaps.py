@@ -58,10 +58,10 @@ from tests.simulated.path import loop_path
 from tests.simulated_database import camera_options, matched_photos, write_database
 
 from rangesfm.demo.ranges import Radio, simulate_ranges
+from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.options import MapperOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.readers.canonical import write_ranges_csv
-from rangesfm.reference import Reference, write_reference
 from rangesfm.vision.mapping import map_incrementally, pipeline_options, write_models
 from rangesfm.vision.submap_joining import join_submaps
 from rangesfm.vision.submap_refinement import refine_joined

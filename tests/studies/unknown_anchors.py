@@ -23,12 +23,12 @@ from tests.simulated.ranges import simulate_ranges_at
 
 from rangesfm.demo.ranges import Radio
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import Similarity
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import ScaleOptions
-from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

@@ -38,9 +38,9 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
         raise InputError(f"--num_photos is {args.num_photos}, expected {_NUM_PHOTOS[0]} to {_NUM_PHOTOS[-1]}")
     if args.seed < 0:
         raise InputError(f"--seed is {args.seed}, expected 0 or more")
-    from rangesfm.config import read_survey
     from rangesfm.demo.survey import make_demo_survey
-    from rangesfm.pipeline import run_survey
+    from rangesfm.survey.settings import read_survey
+    from rangesfm.workflows.run import run_survey
 
     folder = Path(args.folder)
     made = make_demo_survey(folder, num_photos=args.num_photos, seed=args.seed)

@@ -20,7 +20,7 @@ def add_command(commands: Commands) -> None:
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
-    from rangesfm.doctor import diagnose
+    from rangesfm.ceres.doctor import diagnose
 
     checks = diagnose()
     width = max(len(check.name) for check in checks)

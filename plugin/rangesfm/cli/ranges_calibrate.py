@@ -14,7 +14,7 @@ from rangesfm.progress import Progress
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rangesfm.ranging.calibration import Calibration
+    from rangesfm.ranging.errors.calibration import Calibration
 
 
 def add_command(commands: Commands) -> None:
@@ -36,14 +36,14 @@ def add_command(commands: Commands) -> None:
     parser.add_argument("--anchors", required=True, metavar="CSV", help="anchor_id,x_m,y_m,z_m: surveyed")
     add_position_arguments(parser, max_interpolation_gap_s=0.2)
     parser.add_argument("--output_path", required=True, metavar="CSV", help="write the curve there")
-    parser.add_argument("--plot", metavar="PNG", help="draw the curve and the ranges' errors there")
+    parser.add_argument("--plot", metavar="FILE", help="draw the curve and the ranges' errors there (PNG or SVG)")
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
-    from rangesfm.inputs import of_one_tag
-    from rangesfm.ranging.anchor_file import read_anchors
-    from rangesfm.ranging.calibration import calibrate_ranges
-    from rangesfm.ranging.error_curve import write_error_curve
+    from rangesfm.ranging.anchors.anchor_file import read_anchors
+    from rangesfm.ranging.errors.calibration import calibrate_ranges
+    from rangesfm.ranging.errors.error_curve import write_error_curve
+    from rangesfm.survey.inputs import of_one_tag
 
     anchors = read_anchors(args.anchors)
     log = of_one_tag(read_log(args), args.tag_id)
@@ -51,9 +51,10 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     calibration = calibrate_ranges(log, tags, anchors)
     lines = [*_lines(calibration, len(log)), "", f"written to {args.output_path}"]
     if args.plot is not None:
-        from rangesfm.ranging.plot import plot_error_curve, write_figure
+        from rangesfm.report.pictures import write_picture
+        from rangesfm.report.range_plots import plot_error_curve
 
-        write_figure(plot_error_curve(calibration), args.plot)
+        write_picture(plot_error_curve(calibration), Path(args.plot))
         lines.append(f"drawn in {args.plot}")
     write_error_curve(calibration.curve, Path(args.output_path))
     return Outcome(lines)

@@ -13,7 +13,7 @@ from rangesfm.progress import Progress
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rangesfm.ranging.anchor_survey import AnchorPlacement
+    from rangesfm.ranging.anchors.anchor_survey import AnchorPlacement
     from rangesfm.ranging.log import RangeLog
 
 _TOWARD = {
@@ -77,10 +77,10 @@ def _add_estimate_options(parser: argparse.ArgumentParser) -> None:
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     from rangesfm.errors import GeometryError
-    from rangesfm.inputs import of_one_tag
-    from rangesfm.ranging.anchor_file import write_anchors
-    from rangesfm.ranging.anchor_survey import trilaterate_anchors
-    from rangesfm.ranging.trilateration import TrilaterationOptions
+    from rangesfm.ranging.anchors.anchor_file import write_anchors
+    from rangesfm.ranging.anchors.anchor_survey import trilaterate_anchors
+    from rangesfm.ranging.anchors.trilateration import TrilaterationOptions
+    from rangesfm.survey.inputs import of_one_tag
 
     log = of_one_tag(read_log(args), args.tag_id)
     positions = read_tag_positions(args, log)

@@ -21,10 +21,10 @@ from scipy.spatial.transform import Rotation
 from rangesfm.demo.path import CameraPath
 from rangesfm.demo.ranges import Radio, SimulatedRanges, simulate_ranges
 from rangesfm.errors import InputError
-from rangesfm.files import LEFTOVER, new_file, new_folder
+from rangesfm.files.atomic import LEFTOVER, new_file, new_folder
+from rangesfm.files.sole_writer import LOCK_NAME, sole_writer
+from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.ranging.readers.canonical import write_ranges_csv
-from rangesfm.reference import Reference, write_reference
-from rangesfm.sole_writer import LOCK_NAME, sole_writer
 
 FloatArray = npt.NDArray[np.float64]
 
