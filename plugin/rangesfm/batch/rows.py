@@ -7,8 +7,8 @@ from dataclasses import dataclass, fields
 from enum import Enum
 from typing import Any
 
-from rangesfm.compare.with_reference import align_rows
 from rangesfm.failures import INTERNAL_ERROR
+from rangesfm.text_table import align_rows
 
 _FAILED = 4
 
