@@ -24,8 +24,10 @@ from rangesfm.result.folder import ResultFolder, read_result_folder
 def main() -> None:
     before, after = (read_result_folder(Path(path)) for path in sys.argv[1:3])
     for result in (before, after):
-        if result.frame != "site":
-            sys.exit(f"{result.path}: in the frame {result.frame!r}; only maps in one site frame can be compared")
+        if result.summary.frame != "site":
+            sys.exit(
+                f"{result.path}: in the frame {result.summary.frame!r}; only maps in one site frame can be compared"
+            )
     old, new = metric_model(before), metric_model(after)
     points = positions(new)
     distance_m = KDTree(positions(old)).query(points)[0]
@@ -45,7 +47,7 @@ def main() -> None:
 
 
 def metric_model(result: ResultFolder) -> pycolmap.Reconstruction:
-    model = result.read_model("sparse_metric") or result.read_model("sparse_scaled")
+    model = result.read_metric_model()
     if model is None:
         sys.exit(f"{result.path}: no metric model")
     return model

@@ -17,6 +17,7 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
+from tests.result_document import result_document
 
 from rangesfm.cli import main
 
@@ -323,17 +324,17 @@ def test_failure_leaves_an_earlier_result_as_it_was(
     ("spoil", "said"),
     [
         (write("result.json", '{"frame":\n'), "out/result.json:2: not JSON"),
-        (write("result.json", "[]\n"), "out/result.json:1: expected a JSON object"),
+        (write("result.json", "{}\n"), "out/result.json: 'scale' is missing"),
         (write("sparse_scaled/0/images.bin", "x" * 99), "out/sparse_scaled/0/images.bin: is damaged or cut off"),
     ],
-    ids=["cut", "list", "model"],
+    ids=["cut", "empty", "model"],
 )
 def test_damaged_result_is_named(
     command: str, spoil: Spoil, said: str, own_survey: WalkedSurvey, refusal: Refusal
 ) -> None:
     out = own_survey.folder / "out"
     shutil.copytree(own_survey.folder / "sparse", out / "sparse_scaled")
-    (out / "result.json").write_text('{"frame": "site"}\n')
+    (out / "result.json").write_text(json.dumps(result_document()))
     spoil(out)
     reference = ("--reference", "reference.csv") if command == "compare" else ()
     assert said in refusal(command, "out", *reference)

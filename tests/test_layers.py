@@ -16,8 +16,7 @@ PACKAGE = Path(rangesfm.__file__).parent
 LAYERS = (
     "files processes",
     "geometry",
-    "colmap _ceres",
-    "ceres",
+    "colmap ceres",
     "ranging",
     "distances",
     "vision scale export",
@@ -26,10 +25,10 @@ LAYERS = (
     "join",
     "result",
     "report",
-    "compare",
+    "comparison",
     "workflows",
     "batch",
-    "simulate",
+    "demo",
     "cli",
 )
 LAYER_OF = {folder: number for number, folders in enumerate(LAYERS) for folder in folders.split()}
@@ -99,7 +98,7 @@ def test_only_one_package_touches_the_compiled_part_and_pyceres() -> None:
         if any(f"{name}.".startswith(("rangesfm._cpp.", "pyceres.")) for name in imports(path))
     ]
     assert touching, "not even the package that is there for it"
-    assert all(module.split(".")[0] == "_ceres" for module in touching)
+    assert all(module.split(".")[0] == "ceres" for module in touching)
 
 
 def test_importing_the_package_imports_neither_pycolmap_nor_scipy() -> None:

@@ -12,7 +12,7 @@ import pytest
 import rangesfm
 
 # Slow to load, and of no use to somebody who only wants to know what there is.
-HEAVY = {"numpy", "scipy", "pycolmap", "pyceres", "PIL", "matplotlib"}
+HEAVY = {"numpy", "scipy", "pycolmap", "pyceres", "PIL", "jinja2", "vl_convert"}
 
 
 def modules_after(code: str) -> set[str]:

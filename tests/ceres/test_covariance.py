@@ -12,15 +12,17 @@ import pycolmap
 import pytest
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
+from tests.simulated.model import synthetic_model
+from tests.simulated.path import orbit_path
 
-from rangesfm._ceres import (
+from rangesfm.ceres import (
     PlacedRanges,
     RangeBlocks,
+    add_normal_prior,
     add_ranges,
     add_residual_block,
     distance_cost,
     keep_from_elimination,
-    normal_prior_cost,
     range_cost,
     tangent_jacobian,
 )
@@ -28,8 +30,6 @@ from rangesfm.ceres.covariance import ResidualErrors, joint_covariance
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.geometry.trajectory import pose_of
-from rangesfm.simulate.model import synthetic_model
-from rangesfm.simulate.path import orbit_path
 
 Array = npt.NDArray[np.float64]
 
@@ -118,7 +118,7 @@ def joint(
     )
     add_ranges(adjuster, ranges, RangeBlocks(survey.poses, survey.anchors, survey.biases, [TAG_IN_CAM_M]))
     for position, bias in zip(survey.anchors, survey.biases, strict=False):
-        add_residual_block(adjuster, normal_prior_cost(mean=[0.0], stddev=[BIAS_STDDEV_M]), None, [bias])
+        add_normal_prior(adjuster, bias, mean=[0.0], stddev=BIAS_STDDEV_M)
         if hold_anchors:
             survey.problem.set_parameter_block_constant(position)
     return survey

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_array
+from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.path import sequence_path
 
 from rangesfm.ceres.linear_solver import inverse_is_affordable, max_num_images_direct, overlaps_in, overlaps_of
 from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.refine.bundle_adjustment import bundle_adjustment
-from rangesfm.simulate.model import SyntheticModel, synthetic_model
-from rangesfm.simulate.path import sequence_path
 
 
 def walk(num: int, num_observations: int) -> SyntheticModel:

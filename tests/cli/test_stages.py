@@ -22,10 +22,11 @@ class Calls:
     made: list[tuple[str, Survey, dict[str, Any]]] = field(default_factory=list)
 
     def stage(self, name: str) -> Any:
-        def run(survey: Survey, **options: Any) -> SimpleNamespace:
+        def run(survey: Survey, **options: Any) -> SimpleNamespace | list[str]:
             options.pop("progress").message("working")
             self.made.append((name, survey, options))
-            return SimpleNamespace(summary_lines=lambda: [f"{name} is done", "scale 2.5"])
+            lines = [f"{name} is done", "scale 2.5"]
+            return lines if name == "reconstruct_survey" else SimpleNamespace(summary_lines=lambda: lines)
 
         return run
 
@@ -73,14 +74,14 @@ def test_quiet_run_prints_the_summary_alone(calls: Calls, capsys: pytest.Capture
 
 
 def test_demo_makes_a_survey_and_runs_it_against_the_truth(calls: Calls, monkeypatch: pytest.MonkeyPatch) -> None:
-    def make(folder: Path, *, num_photos: int, seed: int, progress: object) -> SimpleNamespace:
+    def make(folder: Path, *, num_photos: int, seed: int) -> SimpleNamespace:
         folder.mkdir()
         (folder / "reference.csv").touch()
         survey_path = folder / "survey.toml"
         survey_path.write_text(f"[images]\nevery_nth = {num_photos}\n[output]\nseed = 1\n")
         return SimpleNamespace(survey_path=survey_path)
 
-    monkeypatch.setattr("rangesfm.simulate.survey.make_demo_survey", make)
+    monkeypatch.setattr("rangesfm.demo.survey.make_demo_survey", make)
     assert main(["demo", "yard", "--num-photos", "12", "--seed", "5", "--num-threads", "2"]) == 0
     ((name, survey, options),) = calls.made
     assert (name, options) == ("run_survey", {"restart": False})

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.path import orbit_path
 
 from rangesfm.colmap.transform import rescale
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
-from rangesfm.simulate.model import SyntheticModel, synthetic_model
-from rangesfm.simulate.path import orbit_path
 
 
 @pytest.fixture(scope="module")

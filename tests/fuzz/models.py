@@ -40,10 +40,11 @@ _TAG_IN_CAM_M = (0.03, -0.12, -0.05)
 
 def make_survey(folder: Path) -> None:
     """A model of ten photos along a loop, binary and as text, with ranges to four anchors."""
+    from tests.simulated.model import synthetic_model
+    from tests.simulated.path import loop_path
+
+    from rangesfm.demo.ranges import Radio, simulate_ranges
     from rangesfm.ranging.readers.canonical import write_ranges_csv
-    from rangesfm.simulate.model import synthetic_model
-    from rangesfm.simulate.path import loop_path
-    from rangesfm.simulate.ranges import Radio, simulate_ranges
 
     anchors_m = {"A1": (-6.0, -5.0, 0.5), "A2": (6.0, -5.0, 2.5), "A3": (6.0, 5.0, 0.7), "A4": (-6.0, 5.0, 2.2)}
     path = loop_path(15.0, start_s=0.0, seed=3)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges, write_ranges_csv
 from rangesfm.ranging.summary import summarize_ranges
 from rangesfm.result.folder import ResultFolder, read_result_folder
+from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import Survey, read_survey
 from rangesfm.vision.image_times import ImageTimes, read_image_times_csv
 
@@ -138,13 +139,13 @@ def _check_survey(survey: Survey) -> None:
 def _read_whole_result(path: Path) -> ResultFolder:
     """Everything that pages and exports ask for."""
     result = read_result_folder(path.parent)
-    for name in (item.name for item in fields(result)):
-        getattr(result, name)
-    for ask in (
-        lambda: (result.frame, result.anchors, result.metric_from_sfm, result.relative_scale_stddev),
-        lambda: (result.images_path, result.georeference, result.association, result.lever_arms_m(["T1"])),
-    ):
-        ask()
+    summary = result.summary
+    summary.metric_from_sfm.similarity, summary.scale.relative_stddev_empirical, summary.scale.larger_stddev  # noqa: B018
+    result.anchor_positions_m, result.images_path, result.lever_arms_m(["T1"])
+    _expect(summary.georeference is None or summary.georeference.georeference.crs, "a coordinate system")
+    _expect(list(summary.lines(path.parent, None)), "lines for people")
+    summary.write(path)
+    _expect(ResultSummary.read(path) == summary, "a result that is read as it was written")
     return result
 
 

@@ -11,12 +11,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from scipy.spatial.transform import Rotation
+from tests.simulated.model import random_similarity, synthetic_model
+from tests.simulated.path import loop_path
+from tests.simulated.ranges import simulate_ranges_at
 
 from rangesfm.cli import main
 from rangesfm.colmap.merge import without_photos
 from rangesfm.colmap.model_files import read_model
 from rangesfm.colmap.transform import rescale
+from rangesfm.demo.path import CameraPath
+from rangesfm.demo.ranges import Radio
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import align_points
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
@@ -27,12 +31,9 @@ from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers.canonical import write_ranges_csv
-from rangesfm.simulate.model import random_similarity, synthetic_model
-from rangesfm.simulate.path import CameraPath, loop_path
-from rangesfm.simulate.ranges import Radio, simulate_ranges_at
 from rangesfm.survey.settings import RangesConfig, Survey
 from rangesfm.vision.reconstruct import ReconstructionSummary
-from rangesfm.workflows import run as pipeline
+from rangesfm.workflows.run import run_survey, scale_model
 
 Array = npt.NDArray[np.float64]
 
@@ -179,24 +180,23 @@ def test_a_run_joins_what_the_mapper_left_in_pieces(
     def reconstruct(*_: Any, **__: Any) -> ReconstructionSummary:
         return ReconstructionSummary(models, len(names), HALF, {}, tmp_path / "mapper.log")
 
-    monkeypatch.setattr(pipeline, "reconstruct", reconstruct)
+    monkeypatch.setattr("rangesfm.workflows.photos.reconstruct", reconstruct)
     survey = replace(exact.write(tmp_path), images_path=tmp_path / "photos")
-    result = pipeline.run_survey(survey, progress=SilentProgress()).result
+    result = run_survey(survey, progress=SilentProgress()).summary
     path = trajectory_from_reconstruction(read_model(tmp_path / "out" / "sparse_scaled" / "0"))
     assert path.image_names == tuple(names)
     assert exact.off_m(path.centers, with_scale=False) < 1e-6
-    assert [(model["name"], model["joined"], model["num_images"]) for model in result["models"]] == [
+    assert [(model.name, model.joined, model.num_images) for model in result.models] == [
         ("sparse/0", True, HALF),
         ("sparse/1", True, HALF),
     ]
-    for part, model, first in zip(exact.parts, result["models"], (0, HALF), strict=True):
-        own, motion = model["scale"], model["metric_from_sfm"]
-        assert own["interval_95"][0] < own["value"] < own["interval_95"][1]
-        assert own["verdict"] in ("good", "doubtful")
-        turned = Rotation.from_quat(motion["rotation_xyzw"]).apply(part.trajectory.centers[0])
-        at = motion["scale"] * turned + motion["translation_m"]
+    for part, model, first in zip(exact.parts, result.models, (0, HALF), strict=True):
+        own, motion = model.scale, model.metric_from_sfm
+        assert own.interval_95[0] < own.value < own.interval_95[1]
+        assert own.verdict in ("good", "doubtful")
+        at = motion.similarity.apply(part.trajectory.centers[0])
         assert at == pytest.approx(path.centers[first], abs=1e-6)
-    assert result["metric_from_sfm"]["scale"] == pytest.approx(result["models"][0]["metric_from_sfm"]["scale"])
+    assert result.metric_from_sfm.scale == pytest.approx(result.models[0].metric_from_sfm.scale)
 
 
 @pytest.fixture(scope="module")
@@ -207,7 +207,7 @@ def finished(exact: Halves, tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / day).mkdir()
         part.sfm.write(folder / day)
         survey = replace(exact.write(folder), model_path=folder / day, output_path=folder / day / "out")
-        pipeline.scale_model(survey, progress=SilentProgress())
+        scale_model(survey, progress=SilentProgress())
     return folder
 
 

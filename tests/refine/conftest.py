@@ -6,12 +6,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.path import lap_path
 
 from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.refine.vision_information import Observations, Poses, model_observations, model_poses
-from rangesfm.simulate.model import SyntheticModel, synthetic_model
-from rangesfm.simulate.path import lap_path
 
 Array = npt.NDArray[np.float64]
 NUM_KEYFRAMES = 60

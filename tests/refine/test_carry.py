@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from tests.refine.conftest import bent, poses_and_rays
+from tests.simulated.model import SyntheticModel
 
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.refine.carry import carry_model
 from rangesfm.refine.vision_information import model_poses, project, ray_residuals
-from rangesfm.simulate.model import SyntheticModel
 
 
 def test_points_follow_a_bend_and_a_growth_of_the_map(chain: SyntheticModel) -> None:

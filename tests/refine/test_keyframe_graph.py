@@ -9,16 +9,16 @@ import numpy.typing as npt
 import pytest
 from scipy.optimize import approx_fprime
 from tests.refine.conftest import bent, poses_and_rays
+from tests.simulated.model import SyntheticModel
 
 from rangesfm.geometry.gravity import UP_IN_SITE, Gravity
 from rangesfm.geometry.similarity import align_points, rmse
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE
-from rangesfm.refine import keyframe_graph
 from rangesfm.refine.antennas import Antennas
 from rangesfm.refine.keyframe_graph import KeyframeGraph, solve_graph
 from rangesfm.refine.vision_information import Poses, vision_information
-from rangesfm.simulate.model import SyntheticModel
+from rangesfm.refine import keyframe_graph
 
 Array = npt.NDArray[np.float64]
 ANCHORS_M = np.array([[-40.0, -28.0, 12.0], [-15.0, -28.0, 0.0], [-28.0, -42.0, 9.0], [-30.0, -20.0, 15.0]])

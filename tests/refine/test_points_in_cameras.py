@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pycolmap
 import pytest
+from tests.simulated.model import SyntheticModel
 
 from rangesfm.colmap.transform import rescale
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.refine.points_in_cameras import points_in_cameras
 from rangesfm.refine.vision_information import model_observations, model_poses
-from rangesfm.simulate.model import SyntheticModel
 
 
 def ids_in_cameras(model: pycolmap.Reconstruction) -> list[int]:

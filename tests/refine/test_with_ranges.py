@@ -13,10 +13,15 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 from tests.few_links import leave_few_links
+from tests.simulated.model import synthetic_model
+from tests.simulated.path import lap_path, loop_path, sequence_path
+from tests.simulated.ranges import simulate_ranges_at
 from tests.studies.scale_breakdown import spoilt
 
-from rangesfm import _ceres
+from rangesfm import ceres
 from rangesfm.colmap.transform import rescale
+from rangesfm.demo.path import CameraPath
+from rangesfm.demo.ranges import Radio, simulate_ranges
 from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.tape import Marker, Tape, TapedDistance
 from rangesfm.errors import InputError, SolverError
@@ -31,9 +36,6 @@ from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
 from rangesfm.refine.with_ranges import RefineSummary, predicted_ranges, refine_with_ranges
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.simulate.model import synthetic_model
-from rangesfm.simulate.path import CameraPath, lap_path, loop_path, sequence_path
-from rangesfm.simulate.ranges import Radio, simulate_ranges, simulate_ranges_at
 
 Array = npt.NDArray[np.float64]
 
@@ -161,7 +163,7 @@ def adjust_by_colmap(sfm: pycolmap.Reconstruction) -> None:
 @pytest.fixture
 def adjusters(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[pycolmap.CeresBundleAdjuster]]:
     """The bundle adjusters that the refinement makes, to look into their problems."""
-    _ceres.check_compatibility()
+    ceres.check_compatibility()
     make, made = pycolmap.create_default_ceres_bundle_adjuster, []
 
     def make_and_keep(*arguments: Any) -> pycolmap.CeresBundleAdjuster:

@@ -14,7 +14,6 @@ and their bindings, and all memory and locks of the process, but no races within
 from __future__ import annotations
 
 import argparse
-import importlib.metadata
 import os
 import shutil
 import subprocess
@@ -38,12 +37,10 @@ _SITE = "import sys\nsys.meta_path = [finder for finder in sys.meta_path if isin
 def build(sanitizer: str, folder: Path) -> None:
     """The extension and its C++ tests."""
     pybind11 = subprocess.check_output([sys.executable, "-m", "pybind11", "--cmakedir"], text=True).strip()
-    version = importlib.metadata.version("rangesfm")
     options = {
         "CMAKE_BUILD_TYPE": "Debug",
         "RANGESFM_BUILD_TESTS": "ON",
         "RANGESFM_SANITIZE": sanitizer,
-        "SKBUILD_PROJECT_VERSION": version,
         "Python_EXECUTABLE": sys.executable,
         "pybind11_DIR": pybind11,
     }

@@ -10,15 +10,15 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.distance import pdist
+from tests.simulated.path import orbit_path
 
+from rangesfm.demo.ranges import Radio
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.options import CheckOptions, RangeModelOptions, ScaleOptions
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeStatus, hold_out
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.simulate.path import orbit_path
-from rangesfm.simulate.ranges import Radio
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey

@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from rangesfm.demo.ranges import Radio
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.ranging.errors.shared_errors import ANTENNA_STDDEV_M
 from rangesfm.scale.estimate import ScaleUncertainty
-from rangesfm.simulate.ranges import Radio
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey

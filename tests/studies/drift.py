@@ -46,7 +46,7 @@ from tests.studies.simulated_survey import (
     unit_pixel_errors,
 )
 
-from rangesfm.compare.with_reference import papers_table
+from rangesfm.comparison.with_reference import papers_table
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.reference import Reference
 from rangesfm.geometry.similarity import align_points, rmse

@@ -1,8 +1,8 @@
 """A survey of yours, with true positions, cut into one that drifts: no photo knows any but its neighbours.
 
-Run: python tests/studies/drift_prone_cut.py SURVEY.toml --base_path DATA --output_path OUT [--first 0]
+Run: python -m tests.studies.drift_prone_cut SURVEY.toml --base_path DATA --output_path OUT [--first 0]
      [--num_photos 120] [--overlap 2] [--max_num_features 1000] [--ranges_in_mapping]
- or: python tests/studies/drift_prone_cut.py SURVEY.toml --base_path DATA --output_path OUT --input_path sparse/0
+ or: python -m tests.studies.drift_prone_cut SURVEY.toml --base_path DATA --output_path OUT --input_path sparse/0
      [--max_track_length 3] [--share_of_points 0.15] [--num_seeds 3]
 
 The first maps a stretch of successive photos (all of them, whatever the survey file thins out, so that neighbours
@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from rangesfm.compare.with_reference import ComparisonRow, compare, format_table
+from rangesfm.comparison.with_reference import compare, format_table
 from rangesfm.errors import InputError
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.progress import SilentProgress
@@ -160,8 +160,8 @@ def print_row(survey: Survey, sfm: pycolmap.Reconstruction) -> None:
         refine=replace(survey.refine, covariance=False),
         report_enabled=False,
     )
-    result = refine_model(cut, progress=SilentProgress()).result
-    print(format_table((*unscaled, *(ComparisonRow(**row) for row in result["comparison"]))))
+    result = refine_model(cut, progress=SilentProgress()).summary
+    print(format_table((*unscaled, *result.comparison)))
     print(f"{result['refine']['iterations']} iterations of the full problem\n", flush=True)
 
 

@@ -1,6 +1,6 @@
 """Are ranges between the photos worth having? Scale and path from all ranges, and from those at photos alone.
 
-    python tests/studies/interpolation.py RESULT_FOLDER REFERENCE ANCHORS [--tag_in_cam=X,Y,Z]
+    python -m tests.studies.interpolation RESULT_FOLDER REFERENCE ANCHORS [--tag_in_cam=X,Y,Z]
 
 Takes the folder that a run left (``sparse/0``, ``images.csv``, ``ranges.csv``, ``result.json``), of a log with times,
 and a reference (``image_name,x_m,y_m,z_m`` or ``timestamp_s,...``). Places the log on the path anew and estimates the

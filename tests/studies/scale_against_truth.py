@@ -1,6 +1,6 @@
 """Error and 95 % interval of the scale on a real log, in every way of knowing its anchors.
 
-Run: python tests/studies/scale_against_truth.py --ranges uwb.csv --anchors surveyed.csv --reference truth.csv
+Run: python -m tests.studies.scale_against_truth --ranges uwb.csv --anchors surveyed.csv --reference truth.csv
      [--model sparse/0 --images images.csv] [--tag_in_cam X,Y,Z] [--time_offset SECONDS] [--error_curve curve.csv]
 
 With a model: its path, and the truth is the scale of its similarity to the reference, which holds camera poses.

@@ -1,6 +1,6 @@
 """Is the refined scale as good as the data allow? Its error over many noisy surveys, against the Cramer-Rao bound.
 
-    python tests/studies/scale_crb.py [--num_seeds 50]
+    python -m tests.studies.scale_crb [--num_seeds 50]
 
 One simulated survey for each case of anchors: a COLMAP model of known truth and ranges taken at its keyframes. Each
 seed draws pixel noise, range noise and range biases anew; COLMAP adjusts the model, as a mapper leaves it, then scale,
@@ -25,8 +25,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import pycolmap
+from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.path import loop_path
+from tests.simulated.ranges import simulate_ranges_at
 
 from rangesfm.colmap.transform import rescale
+from rangesfm.demo.ranges import Radio
 from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.options import CameraOptions, RangeModelOptions
@@ -34,9 +38,6 @@ from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.refine.with_ranges import refine_with_ranges
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.simulate.model import SyntheticModel, synthetic_model
-from rangesfm.simulate.path import loop_path
-from rangesfm.simulate.ranges import Radio, simulate_ranges_at
 
 Array = npt.NDArray[np.float64]
 

@@ -14,11 +14,11 @@ import numpy.typing as npt
 import pycolmap
 import pytest
 from tests.few_links import leave_few_links
+from tests.simulated.model import synthetic_model
+from tests.simulated.path import loop_path
 from tests.studies.simulated_database import write_database
 
 from rangesfm.options import CameraOptions, MapperOptions
-from rangesfm.simulate.model import synthetic_model
-from rangesfm.simulate.path import loop_path
 from rangesfm.vision.mapping import pipeline_options
 from rangesfm.vision.mapping_loop import incremental_mapping
 

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pycolmap
 import pytest
+from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.path import loop_path
 from tests.simulated_database import camera_options, matched_photos, write_database
 
 from rangesfm.errors import InputError, ReconstructionError
@@ -18,8 +20,6 @@ from rangesfm.files.sole_writer import LOCK_NAME
 from rangesfm.geometry.similarity import align_points, rmse
 from rangesfm.options import MapperOptions
 from rangesfm.progress import SilentProgress
-from rangesfm.simulate.model import SyntheticModel, synthetic_model
-from rangesfm.simulate.path import loop_path
 from rangesfm.vision.mapping import pipeline_options
 from rangesfm.vision.matched_photos import MatchedPhotos
 from rangesfm.vision.reconstruct import reconstruct

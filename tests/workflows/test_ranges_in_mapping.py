@@ -13,6 +13,7 @@ import numpy.typing as npt
 import pycolmap
 import pytest
 
+from rangesfm.demo.survey import TIME_OFFSET_S
 from rangesfm.geometry.similarity import align_points, rmse
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.options import CheckOptions, RefineOptions, ScaleOptions
@@ -168,7 +169,7 @@ def test_a_run_maps_with_ranges_where_it_is_asked_to(photo_run: PhotoRun, tmp_pa
     output = shutil.copytree(photo_run.output_path, tmp_path / "out")
     asked = {
         "output.path": str(output),
-        "ranges.time_offset": photo_run.survey.time_offset_s,
+        "ranges.time_offset": TIME_OFFSET_S,
         "mapper.num_threads": 1,
         # Fewer global adjustments than usual, which is quicker.
         "mapper.ba_global_max_refinements": 1,
@@ -179,10 +180,10 @@ def test_a_run_maps_with_ranges_where_it_is_asked_to(photo_run: PhotoRun, tmp_pa
         "refine.covariance": False,
         "scale.num_bootstrap": 20,
     }
-    result = run_survey(read_survey(photo_run.survey.survey_path, asked), progress=SilentProgress()).result
-    assert set(result["seconds"]) >= {"mapping", "scale", "refinement"}
-    assert "matching" not in result["seconds"]
-    (note,) = [warning for warning in result["warnings"] if warning.startswith("ranges took part in")]
+    result = run_survey(read_survey(photo_run.survey.survey_path, asked), progress=SilentProgress()).summary
+    assert set(result.seconds) >= {"mapping", "scale", "refinement"}
+    assert "matching" not in result.seconds
+    (note,) = [warning for warning in result.warnings if warning.startswith("ranges took part in")]
     num_with, num = (int(word) for word in note.split() if word.isdigit())
     assert 0 < num_with < num
-    assert result["comparison"][-1]["rmse_m"] < 1.2 * before["comparison"][-1]["rmse_m"]
+    assert result.comparison[-1].rmse_m < 1.2 * before["comparison"][-1]["rmse_m"]

@@ -4,28 +4,27 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import json
 import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
+from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.path import loop_path
 
 from rangesfm.colmap.model_files import read_model
 from rangesfm.errors import GeometryError, InputError
-from rangesfm.files.tables import read_table
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.options import CheckOptions, ExportOptions, RefineOptions, ScaleOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.readers import read_ranges
-from rangesfm.result.outputs import forget_result, refuse_to_overwrite, replacing_result, write_result
-from rangesfm.simulate.model import SyntheticModel, synthetic_model
-from rangesfm.simulate.path import loop_path
+from rangesfm.result.summary import ResultSummary
+from rangesfm.result.tables import ScaleBootstrap, ScaleCandidates, ScaleConsensus
 from rangesfm.survey.settings import RangesConfig, Survey
 from rangesfm.workflows.export_result import export_result
 from rangesfm.workflows.journal import Journal
@@ -71,11 +70,10 @@ def test_result_and_summary_are_returned_as_written(survey: Survey) -> None:
     done = refine_model(survey, progress=listener)
     assert listener.stages == ["scale", "refinement", "results"]
     assert done.output_path == survey.output_path
-    written = json.loads((survey.output_path / "result.json").read_text())
-    assert written["scale"]["value"] == done.result["scale"]["value"]
-    assert written["settings"] == done.result["settings"]
-    assert done.summary_lines()[0].startswith(f"scale: {done.result['scale']['value']:.6g} m per SfM unit")
-    assert "comparison" not in written
+    written = ResultSummary.read(survey.output_path / "result.json")
+    assert written == done.summary
+    assert done.summary_lines()[0].startswith(f"scale: {done.summary.scale.value:.6g} m per SfM unit")
+    assert "comparison" not in written.to_json()
 
 
 def test_a_run_in_the_same_folder_leaves_nothing_of_the_one_before(survey: Survey, walked_survey: WalkedSurvey) -> None:
@@ -90,31 +88,24 @@ def test_a_run_in_the_same_folder_leaves_nothing_of_the_one_before(survey: Surve
 
 
 def test_tables_beside_the_result_tell_how_the_scale_came_about(survey: Survey) -> None:
-    scale = scale_model(survey, progress=SilentProgress()).result["scale"]
-    tables = {
-        name: read_table(survey.output_path / f"scale_{name}.csv", columns)
-        for name, columns in (
-            ("candidates", ("alpha0", "alpha1")),
-            ("consensus", ("scale", "num_agreeing")),
-            ("bootstrap", ("scale",)),
-        )
-    }
-    for branch in ("alpha0", "alpha1"):
-        paper = scale["two_candidate"][branch]
-        values = tables["candidates"].numbers(branch)
-        assert values.mean() == pytest.approx(paper["mean"], rel=1e-4)
-        assert values.std(ddof=1) == pytest.approx(paper["std"], rel=1e-4)
-    agreeing = tables["consensus"].numbers("num_agreeing")
-    assert tables["consensus"].numbers("scale")[np.argmax(agreeing)] == pytest.approx(scale["value"], rel=0.02)
-    assert agreeing.max() > 0.95 * len(tables["candidates"])
-    resampled = tables["bootstrap"].numbers("scale")
-    spread = np.diff(np.quantile(resampled, [0.16, 0.84]))[0] / 2 / scale["value"]
-    assert spread == pytest.approx(scale["relative_stddev"]["bootstrap"], rel=0.25)
+    scale = scale_model(survey, progress=SilentProgress()).summary.scale
+    candidates, consensus, bootstrap = (
+        kind.read(survey.output_path) for kind in (ScaleCandidates, ScaleConsensus, ScaleBootstrap)
+    )
+    for values, paper in zip(
+        (candidates.alpha0, candidates.alpha1), (scale.two_candidate.alpha0, scale.two_candidate.alpha1)
+    ):
+        assert values.mean() == pytest.approx(paper.mean, rel=1e-4)
+        assert values.std(ddof=1) == pytest.approx(paper.std, rel=1e-4)
+    assert consensus.scale[np.argmax(consensus.num_agreeing)] == pytest.approx(scale.value, rel=0.02)
+    assert consensus.num_agreeing.max() > 0.95 * len(candidates.alpha0)
+    spread = np.diff(np.quantile(bootstrap.scale, [0.16, 0.84]))[0] / 2 / scale.value
+    assert spread == pytest.approx(scale.relative_stddev.bootstrap, rel=0.25)
 
 
 def test_the_result_names_its_inputs_by_their_hashes(survey: Survey) -> None:
-    inputs = scale_model(survey, progress=SilentProgress()).result["inputs"]
-    by_path = {entry["path"]: entry for entry in inputs}
+    inputs = scale_model(survey, progress=SilentProgress()).summary.inputs
+    by_path = {entry.path: entry.to_json() for entry in inputs}
     assert survey.ranges.path is not None
     data = survey.ranges.path.read_bytes()
     expected = {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data), "hashed": "content"}
@@ -133,14 +124,14 @@ def test_refused_run_leaves_the_result_before_it(survey: Survey) -> None:
 
 def test_ranges_held_out_check_the_result(survey: Survey) -> None:
     ranges = replace(survey.ranges, checks=CheckOptions(check_share=0.25))
-    result = refine_model(replace(survey, ranges=ranges), progress=SilentProgress()).result
+    result = refine_model(replace(survey, ranges=ranges), progress=SilentProgress()).summary
     with (survey.output_path / "ranges.csv").open(newline="") as file:
         statuses = Counter(row["status"] for row in csv.DictReader(file))
     num_on_path = sum(statuses[name] for name in ("used", "down-weighted", "outlier", "check"))
-    assert result["check_ranges"]["num"] == statuses["check"]
+    assert result.check_ranges.num == statuses["check"]
     assert statuses["check"] == pytest.approx(0.25 * num_on_path, rel=0.05)
-    assert result["check_ranges"]["rms_m"] == pytest.approx(0.05, rel=0.3)
-    assert result["ranges"]["num_used"] == statuses["used"] + statuses["down-weighted"]
+    assert result.check_ranges.rms_m == pytest.approx(0.05, rel=0.3)
+    assert result.ranges.num_used == statuses["used"] + statuses["down-weighted"]
 
 
 def test_an_anchor_and_a_stretch_of_time_can_be_held_out(survey: Survey) -> None:
@@ -149,17 +140,17 @@ def test_an_anchor_and_a_stretch_of_time_can_be_held_out(survey: Survey) -> None
     anchor_id, times = log.anchor_ids[0], tuple(np.quantile(log.timestamp_s, [0.4, 0.5]).tolist())
     checks = CheckOptions(check_anchors=(anchor_id,), check_times_s=times)
     ranges = replace(survey.ranges, checks=checks)
-    result = refine_model(replace(survey, ranges=ranges), progress=SilentProgress()).result
+    result = refine_model(replace(survey, ranges=ranges), progress=SilentProgress()).summary
     with (survey.output_path / "ranges.csv").open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["predicted_refined_m"]]
     held_out = {True: Counter[bool](), False: Counter[bool]()}
     for row in rows:
         wanted = row["anchor_id"] == anchor_id or times[0] <= float(row["timestamp_s"]) <= times[1]
         held_out[wanted][row["status"] == "check"] += 1
-    assert held_out[True] == {True: result["check_ranges"]["num"]}
+    assert held_out[True] == {True: result.check_ranges.num}
     assert not held_out[False][True]
-    assert result["ranges"]["per_anchor"][anchor_id]["num_used"] == 0
-    assert result["check_ranges"]["per_anchor"][anchor_id]["rms_m"] == pytest.approx(0.05, rel=0.4)
+    assert result.ranges.per_anchor[anchor_id].num_used == 0
+    assert result.check_ranges.per_anchor[anchor_id].rms_m == pytest.approx(0.05, rel=0.4)
 
 
 @pytest.mark.parametrize(
@@ -224,23 +215,23 @@ class TestSeveralTags:
         return trajectory_from_reconstruction(read_model(survey.output_path / model / "0")).centers
 
     def test_map_is_exact_where_each_has_its_lever_arm(self, survey: Survey, made: SyntheticModel) -> None:
-        result = refine_model(survey, progress=SilentProgress()).result
-        assert result["scale"]["value"] == pytest.approx(made.metric_from_sfm.scale, rel=1e-6)
+        result = refine_model(survey, progress=SilentProgress()).summary
+        assert result.scale.value == pytest.approx(made.metric_from_sfm.scale, rel=1e-6)
         np.testing.assert_allclose(self.centers(survey, "sparse_scaled"), made.centers_m, atol=1e-6)
         np.testing.assert_allclose(self.centers(survey, "sparse_metric"), made.centers_m, atol=1e-6)
-        assert result["ranges"]["num_used"] == result["ranges"]["num"] == 8 * len(made.centers_m)
-        assert result["ranges"]["rms_m"] < 1e-6
+        assert result.ranges.num_used == result.ranges.num == 8 * len(made.centers_m)
+        assert result.ranges.rms_m < 1e-6
 
     def test_map_is_wrong_with_the_lever_arms_of_each_other(self, survey: Survey, made: SyntheticModel) -> None:
         left, right = LEVER_ARMS_M.values()
         swapped = replace(survey, lever_arms_m={"left": right, "right": left})
-        result = scale_model(swapped, progress=SilentProgress()).result
+        result = scale_model(swapped, progress=SilentProgress()).summary
         assert np.abs(self.centers(survey, "sparse_scaled") - made.centers_m).max() > 0.01
-        assert result["ranges"]["rms_m"] > 0.05
+        assert result.ranges.rms_m > 0.05
 
     def test_ranges_between_two_of_a_kind_are_in_the_results_with_their_status(self, survey: Survey) -> None:
-        result = scale_model(survey, progress=SilentProgress()).result
-        assert (result["ranges"]["num_anchor_anchor"], result["ranges"]["num_tag_tag"]) == (1, 1)
+        result = scale_model(survey, progress=SilentProgress()).summary
+        assert (result.ranges.num_anchor_anchor, result.ranges.num_tag_tag) == (1, 1)
         with (survey.output_path / "ranges.csv").open(newline="") as file:
             rows = [row for row in csv.DictReader(file) if row["status"] in ("anchor-anchor", "tag-tag")]
         assert [(row["tag_id"], row["anchor_id"], row["range_m"], row["residual_m"]) for row in rows] == [
@@ -251,20 +242,20 @@ class TestSeveralTags:
 
 def test_what_the_refinement_found_beside_the_map_is_in_the_result(survey: Survey) -> None:
     options = RefineOptions(lever_arm_stddev_m=0.05, time_offset_stddev_s=0.05, short_range_stddev_m=0.1)
-    result = refine_model(replace(survey, refine=options), progress=SilentProgress()).result
-    found = result["refine"]
-    (tag_id,) = found["tag_in_cam_m"]
-    assert 0 < np.linalg.norm(np.subtract(found["tag_in_cam_m"][tag_id], survey.tag_in_cam_m)) < 0.15
-    assert 0 < abs(found["time_offset_change_s"]) < 0.15
-    assert 0 < abs(found["short_range_error_m"]) < 0.3
-    held = refine_model(survey, progress=SilentProgress()).result["refine"]
-    assert list(held["tag_in_cam_m"].values()) == [list(survey.tag_in_cam_m)]
-    assert (held["time_offset_change_s"], held["short_range_error_m"]) == (None, None)
+    result = refine_model(replace(survey, refine=options), progress=SilentProgress()).summary
+    found = result.refine
+    (tag_id,) = found.tag_in_cam_m
+    assert 0 < np.linalg.norm(np.subtract(found.tag_in_cam_m[tag_id], survey.tag_in_cam_m)) < 0.15
+    assert 0 < abs(found.time_offset_change_s) < 0.15
+    assert 0 < abs(found.short_range_error_m) < 0.3
+    held = refine_model(survey, progress=SilentProgress()).summary.refine
+    assert list(held.tag_in_cam_m.values()) == [survey.tag_in_cam_m]
+    assert (held.time_offset_change_s, held.short_range_error_m) == (None, None)
 
 
 def test_covariances_of_the_centres_are_in_the_result_unless_unwanted(survey: Survey) -> None:
     export = ExportOptions(formats=("tum_covariance",))
-    result = refine_model(replace(survey, export=export), progress=SilentProgress()).result
+    result = refine_model(replace(survey, export=export), progress=SilentProgress()).summary
     path = survey.output_path / "pose_covariance.csv"
     written = np.loadtxt(survey.output_path / "trajectory_covariance.tum")
     with path.open(newline="") as file:
@@ -278,11 +269,11 @@ def test_covariances_of_the_centres_are_in_the_result_unless_unwanted(survey: Su
         assert np.isclose(written[:, 8:], [xx, xy, xz, yy, yz, zz], rtol=1e-6).all(axis=1).any()
     (exported,) = export_result(survey.output_path, ["tum_covariance"], survey.output_path / "again")
     np.testing.assert_allclose(np.loadtxt(exported), written, rtol=1e-6)
-    assert 0 < result["refine"]["relative_scale_stddev"] < 0.1
+    assert 0 < result.refine.relative_scale_stddev < 0.1
     unwanted = replace(survey, export=export, refine=RefineOptions(covariance=False))
-    without = refine_model(unwanted, progress=SilentProgress()).result
-    assert "without covariances of the poses there is no tum_covariance" in without["warnings"]
-    assert without["refine"]["relative_scale_stddev"] is None
+    without = refine_model(unwanted, progress=SilentProgress()).summary
+    assert "without covariances of the poses there is no tum_covariance" in without.warnings
+    assert without.refine.relative_scale_stddev is None
     assert not path.exists()
 
 
@@ -294,13 +285,13 @@ def test_a_site_in_national_coordinates_loses_nothing(survey: Survey, tmp_path: 
         name, *numbers = row.split(",")
         lines.append(",".join([name, *(repr(float(n) + float(o)) for n, o in zip(numbers, far, strict=True))]))
     (tmp_path / "far.csv").write_text("\n".join([header, *lines]) + "\n")
-    near = refine_model(survey, progress=SilentProgress()).result
+    near = refine_model(survey, progress=SilentProgress()).summary
     moved = replace(survey, anchors_path=tmp_path / "far.csv", output_path=tmp_path / "far")
-    away = refine_model(moved, progress=SilentProgress()).result
-    assert away["scale"]["value"] == pytest.approx(near["scale"]["value"], rel=1e-9)
-    assert away["refine"]["scale_value"] == pytest.approx(near["refine"]["scale_value"], rel=1e-7)
-    for anchor_id, anchor in near["anchors"].items():
-        np.testing.assert_allclose(away["anchors"][anchor_id]["position_m"] - far, anchor["position_m"], atol=1e-6)
+    away = refine_model(moved, progress=SilentProgress()).summary
+    assert away.scale.value == pytest.approx(near.scale.value, rel=1e-9)
+    assert away.refine.scale_value == pytest.approx(near.refine.scale_value, rel=1e-7)
+    for anchor_id, anchor in near.anchors.items():
+        np.testing.assert_allclose(np.subtract(away.anchors[anchor_id].position_m, far), anchor.position_m, atol=1e-6)
     paths = (survey.output_path, tmp_path / "far")
     models = [pycolmap.Reconstruction(path / "sparse_metric" / "0") for path in paths]
     for image_id, image in models[0].images.items():
@@ -316,98 +307,19 @@ def test_two_surveyed_anchors_stay_as_far_apart_as_they_were_surveyed(survey: Su
     known = [",".join([name, *map(repr, place.tolist())]) for name, place in zip(names[:2], places, strict=True)]
     (tmp_path / "two.csv").write_text("\n".join([header, *known, *(f"{name},,," for name in names[2:])]) + "\n")
     two = replace(survey, anchors_path=tmp_path / "two.csv", anchor_frame="site")
-    result = refine_model(two, progress=SilentProgress()).result
-    assert result["frame"] == "first_camera"
-    first, second = (np.array(result["anchors"][name]["position_m"]) for name in names[:2])
+    result = refine_model(two, progress=SilentProgress()).summary
+    assert result.frame == "first_camera"
+    first, second = (np.array(result.anchors[name].position_m) for name in names[:2])
     assert np.linalg.norm(first - second) == pytest.approx(np.linalg.norm(places[0] - places[1]), abs=0.01)
 
 
 def test_doubts_are_warnings_in_the_result_and_for_the_user(survey: Survey) -> None:
     listener = Listener()
     method = ScaleOptions(method="two-candidate", num_bootstrap=20)
-    result = scale_model(replace(survey, scale=method), progress=listener).result
-    assert result["scale"]["method"] == "two-candidate"
-    assert result["scale"]["verdict"] == "doubtful"
-    assert result["warnings"] == listener.messages != []
-
-
-@pytest.mark.parametrize(
-    "name", ["ranges.csv", "images.csv", "reference.csv", "trajectory.tum", "sparse_scaled/0", "sparse_metric/0"]
-)
-def test_input_is_never_overwritten(name: str, tmp_path: Path) -> None:
-    (tmp_path / "link").symlink_to(tmp_path / "out", target_is_directory=True)
-    for path in (tmp_path / "out" / name, tmp_path / "out" / "." / name, tmp_path / "link" / name):
-        with pytest.raises(InputError, match="the results would overwrite this input") as caught:
-            refuse_to_overwrite([None, path], tmp_path / "out")
-        assert caught.value.path == path
-    refuse_to_overwrite([None, tmp_path / name, tmp_path / "out" / "sparse" / "0"], tmp_path / "out")
-
-
-class TestForgetting:
-    @pytest.fixture
-    def folder(self, tmp_path: Path) -> Path:
-        (tmp_path / "sparse" / "0").mkdir(parents=True)
-        for name in ("result.json", "report.html", "ranges.csv", "mine.txt"):
-            (tmp_path / name).touch()
-        return tmp_path
-
-    def test_takes_away_what_was_said_of_the_model_and_nothing_else(self, folder: Path) -> None:
-        forget_result(folder)
-        assert files_of(folder) == {"sparse", "mine.txt"}
-
-    def test_leaves_files_alone_that_belong_to_no_result(self, folder: Path) -> None:
-        (folder / "result.json").unlink()
-        forget_result(folder)
-        assert files_of(folder) == {"sparse", "report.html", "ranges.csv", "mine.txt"}
-
-    def test_goes_on_where_it_was_killed(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        def die(path: Path, **_: Any) -> None:
-            raise KeyboardInterrupt
-
-        with monkeypatch.context() as patched:
-            patched.setattr(Path, "unlink", die)
-            with pytest.raises(KeyboardInterrupt):
-                forget_result(folder)
-        assert {"report.html", "ranges.csv"} < files_of(folder)
-        assert "result.json" not in files_of(folder)
-        forget_result(folder)
-        assert files_of(folder) == {"sparse", "mine.txt"}
-
-    def test_comes_before_a_new_result_of_which_nothing_stays_if_it_fails(self, folder: Path) -> None:
-        def write_and_fail() -> None:
-            with replacing_result(folder):
-                assert {path.name for path in folder.glob("[!.]*")} == {"sparse", "mine.txt"}
-                (folder / "ranges.csv").touch()
-                raise KeyboardInterrupt
-
-        with pytest.raises(KeyboardInterrupt):
-            write_and_fail()
-        assert files_of(folder) == {"sparse", "mine.txt"}
-
-    def test_leaves_nothing_beside_a_new_result(self, folder: Path) -> None:
-        with replacing_result(folder):
-            (folder / "result.json").touch()
-        assert files_of(folder) == {"sparse", "mine.txt", "result.json"}
-
-
-def test_result_file_is_plain_json_whatever_the_numbers(tmp_path: Path) -> None:
-    result: dict[Any, Any] = {
-        "array": np.array([1.0, np.nan]),
-        "number": np.float64(np.inf),
-        "count": np.int64(3),
-        "reasons": ("über", True, None),
-        1: {"inner": -np.inf},
-    }
-    write_result(result, tmp_path / "result.json")
-    text = (tmp_path / "result.json").read_text(encoding="utf-8")
-    assert json.loads(text, parse_constant=pytest.fail) == {
-        "array": [1.0, None],
-        "number": None,
-        "count": 3,
-        "reasons": ["über", True, None],
-        "1": {"inner": None},
-    }
-    assert files_of(tmp_path) == {"result.json"}
+    result = scale_model(replace(survey, scale=method), progress=listener).summary
+    assert result.scale.method == "two-candidate"
+    assert result.scale.verdict == "doubtful"
+    assert list(result.warnings) == listener.messages != []
 
 
 def test_journal_times_stages_and_all_of_it() -> None:

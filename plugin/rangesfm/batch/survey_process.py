@@ -26,9 +26,9 @@ def _run(given: tuple[Survey, bool, bool], worker: MessagesToParent) -> dict[str
     if only_prepare:
         submaps = prepare_survey(survey, progress=worker, restart=restart)
         return {"submaps": base64.b64encode(pickle.dumps(submaps)).decode()}
-    result = run_survey(survey, progress=worker, restart=restart).result
-    reasons = result["scale"]["reasons"] if result["scale"]["verdict"] != "good" else ()
-    return {"figures": asdict(figures_of(result)), "reason": "; ".join(reasons)}
+    summary = run_survey(survey, progress=worker, restart=restart).summary
+    reasons = summary.scale.reasons if summary.scale.verdict != "good" else ()
+    return {"figures": asdict(figures_of(summary)), "reason": "; ".join(reasons)}
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix, diags
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
-from rangesfm._ceres import num_columns, tangent_jacobian
+from rangesfm.ceres import num_columns, tangent_jacobian
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.trajectory import pose_of
 

@@ -7,7 +7,7 @@ import platform
 import sys
 from dataclasses import dataclass
 
-from rangesfm._ceres import check_compatibility, compiled_part_version, pyceres_ceres_version
+from rangesfm.ceres import check_compatibility, compiled_part_version, pyceres_ceres_version
 from rangesfm.errors import SolverError
 from rangesfm.installed_versions import INSTALL_COMMAND, NEEDED_VERSIONS, installed_version
 

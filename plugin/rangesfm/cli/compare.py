@@ -12,8 +12,8 @@ from rangesfm.errors import InputError
 from rangesfm.progress import Progress
 
 if TYPE_CHECKING:
-    from rangesfm.compare.models import NamedModel
-    from rangesfm.compare.ranges import ModelRanges
+    from rangesfm.comparison.models import NamedModel
+    from rangesfm.comparison.ranges import ModelRanges
     from rangesfm.distances.tape import Tape
     from rangesfm.survey.settings import Survey
 
@@ -53,7 +53,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     reference = None if args.reference is None else Path(args.reference)
     if len(paths) == 1:
         _check_more_than_one_is_not_asked_for(args, paths[0])
-        from rangesfm.compare.with_reference import compare_folder
+        from rangesfm.comparison.with_reference import compare_folder
 
         return Outcome([str(compare_folder(paths[0], reference))])
     return _compare_many(args, paths, reference)
@@ -67,8 +67,8 @@ def _check_more_than_one_is_not_asked_for(args: argparse.Namespace, path: Path) 
 
 
 def _compare_many(args: argparse.Namespace, paths: list[Path], reference_path: Path | None) -> Outcome:
-    from rangesfm.compare.models import compare_many, read_models
-    from rangesfm.compare.with_reference import compare, format_table
+    from rangesfm.comparison.models import compare_many, read_models
+    from rangesfm.comparison.with_reference import compare, format_table
     from rangesfm.geometry.reference import read_reference
 
     survey = _survey(args)
@@ -79,7 +79,7 @@ def _compare_many(args: argparse.Namespace, paths: list[Path], reference_path: P
         trajectories = {model.name: model.path for model in comparison.models}
         lines += ["", format_table(compare(trajectories, read_reference(reference_path), frame=None))]
     if args.output_path is not None:
-        from rangesfm.compare.page import write_comparison
+        from rangesfm.comparison.page import write_comparison
 
         lines += ["", f"page: {write_comparison(comparison, Path(args.output_path))}"]
     return Outcome(lines)
@@ -95,7 +95,7 @@ def _survey(args: argparse.Namespace) -> Survey:
 
 
 def _ranges(survey: Survey, first: NamedModel, path: Path) -> ModelRanges | None:
-    from rangesfm.compare.ranges import ranges_of_survey
+    from rangesfm.comparison.ranges import ranges_of_survey
     from rangesfm.survey.inputs import read_ranging_inputs
 
     if survey.ranges.path is None or first.model is None:

@@ -86,7 +86,7 @@ def _apply(source: Path, args: argparse.Namespace, options: ExportOptions) -> Ou
 def _is_site(source: Path) -> bool:
     from rangesfm.result.folder import read_result_folder
 
-    return read_result_folder(source).frame == "site"
+    return read_result_folder(source).summary.frame == "site"
 
 
 def _frame_note(options: ExportOptions, result_folder: Path) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rangesfm.cli.arguments import Commands, Outcome
@@ -36,7 +37,7 @@ def add_command(commands: Commands) -> None:
     add_log_arguments(parser)
     parser.add_argument("--anchors", metavar="CSV", help="who is an anchor, to tell ranges between two of them")
     parser.add_argument("--output_path", metavar="CSV", help="write the ranges there")
-    parser.add_argument("--plot", metavar="PNG", help="draw the ranges over time there")
+    parser.add_argument("--plot", metavar="FILE", help="draw the ranges over time there (PNG or SVG)")
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
@@ -51,9 +52,10 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
         write_ranges_csv(log, args.output_path)
         lines += ["", f"written to {args.output_path}"]
     if args.plot is not None:
-        from rangesfm.ranging.plot import plot_ranges, write_figure
+        from rangesfm.report.pictures import write_picture
+        from rangesfm.report.range_plots import plot_ranges
 
-        write_figure(plot_ranges(log), args.plot)
+        write_picture(plot_ranges(log), Path(args.plot))
         lines += ["", f"drawn in {args.plot}"]
     return Outcome(lines)
 

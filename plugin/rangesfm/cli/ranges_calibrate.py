@@ -37,7 +37,7 @@ def add_command(commands: Commands) -> None:
     parser.add_argument("--anchors", required=True, metavar="CSV", help="anchor_id,x_m,y_m,z_m: surveyed")
     add_position_arguments(parser, max_interpolation_gap_s=0.2)
     parser.add_argument("--output_path", required=True, metavar="CSV", help="write the curve there")
-    parser.add_argument("--plot", metavar="PNG", help="draw the curve and the ranges' errors there")
+    parser.add_argument("--plot", metavar="FILE", help="draw the curve and the ranges' errors there (PNG or SVG)")
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
@@ -52,9 +52,10 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     calibration = calibrate_ranges(log, tags, anchors)
     lines = [*_lines(calibration, len(log)), "", f"written to {args.output_path}"]
     if args.plot is not None:
-        from rangesfm.ranging.plot import plot_error_curve, write_figure
+        from rangesfm.report.pictures import write_picture
+        from rangesfm.report.range_plots import plot_error_curve
 
-        write_figure(plot_error_curve(calibration), args.plot)
+        write_picture(plot_error_curve(calibration), Path(args.plot))
         lines.append(f"drawn in {args.plot}")
     write_error_curve(calibration.curve, Path(args.output_path))
     return Outcome(lines)

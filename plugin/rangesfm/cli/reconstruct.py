@@ -32,5 +32,4 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     require_images(survey)
     from rangesfm.workflows.run import reconstruct_survey
 
-    result = reconstruct_survey(survey, progress=progress, restart=args.restart)
-    return Outcome(result.summary_lines())
+    return Outcome(reconstruct_survey(survey, progress=progress, restart=args.restart))

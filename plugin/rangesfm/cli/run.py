@@ -23,7 +23,7 @@ from rangesfm.progress import Progress
 
 if TYPE_CHECKING:
     from rangesfm.survey.settings import Survey
-    from rangesfm.workflows.run import RunResult
+    from rangesfm.workflows.results import RunResult
 
 
 def add_command(commands: Commands) -> None:

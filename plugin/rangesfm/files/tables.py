@@ -1,4 +1,4 @@
-"""Tables in text files: the one place that reads CSV and its relatives.
+"""Tables in text files: the one place that reads CSV and its relatives, and writes it.
 
 A table has a header row; ``#`` comments and blank lines may stand anywhere; a byte order mark, any
 line ending and quoted cells are understood. Whatever is wrong is an InputError with its line.
@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import InputError, one_line
+from rangesfm.files.atomic import new_file
 
 _HEAD_BYTES = 1 << 16
 _CHUNK_ROWS = 20_000  # split at once: wide tables would otherwise hold every cell in memory
@@ -204,6 +205,14 @@ def _table_of_texts(
         for name, index in wanted.items():
             cells[name] += chunk[index :: len(names)]
     return Table(path, tuple(names), line, cells)
+
+
+def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Write a CSV file, whole or not at all."""
+    with new_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows(rows)
 
 
 def read_text(path: str | Path, *, errors: str = "strict") -> str:

@@ -50,10 +50,6 @@ class Georeference:
     crs: str = GEOGRAPHIC
     enu_from_world: Similarity = IDENTITY
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, without the world."""
-        return {"lat_deg": self.lat_deg, "lon_deg": self.lon_deg, "height_m": self.height_m, "crs": self.crs}
-
     def geographic(self, points: Array) -> Array:
         """(n, 3) longitude, latitude (degrees) and height of points in the map's world."""
         return _apply(self._enu_from_geographic, self.enu_from_world.apply(points), inverse=True)

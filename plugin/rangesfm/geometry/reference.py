@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +11,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation, Slerp
 
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import new_file
-from rangesfm.files.tables import Table, header_names, printable, read_head, read_table, read_text
+from rangesfm.files.tables import Table, header_names, printable, read_head, read_table, read_text, write_table
 from rangesfm.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
@@ -151,11 +149,8 @@ def write_reference(reference: Reference, path: Path) -> Path:
         names += QUATERNION_COLUMNS
     is_by_image = reference.image_names is not None
     keys = reference.image_names or [f"{time:.9f}" for time in np.asarray(reference.timestamps_s)]
-    with new_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["image_name" if is_by_image else "timestamp_s", *names])
-        for key, row in zip(keys, np.hstack(columns)):
-            writer.writerow([key, *(f"{value:.9f}" for value in row)])
+    rows = ([key, *(f"{value:.9f}" for value in row)] for key, row in zip(keys, np.hstack(columns)))
+    write_table(path, ["image_name" if is_by_image else "timestamp_s", *names], rows)
     return path
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from rangesfm import _ceres
+from rangesfm import ceres
 from rangesfm.ceres.linear_solver import max_num_images_direct, overlaps_in
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import SolverError
@@ -80,7 +80,7 @@ class BundleAdjustment:
         """Have Ceres eliminate the map's points only; see ``keep_from_elimination`` of the costs."""
         tie_point = next(self.tie_points, None)
         if tie_point is not None:
-            _ceres.keep_from_elimination(self.adjuster, block, tie_point)
+            ceres.keep_from_elimination(self.adjuster, block, tie_point)
 
 
 def bundle_adjustment(
@@ -139,7 +139,7 @@ def solve(problem: BundleAdjustment, tolerance_m: float) -> Solution:
     """
     start = time.monotonic()
     progress = Progress(problem.metric, problem.pixel_stddev, tolerance_m)
-    summary = _ceres.solve(problem.adjuster, progress.is_over)
+    summary = ceres.solve(problem.adjuster, progress.is_over)
     if not summary.IsSolutionUsable():
         raise SolverError(f"the bundle adjustment with ranges failed: {summary.message}")
     return Solution(
@@ -192,7 +192,7 @@ def _settle_radio(problem: BundleAdjustment) -> None:
     ]
     for block in held:
         ceres_problem.set_parameter_block_constant(block)
-    _ceres.solve(problem.adjuster, lambda _: False)
+    ceres.solve(problem.adjuster, lambda _: False)
     for block in held:
         ceres_problem.set_parameter_block_variable(block)
 

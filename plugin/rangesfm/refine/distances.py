@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from rangesfm import _ceres
+from rangesfm import ceres
 from rangesfm.distances.ends import LocatedDistances, images_by_name, triangulate_markers
 from rangesfm.distances.tape import Tape
 from rangesfm.geometry.trajectory import pose_of
@@ -114,13 +114,13 @@ def _add_taped(bundle: BundleAdjustment, distances: MeasuredDistances, anchors: 
         a, b = (ends[name] for name in taped.ends)
         if a.block is b.block or np.shares_memory(a.block, b.block):
             continue  # two cameras of one rig, which is as it is
-        cost = _ceres.distance_cost(
+        cost = ceres.distance_cost(
             distance_m=taped.distance_m,
             stddev_m=taped.stddev_m / bundle.pixel_stddev,
             a_in_cam_m=a.in_rig_m,
             b_in_cam_m=b.in_rig_m,
         )
-        _ceres.add_residual_block(bundle.adjuster, cost, None, [a.block, b.block])
+        ceres.add_residual_block(bundle.adjuster, cost, None, [a.block, b.block])
 
 
 def _camera(metric: pycolmap.Reconstruction, image: pycolmap.Image) -> _End:
@@ -139,18 +139,17 @@ def _add_by_radio(
     if not rows:
         return []
     for row in rows:
-        cost = _ceres.distance_cost(
+        cost = ceres.distance_cost(
             distance_m=by_radio.distance_m[row],
             stddev_m=by_radio.stddev_m[row] / bundle.pixel_stddev,
             has_bias=True,
             loss_scale=loss_scale * bundle.pixel_stddev,
         )
         pair = [anchor_blocks[k] for k in by_radio.anchor_pair[row]]
-        _ceres.add_residual_block(bundle.adjuster, cost, None, [*pair, bias])
+        ceres.add_residual_block(bundle.adjuster, cost, None, [*pair, bias])
     if distances.bias_stddev_m == 0:
         bundle.adjuster.problem.set_parameter_block_constant(bias)
     else:
-        stddev = [distances.bias_stddev_m / bundle.pixel_stddev]
-        _ceres.add_residual_block(bundle.adjuster, _ceres.normal_prior_cost(mean=[0.0], stddev=stddev), None, [bias])
+        ceres.add_normal_prior(bundle.adjuster, bias, mean=[0.0], stddev=distances.bias_stddev_m / bundle.pixel_stddev)
         bundle.keep_from_elimination(bias)
     return [bias]

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from rangesfm import _ceres
+from rangesfm import ceres
 from rangesfm.geometry.trajectory import pose_of
 
 Array = npt.NDArray[np.float64]
@@ -36,7 +36,7 @@ class Progress:
         self._centers = keyframe_centers(metric)
         self._last_m = self._last_gain = 0.0
 
-    def is_over(self, step: _ceres.Step) -> bool:
+    def is_over(self, step: ceres.Step) -> bool:
         """Whether to stop: nothing is left to gain, or nothing in steps that the solver dares not make larger.
 
         Steps to come are taken to be each smaller than its last by as much as this one: Gauss-Newton's are so in the

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from rangesfm import _ceres
+from rangesfm import ceres
 from rangesfm.geometry.trajectory import Trajectory, pose_of
 from rangesfm.options import RefineOptions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
@@ -133,7 +133,7 @@ def add_ranges(
         (k,) where the residual of each range that takes part is among the problem's.
     """
     log, rows, antennas = ranges.observations.log, ranges.rows, ranges.antennas
-    placed = _ceres.PlacedRanges(
+    placed = ceres.PlacedRanges(
         range_m=log.range_m[rows],
         stddev_m=weights.stddev_m[rows],
         before=antennas.before[rows],
@@ -145,7 +145,7 @@ def add_ranges(
         interval_s=ranges.interval_s[rows],
         share=bundle.pixel_stddev**2 * weights.share[rows],
     )
-    range_blocks = _ceres.RangeBlocks(
+    range_blocks = ceres.RangeBlocks(
         poses=[pose_of(bundle.metric.frame(int(frame_id))).params for frame_id in ranges.trajectory.frame_ids],
         anchors=blocks.positions,
         biases=blocks.biases,
@@ -154,13 +154,14 @@ def add_ranges(
         time_shift=blocks.time_shift,
         amplitude=blocks.short_range_error,
     )
-    length = None if blocks.short_range_error is None else SHORT_RANGE_LENGTH_M
-    loss = weights.loss
-    model = _ceres.RangeErrorModel(length, None, loss.width, loss.width, loss.is_bounded)
-    first = bundle.adjuster.problem.num_residuals()
-    added = _ceres.add_ranges(bundle.adjuster, placed, range_blocks, model)
-    rows_of_ranges: Indices = first + np.argsort(added.rows)
-    return rows_of_ranges
+    return ceres.add_ranges(
+        bundle.adjuster,
+        placed,
+        range_blocks,
+        short_range_length_m=None if blocks.short_range_error is None else SHORT_RANGE_LENGTH_M,
+        loss_scale=weights.loss.width,
+        loss_is_bounded=weights.loss.is_bounded,
+    )
 
 
 def add_radio_priors(
@@ -197,11 +198,11 @@ def _add_bias_priors(
             drawn.append((anchor, bias))
     if drawn:
         own_stddev_m = np.array([anchor.prior_bias_stddev_m for anchor, _ in drawn])
-        cost = _ceres.joint_prior_cost(
+        cost = ceres.joint_prior_cost(
             mean=np.array([anchor.prior_bias_m for anchor, _ in drawn]),
             whitening=bundle.pixel_stddev * bias_whitening(own_stddev_m, common_stddev_m),
         )
-        _ceres.add_residual_block(bundle.adjuster, cost, None, [bias for _, bias in drawn])
+        ceres.add_residual_block(bundle.adjuster, cost, None, [bias for _, bias in drawn])
 
 
 def _add_prior(bundle: BundleAdjustment, block: Array | None, mean: Array | None, stddev: float) -> None:
@@ -213,6 +214,5 @@ def _add_prior(bundle: BundleAdjustment, block: Array | None, mean: Array | None
         problem.set_parameter_block_constant(block)
         return
     if mean is not None:
-        cost = _ceres.normal_prior_cost(mean=mean, stddev=np.full(len(block), stddev / bundle.pixel_stddev))
-        _ceres.add_residual_block(bundle.adjuster, cost, None, [block])
+        ceres.add_normal_prior(bundle.adjuster, block, mean, stddev / bundle.pixel_stddev)
     bundle.keep_from_elimination(block)

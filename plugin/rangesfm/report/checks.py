@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rangesfm.report.content import Summary, as_number
-from rangesfm.report.text import sentence
+from rangesfm.report.text import fixed, sentence
+
+NORMAL_QUANTILE_95 = 1.96
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,33 @@ class Check:
         if sign * self.value <= sign * self.green_limit:
             return "green"
         return "amber" if sign * self.value <= sign * self.amber_limit else "red"
+
+    @property
+    def text(self) -> str:
+        return fixed(self.value, self.decimals, self.unit, nothing="not measured")
+
+    @property
+    def limits(self) -> str:
+        """What the value is measured against."""
+        relation = "≥" if self.larger_is_better else "≤"
+        green, amber = (fixed(x, 0 if x >= 1 else 2, self.unit) for x in (self.green_limit, self.amber_limit))
+        return f"green {relation} {green} · amber {relation} {amber}"
+
+    @property
+    def zones(self) -> list[tuple[str, float]]:
+        """Colour and width, in percent of the gauge, of each stretch from zero to its end."""
+        low, high = sorted(100.0 * limit / self._gauge_end for limit in (self.green_limit, self.amber_limit))
+        colors = ("red", "amber", "green") if self.larger_is_better else ("green", "amber", "red")
+        return list(zip(colors, (low, high - low, 100.0 - high)))
+
+    @property
+    def needle_percent(self) -> float | None:
+        """Where on the gauge the value is."""
+        return None if self.value is None else min(max(100.0 * self.value / self._gauge_end, 0.0), 100.0)
+
+    @property
+    def _gauge_end(self) -> float:
+        return 100.0 if self.larger_is_better else 1.5 * self.amber_limit
 
 
 def quality_checks(summary: Summary) -> tuple[Check, ...]:
@@ -114,6 +143,18 @@ def larger_stddev(summary: Summary) -> float | None:
     """The larger of the scale's formal and empirical stddev: formal ones are far too small on real logs."""
     both = (summary.number("scale", "stddev_formal"), summary.number("scale", "stddev_empirical"))
     return max((stddev for stddev in both if stddev is not None), default=None)
+
+
+def scale_interval(summary: Summary) -> tuple[float, float] | None:
+    """The scale's 95 % interval: the result's own, else that of a normal distribution of the larger stddev."""
+    given = summary.get("scale", "interval_95")
+    ends = [as_number(end) for end in given] if isinstance(given, list) else []
+    if len(ends) == 2 and ends[0] is not None and ends[1] is not None:
+        return ends[0], ends[1]
+    value, stddev = summary.number("scale", "value"), larger_stddev(summary)
+    if value is None or stddev is None:
+        return None
+    return value - NORMAL_QUANTILE_95 * stddev, value + NORMAL_QUANTILE_95 * stddev
 
 
 def _why_no_offset_matters(summary: Summary) -> str | None:

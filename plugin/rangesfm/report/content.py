@@ -17,7 +17,9 @@ from rangesfm.errors import InputError
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.report.true_ranges import true_ranges_m
-from rangesfm.result.folder import RangesAsUsed, ResultFolder
+from rangesfm.result.folder import ResultFolder
+from rangesfm.result.ranges_as_used import RangesAsUsed
+from rangesfm.result.tables import ScaleBootstrap, ScaleCandidates, ScaleConsensus, TimeOffsetCurve
 
 if TYPE_CHECKING:
     import pycolmap
@@ -25,13 +27,8 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 DEFAULT_FOLDER = "out"
-TABLES = {
-    "scale_candidates": ("timestamp_s", "alpha0", "alpha1"),
-    "scale_consensus": ("scale", "num_agreeing"),
-    "scale_bootstrap": ("scale",),
-    "time_offset_curve": ("time_offset_s", "cost"),
-}
-"""Columns of numbers of the files of these names, which a run leaves for the figures."""
+TABLES = (ScaleCandidates, ScaleConsensus, ScaleBootstrap, TimeOffsetCurve)
+"""What a run leaves for the figures."""
 
 
 class Summary:
@@ -146,14 +143,14 @@ def gather(result: ResultFolder, *, images_path: Path | None = None) -> Content:
     Raises:
         InputError: a file of the result is there but cannot be read.
     """
-    ranges = result.read_ranges()
+    ranges = result.read(RangesAsUsed)
     scaled, refined = result.read_model("sparse_scaled"), result.read_model("sparse_metric")
     final = refined or scaled
     path_scaled = None if scaled is None else trajectory_from_reconstruction(scaled, result.timestamps_s)
     points_m, points_rgb = (None, None) if final is None else points_of(final)
     reference_path = result.path / "reference.csv"
     reference = read_reference(reference_path) if reference_path.is_file() else None
-    summary = Summary(result.summary)
+    summary = Summary(result.summary.to_json())
     known = summary.get("settings", "images_path")
     return Content(
         title=_title(result.path.resolve()),
@@ -171,7 +168,7 @@ def gather(result: ResultFolder, *, images_path: Path | None = None) -> Content:
         true_scale=None if path_scaled is None else _with_true_scale(path_scaled, summary),
         reference_by_photo={} if reference is None else dict(zip(reference.image_names or (), reference.positions_m)),
         images_path=images_path or (Path(known) if isinstance(known, str) else None),
-        tables={name: table for name, columns in TABLES.items() if (table := result.read_numbers(name, columns))},
+        tables={kind.NAME.removesuffix(".csv"): vars(table) for kind in TABLES if (table := result.read(kind))},
     )
 
 

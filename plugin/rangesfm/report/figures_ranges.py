@@ -7,15 +7,14 @@ import numpy.typing as npt
 
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.report.content import Content, in_natural_order
-from rangesfm.report.plot import WIDE_SIZE, Figure, Panel, Series
-from rangesfm.report.svg import running_median
-from rangesfm.result.folder import RangesAsUsed
+from rangesfm.report.plot import WIDE_SIZE, Figure, Panel, Series, running_median
+from rangesfm.result.ranges_as_used import RangesAsUsed
 
 Array = npt.NDArray[np.float64]
 
 NUM_HISTOGRAM_BINS = 60
 NUM_MEDIAN_BINS = 48
-PANEL_SIZE = (360, 172)
+PANEL_SIZE = (270.0, 125.0)
 
 
 def residuals_over_time(content: Content) -> Figure | None:
@@ -39,11 +38,11 @@ def residual_histogram(content: Content) -> Figure | None:
     limit = _residual_limit(ranges)
     edges = np.linspace(-limit, limit, NUM_HISTOGRAM_BINS + 1)
     outlines = []
-    for name, style, residuals in _both(ranges):
+    for name, color, residuals in _both(ranges):
         known = residuals[ranges.is_used & np.isfinite(residuals)]
         heights = np.histogram(np.clip(known, -limit, limit), edges)[0].astype(float)
         if heights.any():
-            outlines.append(Series(name, style, outline(edges, heights), "filled"))
+            outlines.append(Series(name, color, outline(edges, heights), "filled"))
     highest = max(float(series.points[:, 1].max()) for series in outlines)
     panel = Panel(
         "",
@@ -53,7 +52,7 @@ def residual_histogram(content: Content) -> Figure | None:
         tuple(outlines),
         x_range=(-limit, limit),
         y_range=(0.0, 1.08 * highest),
-        verticals=((0.0, "zero"),),
+        verticals=((0.0, "ink"),),
     )
     caption = "Residuals of the ranges used. Real radios lean to long measurements, which here are negative."
     return Figure("range_residual_histogram", caption, (panel,))
@@ -73,15 +72,15 @@ def absolute_errors(content: Content) -> Figure | None:
     if len(rows) == 0:
         return None
     times, time_label = _times(content, ranges)
-    errors = [("measured", "measured", ranges.range_m)]
-    errors += [(name, style, residuals + ranges.range_m) for name, style, residuals in _both(ranges)]
+    errors = [("measured", "rejected", ranges.range_m)]
+    errors += [(name, color, residuals + ranges.range_m) for name, color, residuals in _both(ranges)]
     x_range = (float(times[rows].min()), float(times[rows].max()))
     dots, lines = [], []
-    for name, style, values in errors:
+    for name, color, values in errors:
         points = np.column_stack([times[rows], np.abs(values - true_m)[rows]])
         if np.isfinite(points[:, 1]).any():
-            dots.append(Series(name, style, points))
-            lines.append(Series(name, style, running_median(points, x_range, NUM_MEDIAN_BINS), "line", is_data=False))
+            dots.append(Series(name, color, points))
+            lines.append(Series(name, color, running_median(points, x_range, NUM_MEDIAN_BINS), "line", is_data=False))
     sizes = np.concatenate([series.points[:, 1] for series in dots])
     panel = Panel(
         "",
@@ -109,10 +108,10 @@ def _residual_panel(content: Content, ranges: RangesAsUsed, anchor_id: str) -> P
     final = _both(ranges)[-1][2]
     series = [Series("rejected", "rejected", np.column_stack([times, final])[is_rejected])]
     medians = []
-    for name, style, residuals in _both(ranges):
+    for name, color, residuals in _both(ranges):
         points = np.column_stack([times, residuals])[is_mine & ranges.is_used]
-        series.append(Series(name, style, points))
-        medians.append(Series(name, style, running_median(points, time_range, NUM_MEDIAN_BINS), "line", is_data=False))
+        series.append(Series(name, color, points))
+        medians.append(Series(name, color, running_median(points, time_range, NUM_MEDIAN_BINS), "line", is_data=False))
     return Panel(
         f"Anchor {anchor_id}",
         f"Range residuals of anchor {anchor_id} over time",
@@ -127,7 +126,7 @@ def _residual_panel(content: Content, ranges: RangesAsUsed, anchor_id: str) -> P
 
 
 def _both(ranges: RangesAsUsed) -> list[tuple[str, str, Array]]:
-    """Name, style and residuals before and, where there are any, after the refinement."""
+    """Name, color and residuals before and, where there are any, after the refinement."""
     both = [("scaled", "before", ranges.residual_scaled_m), ("refined", "after", ranges.residual_refined_m)]
     return both if np.isfinite(ranges.residual_refined_m).any() else both[:1]
 

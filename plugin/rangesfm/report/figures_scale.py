@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.report.checks import larger_stddev
+from rangesfm.report.checks import larger_stddev, scale_interval
 from rangesfm.report.content import Content, as_number, in_natural_order
 from rangesfm.report.figures_ranges import outline
-from rangesfm.report.head import scale_interval
-from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Panel, Series
+from rangesfm.report.plot import WIDE_SIZE, Figure, LegendEntry, Mark, Panel, Series
 from rangesfm.report.text import signed
 
 Array = npt.NDArray[np.float64]
@@ -35,7 +34,9 @@ def scale_per_anchor(content: Content) -> Figure | None:
         percent = signed(100.0 * (value / joint - 1.0), 2, "%")
         rows.append((float(row), anchor_id, percent))
         marks.append(
-            Mark("one anchor", value, row, "disc", "", f"anchor {anchor_id}: {value:.6g} m per unit, {percent}")
+            Mark(
+                "one anchor", "after", "disc", value, row, "", f"anchor {anchor_id}: {value:.6g} m per unit, {percent}"
+            )
         )
     panel = Panel(
         "",
@@ -46,8 +47,8 @@ def scale_per_anchor(content: Content) -> Figure | None:
         tuple(marks),
         x_range=(joint - half, joint + half),
         y_range=(len(alone) - 0.5, -0.5),
-        size=(460, 24 * len(alone) + 56),
-        verticals=((joint, "joint"),),
+        size=(322.0, 24.0 * len(alone) + 10),
+        verticals=((joint, "ink"),),
         bands=() if stddev is None else ((joint - stddev, joint + stddev, "interval"),),
         rows=tuple(rows),
     )
@@ -55,7 +56,7 @@ def scale_per_anchor(content: Content) -> Figure | None:
         "The scale from each anchor alone, and how far it is from the joint one. Line and band: the joint scale "
         "and one standard deviation. The spread of the anchors is the most honest error bar there is."
     )
-    legend = (("joint", "joint scale"), *((("interval", "± one standard deviation"),) if stddev is not None else ()))
+    legend = (_line("joint scale"), *((_band("± one standard deviation"),) if stddev is not None else ()))
     return Figure("scale_per_anchor", caption, (panel,), legend=legend)
 
 
@@ -74,7 +75,7 @@ def candidates(content: Content) -> Figure | None:
         Series("alpha0", "before", np.column_stack([times, table["alpha0"]])),
         Series("alpha1", "after", np.column_stack([times, table["alpha1"]])),
         Series(
-            "scale found", "reference", np.array([[times.min(), scale], [times.max(), scale]]), "line", is_data=False
+            "scale found", "reference", np.array([[times.min(), scale], [times.max(), scale]]), "dashed", is_data=False
         ),
     ]
     panel = Panel(
@@ -114,7 +115,7 @@ def consensus(content: Content) -> Figure | None:
         "How many ranges fit to each scale within their tolerance, anchors where the estimate has them. One high, "
         "narrow peak at the scale found (the line) is what a sound survey looks like."
     )
-    return Figure("scale_consensus", caption, (panel,), legend=(("joint", "scale found"),))
+    return Figure("scale_consensus", caption, (panel,), legend=(_line("scale found"),))
 
 
 def bootstrap(content: Content) -> Figure | None:
@@ -140,7 +141,7 @@ def bootstrap(content: Content) -> Figure | None:
         bands=() if interval is None else ((*interval, "interval"),),
     )
     caption = f"{len(values)} scales from blocks of time drawn anew. The band is the 95 % interval of the scale."
-    legend = (("joint", "scale found"), *((("interval", "95 % interval"),) if interval is not None else ()))
+    legend = (_line("scale found"), *((_band("95 % interval"),) if interval is not None else ()))
     return Figure("scale_bootstrap", caption, (panel,), legend=legend)
 
 
@@ -157,12 +158,20 @@ def clock_curve(content: Content) -> Figure | None:
         "time offset s",
         "misfit",
         (curve,),
-        verticals=() if offset is None else ((offset, "joint"),),
+        verticals=() if offset is None else ((offset, "ink"),),
     )
     caption = "Misfit of the ranges for each offset between the clocks. One sharp valley at the line is what is wanted."
-    return Figure("time_offset_curve", caption, (panel,), legend=() if offset is None else (("joint", "offset used"),))
+    return Figure("time_offset_curve", caption, (panel,), legend=() if offset is None else (_line("offset used"),))
 
 
 def _joint(content: Content) -> tuple[tuple[float, str], ...]:
     scale = content.summary.number("scale", "value")
-    return () if scale is None else ((scale, "joint"),)
+    return () if scale is None else ((scale, "ink"),)
+
+
+def _line(text: str) -> LegendEntry:
+    return LegendEntry(text, "ink", "upright")
+
+
+def _band(text: str) -> LegendEntry:
+    return LegendEntry(text, "interval", "strip")

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.report.checks import scale_interval
 from rangesfm.report.content import Content, Summary, as_number, is_position
-from rangesfm.report.head import scale_interval
 from rangesfm.report.scene import Scene, SceneAnchor, ScenePath
 
 Array = npt.NDArray[np.float64]

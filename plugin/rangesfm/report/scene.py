@@ -14,7 +14,7 @@ from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.report.packing import pack
 from rangesfm.report.thumbnails import thumbnails
-from rangesfm.result.folder import RangesAsUsed
+from rangesfm.result.ranges_as_used import RangesAsUsed
 
 Array = npt.NDArray[np.float64]
 

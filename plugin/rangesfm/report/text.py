@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from markupsafe import Markup
+
 from rangesfm.report.content import as_number
 
 NOTHING = "–"
@@ -67,3 +69,11 @@ def plain(value: Any) -> str:
     if isinstance(value, list):
         return ", ".join(map(plain, value)) or NOTHING
     return str(value)
+
+
+def keyed(key: str, value: Any, text: str) -> str:
+    """A number of ``result.json`` as the reader sees it, marked with its key (joined by dots) and its full value."""
+    number = as_number(value)
+    if number is None:
+        return text
+    return Markup('<data value="{}" data-key="{}">{}</data>').format(repr(number), key, text)

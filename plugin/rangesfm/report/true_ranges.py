@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.result.folder import RangesAsUsed
+from rangesfm.result.ranges_as_used import RangesAsUsed
 
 Array = npt.NDArray[np.float64]
 

@@ -1,8 +1,9 @@
-"""MetricResult: all that the stages after the reconstruction found."""
+"""MetricResult: all that the stages after the reconstruction found, in memory; what is written follows from it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -14,11 +15,15 @@ from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruct
 from rangesfm.join.models import ModelVerdict
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.clock.estimate import TimeOffset
-from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.observations import RangeObservations, RangeStatus
 from rangesfm.refine.with_ranges import RefineSummary
+from rangesfm.scale.diagnostics import ScaleDiagnostics, scale_diagnostics
 from rangesfm.scale.estimate import ScaleEstimate
 
 Array = npt.NDArray[np.float64]
+
+USED = (RangeStatus.USED, RangeStatus.DOWN_WEIGHTED)
+"""Of ranges with a say in the final model, however small."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +96,11 @@ class MetricResult:
             return {}
         index = np.searchsorted(found.frame_ids, self.trajectory.frame_ids)
         return dict(zip(self.trajectory.image_names, found.centers[index], strict=True))
+
+    @cached_property
+    def diagnostics(self) -> ScaleDiagnostics:
+        """How the scale came about."""
+        return scale_diagnostics(self.estimate, self.trajectory)
 
     @property
     def refined_scale(self) -> float | None:

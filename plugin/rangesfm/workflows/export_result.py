@@ -12,6 +12,7 @@ from rangesfm.export.frames import in_frame
 from rangesfm.files.sole_writer import sole_writer
 from rangesfm.options import ExportOptions
 from rangesfm.result.folder import ResultFolder, read_result_folder
+from rangesfm.result.tables import CenterCovariances
 
 
 def export_result(
@@ -70,17 +71,18 @@ def apply_result(
 
 
 def _read_map(result: ResultFolder, images_path: Path | None) -> MetricMap:
-    reconstruction = result.read_model("sparse_metric") or result.read_model("sparse_scaled")
+    reconstruction, summary = result.read_metric_model(), result.summary
     if reconstruction is None:
         raise InputError("there is no metric model (sparse_metric/0 or sparse_scaled/0) to export", result.path)
+    covariances = result.read(CenterCovariances)
     return MetricMap(
         reconstruction,
         timestamps_s=result.timestamps_s,
         anchors_m=result.anchor_positions_m,
-        metric_from_sfm=result.metric_from_sfm,
-        relative_scale_stddev=result.relative_scale_stddev,
+        metric_from_sfm=summary.metric_from_sfm.similarity,
+        relative_scale_stddev=summary.scale.relative_stddev_empirical,
         images_path=images_path or result.images_path,
-        is_site=result.frame == "site",
-        georeference=result.georeference,
-        center_covariance_m2=result.read_center_covariance_m2(),
+        is_site=summary.frame == "site",
+        georeference=None if summary.georeference is None else summary.georeference.georeference,
+        center_covariance_m2=None if covariances is None else covariances.by_photo_m2,
     )

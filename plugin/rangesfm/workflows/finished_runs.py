@@ -17,7 +17,8 @@ from rangesfm.join.models import PathOfModel
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeStatus
-from rangesfm.result.folder import RangesAsUsed, ResultFolder, read_result_folder
+from rangesfm.result.folder import ResultFolder, read_result_folder
+from rangesfm.result.ranges_as_used import RangesAsUsed
 
 Array = npt.NDArray[np.float64]
 
@@ -83,7 +84,7 @@ def _names(folders: Sequence[Path]) -> list[str]:
 
 
 def _read(name: str, result: ResultFolder) -> FinishedRun:
-    model, ranges = _unscaled_model(result), result.read_ranges()
+    model, ranges = _unscaled_model(result), result.read(RangesAsUsed)
     if ranges is None:
         raise InputError("there is no ranges.csv, expected the output_path of a run", result.path)
     path = trajectory_from_reconstruction(model, result.timestamps_s)
@@ -156,7 +157,7 @@ def joined_log(
     Raises:
         InputError: an anchor to be used is in none of the logs.
     """
-    anchor_ids = {id_ for survey in surveys for id_ in survey.result.summary.get("anchors") or {}}
+    anchor_ids = {id_ for survey in surveys for id_ in survey.result.summary.anchors}
     for id_ in use_anchors:
         if id_ not in anchor_ids:
             raise InputError(f"anchor {id_!r} to be used is in none of the surveys ({', '.join(sorted(anchor_ids))})")
@@ -209,7 +210,7 @@ def _camera_times_s(survey: FinishedRun) -> Array:
     ranges, times = survey.ranges, survey.result.timestamps_s
     if times is None:
         return np.full(len(ranges.range_m), np.nan)
-    offset = (survey.result.summary.get("time_offset") or {}).get("value_s") or 0.0
+    offset = survey.result.summary.time_offset.value_s or 0.0
     before, after = (
         np.array([times.get(name, np.nan) for name in names], dtype=np.float64)
         for names in (ranges.keyframe_before, ranges.keyframe_after)
@@ -228,7 +229,7 @@ def paths_of_surveys(
     """Each survey's model with its own ranges on its path, as the survey put them there; checks stay checks."""
     paths = []
     for k, survey in enumerate(surveys):
-        placed = associate(log, survey.path, tags_in_cam_m, options=survey.result.association)
+        placed = associate(log, survey.path, tags_in_cam_m, options=survey.result.summary.settings.ranges.association)
         status = np.where(placed.has_place & (number != k), RangeStatus.OUTSIDE_PATH, placed.status).astype(np.int8)
         status[(status == RangeStatus.USED) & is_check] = RangeStatus.CHECK
         paths.append(PathOfModel(survey.name, survey.model, survey.path, replace(placed, status=status)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +21,8 @@ from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.workflows.finished_runs import FinishedRun, joined_log, paths_of_surveys, read_finished_runs
 from rangesfm.workflows.journal import Journal
-from rangesfm.workflows.run import RunResult, map_in_metres
+from rangesfm.workflows.results import RunResult
+from rangesfm.workflows.run import map_in_metres
 
 # Two surveys' files may give a place with other digits.
 _SAME_PLACE_M = 1e-3
@@ -45,7 +46,7 @@ def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress)
         raise InputError("the results would overwrite this survey, expected another output path", survey.output_path)
     log, number, is_check = joined_log(finished, survey.use_anchors)
     anchors, frame = _anchors(survey, finished, log)
-    crs = survey.anchor_crs or _common(finished, "anchor_crs")
+    crs = survey.anchor_crs or _common(one.result.summary.settings.anchor_crs for one in finished)
     site, anchors = local_site(anchors, frame, crs, survey.anchors_path)
     arms = {tag_id: arm for one in finished for tag_id, arm in one.tags_in_cam_m.items()}
     tags_in_cam_m = np.array([arms[tag_id] for tag_id in log.tag_ids])
@@ -98,8 +99,8 @@ def _anchors_of_surveys(finished: Sequence[FinishedRun]) -> tuple[Anchor, ...]:
 
 
 def _anchors_of(one: FinishedRun) -> tuple[Anchor, ...]:
-    settings = one.result.summary.get("settings") or {}
-    path, frame = settings.get("anchors_path"), settings.get("anchor_frame")
+    settings = one.result.summary.settings
+    path, frame = settings.anchors_path, settings.anchor_frame
     if path is None or frame == "unknown":
         return ()
     if frame == "first_camera":
@@ -113,14 +114,14 @@ def _anchors_of(one: FinishedRun) -> tuple[Anchor, ...]:
     return read_anchors(path)
 
 
-def _common(finished: Sequence[FinishedRun], key: str) -> str | None:
-    """A setting that all surveys have alike; None if they do not."""
-    values = {(one.result.summary.get("settings") or {}).get(key) for one in finished}
-    return str(values.pop()) if len(values) == 1 and None not in values else None
+def _common(settings: Iterable[str | None]) -> str | None:
+    """What all surveys have alike; None if they do not."""
+    values = set(settings)
+    return values.pop() if len(values) == 1 else None
 
 
 def _images_path(finished: Sequence[FinishedRun]) -> Path | None:
     """The folder of all photos, where there is one and they have kept their names."""
-    path = _common(finished, "images_path")
+    path = _common(one.result.summary.settings.images_path for one in finished)
     is_renamed = any(name != own for one in finished for own, name in one.own_name.items())
     return None if path is None or is_renamed else Path(path)

@@ -6,13 +6,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.stats import chi2
+from tests.simulated.path import loop_path
 from tests.studies import anchor_initialization
 
 from rangesfm.errors import GeometryError
 from rangesfm.ranging.anchors.anchor_survey import trilaterate_anchors
 from rangesfm.ranging.anchors.trilateration import Trilateration, TrilaterationOptions, trilaterate
 from rangesfm.ranging.log import RangeLog
-from rangesfm.simulate.path import loop_path
 
 Array = npt.NDArray[np.float64]
 

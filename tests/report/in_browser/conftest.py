@@ -51,6 +51,7 @@ class Browser:
         for kind in ("browser", "performance"):
             self._driver.get_log(kind)
         self._driver.get(page.as_uri())
+        self.wait_for("!document.querySelector('#figures') || window.rangesfmFigures")
         self.wait_for("!document.querySelector('#view') || window.rangesfmView")
 
     def run(self, script: str, *arguments: Any) -> Any:
