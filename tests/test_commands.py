@@ -109,7 +109,7 @@ class Left:
     def without_seconds(self) -> dict[str, Any]:
         """A copy of result.json but for how long things took and where it lies."""
         result = copy.deepcopy(self.result)
-        del result["seconds"], result["settings"]["output_path"]
+        del result["seconds"], result["settings"]["output"]["path"]
         if result["refine"] is not None:
             del result["refine"]["seconds"]
         return result

@@ -21,6 +21,7 @@ from unittest import mock
 import numpy as np
 import numpy.typing as npt
 import pycolmap
+from tests.known_errors import known_errors
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import sequence_path
 
@@ -164,8 +165,8 @@ def solve(survey: Survey, variant: Variant, num_iterations: int) -> Solve:
             observations,
             IDENTITY,
             [anchor(name, variant.anchors_are_free) for name in observations.log.anchor_ids],
+            known_errors(observations, RANGE_STDDEV_M),
             tag_in_cam_m=TAG_IN_CAM_M,
-            range_stddev_m=np.full(len(observations.log), RANGE_STDDEV_M),
             first_pose_is_fixed=True,
             camera=CameraOptions(refine_intrinsics=False),
             num_threads=1,

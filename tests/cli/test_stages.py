@@ -62,7 +62,7 @@ def test_command_runs_its_stage_and_prints_the_summary(
     assert main(argv) == 0
     ((name, survey, given),) = calls.made
     assert (name, given) == (stage, options)
-    assert (survey.images_path is None) != (survey.model_path is None)
+    assert (survey.images.path is None) != (survey.model_path is None)
     captured = capsys.readouterr()
     assert captured.out.splitlines() == [f"{stage} is done", "scale 2.5"]
     assert captured.err == "working\n"
@@ -85,9 +85,9 @@ def test_demo_makes_a_survey_and_runs_it_against_the_truth(calls: Calls, monkeyp
     assert main(["demo", "yard", "--num-photos", "12", "--seed", "5", "--num-threads", "2"]) == 0
     ((name, survey, options),) = calls.made
     assert (name, options) == ("run_survey", {"restart": False})
-    assert (survey.keyframes.every_nth, survey.seed, survey.mapper.num_threads) == (12, 5, 2)
-    assert survey.reference_path == Path.cwd() / "yard" / "reference.csv"
-    assert survey.output_path == Path.cwd() / "yard" / "out"
+    assert (survey.images.every_nth, survey.output.seed, survey.mapper.num_threads) == (12, 5, 2)
+    assert survey.report.reference == Path.cwd() / "yard" / "reference.csv"
+    assert survey.output.path == Path.cwd() / "yard" / "out"
 
 
 @pytest.mark.parametrize(("ok", "status"), [(True, 0), (False, 4)])
@@ -110,8 +110,8 @@ def test_lever_arms_of_several_tags_are_given_one_by_one(calls: Calls) -> None:
     assert main([*start, "--tag-in-cam", "T1:-0.1,0,2", "--tag_in_cam", "A:B:0,0,1"]) == 0
     assert main([*start, "--tag_in_cam", "-0.1,0,2"]) == 0
     (_, several, _), (_, one, _) = calls.made
-    assert several.lever_arms_m == {"T1": (-0.1, 0.0, 2.0), "A:B": (0.0, 0.0, 1.0)}
-    assert (one.tag_in_cam_m, one.lever_arms_m) == ((-0.1, 0.0, 2.0), {})
+    assert several.tag.lever_arms_m == {"T1": (-0.1, 0.0, 2.0), "A:B": (0.0, 0.0, 1.0)}
+    assert (one.tag.tag_in_cam_m, one.tag.lever_arms_m) == ((-0.1, 0.0, 2.0), {})
 
 
 @pytest.mark.parametrize(
@@ -135,5 +135,5 @@ def test_radio_log_is_described_by_the_flags_of_the_ranges_command(calls: Calls)
     assert main(["refine", "--input_path", "model", "--ranges", "uwb.csv", *flags, "--ranging_interval_s", "0.1"]) == 0
     ranges = calls.made[0][1].ranges
     assert ranges.columns == {"timestamp": "t", "anchor_id": "n"}
-    assert (ranges.stamps.unit_s, ranges.stamps.propagation_speed_m_per_s) == (1e-6, 299.7e6)
+    assert (ranges.stamp_unit, ranges.propagation_speed) == ("us", 299.7e6)
     assert ranges.ranging_interval_s == 0.1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,10 +18,9 @@ from rangesfm.comparison.page import write_comparison
 from rangesfm.comparison.ranges import ranges_of_survey
 from rangesfm.distances.tape import read_tape
 from rangesfm.errors import InputError
-from rangesfm.options import ScaleOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.survey.inputs import read_ranging_inputs
-from rangesfm.survey.settings import RangesConfig, Survey
+from rangesfm.survey.settings import Survey
 from rangesfm.workflows.run import scale_model
 
 if TYPE_CHECKING:
@@ -49,23 +49,28 @@ def models(walked_survey: WalkedSurvey, tmp_path_factory: pytest.TempPathFactory
     return paths[0], paths[1], paths[2]
 
 
+def survey_of(files: Path, others: Mapping[str, object] | None = None) -> Survey:
+    """Of the walked survey's files, with other keys beside them."""
+    keys = {
+        "images.times": files / "images.csv",
+        "ranges.path": files / "uwb.csv",
+        "ranges.time_offset": 2.0,
+        "anchors.path": files / "anchors.csv",
+        "tag.tag_in_cam_m": TAG_IN_CAM_M,
+        "scale.num_bootstrap": 20,
+    }
+    return Survey().changed({**keys, **(others or {})})
+
+
 @pytest.fixture(scope="module")
 def result(walked_survey: WalkedSurvey, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same model scaled with its ranges."""
     files = walked_survey.folder
-    survey = Survey(
-        model_path=files / "sparse" / "0",
-        image_times_path=files / "images.csv",
-        ranges=RangesConfig(path=files / "uwb.csv", time_offset_s=2.0),
-        anchors_path=files / "anchors.csv",
-        anchor_frame="site",
-        tag_in_cam_m=TAG_IN_CAM_M,
-        scale=ScaleOptions(num_bootstrap=20),
-        output_path=tmp_path_factory.mktemp("result") / "out",
-        report_enabled=False,
-    )
+    output_path = tmp_path_factory.mktemp("result") / "out"
+    survey = survey_of(files, {"anchors.frame": "site", "output.path": output_path, "report.enabled": False})
+    survey = survey.model_copy(update={"model_path": files / "sparse" / "0"})
     scale_model(survey, progress=SilentProgress())
-    return survey.output_path
+    return survey.output.path
 
 
 def compared(*paths: Path) -> ModelsComparison:
@@ -119,13 +124,7 @@ def test_a_log_is_held_against_models_that_no_run_has_made(
     walked_survey: WalkedSurvey, models: tuple[Path, Path, Path]
 ) -> None:
     files = walked_survey.folder
-    survey = Survey(
-        image_times_path=files / "images.csv",
-        ranges=RangesConfig(path=files / "uwb.csv", time_offset_s=2.0),
-        anchors_path=files / "anchors.csv",
-        tag_in_cam_m=TAG_IN_CAM_M,
-        scale=ScaleOptions(num_bootstrap=20),
-    )
+    survey = survey_of(files)
     named = read_models(models)
     assert named[0].model is not None
     ranges = ranges_of_survey(survey, read_ranging_inputs(survey), named[0].model, models[0])

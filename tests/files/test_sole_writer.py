@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from tests.result_document import result_document
 
 from rangesfm.cli import main
 from rangesfm.errors import InputError
@@ -63,7 +65,7 @@ def test_what_is_written_into_a_result_waits_for_its_run(
     monkeypatch.chdir(tmp_path)
     for name in ("out", "other"):
         (tmp_path / name).mkdir()
-        (tmp_path / name / "result.json").write_text("{}")
+        (tmp_path / name / "result.json").write_text(json.dumps(result_document()))
     process = hold(tmp_path / "out")
     assert main(command.split()) == InputError.exit_status
     assert re.fullmatch(rf"rangesfm: error: out: .*process {process.pid}.*\n", capsys.readouterr().err)

@@ -132,7 +132,7 @@ def _check_curve(curve: ErrorCurve) -> None:
 
 
 def _check_survey(survey: Survey) -> None:
-    _expect(survey.output_path.is_absolute(), "an absolute path")
+    _expect(survey.output.path.is_absolute(), "an absolute path")
     _expect(isinstance(survey.to_dict(), dict), "plain values")
 
 

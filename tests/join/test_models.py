@@ -25,13 +25,13 @@ from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import align_points
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.join.models import JoinedModels, PathOfModel, Ranging, join_models
-from rangesfm.options import ExportOptions, RangeModelOptions, RefineOptions, ScaleOptions
+from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers.canonical import write_ranges_csv
-from rangesfm.survey.settings import RangesConfig, Survey
+from rangesfm.survey.settings import Survey
 from rangesfm.vision.reconstruct import ReconstructionSummary
 from rangesfm.workflows.run import run_survey, scale_model
 
@@ -88,16 +88,20 @@ class Halves:
             assert path.timestamps_s is not None
             rows += [f"{name},{time!r}\n" for name, time in zip(path.image_names, path.timestamps_s.tolist())]
         (folder / "images.csv").write_text("".join(rows))
-        return Survey(
-            image_times_path=folder / "images.csv",
-            ranges=RangesConfig(path=folder / "uwb.csv", time_offset_s=0.0),
-            anchor_frame="unknown",
-            tag_in_cam_m=TAG_IN_CAM_M,
-            scale=ScaleOptions(num_bootstrap=0, max_relative_stddev=0.2),
-            refine=RefineOptions(enabled=False),
-            export=ExportOptions(formats=()),
-            report_enabled=False,
-            output_path=folder / "out",
+        return Survey().changed(
+            {
+                "images.times": folder / "images.csv",
+                "ranges.path": folder / "uwb.csv",
+                "ranges.time_offset": 0.0,
+                "anchors.frame": "unknown",
+                "tag.tag_in_cam_m": TAG_IN_CAM_M,
+                "scale.num_bootstrap": 0,
+                "scale.max_relative_stddev": 0.2,
+                "refine.enabled": False,
+                "export.formats": (),
+                "report.enabled": False,
+                "output.path": folder / "out",
+            }
         )
 
 
@@ -181,7 +185,7 @@ def test_a_run_joins_what_the_mapper_left_in_pieces(
         return ReconstructionSummary(models, len(names), HALF, {}, tmp_path / "mapper.log")
 
     monkeypatch.setattr("rangesfm.workflows.photos.reconstruct", reconstruct)
-    survey = replace(exact.write(tmp_path), images_path=tmp_path / "photos")
+    survey = exact.write(tmp_path).changed({"images.path": tmp_path / "photos"})
     result = run_survey(survey, progress=SilentProgress()).summary
     path = trajectory_from_reconstruction(read_model(tmp_path / "out" / "sparse_scaled" / "0"))
     assert path.image_names == tuple(names)
@@ -206,7 +210,8 @@ def finished(exact: Halves, tmp_path_factory: pytest.TempPathFactory) -> Path:
     for part, day in zip(exact.parts, ("monday", "tuesday"), strict=True):
         (folder / day).mkdir()
         part.sfm.write(folder / day)
-        survey = replace(exact.write(folder), model_path=folder / day, output_path=folder / day / "out")
+        survey = exact.write(folder).changed({"output.path": folder / day / "out"})
+        survey = survey.model_copy(update={"model_path": folder / day})
         scale_model(survey, progress=SilentProgress())
     return folder
 

@@ -14,11 +14,12 @@ from tests.simulated.model import SyntheticModel
 from rangesfm.geometry.gravity import UP_IN_SITE, Gravity
 from rangesfm.geometry.similarity import align_points, rmse
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE
-from rangesfm.refine.antennas import Antennas
-from rangesfm.refine.keyframe_graph import KeyframeGraph, solve_graph
-from rangesfm.refine.vision_information import Poses, vision_information
 from rangesfm.refine import keyframe_graph
+from rangesfm.refine.antennas import Antennas
+from rangesfm.refine.keyframe_graph import KeyframeGraph, local_scales, solve_graph
+from rangesfm.refine.vision_information import Poses, vision_information
 
 Array = npt.NDArray[np.float64]
 ANCHORS_M = np.array([[-40.0, -28.0, 12.0], [-15.0, -28.0, 0.0], [-28.0, -42.0, 9.0], [-30.0, -20.0, 15.0]])
@@ -41,15 +42,30 @@ def make_graph(
     return KeyframeGraph(
         vision=replace(vision_information(rays, truth), origin=origin),
         antennas=antennas,
-        anchor_index=index,
         range_m=np.linalg.norm(at - ANCHORS_M[index], axis=1) + 0.05,
-        stddev_m=np.full(len(index), stddev_m),
-        share=np.ones(len(index)),
+        errors=errors_of(index, stddev_m),
         anchors=tuple(anchor(k, anchors_are_free) for k in range(m)),
-        common_bias_stddev_m=0.1,
         gravity=None,
         held_frame=held_frame,
+    )
+
+
+def errors_of(anchor_index: npt.NDArray[np.int64], stddev_m: float) -> RangeErrors:
+    """Independent ones, under no loss to speak of."""
+    n = len(anchor_index)
+    known, label = np.full(n, stddev_m), np.arange(n)
+    return RangeErrors(
+        stddev_m=known,
+        share=np.ones(n),
+        inflation=1.0,
+        given_m=known,
+        shared_m=np.zeros(n),
+        placing_m=np.zeros(n),
+        anchor_index=anchor_index,
+        block=label,
+        place=label,
         loss=GEMAN_MCCLURE.scaled(1e6),
+        common_bias_stddev_m=0.1,
     )
 
 
@@ -142,3 +158,14 @@ def test_the_ranges_determine_no_more_than_there_is(chain: SyntheticModel) -> No
     graphs = [make_graph(chain, truth, stddev_m=stddev_m) for stddev_m in (100.0, 0.1)]
     few, many = (solve_graph(graph, graph.start(), tolerance_m=1e-4).num_absorbed for graph in graphs)
     assert 0 <= few < many < len(graphs[0].range_m)
+
+
+def test_neighbours_of_one_place_have_no_scale_of_their_own(chain: SyntheticModel) -> None:
+    """As where a camera turns on a tripod: its centres differ by rounding."""
+    truth, rays = poses_and_rays(chain)
+    still = Poses(truth.world_from_rig, truth.centers.copy())
+    still.centers[:12] = truth.centers[0]
+    rng = np.random.default_rng(0)
+    before, now = (Poses(still.world_from_rig, still.centers + 1e-14 * rng.normal(size=(60, 3))) for _ in range(2))
+    scales = local_scales(replace(vision_information(rays, truth), origin=before), now)
+    np.testing.assert_allclose(scales, 1.0, atol=1e-9)

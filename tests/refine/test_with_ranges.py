@@ -13,6 +13,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 from tests.few_links import leave_few_links
+from tests.known_errors import known_errors
 from tests.simulated.model import synthetic_model
 from tests.simulated.path import lap_path, loop_path, sequence_path
 from tests.simulated.ranges import simulate_ranges_at
@@ -32,9 +33,11 @@ from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.anchors.anchor import Anchor, AnchorEstimate
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.errors.noise import shared_stddev
+from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
-from rangesfm.refine.with_ranges import RefineSummary, predicted_ranges, refine_with_ranges
+from rangesfm.refine.radio import predicted_ranges
+from rangesfm.refine.with_ranges import RefineSummary, refine_with_ranges
 from rangesfm.scale.initialize import initialize_scale
 
 Array = npt.NDArray[np.float64]
@@ -82,18 +85,20 @@ class Survey:
     def refine(
         self, anchors: Sequence[AnchorEstimate], scale_error: float = 1.0, **changes: Any
     ) -> tuple[pycolmap.Reconstruction, RefineSummary]:
-        """From the true similarity, its scale off by a factor."""
+        """From the true similarity, its scale off by a factor; ``errors`` may be the stddev of all ranges."""
         start = Similarity(scale_error, np.eye(3), np.zeros(3)) @ self.metric_from_sfm
         observations = changes.pop("observations", self.observations)
+        errors = changes.pop("errors", RANGE_STDDEV_M)
+        if not isinstance(errors, RangeErrors):
+            errors = known_errors(observations, errors)
         arguments: dict[str, Any] = {
             "tag_in_cam_m": TAG_IN_CAM_M,
-            "range_stddev_m": np.full(len(observations.log), RANGE_STDDEV_M),
             "first_pose_is_fixed": self.frame != "site",
             "camera": CameraOptions(refine_intrinsics=False),
             "num_threads": 1,
         }
         return refine_with_ranges(
-            rescale(self.sfm, start), self.trajectory, observations, start, anchors, **(arguments | changes)
+            rescale(self.sfm, start), self.trajectory, observations, start, anchors, errors, **(arguments | changes)
         )
 
     def centers(self, model: pycolmap.Reconstruction) -> Array:
@@ -215,9 +220,12 @@ class TestWithoutNoise:
 
     def test_a_bias_that_all_anchors_share_is_found_though_their_own_are_small(self) -> None:
         survey = make_survey(radio=Radio(range_bias_m=dict.fromkeys(ANCHORS_M, 0.08)))
-        _, summary = survey.refine(survey.anchors(0.0, bias_stddev_m=0.001), common_bias_stddev_m=0.1)
+        errors = [
+            known_errors(survey.observations, RANGE_STDDEV_M, common_bias_stddev_m=stddev_m) for stddev_m in (0.1, 0.0)
+        ]
+        _, summary = survey.refine(survey.anchors(0.0, bias_stddev_m=0.001), errors=errors[0])
         np.testing.assert_allclose([anchor.range_bias_m for anchor in summary.anchors], 0.08, atol=0.005)
-        _, apart = survey.refine(survey.anchors(0.0, bias_stddev_m=0.001), common_bias_stddev_m=0.0)
+        _, apart = survey.refine(survey.anchors(0.0, bias_stddev_m=0.001), errors=errors[1])
         assert all(abs(anchor.range_bias_m) < 0.04 for anchor in apart.anchors)
 
     def test_points_and_poses_scale_together(self) -> None:
@@ -244,10 +252,9 @@ class TestWithoutNoise:
         tags = np.array([TAG_IN_CAM_M, [-0.4, 0.3, 0.5]])
         metric = rescale(survey.sfm, survey.metric_from_sfm)
         log, similarity = survey.observations.log, survey.metric_from_sfm
-        positions = [survey.anchors_m[name] for name in log.anchor_ids]
         places = [associate(log, survey.trajectory, tag) for tag in tags]
         each = [
-            predicted_ranges(metric, survey.trajectory, places[k], similarity, tags[k], positions, [0.0] * 4)
+            predicted_ranges(metric, survey.trajectory, places[k], similarity, tags[k], survey.anchors(0.0))
             for k in range(2)
         ]
         assert np.nanmedian(np.abs(each[1] - each[0])) > 0.1
@@ -260,7 +267,7 @@ class TestWithoutNoise:
         np.testing.assert_allclose(survey.centers(refined), survey.centers_m, atol=1e-2)
         placed = observations.has_place
         np.testing.assert_allclose(summary.predicted_m[placed], log.range_m[placed], atol=1e-2)
-        with pytest.raises(ValueError, match=r"expected \(3,\) or \(2, 3\)"):
+        with pytest.raises(InputError, match=r"expected \(3,\) or \(2, 3\)"):
             survey.refine(survey.anchors(0.0), observations=observations, tag_in_cam_m=np.zeros((3, 3)))
 
     def test_the_model_given_stays_as_it_was(self) -> None:
@@ -273,8 +280,8 @@ class TestWithoutNoise:
             survey.observations,
             survey.metric_from_sfm,
             anchors := survey.anchors(np.inf),
+            known_errors(survey.observations, RANGE_STDDEV_M),
             tag_in_cam_m=TAG_IN_CAM_M + 0.1,
-            range_stddev_m=np.full(len(survey.observations.log), RANGE_STDDEV_M),
             first_pose_is_fixed=False,
         )
         np.testing.assert_array_equal(survey.centers(metric), before)
@@ -458,14 +465,7 @@ class TestDistances:
             {"door": marker_of(survey.sfm, points[0]), "wall": marker_of(survey.sfm, points[1])},
         )
         observations = with_ranges_between_anchors(survey)
-        stddev = np.full(len(observations.log), RANGE_STDDEV_M)
-        survey.refine(
-            survey.anchors(np.inf),
-            observations=observations,
-            range_stddev_m=stddev,
-            common_bias_stddev_m=0.1,
-            tape=tape,
-        )
+        survey.refine(survey.anchors(np.inf), observations=observations, tape=tape)
         summary = adjusters[-1].solve()
         assert isinstance(summary, pycolmap.CeresBundleAdjustmentSummary)
         assert summary.ceres_summary.schur_structure_used == "2,3,6"
@@ -473,18 +473,15 @@ class TestDistances:
     def test_ranges_between_anchors_put_unknown_ones_nearer_to_their_places(self) -> None:
         survey = make_survey("first_camera", pixel_stddev=0.5, radio=Radio(range_stddev_m=0.3))
         observations, without = with_ranges_between_anchors(survey, error_m=0.05), survey.observations
-        errors = {}
+        off_m = {}
         for name, taken in {"with": observations, "without": without}.items():
-            stddev = np.full(len(taken.log), 0.3)
-            stddev[taken.status == RangeStatus.ANCHOR_ANCHOR] = 0.02
-            _, summary = survey.refine(
-                survey.anchors(np.inf), observations=taken, range_stddev_m=stddev, common_bias_stddev_m=0.05
-            )
+            errors = known_errors(taken, 0.3, common_bias_stddev_m=0.05)
+            _, summary = survey.refine(survey.anchors(np.inf), observations=taken, errors=errors)
             places = np.array([anchor.position_m for anchor in summary.anchors])
             truth = np.array([survey.anchors_m[anchor.anchor_id] for anchor in summary.anchors])
             lengths = [[np.linalg.norm(a - b) for a, b in itertools.combinations(at, 2)] for at in (places, truth)]
-            errors[name] = rmse(np.diff(lengths, axis=0).T)
-        assert errors["with"] < 0.5 * errors["without"]
+            off_m[name] = rmse(np.diff(lengths, axis=0).T)
+        assert off_m["with"] < 0.5 * off_m["without"]
 
     def test_a_range_between_anchors_that_is_far_off_has_no_say(self) -> None:
         survey = make_survey("first_camera", pixel_stddev=0.5, radio=Radio(range_stddev_m=RANGE_STDDEV_M))
@@ -496,12 +493,8 @@ class TestDistances:
             replace(observations, log=replace(observations.log, range_m=range_m)),
             with_ranges_between_anchors(survey, first_pair=1),
         ):
-            _, summary = survey.refine(
-                survey.anchors(np.inf),
-                observations=taken,
-                range_stddev_m=np.full(len(taken.log), RANGE_STDDEV_M),
-                common_bias_stddev_m=0.05,
-            )
+            errors = known_errors(taken, RANGE_STDDEV_M, common_bias_stddev_m=0.05)
+            _, summary = survey.refine(survey.anchors(np.inf), observations=taken, errors=errors)
             places.append(np.array([anchor.position_m for anchor in summary.anchors]))
         assert rmse(places[1] - places[0]) < 0.001
 
@@ -553,8 +546,7 @@ class TestWithNoise:
     def test_outliers_are_marked_and_do_not_bend_the_map(self) -> None:
         radio = Radio(range_stddev_m=0.03, obstructed_share=0.2, obstructed_mean_m=5.0)
         survey = make_survey(pixel_stddev=0.5, radio=radio, num_epochs=3)
-        stddev = np.full(len(survey.observations.log), 0.03)
-        refined, summary = survey.refine(survey.anchors(0.0), range_stddev_m=stddev)
+        refined, summary = survey.refine(survey.anchors(0.0), errors=0.03)
         assert rmse(survey.centers(refined) - survey.centers_m) < 0.03
         off = np.abs(summary.predicted_m - survey.observations.log.range_m)
         assert np.all(summary.observations.status[off > 0.5] == RangeStatus.OUTLIER)
@@ -569,10 +561,7 @@ class TestWithNoise:
         refined, _ = scaled.refine(
             scale.anchors,
             observations=scale.observations,
-            range_stddev_m=scale.range_stddev_m,
-            range_share=scale.range_share,
-            stddev_is_estimated=np.ones(len(survey.observations.log), dtype=bool),
-            correlation_inflation=scale.correlation_inflation,
+            errors=scale.errors,
         )
         before, after = scale.metric_from_sfm.apply(survey.trajectory.centers), survey.centers(refined)
         assert rmse(before - survey.centers_m) < 0.1
@@ -594,11 +583,11 @@ class TestWithNoise:
         survey = make_survey(frame, pixel_stddev=0.3, radio=radio, num_epochs=num_epochs, seed=1)
         log = survey.observations.log
         wrong = replace(log, range_m=spoilt(log.range_m, kind, share, np.random.default_rng(1)))
+        observations = replace(survey.observations, log=wrong)
         refined, _ = survey.refine(
             survey.anchors(0.0, bias_stddev_m=0.01),
-            observations=replace(survey.observations, log=wrong),
-            stddev_is_estimated=np.ones(len(log), dtype=bool),
-            common_bias_stddev_m=0.1,
+            observations=observations,
+            errors=known_errors(observations, RANGE_STDDEV_M, is_estimated=True),
         )
         assert rmse(survey.centers(refined) - survey.centers_m) < max_error_m
 
@@ -616,13 +605,13 @@ class TestWithNoise:
             replace(observations, status=status), survey.trajectory, surveyed, anchor_frame="first_camera"
         )
         moved = {}
-        for name, share in (("weighed", scale.range_share), ("alike", None)):
+        # Of noise that is known, so that the shares stay as they are.
+        weighed = replace(scale.errors, given_m=scale.errors.stddev_m)
+        for name, errors in (("weighed", weighed), ("alike", replace(weighed, share=np.ones(len(log))))):
             refined, _ = replace(survey, metric_from_sfm=scale.metric_from_sfm).refine(
                 scale.anchors,
                 observations=scale.observations,
-                range_stddev_m=scale.range_stddev_m,
-                range_share=share,
-                correlation_inflation=scale.correlation_inflation,
+                errors=errors,
             )
             moved[name] = rmse(survey.centers(refined) - scale.metric_from_sfm.apply(survey.trajectory.centers))
         assert moved["weighed"] < 0.003
@@ -635,9 +624,8 @@ class TestWithNoise:
         askew = replace(
             survey, metric_from_sfm=Similarity(1.0, turn, np.array([0.02, -0.03, 0.02])) @ survey.metric_from_sfm
         )
-        stddevs_m = np.full(len(survey.observations.log), stddev_m)
-        refined, summary = askew.refine(survey.anchors(0.0), range_stddev_m=stddevs_m)
-        straight, _ = survey.refine(survey.anchors(0.0), range_stddev_m=stddevs_m)
+        refined, summary = askew.refine(survey.anchors(0.0), errors=stddev_m)
+        straight, _ = survey.refine(survey.anchors(0.0), errors=stddev_m)
         # To Ceres' steps a turn of the whole world is no straight line: each gains less than it promised.
         assert summary.num_iterations <= 5
         np.testing.assert_allclose(survey.centers(refined), survey.centers(straight), atol=2e-3)
@@ -663,7 +651,7 @@ class TestWithNoise:
             observations=associate(survey.observations.log, trajectory, TAG_IN_CAM_M),
             metric_from_sfm=align_points(trajectory.centers, survey.centers_m),
         )
-        _, summary = hinged.refine(survey.anchors(0.0), range_stddev_m=np.full(len(survey.observations.log), stddev_m))
+        _, summary = hinged.refine(survey.anchors(0.0), errors=stddev_m)
         assert 0.1 < summary.bend_m < stddev_m
         assert summary.num_iterations <= 5
 
@@ -718,7 +706,7 @@ class TestBesideTheMap:
         wrong = TAG_IN_CAM_M + np.array([0.1, -0.05, 0.08])
         placed = associate(survey.observations.log, survey.trajectory, wrong)
         given: dict[str, Any] = {"observations": placed, "tag_in_cam_m": wrong}
-        given["range_stddev_m"] = np.full(len(placed.log), 0.01)
+        given["errors"] = 0.01
         bent, held = survey.refine(survey.anchors(0.0), **given)
         np.testing.assert_array_equal(held.tags_in_cam_m, [wrong])
         options = RefineOptions(lever_arm_stddev_m=0.1)
@@ -740,11 +728,10 @@ class TestBesideTheMap:
         # At an even speed round a loop, a late clock and a map turned back are the same.
         survey = self.survey(path=loop_path(20.0, unsteadiness_m=1.0, seed=3), num_keyframes=81)
         late = associate(survey.observations.log, survey.trajectory, TAG_IN_CAM_M, time_offset_s=-0.1)
-        stddev = np.full(len(late.log), 0.03)
-        bent, held = survey.refine(survey.anchors(0.0), observations=late, range_stddev_m=stddev)
+        bent, held = survey.refine(survey.anchors(0.0), observations=late, errors=0.03)
         assert held.time_shift_s is None
         options = RefineOptions(time_offset_stddev_s=0.1)
-        refined, summary = survey.refine(survey.anchors(0.0), observations=late, range_stddev_m=stddev, options=options)
+        refined, summary = survey.refine(survey.anchors(0.0), observations=late, errors=0.03, options=options)
         assert summary.time_shift_s == pytest.approx(0.1, abs=0.01)
         assert rmse(survey.centers(refined) - survey.centers_m) < 0.02
         assert rmse(survey.centers(refined) - survey.centers_m) < 0.5 * rmse(survey.centers(bent) - survey.centers_m)
@@ -765,12 +752,10 @@ class TestBesideTheMap:
         assert np.abs(short).max() > 0.05
         observations = replace(survey.observations, log=replace(log, range_m=log.range_m + short))
         stddev = np.hypot(0.03, shared_stddev(observations.log))
-        _, held = survey.refine(survey.anchors(0.0), observations=observations, range_stddev_m=stddev)
+        _, held = survey.refine(survey.anchors(0.0), observations=observations, errors=stddev)
         assert held.short_range_error_m is None
         options = RefineOptions(short_range_stddev_m=0.3)
-        _, summary = survey.refine(
-            survey.anchors(0.0), observations=observations, range_stddev_m=stddev, options=options
-        )
+        _, summary = survey.refine(survey.anchors(0.0), observations=observations, errors=stddev, options=options)
         assert summary.short_range_error_m == pytest.approx(-0.3, abs=0.05)
 
 
@@ -778,7 +763,7 @@ class TestBesideTheMap:
 def radio_without_shared_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of which every range errs on its own, and which is known to do so."""
     monkeypatch.setattr("rangesfm.ranging.errors.shared_errors.ANTENNA_STDDEV_M", 0.0)
-    monkeypatch.setattr("rangesfm.refine.with_ranges.CURVE_STDDEV_M", 0.0)
+    monkeypatch.setattr("rangesfm.ranging.errors.shared_errors.CURVE_STDDEV_M", 0.0)
 
 
 def with_shared_errors(survey: Survey, seed: int) -> RangeObservations:
@@ -831,7 +816,8 @@ class TestCovariance:
         survey = make_survey(pixel_stddev=0.5, radio=Radio(range_stddev_m=RANGE_STDDEV_M))
         scale_stddevs = []
         for inflation in (1.0, 5.0):
-            _, summary = survey.refine(survey.anchors(0.0), correlation_inflation=inflation)
+            errors = known_errors(survey.observations, RANGE_STDDEV_M, inflation=inflation)
+            _, summary = survey.refine(survey.anchors(0.0), errors=errors)
             assert summary.covariance is not None
             scale_stddevs.append(summary.covariance.relative_scale_stddev)
         assert scale_stddevs[1] > 2.5 * scale_stddevs[0]
@@ -851,7 +837,7 @@ class TestProblem:
         # Without a robust loss, whose square root the problem's residuals would hold.
         _, summary = survey.refine(
             survey.anchors(0.0),
-            correlation_inflation=3.0,
+            errors=known_errors(survey.observations, RANGE_STDDEV_M, inflation=3.0),
             options=RefineOptions(range_loss_scale=1e9),
         )
         placed = survey.observations.has_place
@@ -871,8 +857,7 @@ class TestProblem:
             survey.observations,
             survey.metric_from_sfm,
             TAG_IN_CAM_M,
-            [survey.anchors_m[name] for name in survey.observations.log.anchor_ids],
-            [0.0] * 4,
+            survey.anchors(0.0),
         )
         placed = survey.observations.has_place
         # Up to what interpolation misses.
@@ -883,7 +868,9 @@ class TestProblem:
         radio = Radio(range_stddev_m=RANGE_STDDEV_M)
         survey = make_survey(pixel_stddev=2.0, radio=radio, num_epochs=5)
         reprojection = [
-            survey.refine(survey.anchors(0.0), correlation_inflation=inflation)[1].reprojection_rms_px
+            survey.refine(
+                survey.anchors(0.0), errors=known_errors(survey.observations, RANGE_STDDEV_M, inflation=inflation)
+            )[1].reprojection_rms_px
             for inflation in (1.0, 10.0)
         ]
         assert reprojection[1] < reprojection[0]

@@ -73,7 +73,7 @@ def write_result(
     _write_scale_tables(folder, rows)
     summary = _summary(rows, anchor_ids, is_refined, has_reference)
     if has_photos:
-        summary["settings"]["images_path"] = str(_write_photos(folder / "photos", num_keyframes))
+        summary["settings"]["images"]["path"] = str(_write_photos(folder / "photos", num_keyframes))
     (folder / "result.json").write_text(json.dumps(merged(summary, changes or {})))
     return folder
 
@@ -275,7 +275,7 @@ def _summary(
         "settings": {
             "images": {"path": "images", "every_nth": 3},
             "anchors": {"path": "anchors.csv", "frame": "site"},
-            "tag_in_cam_m": [-0.0012, -0.09, -0.0663],
+            "tag": {"tag_in_cam_m": [-0.0012, -0.09, -0.0663]},
             "refine": {"enabled": is_refined, "max_num_iterations": 200, "range_loss_scale": 3.46},
         },
         "seconds": {"features": 31.2, "matching": 18.4, "mapping": 64.0, "scale": 3.1, "refine": 12.3, "output": 1.2},

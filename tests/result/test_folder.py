@@ -101,7 +101,7 @@ def test_every_file_of_a_result_stands_in_the_table_of_the_readme() -> None:
 
 def test_anchors_and_lever_arms_are_arrays(tmp_path: Path) -> None:
     anchors = {"A1": anchor_entry([1.0, 2.0, 3.0]), "A2": anchor_entry(None)}
-    settings = {"lever_arms_m": {"left": [0.5, 0.0, 0.0]}}
+    settings = {"tag": {"lever_arms_m": {"left": [0.5, 0.0, 0.0]}}}
     result = read_result_folder(write_document(tmp_path, anchors=anchors, settings=settings))
     assert {id_: at.tolist() for id_, at in result.anchor_positions_m.items()} == {"A1": [1.0, 2.0, 3.0]}
     assert result.lever_arms_m(["left", "other"]).tolist() == [[0.5, 0.0, 0.0], [0.0, 0.0, 0.1]]

@@ -42,7 +42,7 @@ def test_a_run_leaves_what_the_schema_says(photo_run: PhotoRun) -> None:
                 "A2": anchor_entry(None),
             }
         },
-        {"settings": {"seed": 0, "mapper": {"matching": "auto"}, "images_path": "caf\udce9"}},
+        {"settings": {"output": {"seed": 0}, "mapper": {"matching": "auto"}, "images": {"path": "caf\udce9"}}},
         {"time_offset": {"value_s": None, "stddev_s": None}},
     ],
 )
@@ -81,8 +81,8 @@ def test_a_key_of_a_later_version_is_passed_over(tmp_path: Path) -> None:
         ({"warnings": [3]}, "'warnings.0' is 3, expected text"),
         ({"warnings": [[1234567] * 9]}, f"'warnings.0' is [{6 * '1234567, '}12345..., expected text"),
         (
-            {"settings": {"lever_arms_m": {"T": [1, 2, 3, 4]}}},
-            "'settings.lever_arms_m.T' is [1, 2, 3, 4], expected 3 items",
+            {"settings": {"tag": {"lever_arms_m": {"T": [1, 2, 3, 4]}}}},
+            "'settings.tag.lever_arms_m.T' is [1, 2, 3, 4], expected 3 items",
         ),
     ],
 )
@@ -104,11 +104,11 @@ def test_similarity_is_that_of_its_keys() -> None:
 
 
 def test_lines_for_people_tell_what_is_known() -> None:
-    sensitive = {"sensitivity": {"short_range_per_cm": -0.6, "common_bias_per_cm": 0.5}, "interval_95": [1.4, None]}
+    sensitive = {"sensitivity": {"short_range_per_cm": -0.6, "common_bias_per_cm": 0.5}, "interval_95": None}
     document = result_document(scale=sensitive, refine=REFINE, ranges={"num": 9, "num_used": 7, "rms_m": 0.0512})
     lines = list(ResultSummary.model_validate(document).lines(Path("out"), "a  b\nc  d"))
     assert lines == [
-        "scale: 1.5 m per SfM unit, 95 % interval 1.4 to unknown",
+        "scale: 1.5 m per SfM unit, 95 % interval unknown to unknown",
         "verdict: good: the scale is known to 2 % (95 % interval)",
         "the scale is sensitive: -0.60 % per cm of bias in short ranges",
         "refined: 1.501 m per SfM unit after 23 iterations",

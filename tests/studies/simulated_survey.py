@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import pycolmap
+from tests.known_errors import known_errors
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import lap_path, loop_path
 from tests.simulated.ranges import simulate_ranges_at
@@ -230,8 +231,11 @@ def run_stages(
     estimate: ScaleEstimate = initialize_scale(
         observations, trajectory, anchors, anchor_frame=survey.anchor_frame, range_model=RANGE_MODEL
     )
-    is_estimated = range_stddev_m is None
-    num = len(log)
+    errors = estimate.errors
+    if range_stddev_m is not None:
+        errors = known_errors(
+            estimate.observations, range_stddev_m, common_bias_stddev_m=RANGE_MODEL.common_bias_stddev_m
+        )
     scaled = rescale(sfm, estimate.metric_from_sfm)
     refined, summary = refine_with_ranges(
         scaled,
@@ -239,12 +243,8 @@ def run_stages(
         estimate.observations,
         estimate.metric_from_sfm,
         estimate.anchors,
+        errors,
         tag_in_cam_m=TAG_IN_CAM_M,
-        range_stddev_m=estimate.range_stddev_m if range_stddev_m is None else np.full(num, range_stddev_m),
-        range_share=estimate.range_share if is_estimated else None,
-        stddev_is_estimated=np.full(num, is_estimated),
-        correlation_inflation=estimate.correlation_inflation if is_estimated else 1.0,
-        common_bias_stddev_m=RANGE_MODEL.common_bias_stddev_m,
         first_pose_is_fixed=survey.is_in_first_camera,
         camera=CameraOptions(refine_intrinsics=False),
         num_threads=1,

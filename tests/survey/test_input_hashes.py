@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
+from rangesfm.options import AnchorOptions, ImageOptions, RangesOptions, ReportOptions, ScaleAndTapeOptions
 from rangesfm.survey.input_hashes import input_hashes
-from rangesfm.survey.settings import RangesConfig, Survey
+from rangesfm.survey.settings import Survey
 
 
 def photos(folder: Path, **sizes: int) -> Path:
@@ -23,7 +24,7 @@ def test_a_folder_of_photos_is_known_by_names_and_sizes(tmp_path: Path) -> None:
         photos(tmp_path / "renamed", a=3, c=5),
         photos(tmp_path / "grown", a=3, b=6),
     ]
-    one, same, renamed, grown = (input_hashes(Survey(images_path=folder))[0] for folder in folders)
+    one, same, renamed, grown = (input_hashes(Survey(images=ImageOptions(path=folder)))[0] for folder in folders)
     assert one["sha256"] == same["sha256"]
     assert len({entry["sha256"] for entry in (one, renamed, grown)}) == 3
     assert one["hashed"] == "names and sizes of 2 files"
@@ -36,16 +37,16 @@ def test_every_file_that_a_survey_names_is_listed(tmp_path: Path) -> None:
         (tmp_path / name).write_text(name)
     ranges, curve, anchors, times, distances, markers, reference = (tmp_path / name for name in names)
     survey = Survey(
-        ranges=RangesConfig(path=ranges, error_curve_path=curve),
-        anchors_path=anchors,
-        image_times_path=times,
-        distances_path=distances,
-        markers_path=markers,
-        reference_path=reference,
+        ranges=RangesOptions(path=ranges, error_curve=curve),
+        anchors=AnchorOptions(path=anchors),
+        images=ImageOptions(times=times),
+        scale=ScaleAndTapeOptions(distances=distances, markers=markers),
+        report=ReportOptions(reference=reference),
     )
     listed = {entry["path"]: entry["sha256"] for entry in input_hashes(survey)}
     assert listed == {str(tmp_path / name): hashlib.sha256(name.encode()).hexdigest() for name in names}
 
 
 def test_what_is_not_there_is_not_named(tmp_path: Path) -> None:
-    assert input_hashes(Survey(images_path=tmp_path / "gone", anchors_path=tmp_path / "gone.csv")) == []
+    gone = Survey(images=ImageOptions(path=tmp_path / "gone"), anchors=AnchorOptions(path=tmp_path / "gone.csv"))
+    assert input_hashes(gone) == []

@@ -11,8 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rangesfm.errors import InputError
-from rangesfm.options import KeyframeOptions, MapperOptions
+from rangesfm.options import MapperOptions, OutputOptions
 from rangesfm.ranging.twr import DW1000_TICK_S, VACUUM_M_PER_S, StampOptions
+from rangesfm.survey.inputs import stamp_options
 from rangesfm.survey.settings import Survey, read_survey, survey_from_tables
 
 WHOLE = """
@@ -81,9 +82,9 @@ def refusal(path: Path, overrides: dict[str, object] | None = None) -> InputErro
 
 def test_whole_survey_is_read(folder: Path) -> None:
     survey = read_survey(write(folder, WHOLE))
-    assert survey.images_path == folder / "images"
-    assert survey.image_times_path == folder / "images.csv"
-    assert survey.keyframes == KeyframeOptions(every_nth=3)
+    assert survey.images.path == folder / "images"
+    assert survey.images.times == folder / "images.csv"
+    assert survey.images.every_nth == 3
     assert survey.camera.model == "OPENCV"
     assert survey.camera.params is not None
     assert survey.camera.params[:3] == (377.25, 431.78, 308.0)
@@ -91,15 +92,19 @@ def test_whole_survey_is_read(folder: Path) -> None:
     assert survey.ranges.time_offset_s is None
     assert survey.ranges.columns == {"timestamp": "t", "anchor_id": "node", "range": "d"}
     assert survey.ranges.range_unit == "cm"
-    assert survey.ranges.association.max_interpolation_gap_s == 1.0
-    assert survey.ranges.model.range_stddev_m == 0.1
-    assert (survey.anchors_path, survey.anchor_frame) == (folder / "anchors.csv", "site")
-    assert survey.tag_in_cam_m == (-0.0012, -0.09, -0.0663)
+    assert survey.ranges.max_interpolation_gap_s == 1.0
+    assert survey.ranges.range_stddev_m == 0.1
+    assert (survey.anchors.path, survey.anchors.frame) == (folder / "anchors.csv", "site")
+    assert survey.tag.tag_in_cam_m == (-0.0012, -0.09, -0.0663)
     assert survey.scale.method == "two-candidate"
     assert not survey.refine.enabled
     assert survey.refine.bundle_adjustment == {"refine_extra_params": False}
-    assert (survey.export.formats, survey.report_enabled) == (("tum",), False)
-    assert (survey.reference_path, survey.output_path, survey.seed) == (folder / "truth.csv", folder / "result", 7)
+    assert (survey.export.formats, survey.report.enabled) == (("tum",), False)
+    assert (survey.report.reference, survey.output.path, survey.output.seed) == (
+        folder / "truth.csv",
+        folder / "result",
+        7,
+    )
 
 
 def test_mapper_keys_that_are_not_ours_are_the_pipelines(folder: Path) -> None:
@@ -131,13 +136,13 @@ def test_a_word_on_gravity_or_side_that_says_nothing_is_refused(folder: Path, li
 
 
 def test_empty_survey_has_the_defaults(folder: Path) -> None:
-    assert read_survey(write(folder, "")) == Survey(output_path=folder / "out")
+    assert read_survey(write(folder, "")) == Survey(output=OutputOptions(path=folder / "out"))
 
 
 def test_relative_path_of_the_survey_still_gives_absolute_paths(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write(folder, '[images]\npath = "photos"')
     monkeypatch.chdir(folder)
-    assert read_survey("survey.toml").images_path == folder / "photos"
+    assert read_survey("survey.toml").images.path == folder / "photos"
 
 
 @pytest.mark.parametrize(("given", "seconds"), [('"auto"', None), ("-3600.37", -3600.37), ("12", 12.0)])
@@ -147,15 +152,15 @@ def test_time_offset_is_auto_or_seconds(folder: Path, given: str, seconds: float
 
 def test_several_tags_have_a_lever_arm_each(folder: Path) -> None:
     survey = read_survey(write(folder, "[tag.lever_arms_m]\n7 = [1, 2, 3]\nB2 = [0.1, 0, 0]\n"))
-    assert survey.lever_arms_m == {"7": (1.0, 2.0, 3.0), "B2": (0.1, 0.0, 0.0)}
+    assert survey.tag.lever_arms_m == {"7": (1.0, 2.0, 3.0), "B2": (0.1, 0.0, 0.0)}
 
 
 def test_lever_arms_given_by_flag_take_the_place_of_those_in_the_file(folder: Path) -> None:
     one, several = "[tag]\ntag_in_cam_m = [1, 2, 3]\n", "[tag.lever_arms_m]\n7 = [1, 2, 3]\n"
     survey = read_survey(write(folder, one), {"tag.lever_arms_m": {"8": [0, 0, 1]}})
-    assert (survey.tag_in_cam_m, survey.lever_arms_m) == ((0.0, 0.0, 0.0), {"8": (0.0, 0.0, 1.0)})
+    assert (survey.tag.tag_in_cam_m, survey.tag.lever_arms_m) == ((0.0, 0.0, 0.0), {"8": (0.0, 0.0, 1.0)})
     survey = read_survey(write(folder, several), {"tag.tag_in_cam_m": [0, 0, 1]})
-    assert (survey.tag_in_cam_m, survey.lever_arms_m) == ((0.0, 0.0, 1.0), {})
+    assert (survey.tag.tag_in_cam_m, survey.tag.lever_arms_m) == ((0.0, 0.0, 1.0), {})
 
 
 def test_time_stamps_are_described_in_the_survey(folder: Path) -> None:
@@ -166,10 +171,10 @@ def test_time_stamps_are_described_in_the_survey(folder: Path) -> None:
             "ranging_interval_s = 0.1\n",
         )
     ).ranges
-    assert ranges.stamps == StampOptions(DW1000_TICK_S, 2**40 * DW1000_TICK_S, VACUUM_M_PER_S, 1e-8)
+    assert stamp_options(ranges) == StampOptions(DW1000_TICK_S, 2**40 * DW1000_TICK_S, VACUUM_M_PER_S, 1e-8)
     assert ranges.ranging_interval_s == 0.1
-    assert read_survey(write(folder, "")).ranges.stamps == StampOptions()
-    speed = read_survey(write(folder, "[ranges]\npropagation_speed = 299.7e6\n")).ranges.stamps
+    assert stamp_options(read_survey(write(folder, "")).ranges) == StampOptions()
+    speed = stamp_options(read_survey(write(folder, "[ranges]\npropagation_speed = 299.7e6\n")).ranges)
     assert speed.propagation_speed_m_per_s == 299.7e6
 
 
@@ -183,22 +188,22 @@ def test_overrides_replace_keys_and_their_paths_are_relative_to_the_working_dire
     overrides = {"ranges.path": "other.csv", "output.path": Path("o"), "scale.method": "robust", "tag.tag_id": "t"}
     survey = read_survey(write(folder, WHOLE), overrides)
     assert survey.ranges.path == elsewhere / "other.csv"
-    assert survey.output_path == elsewhere / "o"
-    assert (survey.scale.method, survey.tag_id) == ("robust", "t")
-    assert survey.anchors_path == folder / "anchors.csv"
+    assert survey.output.path == elsewhere / "o"
+    assert (survey.scale.method, survey.tag.tag_id) == ("robust", "t")
+    assert survey.anchors.path == folder / "anchors.csv"
 
 
 def test_survey_can_be_made_from_tables(folder: Path) -> None:
     survey = survey_from_tables({"images": {"path": "images"}, "camera": {"params": (1, 2)}}, folder)
-    assert survey.images_path == folder / "images"
+    assert survey.images.path == folder / "images"
     assert survey.camera.params == (1.0, 2.0)
 
 
 def test_settings_are_plain_json(folder: Path) -> None:
     settings_of_run = read_survey(write(folder, WHOLE)).to_dict()
     assert json.loads(json.dumps(settings_of_run)) == settings_of_run
-    assert settings_of_run["images_path"] == str(folder / "images")
-    assert settings_of_run["ranges"]["model"]["range_stddev_m"] == 0.1
+    assert settings_of_run["images"]["path"] == str(folder / "images")
+    assert settings_of_run["ranges"]["range_stddev_m"] == 0.1
 
 
 @pytest.mark.parametrize(
@@ -208,16 +213,17 @@ def test_settings_are_plain_json(folder: Path) -> None:
         ("\n[imges]\n", 2, "unknown table [imges]; the nearest known one is 'images'"),
         ("images = 3", 1, "images is 3, expected a table [images]"),
         ("[images]\nevery_nth = '3'", 2, "[images] every_nth is '3', expected a whole number"),
-        ("[images]\n\nevery_nth = 0", 3, "every_nth is 0, expected 1 or more"),
+        ("[images]\n\nevery_nth = 0", 3, "every_nth is 0, expected a whole number from 1 to 1000000"),
         ("[images]\nevery_nth = true", 2, "expected a whole number"),
         ("[images]\nevery_nth = 1.5", 2, "expected a whole number"),
         ("[images]\npath = ''", 2, "expected a path"),
         ("[camera]\nparams = [1, 'x']", 2, "expected a list of numbers"),
         ("[camera]\nrefine_intrinsics = 1", 2, "expected true or false"),
         ("[ranges]\ntime_offset = 'later'", 2, "time_offset is 'later', expected \"auto\" or seconds"),
-        ("[ranges]\nrange_stddev_m = nan", 2, "expected a finite number"),
-        ("[ranges]\nrange_stddev_m = 0", 2, "expected more than 0"),
-        ("[ranges.columns]\nrange = 3", 1, "expected a table in which each value is text"),
+        ("[ranges]\nrange_stddev_m = nan", 2, "range_stddev_m is nan, expected a number of metres from 1e-06 to 1000"),
+        ("[ranges]\nrange_stddev_m = 0", 2, "expected a number of metres from 1e-06 to 1000"),
+        ("[ranges.columns]\nrange = 3", 2, "[ranges] columns.range is 3, expected text"),
+        ("[ranges]\ncolumns = 3", 2, "[ranges] columns is 3, expected a table in which each value is text"),
         ("[anchors]\nframe = 'sight'", 2, "expected one of site, first_camera, unknown"),
         ("[tag]\ntag_in_cam_m = [1, 2]", 2, "expected a list of 3 numbers"),
         (
@@ -225,20 +231,20 @@ def test_settings_are_plain_json(folder: Path) -> None:
             2,
             "either one lever arm or one by tag id",
         ),
-        ("[tag]\nlever_arms_m = { a = [1, 2] }", 2, "a table in which each value is a list of 3 numbers"),
-        ("[tag.lever_arms_m]\na = 1", 1, "a table in which each value is a list of 3 numbers"),
-        ("[ranges]\nstamp_bits = 33", 2, "expected 32 or 40"),
+        ("[tag]\nlever_arms_m = { a = [1, 2] }", 2, "[tag] lever_arms_m.a is [1, 2], expected a list of 3 numbers"),
+        ("[tag.lever_arms_m]\na = 1", 2, "[tag] lever_arms_m.a is 1, expected a list of 3 numbers"),
+        ("[ranges]\nstamp_bits = 33", 2, "expected one of 32, 40"),
         ("[ranges]\nstamp_unit = 'hours'", 2, "expected one of ns, us, ms, s, ticks"),
         ("[ranges]\npropagation_speed = 'sound'", 2, "expected air, vacuum or a speed of light in m/s"),
         ("[ranges]\npropagation_speed = 340", 2, "expected air, vacuum or a speed of light in m/s"),
-        ("[ranges]\nranging_interval_s = 0", 2, "expected more than 0"),
+        ("[ranges]\nranging_interval_s = 0", 2, "expected a number of seconds from 1e-06 to 1000000"),
         ("[mapper]\nmatchng = 'auto'", 2, "unknown key 'matchng' in [mapper]; the nearest known one is 'matching'"),
         ("[mapper]\nfeatures = 3", 2, "features is 3, expected a table"),
         ("[refine]\nbundle_adjustmnt.x = 1", 2, "nearest known one is 'bundle_adjustment'"),
         ("[refine.bundle_adjustmnt]\nx = 1", 1, "nearest known one is 'bundle_adjustment'"),
         ("[scale]\nmethod = 'guess'", 2, "expected one of robust, two-candidate"),
         ("[export]\nformats = 'tum'", 2, "expected a list of texts"),
-        ("[output]\nseed = -1", 2, "expected 0 or more"),
+        ("[output]\nseed = -1", 2, "expected a whole number from 0 to 2147483647"),
         ("[images]\npath = ", 2, "not a TOML file"),
         ("[images]\npath = 'a'\n[images]\n", 3, "not a TOML file"),
     ],

@@ -54,7 +54,7 @@ def options() -> pycolmap.IncrementalPipelineOptions:
         "extract_colors": False,
         "mapper": {"init_min_num_inliers": 20, "abs_pose_min_num_inliers": 15},
     }
-    camera = CameraOptions("PINHOLE", (750.0, 750.0, 480.0, 320.0))
+    camera = CameraOptions(model="PINHOLE", params=(750.0, 750.0, 480.0, 320.0))
     return pipeline_options(camera, MapperOptions(num_threads=1, pipeline=pipeline), seed=0)
 
 

@@ -16,12 +16,11 @@ import pytest
 from rangesfm.demo.survey import TIME_OFFSET_S
 from rangesfm.geometry.similarity import align_points, rmse
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
-from rangesfm.options import CheckOptions, RefineOptions, ScaleOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.observations import RangeStatus, hold_out
 from rangesfm.survey.inputs import read_ranging_inputs
-from rangesfm.survey.settings import RangesConfig, Survey, read_survey
+from rangesfm.survey.settings import Survey, read_survey
 from rangesfm.vision.image_times import read_image_times_csv
 from rangesfm.workflows.ranges_in_mapping import AdjustmentWithRanges
 from rangesfm.workflows.run import run_survey
@@ -38,13 +37,16 @@ def survey(walked_survey: WalkedSurvey, tmp_path: Path) -> Survey:
     folder = walked_survey.folder
     header, *rows = (folder / "uwb.csv").read_text().splitlines(keepends=True)
     (tmp_path / "uwb.csv").write_text(header + "".join(rows[::3]))
-    return Survey(
-        image_times_path=folder / "images.csv",
-        ranges=RangesConfig(path=tmp_path / "uwb.csv", time_offset_s=2.0),
-        anchors_path=folder / "anchors.csv",
-        tag_in_cam_m=(0.03, -0.12, -0.05),
-        scale=ScaleOptions(num_bootstrap=20),
-        output_path=tmp_path / "out",
+    return Survey().changed(
+        {
+            "images.times": folder / "images.csv",
+            "ranges.path": tmp_path / "uwb.csv",
+            "ranges.time_offset": 2.0,
+            "anchors.path": folder / "anchors.csv",
+            "tag.tag_in_cam_m": (0.03, -0.12, -0.05),
+            "scale.num_bootstrap": 20,
+            "output.path": tmp_path / "out",
+        }
     )
 
 
@@ -69,8 +71,8 @@ def model(mapped_alone: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
 
 
 def adjustment(survey: Survey) -> AdjustmentWithRanges:
-    assert survey.image_times_path is not None
-    times = read_image_times_csv(survey.image_times_path)
+    assert survey.images.times is not None
+    times = read_image_times_csv(survey.images.times)
     return AdjustmentWithRanges(survey, read_ranging_inputs(survey), times.image_names[0], times)
 
 
@@ -106,7 +108,7 @@ def test_a_map_whose_scale_is_open_is_left_to_colmap_as_it_is(
 ) -> None:
     only_first(model, num_keyframes)
     before = centers(model)
-    adjust = adjustment(replace(survey, scale=ScaleOptions(num_bootstrap=20, max_relative_stddev=max_relative_stddev)))
+    adjust = adjustment(survey.changed({"scale.max_relative_stddev": max_relative_stddev}))
     assert not adjust.adjust(model)
     assert np.array_equal(centers(model), before)
     assert adjust.note() == "ranges took part in 0 of 1 global adjustments of the map while it grew"
@@ -117,10 +119,10 @@ def test_anchors_in_the_first_camera_serve_as_unknown_ones_until_it_is_there(
 ) -> None:
     """Positions that refer to a photo which is not in the map yet would bend it to something else."""
     drift_m = distortion_m(model, walked_survey)
-    anchors = replace(survey, anchors_path=walked_survey.folder / "anchors_first_camera.csv")
-    anchors = replace(anchors, anchor_frame="first_camera")
-    assert anchors.image_times_path is not None
-    times = read_image_times_csv(anchors.image_times_path)
+    path = walked_survey.folder / "anchors_first_camera.csv"
+    anchors = survey.changed({"anchors.path": path, "anchors.frame": "first_camera"})
+    assert anchors.images.times is not None
+    times = read_image_times_csv(anchors.images.times)
     adjust = AdjustmentWithRanges(anchors, read_ranging_inputs(anchors), "another.jpg", times)
     assert adjust.adjust(model)
     assert distortion_m(model, walked_survey) < 0.5 * drift_m
@@ -129,12 +131,14 @@ def test_anchors_in_the_first_camera_serve_as_unknown_ones_until_it_is_there(
 def test_ranges_held_out_of_the_result_have_no_say_while_the_map_is_a_part_of_it(
     survey: Survey, model: pycolmap.Reconstruction
 ) -> None:
-    survey = replace(survey, ranges=replace(survey.ranges, checks=CheckOptions(check_share=0.2)))
+    survey = survey.changed({"ranges.check_share": 0.2})
     adjust = adjustment(survey)
-    assert survey.image_times_path is not None
-    whole = trajectory_from_reconstruction(model, read_image_times_csv(survey.image_times_path).by_name())
+    assert survey.images.times is not None
+    whole = trajectory_from_reconstruction(model, read_image_times_csv(survey.images.times).by_name())
     log = read_ranging_inputs(survey).log
-    placed = hold_out(associate(log, whole, survey.tag_in_cam_m, time_offset_s=2.0), survey.ranges.checks, survey.seed)
+    placed = hold_out(
+        associate(log, whole, survey.tag.tag_in_cam_m, time_offset_s=2.0), survey.ranges, survey.output.seed
+    )
     is_check = placed.status == RangeStatus.CHECK
     assert np.mean(is_check) == pytest.approx(0.2, abs=0.03)
     only_first(model, 30)
@@ -148,20 +152,19 @@ def test_ranges_held_out_of_the_result_have_no_say_while_the_map_is_a_part_of_it
 
 def test_the_clocks_offset_is_found_on_the_way(survey: Survey, walked_survey: WalkedSurvey) -> None:
     model = pycolmap.Reconstruction(walked_survey.folder / "sparse" / "0")
-    ranges = replace(survey.ranges, path=walked_survey.folder / "uwb.csv", time_offset_s=None)
-    adjust = adjustment(replace(survey, ranges=ranges))
+    adjust = adjustment(survey.changed({"ranges.path": walked_survey.folder / "uwb.csv", "ranges.time_offset": "auto"}))
     assert adjust.adjust(model)
     assert distortion_m(model, walked_survey) < 0.02
 
 
 def test_inputs_change_with_what_the_map_will_depend_on(survey: Survey, tmp_path: Path) -> None:
     inputs = adjustment(survey).inputs
-    assert adjustment(replace(survey, output_path=Path("elsewhere"))).inputs == inputs
+    assert adjustment(survey.changed({"output.path": Path("elsewhere")})).inputs == inputs
     moved = Path(shutil.copy(tmp_path / "uwb.csv", tmp_path / "moved.csv"))
-    assert adjustment(replace(survey, ranges=replace(survey.ranges, path=moved))).inputs == inputs
+    assert adjustment(survey.changed({"ranges.path": moved})).inputs == inputs
     moved.write_text(moved.read_text().rstrip("\n").rpartition("\n")[0] + "\n")
-    assert adjustment(replace(survey, ranges=replace(survey.ranges, path=moved))).inputs != inputs
-    assert adjustment(replace(survey, refine=RefineOptions(range_loss_scale=9.0))).inputs != inputs
+    assert adjustment(survey.changed({"ranges.path": moved})).inputs != inputs
+    assert adjustment(survey.changed({"refine.range_loss_scale": 9.0})).inputs != inputs
 
 
 def test_a_run_maps_with_ranges_where_it_is_asked_to(photo_run: PhotoRun, tmp_path: Path) -> None:

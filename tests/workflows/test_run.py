@@ -6,7 +6,6 @@ import csv
 import hashlib
 import time
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,12 +19,11 @@ from tests.simulated.path import loop_path
 from rangesfm.colmap.model_files import read_model
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
-from rangesfm.options import CheckOptions, ExportOptions, RefineOptions, ScaleOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.readers import read_ranges
 from rangesfm.result.summary import ResultSummary
 from rangesfm.result.tables import ScaleBootstrap, ScaleCandidates, ScaleConsensus
-from rangesfm.survey.settings import RangesConfig, Survey
+from rangesfm.survey.settings import KEYS, Survey
 from rangesfm.workflows.export_result import export_result
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.run import refine_model, scale_model
@@ -50,14 +48,16 @@ class Listener(SilentProgress):
 def survey(walked_survey: WalkedSurvey, tmp_path: Path) -> Survey:
     """The walked survey with anchors in the site frame, the clocks' offset known."""
     folder = walked_survey.folder
-    return Survey(
-        model_path=folder / "sparse" / "0",
-        image_times_path=folder / "images.csv",
-        ranges=RangesConfig(path=folder / "uwb.csv", time_offset_s=2.0),
-        anchors_path=folder / "anchors.csv",
-        tag_in_cam_m=(0.03, -0.12, -0.05),
-        scale=ScaleOptions(num_bootstrap=20),
-        output_path=tmp_path / "out",
+    return Survey(model_path=folder / "sparse" / "0").changed(
+        {
+            "images.times": folder / "images.csv",
+            "ranges.path": folder / "uwb.csv",
+            "ranges.time_offset": 2.0,
+            "anchors.path": folder / "anchors.csv",
+            "tag.tag_in_cam_m": (0.03, -0.12, -0.05),
+            "scale.num_bootstrap": 20,
+            "output.path": tmp_path / "out",
+        }
     )
 
 
@@ -69,20 +69,20 @@ def test_result_and_summary_are_returned_as_written(survey: Survey) -> None:
     listener = Listener()
     done = refine_model(survey, progress=listener)
     assert listener.stages == ["scale", "refinement", "results"]
-    assert done.output_path == survey.output_path
-    written = ResultSummary.read(survey.output_path / "result.json")
+    assert done.output_path == survey.output.path
+    written = ResultSummary.read(survey.output.path / "result.json")
     assert written == done.summary
     assert done.summary_lines()[0].startswith(f"scale: {done.summary.scale.value:.6g} m per SfM unit")
     assert "comparison" not in written.to_json()
 
 
 def test_a_run_in_the_same_folder_leaves_nothing_of_the_one_before(survey: Survey, walked_survey: WalkedSurvey) -> None:
-    first = replace(survey, reference_path=walked_survey.folder / "reference.csv")
+    first = survey.changed({"report.reference": walked_survey.folder / "reference.csv"})
     refine_model(first, progress=SilentProgress())
-    assert {"sparse_metric", "reference.csv", "report.html"} <= files_of(survey.output_path)
-    second = replace(survey, export=ExportOptions(formats=()), report_enabled=False)
+    assert {"sparse_metric", "reference.csv", "report.html"} <= files_of(survey.output.path)
+    second = survey.changed({"export.formats": (), "report.enabled": False})
     scale_model(second, progress=SilentProgress())
-    left = files_of(survey.output_path) - {"trajectory.tum", "points.ply"}  # exported by request, not part of a result
+    left = files_of(survey.output.path) - {"trajectory.tum", "points.ply"}  # exported by request, not part of a result
     scale_tables = {"scale_candidates.csv", "scale_consensus.csv", "scale_bootstrap.csv"}
     assert left == {"sparse_scaled", "result.json", "ranges.csv", "images.csv", *scale_tables}
 
@@ -90,7 +90,7 @@ def test_a_run_in_the_same_folder_leaves_nothing_of_the_one_before(survey: Surve
 def test_tables_beside_the_result_tell_how_the_scale_came_about(survey: Survey) -> None:
     scale = scale_model(survey, progress=SilentProgress()).summary.scale
     candidates, consensus, bootstrap = (
-        kind.read(survey.output_path) for kind in (ScaleCandidates, ScaleConsensus, ScaleBootstrap)
+        kind.read(survey.output.path) for kind in (ScaleCandidates, ScaleConsensus, ScaleBootstrap)
     )
     for values, paper in zip(
         (candidates.alpha0, candidates.alpha1), (scale.two_candidate.alpha0, scale.two_candidate.alpha1)
@@ -115,17 +115,16 @@ def test_the_result_names_its_inputs_by_their_hashes(survey: Survey) -> None:
 
 def test_refused_run_leaves_the_result_before_it(survey: Survey) -> None:
     scale_model(survey, progress=SilentProgress())
-    before = {path: path.stat().st_mtime_ns for path in survey.output_path.rglob("*")}
-    strict = replace(survey, scale=ScaleOptions(num_bootstrap=20, max_relative_stddev=1e-6))
+    before = {path: path.stat().st_mtime_ns for path in survey.output.path.rglob("*")}
+    strict = survey.changed({"scale.max_relative_stddev": 1e-6})
     with pytest.raises(GeometryError, match="the scale is only known to"):
         refine_model(strict, progress=SilentProgress())
-    assert {path: path.stat().st_mtime_ns for path in survey.output_path.rglob("*")} == before
+    assert {path: path.stat().st_mtime_ns for path in survey.output.path.rglob("*")} == before
 
 
 def test_ranges_held_out_check_the_result(survey: Survey) -> None:
-    ranges = replace(survey.ranges, checks=CheckOptions(check_share=0.25))
-    result = refine_model(replace(survey, ranges=ranges), progress=SilentProgress()).summary
-    with (survey.output_path / "ranges.csv").open(newline="") as file:
+    result = refine_model(survey.changed({"ranges.check_share": 0.25}), progress=SilentProgress()).summary
+    with (survey.output.path / "ranges.csv").open(newline="") as file:
         statuses = Counter(row["status"] for row in csv.DictReader(file))
     num_on_path = sum(statuses[name] for name in ("used", "down-weighted", "outlier", "check"))
     assert result.check_ranges.num == statuses["check"]
@@ -138,10 +137,9 @@ def test_an_anchor_and_a_stretch_of_time_can_be_held_out(survey: Survey) -> None
     log = read_ranges(survey.ranges.path or "")
     assert log.timestamp_s is not None
     anchor_id, times = log.anchor_ids[0], tuple(np.quantile(log.timestamp_s, [0.4, 0.5]).tolist())
-    checks = CheckOptions(check_anchors=(anchor_id,), check_times_s=times)
-    ranges = replace(survey.ranges, checks=checks)
-    result = refine_model(replace(survey, ranges=ranges), progress=SilentProgress()).summary
-    with (survey.output_path / "ranges.csv").open(newline="") as file:
+    checked = survey.changed({"ranges.check_anchors": (anchor_id,), "ranges.check_times_s": times})
+    result = refine_model(checked, progress=SilentProgress()).summary
+    with (survey.output.path / "ranges.csv").open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["predicted_refined_m"]]
     held_out = {True: Counter[bool](), False: Counter[bool]()}
     for row in rows:
@@ -156,18 +154,18 @@ def test_an_anchor_and_a_stretch_of_time_can_be_held_out(survey: Survey) -> None
 @pytest.mark.parametrize(
     ("checks", "frame", "said"),
     [
-        (CheckOptions(check_anchors=("nobody",)), "site", "the position of anchor 'nobody' is not known, .*"),
-        (CheckOptions(check_anchors=("A1",)), "unknown", "the position of anchor 'A1' is not known, .* none"),
-        (CheckOptions(check_times_s=(-20.0, -10.0)), "site", "no range from -20 to -10 s, expected within .*"),
+        ({"check_anchors": ("nobody",)}, "site", "the position of anchor 'nobody' is not known, .*"),
+        ({"check_anchors": ("A1",)}, "unknown", "the position of anchor 'A1' is not known, .* none"),
+        ({"check_times_s": (-20.0, -10.0)}, "site", "no range from -20 to -10 s, expected within .*"),
         (
-            CheckOptions(check_times_s=(1778768400.5, 1778768401.0)),
+            {"check_times_s": (1778768400.5, 1778768401.0)},
             "site",
             "no range from 1778768400.5 to 1778768401 s",
         ),
     ],
 )
-def test_what_cannot_be_held_out_is_refused(checks: CheckOptions, frame: str, said: str, survey: Survey) -> None:
-    wrong = replace(survey, ranges=replace(survey.ranges, checks=checks), anchor_frame=frame)
+def test_what_cannot_be_held_out_is_refused(checks: dict[str, object], frame: str, said: str, survey: Survey) -> None:
+    wrong = survey.changed({"anchors.frame": frame, **{f"ranges.{key}": value for key, value in checks.items()}})
     with pytest.raises(InputError, match=said):
         scale_model(wrong, progress=SilentProgress())
 
@@ -201,18 +199,19 @@ class TestSeveralTags:
         (tmp_path / "uwb.csv").write_text("\n".join(rows))
         anchors = [f"{name},{x},{y},{z}" for name, (x, y, z) in ANCHORS_M.items()]
         (tmp_path / "anchors.csv").write_text("\n".join(["anchor_id,x_m,y_m,z_m", *anchors]))
-        return Survey(
-            model_path=tmp_path / "sparse",
-            ranges=RangesConfig(path=tmp_path / "uwb.csv"),
-            anchors_path=tmp_path / "anchors.csv",
-            lever_arms_m=LEVER_ARMS_M,
-            scale=ScaleOptions(num_bootstrap=5),
-            export=ExportOptions(formats=()),
-            output_path=tmp_path / "out",
+        return Survey(model_path=tmp_path / "sparse").changed(
+            {
+                "ranges.path": tmp_path / "uwb.csv",
+                "anchors.path": tmp_path / "anchors.csv",
+                "tag.lever_arms_m": LEVER_ARMS_M,
+                "scale.num_bootstrap": 5,
+                "export.formats": (),
+                "output.path": tmp_path / "out",
+            }
         )
 
     def centers(self, survey: Survey, model: str) -> npt.NDArray[np.float64]:
-        return trajectory_from_reconstruction(read_model(survey.output_path / model / "0")).centers
+        return trajectory_from_reconstruction(read_model(survey.output.path / model / "0")).centers
 
     def test_map_is_exact_where_each_has_its_lever_arm(self, survey: Survey, made: SyntheticModel) -> None:
         result = refine_model(survey, progress=SilentProgress()).summary
@@ -224,7 +223,7 @@ class TestSeveralTags:
 
     def test_map_is_wrong_with_the_lever_arms_of_each_other(self, survey: Survey, made: SyntheticModel) -> None:
         left, right = LEVER_ARMS_M.values()
-        swapped = replace(survey, lever_arms_m={"left": right, "right": left})
+        swapped = survey.changed({"tag.lever_arms_m": {"left": right, "right": left}})
         result = scale_model(swapped, progress=SilentProgress()).summary
         assert np.abs(self.centers(survey, "sparse_scaled") - made.centers_m).max() > 0.01
         assert result.ranges.rms_m > 0.05
@@ -232,7 +231,7 @@ class TestSeveralTags:
     def test_ranges_between_two_of_a_kind_are_in_the_results_with_their_status(self, survey: Survey) -> None:
         result = scale_model(survey, progress=SilentProgress()).summary
         assert (result.ranges.num_anchor_anchor, result.ranges.num_tag_tag) == (1, 1)
-        with (survey.output_path / "ranges.csv").open(newline="") as file:
+        with (survey.output.path / "ranges.csv").open(newline="") as file:
             rows = [row for row in csv.DictReader(file) if row["status"] in ("anchor-anchor", "tag-tag")]
         assert [(row["tag_id"], row["anchor_id"], row["range_m"], row["residual_m"]) for row in rows] == [
             ("A2", "A1", "12.0", ""),
@@ -241,37 +240,37 @@ class TestSeveralTags:
 
 
 def test_what_the_refinement_found_beside_the_map_is_in_the_result(survey: Survey) -> None:
-    options = RefineOptions(lever_arm_stddev_m=0.05, time_offset_stddev_s=0.05, short_range_stddev_m=0.1)
-    result = refine_model(replace(survey, refine=options), progress=SilentProgress()).summary
+    stddevs = {"lever_arm_stddev_m": 0.05, "time_offset_stddev_s": 0.05, "short_range_stddev_m": 0.1}
+    freed = survey.changed({f"refine.{key}": stddev for key, stddev in stddevs.items()})
+    result = refine_model(freed, progress=SilentProgress()).summary
     found = result.refine
     (tag_id,) = found.tag_in_cam_m
-    assert 0 < np.linalg.norm(np.subtract(found.tag_in_cam_m[tag_id], survey.tag_in_cam_m)) < 0.15
+    assert 0 < np.linalg.norm(np.subtract(found.tag_in_cam_m[tag_id], survey.tag.tag_in_cam_m)) < 0.15
     assert 0 < abs(found.time_offset_change_s) < 0.15
     assert 0 < abs(found.short_range_error_m) < 0.3
     held = refine_model(survey, progress=SilentProgress()).summary.refine
-    assert list(held.tag_in_cam_m.values()) == [survey.tag_in_cam_m]
+    assert list(held.tag_in_cam_m.values()) == [survey.tag.tag_in_cam_m]
     assert (held.time_offset_change_s, held.short_range_error_m) == (None, None)
 
 
 def test_covariances_of_the_centres_are_in_the_result_unless_unwanted(survey: Survey) -> None:
-    export = ExportOptions(formats=("tum_covariance",))
-    result = refine_model(replace(survey, export=export), progress=SilentProgress()).summary
-    path = survey.output_path / "pose_covariance.csv"
-    written = np.loadtxt(survey.output_path / "trajectory_covariance.tum")
+    survey = survey.changed({"export.formats": ("tum_covariance",)})
+    result = refine_model(survey, progress=SilentProgress()).summary
+    path = survey.output.path / "pose_covariance.csv"
+    written = np.loadtxt(survey.output.path / "trajectory_covariance.tum")
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
-    model = pycolmap.Reconstruction(survey.output_path / "sparse_metric" / "0")
+    model = pycolmap.Reconstruction(survey.output.path / "sparse_metric" / "0")
     assert {row["image_name"] for row in rows} == {image.name for image in model.images.values()}
     for row in rows:
         xx, xy, xz, yy, yz, zz = (float(row[f"cov_{axes}_m2"]) for axes in ("xx", "xy", "xz", "yy", "yz", "zz"))
         stddevs = np.sqrt(np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
         assert 1e-5 < stddevs.min() < stddevs.max() < 1.0
         assert np.isclose(written[:, 8:], [xx, xy, xz, yy, yz, zz], rtol=1e-6).all(axis=1).any()
-    (exported,) = export_result(survey.output_path, ["tum_covariance"], survey.output_path / "again")
+    (exported,) = export_result(survey.output.path, ["tum_covariance"], survey.output.path / "again")
     np.testing.assert_allclose(np.loadtxt(exported), written, rtol=1e-6)
     assert 0 < result.refine.relative_scale_stddev < 0.1
-    unwanted = replace(survey, export=export, refine=RefineOptions(covariance=False))
-    without = refine_model(unwanted, progress=SilentProgress()).summary
+    without = refine_model(survey.changed({"refine.covariance": False}), progress=SilentProgress()).summary
     assert "without covariances of the poses there is no tum_covariance" in without.warnings
     assert without.refine.relative_scale_stddev is None
     assert not path.exists()
@@ -279,20 +278,20 @@ def test_covariances_of_the_centres_are_in_the_result_unless_unwanted(survey: Su
 
 def test_a_site_in_national_coordinates_loses_nothing(survey: Survey, tmp_path: Path) -> None:
     far = np.array([2_600_000.0, 1_200_000.0, 400.0])
-    header, *rows = (survey.anchors_path or Path()).read_text().splitlines()
+    header, *rows = (survey.anchors.path or Path()).read_text().splitlines()
     lines = []
     for row in rows:
         name, *numbers = row.split(",")
         lines.append(",".join([name, *(repr(float(n) + float(o)) for n, o in zip(numbers, far, strict=True))]))
     (tmp_path / "far.csv").write_text("\n".join([header, *lines]) + "\n")
     near = refine_model(survey, progress=SilentProgress()).summary
-    moved = replace(survey, anchors_path=tmp_path / "far.csv", output_path=tmp_path / "far")
+    moved = survey.changed({"anchors.path": tmp_path / "far.csv", "output.path": tmp_path / "far"})
     away = refine_model(moved, progress=SilentProgress()).summary
     assert away.scale.value == pytest.approx(near.scale.value, rel=1e-9)
     assert away.refine.scale_value == pytest.approx(near.refine.scale_value, rel=1e-7)
     for anchor_id, anchor in near.anchors.items():
         np.testing.assert_allclose(np.subtract(away.anchors[anchor_id].position_m, far), anchor.position_m, atol=1e-6)
-    paths = (survey.output_path, tmp_path / "far")
+    paths = (survey.output.path, tmp_path / "far")
     models = [pycolmap.Reconstruction(path / "sparse_metric" / "0") for path in paths]
     for image_id, image in models[0].images.items():
         apart = models[1].image(image_id).projection_center() - far - image.projection_center()
@@ -301,12 +300,12 @@ def test_a_site_in_national_coordinates_loses_nothing(survey: Survey, tmp_path: 
 
 def test_two_surveyed_anchors_stay_as_far_apart_as_they_were_surveyed(survey: Survey, tmp_path: Path) -> None:
     """They fix no frame, but a length, here one that the ranges contradict by 2 %: the refinement keeps to it."""
-    header, *rows = (survey.anchors_path or Path()).read_text().splitlines()
+    header, *rows = (survey.anchors.path or Path()).read_text().splitlines()
     names = [row.split(",")[0] for row in rows]
     places = 1.02 * np.array([row.split(",")[1:] for row in rows[:2]], dtype=np.float64)
     known = [",".join([name, *map(repr, place.tolist())]) for name, place in zip(names[:2], places, strict=True)]
     (tmp_path / "two.csv").write_text("\n".join([header, *known, *(f"{name},,," for name in names[2:])]) + "\n")
-    two = replace(survey, anchors_path=tmp_path / "two.csv", anchor_frame="site")
+    two = survey.changed({"anchors.path": tmp_path / "two.csv", "anchors.frame": "site"})
     result = refine_model(two, progress=SilentProgress()).summary
     assert result.frame == "first_camera"
     first, second = (np.array(result.anchors[name].position_m) for name in names[:2])
@@ -315,8 +314,7 @@ def test_two_surveyed_anchors_stay_as_far_apart_as_they_were_surveyed(survey: Su
 
 def test_doubts_are_warnings_in_the_result_and_for_the_user(survey: Survey) -> None:
     listener = Listener()
-    method = ScaleOptions(method="two-candidate", num_bootstrap=20)
-    result = scale_model(replace(survey, scale=method), progress=listener).summary
+    result = scale_model(survey.changed({"scale.method": "two-candidate"}), progress=listener).summary
     assert result.scale.method == "two-candidate"
     assert result.scale.verdict == "doubtful"
     assert list(result.warnings) == listener.messages != []
@@ -335,3 +333,15 @@ def test_journal_times_stages_and_all_of_it() -> None:
     seconds = journal.all_seconds()
     assert seconds.keys() == {"scale", "quick", "total"}
     assert 0.01 <= seconds["scale"] <= seconds["total"]
+
+
+@pytest.mark.parametrize("key", [item.dotted for item in KEYS if item.role == "file"])
+def test_no_file_that_a_survey_reads_is_overwritten(key: str, survey: Survey) -> None:
+    path = survey.output.path / "ranges.csv"
+    path.parent.mkdir()
+    path.write_text("an input\n")
+    taped = {"scale.distances": survey.ranges.path} if key == "scale.markers" else {}
+    with pytest.raises(InputError, match="the results would overwrite this input") as caught:
+        scale_model(survey.changed({**taped, key: path}), progress=SilentProgress())
+    assert caught.value.path == path
+    assert path.read_text() == "an input\n"

@@ -44,7 +44,7 @@ def read_jobs(paths: Sequence[str | Path], overrides: Mapping[str, object], outp
     for job in jobs:
         if job.survey is None:
             continue
-        folder = job.survey.output_path.resolve()
+        folder = job.survey.output.path.resolve()
         if folder in writes_to:
             raise InputError(
                 f"writes to {folder}, and so does {writes_to[folder]}: expected an [output] path of its own", job.name

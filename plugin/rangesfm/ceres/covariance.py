@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.ceres import num_columns, tangent_jacobian
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.trajectory import pose_of
 
 Array = npt.NDArray[np.float64]
@@ -260,7 +261,7 @@ def _world_motions(columns: _Columns) -> Array:
         elif kind == "sensor" and len(rows) == 6:
             rows[3:, 6] = block[4:]
         elif kind in ("anchor", "point"):
-            rows[:, :3] = -_cross(block)
+            rows[:, :3] = -cross_matrices(block)
             rows[:, 3:] = np.column_stack([np.eye(3), block])
     return motions
 
@@ -268,7 +269,8 @@ def _world_motions(columns: _Columns) -> Array:
 def _free_motions(jacobian: csc_matrix, motions: Array) -> Array:
     """(num_columns, k) a basis of the motions of the world that change no residual."""
     alone = np.sqrt(np.square(abs(jacobian) @ np.abs(motions)).sum(axis=0))
-    scaled = motions[:, alone > 0] / alone[alone > 0]
+    moves = alone > _FREE_MOTION * alone.max()
+    scaled = motions[:, moves] / alone[moves]
     _, strengths, directions = np.linalg.svd(jacobian @ scaled, full_matrices=False)
     free: Array = scaled @ directions[strengths < _FREE_MOTION].T
     return free
@@ -364,7 +366,7 @@ def _scale_stddev(columns: _Columns, inverse: _Inverse, num_rows: int) -> float:
 def _center_from_step(pose: Array) -> Array:
     """(3, 6) how the centre -R^T t moves with a step in the tangent space of Ceres, which turns by twice the step."""
     rotation = _matrix(pose)
-    moved: Array = -rotation.T @ np.column_stack([2.0 * _cross(pose[4:]), np.eye(3)])
+    moved: Array = -rotation.T @ np.column_stack([2.0 * cross_matrices(pose[4:]), np.eye(3)])
     return moved
 
 
@@ -372,8 +374,3 @@ def _matrix(pose: Array) -> Array:
     """(3, 3) rotation of [qx qy qz qw tx ty tz]."""
     matrix: Array = Rotation.from_quat(pose[:4]).as_matrix()
     return matrix
-
-
-def _cross(v: Array) -> Array:
-    """(3, 3) the cross product with v from the left."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from rangesfm.colmap.log import colmap_log
-from rangesfm.errors import OptionError
-from rangesfm.files.tables import printable
+from rangesfm.errors import OptionError, nearest_known, printable, shown
 
 _EXPECTED = {
     bool: "true or false",
@@ -39,12 +37,6 @@ def apply_options(options: Any, values: Mapping[str, Any], table: str) -> None:
     _assign(options, values, table)
     if values and hasattr(type(options), "check"):
         _check(options, table)
-
-
-def nearest_known(name: str, known: Iterable[str]) -> str:
-    """The one of ``known`` most like ``name``, whatever the case."""
-    by_lower = {item.lower(): item for item in known}
-    return by_lower[difflib.get_close_matches(name.lower(), by_lower, 1, 0.0)[0]]
 
 
 def _assign(options: Any, values: Mapping[str, Any], table: str) -> None:
@@ -93,5 +85,4 @@ def _check(options: Any, table: str) -> None:
 
 
 def _wrong_value(table: str, key: str, value: Any, expected: str) -> OptionError:
-    shown = f"'{value}'" if isinstance(value, str) else "a table" if isinstance(value, Mapping) else str(value)
-    return OptionError(f"[{table}] {key} is {printable(shown)}, expected {expected}", table, key)
+    return OptionError(f"[{table}] {key} is {shown(value)}, expected {expected}", table, key)

@@ -112,9 +112,7 @@ def _scene(comparison: ModelsComparison, aligned: list[Trajectory]) -> Scene:
         paths=(*paths[1:], paths[0]),
         points_m=points_m,
         points_rgb=points_rgb,
-        anchors=()
-        if base.result is None
-        else anchors_in_scene(base.result.summary.to_json(), base.result.anchor_positions_m),
+        anchors=() if base.result is None else anchors_in_scene(base.result.summary, base.result.anchor_positions_m),
     )
 
 

@@ -129,7 +129,7 @@ def ranges_of_survey(
     log = inputs.log
     if log.timestamp_s is not None:
         log = replace(log, timestamp_s=log.timestamp_s + _offsets_s(survey, inputs, path))
-    observations = associate(log, path, inputs.tag_in_cam_m, options=survey.ranges.association)
+    observations = associate(log, path, inputs.tag_in_cam_m, options=survey.ranges)
     if not observations.has_place.any():
         raise InputError("no range is at a photo of the model: are --images and the time offset theirs?", log.source)
     estimate = initialize_scale(
@@ -138,8 +138,8 @@ def ranges_of_survey(
         inputs.anchors,
         anchor_frame=inputs.anchor_frame,
         options=survey.scale,
-        range_model=survey.ranges.model,
-        seed=survey.seed,
+        range_model=survey.ranges,
+        seed=survey.output.seed,
     )
     metric = estimate.metric_from_sfm
     to_site = inputs.site.offset_m if estimate.frame == "site" else np.zeros(3)
@@ -151,7 +151,7 @@ def ranges_of_survey(
         biases_m={id_: anchor.range_bias_m for id_, anchor in anchors.items()},
         image_times_s=times,
         metric_path=path.transformed(metric.scale, metric.rotation, metric.translation + to_site),
-        association=survey.ranges.association,
+        association=survey.ranges,
     )
 
 
@@ -164,6 +164,6 @@ def _offsets_s(survey: Survey, inputs: RangingInputs, path: Trajectory) -> float
     if survey.ranges.time_offset_s is not None or inputs.log.timestamp_s is None:
         return survey.ranges.time_offset_s or 0.0
     offset = estimate_time_offset(
-        inputs.log, path, inputs.tag_in_cam_m, association=survey.ranges.association, seed=survey.seed
+        inputs.log, path, inputs.tag_in_cam_m, association=survey.ranges, seed=survey.output.seed
     )
     return offset.at(inputs.log.timestamp_s)

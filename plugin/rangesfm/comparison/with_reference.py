@@ -12,7 +12,7 @@ import pycolmap
 
 from rangesfm.errors import InputError
 from rangesfm.geometry.reference import Reference, read_reference
-from rangesfm.geometry.similarity import align_points, path_shape, rmse
+from rangesfm.geometry.similarity import align_points, rmse, similarity_between
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.result.entries import ComparisonRow
 from rangesfm.result.folder import ResultFolder, read_result_folder
@@ -139,15 +139,8 @@ def _aligned_rmse(source: Array, target: Array, *, with_scale: bool) -> float:
 
 def _scale_to(source: Array, target: Array) -> float | None:
     """Scale of the best similarity from source to target; None where there is none."""
-    if len(source) < MIN_NUM_ALIGNED or not (_moves(source) and _moves(target)):
-        return None
-    scale = align_points(source, target).scale
-    return scale if scale > 0 else None
-
-
-def _moves(points: Array) -> bool:
-    shape = path_shape(points)
-    return bool(shape.stddevs[0] > 1e-9 * (1.0 + np.abs(shape.centroid).max()))
+    found = similarity_between(source, target) if len(source) >= MIN_NUM_ALIGNED else None
+    return None if found is None else found.scale
 
 
 def format_table(rows: tuple[ComparisonRow, ...]) -> str:

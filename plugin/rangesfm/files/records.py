@@ -38,9 +38,9 @@ def _as_json(value: Any) -> Any:
     return [_as_json(item) for item in value] if isinstance(value, (list, tuple)) else _plain(value)
 
 
-def _vector(value: Any) -> Any:
+def _whole(value: Any) -> Any:
     value = _plain(value)
-    return None if isinstance(value, list) and None in map(_plain, value) else value
+    return None if isinstance(value, (list, tuple)) and None in map(_plain, value) else value
 
 
 Text = InstanceOf[str]  # not ``str``, which refuses paths that are no UTF-8
@@ -50,7 +50,8 @@ Number = Annotated[float, Strict(), BeforeValidator(_plain)]
 NumberOrNull = Annotated[Annotated[float, Strict()] | None, BeforeValidator(_plain)]
 """Null where the number is not known, or not finite."""
 Vector = Annotated[tuple[Number, Number, Number], BeforeValidator(_plain)]
-VectorOrNull = Annotated[tuple[Number, Number, Number] | None, BeforeValidator(_vector)]
+VectorOrNull = Annotated[tuple[Number, Number, Number] | None, BeforeValidator(_whole)]
+IntervalOrNull = Annotated[tuple[Number, Number] | None, BeforeValidator(_whole)]
 
 
 class Record(BaseModel):

@@ -18,13 +18,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.errors import InputError, one_line
+from rangesfm.errors import InputError, printable
 from rangesfm.files.atomic import new_file
 
 _HEAD_BYTES = 1 << 16
 _CHUNK_ROWS = 20_000  # split at once: wide tables would otherwise hold every cell in memory
 _UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
-_MAX_SHOWN = 100
 _UNPACKED = (".gz", ".bz2", ".xz")  # by numpy, whatever such a file holds
 
 
@@ -249,11 +248,6 @@ def guess_separator(row: str) -> str:
     """The most frequent of comma, semicolon and tab in a row; a blank if there is none of them."""
     separator = max(",;\t", key=row.count)
     return separator if separator in row else " "
-
-
-def printable(text: str) -> str:
-    """``text`` fit for one line of a message."""
-    return one_line(text if len(text) <= _MAX_SHOWN else text[:_MAX_SHOWN] + "...")
 
 
 def _read_bytes(path: str | Path, num: int = -1) -> bytes:

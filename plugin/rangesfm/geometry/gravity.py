@@ -8,6 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from rangesfm.geometry.rotations import cross_matrices
+
 Array = npt.NDArray[np.float64]
 
 UP_IN_SITE = np.array([0.0, 0.0, 1.0])
@@ -34,9 +36,7 @@ class Gravity:
 
     def jacobian(self, rotation: Array, left: Array) -> Array:
         """(3, 3) of the residuals by a rotation vector; ``left`` is its left Jacobian."""
-        x, y, z = rotation @ self.up_in_first_camera
-        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        slope: Array = -cross @ left / self.stddev_rad
+        slope: Array = -cross_matrices(rotation @ self.up_in_first_camera) @ left / self.stddev_rad
         return slope
 
     def level_rotations(self, num: int) -> Rotation:

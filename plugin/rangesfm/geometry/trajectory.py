@@ -12,6 +12,9 @@ import numpy.typing as npt
 if TYPE_CHECKING:
     import pycolmap
 
+ROUNDING_S = 1e-6
+"""Of a difference of two times that are seconds since 1970."""
+
 
 @dataclass(frozen=True)
 class Trajectory:
@@ -50,6 +53,12 @@ class Trajectory:
             rotation @ self.world_from_cam,
             self.time_resolution_s,
         )
+
+    def as_in(self, model: pycolmap.Reconstruction) -> Trajectory:
+        """The same keyframes as another model has them."""
+        times = self.timestamps_s
+        by_name = None if times is None else dict(zip(self.image_names, times.tolist(), strict=True))
+        return trajectory_from_reconstruction(model, by_name)
 
     def timed(self, timestamps_s: Mapping[str, float]) -> Trajectory:
         """The keyframes whose photo has a time by its name, in the order of these times."""

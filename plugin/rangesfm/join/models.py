@@ -100,7 +100,7 @@ def join_models(parts: Sequence[PathOfModel], ranging: Ranging) -> JoinedModels:
     parts = [replace(part, observations=of) for part, of in zip(parts, exclusive, strict=True)]
     first = _first_in_time(parts)
     scaled, reasons = _scaled_alone(parts, ranging, first)
-    placements = place_models(list(scaled.values()), ranging.range_model.common_bias_stddev_m)
+    placements = place_models(list(scaled.values()))
     reasons |= {k: reason for k, reason in zip(scaled, placements.reasons, strict=True) if reason}
     if first in reasons and ranging.anchor_frame == "first_camera":
         why = f"the anchors are given in the frame of the first photo, and {parts[first].name}, which has it, "
@@ -151,7 +151,7 @@ def _alone(part: PathOfModel, ranging: Ranging, *, has_first_camera: bool) -> Sc
     frame, options = ranging.anchor_frame, ranging.scale
     if not has_first_camera:
         frame = "site" if frame == "first_camera" else frame
-        options = replace(options, up_in_first_camera=None)
+        options = options.changed(up_in_first_camera=None)
     anchor_ids = part.observations.log.anchor_ids
     distances = None
     if ranging.tape is not None:

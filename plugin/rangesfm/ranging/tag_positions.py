@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.errors import InputError
-from rangesfm.files.tables import printable
+from rangesfm.errors import InputError, printable
 from rangesfm.geometry.reference import Reference
 from rangesfm.ranging.log import RangeLog
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
-import pycolmap
 
 from rangesfm.geometry.similarity import Similarity
-from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.ranging.log import RangeLog
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.observations import RangeObservations
 
 Array = npt.NDArray[np.float64]
@@ -47,29 +44,20 @@ class Antennas:
 
     def subset(self, rows: Indices) -> Antennas:
         """Of some of the ranges."""
-        return Antennas(
-            self.before[rows],
-            self.after[rows],
-            self.weight[rows],
-            self.tag_in_cam_m[rows],
-            self.offset_in_world_m[rows],
-        )
+        return Antennas(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 def antennas(
-    trajectory: Trajectory, observations: RangeObservations, metric_from_sfm: Similarity, tag_in_cam_m: npt.ArrayLike
+    trajectory: Trajectory, observations: RangeObservations, metric_from_sfm: Similarity, tags_in_cam_m: Array
 ) -> Antennas:
     """Antennas of all ranges.
 
     Args:
         trajectory, observations: of the unscaled model.
         metric_from_sfm: to the world of the poses that will be asked for.
-        tag_in_cam_m: (3,) or (num_tags, 3), in the order of the log's tags.
-
-    Raises:
-        ValueError: tag_in_cam_m of another shape.
+        tags_in_cam_m: (num_tags, 3), in the order of the log's tags.
     """
-    tags_in_cam = tags_in_cam_of_ranges(observations.log, tag_in_cam_m)
+    tags_in_cam = tags_in_cam_m[observations.log.tag_index]
     turns, weight = trajectory.world_from_cam, observations.weight[:, None]
     before, after = (
         np.einsum("nij,nj->ni", turns[ends], tags_in_cam) for ends in (observations.before, observations.after)
@@ -83,54 +71,3 @@ def antennas(
         tags_in_cam,
         beyond @ metric_from_sfm.rotation.T,
     )
-
-
-def tags_in_cam_of_ranges(log: RangeLog, tag_in_cam_m: npt.ArrayLike) -> Array:
-    """(n, 3) antenna that took each range, in the camera frame: of one tag (3,), or of each of the log's (num_tags, 3).
-
-    Raises:
-        ValueError: of another shape.
-    """
-    return tags_in_cam(log, tag_in_cam_m)[log.tag_index]
-
-
-def tags_in_cam(log: RangeLog, tag_in_cam_m: npt.ArrayLike) -> Array:
-    """(num_tags, 3) in the order of the log's tags, where all may have been given as one (3,).
-
-    Raises:
-        ValueError: of another shape.
-    """
-    tags, num_tags = np.asarray(tag_in_cam_m, dtype=np.float64), len(log.tag_ids)
-    if tags.shape not in ((3,), (num_tags, 3)):
-        raise ValueError(f"tag_in_cam_m is {tags.shape}, expected (3,) or ({num_tags}, 3): one for each tag")
-    return np.broadcast_to(tags, (num_tags, 3))
-
-
-def antenna_positions(metric: pycolmap.Reconstruction, trajectory: Trajectory, antennas: Antennas) -> Array:
-    """(n, 3) in the world of a metric model with the trajectory's keyframes."""
-    times = (
-        None
-        if trajectory.timestamps_s is None
-        else dict(zip(trajectory.image_names, trajectory.timestamps_s, strict=True))
-    )
-    now = trajectory_from_reconstruction(metric, times)
-    return antennas.positions(now.centers, now.world_from_cam)
-
-
-def predicted_ranges(
-    metric: pycolmap.Reconstruction,
-    trajectory: Trajectory,
-    observations: RangeObservations,
-    metric_from_sfm: Similarity,
-    tag_in_cam_m: npt.ArrayLike,
-    anchors: Sequence[Array],
-    biases: Sequence[float],
-) -> Array:
-    """(n,) ranges that a metric model predicts, interpolated as the residuals are; NaN without a place.
-
-    Arguments as for ``refine_with_ranges``.
-    """
-    at = antenna_positions(metric, trajectory, antennas(trajectory, observations, metric_from_sfm, tag_in_cam_m))
-    index = observations.log.anchor_index
-    predicted = np.linalg.norm(at - np.array(anchors)[index], axis=1) + np.array(biases)[index]
-    return np.where(observations.before >= 0, predicted, np.nan)

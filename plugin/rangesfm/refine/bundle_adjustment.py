@@ -17,7 +17,8 @@ from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import SolverError
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.options import CameraOptions, RefineOptions
-from rangesfm.refine.progress import Progress, farthest, keyframe_centers
+from rangesfm.ranging.errors.noise import robust_stddev
+from rangesfm.refine.stillness import Stillness, farthest, keyframe_centers
 
 Array = npt.NDArray[np.float64]
 
@@ -138,8 +139,8 @@ def solve(problem: BundleAdjustment, tolerance_m: float) -> Solution:
         SolverError: the solver failed.
     """
     start = time.monotonic()
-    progress = Progress(problem.metric, problem.pixel_stddev, tolerance_m)
-    summary = ceres.solve(problem.adjuster, progress.is_over)
+    stillness = Stillness(problem.metric, problem.pixel_stddev, tolerance_m)
+    summary = ceres.solve(problem.adjuster, stillness.is_over)
     if not summary.IsSolutionUsable():
         raise SolverError(f"the bundle adjustment with ranges failed: {summary.message}")
     return Solution(
@@ -148,9 +149,9 @@ def solve(problem: BundleAdjustment, tolerance_m: float) -> Solution:
         final_cost=summary.final_cost,
         seconds=time.monotonic() - start,
         converged=summary.termination_type.name in ("CONVERGENCE", "USER_SUCCESS"),
-        is_still=progress.is_still,
+        is_still=stillness.is_still,
         message=f"What is left to gain moves nothing that matters ({tolerance_m:.2g} m)."
-        if progress.is_still
+        if stillness.is_still
         else summary.message,
     )
 
@@ -232,6 +233,5 @@ def _bundle_adjuster(
 def _pixel_stddev(adjuster: pycolmap.CeresBundleAdjuster, num_residuals: int) -> float:
     """Stddev of a feature's coordinate from the residuals, which the parameters have already absorbed in part."""
     residuals = np.asarray(adjuster.problem.evaluate_residuals())
-    spread = 1.4826 * float(np.median(np.abs(residuals)))
     degrees_of_freedom = max(num_residuals - adjuster.problem.num_parameters(), 1)
-    return max(spread * float(np.sqrt(num_residuals / degrees_of_freedom)), _MIN_PIXEL_STDDEV)
+    return max(robust_stddev(residuals) * float(np.sqrt(num_residuals / degrees_of_freedom)), _MIN_PIXEL_STDDEV)

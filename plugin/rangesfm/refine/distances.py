@@ -14,6 +14,7 @@ from rangesfm.distances.ends import LocatedDistances, images_by_name, triangulat
 from rangesfm.distances.tape import Tape
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.refine.bundle_adjustment import BundleAdjustment
 
 Array = npt.NDArray[np.float64]
@@ -27,11 +28,9 @@ class MeasuredDistances:
         tape: the control distances.
         marker_ids: by name, the markers among their ends as 3-D points of the model.
         by_radio: between anchors; their stddevs without what all of them share.
-        bias_stddev_m: of that: what all ranges between anchors read too long.
     """
 
     by_radio: LocatedDistances
-    bias_stddev_m: float
     tape: Tape = field(default_factory=Tape)
     marker_ids: Mapping[str, int] = field(default_factory=dict)
 
@@ -73,13 +72,13 @@ def add_distances(
     distances: MeasuredDistances,
     anchors: Sequence[AnchorEstimate],
     anchor_blocks: Sequence[Array],
-    loss_scale: float,
+    errors: RangeErrors,
 ) -> list[Array]:
     """Add them in units of pixels.
 
     Args:
         anchors, anchor_blocks: in the order of the log; distances to one without a place are left out.
-        loss_scale: of the bounded loss of distances by radio, stddevs.
+        errors: of ranges, of which those between anchors have the loss and the common bias.
 
     Returns:
         the parameter blocks that came with them.
@@ -90,7 +89,7 @@ def add_distances(
         if np.isfinite(block).all()
     }
     _add_taped(bundle, distances, placed)
-    return _add_by_radio(bundle, distances, anchor_blocks, loss_scale)
+    return _add_by_radio(bundle, distances.by_radio, anchor_blocks, errors)
 
 
 @dataclass(frozen=True)
@@ -130,9 +129,9 @@ def _camera(metric: pycolmap.Reconstruction, image: pycolmap.Image) -> _End:
 
 
 def _add_by_radio(
-    bundle: BundleAdjustment, distances: MeasuredDistances, anchor_blocks: Sequence[Array], loss_scale: float
+    bundle: BundleAdjustment, by_radio: LocatedDistances, anchor_blocks: Sequence[Array], errors: RangeErrors
 ) -> list[Array]:
-    by_radio, bias = distances.by_radio, np.zeros(1)
+    bias, bias_stddev_m = np.zeros(1), errors.common_bias_stddev_m
     rows = [
         row for row, pair in enumerate(by_radio.anchor_pair) if all(np.isfinite(anchor_blocks[k]).all() for k in pair)
     ]
@@ -143,13 +142,13 @@ def _add_by_radio(
             distance_m=by_radio.distance_m[row],
             stddev_m=by_radio.stddev_m[row] / bundle.pixel_stddev,
             has_bias=True,
-            loss_scale=loss_scale * bundle.pixel_stddev,
+            loss_scale=errors.loss.width * bundle.pixel_stddev,
         )
         pair = [anchor_blocks[k] for k in by_radio.anchor_pair[row]]
         ceres.add_residual_block(bundle.adjuster, cost, None, [*pair, bias])
-    if distances.bias_stddev_m == 0:
+    if bias_stddev_m == 0:
         bundle.adjuster.problem.set_parameter_block_constant(bias)
     else:
-        ceres.add_normal_prior(bundle.adjuster, bias, mean=[0.0], stddev=distances.bias_stddev_m / bundle.pixel_stddev)
+        ceres.add_normal_prior(bundle.adjuster, bias, mean=[0.0], stddev=bias_stddev_m / bundle.pixel_stddev)
         bundle.keep_from_elimination(bias)
     return [bias]

@@ -17,11 +17,13 @@ from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial.transform import Rotation
 
 from rangesfm.geometry.gravity import Gravity
+from rangesfm.geometry.rotations import cross_matrices
+from rangesfm.geometry.similarity import rounding_of
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.errors.robust_loss import RobustLoss
+from rangesfm.ranging.errors.range_errors import RangeErrors
+from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.refine.antennas import Antennas
-from rangesfm.refine.vision_information import Poses, VisionInformation, cross_matrices
-from rangesfm.refine.weights import RangeWeights
+from rangesfm.refine.vision_information import Poses, VisionInformation
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -29,7 +31,6 @@ Indices = npt.NDArray[np.int64]
 _MAX_NUM_STEPS = 60
 _INITIAL_DAMPING = 1e-8
 _MAX_DAMPING = 1e6
-_TINY_DISTANCE_M = 1e-9
 # For the number of parameters that the ranges determine: random vectors to estimate a trace with.
 _NUM_PROBES = 12
 
@@ -49,11 +50,10 @@ class GraphState:
     biases_m: Array
     common_bias_m: float
 
-    def predicted_ranges(self, antennas: Antennas, anchor_index: Indices) -> Array:
-        """(k,) metres."""
+    def range_gradient(self, antennas: Antennas, anchor_index: Indices) -> RangeGradient:
+        """Of the k distances."""
         at = antennas.positions(self.poses.centers, self.poses.world_from_rig)
-        distances: Array = np.linalg.norm(at - self.anchors_m[anchor_index], axis=1)
-        return distances + self.biases_m[anchor_index]
+        return RangeGradient.of(at - self.anchors_m[anchor_index])
 
 
 @dataclass(frozen=True)
@@ -63,26 +63,19 @@ class KeyframeGraph:
     Attributes:
         vision: what the photos say.
         antennas: of the k ranges that take part, by indices of the graph's keyframes.
-        anchor_index: (k,). range_m: (k,). stddev_m: (k,).
-        share: (k,) by how much each range counts against the photos, beside its stddev.
+        range_m: (k,) measured. errors: of these.
         anchors: m, with priors as for ``refine_with_ranges``.
-        common_bias_stddev_m: of what all free biases share beyond their priors' means; 0: nothing.
         held_frame: a keyframe that stays where it is; None: none does.
         gravity: which way is up in the first keyframe; None: nobody knows.
-        loss: of single ranges, in their stddevs.
     """
 
     vision: VisionInformation
     antennas: Antennas
-    anchor_index: Indices
     range_m: Array
-    stddev_m: Array
-    share: Array
+    errors: RangeErrors
     anchors: tuple[AnchorEstimate, ...]
-    common_bias_stddev_m: float
     held_frame: int | None
     gravity: Gravity | None
-    loss: RobustLoss
 
     def start(self) -> GraphState:
         """The map as it was given."""
@@ -90,12 +83,10 @@ class KeyframeGraph:
         biases = np.array([anchor.range_bias_m for anchor in self.anchors])
         return GraphState(self.vision.origin, positions, biases, 0.0)
 
-    def with_weights(self, weights: RangeWeights) -> KeyframeGraph:
-        return replace(self, stddev_m=weights.stddev_m, share=weights.share, loss=weights.loss)
-
     def residuals_m(self, state: GraphState) -> Array:
         """(k,) predicted minus measured."""
-        return state.predicted_ranges(self.antennas, self.anchor_index) - self.range_m
+        index = self.errors.anchor_index
+        return state.range_gradient(self.antennas, index).distance_m + state.biases_m[index] - self.range_m
 
 
 @dataclass(frozen=True)
@@ -168,12 +159,12 @@ class _Layout:
         is_free = np.ones(6 * n + 4 * m + 1, dtype=bool)
         if graph.held_frame is not None:
             is_free[6 * graph.held_frame : 6 * graph.held_frame + 6] = False
-        heard = np.isin(np.arange(m), graph.anchor_index)
+        heard = np.isin(np.arange(m), graph.errors.anchor_index)
         anchor_is_free = heard & [anchor.prior_position_stddev_m > 0 for anchor in graph.anchors]
         bias_is_free = heard & [anchor.prior_bias_stddev_m > 0 for anchor in graph.anchors]
         is_free[6 * n : 6 * n + 3 * m] = np.repeat(anchor_is_free, 3)
         is_free[6 * n + 3 * m : -1] = bias_is_free
-        is_free[-1] = graph.common_bias_stddev_m > 0 and bool(bias_is_free.any())
+        is_free[-1] = graph.errors.common_bias_stddev_m > 0 and bool(bias_is_free.any())
         return cls(n, m, np.flatnonzero(is_free))
 
 
@@ -201,7 +192,7 @@ class _Terms:
         hessian.resize(layout.num, layout.num)
 
         scaled, derivative = _range_rows(graph, layout, state)
-        rho, weights, _ = graph.share * graph.loss.rho(scaled**2)
+        rho, weights, _ = graph.errors.weight * graph.errors.loss.rho(scaled**2)
         whitened = sparse.diags_array(np.sqrt(weights)) @ derivative
         cost += 0.5 * float(rho.sum())
         gradient = gradient + derivative.T @ (weights * scaled)
@@ -250,7 +241,8 @@ def _local_scale(vision: VisionInformation, shift: Array, shift_before: Array) -
     n = len(vision.origin)
     now = np.bincount(vision.reference, np.sum(shift**2, axis=1), minlength=n)
     before = np.bincount(vision.reference, np.sum(shift_before**2, axis=1), minlength=n)
-    known = (now > 0) & (before > 0)
+    least = rounding_of(vision.origin.centers) ** 2  # all of one place have no scale
+    known = (now > least) & (before > least)
     return np.sqrt(np.divide(now, before, where=known, out=np.ones(n)))
 
 
@@ -263,20 +255,17 @@ def local_scales(vision: VisionInformation, poses: Poses) -> Array:
 
 def _range_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tuple[Array, sparse.csr_array]:
     """(k,) residuals in stddevs, and their derivative."""
-    antennas, poses, index = graph.antennas, state.poses, graph.anchor_index
-    from_anchor = antennas.positions(poses.centers, poses.world_from_rig) - state.anchors_m[index]
-    distance = np.linalg.norm(from_anchor, axis=1)
-    residuals = (distance + state.biases_m[index] - graph.range_m) / graph.stddev_m
-    direction = from_anchor / (np.maximum(distance, _TINY_DISTANCE_M) * graph.stddev_m)[:, None]
+    antennas, index, stddev_m = graph.antennas, graph.errors.anchor_index, graph.errors.stddev_m
+    by = state.range_gradient(antennas, index)
+    residuals = (by.distance_m + state.biases_m[index] - graph.range_m) / stddev_m
     values, columns = [], []
     for frame, weight in ((antennas.before, 1 - antennas.weight), (antennas.after, antennas.weight)):
-        in_cam = np.einsum("nji,nj->ni", poses.world_from_rig[frame], direction)
-        turned = np.cross(antennas.tag_in_cam_m, in_cam)
-        values.append(weight[:, None] * np.concatenate([turned, direction], axis=1))
+        turned = by.by_turn_of_cam(antennas.tag_in_cam_m, state.poses.world_from_rig[frame])
+        values.append(weight[:, None] * np.concatenate([turned, by.by_tag], axis=1))
         columns.append(6 * frame[:, None] + np.arange(6))
-    values += [-direction, 1 / graph.stddev_m[:, None]]
+    values += [by.by_anchor, np.ones((len(index), 1))]
     columns += [layout.first_anchor + 3 * index[:, None] + np.arange(3), layout.first_bias + index[:, None]]
-    value, column = np.concatenate(values, axis=1), np.concatenate(columns, axis=1)
+    value, column = np.concatenate(values, axis=1) / stddev_m[:, None], np.concatenate(columns, axis=1)
     rows = np.repeat(np.arange(len(value)), value.shape[1])
     shape = (len(value), layout.num)
     return residuals, sparse.coo_array((value.ravel(), (rows, column.ravel())), shape=shape).tocsr()
@@ -299,8 +288,8 @@ def _prior_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tup
             entries += [(len(residuals), column, 1 / stddev), (len(residuals), layout.num - 1, -1 / stddev)]
             residuals.append((state.biases_m[k] - anchor.prior_bias_m - state.common_bias_m) / stddev)
     if layout.num - 1 in free:
-        entries.append((len(residuals), layout.num - 1, 1 / graph.common_bias_stddev_m))
-        residuals.append(state.common_bias_m / graph.common_bias_stddev_m)
+        entries.append((len(residuals), layout.num - 1, 1 / graph.errors.common_bias_stddev_m))
+        residuals.append(state.common_bias_m / graph.errors.common_bias_stddev_m)
     if graph.gravity is not None:
         rotation = state.poses.world_from_rig[0]
         slopes = graph.gravity.jacobian(rotation, rotation)
@@ -342,10 +331,6 @@ def _num_absorbed(terms: _Terms, layout: _Layout) -> float:
 def moved_anchors(anchors: Sequence[AnchorEstimate], state: GraphState) -> tuple[AnchorEstimate, ...]:
     """The anchors where the graph has them."""
     return tuple(
-        replace(
-            anchor,
-            position_m=position,
-            range_bias_m=float(bias),
-        )
+        replace(anchor, position_m=position, range_bias_m=float(bias))
         for anchor, position, bias in zip(anchors, state.anchors_m, state.biases_m, strict=True)
     )

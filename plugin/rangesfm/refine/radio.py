@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -9,14 +10,16 @@ import numpy.typing as npt
 import pycolmap
 
 from rangesfm import ceres
+from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory, pose_of
 from rangesfm.options import RefineOptions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.association import lever_arms
 from rangesfm.ranging.errors.noise import SHORT_RANGE_LENGTH_M, bias_whitening
+from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.observations import RangeObservations
-from rangesfm.refine.antennas import Antennas, antenna_positions
+from rangesfm.refine.antennas import Antennas, antennas
 from rangesfm.refine.bundle_adjustment import BundleAdjustment
-from rangesfm.refine.weights import RangeWeights
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -52,7 +55,19 @@ class RadioRanges:
     observations: RangeObservations
     trajectory: Trajectory
     antennas: Antennas
-    rows: npt.NDArray[np.int64]
+    rows: Indices
+
+    @classmethod
+    def of(
+        cls,
+        trajectory: Trajectory,
+        observations: RangeObservations,
+        metric_from_sfm: Similarity,
+        tags_in_cam_m: Array,
+    ) -> RadioRanges:
+        """All that have a place; arguments as for ``antennas``."""
+        placed = antennas(trajectory, observations, metric_from_sfm, tags_in_cam_m)
+        return cls(observations, trajectory, placed, observations.placed_rows)
 
     @property
     def interval_s(self) -> Array:
@@ -69,7 +84,8 @@ class RadioRanges:
         if radio.time_shift_s:
             weight[between] += radio.time_shift_s / self.interval_s[between]
         tags = radio.tags_in_cam_m[self.observations.log.tag_index]
-        at = antenna_positions(metric, self.trajectory, replace(self.antennas, tag_in_cam_m=tags, weight=weight))
+        path = self.trajectory.as_in(metric)
+        at = replace(self.antennas, tag_in_cam_m=tags, weight=weight).positions(path.centers, path.world_from_cam)
         from_anchor: Array = at - np.array([a.position_m for a in radio.anchors])[index]
         return from_anchor
 
@@ -80,6 +96,23 @@ class RadioRanges:
         predicted = distance + np.array([a.range_bias_m for a in radio.anchors])[index]
         predicted += radio.short_range_error_m * np.exp(-distance / SHORT_RANGE_LENGTH_M)
         return np.where(self.observations.before >= 0, predicted, np.nan)
+
+
+def predicted_ranges(
+    metric: pycolmap.Reconstruction,
+    trajectory: Trajectory,
+    observations: RangeObservations,
+    metric_from_sfm: Similarity,
+    tag_in_cam_m: npt.ArrayLike,
+    anchors: Sequence[AnchorEstimate],
+) -> Array:
+    """(n,) ranges that a metric model predicts, interpolated as the residuals are; NaN without a place.
+
+    Arguments as for ``refine_with_ranges``.
+    """
+    tags_in_cam_m = lever_arms(observations.log, tag_in_cam_m)
+    ranges = RadioRanges.of(trajectory, observations, metric_from_sfm, tags_in_cam_m)
+    return ranges.predicted_m(metric, RadioEstimate(tuple(anchors), tags_in_cam_m))
 
 
 @dataclass(frozen=True)
@@ -125,25 +158,28 @@ class RadioBlocks:
 
 
 def add_ranges(
-    bundle: BundleAdjustment, ranges: RadioRanges, weights: RangeWeights, blocks: RadioBlocks, options: RefineOptions
+    bundle: BundleAdjustment, ranges: RadioRanges, errors: RangeErrors, blocks: RadioBlocks, options: RefineOptions
 ) -> Indices:
     """Ranges in units of pixels: one stddev of either weighs the same.
+
+    Args:
+        errors: of those that take part.
 
     Returns:
         (k,) where the residual of each range that takes part is among the problem's.
     """
-    log, rows, antennas = ranges.observations.log, ranges.rows, ranges.antennas
+    log, rows, at = ranges.observations.log, ranges.rows, ranges.antennas.subset(ranges.rows)
     placed = ceres.PlacedRanges(
         range_m=log.range_m[rows],
-        stddev_m=weights.stddev_m[rows],
-        before=antennas.before[rows],
-        after=antennas.after[rows],
-        weight=antennas.weight[rows],
-        offset_in_world_m=antennas.offset_in_world_m[rows],
+        stddev_m=errors.stddev_m,
+        before=at.before,
+        after=at.after,
+        weight=at.weight,
+        offset_in_world_m=at.offset_in_world_m,
         anchor_index=log.anchor_index[rows],
         tag_index=log.tag_index[rows],
         interval_s=ranges.interval_s[rows],
-        share=bundle.pixel_stddev**2 * weights.share[rows],
+        share=bundle.pixel_stddev**2 * errors.weight,
     )
     range_blocks = ceres.RangeBlocks(
         poses=[pose_of(bundle.metric.frame(int(frame_id))).params for frame_id in ranges.trajectory.frame_ids],
@@ -159,8 +195,8 @@ def add_ranges(
         placed,
         range_blocks,
         short_range_length_m=None if blocks.short_range_error is None else SHORT_RANGE_LENGTH_M,
-        loss_scale=weights.loss.width,
-        loss_is_bounded=weights.loss.is_bounded,
+        loss_scale=errors.loss.width,
+        loss_is_bounded=errors.loss.is_bounded,
     )
 
 

@@ -17,6 +17,7 @@ import pycolmap
 from scipy import sparse
 
 from rangesfm.errors import SolverError
+from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.trajectory import pose_of
 
 Array = npt.NDArray[np.float64]
@@ -30,6 +31,8 @@ _MAX_NUM_PIECES = 20000
 _BATCH = 2000
 # In stddevs: from here on an observation has half the say.
 _ROBUST_WIDTH = 3.0
+# Of the median depth: a point so near lies in the camera. What a point says goes by the square.
+_MIN_DEPTH = 1e-4
 
 
 @dataclass(frozen=True)
@@ -167,6 +170,20 @@ def project(observations: Observations, poses: Poses, points: Array) -> tuple[Ar
     return in_rig, in_cam, derivative * observations.weight[:, None, None]
 
 
+def points_in_cameras(observations: Observations, poses: Poses) -> npt.NDArray[np.bool_]:
+    """(p,) whether a point lies in a camera that sees it: what a mapper makes, now and then, of wrong matches of photos
+    from one place.
+
+    A feature goes by its point's place over the depth. At next to no depth, what such a point says about one photo is
+    so much more than all else that rounding it makes a solver's matrix indefinite in all but timid steps; one of 50 000
+    does.
+    """
+    depth = project(observations, poses, observations.points)[1][:, 2]
+    in_camera: npt.NDArray[np.bool_] = np.zeros(len(observations.points), dtype=np.bool_)
+    in_camera[observations.point[np.abs(depth) < _MIN_DEPTH * np.median(np.abs(depth))]] = True
+    return in_camera
+
+
 def ray_residuals(observations: Observations, in_cam: Array) -> Array:
     """(n, 2) in stddevs; infinite behind the camera."""
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -268,10 +285,3 @@ def _eliminate(rows: Indices, frame: Indices, in_rig: Array, to_rig: Array, pose
     keys = reference[:, None, None] * n**2 + frames[:, :, None] * n + frames[:, None, :]
     both_move = (frames != reference[:, None])[:, :, None] & (frames != reference[:, None])[:, None, :]
     return keys[both_move], blocks[both_move]
-
-
-def cross_matrices(vectors: Array) -> Array:
-    """(..., 3, 3): v x, as matrices."""
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*vectors.shape, 3)

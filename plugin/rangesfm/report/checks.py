@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rangesfm.report.content import Summary, as_number
 from rangesfm.report.text import fixed, sentence
-
-NORMAL_QUANTILE_95 = 1.96
+from rangesfm.result.entries import ScaleEntry, TimeOffsetEntry
+from rangesfm.result.summary import ResultSummary
 
 
 @dataclass(frozen=True)
@@ -76,13 +75,13 @@ class Check:
         return 100.0 if self.larger_is_better else 1.5 * self.amber_limit
 
 
-def quality_checks(summary: Summary) -> tuple[Check, ...]:
+def quality_checks(summary: ResultSummary) -> tuple[Check, ...]:
     """The checks of a result, in the order in which they matter."""
     return (
         Check(
             "Scale uncertainty",
             "The larger of the formal and the empirical standard deviation.",
-            _relative_percent(larger_stddev(summary), summary.number("scale", "value")),
+            _relative_percent(summary.scale.larger_stddev, summary.scale.value),
             "%",
             1.0,
             5.0,
@@ -91,7 +90,7 @@ def quality_checks(summary: Summary) -> tuple[Check, ...]:
         Check(
             "Anchor agreement",
             "Farthest that the scale from one anchor alone is from the joint one.",
-            _anchor_spread_percent(summary),
+            _anchor_spread_percent(summary.scale),
             "%",
             2.0,
             5.0,
@@ -100,17 +99,17 @@ def quality_checks(summary: Summary) -> tuple[Check, ...]:
         Check(
             "Check ranges",
             "RMS of ranges that no estimate has seen.",
-            summary.number("check_ranges", "rms_m") if summary.number("check_ranges", "num") else None,
+            summary.check_ranges.rms_m,
             "m",
             0.20,
             0.40,
             3,
         ),
-        Check("Range residuals", "RMS of the ranges used.", summary.number("ranges", "rms_m"), "m", 0.15, 0.30, 3),
+        Check("Range residuals", "RMS of the ranges used.", summary.ranges.rms_m, "m", 0.15, 0.30, 3),
         Check(
             "Ranges used",
             "Share of all ranges in the log that had a say.",
-            _relative_percent(summary.number("ranges", "num_used"), summary.number("ranges", "num")),
+            _relative_percent(summary.ranges.num_used, summary.ranges.num),
             "%",
             70.0,
             40.0,
@@ -120,17 +119,17 @@ def quality_checks(summary: Summary) -> tuple[Check, ...]:
         Check(
             "Clock offset",
             "Standard deviation of the offset between the camera's and the radio's clock.",
-            summary.number("time_offset", "stddev_s"),
+            summary.time_offset.stddev_s,
             "s",
             0.02,
             0.10,
             4,
-            no_matter=_why_no_offset_matters(summary),
+            no_matter=_why_no_offset_matters(summary.time_offset),
         ),
         Check(
             "Reprojection",
             "RMS distance of the map's points from where the photos show them.",
-            summary.number("refine", "reprojection_rms_px"),
+            None if summary.refine is None else summary.refine.reprojection_rms_px,
             "px",
             1.0,
             2.0,
@@ -139,36 +138,16 @@ def quality_checks(summary: Summary) -> tuple[Check, ...]:
     )
 
 
-def larger_stddev(summary: Summary) -> float | None:
-    """The larger of the scale's formal and empirical stddev: formal ones are far too small on real logs."""
-    both = (summary.number("scale", "stddev_formal"), summary.number("scale", "stddev_empirical"))
-    return max((stddev for stddev in both if stddev is not None), default=None)
-
-
-def scale_interval(summary: Summary) -> tuple[float, float] | None:
-    """The scale's 95 % interval: the result's own, else that of a normal distribution of the larger stddev."""
-    given = summary.get("scale", "interval_95")
-    ends = [as_number(end) for end in given] if isinstance(given, list) else []
-    if len(ends) == 2 and ends[0] is not None and ends[1] is not None:
-        return ends[0], ends[1]
-    value, stddev = summary.number("scale", "value"), larger_stddev(summary)
-    if value is None or stddev is None:
+def _why_no_offset_matters(offset: TimeOffsetEntry) -> str | None:
+    if offset.offset_matters is not False:
         return None
-    return value - NORMAL_QUANTILE_95 * stddev, value + NORMAL_QUANTILE_95 * stddev
+    return sentence(offset.note or "any offset near this one gives the same result")
 
 
-def _why_no_offset_matters(summary: Summary) -> str | None:
-    if summary.get("time_offset", "offset_matters") is not False:
-        return None
-    return sentence(str(summary.get("time_offset", "note") or "any offset near this one gives the same result"))
-
-
-def _relative_percent(part: float | None, whole: float | None) -> float | None:
+def _relative_percent(part: float | None, whole: float) -> float | None:
     return None if part is None or not whole else 100.0 * part / whole
 
 
-def _anchor_spread_percent(summary: Summary) -> float | None:
-    joint = summary.number("scale", "value")
-    alone = [as_number(value) for value in summary.table("scale", "per_anchor").values()]
-    known = [value for value in alone if value is not None]
-    return None if not joint or len(known) < 2 else max(100.0 * abs(value / joint - 1.0) for value in known)
+def _anchor_spread_percent(scale: ScaleEntry) -> float | None:
+    known = [value for value in scale.per_anchor.values() if value is not None]
+    return None if not scale.value or len(known) < 2 else max(100.0 * abs(one / scale.value - 1.0) for one in known)

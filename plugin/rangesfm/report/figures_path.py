@@ -8,7 +8,7 @@ import numpy.typing as npt
 from rangesfm.geometry.similarity import align_points
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.report.content import Content
-from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Panel, Picture, Range, Series, equal_view
+from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Panel, Pixels, Range, Series, equal_view
 from rangesfm.report.text import count
 
 Array = npt.NDArray[np.float64]
@@ -27,7 +27,9 @@ def trajectory_views(content: Content) -> Figure | None:
     if content.final is None or len(content.final) == 0:
         return None
     views = tuple(_trajectory_view(content, *of_view) for of_view in _views(content))
-    caption = f"The camera's path in metres, in the {'site' if content.frame == 'site' else 'first camera'} frame."
+    caption = (
+        f"The camera's path in metres, in the {'site' if content.summary.frame == 'site' else 'first camera'} frame."
+    )
     if content.points_m is not None and len(content.points_m):
         drawn = min(len(content.points_m), MAX_NUM_POINTS_DRAWN)
         caption += f" {count(drawn)} of the map's {count(len(content.points_m))} points are drawn, those that are near."
@@ -71,7 +73,7 @@ def _views(content: Content) -> list[tuple[str, tuple[int, int], tuple[int, int]
     path = content.final
     assert path is not None
     extents = np.ptp(path.centers, axis=0)
-    if content.frame == "site":
+    if content.summary.frame == "site":
         along = 0 if extents[0] >= extents[1] else 1
         return [("Plan", (0, 1), (1, 1)), ("Elevation", (along, 2), (1, 1))]
     # A camera looks along +z and its y axis points down.
@@ -150,7 +152,7 @@ def _map_view(content: Content, name: str, axes: tuple[int, int], signs: tuple[i
         y_range=y_range,
         size=size,
         keeps_shape=True,
-        picture=Picture(pixels),
+        picture=pixels,
     )
 
 
@@ -158,17 +160,17 @@ def _depth(content: Content, axes: tuple[int, int]) -> Array:
     """What is nearer to the reader comes last: from above, what is higher."""
     assert content.points_m is not None
     (across,) = {0, 1, 2} - set(axes)
-    towards_reader = 1.0 if content.frame == "site" and across == 2 else -1.0
+    towards_reader = 1.0 if content.summary.frame == "site" and across == 2 else -1.0
     return np.asarray(towards_reader * content.points_m[:, across])
 
 
 def _raster(
     points: Array,
-    colors: npt.NDArray[np.uint8],
+    colors: Pixels,
     x_range: Range,
     y_range: Range,
     aspect: float,
-) -> npt.NDArray[np.uint8]:
+) -> Pixels:
     """(h, w, 4) pixels with each point two pixels wide."""
     width, height = PICTURE_WIDTH_PX, max(round(PICTURE_WIDTH_PX * aspect), 1)
     pixels = np.zeros((height, width, 4), dtype=np.uint8)

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import reduce
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
-from rangesfm.report.content import Content, Summary, as_number
+from rangesfm.report.content import Content
 from rangesfm.report.text import count, decimals_for, duration, fixed, keyed, signed
+from rangesfm.result.entries import ScaleEntry
 
 
-def stddevs(summary: Summary) -> list[str]:
+def stddevs(scale: ScaleEntry) -> list[str]:
     """The formal and the empirical stddev of the scale, as far as they are known."""
-    known = {kind: summary.number("scale", f"stddev_{kind}") for kind in ("formal", "empirical")}
+    known = {"formal": scale.stddev_formal, "empirical": scale.stddev_empirical}
     return [
         Markup("{} {}").format(kind, keyed(f"scale.stddev_{kind}", value, fixed(value, decimals_for(value, default=5))))
         for kind, value in known.items()
@@ -26,11 +29,10 @@ def tiles(content: Content) -> list[tuple[str, str, str]]:
     summary, path = content.summary, content.final
     length_m = None if path is None else float(np.linalg.norm(np.diff(path.centers, axis=0), axis=1).sum())
     num_points = None if content.points_m is None else len(content.points_m)
-    offset_decimals = min(decimals_for(summary.number("time_offset", "stddev_s"), default=3), 6)
-    num_checks = summary.number("check_ranges", "num") or 0
+    offset_decimals = min(decimals_for(summary.time_offset.stddev_s, default=3), 6)
 
     def shown(key: str, write: Callable[..., str], *how: object) -> str:
-        value = summary.number(*key.split("."))
+        value: Any = reduce(lambda entry, name: entry and getattr(entry, name), key.split("."), summary)
         return keyed(key, value, write(value, *how))
 
     return [
@@ -48,7 +50,7 @@ def tiles(content: Content) -> list[tuple[str, str, str]]:
         (
             "Check range RMS",
             shown("check_ranges.rms_m", fixed, 3, "m"),
-            Markup("{} held out").format(keyed("check_ranges.num", num_checks, count(num_checks))),
+            Markup("{} held out").format(shown("check_ranges.num", count)),
         ),
         (
             "Reprojection RMS",
@@ -60,11 +62,10 @@ def tiles(content: Content) -> list[tuple[str, str, str]]:
             shown("time_offset.value_s", signed, offset_decimals, "s"),
             Markup("± {}").format(shown("time_offset.stddev_s", fixed, offset_decimals, "s")),
         ),
-        ("Time taken", duration(_total_seconds(summary)), "all stages"),
+        ("Time taken", duration(_total_seconds(summary.seconds)), "all stages"),
     ]
 
 
-def _total_seconds(summary: Summary) -> float | None:
-    seconds = summary.table("seconds")
-    known = [value for value in map(as_number, seconds.values()) if value is not None]
-    return as_number(seconds.get("total")) or (sum(known) if known else None)
+def _total_seconds(seconds: dict[str, float | None]) -> float | None:
+    known = [value for value in seconds.values() if value is not None]
+    return seconds.get("total") or (sum(known) if known else None)

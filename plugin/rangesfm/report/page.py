@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from rangesfm.report import head, tables, text
 from rangesfm.report.chart import page_charts
-from rangesfm.report.checks import larger_stddev, quality_checks, scale_interval
+from rangesfm.report.checks import quality_checks
 from rangesfm.report.content import Content
 from rangesfm.report.figures import SECTIONS, figures_of
 from rangesfm.report.result_scene import scene_of
@@ -40,9 +40,7 @@ def render_report(content: Content) -> str:
         content=content,
         summary=content.summary,
         checks=quality_checks(content.summary),
-        stddev=larger_stddev(content.summary),
-        stddevs=head.stddevs(content.summary),
-        interval=scale_interval(content.summary),
+        stddevs=head.stddevs(content.summary.scale),
         tiles=head.tiles(content),
         view=None if scene is None else view_of(scene),
         figures=figures,

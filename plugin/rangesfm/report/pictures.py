@@ -18,7 +18,7 @@ MAX_WIDTH_PX = 660.0
 
 FORMATS = ("png", "svg")
 _NUM_COLUMNS = {"single": 1, "views": 2, "panels": 3}
-_SYMBOLS = {"line": "stroke", "dashed": "stroke", "upright": "stroke", "triangle": "triangle-up"}
+_SYMBOLS = {"dots": "circle", "disc": "circle", "triangle": "triangle-up"}
 
 
 def write_pictures(figures: list[Figure], folder: Path) -> list[Path]:
@@ -89,7 +89,7 @@ def _legend(entries: list[LegendEntry], color: Color) -> Spec:
     legend = {"title": None, "orient": "top", "columns": 6, "symbolOpacity": 1}
     ranges = {
         "color": [color(entry.color) for entry in entries],
-        "shape": [_SYMBOLS.get(entry.shape, "circle") for entry in entries],
+        "shape": [_SYMBOLS.get(entry.shape, "square") for entry in entries],
     }
     encoding = {
         channel: {"field": "text", "scale": {"domain": texts, "range": values}, "legend": legend}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,8 +11,9 @@ import numpy as np
 import numpy.typing as npt
 from markupsafe import Markup
 
-from rangesfm.report.content import Content, Summary, as_number, in_natural_order, is_position
+from rangesfm.report.content import Content, in_natural_order
 from rangesfm.report.text import count, duration, fixed, keyed, plain, signed
+from rangesfm.result.entries import AnchorEntry
 
 Array = npt.NDArray[np.float64]
 
@@ -68,10 +69,13 @@ def comparison(content: Content) -> Table:
     )
     rows = [
         [
-            plain(row.get("name")),
-            *(keyed(f"comparison.{i}.{key}", row.get(key), write(row.get(key), n)) for key, write, n in columns),
+            row.name,
+            *(
+                keyed(f"comparison.{i}.{key}", getattr(row, key), write(getattr(row, key), n))
+                for key, write, n in columns
+            ),
         ]
-        for i, row in _rows_of(content, "comparison")
+        for i, row in enumerate(content.summary.comparison)
     ]
     return Table(
         "Keyframe centres against the reference",
@@ -81,27 +85,17 @@ def comparison(content: Content) -> Table:
     )
 
 
-def _rows_of(content: Content, key: str) -> list[tuple[int, dict[str, Any]]]:
-    """Entries of a list of the result, each with its place in it; whatever is not an object is left out."""
-    given = content.summary.get(key)
-    return [(i, row) for i, row in enumerate(given if isinstance(given, list) else []) if isinstance(row, dict)]
-
-
 def two_candidates(content: Content) -> Table:
     """Mean and standard deviation of the paper's two branches."""
-    given = content.summary.table("scale", "two_candidate")
-    branches = [(name, given.get(name)) for name in ("alpha0", "alpha1")]
+    given = content.summary.scale.two_candidate
     rows = [
         [
             name,
-            *(
-                keyed(f"scale.two_candidate.{name}.{key}", branch.get(key), plain(branch.get(key)))
-                for key in ("mean", "std")
-            ),
-            "chosen" if given.get("chosen") == name else "",
+            keyed(f"scale.two_candidate.{name}.mean", branch.mean, plain(branch.mean)),
+            keyed(f"scale.two_candidate.{name}.std", branch.std, plain(branch.std)),
+            "chosen" if given.chosen == name else "",
         ]
-        for name, branch in branches
-        if isinstance(branch, dict)
+        for name, branch in ([] if given is None else [("alpha0", given.alpha0), ("alpha1", given.alpha1)])
     ]
     return Table(
         "The paper's two candidates",
@@ -114,40 +108,25 @@ def two_candidates(content: Content) -> Table:
 
 def anchors(content: Content) -> Table:
     """Where the anchors are, with what is not certain about it."""
-    rows = [
-        [
-            anchor_id,
-            *_keyed_coordinates(f"anchors.{anchor_id}.position_m", anchor.get("position_m")),
-            Markup(" ").join(
-                keyed(f"anchors.{anchor_id}.{key}", value, fixed(value, 3))
-                for key, value in _stddevs(anchor.get("stddev_m"))
-            ),
-            *(signed(value, 3) for value in _difference(anchor)),
-            keyed(
-                f"anchors.{anchor_id}.range_bias_m", anchor.get("range_bias_m"), signed(anchor.get("range_bias_m"), 3)
-            ),
-            " ".join(_coordinates(anchor["mirror_position_m"])) if anchor.get("mirror_position_m") else "none",
-        ]
-        for anchor_id, anchor in _anchors_in_order(content.summary)
-    ]
+    given = content.summary.anchors
+    rows = [_anchor(f"anchors.{anchor_id}", anchor_id, given[anchor_id]) for anchor_id in in_natural_order(given)]
     header = ["anchor", "x m", "y m", "z m", "stddev m", "Δx m", "Δy m", "Δz m", "range bias m", "mirror image at m"]
     note = "Δ: estimated minus surveyed position, where it was surveyed. A stddev of 0: held there."
     return Table("Anchors in the map's frame", header, rows, note)
 
 
-def _anchors_in_order(summary: Summary) -> list[tuple[str, dict[str, Any]]]:
-    given = summary.table("anchors")
+def _anchor(key: str, anchor_id: str, anchor: AnchorEntry) -> list[str]:
+    position, surveyed, mirror = anchor.position_m, anchor.surveyed_position_m, anchor.mirror_position_m
+    nowhere = (None, None, None)
+    moved = zip(position, surveyed) if position and surveyed else ()
     return [
-        (anchor_id, given[anchor_id]) for anchor_id in in_natural_order(given) if isinstance(given[anchor_id], dict)
+        anchor_id,
+        *(keyed(f"{key}.position_m.{axis}", x, fixed(x, 3)) for axis, x in enumerate(position or nowhere)),
+        keyed(f"{key}.stddev_m", anchor.stddev_m, fixed(anchor.stddev_m, 3)),
+        *([signed(a - b, 3) for a, b in moved] or [signed(None, 3)] * 3),
+        keyed(f"{key}.range_bias_m", anchor.range_bias_m, signed(anchor.range_bias_m, 3)),
+        " ".join(fixed(x, 3) for x in mirror) if mirror else "none",
     ]
-
-
-def _difference(anchor: dict[str, Any]) -> list[float | None]:
-    """Estimated minus surveyed position."""
-    estimated, surveyed = anchor.get("position_m"), anchor.get("surveyed_position_m")
-    if is_position(estimated) and is_position(surveyed):
-        return [a - b for a, b in zip(estimated, surveyed)]
-    return [None] * 3
 
 
 def distances(content: Content) -> Table:
@@ -155,11 +134,11 @@ def distances(content: Content) -> Table:
     columns = (("measured_m", fixed), ("stddev_m", fixed), ("estimated_m", fixed), ("residual_m", signed))
     rows = [
         [
-            f"{plain(row.get('from'))} to {plain(row.get('to'))}",
-            plain(row.get("kind")),
-            *(keyed(f"distances.{i}.{key}", row.get(key), write(row.get(key), 4)) for key, write in columns),
+            f"{row.from_} to {row.to}",
+            row.kind,
+            *(keyed(f"distances.{i}.{key}", getattr(row, key), write(getattr(row, key), 4)) for key, write in columns),
         ]
-        for i, row in _rows_of(content, "distances")
+        for i, row in enumerate(content.summary.distances)
     ]
     header = ["distance", "kind", "by tape m", "stddev m", "in the map m", "difference m"]
     return Table("Control and check distances", header, rows)
@@ -183,27 +162,22 @@ def intrinsics(content: Content) -> Table:
 
 def sensitivity(content: Content) -> Table:
     """How the scale answers to what was assumed, where the run tells."""
-    rows = _flattened(content.summary, "scale", "cutoff_test") + _flattened(content.summary, "scale", "sensitivity")
+    rows = _flattened(content.summary.scale.to_json()["sensitivity"])
     return Table("How the scale answers to what was assumed", [], rows)
 
 
 def inputs(content: Content) -> Table:
     """The files that the result was made from."""
     rows = [
-        [
-            plain(row.get("path")),
-            keyed(f"inputs.{i}.bytes", row.get("bytes"), count(row.get("bytes"))),
-            plain(row.get("sha256")),
-            plain(row.get("hashed")),
-        ]
-        for i, row in _rows_of(content, "inputs")
+        [entry.path, keyed(f"inputs.{i}.bytes", entry.bytes, count(entry.bytes)), entry.sha256, entry.hashed]
+        for i, entry in enumerate(content.summary.inputs)
     ]
     return Table("Inputs", ["file", "bytes", "SHA-256", "of"], rows, kind="settings")
 
 
 def stages(content: Content) -> Table:
     """Where the time went."""
-    seconds = {name: as_number(value) for name, value in content.summary.table("seconds").items()}
+    seconds = content.summary.seconds
     known = {name: value for name, value in seconds.items() if value is not None and name != "total"}
     longest = max(known.values(), default=0.0) or 1.0
     rows = [
@@ -221,19 +195,19 @@ def refinement(content: Content) -> Table:
     """What the solver did."""
     rows = [
         [name.replace("_", " "), keyed(f"refine.{name}", value, plain(value))]
-        for name, value in content.summary.table("refine").items()
+        for name, value in ({} if content.summary.refine is None else content.summary.refine.to_json()).items()
     ]
     return Table("Refinement", [], rows)
 
 
 def versions(content: Content) -> Table:
     """What the result was made with."""
-    return Table("Versions", [], _flattened(content.summary, "versions"))
+    return Table("Versions", [], _flattened(content.summary.versions))
 
 
 def settings(content: Content) -> Table:
     """What was asked for."""
-    return Table("Settings", [], _flattened(content.summary, "settings"), kind="settings")
+    return Table("Settings", [], _flattened(content.summary.settings.to_json()), kind="settings")
 
 
 def _fixed_or_nothing(values: Array, measure: Any, *, root: bool = False) -> str:
@@ -243,29 +217,12 @@ def _fixed_or_nothing(values: Array, measure: Any, *, root: bool = False) -> str
     return fixed(value**0.5 if root else value, 3)
 
 
-def _coordinates(position: Any) -> list[str]:
-    values = position if isinstance(position, list) and len(position) == 3 else [None] * 3
-    return [fixed(value, 3) for value in values]
-
-
-def _keyed_coordinates(key: str, position: Any) -> list[str]:
-    values = position if is_position(position) else [None] * 3
-    return [keyed(f"{key}.{axis}", value, fixed(value, 3)) for axis, value in enumerate(values)]
-
-
-def _stddevs(value: Any) -> list[tuple[str, Any]]:
-    """One for all coordinates or one for each, with their keys."""
-    if isinstance(value, list):
-        return [(f"stddev_m.{axis}", item) for axis, item in enumerate(value)]
-    return [("stddev_m", value)]
-
-
-def _flattened(summary: Summary, *keys: str) -> list[list[str]]:
+def _flattened(values: Mapping[str, Any]) -> list[list[str]]:
     """Rows of key and value of a nested object, keys joined by dots."""
     rows = []
-    for key in summary.table(*keys):
-        if summary.table(*keys, key):
-            rows += [[f"{key}.{inner}", value] for inner, value in _flattened(summary, *keys, key)]
+    for key, value in values.items():
+        if value and isinstance(value, dict):
+            rows += [[f"{key}.{inner}", text] for inner, text in _flattened(value)]
         else:
-            rows.append([key, plain(summary.get(*keys, key))])
+            rows.append([key, plain(value)])
     return rows

@@ -6,10 +6,10 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import AfterValidator, AliasChoices, ConfigDict, Field
+from pydantic import AfterValidator, AliasChoices, AliasPath, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
-from rangesfm.files.records import Count, Flag, Number, NumberOrNull, Record, Text, Vector, VectorOrNull
+from rangesfm.files.records import Count, Flag, IntervalOrNull, Number, NumberOrNull, Record, Text, Vector, VectorOrNull
 from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.join.models import ModelVerdict
@@ -31,7 +31,6 @@ def _unit(quaternion: tuple[float, ...]) -> tuple[float, ...]:
 
 
 Quaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_unit)]
-Interval = tuple[NumberOrNull, NumberOrNull]
 
 
 class SimilarityEntry(Record):
@@ -71,7 +70,7 @@ class ScaleEntry(Record):
     value: Number
     stddev_formal: NumberOrNull
     stddev_empirical: NumberOrNull
-    interval_95: Interval
+    interval_95: IntervalOrNull
     relative_stddev: ScaleUncertainty = Field(validation_alias=AliasChoices("relative_stddev", "uncertainty"))
     method: Text
     verdict: Literal["good", "doubtful"]
@@ -81,7 +80,9 @@ class ScaleEntry(Record):
     sensitivity: ScaleSensitivity
     per_anchor: dict[Text, NumberOrNull]
     range_noise_stddev_m: NumberOrNull = Field(validation_alias=AliasChoices("range_noise_stddev_m", "noise_stddev_m"))
-    correlation_inflation: NumberOrNull
+    correlation_inflation: NumberOrNull = Field(
+        validation_alias=AliasChoices("correlation_inflation", AliasPath("errors", "inflation"))
+    )
     two_candidate: TwoCandidateEntry | None
 
     @property
@@ -101,7 +102,7 @@ class ModelScaleEntry(Record):
 
     value: NumberOrNull
     stddev_empirical: NumberOrNull
-    interval_95: Interval | None
+    interval_95: IntervalOrNull
     verdict: Literal["good", "doubtful", "refused"]
     reasons: tuple[Text, ...]
 
@@ -269,6 +270,7 @@ class RefineEntry(Record):
         others = {
             "iterations": summary.num_iterations,
             "keyframe_graph_steps": summary.num_graph_steps,
+            "correlation_inflation": summary.errors.inflation,
             "converged": summary.converged and not summary.misfits,
             "message": "; ".join(summary.misfits) or summary.message,
             "scale_value": found.refined_scale,
@@ -314,26 +316,43 @@ class GeoreferenceEntry(Record):
         return Georeference(self.lat_deg, self.lon_deg, self.height_m, self.crs)
 
 
-class RangesSettings(Record):
-    """Of ``[ranges]``, what is read again."""
+class _Table(Record):
+    """A table of a survey; named are the keys that are read again."""
 
     model_config = ConfigDict(extra="allow")
 
-    association: AssociationOptions
+
+class ImageSettings(_Table):
+    path: Text | None
 
 
-class Settings(Record):
-    """All settings of the run, as ``Survey.to_dict`` has them; named here are those that are read again."""
+class RangesSettings(_Table):
+    max_interpolation_gap_s: Number
+    max_time_difference_s: Number
 
-    model_config = ConfigDict(extra="allow")
+    @property
+    def association(self) -> AssociationOptions:
+        return AssociationOptions(**{name: getattr(self, name) for name in AssociationOptions.model_fields})
 
-    images_path: Text | None
-    anchors_path: Text | None
-    anchor_frame: Text | None
-    anchor_crs: Text | None
+
+class AnchorSettings(_Table):
+    path: Text | None
+    frame: Text | None
+    crs: Text | None
+
+
+class TagSettings(_Table):
     tag_in_cam_m: Vector
     lever_arms_m: dict[Text, Vector]
+
+
+class Settings(_Table):
+    """The survey as the run had it, by tables and keys."""
+
+    images: ImageSettings
     ranges: RangesSettings
+    anchors: AnchorSettings
+    tag: TagSettings
 
 
 class InputEntry(Record):

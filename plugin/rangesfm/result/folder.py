@@ -117,12 +117,12 @@ class ResultFolder:
     @property
     def images_path(self) -> Path | None:
         """Folder of the photos, as the run was told; None if it had none."""
-        path = self.summary.settings.images_path
+        path = self.summary.settings.images.path
         return None if path is None else path_of(path)
 
     def lever_arms_m(self, tag_ids: Sequence[str]) -> Array:
         """(n, 3) antenna in the camera's frame of each tag of a list; of one the settings do not name, the common."""
-        settings = self.summary.settings
+        settings = self.summary.settings.tag
         arms = [settings.lever_arms_m.get(tag_id, settings.tag_in_cam_m) for tag_id in tag_ids]
         return np.array(arms, dtype=np.float64).reshape(-1, 3)
 

@@ -11,7 +11,7 @@ import pycolmap
 
 from rangesfm.colmap.transform import rescale
 from rangesfm.geometry.similarity import Similarity, align_points
-from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.join.models import ModelVerdict
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.clock.estimate import TimeOffset
@@ -81,7 +81,7 @@ class MetricResult:
     @property
     def range_stddev_m(self) -> Array:
         """(n,) noise of each range as weighted last; NaN without a place."""
-        return self.estimate.range_stddev_m if self.refinement is None else self.refinement.range_stddev_m
+        return (self.estimate if self.refinement is None else self.refinement).errors.stddev_m
 
     @property
     def residuals_m(self) -> Array:
@@ -139,9 +139,7 @@ class MetricResult:
 
     def path_of(self, model: pycolmap.Reconstruction) -> Trajectory:
         """The keyframes as another model has them."""
-        times = self.trajectory.timestamps_s
-        by_name = None if times is None else dict(zip(self.trajectory.image_names, times.tolist(), strict=True))
-        return trajectory_from_reconstruction(model, by_name)
+        return self.trajectory.as_in(model)
 
 
 def _moved_anchor(anchor: AnchorEstimate, offset_m: Array) -> AnchorEstimate:

@@ -95,8 +95,9 @@ class ResultSummary(Record):
     def lines(self, folder: Path, table: str | None) -> Iterator[str]:
         """What a user wants to know at the end of a run, with the comparison's table, if there is one."""
         scale, ranges, offset = self.scale, self.ranges, self.time_offset
-        low, high = (_text(end, ".6g") for end in scale.interval_95)
-        yield f"scale: {scale.value:.6g} m per SfM unit, 95 % interval {low} to {high}"
+        low, high = scale.interval_95 or (None, None)
+        interval = f"{_text(low, '.6g')} to {_text(high, '.6g')}"
+        yield f"scale: {scale.value:.6g} m per SfM unit, 95 % interval {interval}"
         yield f"verdict: {scale.verdict}: {'; '.join(scale.reasons)}"
         for advice in scale.advice:
             yield f"next time: {advice}"

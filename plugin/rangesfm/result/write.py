@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,4 +50,4 @@ def write_models_and_tables(
     impossible = [] if found.final.num_points3D() else ["ply"]
     impossible += [] if found.center_covariance_m2 else COVARIANCE_FORMATS
     formats = tuple(name for name in export.formats if name not in impossible)
-    export_map(map_, folder, replace(export, formats=formats))
+    export_map(map_, folder, export.changed(formats=formats))

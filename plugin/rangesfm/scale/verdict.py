@@ -51,7 +51,7 @@ class _Doubt:
 
 
 def judge(
-    survey: ScaleProblem,
+    problem: ScaleProblem,
     solution: Solution,
     uncertainty: ScaleUncertainty,
     per_anchor: dict[str, float],
@@ -69,8 +69,8 @@ def judge(
     narrower = weak[0].advice if weak else _what_narrows_it(solution, uncertainty)
     doubts = [
         *weak,
-        *(_Doubt(note, "survey three anchors or more that are not on one line") for note in survey.notes),
-        *_left_out_doubts(survey.left_out),
+        *(_Doubt(note, "survey three anchors or more that are not on one line") for note in problem.notes),
+        *_left_out_doubts(problem.left_out),
         *_path_doubts(solution, anchors),
         *_range_doubts(solution.fit),
         *_anchor_doubts(per_anchor),

@@ -16,19 +16,13 @@ def input_hashes(survey: Survey) -> list[dict[str, Any]]:
     Of a folder of photos only the names and sizes are hashed: reading gigabytes again would take
     longer than what is gained.
     """
-    files = (
-        survey.ranges.path,
-        survey.ranges.error_curve_path,
-        survey.anchors_path,
-        survey.image_times_path,
-        survey.distances_path,
-        survey.markers_path,
-        survey.reference_path,
-        *sorted((survey.model_path or Path()).glob("*.bin") if survey.model_path else ()),
-    )
-    entries = [_file(path) for path in files if path is not None and path.is_file()]
-    if survey.images_path is not None and survey.images_path.is_dir():
-        entries.append(_folder(survey.images_path))
+    entries: list[dict[str, Any]] = []
+    for item in survey.input_paths():
+        if item.role == "photos":
+            entries += [_folder(item.path)] if item.path.is_dir() else []
+        else:
+            files = sorted(item.path.glob("*.bin")) if item.role == "model" else [item.path]
+            entries += [_file(path) for path in files if path.is_file()]
     return entries
 
 

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from rangesfm.distances.tape import Tape, read_tape
 from rangesfm.errors import InputError
 from rangesfm.geometry.reference import Reference, read_reference
+from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.anchor_file import default_anchor_frame, read_anchors
 from rangesfm.ranging.anchors.site import Site, local_site
@@ -20,14 +21,15 @@ from rangesfm.ranging.clock.time_resolution import time_resolution_s
 from rangesfm.ranging.errors.error_curve import correct_ranges, read_error_curve
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges
-from rangesfm.survey.settings import RangesConfig, Survey
+from rangesfm.ranging.readers.time_units import SECONDS_PER_UNIT
+from rangesfm.ranging.twr import AIR_M_PER_S, DW1000_TICK_S, VACUUM_M_PER_S, StampOptions
+from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes, find_image_times, read_image_times_csv
 
 if TYPE_CHECKING:
     import pycolmap
 
-# Beyond these a unit is wrong, or the file: no camera carries its tag so far away, and no such radio reaches so far.
-_MAX_LEVER_ARM_M = 20.0
+# Beyond it a unit is wrong, or the file: no such radio reaches so far.
 _MAX_RANGE_M = 1e6
 # Times in coarser steps than this are worth a word.
 _COARSE_STEP_S = 0.1
@@ -42,7 +44,7 @@ class RangingInputs:
         tag_in_cam_m: (num_tags, 3) lever arms in the order of ``log.tag_ids``; NaN for a tag that ranges with
             tags only.
         anchors: every anchor of the log.
-        anchor_frame: one of ANCHOR_FRAMES.
+        anchor_frame: "site", "first_camera" or "unknown".
         site: the frame of the anchors' positions.
         tape: taped distances, if given.
         reference: true positions, if given.
@@ -65,72 +67,74 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     Raises:
         InputError: a file is missing or wrong, or the log has an anchor or tags that nobody explained.
     """
-    _check_lever_arms(survey)
-    given = read_anchors(survey.anchors_path) if survey.anchors_path is not None else None
-    tag_ids = [*survey.lever_arms_m, *([] if survey.tag_id is None else [survey.tag_id])]
+    given = read_anchors(survey.anchors.path) if survey.anchors.path is not None else None
+    tag_ids = [*survey.tag.lever_arms_m, *([] if survey.tag.tag_id is None else [survey.tag.tag_id])]
     log = read_log(survey.ranges, [anchor.anchor_id for anchor in given or ()], tag_ids)
     _check_lengths(log)
-    log = _of_wanted_anchors(_of_wanted_tag(log, survey.tag_id), survey.use_anchors)
+    log = _of_wanted_anchors(_of_wanted_tag(log, survey.tag.tag_id), survey.anchors.use)
     _check_camera_is_heard(log)
     tag_in_cam_m = _lever_arms_of_log(log, survey)
     anchors = _anchors_of_log(log) if given is None else given
     _check_anchors_known(log, anchors, survey)
-    frame = survey.anchor_frame or default_anchor_frame(anchors)
-    site, anchors = local_site(anchors, frame, survey.anchor_crs, survey.anchors_path)
+    frame = survey.anchors.frame or default_anchor_frame(anchors)
+    site, anchors = local_site(anchors, frame, survey.anchors.crs, survey.anchors.path)
     if frame != "unknown" and all(anchor.position_m is None for anchor in anchors):
         raise InputError(
             f"anchor frame {frame!r} needs anchor positions and there are none: give anchors.csv, or frame unknown",
-            survey.anchors_path,
+            survey.anchors.path,
         )
     _check_held_out(survey, anchors, frame)
     log, curve_notes = _without_known_errors(log, survey)
-    tape = None if survey.distances_path is None else read_tape(survey.distances_path, survey.markers_path)
-    reference = None if survey.reference_path is None else read_reference(survey.reference_path)
+    tape = None if survey.scale.distances is None else read_tape(survey.scale.distances, survey.scale.markers)
+    reference = None if survey.report.reference is None else read_reference(survey.report.reference)
     notes = (*_notes(log, anchors, survey, anchors_are_of_log=given is None), *curve_notes)
     return RangingInputs(log, tag_in_cam_m, anchors, frame, site, tape, reference, notes)
 
 
 def _check_held_out(survey: Survey, anchors: Sequence[Anchor], frame: str) -> None:
     surveyed = [anchor.anchor_id for anchor in anchors if anchor.position_m is not None and frame != "unknown"]
-    for anchor_id in survey.ranges.checks.check_anchors:
+    for anchor_id in survey.ranges.check_anchors:
         if anchor_id not in surveyed:
             raise InputError(
                 f"check_anchors: the position of anchor {anchor_id!r} is not known, so that its ranges can check "
                 f"nothing; expected of: {', '.join(surveyed) or 'none'}",
-                survey.anchors_path,
+                survey.anchors.path,
             )
 
 
 def _without_known_errors(log: RangeLog, survey: Survey) -> tuple[RangeLog, list[str]]:
-    curve_path = survey.ranges.error_curve_path
+    curve_path = survey.ranges.error_curve
     return (log, []) if curve_path is None else correct_ranges(log, read_error_curve(curve_path))
 
 
-def read_log(config: RangesConfig, anchor_ids: Collection[str] = (), tag_ids: Collection[str] = ()) -> RangeLog:
+def read_log(options: LogOptions, anchor_ids: Collection[str] = (), tag_ids: Collection[str] = ()) -> RangeLog:
     """The radio's log as a survey describes it; see ``read_ranges``."""
-    if config.path is None:
+    if options.path is None:
         raise InputError("no ranges: give [ranges] path in a survey file, or --ranges LOG")
     return read_ranges(
-        config.path,
-        format=config.format,
-        columns=config.columns or None,
-        timestamp_unit=config.timestamp_unit,
-        range_unit=config.range_unit,
-        separator=config.separator,
+        options.path,
+        format=options.format,
+        columns=options.columns or None,
+        timestamp_unit=options.timestamp_unit,
+        range_unit=options.range_unit,
+        separator=options.separator,
         anchor_ids=anchor_ids,
         tag_ids=tag_ids,
-        ranging_interval_s=config.ranging_interval_s,
-        stamps=config.stamps,
+        ranging_interval_s=options.ranging_interval_s,
+        stamps=stamp_options(options),
     )
 
 
-def _check_lever_arms(survey: Survey) -> None:
-    for tag_id, tag_in_cam_m in {"": survey.tag_in_cam_m, **survey.lever_arms_m}.items():
-        if any(abs(coordinate) > _MAX_LEVER_ARM_M for coordinate in tag_in_cam_m):
-            raise InputError(
-                f"tag_in_cam_m {f'of tag {tag_id} ' if tag_id else ''}is {list(tag_in_cam_m)}, expected metres from "
-                f"the camera to its tag, each at most {_MAX_LEVER_ARM_M:g}"
-            )
+def stamp_options(options: LogOptions) -> StampOptions:
+    """How a survey's time stamps of two-way ranging become ranges."""
+    named: dict[str | float, float] = {"air": AIR_M_PER_S, "vacuum": VACUUM_M_PER_S}
+    speed = options.propagation_speed
+    return StampOptions(
+        unit_s=DW1000_TICK_S if options.stamp_unit == "ticks" else SECONDS_PER_UNIT[options.stamp_unit],
+        wrap_s=2**options.stamp_bits * DW1000_TICK_S,
+        propagation_speed_m_per_s=named[speed] if speed in named else float(speed),
+        t_off_s=options.t_off_s,
+    )
 
 
 def _check_camera_is_heard(log: RangeLog) -> None:
@@ -144,26 +148,27 @@ def _check_camera_is_heard(log: RangeLog) -> None:
 
 def _lever_arms_of_log(log: RangeLog, survey: Survey) -> npt.NDArray[np.float64]:
     """(num_tags, 3) as ``RangingInputs.tag_in_cam_m``; InputError for a tag that ranges with anchors and has none."""
+    given = survey.tag.lever_arms_m
     heard = np.unique(log.tag_index[log.kind == RangeKind.TAG_ANCHOR]).tolist()
     arms = np.full((len(log.tag_ids), 3), np.nan)
-    if not survey.lever_arms_m:
+    if not given:
         if len(heard) > 1:
             raise InputError(
                 f"the log has several tags ({', '.join(log.tag_ids[k] for k in heard)}): give each its lever arm "
                 "([tag.lever_arms_m], or --tag_in_cam ID:X,Y,Z for each), or say which is the camera's (--tag_id)",
                 log.source,
             )
-        arms[heard] = survey.tag_in_cam_m
+        arms[heard] = survey.tag.tag_in_cam_m
         return arms
     for k in heard:
-        if log.tag_ids[k] not in survey.lever_arms_m:
+        if log.tag_ids[k] not in given:
             raise InputError(
-                f"tag {log.tag_ids[k]!r} has no lever arm, those given are of {', '.join(survey.lever_arms_m)}: give "
+                f"tag {log.tag_ids[k]!r} has no lever arm, those given are of {', '.join(given)}: give "
                 "it one ([tag.lever_arms_m], or --tag_in_cam ID:X,Y,Z), or choose a tag (--tag_id)",
                 log.source,
                 int(log.line[np.argmax(log.tag_index == k)]),
             )
-        arms[k] = survey.lever_arms_m[log.tag_ids[k]]
+        arms[k] = given[log.tag_ids[k]]
     return arms
 
 
@@ -183,10 +188,10 @@ def _anchors_of_log(log: RangeLog) -> tuple[Anchor, ...]:
 
 def times_of_model(survey: Survey, sfm: pycolmap.Reconstruction, model_path: Path) -> ImageTimes:
     """Times of a model's photos; the table may list others, which did not become keyframes."""
-    if survey.image_times_path is not None:
-        return read_image_times_csv(survey.image_times_path)
+    if survey.images.times is not None:
+        return read_image_times_csv(survey.images.times)
     names = tuple(sorted(image.name for image in sfm.images.values()))
-    return find_image_times(survey.images_path or model_path, names)
+    return find_image_times(survey.images.path or model_path, names)
 
 
 def of_one_tag(log: RangeLog, tag_id: str | None) -> RangeLog:
@@ -228,7 +233,7 @@ def _check_anchors_known(log: RangeLog, anchors: Sequence[Anchor], survey: Surve
         if anchor_id not in known:
             first = int(np.argmax((log.anchor_index == k) | ((log.tag_index < 0) & (log.peer_index == k))))
             raise InputError(
-                f"anchor_id is {anchor_id!r}, expected one of {survey.anchors_path}: {', '.join(sorted(known))} "
+                f"anchor_id is {anchor_id!r}, expected one of {survey.anchors.path}: {', '.join(sorted(known))} "
                 "(--use_anchors leaves others out)",
                 log.source,
                 int(log.line[first]),
@@ -238,7 +243,7 @@ def _check_anchors_known(log: RangeLog, anchors: Sequence[Anchor], survey: Surve
 def _notes(log: RangeLog, anchors: Sequence[Anchor], survey: Survey, *, anchors_are_of_log: bool) -> list[str]:
     silent = [anchor.anchor_id for anchor in anchors if anchor.anchor_id not in log.anchor_ids]
     notes = [f"no ranges to anchor {', '.join(silent)}"] if silent else []
-    silent = [tag_id for tag_id in survey.lever_arms_m if tag_id not in log.tag_ids and survey.tag_id is None]
+    silent = [tag_id for tag_id in survey.tag.lever_arms_m if tag_id not in log.tag_ids and survey.tag.tag_id is None]
     notes += [f"no ranges of tag {', '.join(silent)}"] if silent else []
     for kind, what in (
         (RangeKind.ANCHOR_ANCHOR, "anchors: they are distances for the map to keep to"),

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pycolmap
 
-from rangesfm.colmap.passthrough import nearest_known
-from rangesfm.errors import InputError
+from rangesfm.errors import InputError, nearest_known
 from rangesfm.options import CameraOptions
 
 _MODELS = {name: model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}

@@ -56,7 +56,7 @@ class Submap:
 
     def with_threads(self, num_threads: int) -> Submap:
         """The same, mapped with so many threads."""
-        return replace(self, mapper=replace(self.mapper, num_threads=num_threads))
+        return replace(self, mapper=self.mapper.changed(num_threads=num_threads))
 
     def models(self) -> tuple[pycolmap.Reconstruction, ...]:
         """Those that its photos gave, with the ids of the whole survey's database; there may be none."""

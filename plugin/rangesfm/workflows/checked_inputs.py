@@ -24,19 +24,9 @@ from rangesfm.workflows.placed_ranges import ranges_on_path
 def read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
     """Everything that can be wrong is found before the long work begins."""
     check_formats(survey.export.formats)
-    with survey.naming_its_lines():
+    with survey.source.naming_lines():
         apply_options(pycolmap.BundleAdjustmentOptions(), survey.refine.bundle_adjustment, "refine.bundle_adjustment")
-    refuse_to_overwrite(
-        (
-            survey.ranges.path,
-            survey.ranges.error_curve_path,
-            survey.anchors_path,
-            survey.image_times_path,
-            survey.reference_path,
-            survey.model_path,
-        ),
-        survey.output_path,
-    )
+    refuse_to_overwrite((item.path for item in survey.input_paths()), survey.output.path)
     inputs = read_ranging_inputs(survey)
     for note in inputs.notes:
         journal.warn(note)
@@ -55,7 +45,7 @@ def check_times(survey: Survey, inputs: RangingInputs, path: Trajectory) -> None
     """Refuse a reference and ranges that have nothing to do with these photos; where they were does not matter."""
     reference, offset_s = inputs.reference, survey.ranges.time_offset_s
     if reference is not None and not np.isfinite(reference.positions_at(path)[0]).any():
-        raise InputError(reference.why_nothing_is_known(path), survey.reference_path)
+        raise InputError(reference.why_nothing_is_known(path), survey.report.reference)
     if inputs.log.image_name is not None or offset_s is not None:
         ranges_on_path(survey, inputs, path, offset_s or 0.0)
 

@@ -33,7 +33,7 @@ def export_result(
         InputError: as ``export_model``, the folder is not a result with a metric model, or a run is writing to the
             destination.
     """
-    options = replace(options or ExportOptions(), formats=tuple(formats))
+    options = (options or ExportOptions()).changed(formats=tuple(formats))
     check_formats(options.formats)
     result = read_result_folder(output_path)
     with sole_writer(destination):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -42,38 +41,39 @@ def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress)
     journal = Journal(progress)
     check_formats(survey.export.formats)
     finished = read_finished_runs(folders)
-    if survey.output_path.resolve() in [folder.resolve() for folder in folders]:
-        raise InputError("the results would overwrite this survey, expected another output path", survey.output_path)
-    log, number, is_check = joined_log(finished, survey.use_anchors)
+    if survey.output.path.resolve() in [folder.resolve() for folder in folders]:
+        raise InputError("the results would overwrite this survey, expected another output path", survey.output.path)
+    log, number, is_check = joined_log(finished, survey.anchors.use)
     anchors, frame = _anchors(survey, finished, log)
-    crs = survey.anchor_crs or _common(one.result.summary.settings.anchor_crs for one in finished)
-    site, anchors = local_site(anchors, frame, crs, survey.anchors_path)
+    crs = survey.anchors.crs or _common(one.result.summary.settings.anchors.crs for one in finished)
+    site, anchors = local_site(anchors, frame, crs, survey.anchors.path)
     arms = {tag_id: arm for one in finished for tag_id, arm in one.tags_in_cam_m.items()}
     tags_in_cam_m = np.array([arms[tag_id] for tag_id in log.tag_ids])
-    reference = None if survey.reference_path is None else read_reference(survey.reference_path)
+    reference = None if survey.report.reference is None else read_reference(survey.report.reference)
     inputs = RangingInputs(log, tags_in_cam_m, anchors, frame, site, None, reference, ())
-    as_joined = replace(
-        survey,
-        ranges=replace(survey.ranges, time_offset_s=0.0),
-        lever_arms_m={tag_id: (float(arm[0]), float(arm[1]), float(arm[2])) for tag_id, arm in arms.items()},
-        images_path=_images_path(finished),
+    as_joined = survey.changed(
+        {
+            "images.path": _images_path(finished),
+            "ranges.time_offset": 0.0,
+            "tag.lever_arms_m": {tag_id: tuple(arm.tolist()) for tag_id, arm in arms.items()},
+        }
     )
-    with sole_writer(survey.output_path):
+    with sole_writer(survey.output.path):
         paths = paths_of_surveys(finished, log, number, is_check, tags_in_cam_m)
         return map_in_metres(as_joined, inputs, paths, None, journal, refine=survey.refine.enabled, must_join=True)
 
 
 def _anchors(survey: Survey, finished: Sequence[FinishedRun], log: RangeLog) -> tuple[tuple[Anchor, ...], str]:
     """What is known of the anchors, and the frame of their positions."""
-    if survey.anchors_path is not None:
-        given = read_anchors(survey.anchors_path)
-    elif survey.anchor_frame == "unknown":
+    if survey.anchors.path is not None:
+        given = read_anchors(survey.anchors.path)
+    elif survey.anchors.frame == "unknown":
         given = ()
     else:
         given = _anchors_of_surveys(finished)
     known = {anchor.anchor_id for anchor in given}
     anchors = (*given, *(Anchor(anchor_id) for anchor_id in log.anchor_ids if anchor_id not in known))
-    frame = survey.anchor_frame or default_anchor_frame(anchors)
+    frame = survey.anchors.frame or default_anchor_frame(anchors)
     if frame != "unknown" and all(anchor.position_m is None for anchor in anchors):
         raise InputError(f"anchor frame {frame!r} needs anchor positions and the surveys have none: give --anchors CSV")
     return anchors, frame
@@ -99,8 +99,8 @@ def _anchors_of_surveys(finished: Sequence[FinishedRun]) -> tuple[Anchor, ...]:
 
 
 def _anchors_of(one: FinishedRun) -> tuple[Anchor, ...]:
-    settings = one.result.summary.settings
-    path, frame = settings.anchors_path, settings.anchor_frame
+    anchors = one.result.summary.settings.anchors
+    path, frame = anchors.path, anchors.frame
     if path is None or frame == "unknown":
         return ()
     if frame == "first_camera":
@@ -122,6 +122,6 @@ def _common(settings: Iterable[str | None]) -> str | None:
 
 def _images_path(finished: Sequence[FinishedRun]) -> Path | None:
     """The folder of all photos, where there is one and they have kept their names."""
-    path = _common(one.result.summary.settings.images_path for one in finished)
+    path = _common(one.result.summary.settings.images.path for one in finished)
     is_renamed = any(name != own for one in finished for own, name in one.own_name.items())
     return None if path is None or is_renamed else Path(path)

@@ -12,14 +12,12 @@ from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError
 from rangesfm.join.models import ModelVerdict, PathOfModel, Ranging, join_models
 from rangesfm.ranging.clock.estimate import TimeOffset
-from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE
-from rangesfm.refine.with_ranges import predicted_ranges
+from rangesfm.refine.radio import predicted_ranges
 from rangesfm.result.metric_result import MetricResult
-from rangesfm.scale.initialize import initialize_scale
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.workflows.journal import Journal
-from rangesfm.workflows.survey_stages import refine_by_survey
+from rangesfm.workflows.survey_stages import estimate_scale, refine_by_survey
 
 
 def join_by_survey(
@@ -28,7 +26,7 @@ def join_by_survey(
     """All models that can be, as one."""
     if len(paths) == 1:
         return paths[0], ()
-    ranging = Ranging(inputs.anchors, inputs.anchor_frame, survey.scale, survey.ranges.model, inputs.tape, survey.seed)
+    ranging = Ranging(inputs.anchors, inputs.anchor_frame, survey.scale, survey.ranges, inputs.tape, survey.output.seed)
     joined = join_models(paths, ranging)
     left_out = [model for model in joined.verdicts if model.joined_from_sfm is None]
     if must_join and len(left_out) == len(paths) - 1:
@@ -49,16 +47,7 @@ def scale_by_survey(
     distances = None
     if inputs.tape is not None:
         distances = locate_distances(inputs.tape, sfm, observations.log.anchor_ids)
-    estimate = initialize_scale(
-        observations,
-        trajectory,
-        inputs.anchors,
-        anchor_frame=inputs.anchor_frame,
-        options=survey.scale,
-        range_model=survey.ranges.model,
-        distances=distances,
-        seed=survey.seed,
-    )
+    estimate = estimate_scale(survey, inputs, observations, trajectory, inputs.anchor_frame, distances)
     for doubt in estimate.reasons if estimate.verdict != "good" else ():
         journal.warn(doubt)
     scaled = rescale(sfm, estimate.metric_from_sfm)
@@ -68,10 +57,9 @@ def scale_by_survey(
         estimate.observations,
         estimate.metric_from_sfm,
         inputs.tag_in_cam_m,
-        [anchor.position_m for anchor in estimate.anchors],
-        [anchor.range_bias_m for anchor in estimate.anchors],
+        estimate.anchors,
     )
-    weights = GEMAN_MCCLURE.weights((predicted - inputs.log.range_m) / estimate.range_stddev_m)
+    weights = estimate.errors.robust_weights(predicted - inputs.log.range_m)
     offset_s = offset.value_s if offset is not None else survey.ranges.time_offset_s
     return MetricResult(trajectory, offset, offset_s, estimate, scaled, predicted, weights)
 

@@ -34,11 +34,11 @@ def find_keyframes(
     with journal.timed("keyframes"):
         names = list_images(folder)
         image_times = None
-        with nullcontext() if survey.image_times_path or log_names_photos is False else suppress(InputError):
-            image_times = find_image_times(folder, names, survey.image_times_path)
-        if image_times is None or (log_names_photos and not survey.image_times_path and image_times.num_left_out):
-            return select_keyframes(names, survey.keyframes), None
-        keyframes = select_keyframes(image_times, survey.keyframes)
+        with nullcontext() if survey.images.times or log_names_photos is False else suppress(InputError):
+            image_times = find_image_times(folder, names, survey.images.times)
+        if image_times is None or (log_names_photos and not survey.images.times and image_times.num_left_out):
+            return select_keyframes(names, survey.images), None
+        keyframes = select_keyframes(image_times, survey.images)
         return keyframes, noted(image_times, journal).of(keyframes)
 
 
@@ -62,24 +62,24 @@ def with_photos(
     do: Callable[..., _Done], survey: Survey, keyframes: tuple[str, ...], journal: Journal, restart: bool
 ) -> _Done:
     """Call ``reconstruct``, or a part of it, for the keyframes of a survey."""
-    with survey.naming_its_lines():
+    with survey.source.naming_lines():
         return do(
             _images_path(survey),
             keyframes,
-            survey.output_path,
+            survey.output.path,
             camera=survey.camera,
             mapper=survey.mapper,
-            seed=survey.seed,
+            seed=survey.output.seed,
             progress=journal.progress,
             restart=restart,
-            before_change=lambda: forget_result(survey.output_path),
+            before_change=lambda: forget_result(survey.output.path),
         )
 
 
 def _images_path(survey: Survey) -> Path:
-    if survey.images_path is None:
+    if survey.images.path is None:
         raise InputError("no photos: give [images] path in a survey file, or --images FOLDER")
-    return survey.images_path
+    return survey.images.path
 
 
 def noted(image_times: ImageTimes, journal: Journal) -> ImageTimes:

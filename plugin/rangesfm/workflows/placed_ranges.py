@@ -30,7 +30,7 @@ def path_with_times(
     trajectory = path_of_model(model, times)
     if not len(trajectory):
         first = min(image.name for image in model.images.values())
-        raise InputError(f"none of the model's photos has a time, the first is {first}", survey.image_times_path)
+        raise InputError(f"none of the model's photos has a time, the first is {first}", survey.images.times)
     num = model.num_reg_frames()
     if num_without_time := num - len(trajectory):
         journal.warn(f"{num_without_time} of {num} photos of the model have no time and are left out")
@@ -48,8 +48,8 @@ def find_time_offset(
             inputs.log,
             trajectory,
             inputs.tag_in_cam_m,
-            association=survey.ranges.association,
-            seed=survey.seed,
+            association=survey.ranges,
+            seed=survey.output.seed,
             progress=journal.progress,
         )
     if offset.note:
@@ -83,7 +83,7 @@ def ranges_on_paths(
             journal.warn(f"sparse/{k} is left out: its photos have no time, or are in other models too")
             continue
         names.update(path.image_names)
-        observations = hold_out(_on_path(survey, inputs, path, offsets_s), survey.ranges.checks, survey.seed)
+        observations = hold_out(_on_path(survey, inputs, path, offsets_s), survey.ranges, survey.output.seed)
         paths.append(PathOfModel(f"sparse/{k}", rest, path, observations))
     return paths
 
@@ -97,15 +97,13 @@ def ranges_on_path(
         raise InputError(
             _why_no_range_has_a_place(observations, trajectory, float(np.mean(offset_s))), survey.ranges.path
         )
-    return hold_out(observations, survey.ranges.checks, survey.seed)
+    return hold_out(observations, survey.ranges, survey.output.seed)
 
 
 def _on_path(
     survey: Survey, inputs: RangingInputs, trajectory: Trajectory, offset_s: float | npt.NDArray[np.float64]
 ) -> RangeObservations:
-    return associate(
-        inputs.log, trajectory, inputs.tag_in_cam_m, time_offset_s=offset_s, options=survey.ranges.association
-    )
+    return associate(inputs.log, trajectory, inputs.tag_in_cam_m, time_offset_s=offset_s, options=survey.ranges)
 
 
 def _why_no_range_has_a_place(observations: RangeObservations, trajectory: Trajectory, offset_s: float) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 from typing import Any
 
 import pycolmap
@@ -12,14 +11,13 @@ from rangesfm.colmap.transform import rescale, take_over
 from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.files.atomic import sha256_of
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock.estimate import estimate_time_offset
-from rangesfm.ranging.observations import RangeObservations, hold_out
-from rangesfm.scale.initialize import initialize_scale
+from rangesfm.ranging.observations import RangeObservations
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes
-from rangesfm.workflows.survey_stages import path_of_model, refine_by_survey
+from rangesfm.workflows.placed_ranges import ranges_on_path
+from rangesfm.workflows.survey_stages import estimate_scale, path_of_model, refine_by_survey
 
 # Fewer have no shape by which ranges could tell a scale.
 _MIN_NUM_KEYFRAMES = 5
@@ -55,12 +53,14 @@ class AdjustmentWithRanges:
     def inputs(self) -> list[Any]:
         """All settings that it may look at, and its files by their content."""
         survey = self._survey
-        settings = survey.to_dict()
-        ranges = {key: value for key, value in settings["ranges"].items() if key not in ("path", "error_curve_path")}
-        others = ("camera", "scale", "refine", "anchor_crs", "tag_in_cam_m", "lever_arms_m", "tag_id", "use_anchors")
-        files = (survey.ranges.path, survey.ranges.error_curve_path, survey.anchors_path, survey.image_times_path)
+        settings = survey.model_dump(
+            mode="json",
+            include={"camera", "ranges", "anchors", "tag", "scale", "refine"},
+            exclude={"ranges": {"path", "error_curve"}, "anchors": {"path"}, "scale": {"distances", "markers"}},
+        )
+        files = (survey.ranges.path, survey.ranges.error_curve, survey.anchors.path, survey.images.times)
         contents = [None if path is None else sha256_of(path) for path in files]
-        return [ranges, *(settings[key] for key in others), self._inputs.anchor_frame, self._first_keyframe, contents]
+        return [settings, self._inputs.anchor_frame, self._first_keyframe, contents]
 
     def adjust(self, model: pycolmap.Reconstruction) -> bool:
         """Adjust a model in place; False, and it is as it was, while the ranges do not determine its scale."""
@@ -86,38 +86,21 @@ class AdjustmentWithRanges:
     def _adjusted(self, model: pycolmap.Reconstruction, path: Trajectory) -> pycolmap.Reconstruction:
         survey, inputs = self._survey, self._inputs
         observations = self._observations(path)
-        estimate = initialize_scale(
-            observations,
-            path,
-            inputs.anchors,
-            anchor_frame=self._anchor_frame(path),
-            options=survey.scale,
-            range_model=survey.ranges.model,
-            seed=survey.seed,
-        )
-        asked = replace(
-            survey,
-            camera=replace(survey.camera, refine_intrinsics=survey.camera.mapping_refines_intrinsics),
-            refine=replace(survey.refine, covariance=False),
-        )
+        estimate = estimate_scale(survey, inputs, observations, path, self._anchor_frame(path), distances=None)
+        refine_intrinsics = survey.camera.mapping_refines_intrinsics
+        asked = survey.changed({"camera.refine_intrinsics": refine_intrinsics, "refine.covariance": False})
         scaled = rescale(model, estimate.metric_from_sfm)
         refined, _ = refine_by_survey(asked, inputs, scaled, path, estimate, tape=None)
         return refined
 
     def _observations(self, path: Trajectory) -> RangeObservations:
         survey, inputs = self._survey, self._inputs
-        association = survey.ranges.association
         if self._is_to_look_for_offset(path):
             found = estimate_time_offset(
-                inputs.log, path, inputs.tag_in_cam_m, association=association, seed=survey.seed
+                inputs.log, path, inputs.tag_in_cam_m, association=survey.ranges, seed=survey.output.seed
             )
             self._offset_s, self._num_with_offset = found.value_s, len(path)
-        placed = associate(
-            inputs.log, path, inputs.tag_in_cam_m, time_offset_s=self._offset_s or 0.0, options=association
-        )
-        if not placed.has_place.any():
-            raise InputError("no range is near enough to a keyframe in time")
-        return hold_out(placed, survey.ranges.checks, survey.seed)
+        return ranges_on_path(survey, inputs, path, self._offset_s or 0.0)
 
     def _is_to_look_for_offset(self, path: Trajectory) -> bool:
         if self._inputs.log.timestamp_s is None or self._survey.ranges.time_offset_s is not None:

@@ -55,13 +55,13 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
     for note in disagreeing:
         journal.warn(note)
     metric = metric.doubted(disagreeing)
-    folder = survey.output_path
+    folder = survey.output.path
     with replacing_result(folder):
         with journal.stage("results"):
             comparison = _comparison(survey, inputs, metric)
             georeference = _georeference(inputs, metric)
             write_models_and_tables(
-                metric, survey.export, folder, images_path=survey.images_path, georeference=georeference
+                metric, survey.export, folder, images_path=survey.images.path, georeference=georeference
             )
         summary = ResultSummary.of(
             metric,
@@ -76,7 +76,7 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
         )
         summary.write(folder / summary.NAME)
     lines = [*summary.lines(folder, format_table(comparison) if comparison else None)]
-    if survey.report_enabled:
+    if survey.report.enabled:
         lines.append(f"report: {write_report(folder)}")
     return RunResult(folder, summary, tuple(lines))
 
@@ -105,5 +105,5 @@ def _comparison(survey: Survey, inputs: RangingInputs, metric: MetricResult) -> 
     rows = papers_table(scaled, refined, inputs.reference, frame=frame)
     in_frame = reference_in_frame(refined or scaled, inputs.reference, frame=frame)
     if in_frame is not None:
-        write_reference(in_frame, survey.output_path / REFERENCE_NAME)
+        write_reference(in_frame, survey.output.path / REFERENCE_NAME)
     return rows

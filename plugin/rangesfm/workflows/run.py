@@ -34,7 +34,7 @@ def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> 
     """Photos and ranges to a metric model. Steps of the reconstruction that are done are reused."""
     journal = Journal(progress)
     inputs, keyframes, times = checked_inputs(survey, journal)
-    with sole_writer(survey.output_path):
+    with sole_writer(survey.output.path):
         adjustment = AdjustmentWithRanges(survey, inputs, keyframes[0], times)
         models = map_keyframes(
             survey, keyframes, journal, restart, adjustment if survey.mapper.ranges_in_mapping else None
@@ -53,7 +53,7 @@ def prepare_survey(survey: Survey, *, progress: Progress, restart: bool = False)
     """
     journal = Journal(progress)
     _, keyframes, _ = checked_inputs(survey, journal)
-    with sole_writer(survey.output_path):
+    with sole_writer(survey.output.path):
         return with_photos(prepare_submaps, survey, keyframes, journal, restart)
 
 
@@ -63,9 +63,9 @@ def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = Fa
     if survey.mapper.ranges_in_mapping:
         journal.warn("ranges_in_mapping: nothing has been said of ranges here, they take part in a whole run")
     keyframes, _ = find_keyframes(survey, journal)
-    with sole_writer(survey.output_path):
+    with sole_writer(survey.output.path):
         sfm = map_keyframes(survey, keyframes, journal, restart)[0]
-    path = survey.output_path / "sparse" / "0"
+    path = survey.output.path / "sparse" / "0"
     return [f"unscaled model: {sfm.num_reg_images()} photos, {sfm.num_points3D()} points, in {path}"]
 
 
@@ -90,7 +90,7 @@ def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResul
     times = None
     if inputs.log.image_name is None:
         times = noted(times_of_model(survey, sfm, survey.model_path), journal)
-    with sole_writer(survey.output_path):
+    with sole_writer(survey.output.path):
         return to_metric(survey, inputs, [sfm], times, journal, refine=refine)
 
 

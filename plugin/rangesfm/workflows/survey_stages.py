@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pycolmap
 
+from rangesfm.distances.ends import LocatedDistances
 from rangesfm.distances.tape import Tape
 from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.ranging.observations import RangeObservations
 from rangesfm.refine.with_ranges import RefineSummary, refine_with_ranges
 from rangesfm.scale.estimate import ScaleEstimate
+from rangesfm.scale.initialize import initialize_scale
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes
@@ -20,6 +22,27 @@ def path_of_model(model: pycolmap.Reconstruction, times: ImageTimes | None) -> T
     if times is None:
         return trajectory_from_reconstruction(model)
     return trajectory_from_reconstruction(model, times.by_name(), time_resolution_s=times.resolution_s)
+
+
+def estimate_scale(
+    survey: Survey,
+    inputs: RangingInputs,
+    observations: RangeObservations,
+    trajectory: Trajectory,
+    anchor_frame: str,
+    distances: LocatedDistances | None,
+) -> ScaleEstimate:
+    """``initialize_scale`` by a survey's options; its arguments."""
+    return initialize_scale(
+        observations,
+        trajectory,
+        inputs.anchors,
+        anchor_frame=anchor_frame,
+        options=survey.scale,
+        range_model=survey.ranges,
+        distances=distances,
+        seed=survey.output.seed,
+    )
 
 
 def refine_by_survey(
@@ -36,21 +59,14 @@ def refine_by_survey(
         scaled: in the metric world. trajectory: of the unscaled model, as the scale stage had it.
         tape: distances to keep to.
     """
-    ranges = survey.ranges.model
-    # Those of which neither the log nor the survey says how noisy they are.
-    stddev_is_estimated = np.isnan(estimate.observations.log.range_stddev_m) & (ranges.range_stddev_m is None)
     return refine_with_ranges(
         scaled,
         trajectory,
         estimate.observations,
         estimate.metric_from_sfm,
         estimate.anchors,
+        estimate.errors,
         tag_in_cam_m=inputs.tag_in_cam_m,
-        range_stddev_m=estimate.range_stddev_m,
-        range_share=estimate.range_share,
-        stddev_is_estimated=stddev_is_estimated,
-        correlation_inflation=estimate.correlation_inflation,
-        common_bias_stddev_m=ranges.common_bias_stddev_m,
         first_pose_is_fixed=estimate.frame != "site",
         gravity=gravity_of(survey.scale.up_in_first_camera),
         camera=survey.camera,

@@ -259,3 +259,31 @@ class TestErrorCurve:
         assert placement.found is not None
         np.testing.assert_allclose(placement.found.position_m, alone.position_m, atol=1e-9)
         np.testing.assert_allclose(placement.found.covariance_m2, alone.covariance_m2, atol=1e-9)
+
+
+class TestRounding:
+    """What it would decide is decided otherwise, and the same on every machine."""
+
+    @pytest.mark.parametrize("seed", range(6))
+    def test_of_two_places_between_which_no_range_tells_the_upper_one_comes_first(self, seed: int) -> None:
+        for height in (3.5, -1.5):
+            ranges = distances(flat(), np.array([6.0, -4.0, height])) + noise(100, 0.02, seed)
+            found = trilaterate(flat(), ranges)
+            assert found.mirror_position_m is not None
+            assert found.position_m[2] > 3.0 > found.mirror_position_m[2]
+
+    @pytest.mark.parametrize("toward", [(1.0, 0.0, 0.0), (3.0, 4.0, 1e-15), (0.0, 0.0, 0.0)])
+    def test_a_direction_along_the_plane_of_the_positions_leaves_both_places(
+        self, toward: tuple[float, float, float]
+    ) -> None:
+        found = trilaterate(flat(), distances(flat()) + noise(100, 0.02), toward=toward)
+        assert found.mirror_position_m is not None
+
+    @pytest.mark.parametrize("away_m", [20.0, 60.0, 200.0])
+    @pytest.mark.parametrize("seed", range(3))
+    def test_a_bias_that_is_known_does_not_make_a_place_about_a_line_certain(self, away_m: float, seed: int) -> None:
+        """In metres its information is 1e12, and what is left of a direction beside it is rounding."""
+        line = np.outer(np.linspace(-4.0, 4.0, 100), [1.0, 0.0, 0.0])
+        ranges = distances(line, np.array([1.0, away_m, 3.0])) + noise(100, 0.02, seed)
+        with pytest.raises(GeometryError, match="on a line, about which the anchor may stand anywhere"):
+            trilaterate(line, ranges, options=KNOWN_BIAS)

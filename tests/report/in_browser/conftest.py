@@ -54,6 +54,10 @@ class Browser:
         self.wait_for("!document.querySelector('#figures') || window.rangesfmFigures")
         self.wait_for("!document.querySelector('#view') || window.rangesfmView")
 
+    def draw_figures(self) -> None:
+        """All of them, not only those near the window."""
+        self.run("for (const charts of Object.values(rangesfmFigures)) for (const chart of charts) chart.draw()")
+
     def run(self, script: str, *arguments: Any) -> Any:
         """What a script in the page returns."""
         return self._driver.execute_script(script, *arguments)

@@ -67,6 +67,7 @@ def test_an_error_on_the_console_and_a_request_are_noticed(browser: Browser, tmp
 
 def test_it_opens_with_all_figures_a_silent_console_and_no_request(browser: Browser, page: Path) -> None:
     browser.open(page)
+    browser.draw_figures()
     assert browser.console() == []
     assert {url for url in browser.requests() if not url.startswith("data:")} == {page.as_uri()}
     assert browser.run("return document.querySelectorAll('.chart svg').length") == NUM_CHARTS
@@ -80,6 +81,7 @@ def test_it_draws_in_the_readers_theme(browser: Browser, page: Path) -> None:
     }
     for theme, other in (("light", "dark"), ("dark", "light")):
         browser.open(page, theme=theme)
+        browser.draw_figures()
         picture = browser.picture("#trajectory")
         assert all(num_pixels(picture, color) > 50 for color in colors[theme])
         assert not any(num_pixels(picture, color) > 10 for color in colors[other])
@@ -94,6 +96,7 @@ def num_pixels(picture: Pixels, color: tuple[int, int, int]) -> int:
 @pytest.mark.parametrize("theme", ["light", "dark"])
 def test_every_text_is_readable(browser: Browser, page: Path, theme: str) -> None:
     browser.open(page, theme=theme)
+    browser.draw_figures()
     assert browser.run(CONTRASTS) == []
 
 
@@ -107,6 +110,7 @@ def test_unreadable_text_is_noticed(browser: Browser, tmp_path: Path) -> None:
 @pytest.mark.parametrize("width", WIDTHS_PX)
 def test_it_never_scrolls_sideways(browser: Browser, page: Path, width: int) -> None:
     browser.open(page, width=width)
+    browser.draw_figures()
     assert browser.run("return [innerWidth, document.documentElement.scrollWidth]") == [width, width]
 
 
@@ -125,6 +129,7 @@ def test_names_from_files_cannot_break_out(browser: Browser, make_result: MakeRe
     for table in ("ranges.csv", "scale_candidates.csv"):
         assert EVIL in (folder / table).read_text()
     browser.open(write_report(folder))
+    browser.draw_figures()
     assert browser.console() == []
     assert "broken out" not in browser.run("return document.title")
     assert browser.run("return [...document.querySelectorAll('.label.anchor')].map(x => x.textContent)")[0] == EVIL
@@ -170,8 +175,9 @@ def test_a_figures_data_are_those_of_the_result(browser: Browser, page: Path) ->
 def place_in(browser: Browser, chart: str, x: float, y: float) -> tuple[float, float]:
     """Where in the window a place of a chart is."""
     browser.run(f"{chart}.node.scrollIntoView({{block: 'center'}})")
+    browser.wait_for(f"{chart}.view")
     left, top = browser.run(
-        f"const {{node, view}} = {chart}, box = node.getBoundingClientRect(), [left, top] = view.origin();"
+        f"const {{node, view, spec}} = {chart}, box = node.getBoundingClientRect(), {{left, top}} = spec.padding;"
         "return [box.x + left + view.scale('x')(arguments[0]), box.y + top + view.scale('y')(arguments[1])]",
         x,
         y,
@@ -191,6 +197,26 @@ def test_the_pointer_tells_the_values_of_what_is_nearest(browser: Browser, page:
     assert not browser.run(f"return {chart}.tip.checkVisibility()")
 
 
+def test_the_pointer_names_the_mark_that_is_drawn_under_it(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    browser.run("document.querySelector('#trajectory').scrollIntoView({block: 'center'})")
+    browser.wait_for("rangesfmFigures.trajectory[0].view")
+    for i in (0, 3, 7):
+        x, y = browser.run(
+            "const mark = document.querySelectorAll('#trajectory .chart')[1].querySelectorAll('.mark-symbol path');"
+            "const box = mark[arguments[0]].getBoundingClientRect();"
+            "return [box.x + box.width / 2, box.y + box.height / 2]",
+            i,
+        )
+        browser.command("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+        tip, shown_x, shown_y = browser.run(
+            "const {tip, node} = rangesfmFigures.trajectory[1], box = node.getBoundingClientRect();"
+            "return [tip.textContent, box.x + parseFloat(tip.style.left), box.y + parseFloat(tip.style.top)]"
+        )
+        assert tip.startswith("anchor ")
+        assert (shown_x, shown_y) == pytest.approx((x, y), abs=2.0)
+
+
 def test_a_wheel_with_a_key_zooms_a_drag_moves_and_a_double_click_goes_back(browser: Browser, page: Path) -> None:
     browser.open(page)
     chart = "rangesfmFigures.scale_candidates[0]"
@@ -200,6 +226,7 @@ def test_a_wheel_with_a_key_zooms_a_drag_moves_and_a_double_click_goes_back(brow
         low, high = browser.run(f"return {chart}.view.scale('x').domain()")
         return [low, high]
 
+    browser.draw_figures()
     whole = domain()
     x, y = place_in(browser, chart, 95.0, 1.0)
     wheel = {"type": "mouseWheel", "x": x, "y": y, "deltaX": 0, "deltaY": -240}
@@ -225,6 +252,7 @@ def test_on_paper_a_picture_stands_for_the_view(browser: Browser, page: Path) ->
     pdf = base64.b64decode(browser.command("Page.printToPDF", printBackground=True)["data"])
     assert len(re.findall(rb"/Type */Page\b", pdf)) >= 3
     assert browser.run("return document.querySelector('.printed').naturalWidth") > 300
+    assert browser.run("return document.querySelectorAll('.chart svg').length") == NUM_CHARTS
     browser.command("Emulation.setEmulatedMedia", media="print")
     hidden: Any = browser.run("return getComputedStyle(document.querySelector('.stage canvas')).display")
     browser.command("Emulation.setEmulatedMedia", media="")
@@ -233,6 +261,7 @@ def test_on_paper_a_picture_stands_for_the_view(browser: Browser, page: Path) ->
 
 def test_without_webgl_the_page_says_so_and_the_rest_works(browser_without_webgl: Browser, page: Path) -> None:
     browser_without_webgl.open(page)
+    browser_without_webgl.draw_figures()
     assert browser_without_webgl.console() == []
     shown = "return document.querySelector('.without-webgl').checkVisibility()"
     assert browser_without_webgl.run(shown)

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.geometry.similarity import path_shape
+from rangesfm.ranging.errors.noise import robust_stddev
 
 Array = npt.NDArray[np.float64]
 
@@ -31,8 +32,7 @@ def multilaterate(positions: Array, ranges: Array) -> tuple[Array, Array]:
         w = weights * np.sqrt(robust)
         solution = np.linalg.lstsq(design * w[:, None], squared * w, rcond=1e-10)[0]
         residuals = weights * (design @ solution - squared)
-        unit = 1.4826 * np.median(np.abs(residuals)) + 1e-12
-        robust = 1 / (1 + (residuals / (2 * unit)) ** 2)
+        robust = 1 / (1 + (residuals / (2 * robust_stddev(residuals))) ** 2)
     point = np.zeros(3)
     point[seen] = solution[:-1]
     rest = solution[-1] - float(point @ point)

@@ -17,10 +17,10 @@ from rangesfm.geometry.similarity import path_shape
 from rangesfm.ranging.anchors.multilateration import multilaterate
 from rangesfm.ranging.errors.inlier_noise import inlier_noise
 from rangesfm.ranging.errors.robust_loss import CAUCHY, RobustLoss
+from rangesfm.ranging.range_gradient import RangeGradient
 
 Array = npt.NDArray[np.float64]
 
-_TINY_M = 1e-9
 _CONVERGED = 1e-13
 # Of a search: as many ranges and directions of starts, widths of the loss in units, and how far apart places are two.
 _MAX_NUM_RANGES = 300
@@ -57,16 +57,17 @@ class PointProblem:
 
     def residuals_m(self, x: Array) -> Array:
         """(n,) predicted minus measured."""
-        residuals: Array = np.linalg.norm(self.positions_m - x[:3], axis=1) + x[3] - self.range_m
+        residuals: Array = self._gradient(x).distance_m + x[3] - self.range_m
         return residuals
 
     def jacobian(self, x: Array) -> Array:
         """(n, 4) derivatives of the residuals in stddevs."""
-        from_point = self.positions_m - x[:3]
-        # On the point the distance has no derivative; zero keeps the step finite.
-        distances = np.maximum(np.linalg.norm(from_point, axis=1), _TINY_M)
-        derivatives: Array = np.column_stack([-from_point / distances[:, None], np.ones(len(distances))])
-        return derivatives / self.stddev_m[:, None]
+        by_anchor = self._gradient(x).by_anchor
+        jacobian: Array = np.column_stack([by_anchor, np.ones(len(by_anchor))]) / self.stddev_m[:, None]
+        return jacobian
+
+    def _gradient(self, x: Array) -> RangeGradient:
+        return RangeGradient.of(self.positions_m - x[:3])
 
     def cost(self, x: Array, loss: RobustLoss = CAUCHY) -> float:
         """Half the robust sum of squares, the prior included."""

@@ -11,11 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import GeometryError
-from rangesfm.geometry.similarity import PathShape, path_shape
+from rangesfm.geometry.similarity import PathShape, oriented, path_shape
 from rangesfm.ranging.anchors.point_fit import PointProblem, best_start, improve
 from rangesfm.ranging.errors.inlier_noise import inlier_noise
 from rangesfm.ranging.errors.noise import correlation_inflation, inflation_before_fit, short_range_stddev
-from rangesfm.ranging.errors.robust_loss import CAUCHY, GEMAN_MCCLURE
+from rangesfm.ranging.errors.robust_loss import CAUCHY, GEMAN_MCCLURE, SAME_COST
 
 Array = npt.NDArray[np.float64]
 
@@ -38,6 +38,8 @@ _NEARLY_STRAIGHT = 0.1
 _ACROSS = 0.9
 _MIN_BLOCKS = 16
 _NUM_UNKNOWNS = 4
+# Sine of the angle between a plane and a direction that is along it, but for rounding.
+_ALONG_PLANE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,8 @@ def trilaterate(
     """Find an anchor from its ranges to known positions of the tag.
 
     Up to about half of the ranges may be wrong by any amount. If the positions lie in a plane, the anchor's
-    mirror image in it fits as well: then both are returned, unless ``toward`` says which it is.
+    mirror image in it fits as well: then both are returned, unless ``toward`` says which it is; the upper one first if
+    no range tells.
 
     Args:
         tag_positions_m: (n, 3) positions of the tag's antenna, metres.
@@ -160,11 +163,15 @@ def trilaterate(
     covariance, shape = _covariance(fit), path_shape(problem.positions_m)
     _refuse_uncertain(covariance, shape, options)
     mirror = _mirror(fit, covariance, shape)
-    if mirror is not None and toward is not None:
-        if (mirror - fit.x)[:3] @ np.asarray(toward, dtype=np.float64) > 0:
-            fit = replace(fit, x=mirror)
+    if mirror is not None:
+        across = (mirror - fit.x)[:3]
+        told = None if toward is None else _unless_along_plane(np.asarray(toward, dtype=np.float64), across)
+        # Where no range tells the two apart, rounding would choose.
+        is_free = told is not None or abs(_gap(fit, mirror)) < SAME_COST
+        if is_free and across @ (shape.axes[:, 2] if told is None else told) > 0:
+            fit, mirror = replace(fit, x=mirror), fit.x
             covariance = _covariance(fit)
-        mirror = None
+        mirror = mirror if told is None else None
     return Trilateration(
         position_m=middle + fit.x[:3],
         covariance_m2=covariance[:3, :3],
@@ -247,8 +254,11 @@ def _covariance(fit: _Fit) -> Array:
 
 
 def _inverse(information: Array) -> Array:
-    values, vectors = np.linalg.eigh(information)
-    inverse: Array = (vectors / np.maximum(values, 1e-12 * values[-1])) @ vectors.T
+    # Position and bias each in a unit of its own: beside a bias that is known, in metres, no place counts at all.
+    strongest = np.diag(information)
+    unit = 1 / np.sqrt(np.append(np.full(3, strongest[:3].max()), strongest[3]))
+    values, vectors = np.linalg.eigh(unit[:, None] * information * unit)
+    inverse: Array = unit[:, None] * ((vectors / np.maximum(values, 1e-12)) @ vectors.T) * unit
     return inverse
 
 
@@ -294,7 +304,8 @@ def _refuse_uncertain(covariance: Array, shape: PathShape, options: Trilateratio
         why = "the anchor stands near the plane in which the tag's positions lie, and how far off it is not seen"
     else:
         why = f"the tag's positions extend over {length:.3g} by {width:.3g} m, too little or too far away"
-    direction = ", ".join(f"{component:.2f}" for component in axes[:, 2])
+    # No minus sign by rounding, neither of all three nor of a zero.
+    direction = ", ".join(f"{component:.2f}" for component in np.round(oriented(axes)[:, 2], 2) + 0.0)
     raise GeometryError(
         f"the position is not determined: {why} (stddev {min(stddev, _PROFILE_STEPS_M[-1]):.2g} m along {direction})"
     )
@@ -308,6 +319,15 @@ def _mirror(fit: _Fit, covariance: Array, shape: PathShape) -> Array | None:
     apart = (found - fit.x)[:3]
     distance = float(np.linalg.norm(apart))
     stddev = float(np.sqrt(apart @ covariance[:3, :3] @ apart)) / max(distance, 1e-12)
-    # A bounded loss: outliers cost the same wherever the point is.
-    gap = (fit.problem.cost(found, GEMAN_MCCLURE) - fit.problem.cost(fit.x, GEMAN_MCCLURE)) / fit.inflation**2
-    return found if distance > 2 * stddev and gap < _MIN_COST_GAP else None
+    return found if distance > 2 * stddev and _gap(fit, found) < _MIN_COST_GAP * fit.inflation**2 else None
+
+
+def _gap(fit: _Fit, mirror: Array) -> float:
+    """How much worse the mirror image fits, by a bounded loss: outliers cost the same wherever the point is."""
+    return fit.problem.cost(mirror, GEMAN_MCCLURE) - fit.problem.cost(fit.x, GEMAN_MCCLURE)
+
+
+def _unless_along_plane(direction: Array, across: Array) -> Array | None:
+    """A direction that tells two places apart; of one along the plane between them, rounding would choose the sign."""
+    least = _ALONG_PLANE * float(np.linalg.norm(direction) * np.linalg.norm(across))
+    return direction if abs(direction @ across) > least else None

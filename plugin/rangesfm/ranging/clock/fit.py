@@ -12,7 +12,7 @@ from scipy.stats import t as student
 
 from rangesfm.ranging.clock.path import PathSamples
 from rangesfm.ranging.clock.search import TimedRanges
-from rangesfm.ranging.clock.squares import MIN_RESIDUAL_M, SquaresFit, fit_squares, robust_stddev, rows_by_anchor
+from rangesfm.ranging.clock.squares import MIN_RESIDUAL_M, SquaresFit, fit_squares, residual_stddev, rows_by_anchor
 
 Array = npt.NDArray[np.float64]
 
@@ -95,7 +95,7 @@ class OffsetFit:
 
     @property
     def residual_stddev_m(self) -> float:
-        return robust_stddev(self.residuals_m)
+        return residual_stddev(self.residuals_m)
 
     @property
     def is_testable(self) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -76,7 +76,7 @@ def moving_path(trajectory: Trajectory, tags_in_cam_m: Array, options: Associati
     times = start_s + step_s * np.arange(int(span_s / step_s) + 1)
     probe = RangeLog.from_arrays(["probe"] * len(times), np.ones(len(times)), timestamp_s=times)
     # A negative tolerance: a sample next to a keyframe is interpolated like all others.
-    options = replace(options, max_time_difference_s=-1.0)
+    options = options.model_copy(update={"max_time_difference_s": -1.0})
     by_tag = [associate(probe, trajectory, tag_in_cam_m, options=options) for tag_in_cam_m in tags_in_cam_m]
     places = by_tag[0]
     is_known = (places.status == RangeStatus.USED) & (places.before != places.after)

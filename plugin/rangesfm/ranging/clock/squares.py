@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.ranging.errors.noise import robust_stddev
+
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64]
 
@@ -84,7 +86,7 @@ def fit_squares(points: Array, range_m: Array, anchor: Rows, loss_scale: float =
     metres = 1 / (2 * np.maximum(range_m, MIN_RANGE_M))
     residuals_m = np.zeros(len(points))
     for _ in range(_NUM_REWEIGHTINGS + 1):
-        weights = 1 / (1 + (residuals_m / (loss_scale * robust_stddev(residuals_m))) ** 2)
+        weights = 1 / (1 + (residuals_m / (loss_scale * residual_stddev(residuals_m))) ** 2)
         columns = _LinearColumns(points, metres * np.sqrt(weights), groups)
         alpha_squared, coefficients, residuals = columns.solve(range_m**2)
         residuals_m = residuals / np.sqrt(weights)
@@ -144,9 +146,9 @@ class _LinearColumns:
         return alpha_squared, coefficients, left_over - alpha_squared * curvature
 
 
-def robust_stddev(values: Array) -> float:
-    """From the median of the absolute values."""
-    return max(1.4826 * float(np.median(np.abs(values))), MIN_RESIDUAL_M)
+def residual_stddev(residuals_m: Array) -> float:
+    """Robust, of residuals of which none is better than a radio resolves."""
+    return max(robust_stddev(residuals_m), MIN_RESIDUAL_M)
 
 
 def rows_by_anchor(anchor: Rows) -> list[Rows]:

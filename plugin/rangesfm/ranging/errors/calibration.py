@@ -12,6 +12,7 @@ from rangesfm.errors import GeometryError, InputError
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.error_curve import ErrorCurve
 from rangesfm.ranging.errors.noise import correlation_inflation, robust_stddev
+from rangesfm.ranging.errors.range_errors import fit_with_own_errors
 from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.ranging.log import RangeLog
 
@@ -24,6 +25,8 @@ _BEND_STDDEV_M = 0.15
 _BIAS_STDDEV_M = 0.05
 # The level and the slope of the curve: next to nothing is assumed.
 _LEVEL_STDDEV_M = 10.0
+# A tag that is no further away stands on the anchor, where a distance has no logarithm to speak of.
+_AT_ANCHOR_M = 1e-3
 _MIN_RANGES = 100
 _MIN_RANGES_OF_KNOT = 20
 _EDGE_SHARE = 0.001
@@ -91,20 +94,20 @@ def calibrate_ranges(log: RangeLog, tags_m: Array, anchors: Sequence[Anchor]) ->
         GeometryError: there are too few ranges of known length, or all are of one length.
     """
     distance, error = _errors(log, tags_m, anchors)
-    used = np.flatnonzero(np.isfinite(error) & (distance > 0))
+    used = np.flatnonzero(np.isfinite(error) & (distance > _AT_ANCHOR_M))
     if len(used) < _MIN_RANGES:
         raise GeometryError(f"{len(used)} ranges of known length, expected {_MIN_RANGES} or more to learn from")
     distance, error, index = distance[used], error[used], log.anchor_index[used]
     knots = _knots(distance)
     problem = _problem(log, used, distance, error, index, knots)
-    values, weights, noise, inflation = _fit(problem)
-    covariance = np.linalg.inv(_information(problem, weights, noise * inflation))[: len(knots), : len(knots)]
+    fitted, scatter = _fit(problem)
+    covariance = np.linalg.inv(_information(problem, fitted.weights, scatter.stddev_m))[: len(knots), : len(knots)]
     stddev = np.maximum(np.sqrt(np.diag(covariance)), _spread_by_anchor(problem, index, len(knots)))
-    residuals = error - problem.design @ values
-    curve = ErrorCurve(knots, values[: len(knots)], stddev, _noise_by_knot(problem, residuals, len(knots), noise))
-    biases = dict(zip(log.anchor_ids, values[len(knots) :].tolist(), strict=True))
-    outliers = float(np.mean(weights < 0.1))
-    return Calibration(curve, len(used), noise, outliers, biases, inflation, distance, error)
+    noise = _noise_by_knot(problem, fitted.residuals_m, len(knots), scatter.noise_m)
+    curve = ErrorCurve(knots, fitted.values[: len(knots)], stddev, noise)
+    biases = dict(zip(log.anchor_ids, fitted.values[len(knots) :].tolist(), strict=True))
+    outliers = float(np.mean(fitted.weights < 0.1))
+    return Calibration(curve, len(used), scatter.noise_m, outliers, biases, scatter.inflation, distance, error)
 
 
 def _errors(log: RangeLog, tags_m: Array, anchors: Sequence[Anchor]) -> tuple[Array, Array]:
@@ -171,19 +174,46 @@ def _information(problem: _Problem, weights: Array, stddev: float) -> Array:
     return data + problem.prior.T @ problem.prior
 
 
-def _fit(problem: _Problem) -> tuple[Array, Array, float, float]:
-    """Values, robust weights, noise and inflation, each found with the others in turn."""
-    residuals = problem.error_m - np.median(problem.error_m)
-    noise, inflation = robust_stddev(residuals), 1.0
-    for _ in range(_NUM_ROUNDS):
-        weights = CAUCHY.weights(residuals / noise)
-        # Correlated errors are worth fewer ranges, so that the curve does not follow each of them.
-        right = problem.design.T @ (weights * problem.error_m) / (noise * inflation) ** 2
-        values = np.asarray(np.linalg.solve(_information(problem, weights, noise * inflation), right), np.float64)
-        residuals = problem.error_m - problem.design @ values
-        noise = robust_stddev(residuals)
-        inflation = correlation_inflation(residuals / noise, weights, problem.groups)
-    return values, weights, noise, inflation
+@dataclass(frozen=True)
+class _Scatter:
+    """Of ranges about a curve: stddev, and by how much their correlation widens stddevs."""
+
+    noise_m: float
+    inflation: float
+
+    @property
+    def stddev_m(self) -> float:
+        """Correlated errors are worth fewer ranges, so that the curve does not follow each of them."""
+        return self.noise_m * self.inflation
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Values of all unknowns (k + m,), the robust weights (n,) they were found with, and what they leave (n,)."""
+
+    values: Array
+    weights: Array
+    residuals_m: Array
+
+
+def _fit(problem: _Problem) -> tuple[_Fit, _Scatter]:
+    """Values and robust weights, and the scatter that they leave."""
+
+    def fit(scatter: _Scatter, before: _Fit | None) -> _Fit:
+        start_m = problem.error_m - np.median(problem.error_m) if before is None else before.residuals_m
+        weights = CAUCHY.weights(start_m / scatter.noise_m)
+        right = problem.design.T @ (weights * problem.error_m) / scatter.stddev_m**2
+        information = _information(problem, weights, scatter.stddev_m)
+        values = np.asarray(np.linalg.solve(information, right), np.float64)
+        return _Fit(values, weights, problem.error_m - problem.design @ values)
+
+    def estimate(_: _Scatter, fitted: _Fit) -> _Scatter:
+        noise = robust_stddev(fitted.residuals_m)
+        return _Scatter(noise, correlation_inflation(fitted.residuals_m / noise, fitted.weights, problem.groups))
+
+    start = _Scatter(robust_stddev(problem.error_m - np.median(problem.error_m)), 1.0)
+    fitted, _, seen = fit_with_own_errors(fit, estimate, start, max_num_rounds=_NUM_ROUNDS)
+    return fitted, seen
 
 
 def _spread_by_anchor(problem: _Problem, index: npt.NDArray[np.int64], num_knots: int) -> Array:
@@ -195,7 +225,7 @@ def _spread_by_anchor(problem: _Problem, index: npt.NDArray[np.int64], num_knots
     for k in present:
         rest = index != k
         part = _Problem(problem.design[rest], problem.error_m[rest], problem.prior, problem.groups[rest])
-        curves.append(_fit(part)[0][:num_knots])
+        curves.append(_fit(part)[0].values[:num_knots])
     num = len(present)
     spread: Array = np.sqrt((num - 1) / num * np.sum((np.array(curves) - np.mean(curves, axis=0)) ** 2, axis=0))
     return spread

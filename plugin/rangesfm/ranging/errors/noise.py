@@ -16,15 +16,26 @@ _SHORT_RANGE_STDDEV_M = 2.0
 SHORT_RANGE_LENGTH_M = 1.0
 # Of a range of which nothing is known yet. Ranges that may be off together by more say nothing on the noise of others.
 START_STDDEV_M = 0.1
-_MIN_STDDEV_M = 1e-9
+MIN_STDDEV_M = 1e-9
+# Of a Gaussian distribution over the median of its absolute values.
+_STDDEV_PER_MAD = 1.4826
+# In stddevs, root mean square: where residuals are no larger, rounding and the solver's last step are all that they
+# have in common.
+NO_ERROR = 1e-3
 _MAX_INFLATION = 30.0
 # Of fewer there is nothing to resample.
 _MIN_NUM_STRETCHES = 8
 
 
-def robust_stddev(residuals: Array) -> float:
-    """Stddev of the Gaussian bulk: median absolute deviation from zero, scaled."""
-    return max(1.4826 * float(np.median(np.abs(residuals))), _MIN_STDDEV_M) if len(residuals) else _MIN_STDDEV_M
+def robust_stddev(residuals: npt.ArrayLike) -> float:
+    """Stddev of the Gaussian bulk of (n,): median absolute deviation from zero, scaled; never quite 0."""
+    return float(robust_stddevs(np.reshape(residuals, (1, -1)))[0, 0]) if np.size(residuals) else MIN_STDDEV_M
+
+
+def robust_stddevs(residuals: Array) -> Array:
+    """(m, 1) the same of each row of (m, n)."""
+    stddevs: Array = _STDDEV_PER_MAD * np.median(np.abs(residuals), axis=1, keepdims=True)
+    return np.maximum(stddevs, MIN_STDDEV_M)
 
 
 def short_range_stddev(range_m: Array) -> Array:
@@ -75,7 +86,7 @@ def correlation_inflation(
     _, index = np.unique(groups, return_inverse=True)
     sums = np.bincount(index, shares * influence)
     squares = float(np.sum(shares * influence**2))
-    if squares == 0 or len(sums) < 2:
+    if squares <= NO_ERROR**2 * np.sum(shares) or len(sums) < 2:
         return 1.0
     return float(np.clip(np.sqrt(np.sum(sums**2) / squares), 1.0, _MAX_INFLATION))
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.ranging.errors.noise import robust_stddev, robust_stddevs
+
 _WINDOW = 11
 _MAX_NUM_WINDOWS = 20_000
 _MAX_STRETCH = 3.0  # a window so much longer than the typical one has a gap in it
-_STDDEV_PER_MAD = 1.4826
 _CAUCHY_SCALE = 2.4
 _NUM_ITERATIONS = 8
 _TINY = 1e-9
@@ -38,7 +39,7 @@ def estimate_noise_m(timestamp_s: npt.NDArray[np.float64], range_m: npt.NDArray[
     chosen = whole[:: -(-len(whole) // _MAX_NUM_WINDOWS)]
     with np.errstate(over="ignore", invalid="ignore"):  # times or ranges that no radio can mean
         misses = _misses_of_parabola(times[chosen], ranges[chosen])
-        noise = float(_STDDEV_PER_MAD * np.median(np.abs(misses - np.median(misses))))
+        noise = robust_stddev(misses - np.median(misses))
     return noise if np.isfinite(noise) else None
 
 
@@ -55,8 +56,7 @@ def _misses_of_parabola(times: npt.NDArray[np.float64], ranges: npt.NDArray[np.f
         right = np.einsum("mi,mij,mi->mj", weights, powers, ranges - offset)
         coefficients = np.linalg.solve(normal, right[..., np.newaxis])
         residuals = ranges - offset - (powers @ coefficients)[..., 0]
-        scale = _STDDEV_PER_MAD * np.median(np.abs(residuals), axis=1, keepdims=True) + _TINY
-        weights = 1 / (1 + (residuals / (_CAUCHY_SCALE * scale)) ** 2)
+        weights = 1 / (1 + (residuals / (_CAUCHY_SCALE * robust_stddevs(residuals))) ** 2)
     plain = np.einsum("mij,mik->mjk", powers, powers) + _TINY * np.eye(3)
     pull = np.linalg.inv(plain)[:, 0, 0]  # of the middle, where the powers are 1, 0, 0
     return np.asarray(residuals[:, middle] / np.sqrt(np.maximum(1 - pull, _TINY)), np.float64)

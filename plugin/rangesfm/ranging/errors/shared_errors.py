@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.ranging.log import RangeLog
+
 Array = npt.NDArray[np.float64]
 
 # How wrong a radio's range may be as a smooth function of distance, where no error curve was learnt: the DW1000's
@@ -19,6 +21,11 @@ _MIN_DISTANCE_M = 0.05
 # orientation for distance estimation", 2018), which is this stddev as for a uniform distribution. Each anchor has its
 # own, which leaving out one anchor in turn shows; the data of a single one do not.
 ANTENNA_STDDEV_M = 0.05
+
+
+def curve_stddev(log: RangeLog) -> Array:
+    """(n,) how wrong the radio's error curve may be at each range: as was learnt with it, else as it is unknown."""
+    return np.full(len(log), CURVE_STDDEV_M) if log.shared_stddev_m is None else log.shared_stddev_m
 
 
 def curve_modes(distance_m: Array, stddev_m: Array) -> Array:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesfm.errors import InputError
-from rangesfm.files.tables import printable, read_head
+from rangesfm.errors import InputError, printable
+from rangesfm.files.tables import read_head
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.quantization import find_quantization_m, quantization_stddev_m
 from rangesfm.ranging.log import RangeLog

@@ -6,8 +6,8 @@ from collections.abc import Collection, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 
-from rangesfm.errors import InputError
-from rangesfm.files.tables import header_names, printable, read_head
+from rangesfm.errors import InputError, printable
+from rangesfm.files.tables import header_names, read_head
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers.columns import (
     QUANTITIES,

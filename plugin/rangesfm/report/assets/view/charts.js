@@ -4,22 +4,27 @@ const POINTER_PX = 24;
 
 class Chart {
   constructor(node, chart) {
-    Object.assign(this, chart, { node });
-    const datasets = Object.fromEntries(this.series.map((series, i) => [`series${i}`, rowsOf(series)]));
+    Object.assign(this, chart, { node, view: null });
     const { padding, width, height } = this.spec;
     this.shape = this.keeps_shape ? height / width : null;
     this.sides = padding.left + padding.right;
-    const compiled = VEGA.compile({ ...this.spec, datasets }).spec;
-    const expr = VEGA.expressionInterpreter;
-    this.view = new VEGA.View(VEGA.parse(compiled, {}, { ast: true }), { expr, renderer: "svg" });
-    this.view.initialize(node);
+    node.style.height = `${this.#height() + padding.top + padding.bottom}px`;
+  }
+
+  /** Draws it, once: thousands of points take their time. */
+  draw() {
+    if (this.view !== null) return;
+    const datasets = Object.fromEntries(this.series.map((series, i) => [`series${i}`, rowsOf(series)]));
+    const runtime = VEGA.parse(VEGA.compile({ ...this.spec, datasets }).spec, {}, { ast: true });
+    this.view = new VEGA.View(runtime, { expr: VEGA.expressionInterpreter, renderer: "svg" }).initialize(this.node);
+    this.node.style.height = "";
     this.#fit();
-    new ResizeObserver(() => this.#fit()).observe(node);
-    this.tip = node.appendChild(document.createElement("output"));
+    new ResizeObserver(() => this.#fit()).observe(this.node);
+    this.tip = this.node.appendChild(document.createElement("output"));
     this.tip.className = "tip";
-    node.addEventListener("pointermove", (event) => this.#point(event));
-    node.addEventListener("pointerleave", () => (this.tip.hidden = true));
     this.tip.hidden = true;
+    this.node.addEventListener("pointermove", (event) => this.#point(event));
+    this.node.addEventListener("pointerleave", () => (this.tip.hidden = true));
   }
 
   /** [series, x, y] of all data, as the CSV file has them. */
@@ -31,18 +36,22 @@ class Chart {
     for (const { title, x, y } of this.marks) yield [title, x, y];
   }
 
+  #width() {
+    return Math.max(this.node.clientWidth - this.sides, 80);
+  }
+
+  #height() {
+    return this.shape === null ? this.spec.height : Math.round(this.#width() * this.shape);
+  }
+
   #fit() {
-    const width = Math.max(this.node.clientWidth - this.sides, 80);
-    if (width === this.view.width()) return;
-    this.view.width(width);
-    if (this.shape !== null) this.view.height(Math.round(width * this.shape));
-    this.view.run();
+    this.view.width(this.#width()).height(this.#height()).run();
   }
 
   /** What is nearest to the pointer tells its values. */
   #point(event) {
     const box = this.node.getBoundingClientRect();
-    const [left, top] = this.view.origin();
+    const { left, top } = this.spec.padding;
     const [toX, toY] = [this.view.scale("x"), this.view.scale("y")];
     const [low, high] = [this.view.height(), 0];
     let nearest = null;
@@ -74,13 +83,25 @@ function rowsOf({ points, kind }) {
   return rows;
 }
 
-/** All figures of the page, by name: a list of charts each. */
-function makeCharts(figures) {
+/** All figures of the page, by name: a list of charts each, which are drawn when they come near or go to paper. */
+function makeFigures(figures) {
   const made = {};
+  const chartOf = new Map();
+  const observer = new IntersectionObserver(
+    (entries) => {
+      for (const { isIntersecting, target } of entries) if (isIntersecting) chartOf.get(target).draw();
+    },
+    { rootMargin: "100%" },
+  );
   for (const [name, charts] of Object.entries(figures)) {
     const nodes = document.querySelectorAll(`#${name} .chart`);
     made[name] = charts.map((chart, i) => new Chart(nodes[i], chart));
+    for (const chart of made[name]) {
+      chartOf.set(chart.node, chart);
+      observer.observe(chart.node);
+    }
   }
+  addEventListener("beforeprint", () => chartOf.forEach((chart) => chart.draw()));
   return made;
 }
 

@@ -152,7 +152,7 @@ class View {
 const start = () => {
   const scene = readBlock("scene");
   if (scene?.ranges) scene.ranges.residual = scene.ranges[scene.ranges.final];
-  window.rangesfmFigures = makeCharts(readBlock("figures"));
+  window.rangesfmFigures = makeFigures(readBlock("figures"));
   attachDownloads(scene, rangesfmFigures);
   if (scene !== null) window.rangesfmView = new View(document.getElementById("view"), scene);
 };

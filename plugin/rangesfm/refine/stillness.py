@@ -23,7 +23,7 @@ _MAX_LAST_GAIN = 1e-4
 _NUM_STEPS_LEFT = (0.1, 10.0)
 
 
-class Progress:
+class Stillness:
     """How far the keyframes go from step to step, and by how much the cost falls.
 
     Attributes:

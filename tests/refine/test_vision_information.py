@@ -9,8 +9,7 @@ from tests.simulated.model import SyntheticModel
 
 from rangesfm.colmap.transform import rescale
 from rangesfm.geometry.similarity import Similarity
-from rangesfm.refine.points_in_cameras import points_in_cameras
-from rangesfm.refine.vision_information import model_observations, model_poses
+from rangesfm.refine.vision_information import model_observations, model_poses, points_in_cameras
 
 
 def ids_in_cameras(model: pycolmap.Reconstruction) -> list[int]:
