@@ -22,9 +22,16 @@ list(GET eigen_headers 0 eigen_headers)
 rangesfm_version_in(${eigen_headers}/Eigen/src/Core/util/Macros.h
   "EIGEN_WORLD_VERSION;EIGEN_MAJOR_VERSION;EIGEN_MINOR_VERSION" EIGEN_HEADERS_VERSION)
 
-file(READ ${CMAKE_CURRENT_SOURCE_DIR}/../plugin/rangesfm/report/assets/vendor/three.min.js three LIMIT 100)
-string(REGEX MATCH "three\\.js ([0-9.]+)" three "${three}")
-set(THREE_VERSION ${CMAKE_MATCH_1})
+# What the first line of a bundled script says.
+function(rangesfm_version_of_script file name result)
+  file(READ ${CMAKE_CURRENT_SOURCE_DIR}/../plugin/rangesfm/report/assets/vendor/${file} text LIMIT 100)
+  string(REGEX MATCH "${name} ([0-9.]+)" text "${text}")
+  set(${result} ${CMAKE_MATCH_1} PARENT_SCOPE)
+endfunction()
+
+rangesfm_version_of_script(three.min.js "three\\.js" THREE_VERSION)
+rangesfm_version_of_script(vega.min.js "Vega" VEGA_VERSION)
+rangesfm_version_of_script(vega.min.js "Vega-Lite" VEGA_LITE_VERSION)
 
 configure_file(bundled.cdx.json.in bundled.cdx.json @ONLY)
 install(FILES ${CMAKE_CURRENT_BINARY_DIR}/bundled.cdx.json DESTINATION ${SKBUILD_METADATA_DIR}/sboms)

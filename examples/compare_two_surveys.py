@@ -18,19 +18,22 @@ import pycolmap
 from scipy.spatial import KDTree
 
 from rangesfm.export import write_points
-from rangesfm.result_folder import ResultFolder, read_result_folder
+from rangesfm.result.folder import ResultFolder, read_result_folder
 
 
 def main() -> None:
     before, after = (read_result_folder(Path(path)) for path in sys.argv[1:3])
     for result in (before, after):
-        if result.frame != "site":
-            sys.exit(f"{result.path}: in the frame {result.frame!r}; only maps in one site frame can be compared")
+        if result.summary.frame != "site":
+            sys.exit(
+                f"{result.path}: in the frame {result.summary.frame!r}; only maps in one site frame can be compared"
+            )
     old, new = metric_model(before), metric_model(after)
     points = positions(new)
     distance_m = KDTree(positions(old)).query(points)[0]
     # Both scales stretch the maps about their middle.
-    relative = np.hypot(before.relative_scale_stddev or 0.0, after.relative_scale_stddev or 0.0)
+    stddevs = [result.summary.scale.relative_stddev_empirical or 0.0 for result in (before, after)]
+    relative = np.hypot(stddevs[0], stddevs[1])
     spacing_m = float(np.median(KDTree(positions(old)).query(positions(old), k=2)[0][:, 1]))
     explained_m = 3 * (spacing_m + relative * np.linalg.norm(points - points.mean(axis=0), axis=1))
     has_changed = distance_m > explained_m
@@ -45,7 +48,7 @@ def main() -> None:
 
 
 def metric_model(result: ResultFolder) -> pycolmap.Reconstruction:
-    model = result.read_model("sparse_metric") or result.read_model("sparse_scaled")
+    model = result.read_metric_model()
     if model is None:
         sys.exit(f"{result.path}: no metric model")
     return model

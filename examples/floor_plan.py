@@ -20,7 +20,7 @@ from matplotlib.axes import Axes
 from rangesfm.export import MetricMap
 from rangesfm.export.frames import in_frame
 from rangesfm.options import ExportOptions
-from rangesfm.result_folder import read_result_folder
+from rangesfm.result.folder import read_result_folder
 
 Array = npt.NDArray[np.float64]
 
@@ -28,16 +28,16 @@ Array = npt.NDArray[np.float64]
 def main() -> None:
     folder, plan = Path(sys.argv[1]), Path(sys.argv[2])
     result = read_result_folder(folder)
-    model = result.read_model("sparse_metric") or result.read_model("sparse_scaled")
+    model = result.read_metric_model()
     if model is None:
         sys.exit(f"{folder}: no metric model")
     # A site frame has z up by custom; any other map is made level by what its cameras hold for up.
-    frame = "result" if result.frame == "site" else "level"
-    map_ = in_frame(MetricMap(model, result.timestamps_s, result.anchor_positions_m), ExportOptions(frame=frame))
+    options = ExportOptions(frame="result" if result.summary.frame == "site" else "level")
+    map_ = in_frame(MetricMap(model, result.timestamps_s, result.anchor_positions_m), options)
     points = np.array([point.xyz for point in map_.reconstruction.points3D.values()])
     low, high = map(float, sys.argv[3:5]) if len(sys.argv) > 4 else np.quantile(points[:, 2], [0.25, 0.75])
     wall = points[(points[:, 2] >= low) & (points[:, 2] <= high)]
-    relative_stddev = result.relative_scale_stddev or 0.0
+    relative_stddev = result.summary.scale.relative_stddev_empirical or 0.0
 
     figure, axes = plt.subplots(figsize=(8, 8))
     axes.plot(wall[:, 0], wall[:, 1], ".", color="0.35", markersize=1.5, label=f"points from {low:.2f} to {high:.2f} m")

@@ -30,9 +30,9 @@ for frame_id in reconstruction.reg_frame_ids():
         continue
     center = rig_from_world.inverse().translation
     range_m = float(np.linalg.norm(center - anchor_in_world))
-    cost = costs.range_cost(range_m=range_m, tag_in_cam_m=tag_in_cam_m, stddev_m=0.1)
+    cost = costs.range_cost(range_m=range_m, tag_in_cam_m=tag_in_cam_m, stddev_m=0.1, loss_scale=2.4)
     blocks = [rig_from_world.params, anchor_in_world, range_bias_m]
-    costs.add_residual_block(adjuster, cost, costs.cauchy_loss(2.4), blocks)
+    costs.add_residual_block(adjuster, cost, None, blocks)
 adjuster.problem.set_parameter_block_constant(anchor_in_world)
 adjuster.problem.set_parameter_block_constant(range_bias_m)
 print(adjuster.solve().brief_report())

@@ -31,10 +31,8 @@ metric, summary = rangesfm.refine_with_ranges(
     estimate.observations,
     estimate.metric_from_sfm,
     estimate.anchors,
+    estimate.errors,
     tag_in_cam_m=tag_in_cam_m,
-    range_stddev_m=estimate.range_stddev_m,
-    range_share=estimate.range_share,
-    correlation_inflation=estimate.correlation_inflation,
     first_pose_is_fixed=True,
 )
 print(f"refined in {summary.num_iterations} iterations, {summary.reprojection_rms_px:.2f} px")

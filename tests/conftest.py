@@ -21,15 +21,16 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
+from tests.simulated.model import synthetic_model
+from tests.simulated.path import loop_path
+from tests.simulated.small_demo import make_small_demo
 
-from rangesfm.geometry import Similarity
+from rangesfm.demo.ranges import Radio, simulate_ranges
+from rangesfm.demo.survey import TIME_OFFSET_S as DEMO_TIME_OFFSET_S
+from rangesfm.demo.survey import DemoSurvey
+from rangesfm.geometry.reference import Reference, write_reference
+from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.readers.canonical import write_ranges_csv
-from rangesfm.reference import Reference, write_reference
-from rangesfm.simulate.model import synthetic_model
-from rangesfm.simulate.path import loop_path
-from rangesfm.simulate.ranges import Radio, simulate_ranges
-from rangesfm.simulate.survey import TIME_OFFSET_S as DEMO_TIME_OFFSET_S
-from rangesfm.simulate.survey import DemoSurvey, make_demo_survey
 
 Array = npt.NDArray[np.float64]
 Command = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -160,7 +161,7 @@ def photo_run(rangesfm_command: Command, tmp_path_factory: pytest.TempPathFactor
     # With more threads COLMAP starts from the first pair that will do, whichever thread comes first.
     flags = ("survey.toml", "--ranges_time_offset", str(DEMO_TIME_OFFSET_S), "--num_threads", "1")
     with _shared_folder(tmp_path_factory, "photo_run") as folder:
-        survey = make_demo_survey(folder / "yard", num_photos=14, image_size=(360, 240))
+        survey = make_small_demo(folder / "yard")
         printed = folder / "printed.json"
         if not printed.exists():
             done = rangesfm_command("run", *flags, cwd=survey.folder)

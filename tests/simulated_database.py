@@ -51,4 +51,4 @@ def camera_options(database_path: Path) -> CameraOptions:
     """Its camera, as known."""
     with pycolmap.Database.open(database_path) as database:
         camera = database.read_all_cameras()[0]
-    return CameraOptions(camera.model_name, tuple(camera.params.tolist()))
+    return CameraOptions(model=camera.model_name, params=tuple(camera.params.tolist()))

@@ -14,13 +14,13 @@ from typing import Any, TypeGuard
 import numpy as np
 import pycolmap
 import pytest
+from tests.simulated.model import synthetic_model
+from tests.simulated.path import loop_path
 
 import rangesfm
-from rangesfm.geometry import IDENTITY
+from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.options import CameraOptions, MapperOptions, RefineOptions
-from rangesfm.refinement.bundle_adjustment import bundle_adjustment
-from rangesfm.simulate.model import synthetic_model
-from rangesfm.simulate.path import loop_path
+from rangesfm.refine.bundle_adjustment import bundle_adjustment
 from rangesfm.vision import submap_refinement
 from rangesfm.vision.camera import camera_of_photos
 from rangesfm.vision.features import feature_options
@@ -28,7 +28,7 @@ from rangesfm.vision.mapping import pipeline_options
 from rangesfm.vision.matching import matching_options
 
 SEED = 3
-KNOWN_CAMERA = CameraOptions("SIMPLE_PINHOLE", (240.0, 128.0, 96.0))
+KNOWN_CAMERA = CameraOptions(model="SIMPLE_PINHOLE", params=(240.0, 128.0, 96.0))
 
 
 def changes(options: Any) -> dict[str, Any]:
@@ -78,7 +78,7 @@ def test_models_are_mapped_as_colmap_maps_them(camera: CameraOptions, expected: 
 def test_a_camera_is_guessed_as_colmap_guesses_it(monkeypatch: pytest.MonkeyPatch) -> None:
     handed: list[Any] = []
     monkeypatch.setattr(pycolmap, "infer_camera_from_image", lambda _, reader: handed.append(reader))
-    camera_of_photos(CameraOptions("OPENCV"), Path("photo.jpg"), 640, 480)
+    camera_of_photos(CameraOptions(model="OPENCV"), Path("photo.jpg"), 640, 480)
     assert changes(handed[0]) == {"camera_model": "OPENCV"}
 
 

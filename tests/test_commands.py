@@ -19,14 +19,15 @@ import pycolmap
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from tests.simulated.ranges import simulate_ranges_at
 
-from rangesfm.geometry import Similarity
-from rangesfm.model_files import read_model
+from rangesfm.colmap.model_files import read_model
+from rangesfm.demo.ranges import Radio
+from rangesfm.demo.survey import ANCHORS_M, CAMERA_MODEL, TAG_IN_CAM_M
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers import read_ranges, write_ranges_csv
-from rangesfm.simulate.ranges import Radio, simulate_ranges_at
-from rangesfm.simulate.survey import TAG_IN_CAM_M
-from rangesfm.trajectory import trajectory_from_reconstruction
 
 if TYPE_CHECKING:
     from tests.conftest import Command, PhotoRun, WalkedSurvey
@@ -108,7 +109,7 @@ class Left:
     def without_seconds(self) -> dict[str, Any]:
         """A copy of result.json but for how long things took and where it lies."""
         result = copy.deepcopy(self.result)
-        del result["seconds"], result["settings"]["output_path"]
+        del result["seconds"], result["settings"]["output"]["path"]
         if result["refine"] is not None:
             del result["refine"]["seconds"]
         return result
@@ -670,13 +671,13 @@ def test_photos_and_a_log_that_names_them_need_no_times(
             photo.save(tmp_path / "images" / name, quality=95)  # without EXIF
     radio = Radio(range_stddev_m=0.02)
     measured = simulate_ranges_at(
-        survey.timestamps_s, survey.centers_m, survey.world_from_cam, survey.anchors_m, TAG_IN_CAM_M, radio, seed=1
+        survey.timestamps_s, survey.centers_m, survey.world_from_cam, ANCHORS_M, TAG_IN_CAM_M, radio, seed=1
     ).log
-    names = np.repeat(survey.image_names, len(survey.anchors_m)).tolist()
+    names = np.repeat(survey.image_names, len(ANCHORS_M)).tolist()
     log = RangeLog.from_arrays(measured.end_ids()[1], measured.range_m, image_name=names)
     write_ranges_csv(log, tmp_path / "uwb.csv")
     flags = ("--images", "images", "--ranges", "uwb.csv", "--anchors", survey.folder / "anchors.csv", "--seed", "0")
-    camera = ("--camera_model", survey.camera.model, "--camera_params", ",".join(map(str, survey.camera.params)))
+    camera = ("--camera_model", CAMERA_MODEL, "--camera_params", "280.8,180,120,-0.04")  # the small photos'
     tag = ("--tag_in_cam", ",".join(map(str, TAG_IN_CAM_M)), "--num_threads", "1")
     rangesfm_command("run", *flags, *camera, *tag, "--output_path", "out", cwd=tmp_path)
     result = json.loads((tmp_path / "out" / "result.json").read_text())

@@ -13,8 +13,8 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from rangesfm.config import read_survey
-from rangesfm.strict_tables import parse_toml
+from rangesfm.survey.settings import read_survey
+from rangesfm.survey.toml_source import parse_toml
 
 if TYPE_CHECKING:
     from tests.conftest import PhotoRun, WalkedSurvey
@@ -36,9 +36,14 @@ def test_every_program_is_tested_here() -> None:
         "compare_two_surveys.py",
         "floor_plan.py",
         "gaussian_splatting.py",
+        "keys.py",
         "own_problem.py",
         "scale_existing_model.py",
     }
+
+
+def test_the_reference_of_keys_is_up_to_date() -> None:
+    assert run_example("keys.py", cwd=EXAMPLES) == (EXAMPLES / "keys.md").read_text(encoding="utf-8")
 
 
 def test_own_problem_converges_on_a_model_that_fits_its_ranges(walked_survey: WalkedSurvey) -> None:
@@ -103,9 +108,9 @@ def test_survey_file_is_one_for_a_folder_with_its_files(path: Path, tmp_path: Pa
     for name in given.values():
         (tmp_path / name).touch()
     survey = read_survey(path, base_folder=tmp_path)
-    assert survey.images_path == tmp_path / tables["images"]["path"]
+    assert survey.images.path == tmp_path / tables["images"]["path"]
     assert survey.ranges.path == tmp_path / tables["ranges"]["path"]
-    assert survey.output_path == tmp_path / tables.get("output", {}).get("path", "out")
+    assert survey.output.path == tmp_path / tables.get("output", {}).get("path", "out")
 
 
 FILES_OF = {"images": ["times"], "ranges": ["path"], "anchors": ["path"], "report": ["reference"]}
@@ -117,10 +122,10 @@ def test_survey_of_the_readme_is_one(tmp_path: Path) -> None:
     for name in ("images.csv", "uwb.csv", "anchors.csv"):
         (tmp_path / name).touch()
     survey = read_survey(tmp_path / "survey.toml")
-    assert survey.keyframes.every_nth == 3
+    assert survey.images.every_nth == 3
     assert survey.camera.model == "OPENCV"
     assert survey.ranges.time_offset_s is None
-    assert survey.tag_in_cam_m == (-0.0012, -0.09, -0.0663)
+    assert survey.tag.tag_in_cam_m == (-0.0012, -0.09, -0.0663)
 
 
 def test_readme_shows_every_command() -> None:

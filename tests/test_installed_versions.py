@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.metadata
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 import rangesfm
-from rangesfm import costs, installed_versions
-from rangesfm._ceres import check_compatibility
+from rangesfm import ceres, installed_versions
+from rangesfm.ceres import check_compatibility
 from rangesfm.cli import main
 from rangesfm.errors import SolverError
 from rangesfm.installed_versions import INSTALL_COMMAND, NEEDED_VERSIONS, check_versions, installed_version
@@ -53,9 +55,11 @@ def test_commands_end_in_one_line_that_names_the_remedy(
 def test_functions_refuse_too_and_say_so_with_an_error_of_the_package(
     complaint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(SolverError) as caught:
-        costs.range_cost(range_m=4.0, tag_in_cam_m=[0, 0, 0], stddev_m=0.1)
-    assert str(caught.value) == complaint
+    monkeypatch.delitem(sys.modules, "rangesfm.costs", raising=False)
+    for first_use in (lambda: ceres.range_cost, lambda: importlib.import_module("rangesfm.costs")):
+        with pytest.raises(SolverError) as caught:
+            first_use()
+        assert str(caught.value) == complaint
     for name in ("read_ranges", "SolverError"):
         monkeypatch.delitem(vars(rangesfm), name, raising=False)  # as before it was first used
     with pytest.raises(rangesfm.SolverError, match=re.escape(complaint)):

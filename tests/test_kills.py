@@ -36,9 +36,9 @@ sys.exit(main(argv))
 """
 IN_MATCHING = ("rangesfm.vision.matching", "num_compared_pairs", 0)
 IN_MAPPING = ("rangesfm.vision.snapshots", "_keep", 3)
-AMONG_TABLES = ("rangesfm.outputs", "_write_ranges", 0)
-BEFORE_THE_RESULT = ("rangesfm.pipeline", "write_result", 0)
-BEFORE_THE_REPORT = ("rangesfm.pipeline", "write_report", 0)
+AMONG_TABLES = ("rangesfm.result.table_file", "write_table", 2)
+BEFORE_THE_RESULT = ("rangesfm.workflows.results", "input_hashes", 0)
+BEFORE_THE_REPORT = ("rangesfm.workflows.results", "write_report", 0)
 
 
 def killed(moment: tuple[str, str, int], *arguments: str, cwd: Path) -> str:

@@ -1,4 +1,4 @@
-"""Imports run one way: errors, data and readers, stages, pipeline, command line; and no stage knows another."""
+"""Imports run one way, from folder to folder; and no stage knows another."""
 
 from __future__ import annotations
 
@@ -11,64 +11,30 @@ import rangesfm
 
 PACKAGE = Path(rangesfm.__file__).parent
 
-# By module or by package; the most exact name counts. What is not named is part of the pipeline: nothing below it may
-# import it.
-ERRORS, DATA, STAGE, PIPELINE, COMMAND_LINE = range(5)
-LAYER_OF = {
-    "__init__": ERRORS,
-    "errors": ERRORS,
-    "failures": ERRORS,
-    "progress": ERRORS,
-    "files": ERRORS,
-    "installed_versions": ERRORS,
-    "sole_writer": ERRORS,
-    "_ceres": DATA,
-    "child_process": ERRORS,
-    "supervision": ERRORS,
-    "colmap_log": DATA,
-    "config": DATA,
-    "costs": DATA,
-    "covariance": DATA,
-    "distances": DATA,
-    "geometry": DATA,
-    "georeference": DATA,
-    "gravity": DATA,
-    "json_files": DATA,
-    "joined_model": DATA,
-    "linear_solver": DATA,
-    "model_files": DATA,
-    "model_records": DATA,
-    "options": DATA,
-    "passthrough": DATA,
-    "ranging": DATA,
-    "reference": DATA,
-    "model_transform": DATA,
-    # What the stage ``refine`` is made of.
-    "refinement": DATA,
-    "result_folder": DATA,
-    "simulate": DATA,
-    "site": DATA,
-    "strict_tables": DATA,
-    "plain_tables": DATA,
-    "tables": DATA,
-    "trajectory": DATA,
-    "comparison": STAGE,
-    "export": STAGE,
-    "ranging.association": STAGE,
-    "ranging.clock": STAGE,
-    "ranging.clock_bursts": STAGE,
-    "ranging.clock_curve": STAGE,
-    "ranging.clock_drift": STAGE,
-    "ranging.clock_fit": STAGE,
-    "ranging.clock_path": STAGE,
-    "ranging.clock_search": STAGE,
-    "refine": STAGE,
-    "report": STAGE,
-    "scale": STAGE,
-    "vision": STAGE,
-    "__main__": COMMAND_LINE,
-    "cli": COMMAND_LINE,
-}
+# From the bottom to the top. A folder imports from itself and from those below its own line, so that no stage knows
+# another; the root's files are below all folders, but for the doors, which hand on what stands anywhere.
+LAYERS = (
+    "files processes",
+    "geometry",
+    "colmap ceres",
+    "ranging",
+    "distances",
+    "vision scale export",
+    "survey",
+    "refine",
+    "join",
+    "result",
+    "report",
+    "comparison",
+    "workflows",
+    "batch",
+    "demo",
+    "cli",
+)
+LAYER_OF = {folder: number for number, folders in enumerate(LAYERS) for folder in folders.split()}
+DOORS = {"__init__", "__main__", "costs"}
+ROOT = -1
+MAX_NUM_FILES_AT_ROOT = 10
 
 MODULES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__"): path
@@ -76,10 +42,13 @@ MODULES = {
 }
 
 
+def folder_of(module: str) -> str:
+    """The first folder of a module inside the package; its own name where it stands at the root."""
+    return module.partition(".")[0]
+
+
 def layer(module: str) -> int:
-    while module not in LAYER_OF and "." in module:
-        module = module.rpartition(".")[0]
-    return LAYER_OF.get(module, PIPELINE)
+    return LAYER_OF.get(folder_of(module), ROOT)
 
 
 def imports(path: Path) -> set[str]:
@@ -101,20 +70,25 @@ def own_imports(module: str) -> set[str]:
     return {name.removeprefix("rangesfm.") for name in imports(MODULES[module])} & MODULES.keys()
 
 
-def test_a_module_imports_only_from_its_own_layer_and_those_below() -> None:
-    wrong = [(module, name) for module in MODULES for name in own_imports(module) if layer(name) > layer(module)]
-    assert not wrong
-
-
-def test_a_stage_imports_no_other_stage() -> None:
-    stages = [module for module in MODULES if layer(module) == STAGE]
+def test_a_module_imports_only_from_its_own_folder_and_from_layers_below() -> None:
     wrong = [
         (module, name)
-        for module in stages
-        for name in own_imports(module) & set(stages)
-        if name.partition(".")[0] != module.partition(".")[0]
+        for module in MODULES.keys() - DOORS
+        for name in own_imports(module)
+        if folder_of(name) != folder_of(module) and layer(name) >= layer(module) and layer(module) != ROOT
     ]
     assert not wrong
+
+
+def test_what_stands_at_the_root_imports_no_folder() -> None:
+    at_root = [module for module in MODULES.keys() - DOORS if layer(module) == ROOT]
+    assert not [(module, name) for module in at_root for name in own_imports(module) if layer(name) != ROOT]
+
+
+def test_the_root_holds_few_files_and_every_folder_has_its_layer() -> None:
+    assert len(list(PACKAGE.glob("*.py"))) <= MAX_NUM_FILES_AT_ROOT
+    folders = {folder_of(module) for module, path in MODULES.items() if path.parent != PACKAGE}
+    assert folders == LAYER_OF.keys()
 
 
 def test_only_one_package_touches_the_compiled_part_and_pyceres() -> None:
@@ -124,11 +98,7 @@ def test_only_one_package_touches_the_compiled_part_and_pyceres() -> None:
         if any(f"{name}.".startswith(("rangesfm._cpp.", "pyceres.")) for name in imports(path))
     ]
     assert touching, "not even the package that is there for it"
-    assert all(module.split(".")[0] == "_ceres" for module in touching)
-
-
-def test_the_layers_name_no_module_that_is_gone() -> None:
-    assert LAYER_OF.keys() <= MODULES.keys() | {"__init__"}
+    assert all(module.split(".")[0] == "ceres" for module in touching)
 
 
 def test_importing_the_package_imports_neither_pycolmap_nor_scipy() -> None:

@@ -57,13 +57,13 @@ TEST(DistanceCost, GradientsAreRightForAnyTwoEndsAtRandomPoints) {
 TEST(DistanceCost, ALossLimitsWhatAnOutlierCosts) {
   const Block a = {0.0, 0.0, 0.0};
   const Block b = {500.0, 0.0, 0.0};
-  const TwoSidedLoss loss(3.0, 3.0, true);
+  const RobustLoss loss(3.0, true);
   const DistanceCost<PointEnd, PointEnd> cost(2.0, PointEnd(), PointEnd(), 0.1, false, loss);
   EXPECT_NEAR(Evaluate(cost, {a, b}).residuals[0], 3.0, 1e-5);
   Random random(4);
   for (int i = 0; i < 20; ++i) {
     const DistanceCost<CamEnd, PointEnd> robust(random.Uniform(0.1, 20.0), CamEnd(random.Vector(1.0)), PointEnd(), 1.0,
-                                                true, TwoSidedLoss(20.0, 20.0, true));
+                                                true, RobustLoss(20.0, true));
     ExpectGradientsAreRight(robust, {RandomPose(random, 10.0), ToBlock(random.Vector(10.0)), {0.3}}, 1e-7);
   }
 }

@@ -23,17 +23,13 @@ inline RangeModel WithLeverArm(const Eigen::Vector3d& tag_in_cam) {
   return model;
 }
 
-inline RangeCost<KnownPlace> AtKnownPlace(double range, const Eigen::Vector3d& tag_in_world, double stddev) {
-  return {KnownPlace(tag_in_world), OneRange(range, stddev), RangeModel()};
-}
-
 inline RangeCost<KeyframePlace> AtKeyframe(double range, const Eigen::Vector3d& tag_in_cam, double stddev) {
   return {KeyframePlace(), OneRange(range, stddev), WithLeverArm(tag_in_cam)};
 }
 
 inline RangeCost<InterpolatedPlace> BetweenKeyframes(double range, const Eigen::Vector3d& tag_in_cam, double weight,
                                                      const Eigen::Vector3d& offset_in_world, double stddev) {
-  InterpolatedPlace place(Eigen::VectorXd::Constant(1, weight), offset_in_world, 1.0, Eigen::Vector3d::Zero());
+  InterpolatedPlace place(Eigen::VectorXd::Constant(1, weight), offset_in_world, 1.0);
   return {std::move(place), OneRange(range, stddev), WithLeverArm(tag_in_cam)};
 }
 

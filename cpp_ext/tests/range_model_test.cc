@@ -4,16 +4,14 @@
 
 #include <Eigen/Core>
 #include <cmath>
-#include <memory>
 #include <utility>
 #include <vector>
 
 #include "cost_testing.h"
 #include "range_costs.h"
 #include "rangesfm/range_cost.h"
-#include "rangesfm/range_error_curve.h"
+#include "rangesfm/robust_loss.h"
 #include "rangesfm/tag_place.h"
-#include "rangesfm/two_sided_loss.h"
 
 namespace rangesfm {
 namespace {
@@ -35,25 +33,19 @@ MeasuredRanges Measured(Random& random, int size, double max_range) {
 }
 
 InterpolatedPlace Between(Random& random, int size, double interval) {
-  return {Uniform(random, size, 0.0, 1.0), Vectors(random, size, 0.3), interval, Vectors(random, size, 0.2)};
-}
-
-std::shared_ptr<const RangeErrorCurve> CurveTable() {
-  return std::make_shared<TabulatedCurve>(Eigen::Vector4d(0.5, 2.0, 6.0, 20.0), Eigen::Vector4d(-0.2, 0.1, 0.0, 0.3));
+  return {Uniform(random, size, 0.0, 1.0), Vectors(random, size, 0.3), interval};
 }
 
 // Everything free.
-RangeModel FullModel(std::shared_ptr<const RangeErrorCurve> curve, TwoSidedLoss loss) {
+RangeModel FullModel(double short_range_length, RobustLoss loss) {
   RangeModel model;
-  model.tag_in_cam.reset();
   model.has_time_shift = true;
-  model.has_common_bias = true;
-  model.error_curve = std::move(curve);
+  model.short_range_length = short_range_length;
   model.loss = loss;
   return model;
 }
 
-// Two poses, anchor, bias, lever arm, time shift, common bias and amplitude.
+// Two poses, anchor, bias, lever arm, time shift and amplitude.
 std::vector<Block> FullBlocks(Random& random, double extent) {
   return {PoseBlock(random.Rotation(), random.Vector(extent)),
           PoseBlock(random.Rotation(), random.Vector(extent)),
@@ -61,39 +53,35 @@ std::vector<Block> FullBlocks(Random& random, double extent) {
           {random.Uniform(-0.5, 0.5)},
           ToBlock(random.Vector(0.3)),
           {random.Uniform(-0.2, 0.2)},
-          {random.Uniform(-0.5, 0.5)},
           {random.Uniform(-0.5, 0.5)}};
 }
 
 TEST(RangeModel, PredictionIsTheHandComputedOne) {
-  // From (0, 2, 0) to (4, 2, 0) in 2 s; at weight 0 plus half a second: 1 m on, and half a metre of offset that grows
-  // by 0.2 m/s in z: tag at (1, 2, 0.6). The lever arm of 1 m along x moves both ends: (2, 2, 0.6), 5 m from the
-  // anchor. Biases 0.1 and 0.2 m, and 0.3 m that fade over 5 m: predicted 5.3 + 0.3/e; measured 5 m, stddev 0.1 m.
-  InterpolatedPlace place(Eigen::VectorXd::Zero(1), Eigen::Vector3d(0.0, 0.0, 0.5), 2.0,
-                          Eigen::Vector3d(0.0, 0.0, 0.2));
-  const RangeCost<InterpolatedPlace> cost(std::move(place), OneRange(5.0, 0.1),
-                                          FullModel(std::make_shared<ExponentialCurve>(5.0), TwoSidedLoss()));
+  // From (0, 2, 0) to (4, 2, 0) in 2 s; at weight 0 plus half a second: 1 m on, and 0.6 m of offset in z: tag at
+  // (1, 2, 0.6). The lever arm of 1 m along x moves both ends: (2, 2, 0.6), 5 m from the anchor. A bias of 0.3 m, and
+  // 0.3 m that fade over 5 m: predicted 5.3 + 0.3/e; measured 5 m, stddev 0.1 m.
+  InterpolatedPlace place(Eigen::VectorXd::Zero(1), Eigen::Vector3d(0.0, 0.0, 0.6), 2.0);
+  const RangeCost<InterpolatedPlace> cost(std::move(place), OneRange(5.0, 0.1), FullModel(5.0, RobustLoss()));
   const std::vector<Block> blocks = {{0.0, 0.0, 0.0, 1.0, 0.0, -2.0, 0.0},
                                      {0.0, 0.0, 0.0, 1.0, -4.0, -2.0, 0.0},
                                      {5.0, 6.0, 0.6},
-                                     {0.1},
+                                     {0.3},
                                      {1.0, 0.0, 0.0},
                                      {0.5},
-                                     {0.2},
                                      {0.3}};
   EXPECT_NEAR(Evaluate(cost, blocks).residuals[0], (0.3 + 0.3 / std::exp(1.0)) / 0.1, 1e-12);
 }
 
-// A curve that has faded to nothing is left out here: its derivative drowns in rounding.
+// What has faded to nothing is left out, a short-range error far away and an outlier far beyond a bounded loss: its
+// derivative drowns in rounding.
 TEST(RangeModel, GradientsAreRightForEverythingFreeBetweenKeyframes) {
   Random random(1);
   for (int i = 0; i < 40; ++i) {
-    const std::shared_ptr<const RangeErrorCurve> curve =
-        i % 2 == 0 ? CurveTable() : std::make_shared<ExponentialCurve>(random.Uniform(10.0, 50.0));
-    const TwoSidedLoss loss(random.Uniform(1.0, 100.0), i % 3 == 0 ? kInfinity : random.Uniform(1.0, 100.0),
-                            i % 2 == 0);
+    const bool is_bounded = i % 2 == 0;
+    const double min_loss_scale = is_bounded ? 20.0 : 1.0;
+    const RobustLoss loss(i % 3 == 0 ? kInfinity : random.Uniform(min_loss_scale, 100.0), is_bounded);
     const RangeCost<InterpolatedPlace> cost(Between(random, 5, random.Uniform(0.1, 3.0)), Measured(random, 5, 20.0),
-                                            FullModel(curve, loss));
+                                            FullModel(random.Uniform(10.0, 50.0), loss));
     ExpectGradientsAreRight(cost, FullBlocks(random, 10.0), 1e-7);
   }
 }
@@ -101,7 +89,7 @@ TEST(RangeModel, GradientsAreRightForEverythingFreeBetweenKeyframes) {
 TEST(RangeModel, GradientsAreRightForEverythingFreeAtAKeyframe) {
   Random random(2);
   for (int i = 0; i < 20; ++i) {
-    RangeModel model = FullModel(std::make_shared<ExponentialCurve>(20.0), TwoSidedLoss(20.0, 5.0));
+    RangeModel model = FullModel(20.0, RobustLoss(5.0, false));
     model.has_time_shift = false;
     const RangeCost<KeyframePlace> cost(KeyframePlace(), Measured(random, 4, 20.0), std::move(model));
     ExpectGradientsAreRight(cost,
@@ -109,7 +97,6 @@ TEST(RangeModel, GradientsAreRightForEverythingFreeAtAKeyframe) {
                              ToBlock(random.Vector(10.0)),
                              {0.1},
                              ToBlock(random.Vector(0.5)),
-                             {-0.1},
                              {0.2}},
                             1e-7);
   }
@@ -120,7 +107,7 @@ TEST(RangeModel, GradientsAreRightFarBeyondTheKeyframesInTime) {
   std::vector<Block> blocks = FullBlocks(random, 5.0);
   blocks[5] = {30.0};
   const RangeCost<InterpolatedPlace> cost(Between(random, 3, 0.5), Measured(random, 3, 20.0),
-                                          FullModel(CurveTable(), TwoSidedLoss()));
+                                          FullModel(1e3, RobustLoss()));
   ExpectGradientsAreRight(cost, blocks, 1e-7);
 }
 
@@ -128,7 +115,7 @@ TEST(RangeModel, AnswerIsFiniteForAnOutlierOfAMillionStddevs) {
   Random random(4);
   const std::vector<Block> blocks = FullBlocks(random, 5.0);
   const RangeCost<InterpolatedPlace> cost(Between(random, 1, 0.5), OneRange(1e6, 1e-3),
-                                          FullModel(CurveTable(), TwoSidedLoss(2.0, 2.0)));
+                                          FullModel(20.0, RobustLoss(2.0, false)));
   const Evaluation evaluation = Evaluate(cost, blocks);
   ExpectAllFinite(evaluation);
   EXPECT_NEAR(evaluation.residuals[0], -2.0 * std::sqrt(std::log1p(std::pow(1e9 / 2.0, 2))), 1e-3);
@@ -136,8 +123,8 @@ TEST(RangeModel, AnswerIsFiniteForAnOutlierOfAMillionStddevs) {
 
 TEST(RangeModel, AnswerIsFiniteWithTheTagOnTheAnchor) {
   RangeModel model = WithLeverArm(Eigen::Vector3d::Zero());
-  model.error_curve = std::make_shared<ExponentialCurve>(1.0);
-  model.loss = TwoSidedLoss(2.0, 2.0);
+  model.short_range_length = 1.0;
+  model.loss = RobustLoss(2.0, false);
   const RangeCost<KeyframePlace> cost(KeyframePlace(), OneRange(1.0, 1.0), std::move(model));
   const Evaluation evaluation = Evaluate(cost, {{0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0}, {0.0, 0.0, 0.0}, {0.0}, {1.0}});
   ExpectAllFinite(evaluation);
@@ -149,15 +136,14 @@ TEST(RangeModel, ManyRangesAreAsManyCostsOfOne) {
   constexpr int kNumRanges = 6;
   const Eigen::VectorXd weight = Uniform(random, kNumRanges, 0.0, 1.0);
   const Eigen::Matrix3Xd offset = Vectors(random, kNumRanges, 0.3);
-  const Eigen::Matrix3Xd velocity = Vectors(random, kNumRanges, 0.3);
   const MeasuredRanges measured = Measured(random, kNumRanges, 10.0);
-  const RangeModel model = FullModel(CurveTable(), TwoSidedLoss(10.0, 3.0));
+  const RangeModel model = FullModel(20.0, RobustLoss(3.0, false));
   const std::vector<Block> blocks = FullBlocks(random, 5.0);
   const Evaluation many =
-      Evaluate(RangeCost<InterpolatedPlace>(InterpolatedPlace(weight, offset, 0.7, velocity), measured, model), blocks);
+      Evaluate(RangeCost<InterpolatedPlace>(InterpolatedPlace(weight, offset, 0.7), measured, model), blocks);
   for (int i = 0; i < kNumRanges; ++i) {
     const RangeCost<InterpolatedPlace> cost(
-        InterpolatedPlace(weight.segment(i, 1), offset.col(i), 0.7, velocity.col(i)),
+        InterpolatedPlace(weight.segment(i, 1), offset.col(i), 0.7),
         MeasuredRanges{measured.range.segment(i, 1), measured.stddev.segment(i, 1), measured.share.segment(i, 1)},
         model);
     const Evaluation one = Evaluate(cost, blocks);
@@ -172,7 +158,7 @@ TEST(RangeModel, ManyRangesAreAsManyCostsOfOne) {
 
 TEST(RangeModel, AShareMultipliesTheLossOfItsRange) {
   RangeModel model = WithLeverArm(Eigen::Vector3d::Zero());
-  model.loss = TwoSidedLoss(2.0, 3.0, true);
+  model.loss = RobustLoss(3.0, true);
   const std::vector<Block> blocks = {{0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0}, {3.0, 4.0, 0.0}, {0.0}};
   MeasuredRanges measured = OneRange(4.6, 0.1);
   const double whole = Evaluate(RangeCost<KeyframePlace>(KeyframePlace(), measured, model), blocks).residuals[0];
@@ -187,9 +173,7 @@ TEST(RangeModel, AFreeLeverArmIsTheConstantOneWithAGradient) {
   const Eigen::Vector3d tag_in_cam = random.Vector(0.3);
   const std::vector<Block> blocks = {
       PoseBlock(random.Rotation(), random.Vector(5.0)), ToBlock(random.Vector(5.0)), {0.1}};
-  RangeModel model;
-  model.tag_in_cam.reset();
-  const RangeCost<KeyframePlace> cost(KeyframePlace(), OneRange(3.0, 0.1), std::move(model));
+  const RangeCost<KeyframePlace> cost(KeyframePlace(), OneRange(3.0, 0.1), RangeModel());
   const Evaluation found = Evaluate(cost, {blocks[0], blocks[1], blocks[2], ToBlock(tag_in_cam)});
   const Evaluation expected = Evaluate(AtKeyframe(3.0, tag_in_cam, 0.1), blocks);
   EXPECT_EQ(found.residuals, expected.residuals);
@@ -199,7 +183,7 @@ TEST(RangeModel, AFreeLeverArmIsTheConstantOneWithAGradient) {
 TEST(RangeModel, AnyJacobianMayBeLeftOut) {
   Random random(7);
   const RangeCost<InterpolatedPlace> cost(Between(random, 4, 0.5), Measured(random, 4, 10.0),
-                                          FullModel(CurveTable(), TwoSidedLoss(3.0, 2.0)));
+                                          FullModel(20.0, RobustLoss(2.0, false)));
   ExpectAnyJacobianMayBeLeftOut(cost, FullBlocks(random, 5.0));
 }
 

@@ -1,48 +1,33 @@
 """The range and distance residuals alone, for bundle adjustment programs of one's own.
 
-See ``examples/own_problem.py``. Blocks, units and errors are described with each function.
+See ``examples/own_problem.py``. Blocks, units and errors are described with each function. A cost is a
+``pyceres.CostFunction``; importing this raises ``SolverError`` where pyceres does not fit (``rangesfm doctor``).
 """
 
-from rangesfm._ceres import (
-    AddedRanges,
-    CostFunction,
-    LossFunction,
+from rangesfm.ceres import (
     PlacedRanges,
     RangeBlocks,
-    RangeErrorModel,
+    add_normal_prior,
     add_ranges,
     add_residual_block,
-    cauchy_loss,
-    combine_ranges,
     direction_cost,
     distance_cost,
-    fixed_pose_range_cost,
     interpolated_range_cost,
     joint_prior_cost,
     keep_from_elimination,
-    normal_prior_cost,
     range_cost,
-    zero_tie_cost,
 )
 
 __all__ = [
-    "AddedRanges",
-    "CostFunction",
-    "LossFunction",
     "PlacedRanges",
     "RangeBlocks",
-    "RangeErrorModel",
+    "add_normal_prior",
     "add_ranges",
     "add_residual_block",
-    "cauchy_loss",
-    "combine_ranges",
     "direction_cost",
     "distance_cost",
-    "fixed_pose_range_cost",
     "interpolated_range_cost",
     "joint_prior_cost",
     "keep_from_elimination",
-    "normal_prior_cost",
     "range_cost",
-    "zero_tie_cost",
 ]

@@ -6,12 +6,40 @@ never has to look at the text of a message.
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+
+_MAX_SHOWN = 100
 
 
 def one_line(text: str) -> str:
     """``text`` without line breaks and whatever else a terminal would not print but obey."""
     return "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in text)
+
+
+def printable(text: str) -> str:
+    """``text`` fit for one line of a message."""
+    return one_line(text if len(text) <= _MAX_SHOWN else text[:_MAX_SHOWN] + "...")
+
+
+def shown(value: object) -> str:
+    """A value of an option as a message names it."""
+    is_text = isinstance(value, (str, Path))
+    return printable(f"'{value}'" if is_text else "a table" if isinstance(value, Mapping) else _digits(value))
+
+
+def _digits(value: object) -> str:
+    try:
+        return str(value)
+    except ValueError:  # a whole number of thousands of digits
+        return "a number beyond all bounds"
+
+
+def nearest_known(name: str, known: Iterable[str]) -> str:
+    """The one of ``known`` most like ``name``, whatever the case."""
+    by_lower = {item.lower(): item for item in known}
+    return by_lower[difflib.get_close_matches(name.lower(), by_lower, 1, 0.0)[0]]
 
 
 class RangesfmError(Exception):

@@ -1,208 +1,394 @@
-"""Options of the stages: how each does its work. Plain values with defaults.
+"""The keys of a survey file: of each its type, bounds, default, meaning and flag, written here and nowhere else.
 
-A survey file's tables are these classes, key for key; what a key means is said here.
+The stages take these tables, or the part of one that is theirs, as their options. The reader of survey files, the
+commands' flags, their help, the reference of all keys and the settings in ``result.json`` follow from them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
 
-ANCHOR_FRAMES = ("site", "first_camera", "unknown")
-SCALE_METHODS = ("robust", "two-candidate")
-CAMERA_SIDES = ("above", "below")
-EXPORT_FRAMES = ("result", "level", "enu")
+from pydantic import AfterValidator, Field, model_validator
+
+from rangesfm.errors import OptionError
+from rangesfm.option_model import Options, Told, looks_like
+
 DEFAULT_FORMATS = ("tum", "ply")
-STAMP_UNITS = ("ns", "us", "ms", "s", "ticks")
-MATCHING_METHODS = ("sequential", "exhaustive", "auto")
+_LIKE_OURS = 0.85  # a [mapper] key this similar to one of ours is a slip; others are pycolmap's
+
+# Bounds keep out what only a slip can mean, and what would be infinite once it is squared or divided by.
+_Count = Annotated[int, Field(ge=1, le=1_000_000)]
+_Zero = Annotated[float, Field(ge=0, le=0)]
+_Positive = Annotated[float, Field(ge=1e-6, le=1e3)]
+_Uncertainty = _Zero | _Positive
+_Time = Annotated[float, Field(ge=-1e10, le=1e10)]
+_Duration = Annotated[float, Field(ge=0, le=1e9)]
+_Number = Annotated[float, Field(ge=-1e9, le=1e9)]
+_Numbers = Annotated[tuple[_Number, ...], Field(strict=False)]
+_Times = Annotated[tuple[_Time, ...], Field(strict=False)]
+_Three = Annotated[tuple[_Number, _Number, _Number], Field(strict=False)]
+_Texts = Annotated[tuple[str, ...], Field(strict=False)]
+# No camera carries its tag further away: beyond that its unit is wrong.
+_OfLeverArm = Annotated[float, Field(ge=-20, le=20)]
+_LeverArm = Annotated[tuple[_OfLeverArm, _OfLeverArm, _OfLeverArm], Field(strict=False)]
+_Place = Annotated[
+    tuple[
+        Annotated[float, Field(ge=-90, le=90)],
+        Annotated[float, Field(ge=-360, le=360)],
+        Annotated[float, Field(ge=-1e5, le=1e5)],
+    ],
+    Field(strict=False),
+]
 
 
-@dataclass(frozen=True)
-class KeyframeOptions:
-    """Which photos become keyframes (table ``[images]``). All that are given must hold.
-
-    Attributes:
-        every_nth: every n-th photo in time order.
-        min_interval_s: at least this long after the previous keyframe.
-        max_num_keyframes: evenly thinned to at most this many.
-    """
-
-    every_nth: int = 1
-    min_interval_s: float = 0.0
-    max_num_keyframes: int | None = None
+def _direction(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+    if max(map(abs, vector)) < 1e-6:
+        raise ValueError("is 0,0,0")
+    return vector
 
 
-@dataclass(frozen=True)
-class CameraOptions:
-    """One camera for all photos (table ``[camera]``).
+def _span(times: tuple[float, ...]) -> tuple[float, ...]:
+    if times and not (len(times) == 2 and times[0] < times[1]):
+        raise ValueError("is no span")
+    return times
 
-    Attributes:
-        model: COLMAP's camera model name; None lets COLMAP guess from EXIF.
-        params: the model's parameters in COLMAP's order; None if not known.
-        refine_intrinsics: whether mapping and refinement adjust them; None: mapping does if they
-            are not given, and the refinement keeps what it finds, so that it does the same to a
-            model just mapped and to one brought along.
-    """
 
-    model: str | None = None
-    params: tuple[float, ...] | None = None
+class KeyframeOptions(Options):
+    """Which photos become keyframes. All that are given must hold."""
+
+    table: ClassVar[str] = "images"
+
+    every_nth: _Count = 1
+    """Use every n-th photo, in time order."""
+    min_interval_s: _Duration = 0.0
+    """Least time between keyframes."""
+    max_num_keyframes: Annotated[int, Field(ge=3, le=1_000_000)] | None = None
+    """Thin evenly to at most this many."""
+
+
+class ImageOptions(KeyframeOptions):
+    """The photos."""
+
+    path: Annotated[Path | None, Told(flag="images", metavar="PATH", role="photos")] = None
+    """Folder of the photos; as a flag also the CSV of their times."""
+    times: Annotated[Path | None, Told(flag="image_times", role="file")] = None
+    """CSV image_name,timestamp_s (default: EXIF, else file names)."""
+
+
+class CameraOptions(Options):
+    """One camera for all photos."""
+
+    table: ClassVar[str] = "camera"
+
+    model: Annotated[str | None, Told(flag="camera_model")] = None
+    """COLMAP camera model, as OPENCV (default: COLMAP guesses)."""
+    params: Annotated[_Numbers | None, Told(flag="camera_params")] = None
+    """Its parameters in COLMAP's order."""
     refine_intrinsics: bool | None = None
+    """Whether mapping and refinement adjust them (default: mapping does if they are not given; the refinement keeps
+    what it finds, so that it does the same to a model just mapped and to one brought along)."""
 
     @property
     def mapping_refines_intrinsics(self) -> bool:
         return self.params is None if self.refine_intrinsics is None else self.refine_intrinsics
 
 
-@dataclass(frozen=True)
-class MapperOptions:
-    """Photos to unscaled model (table ``[mapper]``).
+class LogOptions(Options):
+    """The radio's log and how to take it."""
 
-    Attributes:
-        matching: "sequential", "exhaustive" or "auto" (exhaustive up to 60 keyframes).
-        features, pairing, matcher, pipeline: passed through to pycolmap's
-            FeatureExtractionOptions, the pairing options of the chosen matching,
-            FeatureMatchingOptions and IncrementalPipelineOptions.
-        ranges_in_mapping: whether each global bundle adjustment of the mapping carries the ranges, as soon as they
-            determine the scale. Takes much longer; the refinement at the end mostly comes to the same map.
-        num_threads: -1 for all cores. Matching on the processor takes one thread all the same, as
-            pycolmap 4.2 loses matches with more; ``matcher.num_threads`` overrides that.
-        submap_size: photos of a submap: more photos than that are mapped in stretches of so many in their order, each
-            on its own, which are joined by the photos that they share; None: all in one piece.
-        submap_overlap: photos that a submap shares with the one before.
-        num_submaps_at_once: each is mapped by a process of its own; they share the threads.
-    """
+    table: ClassVar[str] = "ranges"
 
-    matching: str = "auto"
-    features: dict[str, Any] = field(default_factory=dict)
-    pairing: dict[str, Any] = field(default_factory=dict)
-    matcher: dict[str, Any] = field(default_factory=dict)
-    pipeline: dict[str, Any] = field(default_factory=dict)
+    path: Annotated[Path | None, Told(flag="ranges", metavar="LOG", role="file")] = None
+    """The radio's log."""
+    format: Annotated[str | None, Told(flag="ranges_format")] = None
+    """Its format (default: recognised by content)."""
+    columns: Annotated[dict[str, str], Told(metavar="QUANTITY=NAME,..")] = Field(default_factory=dict)
+    """Names of its columns for timestamp (or image_name), anchor_id, range, tag_id, range_stddev, los; without range,
+    the time stamps tx1, rx1, tx2, rx2 and possibly tx3, rx3 of two-way ranging."""
+    timestamp_unit: str | None = None
+    """One of s, ms, us, ns and iso (default: by format)."""
+    range_unit: str | None = None
+    """One of m, cm and mm (default: by format)."""
+    separator: Annotated[
+        Annotated[str, Field(min_length=1, max_length=1)] | None, Told(metavar="CHARACTER", expected="one character")
+    ] = None
+    """Between cells (default: told from the header row)."""
+    ranging_interval_s: Annotated[float, Field(ge=1e-6, le=1e6)] | None = None
+    """Between two rounds, for a Qorvo log without the host's times (default: 0.2)."""
+    stamp_unit: Literal["ns", "us", "ms", "s", "ticks"] = "ns"
+    """Of time stamps, in a log without ranges."""
+    stamp_bits: Literal[32, 40] = 32
+    """Of the stamps' counter; 32 do up to 67 ms."""
+    propagation_speed: Annotated[
+        Literal["air", "vacuum"] | Annotated[float, Field(ge=1e8, le=3e8)],
+        Told(expected="air, vacuum or a speed of light in m/s"),
+    ] = "air"
+    """Of the signal, for stamps."""
+    t_off_s: Annotated[float, Field(ge=-1, le=1)] = 0.0
+    """What all delays of both devices together add to a round trip of stamps."""
+    error_curve: Annotated[Path | None, Told(role="file")] = None
+    """The radio's error by distance, as rangesfm ranges calibrate writes it."""
+    time_offset: Annotated[
+        Literal["auto"] | _Time,
+        Told(flag="ranges_time_offset", metavar="auto|SECONDS", expected='"auto" or seconds, at most 1e+10 of them'),
+    ] = "auto"
+    """Image time = range time + offset; auto: searched for."""
+
+    @property
+    def time_offset_s(self) -> float | None:
+        """None: to be searched for."""
+        return None if self.time_offset == "auto" else self.time_offset
+
+
+class AssociationOptions(Options):
+    """Ranges to places on the path."""
+
+    table: ClassVar[str] = "ranges"
+
+    max_interpolation_gap_s: _Duration = 2.0
+    """Between keyframes further apart than this no pose is interpolated."""
+    max_time_difference_s: _Duration = 0.02
+    """A range this close to a keyframe counts as taken there, where no pose can be interpolated."""
+
+
+class CheckOptions(Options):
+    """Ranges held out of every estimate, to be compared with the result."""
+
+    table: ClassVar[str] = "ranges"
+
+    check_share: Annotated[float, Field(ge=0, le=0.5)] = 0.0
+    """Share of the ranges held out as checks, chosen at random; neighbours in time err alike, so that this is the
+    mildest check."""
+    check_anchors: _Texts = ()
+    """Ids of anchors with surveyed positions, whose ranges are all held out."""
+    check_times_s: Annotated[
+        _Times, AfterValidator(_span), Told(metavar="A,B", expected="two times in seconds, the later one last")
+    ] = ()
+    """From when to when, on the radio's clock, ranges are held out."""
+
+
+class RangeModelOptions(Options):
+    """What is assumed of the radio."""
+
+    table: ClassVar[str] = "ranges"
+
+    range_stddev_m: _Positive | None = None
+    """Noise of a range (default: estimated from the residuals)."""
+    range_bias_stddev_m: _Uncertainty = 0.01
+    """Prior of each anchor's own constant bias, mean 0; small on purpose: a freer bias soaks up errors that depend on
+    direction, and shifts the map instead."""
+    common_bias_stddev_m: _Uncertainty = 0.1
+    """Prior of the bias that all anchors share (the tag's delay), mean 0."""
+
+
+class RangesOptions(RangeModelOptions, CheckOptions, AssociationOptions, LogOptions):
+    """The radio's log, what is assumed of it, and which of its ranges are held out."""
+
+
+class AnchorOptions(Options):
+    """The anchors."""
+
+    table: ClassVar[str] = "anchors"
+
+    path: Annotated[Path | None, Told(flag="anchors", role="file")] = None
+    """CSV anchor_id,x_m,y_m,z_m[,position_stddev_m,range_bias_m,range_bias_stddev_m] (default: the anchors in the log,
+    all unknown)."""
+    frame: Annotated[Literal["site", "first_camera", "unknown"] | None, Told(flag="anchor_frame")] = None
+    """What their coordinates refer to (default: site if the file knows any position, else unknown)."""
+    crs: Annotated[str | None, Told(flag="anchor_crs")] = None
+    """Coordinate system of their positions, as EPSG:2056 (default: metres of a frame of their own)."""
+    use: Annotated[_Texts, Told(flag="use_anchors")] = ()
+    """Only these anchors' ranges are used (default: all)."""
+
+
+class TagOptions(Options):
+    """The tag on the camera, or several."""
+
+    table: ClassVar[str] = "tag"
+
+    tag_in_cam_m: Annotated[_LeverArm, Told(flag="tag_in_cam", metavar="[ID:]X,Y,Z")] = (0.0, 0.0, 0.0)
+    """Lever arm: the tag's antenna in the camera frame, metres; of several tags, the flag once for each with its ID."""
+    lever_arms_m: Annotated[dict[str, _LeverArm], Told(flag="tag_in_cam", metavar="ID:X,Y,Z")] = Field(
+        default_factory=dict
+    )
+    """The same by tag id, for a camera with several tags."""
+    tag_id: str | None = None
+    """The tag that counts, if the log has others (default: all with a lever arm)."""
+
+    @model_validator(mode="after")
+    def _one_or_several(self) -> TagOptions:
+        if "tag_in_cam_m" in self.model_fields_set and self.lever_arms_m:
+            raise OptionError(
+                f"[tag] tag_in_cam_m is {list(self.tag_in_cam_m)}, expected nothing beside lever_arms_m: either one "
+                "lever arm or one by tag id",
+                "tag",
+                "tag_in_cam_m",
+            )
+        return self
+
+
+class MapperOptions(Options):
+    """Photos to unscaled model. Keys that are not here are pycolmap's IncrementalPipelineOptions', as in pipeline."""
+
+    table: ClassVar[str] = "mapper"
+
+    matching: Literal["sequential", "exhaustive", "auto"] = "auto"
+    """Which photos are matched; auto: exhaustive up to 60 keyframes."""
+    features: dict[str, Any] = Field(default_factory=dict)
+    """Passed through to pycolmap's FeatureExtractionOptions."""
+    pairing: dict[str, Any] = Field(default_factory=dict)
+    """Passed through to pycolmap's pairing options of the chosen matching."""
+    matcher: dict[str, Any] = Field(default_factory=dict)
+    """Passed through to pycolmap's FeatureMatchingOptions."""
+    pipeline: dict[str, Any] = Field(default_factory=dict)
+    """Passed through to pycolmap's IncrementalPipelineOptions."""
     ranges_in_mapping: bool = False
-    num_threads: int = -1
-    submap_size: int | None = None
-    submap_overlap: int = 20
-    num_submaps_at_once: int = 1
+    """Each global bundle adjustment of the mapping carries the ranges, as soon as they determine the scale; takes much
+    longer, and the refinement at the end mostly comes to the same map."""
+    num_threads: Annotated[
+        Literal[-1] | Annotated[int, Field(ge=1, le=4096)], Told(expected="1 or more up to 4096, or -1 for all cores")
+    ] = -1
+    """-1 for all cores. Matching on the processor takes one thread all the same, as pycolmap 4.2 loses matches with
+    more; matcher.num_threads overrides that."""
+    submap_size: Annotated[int, Field(ge=10, le=1_000_000)] | None = None
+    """More photos than that are mapped in stretches of so many in their order, each on its own, which are joined by the
+    photos that they share (default: all in one piece)."""
+    submap_overlap: Annotated[int, Field(ge=3, le=1_000_000)] = 20
+    """Photos that a submap shares with the one before."""
+    num_submaps_at_once: Annotated[int, Field(ge=1, le=4096)] = 1
+    """Each is mapped by a process of its own; they share the threads."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _others_to_pipeline(cls, values: dict[str, Any]) -> dict[str, Any]:
+        """pycolmap knows best what its keys may be; only one much like ours is a slip."""
+        others = {
+            name: value
+            for name, value in values.items()
+            if name not in cls.model_fields and not looks_like(name, cls.model_fields, _LIKE_OURS)
+        }
+        ours = {name: value for name, value in values.items() if name not in others}
+        if others and isinstance(pipeline := ours.get("pipeline", {}), dict):
+            ours["pipeline"] = {**others, **pipeline}
+        return ours
 
 
-@dataclass(frozen=True)
-class AssociationOptions:
-    """Ranges to places on the path (part of table ``[ranges]``).
+class ScaleOptions(Options):
+    """How the scale is found."""
 
-    Attributes:
-        max_interpolation_gap_s: between keyframes further apart than this no pose is interpolated.
-        max_time_difference_s: a range this close to a keyframe counts as taken there, where no pose
-            can be interpolated.
-    """
+    table: ClassVar[str] = "scale"
 
-    max_interpolation_gap_s: float = 2.0
-    max_time_difference_s: float = 0.02
-
-
-@dataclass(frozen=True)
-class CheckOptions:
-    """Ranges held out of every estimate, to be compared with the result (part of table ``[ranges]``).
-
-    Attributes:
-        check_share: share of the ranges, chosen at random. Neighbours in time err alike, so that
-            this is the mildest check.
-        check_anchors: ids of anchors; each must have a surveyed position, or nothing could be said of its ranges.
-        check_times_s: (from, to) on the radio's clock; empty for none.
-    """
-
-    check_share: float = 0.0
-    check_anchors: tuple[str, ...] = ()
-    check_times_s: tuple[float, ...] = ()
+    method: Annotated[Literal["robust", "two-candidate"], Told(flag="scale_method")] = "robust"
+    """How the scale is found; two-candidate is the paper's."""
+    num_bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 200
+    """Resamplings of the block bootstrap over time."""
+    bootstrap_block_s: Annotated[float, Field(ge=1e-3, le=1e9)] = 10.0
+    """Length of its blocks."""
+    max_relative_stddev: Annotated[float, Field(ge=1e-9, le=1e3)] = 0.1
+    """A scale less certain than this is refused."""
+    up_in_first_camera: Annotated[
+        Annotated[_Three, AfterValidator(_direction)] | None,
+        Told(expected="a list of 3 numbers up to 1e+09: a direction, not 0,0,0"),
+    ] = None
+    """Upward in the first keyframe's camera frame, of any length; 0,-1,0 if it was level. Two anchors of a site are
+    enough with it, and a mirror image is ruled out that would stand the map on its head."""
+    camera_side: Literal["above", "below"] | None = None
+    """Where the camera went, seen from surveyed anchors that are all in one plane."""
 
 
-@dataclass(frozen=True)
-class RangeModelOptions:
-    """What is assumed of the radio (part of table ``[ranges]``).
+class ScaleAndTapeOptions(ScaleOptions):
+    """How the scale is found, and distances taped on the site."""
 
-    Attributes:
-        range_stddev_m: noise of a range; None: estimated from the residuals.
-        range_bias_stddev_m: prior of each anchor's own constant bias, mean 0. Small on purpose:
-            a freer bias soaks up errors that depend on direction, and shifts the map instead.
-        common_bias_stddev_m: prior of the bias that all anchors share (the tag's delay), mean 0.
-    """
+    distances: Annotated[Path | None, Told(role="file")] = None
+    """CSV from,to,distance_m[,stddev_m,kind]: taped distances."""
+    markers: Annotated[Path | None, Told(role="file")] = None
+    """CSV marker,image_name,x_px,y_px: marks that they refer to."""
 
-    range_stddev_m: float | None = None
-    range_bias_stddev_m: float = 0.01
-    common_bias_stddev_m: float = 0.1
-
-
-@dataclass(frozen=True)
-class ScaleOptions:
-    """Table ``[scale]``.
-
-    Attributes:
-        method: "robust" (default) or "two-candidate" (the paper's).
-        num_bootstrap: resamplings of the block bootstrap over time.
-        bootstrap_block_s: length of its blocks.
-        max_relative_stddev: a scale less certain than this is refused.
-        up_in_first_camera: (3,) the upward direction in the first keyframe's camera frame, of any length: (0, -1, 0)
-            for a camera held level. Two anchors of a site are enough with it, and a mirror image is ruled out that
-            would stand the map on its head.
-        camera_side: "above" or "below": where the camera went, seen from surveyed anchors that are all in one
-            plane; None: not told.
-    """
-
-    method: str = "robust"
-    num_bootstrap: int = 200
-    bootstrap_block_s: float = 10.0
-    max_relative_stddev: float = 0.1
-    up_in_first_camera: tuple[float, float, float] | None = None
-    camera_side: str | None = None
+    @model_validator(mode="after")
+    def _markers_are_of_distances(self) -> ScaleAndTapeOptions:
+        if self.markers is not None and self.distances is None:
+            raise OptionError(
+                f"[scale] markers is '{self.markers}', expected distances beside it: marks are only the ends of taped "
+                "distances",
+                "scale",
+                "markers",
+            )
+        return self
 
 
-@dataclass(frozen=True)
-class RefineOptions:
-    """Table ``[refine]``.
+class RefineOptions(Options):
+    """Bundle adjustment with the ranges."""
 
-    Attributes:
-        enabled: False leaves the map as scaled.
-        max_num_iterations: of the solver.
-        range_loss_scale: residual in stddevs from which a range is down-weighted (Geman-McClure).
-        lever_arm_stddev_m: of each coordinate of the tags' places in the camera frame, which are estimated if this is
-            more than 0.
-        time_offset_stddev_s: of the clocks' offset, likewise.
-        short_range_stddev_m: of an error of short ranges that all share and that dies out with a length of 1 m,
-            likewise.
-        covariance: whether to find that of poses, anchors and scale; not found of more than 1500 photos that
-            see much of the same; along a path, of some thousands.
-        bundle_adjustment: passed through to pycolmap's BundleAdjustmentOptions.
-    """
+    table: ClassVar[str] = "refine"
 
-    enabled: bool = True
-    max_num_iterations: int = 200
-    range_loss_scale: float = 3.46
-    lever_arm_stddev_m: float = 0.0
-    time_offset_stddev_s: float = 0.0
-    short_range_stddev_m: float = 0.0
+    enabled: Annotated[bool, Told(flag="refine")] = True
+    """Whether the map is refined, or left as scaled."""
+    max_num_iterations: Annotated[int, Field(ge=0, le=1_000_000)] = 200
+    """Of the refinement's solver."""
+    range_loss_scale: Annotated[float, Field(ge=1e-3, le=1e9)] = 3.46
+    """Residual in stddevs from which a range is down-weighted (Geman-McClure)."""
+    lever_arm_stddev_m: _Uncertainty = 0.0
+    """Of each coordinate of the tags' places in the camera frame, which are refined unless it is 0."""
+    time_offset_stddev_s: _Uncertainty = 0.0
+    """Of the clocks' offset, which is refined unless it is 0."""
+    short_range_stddev_m: _Uncertainty = 0.0
+    """Of an error of short ranges that all share and that dies out with a length of 1 m, which is refined unless it is
+    0 (they are trusted less instead)."""
     covariance: bool = True
-    bundle_adjustment: dict[str, Any] = field(default_factory=dict)
+    """Whether to find that of poses, anchors and scale; not found of more than 1500 photos that see much of the same;
+    along a path, of some thousands."""
+    bundle_adjustment: dict[str, Any] = Field(default_factory=dict)
+    """Passed through to pycolmap's BundleAdjustmentOptions."""
 
 
-@dataclass(frozen=True)
-class ExportOptions:
-    """Table ``[export]``: the metric model in other formats, and in which frame.
+class ExportOptions(Options):
+    """The metric model in other formats, and in which frame."""
 
-    Attributes:
-        formats: names of exporters.
-        frame: "result" (the site's or the first camera's, as the result has it), "level" (z up, y as the first camera
-            looks, origin as it is) or "enu" (x east, y north, z up; for that the map must be georeferenced).
-        up: what is up: "cameras" (the mean of what is up in the photos), "path" (across the plane of the path), three
-            numbers, a direction in the result's frame, or "auto": z in a site frame, else as "cameras".
-        crs: coordinate system of what is written for maps (LAZ, GeoPackage), as "EPSG:2056"; None: that of the
-            anchors, else longitude and latitude.
-        origin_anchor: id of an anchor whose place on the Earth is known.
-        origin_lat_lon_height: that place, degrees and metres above the ellipsoid (WGS 84).
-        heading_deg: azimuth in which the first camera looks, from north through east.
-    """
+    table: ClassVar[str] = "export"
 
-    formats: tuple[str, ...] = DEFAULT_FORMATS
-    frame: str = "result"
+    formats: _Texts = DEFAULT_FORMATS
+    """Names of exporters; an unknown one lists them all."""
+    frame: Annotated[Literal["result", "level", "enu"], Told(flag="export_frame")] = "result"
+    """One of result (the site's or the first camera's, as the result has it), level (z up, y as the first camera looks,
+    origin as it is) and enu (x east, y north, z up; for that the map must be georeferenced)."""
     up: str = "auto"
-    crs: str | None = None
+    """What is up: cameras (the mean of what is up in the photos), path (across the plane of the path), X,Y,Z (a
+    direction in the result's frame) or auto (z in a site frame, else as cameras)."""
+    crs: Annotated[str | None, Told(flag="export_crs")] = None
+    """Coordinate system of what is written for maps (LAZ, GeoPackage), as EPSG:2056 (default: the anchors', else
+    longitude and latitude)."""
     origin_anchor: str | None = None
-    origin_lat_lon_height: tuple[float, float, float] | None = None
-    heading_deg: float | None = None
+    """Id of an anchor whose place on the Earth is known."""
+    origin_lat_lon_height: Annotated[
+        _Place | None,
+        Told(
+            metavar="LAT,LON,H",
+            expected="3 numbers: latitude up to 90 and longitude up to 360 degrees, height up to 1e+05 metres",
+        ),
+    ] = None
+    """That place, degrees and metres above the ellipsoid (WGS 84)."""
+    heading_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
+    """Azimuth in which the first camera looks, from north through east."""
+
+
+class ReportOptions(Options):
+    """What is said of the result."""
+
+    table: ClassVar[str] = "report"
+
+    reference: Annotated[Path | None, Told(metavar="FILE", role="file")] = None
+    """True positions, for comparison: CSV or TUM."""
+    enabled: Annotated[bool, Told(flag="report")] = True
+    """Whether report.html is written."""
+
+
+class OutputOptions(Options):
+    """Where the results go."""
+
+    table: ClassVar[str] = "output"
+
+    path: Annotated[Path, Told(flag="output_path", role="output")] = Path("out")
+    """Folder of the results."""
+    seed: Annotated[int, Field(ge=0, le=2**31 - 1)] = 0
+    """Of everything random."""

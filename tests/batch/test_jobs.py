@@ -20,8 +20,8 @@ def test_each_survey_has_its_own_folder_and_the_overrides_of_all(tmp_path: Path)
     paths = [write_survey(tmp_path / name / "survey.toml", None) for name in ("a", "b")]
     jobs = read_jobs(paths, {"output.seed": 7}, tmp_path / "batch")
     surveys = [job.survey for job in jobs if job.survey is not None]
-    assert [survey.output_path for survey in surveys] == [tmp_path / "a" / "out", tmp_path / "b" / "out"]
-    assert [survey.seed for survey in surveys] == [7, 7]
+    assert [survey.output.path for survey in surveys] == [tmp_path / "a" / "out", tmp_path / "b" / "out"]
+    assert [survey.output.seed for survey in surveys] == [7, 7]
 
 
 @pytest.mark.parametrize("output", ["out_of_a", "../surveys/out_of_a", "./x/../out_of_a"])

@@ -13,15 +13,16 @@ from rangesfm.batch.course import Course
 from rangesfm.batch.jobs import Job
 from rangesfm.batch.results import write_results
 from rangesfm.batch.rows import Figures
-from rangesfm.config import Survey
 from rangesfm.failures import Failure
+from rangesfm.options import OutputOptions
+from rangesfm.survey.settings import Survey
 
 BAD_NAME = '</td><script>alert(1)</script>&".toml'
 
 
 @pytest.fixture
 def course(tmp_path: Path) -> Course:
-    jobs = [Job(f"surveys/{i}.toml", Survey(output_path=tmp_path / f"out #{i}")) for i in range(3)]
+    jobs = [Job(f"surveys/{i}.toml", Survey(output=OutputOptions(path=tmp_path / f"out #{i}"))) for i in range(3)]
     course = Course([*jobs, Job(BAD_NAME, None, Failure(f"{BAD_NAME}: no such file", 2))])
     for i, verdict in enumerate(["good", "doubtful"]):
         course.tell(i, {"began_on": "here"})

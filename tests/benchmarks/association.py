@@ -1,6 +1,6 @@
 """How long a million ranges take to find their places among a thousand keyframes.
 
-    python tests/benchmarks/association.py [NUM_RANGES [NUM_KEYFRAMES]]
+    python -m tests.benchmarks.association [NUM_RANGES [NUM_KEYFRAMES]]
 
 The keyframes are a walk at 2 Hz; the ranges to eight anchors are spread over it, in order of time or in no order.
 Beside it stands what anything of the kind must do to the same data at least: sort the times and interpolate three
@@ -16,11 +16,11 @@ from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
+from tests.simulated.path import loop_path
 
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
-from rangesfm.simulate.path import loop_path
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 """How long many demo surveys take on several workers, beside one after another.
 
-python tests/benchmarks/batch.py [--num_surveys 16] [--num_photos 40] [--width 960] [--num_workers 2] [--kill]
+python -m tests.benchmarks.batch [--num_surveys 16] [--num_photos 40] [--small] [--num_workers 2] [--kill]
 
 Makes the surveys, runs each with ``rangesfm run`` one after another (all cores), then all with ``rangesfm batch`` from
 nothing, and prints the seconds of both (by the clock and of the processors), their ratio, the cores, and the machine's
@@ -22,17 +22,17 @@ import time
 from pathlib import Path
 
 import psutil
+from tests.simulated.small_demo import make_small_demo
 
-from rangesfm.simulate.survey import TIME_OFFSET_S, make_demo_survey
+from rangesfm.demo.survey import TIME_OFFSET_S, make_demo_survey
 
-_ASPECT = 2 / 3
 _FLAGS = ("--ranges_time_offset", str(TIME_OFFSET_S))  # short surveys leave it open
 
 
 def make_surveys(folder: Path, arguments: argparse.Namespace) -> list[Path]:
-    size = (arguments.width, round(arguments.width * _ASPECT))
+    make = make_small_demo if arguments.small else make_demo_survey
     return [
-        make_demo_survey(folder / f"yard{seed:02d}", num_photos=arguments.num_photos, seed=seed, image_size=size).folder
+        make(folder / f"yard{seed:02d}", num_photos=arguments.num_photos, seed=seed).folder
         for seed in range(arguments.num_surveys)
     ]
 
@@ -72,7 +72,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--num_surveys", type=int, default=16)
     parser.add_argument("--num_photos", type=int, default=40)
-    parser.add_argument("--width", type=int, default=960)
+    parser.add_argument("--small", action="store_true", help="photos of 360 x 240 pixels")
     parser.add_argument("--num_workers", type=int, default=2)
     parser.add_argument("--kill", action="store_true")
     arguments = parser.parse_args()

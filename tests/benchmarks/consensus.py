@@ -1,6 +1,6 @@
 """How long exact consensus over the scale takes for a million ranges, beside sorting as many numbers.
 
-python tests/benchmarks/consensus.py [NUM_RANGES]
+python -m tests.benchmarks.consensus [NUM_RANGES]
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What ranges cost in COLMAP's bundle adjustment: processor time of a solver iteration with them, against without.
 
-    python tests/benchmarks/range_cost.py [--num_rounds 9]
+    python -m tests.benchmarks.range_cost [--num_rounds 9]
 
 600 keyframes in sequence with 200 observations each, one thread. Every round solves each variant twice, with few and
 with more iterations from the same perturbed start; the difference is what iterations cost, without the set-up. Rounds
@@ -21,18 +21,20 @@ from unittest import mock
 import numpy as np
 import numpy.typing as npt
 import pycolmap
+from tests.known_errors import known_errors
+from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.path import sequence_path
 
-from rangesfm import _ceres
-from rangesfm.geometry import IDENTITY
+from rangesfm import ceres
+from rangesfm.demo.path import CameraPath
+from rangesfm.demo.ranges import Radio, simulate_ranges
+from rangesfm.geometry.similarity import IDENTITY
+from rangesfm.geometry.trajectory import Trajectory, pose_of, trajectory_from_reconstruction
 from rangesfm.options import CameraOptions
-from rangesfm.ranging.anchors import AnchorEstimate
+from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.observations import RangeObservations
-from rangesfm.refine import refine_with_ranges
-from rangesfm.simulate.model import SyntheticModel, synthetic_model
-from rangesfm.simulate.path import CameraPath, sequence_path
-from rangesfm.simulate.ranges import Radio, simulate_ranges
-from rangesfm.trajectory import Trajectory, pose_of, trajectory_from_reconstruction
+from rangesfm.refine.with_ranges import refine_with_ranges
 
 Array = npt.NDArray[np.float64]
 
@@ -163,8 +165,8 @@ def solve(survey: Survey, variant: Variant, num_iterations: int) -> Solve:
             observations,
             IDENTITY,
             [anchor(name, variant.anchors_are_free) for name in observations.log.anchor_ids],
+            known_errors(observations, RANGE_STDDEV_M),
             tag_in_cam_m=TAG_IN_CAM_M,
-            range_stddev_m=np.full(len(observations.log), RANGE_STDDEV_M),
             first_pose_is_fixed=True,
             camera=CameraOptions(refine_intrinsics=False),
             num_threads=1,
@@ -191,7 +193,7 @@ def main() -> None:
     parser.add_argument("--num_rounds", type=int, default=9)
     num_rounds = parser.parse_args().num_rounds
     survey = make_survey()
-    _ceres.check_compatibility()
+    ceres.check_compatibility()
     seconds: dict[Variant, list[float]] = {variant: [] for variant in VARIANTS}
     last: dict[Variant, Solve] = {}
     for _ in range(num_rounds):

@@ -1,6 +1,6 @@
 """How long a log of a million lines takes to read, beside numpy and pandas.
 
-python tests/benchmarks/read_log.py [NUM_LINES]
+python -m tests.benchmarks.read_log [NUM_LINES]
 """
 
 from __future__ import annotations

@@ -42,12 +42,12 @@ import numpy.typing as npt
 import pycolmap
 from scipy.spatial.transform import Rotation
 from tests.peak_memory import peak_bytes
+from tests.simulated.model import synthetic_model
+from tests.simulated.path import sequence_path
 
-from rangesfm import _ceres
-from rangesfm.geometry import IDENTITY
-from rangesfm.simulate.model import synthetic_model
-from rangesfm.simulate.path import sequence_path
-from rangesfm.trajectory import pose_of
+from rangesfm import ceres
+from rangesfm.geometry.similarity import IDENTITY
+from rangesfm.geometry.trajectory import pose_of
 
 Array = npt.NDArray[np.float64]
 
@@ -186,7 +186,7 @@ Solve = Callable[[int], tuple[int, float, float, float, Array]]
 
 
 def ceres_solver(case: Case, folder: Path, arrays: Any) -> Solve:
-    _ceres.check_compatibility()
+    ceres.check_compatibility()
 
     def solve(max_num_iterations: int) -> tuple[int, float, float, float, Array]:
         reconstruction = pycolmap.Reconstruction(folder / "model")  # not a copy of one: memory is measured
@@ -239,7 +239,7 @@ def add_ranges(
     if case.solver == "python":
         add_python_ranges(adjuster, ranges, poses, anchors)
     else:
-        placed = _ceres.PlacedRanges(
+        placed = ceres.PlacedRanges(
             range_m=ranges.range_m,
             stddev_m=np.full(len(ranges.range_m), RANGE_STDDEV),
             before=ranges.keyframe,
@@ -249,8 +249,8 @@ def add_ranges(
             anchor_index=ranges.anchor,
             tag_index=np.zeros(len(ranges.range_m), dtype=np.int64),
         )
-        robust = _ceres.RangeErrorModel(loss_scale_too_long=LOSS_SCALE, loss_scale_too_short=LOSS_SCALE)
-        _ceres.add_ranges(adjuster, placed, _ceres.RangeBlocks(poses, anchors, biases, [TAG_IN_CAM_M]), robust)
+        blocks = ceres.RangeBlocks(poses, anchors, biases, [TAG_IN_CAM_M])
+        ceres.add_ranges(adjuster, placed, blocks, loss_scale=LOSS_SCALE)
     hold_or_tie(adjuster, reconstruction, anchors, biases, case.solver == "free")
     return anchors, biases
 
@@ -269,7 +269,7 @@ def hold_or_tie(
             if problem.has_parameter_block(block) and not (free and block is anchor):
                 problem.set_parameter_block_constant(block)
         if free and problem.has_parameter_block(anchor):
-            _ceres.keep_from_elimination(adjuster, anchor, point.xyz)
+            ceres.keep_from_elimination(adjuster, anchor, point.xyz)
 
 
 def add_python_ranges(
@@ -299,9 +299,9 @@ def add_python_ranges(
                     jacobians[1][:] = -direction
             return True
 
-    loss = _ceres.cauchy_loss(LOSS_SCALE)
+    loss = pyceres.CauchyLoss(LOSS_SCALE)
     for range_m, keyframe, anchor in zip(ranges.range_m, ranges.keyframe, ranges.anchor, strict=True):
-        _ceres.add_residual_block(adjuster, PythonRange(range_m), loss, [poses[keyframe], anchors[anchor]])
+        ceres.add_residual_block(adjuster, PythonRange(range_m), loss, [poses[keyframe], anchors[anchor]])
 
 
 def quaternion_matrix(x: float, y: float, z: float, w: float) -> Array:

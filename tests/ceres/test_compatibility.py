@@ -8,13 +8,11 @@ from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
+import pyceres
 import pytest
 
 from rangesfm import _cpp
-from rangesfm._ceres import (
-    CostFunction,
-    check_compatibility,
-)
+from rangesfm.ceres import check_compatibility
 from rangesfm.errors import SolverError
 
 Array = npt.NDArray[np.float64]
@@ -37,7 +35,7 @@ def unchecked() -> Iterator[None]:
 @pytest.mark.usefixtures("unchecked")
 def test_the_gate_stays_shut_where_types_are_not_shared(monkeypatch: pytest.MonkeyPatch) -> None:
     # What pybind11 does with a type that its internals do not know.
-    def unknown_type(**_: object) -> CostFunction:
+    def unknown_type(**_: object) -> pyceres.CostFunction:
         raise TypeError("Unable to convert function return value to a Python type! The signature was\n\t...")
 
     monkeypatch.setattr(_cpp, "range_cost", unknown_type)

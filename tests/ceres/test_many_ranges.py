@@ -7,17 +7,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+import pyceres
 import pycolmap
 import pytest
 
-from rangesfm._ceres import (
+from rangesfm.ceres import (
     PlacedRanges,
     RangeBlocks,
-    RangeErrorModel,
     add_ranges,
     add_residual_block,
-    cauchy_loss,
-    combine_ranges,
     interpolated_range_cost,
     range_cost,
 )
@@ -28,7 +26,7 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 NUM_RANGES, NUM_ANCHORS, NUM_TAGS, NUM_POSES = 200, 3, 2, 6
-CAUCHY = RangeErrorModel(loss_scale_too_long=2.0, loss_scale_too_short=2.0)
+LOSS_SCALE = 2.0
 
 
 @pytest.fixture
@@ -61,14 +59,19 @@ def blocks_of(reconstruction: pycolmap.Reconstruction, pose_block: PoseBlock) ->
     )
 
 
-def add_one_by_one(adjuster: pycolmap.CeresBundleAdjuster, ranges: PlacedRanges, blocks: RangeBlocks) -> None:
+def add_one_by_one(
+    adjuster: pycolmap.CeresBundleAdjuster,
+    ranges: PlacedRanges,
+    blocks: RangeBlocks,
+    loss: pyceres.LossFunction | None = None,
+) -> None:
     for i in range(NUM_RANGES):
         ends = [blocks.anchors[ranges.anchor_index[i]], blocks.biases[ranges.anchor_index[i]]]
         tag = blocks.tags_in_cam[ranges.tag_index[i]]
         before, after = blocks.poses[ranges.before[i]], blocks.poses[ranges.after[i]]
         if before is after:
             cost = range_cost(range_m=ranges.range_m[i], tag_in_cam_m=tag, stddev_m=ranges.stddev_m[i])
-            add_residual_block(adjuster, cost, cauchy_loss(2.0), [before, *ends])
+            add_residual_block(adjuster, cost, loss, [before, *ends])
         else:
             cost = interpolated_range_cost(
                 range_m=ranges.range_m[i],
@@ -77,7 +80,7 @@ def add_one_by_one(adjuster: pycolmap.CeresBundleAdjuster, ranges: PlacedRanges,
                 offset_in_world_m=ranges.offset_in_world_m[i],
                 stddev_m=ranges.stddev_m[i],
             )
-            add_residual_block(adjuster, cost, cauchy_loss(2.0), [before, after, *ends])
+            add_residual_block(adjuster, cost, loss, [before, after, *ends])
 
 
 def cost_of(adjuster: pycolmap.CeresBundleAdjuster) -> float:
@@ -107,40 +110,24 @@ def test_cost_and_gradient_are_those_of_the_ranges_one_by_one(
     blocks = blocks_of(reconstruction, pose_block)
     one_by_one, together = adjuster_of(reconstruction), adjuster_of(reconstruction)
     before = together.problem.num_residual_blocks()
-    add_one_by_one(one_by_one, ranges, blocks)
-    added = add_ranges(together, ranges, blocks, CAUCHY)
+    add_one_by_one(one_by_one, ranges, blocks, pyceres.CauchyLoss(LOSS_SCALE))
+    add_ranges(together, ranges, blocks, loss_scale=LOSS_SCALE)
     assert gradient_norm(together) == pytest.approx(gradient_norm(one_by_one), rel=1e-9)
     # With one of Ceres' losses, half the squares of what the problem calls residuals are not the cost.
     assert cost_of(together) == pytest.approx(initial_cost(one_by_one), rel=1e-9)
-    assert added.num_residuals == NUM_RANGES
-    assert added.constant_cost == 0.0
-    assert added.num_residual_blocks == together.problem.num_residual_blocks() - before < NUM_RANGES / 2
+    assert 0 < together.problem.num_residual_blocks() - before < NUM_RANGES / 2
 
 
-def test_a_loss_of_ceres_leaves_each_range_its_own_block(
+def test_each_range_has_its_residual_where_it_is_said_to_be(
     reconstruction: pycolmap.Reconstruction, ranges: PlacedRanges, adjuster_of: AdjusterOf, pose_block: PoseBlock
 ) -> None:
     blocks = blocks_of(reconstruction, pose_block)
-    one_by_one, at_once = adjuster_of(reconstruction), adjuster_of(reconstruction)
+    one_by_one, together = adjuster_of(reconstruction), adjuster_of(reconstruction)
     add_one_by_one(one_by_one, ranges, blocks)
-    added = add_ranges(at_once, ranges, blocks, loss=cauchy_loss(2.0))
-    assert added.num_residual_blocks == added.num_residuals == NUM_RANGES
-    residuals = [np.asarray(adjuster.problem.evaluate_residuals()) for adjuster in (at_once, one_by_one)]
-    np.testing.assert_allclose(residuals[0], residuals[1], atol=1e-12)
-    assert initial_cost(at_once) == pytest.approx(initial_cost(one_by_one), rel=1e-12)
-
-
-def test_ranges_at_one_keyframe_become_one_by_least_squares(
-    reconstruction: pycolmap.Reconstruction, ranges: PlacedRanges, adjuster_of: AdjusterOf, pose_block: PoseBlock
-) -> None:
-    blocks = blocks_of(reconstruction, pose_block)
-    combined, separate = adjuster_of(reconstruction), adjuster_of(reconstruction)
-    added = add_ranges(combined, ranges, blocks)
-    # A loss scale so large that it is least squares keeps the ranges apart.
-    add_ranges(separate, ranges, blocks, RangeErrorModel(loss_scale_too_long=1e9, loss_scale_too_short=1e9))
-    assert added.num_residuals < NUM_RANGES
-    assert cost_of(combined) + added.constant_cost == pytest.approx(cost_of(separate), rel=1e-9)
-    assert gradient_norm(combined) == pytest.approx(gradient_norm(separate), rel=1e-9)
+    rows = add_ranges(together, ranges, blocks)
+    assert len(set(rows)) == NUM_RANGES
+    expected = np.asarray(one_by_one.problem.evaluate_residuals())[-NUM_RANGES:]
+    np.testing.assert_allclose(np.asarray(together.problem.evaluate_residuals())[rows], expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("loss_scale", [np.inf, 2.0], ids=["least squares", "robust"])
@@ -152,12 +139,12 @@ def test_a_range_counts_as_often_as_its_share_says(
     loss_scale: float,
 ) -> None:
     blocks = blocks_of(reconstruction, pose_block)
-    model = RangeErrorModel(loss_scale_too_long=loss_scale, loss_scale_too_short=loss_scale)
     thrice, shared = adjuster_of(reconstruction), adjuster_of(reconstruction)
-    lost = sum(add_ranges(thrice, ranges, blocks, model).constant_cost for _ in range(3))
-    added = add_ranges(shared, replace(ranges, share=np.full(NUM_RANGES, 3.0)), blocks, model)
+    for _ in range(3):
+        add_ranges(thrice, ranges, blocks, loss_scale=loss_scale)
+    add_ranges(shared, replace(ranges, share=np.full(NUM_RANGES, 3.0)), blocks, loss_scale=loss_scale)
     assert gradient_norm(shared) == pytest.approx(gradient_norm(thrice), rel=1e-9)
-    assert cost_of(shared) + added.constant_cost == pytest.approx(cost_of(thrice) + lost, rel=1e-9)
+    assert cost_of(shared) == pytest.approx(cost_of(thrice), rel=1e-9)
 
 
 def test_everything_that_can_be_estimated_reaches_its_block(
@@ -167,19 +154,16 @@ def test_everything_that_can_be_estimated_reaches_its_block(
     blocks = replace(
         fixed,
         lever_arms_are_free=True,
-        common_biases=[np.zeros(1) for _ in range(NUM_TAGS)],
         time_shift=np.zeros(1),
         amplitude=np.zeros(1),
     )
-    model = replace(CAUCHY, short_range_length_m=1.0)
     adjuster, same = adjuster_of(reconstruction), adjuster_of(reconstruction)
-    add_ranges(adjuster, ranges, blocks, model)
-    add_ranges(same, ranges, fixed, CAUCHY)
+    add_ranges(adjuster, ranges, blocks, short_range_length_m=1.0, loss_scale=LOSS_SCALE)
+    add_ranges(same, ranges, fixed, loss_scale=LOSS_SCALE)
     assert cost_of(adjuster) == pytest.approx(cost_of(same), rel=1e-12)
-    assert blocks.common_biases is not None
     assert blocks.time_shift is not None
     assert blocks.amplitude is not None
-    for block in (*blocks.tags_in_cam, *blocks.common_biases, blocks.time_shift, blocks.amplitude):
+    for block in (*blocks.tags_in_cam, blocks.time_shift, blocks.amplitude):
         assert adjuster.problem.has_parameter_block(block)
         before = cost_of(adjuster)
         block += 0.1
@@ -187,12 +171,12 @@ def test_everything_that_can_be_estimated_reaches_its_block(
     assert not any(same.problem.has_parameter_block(tag) for tag in fixed.tags_in_cam)
 
 
-def test_a_curve_needs_its_amplitude_and_a_time_shift_its_intervals(
+def test_a_short_range_error_needs_its_amplitude_and_a_time_shift_its_intervals(
     reconstruction: pycolmap.Reconstruction, ranges: PlacedRanges, adjuster_of: AdjusterOf, pose_block: PoseBlock
 ) -> None:
     adjuster, blocks = adjuster_of(reconstruction), blocks_of(reconstruction, pose_block)
     with pytest.raises(ValueError, match="amplitude"):
-        add_ranges(adjuster, ranges, blocks, RangeErrorModel(short_range_length_m=1.0))
+        add_ranges(adjuster, ranges, blocks, short_range_length_m=1.0)
     with pytest.raises(ValueError, match="amplitude"):
         add_ranges(adjuster, ranges, replace(blocks, amplitude=np.zeros(1)))
     with pytest.raises(ValueError, match="interval_s"):
@@ -203,19 +187,10 @@ def test_no_ranges_are_no_blocks(
     reconstruction: pycolmap.Reconstruction, ranges: PlacedRanges, adjuster_of: AdjusterOf, pose_block: PoseBlock
 ) -> None:
     none = PlacedRanges(**{name: value[:0] for name, value in vars(ranges).items() if value is not None})
-    added = add_ranges(adjuster_of(reconstruction), none, blocks_of(reconstruction, pose_block))
-    assert added.num_residual_blocks == added.num_residuals == 0
-
-
-def test_combined_range_has_the_same_cost_at_any_distance_but_for_a_constant() -> None:
-    rng = np.random.default_rng(2)
-    range_m, stddev_m = rng.uniform(1, 10, 7), rng.uniform(0.1, 1, 7)
-    mean, stddev, constant = combine_ranges(range_m, stddev_m)
-    for distance in (0.5, 4.0, 20.0):
-        expected = 0.5 * np.sum(((distance - range_m) / stddev_m) ** 2)
-        assert 0.5 * ((distance - mean[0]) / stddev[0]) ** 2 + constant == pytest.approx(expected)
-    alone = combine_ranges(np.array([3.0]), np.array([0.1]))
-    assert np.concatenate([alone[0], alone[1], [alone[2]]]) == pytest.approx([3.0, 0.1, 0.0])
+    adjuster = adjuster_of(reconstruction)
+    before = adjuster.problem.num_residual_blocks()
+    assert len(add_ranges(adjuster, none, blocks_of(reconstruction, pose_block))) == 0
+    assert adjuster.problem.num_residual_blocks() == before
 
 
 def test_the_tag_hangs_on_the_rig_frame_whichever_cameras_the_rig_has(

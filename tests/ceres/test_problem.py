@@ -14,13 +14,13 @@ import pyceres
 import pycolmap
 import pytest
 
-from rangesfm._ceres import (
+from rangesfm.ceres import (
+    add_normal_prior,
     add_residual_block,
-    cauchy_loss,
     distance_cost,
     keep_from_elimination,
-    normal_prior_cost,
     range_cost,
+    tangent_jacobian,
 )
 
 if TYPE_CHECKING:
@@ -63,6 +63,36 @@ def test_a_block_given_twice_is_refused(
         add_residual_block(adjuster, cost, None, [pose, pose_block(reconstruction, 1)])
 
 
+def test_a_normal_prior_is_off_by_its_stddevs(reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf) -> None:
+    problem = (adjuster := adjuster_of(reconstruction)).problem
+    block, bias = np.array([1.2, 1.0, 7.0]), np.array([1e-9])
+    add_normal_prior(adjuster, block, mean=[1.0, 2.0, 3.0], stddev=[0.1, 0.5, 2.0])
+    add_normal_prior(adjuster, bias, mean=[0.0], stddev=1e-9)
+    assert problem.evaluate_residuals()[-4:] == pytest.approx([2.0, -2.0, 2.0, 1.0], rel=1e-12)
+    jacobian = tangent_jacobian(problem, [block, bias]).toarray()
+    np.testing.assert_allclose(jacobian[-4:], np.diag([10.0, 2.0, 0.5, 1e9]), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("mean", "stddev"),
+    [
+        ([1.0, 2.0, 3.0], [1.0, 1.0]),
+        ([1.0], 1.0),
+        ([], 1.0),
+        ([1.0, 2.0], 0.0),
+        ([1.0, 2.0], [1.0, -1.0]),
+        ([1.0, np.nan], 1.0),
+        ([1.0, 2.0], np.inf),
+    ],
+)
+def test_a_normal_prior_that_means_nothing_is_refused(
+    reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf, mean: list[float], stddev: float | list[float]
+) -> None:
+    # Ceres would end the process.
+    with pytest.raises(ValueError, match=r"prior of|broadcast"):
+        add_normal_prior(adjuster_of(reconstruction), np.zeros(2), mean, stddev)
+
+
 def test_a_range_adds_half_its_squared_residual_to_the_bundle_adjustments_cost(
     reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf, pose_block: PoseBlock
 ) -> None:
@@ -82,7 +112,7 @@ def test_a_cauchy_loss_tames_an_outlier_in_pycolmaps_solver(
     blocks = [pose_block(reconstruction, 1), np.array([3.0, -2.0, 1.0]), np.zeros(1)]
     cost = range_cost(range_m=100.0, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=0.1)
     squared = cost.evaluate(*blocks)[0].item() ** 2
-    add_residual_block(adjuster, cost, cauchy_loss(2.0), blocks)
+    add_residual_block(adjuster, cost, pyceres.CauchyLoss(2.0), blocks)
     summary = adjuster.solve()
     assert isinstance(summary, pycolmap.CeresBundleAdjustmentSummary)
     expected = 0.5 * 2.0**2 * np.log1p(squared / 2.0**2)
@@ -189,7 +219,7 @@ def adjuster_with_free_anchor(
         distance = unbiased.evaluate(pose, ANCHOR_IN_WORLD_M, bias)[0].item() + 1.0
         cost = range_cost(range_m=distance, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=0.1)
         add_residual_block(adjuster, cost, None, [pose, anchor, bias])
-    add_residual_block(adjuster, normal_prior_cost(mean=[0.0], stddev=[0.1]), None, [bias])
+    add_normal_prior(adjuster, bias, mean=[0.0], stddev=0.1)
     adjuster.options.ceres.solver_options.linear_solver_type = pyceres.LinearSolverType.SPARSE_SCHUR
     return adjuster, anchor, bias
 
@@ -198,8 +228,8 @@ LIFETIMES = """
     {imports}
     import gc, itertools
     import numpy as np
-    from rangesfm import _ceres
-    from rangesfm._ceres import problem
+    from rangesfm import ceres
+    from rangesfm.ceres import problem
 
     def make():
         reconstruction = pycolmap.synthesize_dataset(
@@ -215,21 +245,21 @@ LIFETIMES = """
         adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, reconstruction)
         residuals = []
         for frame_id in reconstruction.reg_frame_ids():
-            cost = _ceres.range_cost(range_m=1.0, tag_in_cam_m=[0, 0, 0], stddev_m=1.0)
-            loss = _ceres.cauchy_loss(1.0)
+            cost = ceres.range_cost(range_m=1.0, tag_in_cam_m=[0, 0, 0], stddev_m=1.0)
+            loss = pyceres.CauchyLoss(1.0)
             blocks = [reconstruction.frame(frame_id).rig_from_world.params, np.ones(3), np.zeros(1)]
-            _ceres.add_residual_block(adjuster, cost, loss, blocks)
+            ceres.add_residual_block(adjuster, cost, loss, blocks)
             residuals.append((cost, loss, blocks))
             point = next(iter(reconstruction.points3D.values())).xyz
-            _ceres.keep_from_elimination(adjuster, blocks[1], point)
+            ceres.keep_from_elimination(adjuster, blocks[1], point)
         poses = [reconstruction.frame(frame_id).rig_from_world.params for frame_id in reconstruction.reg_frame_ids()]
         rows = np.arange(4)
-        ranges = _ceres.PlacedRanges(
+        ranges = ceres.PlacedRanges(
             range_m=np.ones(4), stddev_m=np.ones(4), before=rows % 2, after=rows % 2 + rows // 2, weight=rows / 4,
             offset_in_world_m=np.zeros((4, 3)), anchor_index=0 * rows, tag_index=0 * rows,
         )
-        many = _ceres.RangeBlocks(poses, [np.ones(3)], [np.zeros(1)], [np.zeros(3)], lever_arms_are_free=True)
-        _ceres.add_ranges(adjuster, ranges, many, _ceres.RangeErrorModel(loss_scale_too_long=1.0))
+        many = ceres.RangeBlocks(poses, [np.ones(3)], [np.zeros(1)], [np.zeros(3)], lever_arms_are_free=True)
+        ceres.add_ranges(adjuster, ranges, many, loss_scale=1.0)
         residuals.append((ranges, many))
         return dict(adjuster=adjuster, problem=adjuster.problem, reconstruction=reconstruction, residuals=residuals)
 

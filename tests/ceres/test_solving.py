@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from rangesfm._ceres import Step, solve
+from rangesfm.ceres import Step, solve
 
 if TYPE_CHECKING:
     from tests.ceres.conftest import AdjusterOf, PoseBlock

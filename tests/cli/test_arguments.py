@@ -8,8 +8,8 @@ import pytest
 
 from rangesfm.cli.arguments import normalize, parse
 from rangesfm.cli.survey_flags import survey_from_arguments
-from rangesfm.config import Survey
 from rangesfm.errors import InputError
+from rangesfm.survey.settings import Survey
 
 
 def survey_of(*argv: str) -> Survey:
@@ -40,7 +40,7 @@ def test_a_switch_takes_no_value() -> None:
 @pytest.mark.parametrize("spelling", ["--tag_in_cam", "--tag-in-cam"])
 @pytest.mark.parametrize("value", ["-0.0012,-0.09,-0.0663", "-.0012 -9e-2 -0.0663"])
 def test_value_may_begin_with_a_minus_sign(spelling: str, value: str) -> None:
-    assert survey_of("refine", spelling, value).tag_in_cam_m == (-0.0012, -0.09, -0.0663)
+    assert survey_of("refine", spelling, value).tag.tag_in_cam_m == (-0.0012, -0.09, -0.0663)
 
 
 @pytest.mark.parametrize(("text", "seconds"), [("auto", None), ("-3600.37", -3600.37), ("12.8", 12.8)])
@@ -52,10 +52,10 @@ def test_flags_override_the_survey_file(tmp_path: Path, monkeypatch: pytest.Monk
     (tmp_path / "survey.toml").write_text('[images]\npath = "photos"\nevery_nth = 3\n[output]\npath = "a"\nseed = 1\n')
     monkeypatch.chdir(tmp_path)
     survey = survey_of("run", "survey.toml", "--every_nth", "5", "--output_path", "b", "--num_threads", "2")
-    assert survey.keyframes.every_nth == 5
-    assert survey.output_path == tmp_path / "b"
+    assert survey.images.every_nth == 5
+    assert survey.output.path == tmp_path / "b"
     assert survey.mapper.num_threads == 2
-    assert (survey.images_path, survey.seed) == (tmp_path / "photos", 1)
+    assert (survey.images.path, survey.output.seed) == (tmp_path / "photos", 1)
 
 
 def test_images_are_a_folder_of_photos_or_a_file_of_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -63,9 +63,9 @@ def test_images_are_a_folder_of_photos_or_a_file_of_times(tmp_path: Path, monkey
     (tmp_path / "images.csv").touch()
     monkeypatch.chdir(tmp_path)
     survey = survey_of("run", "--images", "photos", "--image-times", "images.csv")
-    assert (survey.images_path, survey.image_times_path) == (tmp_path / "photos", tmp_path / "images.csv")
+    assert (survey.images.path, survey.images.times) == (tmp_path / "photos", tmp_path / "images.csv")
     survey = survey_of("refine", "--input_path", "sparse/0", "--images", "images.csv")
-    assert (survey.images_path, survey.image_times_path) == (None, tmp_path / "images.csv")
+    assert (survey.images.path, survey.images.times) == (None, tmp_path / "images.csv")
     assert survey.model_path == tmp_path / "sparse" / "0"
     with pytest.raises(InputError, match=r"there is no file .*none\.csv"):
         survey_of("refine", "--images", "none.csv")

@@ -70,6 +70,16 @@ def test_help_needs_none_of_the_heavy_packages() -> None:
     assert subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, check=False).returncode == 0
 
 
+def test_help_on_all_commands_is_quick() -> None:
+    """What survey keys are made of is only imported by the command that needs it."""
+    code = (
+        "import sys; from rangesfm.cli import main; main(['--help']); "
+        "sys.exit(bool({'numpy', 'pydantic', 'pycolmap'} & set(sys.modules)))"
+    )
+    env = {**os.environ, "PYTHONPATH": str(Path(rangesfm.__path__[-1]).parent)}
+    assert subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, check=False).returncode == 0
+
+
 def test_module_runs_as_a_command(folder: Path) -> None:
     done = rangesfm_command("ranges", "uwb.csv", cwd=folder)
     assert (done.returncode, done.stderr) == (0, "")
@@ -121,7 +131,8 @@ def test_ranges_writes_the_canonical_csv_from_mapped_columns(folder: Path) -> No
         (["export", "photos"], "photos"),
         (["export", "photos", "--formats", "tum,dxf"], "dxf"),
         (["export", "a", "--input_path", "b"], "two result folders"),
-        (["demo", "--num_photos", "2"], "--num_photos is 2"),
+        (["demo", "--num_photos", "2"], "--num_photos is 2, expected 10 to 40"),
+        (["demo", "--num_photos", "41"], "--num_photos is 41, expected 10 to 40"),
         (["demo", "--seed", "-2"], "--seed is -2"),
     ],
 )

@@ -44,7 +44,7 @@ def test_time_stamps_are_converted_as_told(tmp_path: Path) -> None:
     assert read_ranges(out).range_m[0] == pytest.approx(299_792_458 / 2 * (0.5e-6 - 1e-7), abs=1e-4)
 
 
-@pytest.mark.parametrize("speed", ["fast", "5", "3e9", "nan"])
+@pytest.mark.parametrize("speed", ["5", "3e9", "nan"])
 def test_speed_that_is_not_lights_is_refused(speed: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["ranges", "uwb.csv", "--propagation_speed", speed]) == 2
     assert "expected air, vacuum or a speed of light in m/s" in capsys.readouterr().err
@@ -53,8 +53,9 @@ def test_speed_that_is_not_lights_is_refused(speed: str, capsys: pytest.CaptureF
 @pytest.mark.parametrize(
     ("flag", "value", "said"),
     [
-        ("--stamp_bits", "33", "expected 32 or 40"),
-        ("--ranging_interval_s", "0", "expected more than 0"),
+        ("--propagation_speed", "fast", "'fast' is neither air, vacuum nor a number"),
+        ("--stamp_bits", "33", "choose from 32, 40"),
+        ("--ranging_interval_s", "0", "expected a number of seconds from 1e-06 to 1000000"),
         ("--separator", "ab", "expected one character"),
     ],
 )

@@ -10,8 +10,8 @@ import pytest
 from rangesfm.cli import main
 from rangesfm.cli.arguments import normalize, parse
 from rangesfm.cli.survey_flags import survey_from_arguments
-from rangesfm.inputs import read_ranging_inputs
-from rangesfm.ranging.error_curve import read_error_curve
+from rangesfm.ranging.errors.error_curve import read_error_curve
+from rangesfm.survey.inputs import read_ranging_inputs
 
 ANCHORS = {"a": (0.0, 0.0, 2.0), "b": (6.0, 0.0, 0.3), "c": (6.0, 5.0, 2.0), "d": (0.0, 5.0, 0.3)}
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
+from rangesfm.ceres.doctor import Check
 from rangesfm.cli import main
-from rangesfm.config import Survey
-from rangesfm.doctor import Check
+from rangesfm.survey.settings import Survey
 
 
 @dataclass
@@ -22,10 +22,11 @@ class Calls:
     made: list[tuple[str, Survey, dict[str, Any]]] = field(default_factory=list)
 
     def stage(self, name: str) -> Any:
-        def run(survey: Survey, **options: Any) -> SimpleNamespace:
+        def run(survey: Survey, **options: Any) -> SimpleNamespace | list[str]:
             options.pop("progress").message("working")
             self.made.append((name, survey, options))
-            return SimpleNamespace(summary_lines=lambda: [f"{name} is done", "scale 2.5"])
+            lines = [f"{name} is done", "scale 2.5"]
+            return lines if name == "reconstruct_survey" else SimpleNamespace(summary_lines=lambda: lines)
 
         return run
 
@@ -33,10 +34,10 @@ class Calls:
 @pytest.fixture
 def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calls:
     calls = Calls()
-    pipeline = ModuleType("rangesfm.pipeline")
+    pipeline = ModuleType("rangesfm.workflows.run")
     for name in ("run_survey", "reconstruct_survey", "scale_model", "refine_model"):
         setattr(pipeline, name, calls.stage(name))
-    monkeypatch.setitem(sys.modules, "rangesfm.pipeline", pipeline)
+    monkeypatch.setitem(sys.modules, "rangesfm.workflows.run", pipeline)
     (tmp_path / "photos").mkdir()
     (tmp_path / "model").mkdir()
     (tmp_path / "uwb.csv").touch()
@@ -61,7 +62,7 @@ def test_command_runs_its_stage_and_prints_the_summary(
     assert main(argv) == 0
     ((name, survey, given),) = calls.made
     assert (name, given) == (stage, options)
-    assert (survey.images_path is None) != (survey.model_path is None)
+    assert (survey.images.path is None) != (survey.model_path is None)
     captured = capsys.readouterr()
     assert captured.out.splitlines() == [f"{stage} is done", "scale 2.5"]
     assert captured.err == "working\n"
@@ -73,20 +74,20 @@ def test_quiet_run_prints_the_summary_alone(calls: Calls, capsys: pytest.Capture
 
 
 def test_demo_makes_a_survey_and_runs_it_against_the_truth(calls: Calls, monkeypatch: pytest.MonkeyPatch) -> None:
-    def make(folder: Path, *, num_photos: int, seed: int, progress: object) -> SimpleNamespace:
+    def make(folder: Path, *, num_photos: int, seed: int) -> SimpleNamespace:
         folder.mkdir()
         (folder / "reference.csv").touch()
         survey_path = folder / "survey.toml"
         survey_path.write_text(f"[images]\nevery_nth = {num_photos}\n[output]\nseed = 1\n")
         return SimpleNamespace(survey_path=survey_path)
 
-    monkeypatch.setattr("rangesfm.simulate.survey.make_demo_survey", make)
+    monkeypatch.setattr("rangesfm.demo.survey.make_demo_survey", make)
     assert main(["demo", "yard", "--num-photos", "12", "--seed", "5", "--num-threads", "2"]) == 0
     ((name, survey, options),) = calls.made
     assert (name, options) == ("run_survey", {"restart": False})
-    assert (survey.keyframes.every_nth, survey.seed, survey.mapper.num_threads) == (12, 5, 2)
-    assert survey.reference_path == Path.cwd() / "yard" / "reference.csv"
-    assert survey.output_path == Path.cwd() / "yard" / "out"
+    assert (survey.images.every_nth, survey.output.seed, survey.mapper.num_threads) == (12, 5, 2)
+    assert survey.report.reference == Path.cwd() / "yard" / "reference.csv"
+    assert survey.output.path == Path.cwd() / "yard" / "out"
 
 
 @pytest.mark.parametrize(("ok", "status"), [(True, 0), (False, 4)])
@@ -97,7 +98,7 @@ def test_doctor_fails_where_a_part_does_not_fit(
         Check("numpy", "2.0", "any", True),
         Check("pyceres", "1.0", "2.6", ok, "" if ok else "pip install pyceres==2.6"),
     ]
-    monkeypatch.setattr("rangesfm.doctor.diagnose", lambda: checks)
+    monkeypatch.setattr("rangesfm.ceres.doctor.diagnose", lambda: checks)
     assert main(["doctor"]) == status
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == (2 if ok else 3)
@@ -109,8 +110,8 @@ def test_lever_arms_of_several_tags_are_given_one_by_one(calls: Calls) -> None:
     assert main([*start, "--tag-in-cam", "T1:-0.1,0,2", "--tag_in_cam", "A:B:0,0,1"]) == 0
     assert main([*start, "--tag_in_cam", "-0.1,0,2"]) == 0
     (_, several, _), (_, one, _) = calls.made
-    assert several.lever_arms_m == {"T1": (-0.1, 0.0, 2.0), "A:B": (0.0, 0.0, 1.0)}
-    assert (one.tag_in_cam_m, one.lever_arms_m) == ((-0.1, 0.0, 2.0), {})
+    assert several.tag.lever_arms_m == {"T1": (-0.1, 0.0, 2.0), "A:B": (0.0, 0.0, 1.0)}
+    assert (one.tag.tag_in_cam_m, one.tag.lever_arms_m) == ((-0.1, 0.0, 2.0), {})
 
 
 @pytest.mark.parametrize(
@@ -134,5 +135,5 @@ def test_radio_log_is_described_by_the_flags_of_the_ranges_command(calls: Calls)
     assert main(["refine", "--input_path", "model", "--ranges", "uwb.csv", *flags, "--ranging_interval_s", "0.1"]) == 0
     ranges = calls.made[0][1].ranges
     assert ranges.columns == {"timestamp": "t", "anchor_id": "n"}
-    assert (ranges.stamps.unit_s, ranges.stamps.propagation_speed_m_per_s) == (1e-6, 299.7e6)
+    assert (ranges.stamp_unit, ranges.propagation_speed) == ("us", 299.7e6)
     assert ranges.ranging_interval_s == 0.1

@@ -10,15 +10,15 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
+from tests.simulated.path import loop_path
 
 from rangesfm.cli import main
-from rangesfm.ranging.anchor_file import read_anchors
+from rangesfm.demo.ranges import Radio, simulate_ranges
+from rangesfm.geometry.reference import Reference, write_reference
+from rangesfm.geometry.trajectory import trajectory_from_reconstruction
+from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers import write_ranges_csv
-from rangesfm.reference import Reference, write_reference
-from rangesfm.simulate.path import loop_path
-from rangesfm.simulate.ranges import Radio, simulate_ranges
-from rangesfm.trajectory import trajectory_from_reconstruction
 from rangesfm.vision.image_times import read_image_times_csv
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import pytest
 
 from rangesfm.distances.surveyed import surveyed_distances
 from rangesfm.distances.tape import CONTROL
-from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.anchors.anchor import Anchor
 
 
 def test_each_two_anchors_with_given_positions_have_their_distance() -> None:

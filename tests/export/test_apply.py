@@ -11,11 +11,11 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
 from rangesfm.export import MetricMap, apply_to, best_similarity, export_map
 from rangesfm.export.metric_map import Array
-from rangesfm.geometry import IDENTITY, Similarity
-from rangesfm.model_transform import rescale
+from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.options import ExportOptions
 
 METRIC_FROM_SFM = Similarity(2.5, Rotation.from_rotvec([0.3, -0.7, 1.1]).as_matrix(), np.array([10.0, -20.0, 3.0]))

@@ -16,16 +16,16 @@ import pycolmap
 import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.simulated.model import synthetic_model
+from tests.simulated.path import loop_path
 
+from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
 from rangesfm.export import MetricMap, export_map
 from rangesfm.export.frames import in_frame, up_in_world
-from rangesfm.geometry import Similarity
-from rangesfm.georeference import Georeference, georeference_at
-from rangesfm.model_transform import rescale
+from rangesfm.geometry.georeference import Georeference, georeference_at
+from rangesfm.geometry.similarity import Similarity
 from rangesfm.options import ExportOptions
-from rangesfm.simulate.model import synthetic_model
-from rangesfm.simulate.path import loop_path
 
 Array = npt.NDArray[np.float64]
 

@@ -9,15 +9,15 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.simulated.model import synthetic_model
+from tests.simulated.path import loop_path
 
+from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
 from rangesfm.export import COVARIANCE_FORMATS, MetricMap, export_map
 from rangesfm.export.frames import moved
-from rangesfm.geometry import Similarity
-from rangesfm.model_transform import rescale
+from rangesfm.geometry.similarity import Similarity
 from rangesfm.options import ExportOptions
-from rangesfm.simulate.model import synthetic_model
-from rangesfm.simulate.path import loop_path
 
 Array = npt.NDArray[np.float64]
 

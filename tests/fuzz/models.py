@@ -40,10 +40,11 @@ _TAG_IN_CAM_M = (0.03, -0.12, -0.05)
 
 def make_survey(folder: Path) -> None:
     """A model of ten photos along a loop, binary and as text, with ranges to four anchors."""
+    from tests.simulated.model import synthetic_model
+    from tests.simulated.path import loop_path
+
+    from rangesfm.demo.ranges import Radio, simulate_ranges
     from rangesfm.ranging.readers.canonical import write_ranges_csv
-    from rangesfm.simulate.model import synthetic_model
-    from rangesfm.simulate.path import loop_path
-    from rangesfm.simulate.ranges import Radio, simulate_ranges
 
     anchors_m = {"A1": (-6.0, -5.0, 0.5), "A2": (6.0, -5.0, 2.5), "A3": (6.0, 5.0, 0.7), "A4": (-6.0, 5.0, 2.2)}
     path = loop_path(15.0, start_s=0.0, seed=3)
@@ -98,8 +99,8 @@ def _spoil_file(path: Path, data: bytes, rng: random.Random) -> str:
 
 def use(survey: Path, number: int, model_path: Path) -> str:
     """What became of it: "refused" or "accepted"; anything else that is wrong escapes."""
+    from rangesfm.colmap.model_files import read_model
     from rangesfm.errors import InputError
-    from rangesfm.model_files import read_model
 
     try:
         model = read_model(model_path)
@@ -115,13 +116,13 @@ def use(survey: Path, number: int, model_path: Path) -> str:
 def _do_what_is_done_with_models(model: object, model_path: Path) -> None:
     import pycolmap
 
+    from rangesfm.colmap.transform import rescale
     from rangesfm.errors import RangesfmError
     from rangesfm.export.ply import write_points
-    from rangesfm.geometry import Similarity
-    from rangesfm.model_transform import rescale
+    from rangesfm.geometry.similarity import Similarity
+    from rangesfm.geometry.trajectory import trajectory_from_reconstruction
     from rangesfm.options import CameraOptions, RefineOptions
-    from rangesfm.refinement.bundle_adjustment import bundle_adjustment, solve
-    from rangesfm.trajectory import trajectory_from_reconstruction
+    from rangesfm.refine.bundle_adjustment import bundle_adjustment, solve
 
     assert isinstance(model, pycolmap.Reconstruction)
     path = trajectory_from_reconstruction(model)

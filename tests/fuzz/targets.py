@@ -5,26 +5,27 @@ from __future__ import annotations
 import tempfile
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rangesfm.config import Survey, read_survey
 from rangesfm.distances.tape import Tape, read_tape
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.export.apply import apply_to
-from rangesfm.geometry import Similarity
-from rangesfm.ranging.anchor_file import read_anchors
-from rangesfm.ranging.anchors import Anchor
-from rangesfm.ranging.error_curve import ErrorCurve, read_error_curve
+from rangesfm.geometry.reference import Reference, read_reference
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.anchor_file import read_anchors
+from rangesfm.ranging.errors.error_curve import ErrorCurve, read_error_curve
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges, write_ranges_csv
 from rangesfm.ranging.summary import summarize_ranges
-from rangesfm.reference import Reference, read_reference
-from rangesfm.result_folder import ResultFolder, read_result_folder
+from rangesfm.result.folder import ResultFolder, read_result_folder
+from rangesfm.result.summary import ResultSummary
+from rangesfm.survey.settings import Survey, read_survey
 from rangesfm.vision.image_times import ImageTimes, read_image_times_csv
 
 CORPUS = Path(__file__).parent / "corpus"
@@ -131,20 +132,20 @@ def _check_curve(curve: ErrorCurve) -> None:
 
 
 def _check_survey(survey: Survey) -> None:
-    _expect(survey.output_path.is_absolute(), "an absolute path")
+    _expect(survey.output.path.is_absolute(), "an absolute path")
     _expect(isinstance(survey.to_dict(), dict), "plain values")
 
 
 def _read_whole_result(path: Path) -> ResultFolder:
     """Everything that pages and exports ask for."""
     result = read_result_folder(path.parent)
-    for name in (item.name for item in fields(result)):
-        getattr(result, name)
-    for ask in (
-        lambda: (result.frame, result.anchors, result.metric_from_sfm, result.relative_scale_stddev),
-        lambda: (result.images_path, result.georeference, result.association, result.lever_arms_m(["T1"])),
-    ):
-        ask()
+    summary = result.summary
+    summary.metric_from_sfm.similarity, summary.scale.relative_stddev_empirical, summary.scale.larger_stddev  # noqa: B018
+    result.anchor_positions_m, result.images_path, result.lever_arms_m(["T1"])
+    _expect(summary.georeference is None or summary.georeference.georeference.crs, "a coordinate system")
+    _expect(list(summary.lines(path.parent, None)), "lines for people")
+    summary.write(path)
+    _expect(ResultSummary.read(path) == summary, "a result that is read as it was written")
     return result
 
 

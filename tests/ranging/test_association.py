@@ -12,11 +12,11 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import AssociationOptions
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 TAG_IN_CAM_M = np.array([0.1, -0.2, 0.05])

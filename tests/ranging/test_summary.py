@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rangesfm.ranging.errors.noise_of_log import estimate_noise_m
+from rangesfm.ranging.errors.quantization import find_quantization_m
 from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.noise_of_log import estimate_noise_m
-from rangesfm.ranging.quantization import find_quantization_m
 from rangesfm.ranging.summary import summarize_ranges
 
 Array = npt.NDArray[np.float64]

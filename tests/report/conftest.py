@@ -13,6 +13,7 @@ import numpy.typing as npt
 import pycolmap
 import pytest
 from PIL import Image
+from tests.result_document import REFINE, merged, result_document
 
 Array = npt.NDArray[np.float64]
 MakeResult = Callable[..., Path]
@@ -52,7 +53,7 @@ def write_result(
     num_points: int = 9000,
     changes: dict[str, Any] | None = None,
 ) -> Path:
-    """A whole result folder; ``changes`` replace keys of result.json (None removes one)."""
+    """A whole result folder; ``changes`` are made to result.json (see ``merged``)."""
     rng = np.random.default_rng(3)
     times = np.linspace(0.0, 190.0, num_keyframes)
     truth = _loop(times)
@@ -72,10 +73,8 @@ def write_result(
     _write_scale_tables(folder, rows)
     summary = _summary(rows, anchor_ids, is_refined, has_reference)
     if has_photos:
-        summary["settings"]["images_path"] = str(_write_photos(folder / "photos", num_keyframes))
-    for key, value in (changes or {}).items():
-        summary[key] = value
-    (folder / "result.json").write_text(json.dumps({k: v for k, v in summary.items() if v is not None}))
+        summary["settings"]["images"]["path"] = str(_write_photos(folder / "photos", num_keyframes))
+    (folder / "result.json").write_text(json.dumps(merged(summary, changes or {})))
     return folder
 
 
@@ -200,6 +199,7 @@ def _summary(
             "value": 0.74213,
             "stddev_formal": 0.00031,
             "stddev_empirical": 0.00412,
+            "interval_95": [0.73405, 0.75021],
             "method": "robust",
             "verdict": "good",
             "reasons": ["eight anchors agree within 1.5 %", "the path fills the room in all three directions"],
@@ -208,6 +208,7 @@ def _summary(
                 "alpha0": {"mean": 1.9132, "std": 4.1021},
                 "alpha1": {"mean": 0.7688, "std": 0.2215},
                 "chosen": "alpha1",
+                "num_without_root": 9,
             },
         },
         "metric_from_sfm": {"scale": 0.74213, "rotation_xyzw": [0.0, 0.0, 0.0, 1.0], "translation_m": [0.0, 0.0, 1.0]},
@@ -231,17 +232,11 @@ def _summary(
             "median_abs_m": float(np.median(np.abs(used))),
         },
         "check_ranges": {"num": len(held_out), "rms_m": _rms(held_out)},
-        "refine": {
-            "iterations": 23,
-            "initial_cost": 8123.2,
-            "final_cost": 5120.9,
-            "reprojection_rms_px": 0.83,
-            "pixel_stddev": 0.61,
-            "seconds": 12.3,
-        },
+        "refine": REFINE if is_refined else None,
         "comparison": [
             {
                 "name": "true scale",
+                "num_keyframes": 160,
                 "rmse_m": 0.0712,
                 "rmse_se3_m": 0.0633,
                 "rmse_sim3_m": 0.0633,
@@ -249,6 +244,7 @@ def _summary(
             },
             {
                 "name": "estimated scale",
+                "num_keyframes": 160,
                 "rmse_m": 0.0801,
                 "rmse_se3_m": 0.0702,
                 "rmse_sim3_m": 0.0633,
@@ -256,6 +252,7 @@ def _summary(
             },
             {
                 "name": "refined",
+                "num_keyframes": 160,
                 "rmse_m": 0.0214,
                 "rmse_se3_m": 0.0187,
                 "rmse_sim3_m": 0.0186,
@@ -278,18 +275,15 @@ def _summary(
         "settings": {
             "images": {"path": "images", "every_nth": 3},
             "anchors": {"path": "anchors.csv", "frame": "site"},
-            "ranges": {"path": "uwb.csv", "time_offset": "auto"},
-            "tag_in_cam_m": [-0.0012, -0.09, -0.0663],
+            "tag": {"tag_in_cam_m": [-0.0012, -0.09, -0.0663]},
             "refine": {"enabled": is_refined, "max_num_iterations": 200, "range_loss_scale": 3.46},
         },
         "seconds": {"features": 31.2, "matching": 18.4, "mapping": 64.0, "scale": 3.1, "refine": 12.3, "output": 1.2},
         "warnings": ["12 ranges were taken before the first photo"],
     }
-    if not is_refined:
-        del summary["refine"]
     if not has_reference:
         del summary["comparison"]
-    return summary
+    return result_document(**summary)
 
 
 def _rms(residuals: Array) -> float:

@@ -85,4 +85,4 @@ def test_a_run_that_stops_says_so_and_is_not_waited_for(tmp_path: Path) -> None:
 def test_it_holds_no_script(tmp_path: Path) -> None:
     page = page_of(LivePage(SilentProgress(), tmp_path))
     assert "<script" not in page
-    assert "script-src &#x27;none&#x27;" in page
+    assert "script-src &#39;none&#39;" in page

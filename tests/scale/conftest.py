@@ -10,17 +10,18 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.simulated.path import loop_path
+from tests.simulated.ranges import simulate_ranges_at
 
-from rangesfm.geometry import IDENTITY, Similarity
-from rangesfm.ranging.anchors import Anchor
+from rangesfm.demo.ranges import Radio, SimulatedRanges
+from rangesfm.geometry.similarity import IDENTITY, Similarity
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.simulate.path import loop_path
-from rangesfm.simulate.ranges import Radio, SimulatedRanges, simulate_ranges_at
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

@@ -9,16 +9,17 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
+from tests.simulated.path import loop_path
 
+from rangesfm.demo.path import CameraPath
+from rangesfm.demo.ranges import Radio, simulate_ranges
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import RangeModelOptions, ScaleOptions
-from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.simulate.path import CameraPath, loop_path
-from rangesfm.simulate.ranges import Radio, simulate_ranges
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import Similarity
+from rangesfm.geometry.similarity import Similarity
 from rangesfm.scale.anchor_alignment import PlacedAnchor, align_by_anchors
 
 Array = npt.NDArray[np.float64]

@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from rangesfm.demo.ranges import Radio
 from rangesfm.errors import GeometryError
 from rangesfm.scale.consensus import agreeing_intervals, consensus_scales, local_maxima
 from rangesfm.scale.range_equation import RangeProblem
-from rangesfm.simulate.ranges import Radio
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey

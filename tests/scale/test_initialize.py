@@ -10,15 +10,15 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.distance import pdist
+from tests.simulated.path import orbit_path
 
+from rangesfm.demo.ranges import Radio
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.options import CheckOptions, RangeModelOptions, ScaleOptions
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeStatus, hold_out
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.simulate.path import orbit_path
-from rangesfm.simulate.ranges import Radio
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey
@@ -351,7 +351,7 @@ def test_ranges_set_aside_as_checks_have_no_say(make_survey: MakeSurvey) -> None
     )
     assert first.value == second.value
     assert np.all(second.observations.status[is_check] == RangeStatus.CHECK)
-    assert np.all(np.isnan(second.range_stddev_m[is_check]))
+    assert np.all(np.isnan(second.errors.stddev_m[is_check]))
 
 
 def between_cameras(survey: Survey, *, factor: float = 1.0, stddev_m: float = 0.005) -> LocatedDistances:
@@ -443,5 +443,5 @@ def test_noise_that_the_log_states_is_believed(make_survey: MakeSurvey) -> None:
         range_stddev_m=np.full(len(log), 0.3),
     )
     far = log.range_m > 5.0
-    stddev = survey.scale("first_camera", "ABCDE", stated).range_stddev_m
+    stddev = survey.scale("first_camera", "ABCDE", stated).errors.stddev_m
     np.testing.assert_allclose(stddev[far], 0.3, rtol=0.01)

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rangesfm.demo.ranges import Radio
 from rangesfm.errors import GeometryError
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.association import associate
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.simulate.ranges import Radio
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey

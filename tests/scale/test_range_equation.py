@@ -11,8 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rangesfm.distances.ends import LocatedDistances
-from rangesfm.geometry import IDENTITY, Similarity
-from rangesfm.gravity import gravity_of
+from rangesfm.geometry.gravity import gravity_of
+from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.scale import range_equation
 from rangesfm.scale.range_equation import RangeProblem, RangeState, predicted_ranges, solve
 
@@ -90,19 +90,19 @@ def test_jacobians_are_finite_differences_in_every_column(rng: np.random.Generat
         is_check=np.zeros(3, dtype=bool),
     )
     problem = replace(random_problem(rng, random_state(rng)), distances=taped, gravity=gravity_of((0.3, -1.0, 0.2)))
-    columns = range_equation.columns_of(problem)
+    (columns,) = range_equation.columns_of([problem])
     assert columns.num == 1 + 6 + 3 * NUM_ANCHORS + NUM_ANCHORS
     at = 0.2 * rng.normal(size=columns.num)
     at[1:4] *= turn_rad / np.linalg.norm(at[1:4])
 
     def residuals(x: Array) -> Array:
-        state = range_equation.state_after(problem, columns, start, x)
+        state = range_equation.state_after([columns], start, x)
         return (predicted_ranges(problem, state) - problem.range_m) / problem.stddev_m
 
     def prior_residuals(x: Array) -> Array:
-        return range_equation.prior_residuals(problem, columns, range_equation.state_after(problem, columns, start, x))
+        return range_equation.prior_residuals(problem, columns, range_equation.state_after([columns], start, x))
 
-    state = range_equation.state_after(problem, columns, start, at)
+    state = range_equation.state_after([columns], start, at)
     jacobian = range_equation.range_jacobian(problem, columns, start, state)
     np.testing.assert_allclose(jacobian, finite_differences(residuals, at), rtol=1e-6, atol=1e-6)
     prior_jacobian = range_equation.prior_jacobian(problem, columns, start, state)
@@ -116,7 +116,8 @@ def test_with_the_tag_on_the_anchor_all_numbers_are_finite(rng: np.random.Genera
     anchors = start.anchors_m.copy()
     anchors[problem.anchor_index[0]] = tag
     state = replace(start, anchors_m=anchors)
-    jacobian = range_equation.range_jacobian(problem, range_equation.columns_of(problem), state, state)
+    (columns,) = range_equation.columns_of([problem])
+    jacobian = range_equation.range_jacobian(problem, columns, state, state)
     assert np.all(np.isfinite(jacobian))
     assert np.isfinite(solve(problem, state).cost)
 

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from rangesfm.demo.ranges import Radio
 from rangesfm.errors import GeometryError
 from rangesfm.options import ScaleOptions
-from rangesfm.simulate.ranges import Radio
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from rangesfm.geometry import IDENTITY, path_shape
+from rangesfm.demo.ranges import Radio
+from rangesfm.geometry.similarity import IDENTITY, path_shape
 from rangesfm.options import RangeModelOptions
-from rangesfm.scale.problem import survey_problem
+from rangesfm.scale.problem import scale_problem
 from rangesfm.scale.range_equation import RangeProblem, RangeState
 from rangesfm.scale.starts import choose_sides, sphere_swaps
-from rangesfm.simulate.ranges import Radio
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 def unknown_anchors(survey: Survey) -> RangeProblem:
     anchors = survey.anchors("unknown", "")
-    return survey_problem(survey.observations(), survey.trajectory, anchors, "unknown", RangeModelOptions()).ranges
+    return scale_problem(survey.observations(), survey.trajectory, anchors, "unknown", RangeModelOptions(), 10.0).ranges
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from rangesfm.demo.ranges import Radio
 from rangesfm.options import RangeModelOptions, ScaleOptions
-from rangesfm.ranging.shared_errors import ANTENNA_STDDEV_M
+from rangesfm.ranging.errors.shared_errors import ANTENNA_STDDEV_M
 from rangesfm.scale.estimate import ScaleUncertainty
-from rangesfm.simulate.ranges import Radio
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey
@@ -65,7 +65,7 @@ def test_with_correlated_errors_the_empirical_stddev_is_the_larger_and_covers_th
         errors.append(survey.relative_error(estimate))
         formals.append(estimate.uncertainty.formal)
         empiricals.append(estimate.uncertainty.empirical)
-        inflations.append(estimate.correlation_inflation)
+        inflations.append(estimate.errors.inflation)
     # About 20 ranges in a row of 5 a second err together.
     assert np.median(inflations) > 2.0
     assert np.median(empiricals) > 1.5 * np.median(formals)

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
+from rangesfm.demo.ranges import Radio
 from rangesfm.errors import GeometryError
 from rangesfm.options import ScaleOptions
 from rangesfm.scale.cutoff import scale_drift
 from rangesfm.scale.estimate import CutoffTest, ScaleUncertainty
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.simulate.ranges import Radio
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey

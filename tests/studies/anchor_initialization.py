@@ -1,6 +1,6 @@
 """How well is an anchor found from ranges of which many are wrong? Its error over many simulated flights.
 
-    python tests/studies/anchor_initialization.py [--num_seeds 500] [--outlier_shares 0,0.15,0.3,0.5]
+    python -m tests.studies.anchor_initialization [--num_seeds 500] [--outlier_shares 0,0.15,0.3,0.5]
 
 Each seed draws a flight (a loop of 8 x 6 m that rises and falls by 1.5 m, 120 known poses), an anchor 2 to 10 m from
 its middle, between 1 m below the ground and a height of 6 m, and one range at each pose: noise of 0.1 m, and a share
@@ -28,10 +28,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
 from scipy.stats import chi2
+from tests.simulated.path import loop_path
 
 from rangesfm.errors import GeometryError
-from rangesfm.ranging.trilateration import TrilaterationOptions, trilaterate
-from rangesfm.simulate.path import loop_path
+from rangesfm.ranging.anchors.trilateration import TrilaterationOptions, trilaterate
 
 Array = npt.NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 """How honest the stddev of an estimated clock offset is, on short logs with errors that stay for seconds.
 
-    python tests/studies/clock_coverage.py [--num_seeds 40] [--durations_s 20 40 60 190] [--num_anchors 1 4 8]
+    python -m tests.studies.clock_coverage [--num_seeds 40] [--durations_s 20 40 60 190] [--num_anchors 1 4 8]
 
 A hand-held walk in a room of about 8 x 8 m, a photo a second, five ranges a second to each of
 some anchors that nobody surveyed. The ranges have white noise, a slow error as of multipath and
@@ -20,12 +20,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from rangesfm.demo.path import CameraPath
+from rangesfm.demo.ranges import Radio, simulate_ranges
 from rangesfm.errors import GeometryError
-from rangesfm.ranging.clock import estimate_time_offset
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.ranging.clock.estimate import estimate_time_offset
 from rangesfm.ranging.log import RangeLog
-from rangesfm.simulate.path import CameraPath
-from rangesfm.simulate.ranges import Radio, simulate_ranges
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

@@ -46,12 +46,12 @@ from tests.studies.simulated_survey import (
     unit_pixel_errors,
 )
 
-from rangesfm.comparison import papers_table
+from rangesfm.comparison.with_reference import papers_table
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import align_points, rmse
-from rangesfm.reference import Reference
-from rangesfm.refine import RefineSummary
-from rangesfm.trajectory import trajectory_from_reconstruction
+from rangesfm.geometry.reference import Reference
+from rangesfm.geometry.similarity import align_points, rmse
+from rangesfm.geometry.trajectory import trajectory_from_reconstruction
+from rangesfm.refine.with_ranges import RefineSummary
 
 Array = npt.NDArray[np.float64]
 

@@ -1,8 +1,8 @@
 """A survey of yours, with true positions, cut into one that drifts: no photo knows any but its neighbours.
 
-Run: python tests/studies/drift_prone_cut.py SURVEY.toml --base_path DATA --output_path OUT [--first 0]
+Run: python -m tests.studies.drift_prone_cut SURVEY.toml --base_path DATA --output_path OUT [--first 0]
      [--num_photos 120] [--overlap 2] [--max_num_features 1000] [--ranges_in_mapping]
- or: python tests/studies/drift_prone_cut.py SURVEY.toml --base_path DATA --output_path OUT --input_path sparse/0
+ or: python -m tests.studies.drift_prone_cut SURVEY.toml --base_path DATA --output_path OUT --input_path sparse/0
      [--max_track_length 3] [--share_of_points 0.15] [--num_seeds 3]
 
 The first maps a stretch of successive photos (all of them, whatever the survey file thins out, so that neighbours
@@ -22,22 +22,22 @@ names reference, anchors and ranges.
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pycolmap
+from tests.known import known
 
-from rangesfm.comparison import ComparisonRow, compare, format_table
-from rangesfm.config import Survey, read_survey
+from rangesfm.comparison.with_reference import compare, format_table
 from rangesfm.errors import InputError
-from rangesfm.inputs import read_ranging_inputs, times_of_model
-from rangesfm.pipeline import refine_model
+from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.progress import SilentProgress
-from rangesfm.ranges_in_mapping import AdjustmentWithRanges
-from rangesfm.trajectory import trajectory_from_reconstruction
+from rangesfm.survey.inputs import read_ranging_inputs, times_of_model
+from rangesfm.survey.settings import Survey, read_survey
 from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images
 from rangesfm.vision.reconstruct import reconstruct
+from rangesfm.workflows.ranges_in_mapping import AdjustmentWithRanges
+from rangesfm.workflows.run import refine_model
 
 # What differs little from the last steps of a solver that converges.
 _TOLERANCE = 1e-10
@@ -76,8 +76,8 @@ def main() -> None:
 
 
 def times_of_stretch(survey: Survey, first: int, num_photos: int) -> ImageTimes:
-    assert survey.images_path is not None
-    times = find_image_times(survey.images_path, list_images(survey.images_path), survey.image_times_path)
+    assert survey.images.path is not None
+    times = find_image_times(survey.images.path, list_images(survey.images.path), survey.images.times)
     return times.of(times.image_names[first : first + num_photos])
 
 
@@ -85,21 +85,20 @@ def mapped(
     survey: Survey, times: ImageTimes, overlap: int, max_num_features: int, *, ranges_in_mapping: bool
 ) -> pycolmap.Reconstruction:
     """The largest model of the stretch."""
-    mapper = replace(
-        survey.mapper,
+    mapper = survey.mapper.changed(
         matching="sequential",
         pairing={"overlap": overlap, "quadratic_overlap": False},
         features={"sift": {"max_num_features": max_num_features}},
     )
     adjustment = AdjustmentWithRanges(survey, read_ranging_inputs(survey), times.image_names[0], times)
-    assert survey.images_path is not None
+    assert survey.images.path is not None
     summary = reconstruct(
-        survey.images_path,
+        survey.images.path,
         times.image_names,
-        survey.output_path,
+        survey.output.path,
         camera=survey.camera,
         mapper=mapper,
-        seed=survey.seed,
+        seed=survey.output.seed,
         adjustment=adjustment if ranges_in_mapping else None,
     )
     if note := adjustment.note():
@@ -145,7 +144,7 @@ def print_row(survey: Survey, sfm: pycolmap.Reconstruction) -> None:
     """Unscaled, scaled and refined against the reference."""
     lengths = [point.track.length() for point in sfm.points3D.values()]
     print(f"{sfm.num_reg_images()} photos, {len(lengths)} points, seen {np.mean(lengths):.1f} times on average")
-    path = survey.output_path / "cut"
+    path = survey.output.path / "cut"
     path.mkdir(exist_ok=True)
     sfm.write_binary(path)
     reference = read_ranging_inputs(survey).reference
@@ -153,16 +152,12 @@ def print_row(survey: Survey, sfm: pycolmap.Reconstruction) -> None:
         raise InputError("no true positions: give [report] reference in the survey file")
     times = times_of_model(survey, sfm, path)
     unscaled = compare({"unscaled": trajectory_from_reconstruction(sfm, times.by_name())}, reference, frame=None)
-    cut = replace(
-        survey,
-        model_path=path.absolute(),
-        output_path=survey.output_path / "result",
-        refine=replace(survey.refine, covariance=False),
-        report_enabled=False,
+    cut = survey.model_copy(update={"model_path": path.absolute()}).changed(
+        {"output.path": survey.output.path / "result", "refine.covariance": False, "report.enabled": False}
     )
-    result = refine_model(cut, progress=SilentProgress()).result
-    print(format_table((*unscaled, *(ComparisonRow(**row) for row in result["comparison"]))))
-    print(f"{result['refine']['iterations']} iterations of the full problem\n", flush=True)
+    result = refine_model(cut, progress=SilentProgress()).summary
+    print(format_table((*unscaled, *result.comparison)))
+    print(f"{known(result.refine).iterations} iterations of the full problem\n", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Are ranges between the photos worth having? Scale and path from all ranges, and from those at photos alone.
 
-    python tests/studies/interpolation.py RESULT_FOLDER REFERENCE ANCHORS [--tag_in_cam=X,Y,Z]
+    python -m tests.studies.interpolation RESULT_FOLDER REFERENCE ANCHORS [--tag_in_cam=X,Y,Z]
 
 Takes the folder that a run left (``sparse/0``, ``images.csv``, ``ranges.csv``, ``result.json``), of a log with times,
 and a reference (``image_name,x_m,y_m,z_m`` or ``timestamp_s,...``). Places the log on the path anew and estimates the
@@ -25,17 +25,17 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.colmap.model_files import read_model
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import Similarity, align_points
-from rangesfm.model_files import read_model
-from rangesfm.ranging.anchor_file import read_anchors
-from rangesfm.ranging.anchors import Anchor
+from rangesfm.geometry.reference import read_reference
+from rangesfm.geometry.similarity import Similarity, align_points
+from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
 from rangesfm.ranging.readers import read_ranges
-from rangesfm.reference import read_reference
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.vision.image_times import read_image_times_csv
 
 Array = npt.NDArray[np.float64]

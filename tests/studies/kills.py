@@ -1,6 +1,6 @@
 """SIGKILL at random moments of the pipeline, and a run into the same folder after each.
 
-    python tests/studies/kills.py [--num_kills 50] [--seed 0] [--survey FOLDER]
+    python -m tests.studies.kills [--num_kills 50] [--seed 0] [--survey FOLDER]
 
 A small survey of the demo's yard. Every second run that is killed starts in an empty folder, the others in one that
 holds the result with a slightly other camera. The moment is drawn evenly over the time that an undisturbed run takes
@@ -27,10 +27,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from tests.simulated.small_demo import make_small_demo
 
-from rangesfm.model_files import read_model
-from rangesfm.simulate.survey import TIME_OFFSET_S, make_demo_survey
-from rangesfm.trajectory import trajectory_from_reconstruction
+from rangesfm.colmap.model_files import read_model
+from rangesfm.demo.survey import TIME_OFFSET_S
+from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 
 TOLERANCE = 1e-9
 # All steps depend on it; the demo's has a focal length of 280.8 pixels.
@@ -159,7 +160,7 @@ def main() -> int:
         folder = Path(name)
         survey = arguments.survey
         if survey is None:
-            survey = make_demo_survey(folder / "yard", num_photos=14, image_size=(360, 240)).folder
+            survey = make_small_demo(folder / "yard").folder
         whole = undisturbed(survey.resolve(), folder)
         while left.total() < arguments.num_kills:
             onto_old, output = left.total() % 2 == 1, folder / "out"

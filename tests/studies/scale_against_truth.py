@@ -1,6 +1,6 @@
 """Error and 95 % interval of the scale on a real log, in every way of knowing its anchors.
 
-Run: python tests/studies/scale_against_truth.py --ranges uwb.csv --anchors surveyed.csv --reference truth.csv
+Run: python -m tests.studies.scale_against_truth --ranges uwb.csv --anchors surveyed.csv --reference truth.csv
      [--model sparse/0 --images images.csv] [--tag_in_cam X,Y,Z] [--time_offset SECONDS] [--error_curve curve.csv]
 
 With a model: its path, and the truth is the scale of its similarity to the reference, which holds camera poses.
@@ -21,18 +21,18 @@ import numpy.typing as npt
 
 from rangesfm.cli.survey_flags import position
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import align_points
+from rangesfm.geometry.reference import Reference, read_reference
+from rangesfm.geometry.similarity import align_points
+from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.options import AssociationOptions, ScaleOptions
-from rangesfm.ranging.anchor_file import read_anchors
-from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.error_curve import correct_ranges, read_error_curve
+from rangesfm.ranging.errors.error_curve import correct_ranges, read_error_curve
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers import read_ranges
-from rangesfm.reference import Reference, read_reference
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.vision.image_times import read_image_times_csv
 
 Array = npt.NDArray[np.float64]

@@ -1,6 +1,6 @@
 """How many outliers does each way to the scale survive? One anchor known in the first camera's frame, as in the paper.
 
-    python tests/studies/scale_breakdown.py [--num_seeds 20] [--plot FILE.png]
+    python -m tests.studies.scale_breakdown [--num_seeds 20] [--plot FILE.png]
 
 A walk round a yard, 300 ranges of stddev 0.1 m, of which a share of 0 to 80 % is wrong:
 
@@ -28,17 +28,18 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from tests.simulated.path import loop_path
+from tests.simulated.ranges import simulate_ranges_at
 
+from rangesfm.demo.ranges import Radio
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import ScaleOptions
-from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.two_candidate import two_candidate
-from rangesfm.simulate.path import loop_path
-from rangesfm.simulate.ranges import Radio, simulate_ranges_at
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 """How often the 95 % interval of the scale covers the truth, on simulated surveys with errors as real radios have them.
 
-Run: python tests/studies/scale_coverage.py [--num_seeds 100] [--seed 0] [--cases one]
+Run: python -m tests.studies.scale_coverage [--num_seeds 100] [--seed 0] [--cases one]
 
 Errors: white noise; errors of each anchor that last for seconds (first-order autoregressive); a bias that depends on
 the direction from which the antenna sees the anchor; an error curve over distance of either sign, common to all
@@ -17,17 +17,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from tests.simulated.path import loop_path
 
+from rangesfm.demo.path import CameraPath
+from rangesfm.demo.ranges import Radio, SimulatedRanges, simulate_ranges
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import Similarity
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import ScaleOptions
-from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.simulate.path import CameraPath, loop_path
-from rangesfm.simulate.ranges import Radio, SimulatedRanges, simulate_ranges
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 """Is the refined scale as good as the data allow? Its error over many noisy surveys, against the Cramer-Rao bound.
 
-    python tests/studies/scale_crb.py [--num_seeds 50]
+    python -m tests.studies.scale_crb [--num_seeds 50]
 
 One simulated survey for each case of anchors: a COLMAP model of known truth and ranges taken at its keyframes. Each
 seed draws pixel noise, range noise and range biases anew; COLMAP adjusts the model, as a mapper leaves it, then scale,
@@ -25,18 +25,19 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import pycolmap
+from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.path import loop_path
+from tests.simulated.ranges import simulate_ranges_at
 
-from rangesfm.geometry import Similarity, align_points
-from rangesfm.model_transform import rescale
+from rangesfm.colmap.transform import rescale
+from rangesfm.demo.ranges import Radio
+from rangesfm.geometry.similarity import Similarity, align_points
+from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.options import CameraOptions, RangeModelOptions
-from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
-from rangesfm.refine import refine_with_ranges
+from rangesfm.refine.with_ranges import refine_with_ranges
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.simulate.model import SyntheticModel, synthetic_model
-from rangesfm.simulate.path import loop_path
-from rangesfm.simulate.ranges import Radio, simulate_ranges_at
-from rangesfm.trajectory import trajectory_from_reconstruction
 
 Array = npt.NDArray[np.float64]
 
@@ -150,10 +151,8 @@ def scale_error(case: Case, model: SyntheticModel, seed: int) -> float:
         estimate.observations,
         estimate.metric_from_sfm,
         estimate.anchors,
+        estimate.errors,
         tag_in_cam_m=TAG_IN_CAM_M,
-        range_stddev_m=estimate.range_stddev_m,
-        range_share=estimate.range_share,
-        correlation_inflation=estimate.correlation_inflation,
         first_pose_is_fixed=estimate.frame != "site",
         camera=CameraOptions(refine_intrinsics=False),
         num_threads=1,

@@ -8,23 +8,27 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import pycolmap
+from tests.known_errors import known_errors
+from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.path import lap_path, loop_path
+from tests.simulated.ranges import simulate_ranges_at
 
-from rangesfm.costs import add_residual_block, normal_prior_cost, range_cost
-from rangesfm.covariance import joint_covariance
-from rangesfm.geometry import IDENTITY, rmse
-from rangesfm.model_transform import rescale
+from rangesfm.ceres.covariance import joint_covariance
+from rangesfm.colmap.transform import rescale
+from rangesfm.costs import add_residual_block, joint_prior_cost, range_cost
+from rangesfm.demo.path import CameraPath
+from rangesfm.demo.ranges import Radio
+from rangesfm.geometry.similarity import IDENTITY, rmse
+from rangesfm.geometry.trajectory import Trajectory, pose_of, trajectory_from_reconstruction
 from rangesfm.options import CameraOptions, RangeModelOptions
-from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
+from rangesfm.ranging.errors.noise import bias_whitening
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeObservations
-from rangesfm.refine import RefineSummary, refine_with_ranges
+from rangesfm.refine.with_ranges import RefineSummary, refine_with_ranges
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.simulate.model import SyntheticModel, synthetic_model
-from rangesfm.simulate.path import CameraPath, lap_path, loop_path
-from rangesfm.simulate.ranges import Radio, simulate_ranges_at
-from rangesfm.trajectory import Trajectory, pose_of, trajectory_from_reconstruction
 
 Array = npt.NDArray[np.float64]
 
@@ -227,8 +231,11 @@ def run_stages(
     estimate: ScaleEstimate = initialize_scale(
         observations, trajectory, anchors, anchor_frame=survey.anchor_frame, range_model=RANGE_MODEL
     )
-    is_estimated = range_stddev_m is None
-    num = len(log)
+    errors = estimate.errors
+    if range_stddev_m is not None:
+        errors = known_errors(
+            estimate.observations, range_stddev_m, common_bias_stddev_m=RANGE_MODEL.common_bias_stddev_m
+        )
     scaled = rescale(sfm, estimate.metric_from_sfm)
     refined, summary = refine_with_ranges(
         scaled,
@@ -236,12 +243,8 @@ def run_stages(
         estimate.observations,
         estimate.metric_from_sfm,
         estimate.anchors,
+        errors,
         tag_in_cam_m=TAG_IN_CAM_M,
-        range_stddev_m=estimate.range_stddev_m if range_stddev_m is None else np.full(num, range_stddev_m),
-        range_share=estimate.range_share if is_estimated else None,
-        stddev_is_estimated=np.full(num, is_estimated),
-        correlation_inflation=estimate.correlation_inflation if is_estimated else 1.0,
-        common_bias_stddev_m=RANGE_MODEL.common_bias_stddev_m,
         first_pose_is_fixed=survey.is_in_first_camera,
         camera=CameraOptions(refine_intrinsics=False),
         num_threads=1,
@@ -309,8 +312,7 @@ def _anchor_blocks(survey: Survey) -> list[Array]:
 
 
 def _bias_blocks(survey: Survey) -> list[Array]:
-    """Each anchor's and, last, the one that all share."""
-    return [np.zeros(1) for _ in range(len(survey.anchors_m) + 1)]
+    return [np.zeros(1) for _ in survey.anchors_m]
 
 
 def _add_ranges(
@@ -329,13 +331,13 @@ def _add_ranges(
     """
     poses = [pose_of(model.frame(frame_id)).params for frame_id in sorted(model.reg_frame_ids())]
     stddev = survey.range_stddev_m / pixel_stddev
-    for name, anchor, bias in zip(survey.anchors_m, anchors, biases, strict=False):
+    for name, anchor, bias in zip(survey.anchors_m, anchors, biases, strict=True):
         for pose, range_m in zip(poses, ranges_m[name], strict=True):
-            cost = range_cost(range_m=range_m, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=stddev, has_common_bias=True)
-            add_residual_block(adjuster, cost, None, [pose, anchor, bias, biases[-1]])
+            cost = range_cost(range_m=range_m, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=stddev)
+            add_residual_block(adjuster, cost, None, [pose, anchor, bias])
         if survey.anchor_frame != "unknown":
             adjuster.problem.set_parameter_block_constant(anchor)
-    own, common = RANGE_MODEL.range_bias_stddev_m, RANGE_MODEL.common_bias_stddev_m
-    for bias, stddev_m in zip(biases, [own] * len(anchors) + [common], strict=True):
-        prior = normal_prior_cost(mean=np.zeros(1), stddev=np.array([stddev_m / pixel_stddev]))
-        add_residual_block(adjuster, prior, None, [bias])
+    own_stddev_m = np.full(len(biases), RANGE_MODEL.range_bias_stddev_m)
+    whitening = pixel_stddev * bias_whitening(own_stddev_m, RANGE_MODEL.common_bias_stddev_m)
+    prior = joint_prior_cost(mean=np.zeros(len(biases)), whitening=whitening)
+    add_residual_block(adjuster, prior, None, biases)

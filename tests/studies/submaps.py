@@ -53,15 +53,15 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 from tests.peak_memory import peak_bytes
+from tests.simulated.model import synthetic_model
+from tests.simulated.path import loop_path
 from tests.simulated_database import camera_options, matched_photos, write_database
 
+from rangesfm.demo.ranges import Radio, simulate_ranges
+from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.options import MapperOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.readers.canonical import write_ranges_csv
-from rangesfm.reference import Reference, write_reference
-from rangesfm.simulate.model import synthetic_model
-from rangesfm.simulate.path import loop_path
-from rangesfm.simulate.ranges import Radio, simulate_ranges
 from rangesfm.vision.mapping import map_incrementally, pipeline_options, write_models
 from rangesfm.vision.submap_joining import join_submaps
 from rangesfm.vision.submap_refinement import refine_joined

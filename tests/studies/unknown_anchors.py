@@ -1,6 +1,6 @@
 """Scale from anchors that nobody measured: how often it is right, refused or wrong.
 
-    python tests/studies/unknown_anchors.py [--num_seeds 5]
+    python -m tests.studies.unknown_anchors [--num_seeds 5]
 
 Each survey has 60 keyframes and three ranges of stddev 0.05 m to each anchor at each of them; outliers read too long by
 an exponential length of 2 m in the mean. The paths: a walk round a yard that rises and falls, the same at one height, a
@@ -18,16 +18,17 @@ from itertools import product
 
 import numpy as np
 import numpy.typing as npt
+from tests.simulated.path import loop_path, orbit_path
+from tests.simulated.ranges import simulate_ranges_at
 
+from rangesfm.demo.ranges import Radio
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import Similarity
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import ScaleOptions
-from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.simulate.path import loop_path, orbit_path
-from rangesfm.simulate.ranges import Radio, simulate_ranges_at
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

@@ -71,7 +71,7 @@ def _render_room(folder: Path, num_photos: int, *, seed: int = 0, prefix: str = 
     for name, center, s in zip(names, centers, along, strict=True):
         target = np.array([0.3, 0.3 + 0.3 * s, 0.6])
         Image.fromarray(_photograph(textures, center, target)).save(folder / name)
-    camera = CameraOptions("SIMPLE_PINHOLE", (FOCAL_LENGTH, WIDTH / 2, HEIGHT / 2))
+    camera = CameraOptions(model="SIMPLE_PINHOLE", params=(FOCAL_LENGTH, WIDTH / 2, HEIGHT / 2))
     return Room(folder, names, centers, camera)
 
 

@@ -37,7 +37,7 @@ class Printer:
 
 images, output, *params = sys.argv[1:]
 mapper = MapperOptions(features={"sift": {"max_num_features": 400}})
-camera = CameraOptions("SIMPLE_PINHOLE", tuple(map(float, params)))
+camera = CameraOptions(model="SIMPLE_PINHOLE", params=tuple(map(float, params)))
 try:
     reconstruct(images, list_images(images), output, camera=camera, mapper=mapper, progress=Printer())
 except KeyboardInterrupt:

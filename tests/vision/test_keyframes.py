@@ -49,10 +49,10 @@ def test_all_conditions_hold_together() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"every_nth": 0}, "every_nth is 0, expected 1 or more"),
-        ({"min_interval_s": -1.0}, "min_interval_s is -1, expected 0 or more seconds"),
+        ({"every_nth": 0}, "every_nth is 0, expected a whole number from 1 to"),
+        ({"min_interval_s": -1.0}, "min_interval_s is -1.0, expected a number of seconds from 0 to"),
         ({"min_interval_s": math.nan}, "min_interval_s is nan"),
-        ({"max_num_keyframes": 2}, "max_num_keyframes is 2, expected 3 or more"),
+        ({"max_num_keyframes": 2}, "max_num_keyframes is 2, expected a whole number from 3 to"),
         ({"every_nth": 5}, "2 of 10 photos chosen as keyframes, expected at least 3"),
     ],
 )

@@ -14,11 +14,11 @@ import numpy.typing as npt
 import pycolmap
 import pytest
 from tests.few_links import leave_few_links
+from tests.simulated.model import synthetic_model
+from tests.simulated.path import loop_path
 from tests.studies.simulated_database import write_database
 
 from rangesfm.options import CameraOptions, MapperOptions
-from rangesfm.simulate.model import synthetic_model
-from rangesfm.simulate.path import loop_path
 from rangesfm.vision.mapping import pipeline_options
 from rangesfm.vision.mapping_loop import incremental_mapping
 
@@ -54,7 +54,7 @@ def options() -> pycolmap.IncrementalPipelineOptions:
         "extract_colors": False,
         "mapper": {"init_min_num_inliers": 20, "abs_pose_min_num_inliers": 15},
     }
-    camera = CameraOptions("PINHOLE", (750.0, 750.0, 480.0, 320.0))
+    camera = CameraOptions(model="PINHOLE", params=(750.0, 750.0, 480.0, 320.0))
     return pipeline_options(camera, MapperOptions(num_threads=1, pipeline=pipeline), seed=0)
 
 

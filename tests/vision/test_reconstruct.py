@@ -92,7 +92,7 @@ class TestOneModel:
 
 class TestCamera:
     def test_is_refined_from_colmaps_guess_when_only_its_model_is_known(self, room: Room, tmp_path: Path) -> None:
-        camera = CameraOptions("SIMPLE_PINHOLE")
+        camera = CameraOptions(model="SIMPLE_PINHOLE")
         summary = reconstruct(room.folder, room.names, tmp_path, camera=camera, mapper=MAPPER)
         (refined,) = summary.models[0].cameras.values()
         assert summary.num_registered == 6
@@ -100,18 +100,27 @@ class TestCamera:
         assert refined.focal_length == pytest.approx(240, rel=0.03)  # the guess is 307
 
     def test_is_refined_from_its_parameters_on_demand(self, room: Room, tmp_path: Path) -> None:
-        camera = CameraOptions("SIMPLE_PINHOLE", (250.0, 128.0, 96.0), refine_intrinsics=True)
+        camera = CameraOptions(model="SIMPLE_PINHOLE", params=(250.0, 128.0, 96.0), refine_intrinsics=True)
         summary = reconstruct(room.folder, room.names, tmp_path, camera=camera, mapper=MAPPER)
         assert next(iter(summary.models[0].cameras.values())).focal_length == pytest.approx(240, rel=0.03)
 
     @pytest.mark.parametrize(
         ("camera", "message"),
         [
-            (CameraOptions("PINHOL", (1.0,)), "model is 'PINHOL', expected one of COLMAP's, the nearest is 'PINHOLE'"),
-            (CameraOptions("PINHOLE", (300.0, 160.0, 120.0)), "3 numbers, expected 4 for PINHOLE .fx, fy, cx, cy."),
-            (CameraOptions(None, (300.0, 160.0, 120.0)), "has params but no model"),
-            (CameraOptions("SIMPLE_PINHOLE", (-3.0, 128.0, 96.0)), "expected f, cx, cy with f above 0"),
-            (CameraOptions("SIMPLE_PINHOLE", (1500.0, 800.0, 600.0)), "inside the photos of 256 x 192 pixels"),
+            (
+                CameraOptions(model="PINHOL", params=(1.0,)),
+                "model is 'PINHOL', expected one of COLMAP's, the nearest is 'PINHOLE'",
+            ),
+            (
+                CameraOptions(model="PINHOLE", params=(300.0, 160.0, 120.0)),
+                "3 numbers, expected 4 for PINHOLE .fx, fy, cx, cy.",
+            ),
+            (CameraOptions(model=None, params=(300.0, 160.0, 120.0)), "has params but no model"),
+            (CameraOptions(model="SIMPLE_PINHOLE", params=(-3.0, 128.0, 96.0)), "expected f, cx, cy with f above 0"),
+            (
+                CameraOptions(model="SIMPLE_PINHOLE", params=(1500.0, 800.0, 600.0)),
+                "inside the photos of 256 x 192 pixels",
+            ),
         ],
     )
     def test_that_cannot_be_is_refused_before_anything_is_written(
@@ -129,7 +138,6 @@ class TestCamera:
         (MapperOptions(matcher={"sift": {"max_ratio": "x"}}), r"\[mapper.matcher.sift\] max_ratio is 'x'"),
         (MapperOptions(pairing={"overlap": 3}), r"'overlap' in \[mapper.pairing\]; .* known one is"),
         (MapperOptions(pipeline={"min_num_matches": 0}), r"refuses a value, expected min_num_matches > 0"),
-        (MapperOptions(matching="sequental"), r"matching is 'sequental', expected sequential, exhaustive, auto"),
     ],
 )
 def test_options_that_colmap_does_not_have_are_refused_before_anything_is_written(
@@ -153,7 +161,7 @@ def test_sequential_matching_pairs_neighbours_in_time_whatever_their_names(
     for old, new in zip(room.names, names, strict=True):
         (tmp_path / new).parent.mkdir()
         shutil.copy(room.folder / old, tmp_path / new)
-    mapper = MapperOptions("sequential", FEATURES, pairing={"overlap": 2, "quadratic_overlap": False})
+    mapper = MapperOptions(matching="sequential", features=FEATURES, pairing={"overlap": 2, "quadratic_overlap": False})
     summary = reconstruct(tmp_path, names, tmp_path / "out", camera=room.camera, mapper=mapper, progress=listener)
     assert set(centers_by_name(summary.models[0])) == set(names)
     with pycolmap.Database.open(tmp_path / "out" / "database.db") as database:
@@ -337,7 +345,9 @@ class TestOtherPhotos:
     def test_fewer_or_in_another_order_leave_no_pairs_that_would_not_be_matched(
         self, room: Room, tmp_path: Path, listener: Listener
     ) -> None:
-        mapper = MapperOptions("sequential", FEATURES, {"overlap": 2, "quadratic_overlap": False})
+        mapper = MapperOptions(
+            matching="sequential", features=FEATURES, pairing={"overlap": 2, "quadratic_overlap": False}
+        )
         shorter = (room.names[1], room.names[0], *room.names[3:])
         for names, output in ((room.names, "out"), (shorter, "out"), (shorter, "alone")):
             reconstruct(room.folder, names, tmp_path / output, camera=room.camera, mapper=mapper, progress=listener)
@@ -348,7 +358,7 @@ class TestOtherPhotos:
     def test_with_another_camera_are_matched_again_and_not_extracted(
         self, room: Room, output: Path, tmp_path: Path, listener: Listener
     ) -> None:
-        camera = CameraOptions("SIMPLE_PINHOLE", (241.0, 128.0, 96.0))
+        camera = CameraOptions(model="SIMPLE_PINHOLE", params=(241.0, 128.0, 96.0))
         for folder in (output, tmp_path / "alone"):
             reconstruct(room.folder, room.names, folder, camera=camera, mapper=MAPPER, progress=listener)
         assert listener.messages == ["features: those of 6 photos are taken over from an earlier run"]
@@ -421,7 +431,7 @@ class TestBadPhotos:
             if photo is not None:
                 photo.save(tmp_path / name)
         with pytest.raises(ReconstructionError, match=message):
-            reconstruct(tmp_path, names, tmp_path / "out", camera=CameraOptions("SIMPLE_PINHOLE"), mapper=MAPPER)
+            reconstruct(tmp_path, names, tmp_path / "out", camera=CameraOptions(model="SIMPLE_PINHOLE"), mapper=MAPPER)
         assert not (tmp_path / "out" / "sparse").exists()
 
 

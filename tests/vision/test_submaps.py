@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pycolmap
 import pytest
+from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.path import loop_path
 from tests.simulated_database import camera_options, matched_photos, write_database
 
 from rangesfm.errors import InputError, ReconstructionError
-from rangesfm.geometry import align_points, rmse
+from rangesfm.files.sole_writer import LOCK_NAME
+from rangesfm.geometry.similarity import align_points, rmse
 from rangesfm.options import MapperOptions
 from rangesfm.progress import SilentProgress
-from rangesfm.simulate.model import SyntheticModel, synthetic_model
-from rangesfm.simulate.path import loop_path
-from rangesfm.sole_writer import LOCK_NAME
 from rangesfm.vision.mapping import pipeline_options
 from rangesfm.vision.matched_photos import MatchedPhotos
 from rangesfm.vision.reconstruct import reconstruct
@@ -193,7 +193,7 @@ def test_a_process_that_fails_is_named_with_what_it_said(walk: Walk) -> None:
 def test_whoever_stops_listening_stops_the_processes(walk: Walk, monkeypatch: pytest.MonkeyPatch) -> None:
     # At once: so small a submap is mapped before one would otherwise hear of it.
     monkeypatch.setattr("rangesfm.vision.submap_processes._POLL_INTERVAL_S", 0.0)
-    monkeypatch.setattr("rangesfm.supervision._POLL_INTERVAL_S", 0.01)
+    monkeypatch.setattr("rangesfm.processes.supervision._POLL_INTERVAL_S", 0.01)
 
     class Deaf(SilentProgress):
         def update(self, num_done: int, num_total: int | None = None) -> None:

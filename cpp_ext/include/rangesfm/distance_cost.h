@@ -6,7 +6,7 @@
 #include <Eigen/Core>
 
 #include "rangesfm/range_geometry.h"
-#include "rangesfm/two_sided_loss.h"
+#include "rangesfm/robust_loss.h"
 
 namespace rangesfm {
 
@@ -59,7 +59,7 @@ template <typename EndA, typename EndB>
 class DistanceCost final : public ceres::CostFunction {
  public:
   DistanceCost(double distance, const EndA& a, const EndB& b, double stddev, bool has_bias,
-               TwoSidedLoss loss = TwoSidedLoss())
+               RobustLoss loss = RobustLoss())
       : distance_(distance), a_(a), b_(b), inv_stddev_(1.0 / stddev), has_bias_(has_bias), loss_(loss) {
     set_num_residuals(1);
     *mutable_parameter_block_sizes() = {EndA::kBlockSize, EndB::kBlockSize};
@@ -74,7 +74,7 @@ class DistanceCost final : public ceres::CostFunction {
     const Eigen::Vector3d& b_in_world = b.InWorld();
     const AnchorToTag b_to_a(a.InWorld(), b_in_world.data());
     const double bias = has_bias_ ? *parameters[2] : 0.0;
-    const TwoSidedLoss::Robust robust = loss_((b_to_a.Distance() + bias - distance_) * inv_stddev_);
+    const RobustLoss::Robust robust = loss_((b_to_a.Distance() + bias - distance_) * inv_stddev_);
     residuals[0] = robust.value;
     if (jacobians == nullptr) {
       return true;
@@ -99,7 +99,7 @@ class DistanceCost final : public ceres::CostFunction {
   const EndB b_;
   const double inv_stddev_;
   const bool has_bias_;
-  const TwoSidedLoss loss_;
+  const RobustLoss loss_;
 };
 
 }  // namespace rangesfm

@@ -4,14 +4,13 @@
 #include <ceres/cost_function.h>
 
 #include <Eigen/Core>
-#include <memory>
+#include <cmath>
 #include <optional>
 #include <utility>
 
-#include "rangesfm/range_error_curve.h"
 #include "rangesfm/range_geometry.h"
+#include "rangesfm/robust_loss.h"
 #include "rangesfm/tag_place.h"
-#include "rangesfm/two_sided_loss.h"
 
 namespace rangesfm {
 
@@ -24,23 +23,21 @@ struct MeasuredRanges {
 
 // How a range follows from the two antennas, and what of that is estimated along with the map.
 struct RangeModel {
-  std::optional<Eigen::Vector3d> tag_in_cam = Eigen::Vector3d::Zero();  // nothing: a parameter block
-  bool has_time_shift = false;                                          // a block; of InterpolatedPlace
-  bool has_common_bias = false;                                         // a block
-  std::shared_ptr<const RangeErrorCurve> error_curve;                   // if there is one, its amplitude is a block
-  TwoSidedLoss loss;
+  std::optional<Eigen::Vector3d> tag_in_cam;  // nothing: a parameter block
+  bool has_time_shift = false;                // a block; of InterpolatedPlace
+  std::optional<double> short_range_length;   // given: the short-range error's amplitude is a block
+  RobustLoss loss;
 };
 
 // n-DoF error of the ranges between the tag at one place and one anchor, in stddevs; for each of them
 //
-//   (d + bias + common_bias + amplitude error_curve(d) - range) / stddev,  d = || tag_in_world - anchor_in_world ||,
+//   (d + bias + amplitude exp(-d / short_range_length) - range) / stddev,  d = || tag_in_world - anchor_in_world ||,
 //
 // made robust one by one, times the root of its share. Metres and seconds throughout. Needs the model to be metric
 // already, or close to it.
 //
 // Blocks: those of the place's poses (7 each: qx qy qz qw tx ty tz), anchor_in_world (3), range bias (1: what the radio
-// reads too long), and, as far as the model has them, in this order: tag_in_cam (3), time shift (1), common bias (1),
-// amplitude (1).
+// reads too long), and, as far as the model has them, in this order: tag_in_cam (3), time shift (1), amplitude (1).
 template <typename Place>
 class RangeCost final : public ceres::CostFunction {
  public:
@@ -49,7 +46,8 @@ class RangeCost final : public ceres::CostFunction {
         range_(std::move(measured.range)),
         inv_stddev_(measured.stddev.cwiseInverse()),
         root_share_(measured.share.cwiseSqrt()),
-        model_(std::move(model)) {
+        model_(std::move(model)),
+        inv_short_range_length_(model_.short_range_length ? 1.0 / *model_.short_range_length : 0.0) {
     set_num_residuals(static_cast<int>(range_.size()));
     for (int pose = 0; pose < Place::kNumPoses; ++pose) {
       AddBlock(true, kPoseSize);
@@ -58,27 +56,26 @@ class RangeCost final : public ceres::CostFunction {
     bias_ = AddBlock(true, 1);
     lever_arm_ = AddBlock(!model_.tag_in_cam.has_value(), 3);
     time_shift_ = AddBlock(model_.has_time_shift, 1);
-    common_bias_ = AddBlock(model_.has_common_bias, 1);
-    amplitude_ = AddBlock(model_.error_curve != nullptr, 1);
+    amplitude_ = AddBlock(model_.short_range_length.has_value(), 1);
   }
 
   bool Evaluate(double const* const* parameters, double* residuals, double** jacobians) const override {
     const typename Place::Now place(place_, parameters, Motion(parameters));
-    const double bias = *parameters[bias_] + Number(parameters, common_bias_);
+    const double bias = *parameters[bias_];
+    const double amplitude = Number(parameters, amplitude_);
     for (int i = 0; i < num_residuals(); ++i) {
       const AnchorToTag anchor_to_tag(place.TagInWorld(i), parameters[anchor_]);
-      const RangeErrorCurve::Point curve = Curve(anchor_to_tag.Distance());
-      const double amplitude = Number(parameters, amplitude_);
-      const double predicted = anchor_to_tag.Distance() + bias + amplitude * curve.value;
-      const TwoSidedLoss::Robust robust = model_.loss((predicted - range_[i]) * inv_stddev_[i]);
+      const double distance = anchor_to_tag.Distance();
+      const double fading = std::exp(-distance * inv_short_range_length_);
+      const double predicted = distance + bias + amplitude * fading;
+      const RobustLoss::Robust robust = model_.loss((predicted - range_[i]) * inv_stddev_[i]);
       residuals[i] = root_share_[i] * robust.value;
       if (jacobians != nullptr) {
         const double of_range = root_share_[i] * robust.slope * inv_stddev_[i];
-        const double of_distance = of_range * (1.0 + amplitude * curve.slope);
+        const double of_distance = of_range * (1.0 - amplitude * fading * inv_short_range_length_);
         WriteGeometry(i, place, of_distance * anchor_to_tag.Direction(), jacobians);
         WriteNumber(i, bias_, of_range, jacobians);
-        WriteNumber(i, common_bias_, of_range, jacobians);
-        WriteNumber(i, amplitude_, of_range * curve.value, jacobians);
+        WriteNumber(i, amplitude_, of_range * fading, jacobians);
       }
     }
     return true;
@@ -103,10 +100,6 @@ class RangeCost final : public ceres::CostFunction {
             Number(parameters, time_shift_)};
   }
 
-  RangeErrorCurve::Point Curve(double distance) const {
-    return model_.error_curve == nullptr ? RangeErrorCurve::Point{0.0, 0.0} : model_.error_curve->At(distance);
-  }
-
   // Where the derivatives of one range with respect to a block go; null if nobody asks for them.
   double* Row(int range, int block, double** jacobians) const {
     if (block == kNone || jacobians[block] == nullptr) {
@@ -129,7 +122,7 @@ class RangeCost final : public ceres::CostFunction {
       Eigen::Map<Eigen::Vector3d>{row} = place.OfLeverArm(range, direction);
     }
     if (double* const row = Row(range, time_shift_, jacobians)) {
-      *row = place.OfTimeShift(range, direction);
+      *row = place.OfTimeShift(direction);
     }
   }
 
@@ -144,11 +137,11 @@ class RangeCost final : public ceres::CostFunction {
   const Eigen::VectorXd inv_stddev_;
   const Eigen::VectorXd root_share_;
   const RangeModel model_;
+  const double inv_short_range_length_;
   int anchor_ = kNone;
   int bias_ = kNone;
   int lever_arm_ = kNone;
   int time_shift_ = kNone;
-  int common_bias_ = kNone;
   int amplitude_ = kNone;
 };
 

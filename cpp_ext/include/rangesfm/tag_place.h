@@ -1,4 +1,4 @@
-// Where the tag was when its ranges were measured: at a place that is known, at a keyframe, or between two keyframes.
+// Where the tag was when its ranges were measured: at a keyframe, or between two keyframes.
 //
 // A place says which parameter blocks of poses it has, how many ranges were measured there, and, as its class Now,
 // where the tag is for each of them at the present parameters and how that moves with them. Each gradient is the
@@ -21,36 +21,6 @@ struct TagMotion {
   double time_shift;
 };
 
-// In the world, known. For a keyframe whose pose is held, where a pose block would be one too many, and for finding an
-// anchor from a known path.
-class KnownPlace {
- public:
-  static constexpr int kNumPoses = 0;
-
-  explicit KnownPlace(const Eigen::Vector3d& tag_in_world) : tag_in_world_(tag_in_world) {}
-
-  class Now {
-   public:
-    Now(const KnownPlace& place, double const* const* /*poses*/, const TagMotion& /*motion*/)
-        : tag_in_world_(place.tag_in_world_) {}
-
-    const Eigen::Vector3d& TagInWorld(int /*range*/) const { return tag_in_world_; }
-    static PoseGradient OfPose(int /*pose*/, int /*range*/, const Eigen::Vector3d& /*direction*/) {
-      return PoseGradient::Zero();
-    }
-    static Eigen::Vector3d OfLeverArm(int /*range*/, const Eigen::Vector3d& /*direction*/) {
-      return Eigen::Vector3d::Zero();
-    }
-    static double OfTimeShift(int /*range*/, const Eigen::Vector3d& /*direction*/) { return 0.0; }
-
-   private:
-    const Eigen::Vector3d& tag_in_world_;
-  };
-
- private:
-  Eigen::Vector3d tag_in_world_;
-};
-
 // At a keyframe: R^T (tag_in_cam - t), the same for all its ranges.
 class KeyframePlace {
  public:
@@ -68,7 +38,7 @@ class KeyframePlace {
     Eigen::Vector3d OfLeverArm(int /*range*/, const Eigen::Vector3d& direction) const {
       return tag_.LeverArmGradient(direction);
     }
-    static double OfTimeShift(int /*range*/, const Eigen::Vector3d& /*direction*/) { return 0.0; }
+    static double OfTimeShift(const Eigen::Vector3d& /*direction*/) { return 0.0; }
 
    private:
     TagPosition tag_;
@@ -77,7 +47,7 @@ class KeyframePlace {
 
 // Between two keyframes, one column and one weight a range:
 //
-//   (1 - w) p_before + w p_after + offset_in_world + time_shift offset_velocity_in_world,
+//   (1 - w) p_before + w p_after + offset_in_world,
 //   p = R^T (tag_in_cam - t),  w = weight + time_shift / interval
 //
 // The straight line between the tag's two places moves with both poses; the offset is what the path's curvature adds to
@@ -86,12 +56,8 @@ class InterpolatedPlace {
  public:
   static constexpr int kNumPoses = 2;
 
-  InterpolatedPlace(Eigen::VectorXd weight, Eigen::Matrix3Xd offset_in_world, double interval,
-                    Eigen::Matrix3Xd offset_velocity_in_world)
-      : weight_(std::move(weight)),
-        offset_(std::move(offset_in_world)),
-        inv_interval_(1.0 / interval),
-        offset_velocity_(std::move(offset_velocity_in_world)) {}
+  InterpolatedPlace(Eigen::VectorXd weight, Eigen::Matrix3Xd offset_in_world, double interval)
+      : weight_(std::move(weight)), offset_(std::move(offset_in_world)), inv_interval_(1.0 / interval) {}
 
   class Now {
    public:
@@ -103,8 +69,7 @@ class InterpolatedPlace {
 
     Eigen::Vector3d TagInWorld(int range) const {
       const double weight = Weight(range);
-      return (1.0 - weight) * before_.InWorld() + weight * after_.InWorld() + place_.offset_.col(range) +
-             time_shift_ * place_.offset_velocity_.col(range);
+      return (1.0 - weight) * before_.InWorld() + weight * after_.InWorld() + place_.offset_.col(range);
     }
     PoseGradient OfPose(int pose, int range, const Eigen::Vector3d& direction) const {
       const double weight = Weight(range);
@@ -114,9 +79,8 @@ class InterpolatedPlace {
       const double weight = Weight(range);
       return before_.LeverArmGradient((1.0 - weight) * direction) + after_.LeverArmGradient(weight * direction);
     }
-    double OfTimeShift(int range, const Eigen::Vector3d& direction) const {
-      return direction.dot(place_.inv_interval_ * (after_.InWorld() - before_.InWorld()) +
-                           place_.offset_velocity_.col(range));
+    double OfTimeShift(const Eigen::Vector3d& direction) const {
+      return direction.dot(place_.inv_interval_ * (after_.InWorld() - before_.InWorld()));
     }
 
    private:
@@ -132,7 +96,6 @@ class InterpolatedPlace {
   Eigen::VectorXd weight_;
   Eigen::Matrix3Xd offset_;
   double inv_interval_;
-  Eigen::Matrix3Xd offset_velocity_;
 };
 
 }  // namespace rangesfm

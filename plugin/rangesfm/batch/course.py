@@ -134,7 +134,7 @@ class Course:
 
 
 def _first_row(job: Job) -> SurveyRow:
-    output = "" if job.survey is None else one_line(str(job.survey.output_path))
+    output = "" if job.survey is None else one_line(str(job.survey.output.path))
     if job.failure is None:
         return SurveyRow(job.name, output_path=output)
     return SurveyRow(

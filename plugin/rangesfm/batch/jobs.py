@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rangesfm.config import Survey, read_survey
 from rangesfm.errors import InputError, one_line
 from rangesfm.failures import Failure, failure_of
+from rangesfm.survey.settings import Survey, read_survey
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def read_jobs(paths: Sequence[str | Path], overrides: Mapping[str, object], outp
     for job in jobs:
         if job.survey is None:
             continue
-        folder = job.survey.output_path.resolve()
+        folder = job.survey.output.path.resolve()
         if folder in writes_to:
             raise InputError(
                 f"writes to {folder}, and so does {writes_to[folder]}: expected an [output] path of its own", job.name

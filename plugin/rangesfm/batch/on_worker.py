@@ -7,7 +7,7 @@ import os
 import pickle
 import signal
 import socket
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from dask.system import CPU_COUNT
@@ -15,8 +15,8 @@ from distributed import get_worker
 from distributed.system import MEMORY_LIMIT
 
 from rangesfm.batch.shares import Share
-from rangesfm.config import Survey
-from rangesfm.supervision import Ended, child_command, supervise
+from rangesfm.processes.supervision import Ended, child_command, supervise
+from rangesfm.survey.settings import Survey
 from rangesfm.vision.submaps import Submap
 
 # By the system for want of memory, or by somebody from outside: then it is worth another try.
@@ -105,7 +105,7 @@ def _work(task: SurveyTask, num_threads: int) -> tuple[str, bytes]:
     num = num_threads if own < 1 else min(own, num_threads)
     if task.submap is not None:
         return "rangesfm.vision.submap_process", pickle.dumps(task.submap.with_threads(num))
-    survey = replace(task.survey, mapper=replace(task.survey.mapper, num_threads=num))
+    survey = task.survey.changed({"mapper.num_threads": num})
     return "rangesfm.batch.survey_process", pickle.dumps((survey, task.restart, task.only_prepare))
 
 

@@ -6,14 +6,13 @@ import os
 from pathlib import Path
 from urllib.parse import quote
 
+from markupsafe import Markup
+
 from rangesfm.batch.course import Course, SurveyState
 from rangesfm.batch.rows import Status
-from rangesfm.report.markup import Child, Markup, element
-from rangesfm.report.page import document
-from rangesfm.report.sections import section
-from rangesfm.report.tables import table
+from rangesfm.report import page
+from rangesfm.report.tables import Table
 from rangesfm.report.text import count, decimals_for, duration, fixed, plain
-from rangesfm.report.traffic_lights import traffic_light
 
 RELOAD_S = 5
 _REPORT_NAME = "report.html"
@@ -43,44 +42,35 @@ def render(course: Course, folder: Path) -> str:
         folder: where the page will be, from which its links start.
     """
     heading = f"{len(course.states)} surveys"
-    rows = [_row(state, folder) for state in course.states]
-    others = [state for state in course.states if state.row.reason]
-    return document(
-        f"{heading} – rangesfm batch",
-        heading,
-        element("section", _tiles(course), class_="head", id="counts"),
-        section("surveys", "Surveys", table("What each found", _HEADER, rows, _NOTE)),
-        section("reasons", "To look at", [_reason(state) for state in others] or None),
-        has_script=False,
-        reload=None if course.is_over else str(RELOAD_S),
+    return page.render(
+        "batch.html",
+        title=f"{heading} – rangesfm batch",
+        heading=heading,
+        reload=None if course.is_over else RELOAD_S,
+        tiles=_tiles(course),
+        table=Table("What each found", _HEADER, [_row(state, folder) for state in course.states], _NOTE),
+        reasons=[(_light(state), state.row) for state in course.states if state.row.reason],
     )
 
 
-def _tiles(course: Course) -> Markup:
+def _tiles(course: Course) -> list[tuple[str, str, str]]:
     seconds = sum(row.seconds or 0.0 for row in course.rows)
-    tiles = [
+    num_left = len(course.states) - course.num(Status.DONE) - course.num(Status.FAILED)
+    return [
         ("Done", count(course.num(Status.DONE)), f"of {count(len(course.states))}"),
         ("Failed", count(course.num(Status.FAILED)), "see below why"),
-        ("Not done", count(len(course.states) - course.num(Status.DONE) - course.num(Status.FAILED)), "or not yet"),
+        ("Not done", count(num_left), "or not yet"),
         ("Time taken", duration(course.seconds), f"of all surveys {duration(seconds)}"),
     ]
-    return element(
-        "dl",
-        [
-            element("div", element("dt", name), element("dd", value), element("dd", note, class_="small"))
-            for name, value, note in tiles
-        ],
-        class_="tiles",
-    )
 
 
-def _row(state: SurveyState, folder: Path) -> list[Child]:
+def _row(state: SurveyState, folder: Path) -> list[str]:
     row, found = state.row, state.row.figures
     decimals = decimals_for(found.scale_stddev, default=5)
     scale = fixed(found.scale, decimals)
     return [
         _name(state, folder),
-        [traffic_light(_light(state)), " ", found.verdict or row.status.value],
+        Markup("{} {}").format(page.light(_light(state)), found.verdict or row.status.value),
         scale if found.scale_stddev is None else f"{scale} ± {fixed(found.scale_stddev, decimals)}",
         count(found.num_photos),
         f"{count(found.num_ranges_used)} of {count(found.num_ranges)}" if found.num_ranges is not None else plain(None),
@@ -93,25 +83,16 @@ def _row(state: SurveyState, folder: Path) -> list[Child]:
     ]
 
 
-def _name(state: SurveyState, folder: Path) -> Child:
+def _name(state: SurveyState, folder: Path) -> str:
     """With a link to the survey's report, where it has one."""
     report = Path(state.row.output_path) / _REPORT_NAME
     if state.row.status is not Status.DONE or not report.is_file():
         return state.row.survey
-    return element("a", state.row.survey, href=quote(Path(os.path.relpath(report, folder)).as_posix()))
+    address = quote(Path(os.path.relpath(report, folder)).as_posix())
+    return Markup('<a href="{}">{}</a>').format(address, state.row.survey)
 
 
 def _light(state: SurveyState) -> str:
     if state.row.status is Status.DONE:
         return "green" if state.row.figures.verdict == "good" else "amber"
     return "red" if state.row.status is Status.FAILED else "off"
-
-
-def _reason(state: SurveyState) -> Markup:
-    return element(
-        "p",
-        traffic_light(_light(state)),
-        " ",
-        element("strong", state.row.survey),
-        f": {state.row.reason}",
-    )

@@ -8,9 +8,10 @@ from pathlib import Path
 from rangesfm.batch.course import Course
 from rangesfm.batch.page import render
 from rangesfm.batch.rows import Status, SurveyRow
-from rangesfm.doctor import versions
-from rangesfm.files import new_file
-from rangesfm.outputs import write_csv, write_result
+from rangesfm.ceres.doctor import versions
+from rangesfm.files.atomic import new_file
+from rangesfm.files.records import write_json
+from rangesfm.files.tables import write_table
 
 TABLE_NAME, JSON_NAME, PAGE_NAME = "batch.csv", "batch.json", "batch.html"
 
@@ -19,14 +20,14 @@ def write_results(course: Course, folder: Path) -> None:
     """Write ``batch.csv``, ``batch.json`` and ``batch.html``; while the batch runs the page loads itself anew."""
     rows = course.rows
     cells = [["" if value is None else str(value) for value in row.cells().values()] for row in rows]
-    write_csv(folder / TABLE_NAME, list(SurveyRow("").cells()), cells)
+    write_table(folder / TABLE_NAME, list(SurveyRow("").cells()), cells)
     summary = {
         **{f"num_{status.value}": course.num(status) for status in Status},
         "seconds": course.seconds,
         "versions": _versions(),
         "surveys": [row.cells() for row in rows],
     }
-    write_result(summary, folder / JSON_NAME)
+    write_json(summary, folder / JSON_NAME)
     with new_file(folder / PAGE_NAME) as temporary:
         temporary.write_text(render(course, folder), encoding="utf-8")
 

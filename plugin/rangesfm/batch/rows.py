@@ -7,8 +7,9 @@ from dataclasses import dataclass, fields
 from enum import Enum
 from typing import Any
 
-from rangesfm.comparison import align_rows
 from rangesfm.failures import INTERNAL_ERROR
+from rangesfm.result.summary import ResultSummary
+from rangesfm.text_table import align_rows
 
 _FAILED = 4
 
@@ -81,22 +82,21 @@ class SurveyRow:
         return {**own, "status": self.status.value, **found}
 
 
-def figures_of(result: dict[str, Any]) -> Figures:
-    """From the content of ``result.json``."""
-    scale, refine = result["scale"], result["refine"] or {}
-    comparison = result.get("comparison") or [{}]
+def figures_of(summary: ResultSummary) -> Figures:
+    """From ``result.json``."""
+    scale, ranges = summary.scale, summary.ranges
     return Figures(
-        verdict=scale["verdict"],
-        scale=scale["value"],
-        scale_stddev=max(scale["stddev_formal"], scale["stddev_empirical"]),
-        frame=result["frame"],
-        num_photos=result["map"]["num_photos"],
-        num_ranges=result["ranges"]["num"],
-        num_ranges_used=result["ranges"]["num_used"],
-        range_rms_m=result["ranges"]["rms_m"],
-        reprojection_rms_px=refine.get("reprojection_rms_px"),
-        rmse_m=comparison[-1].get("rmse_m"),
-        num_warnings=len(result["warnings"]),
+        verdict=scale.verdict,
+        scale=scale.value,
+        scale_stddev=scale.larger_stddev,
+        frame=summary.frame,
+        num_photos=summary.map.num_photos,
+        num_ranges=ranges.num,
+        num_ranges_used=ranges.num_used,
+        range_rms_m=ranges.rms_m,
+        reprojection_rms_px=None if summary.refine is None else summary.refine.reprojection_rms_px,
+        rmse_m=summary.comparison[-1].rmse_m if summary.comparison else None,
+        num_warnings=len(summary.warnings),
     )
 
 

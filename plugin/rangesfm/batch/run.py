@@ -20,7 +20,7 @@ from rangesfm.batch.on_worker import KilledError, SurveyTask, run_on_worker, sto
 from rangesfm.batch.results import write_results
 from rangesfm.batch.rows import Figures
 from rangesfm.batch.shares import BatchOptions, Share, share_this_machine
-from rangesfm.sole_writer import sole_writer
+from rangesfm.files.sole_writer import sole_writer
 from rangesfm.vision.submaps import Submap
 
 _POLL_INTERVAL_S = 0.2

@@ -13,22 +13,22 @@ import sys
 from dataclasses import asdict
 from typing import Any
 
-from rangesfm.child_process import MessagesToParent, work_for_parent
-from rangesfm.config import Survey
+from rangesfm.processes.child import MessagesToParent, work_for_parent
+from rangesfm.survey.settings import Survey
 
 
 def _run(given: tuple[Survey, bool, bool], worker: MessagesToParent) -> dict[str, Any]:
     survey, restart, only_prepare = given
     sys.argv = ["rangesfm", "batch", str(survey.source.path)]  # by which others know who writes to its folder
     from rangesfm.batch.rows import figures_of
-    from rangesfm.pipeline import prepare_survey, run_survey
+    from rangesfm.workflows.run import prepare_survey, run_survey
 
     if only_prepare:
         submaps = prepare_survey(survey, progress=worker, restart=restart)
         return {"submaps": base64.b64encode(pickle.dumps(submaps)).decode()}
-    result = run_survey(survey, progress=worker, restart=restart).result
-    reasons = result["scale"]["reasons"] if result["scale"]["verdict"] != "good" else ()
-    return {"figures": asdict(figures_of(result)), "reason": "; ".join(reasons)}
+    summary = run_survey(survey, progress=worker, restart=restart).summary
+    reasons = summary.scale.reasons if summary.scale.verdict != "good" else ()
+    return {"figures": asdict(figures_of(summary)), "reason": "; ".join(reasons)}
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # numpy's and scipy's matrices are small here: threads make them slower, and many times so beside other work.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # COLMAP's log would go to the terminal and to files in the system's temporary folder. Where it is wanted, it is
-    # turned on for so long (rangesfm.colmap_log); what fails is told by whoever called COLMAP.
+    # turned on for so long (rangesfm.colmap.log); what fails is told by whoever called COLMAP.
     os.environ.setdefault("GLOG_minloglevel", "3")
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # whatever the locale, a name that it cannot spell is no failure

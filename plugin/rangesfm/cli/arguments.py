@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from rangesfm.errors import InputError
 from rangesfm.progress import Progress
@@ -43,7 +43,20 @@ Execute = Callable[[argparse.Namespace, Progress], Outcome]
 
 
 class Parser(argparse.ArgumentParser):
-    """Raises InputError where argparse would print its usage and exit."""
+    """Raises InputError where argparse would print its usage and exit; has some arguments only once it reads."""
+
+    def __init__(self, **options: Any):
+        super().__init__(**options)
+        self._later: list[Callable[[Parser], None]] = []
+
+    def add_later(self, add: Callable[[Parser], None]) -> None:
+        """Have arguments added when this parser is the one that reads."""
+        self._later.append(add)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        while self._later:
+            self._later.pop(0)(self)
+        return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
         raise InputError(f"{message} (see {self.prog} --help)")
@@ -113,6 +126,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     commands = Commands(parser)
     for name in COMMANDS:
         import_module(f"rangesfm.cli.{name.replace(' ', '_')}").add_command(commands)
+    args: argparse.Namespace
     args, unknown = parser.parse_known_args(_two_words_in_one(argv))
     if not hasattr(args, "command"):
         parser.error("a command is missing, expected one of " + ", ".join(COMMANDS))

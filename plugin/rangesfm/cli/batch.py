@@ -11,9 +11,6 @@ from pathlib import Path
 from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.cli.batch_progress import BatchTerminal
 from rangesfm.cli.survey_flags import (
-    RANGE_FLAGS,
-    RECONSTRUCTION_FLAGS,
-    REFINE_FLAGS,
     add_flags,
     add_restart_argument,
     overrides_from_arguments,
@@ -21,6 +18,8 @@ from rangesfm.cli.survey_flags import (
 from rangesfm.errors import InputError
 from rangesfm.progress import Progress
 
+# Each survey has its own photos and output; threads are what the workers share.
+_OF_A_SURVEY = ("images.path", "images.times", "mapper.num_threads", "output.path")
 _BYTES_PER_UNIT = {"mb": 10**6, "gb": 10**9, "mib": 1 << 20, "gib": 1 << 30}
 
 
@@ -61,8 +60,7 @@ def add_command(commands: Commands) -> None:
         "--memory_limit", type=_bytes, metavar="SIZE", help="of each survey, as 8GB (default: its share)"
     )
     add_restart_argument(parser)
-    for group in (RECONSTRUCTION_FLAGS, RANGE_FLAGS, REFINE_FLAGS):
-        add_flags(parser, group)
+    add_flags(parser, without=_OF_A_SURVEY)
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:

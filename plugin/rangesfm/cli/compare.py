@@ -7,17 +7,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rangesfm.cli.arguments import Commands, Outcome
-from rangesfm.cli.survey_flags import COMPARE_FLAGS, add_flags, overrides_from_arguments, survey_from_arguments
+from rangesfm.cli.survey_flags import add_flags, flags_given, overrides_from_arguments, survey_from_arguments
 from rangesfm.errors import InputError
 from rangesfm.progress import Progress
 
 if TYPE_CHECKING:
-    from rangesfm.config import Survey
+    from rangesfm.comparison.models import NamedModel
+    from rangesfm.comparison.ranges import ModelRanges
     from rangesfm.distances.tape import Tape
-    from rangesfm.model_comparison import NamedModel
-    from rangesfm.model_ranges import ModelRanges
+    from rangesfm.survey.settings import Survey
 
 
+_KEYS = ("images.path", "ranges", "anchors", "tag", "scale")
+_OF_A_RUN = ("ranges.check_share", "ranges.check_anchors", "ranges.check_times_s", "scale.method")
 _WITHOUT_LOG = ("--distances", "--markers")
 
 
@@ -43,8 +45,7 @@ def add_command(commands: Commands) -> None:
     parser.add_argument("--input_path", metavar="RESULT", help="one result folder (default: out)")
     parser.add_argument("--reference", metavar="FILE", help="true positions: CSV or TUM")
     parser.add_argument("--output_path", metavar="FOLDER", help="of two or more: write comparison.html there as well")
-    parser.add_argument("--images", metavar="PATH", help="CSV of the photos' times, or folder of the photos")
-    add_flags(parser, COMPARE_FLAGS)
+    add_flags(parser, *_KEYS, without=_OF_A_RUN)
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
@@ -53,7 +54,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     reference = None if args.reference is None else Path(args.reference)
     if len(paths) == 1:
         _check_more_than_one_is_not_asked_for(args, paths[0])
-        from rangesfm.comparison import compare_folder
+        from rangesfm.comparison.with_reference import compare_folder
 
         return Outcome([str(compare_folder(paths[0], reference))])
     return _compare_many(args, paths, reference)
@@ -62,14 +63,14 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
 def _check_more_than_one_is_not_asked_for(args: argparse.Namespace, path: Path) -> None:
     if args.output_path is not None:
         raise InputError(f"one model is given, {path}; a page of comparison needs two (see rangesfm report)")
-    if args.images is not None or overrides_from_arguments(args):
+    if overrides_from_arguments(args):
         raise InputError(f"one model is given, {path}; ranges and distances to hold models against need two")
 
 
 def _compare_many(args: argparse.Namespace, paths: list[Path], reference_path: Path | None) -> Outcome:
-    from rangesfm.comparison import compare, format_table
-    from rangesfm.model_comparison import compare_many, read_models
-    from rangesfm.reference import read_reference
+    from rangesfm.comparison.models import compare_many, read_models
+    from rangesfm.comparison.with_reference import compare, format_table
+    from rangesfm.geometry.reference import read_reference
 
     survey = _survey(args)
     models = read_models(paths)
@@ -79,7 +80,7 @@ def _compare_many(args: argparse.Namespace, paths: list[Path], reference_path: P
         trajectories = {model.name: model.path for model in comparison.models}
         lines += ["", format_table(compare(trajectories, read_reference(reference_path), frame=None))]
     if args.output_path is not None:
-        from rangesfm.comparison_page import write_comparison
+        from rangesfm.comparison.page import write_comparison
 
         lines += ["", f"page: {write_comparison(comparison, Path(args.output_path))}"]
     return Outcome(lines)
@@ -87,16 +88,16 @@ def _compare_many(args: argparse.Namespace, paths: list[Path], reference_path: P
 
 def _survey(args: argparse.Namespace) -> Survey:
     """The ranges and distances as the flags describe them."""
-    given = [f"--{flag.name}" for flag in COMPARE_FLAGS if getattr(args, flag.key) is not None]
-    of_log = [name for name in given if name not in _WITHOUT_LOG] + ["--images"] * (args.images is not None)
+    given = flags_given(args, *_KEYS)
+    of_log = [name for name in given if name not in _WITHOUT_LOG]
     if of_log and "--ranges" not in given:
         raise InputError(f"{', '.join(of_log)} given without a log to use it for, expected --ranges LOG as well")
     return survey_from_arguments(args)
 
 
 def _ranges(survey: Survey, first: NamedModel, path: Path) -> ModelRanges | None:
-    from rangesfm.inputs import read_ranging_inputs
-    from rangesfm.model_ranges import ranges_of_survey
+    from rangesfm.comparison.ranges import ranges_of_survey
+    from rangesfm.survey.inputs import read_ranging_inputs
 
     if survey.ranges.path is None or first.model is None:
         return None
@@ -106,4 +107,4 @@ def _ranges(survey: Survey, first: NamedModel, path: Path) -> ModelRanges | None
 def _tape(survey: Survey) -> Tape | None:
     from rangesfm.distances.tape import read_tape
 
-    return None if survey.distances_path is None else read_tape(survey.distances_path, survey.markers_path)
+    return None if survey.scale.distances is None else read_tape(survey.scale.distances, survey.scale.markers)

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 
 from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.cli.result_argument import add_result_argument, result_path
-from rangesfm.cli.survey_flags import position
+from rangesfm.cli.survey_flags import add_flags, overrides_from_arguments
 from rangesfm.errors import InputError
-from rangesfm.options import DEFAULT_FORMATS, EXPORT_FRAMES
 from rangesfm.progress import Progress
 
 if TYPE_CHECKING:
@@ -26,20 +25,7 @@ def add_command(commands: Commands) -> None:
         example="rangesfm export out --formats tum,ply,nerfstudio --frame level --output_path exported",
     )
     add_result_argument(parser)
-    parser.add_argument("--formats", metavar="A,B,..", help="what to write (default: what a run exports)")
-    parser.add_argument("--frame", choices=EXPORT_FRAMES, default="result", help="its frame (default: the result's)")
-    parser.add_argument(
-        "--up",
-        metavar="UP",
-        default="auto",
-        help="what is up: cameras, path or a direction X,Y,Z (default: z in a site frame, else cameras)",
-    )
-    parser.add_argument("--crs", metavar="CRS", help="coordinate system for maps, as EPSG:2056 (default: the anchors')")
-    parser.add_argument("--origin_anchor", metavar="ID", help="an anchor whose place on the Earth is known")
-    parser.add_argument(
-        "--origin_lat_lon_height", metavar="LAT,LON,H", type=position, help="its place: degrees and metres, WGS 84"
-    )
-    parser.add_argument("--heading_deg", metavar="DEG", type=float, help="azimuth in which the first camera looks")
+    add_flags(parser, "export", by_own_names=True)
     parser.add_argument(
         "--apply_to",
         nargs="+",
@@ -51,32 +37,26 @@ def add_command(commands: Commands) -> None:
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
-    from rangesfm.export import export_result
-    from rangesfm.options import ExportOptions
+    from rangesfm.survey.settings import survey_from_tables
+    from rangesfm.workflows.export_result import export_result
 
     source = result_path(args)
-    formats = DEFAULT_FORMATS if args.formats is None else args.formats.replace(",", " ").split()
-    place = args.origin_lat_lon_height
-    options = ExportOptions(
-        frame=args.frame,
-        up=args.up,
-        crs=args.crs,
-        origin_anchor=args.origin_anchor,
-        origin_lat_lon_height=None if place is None else (place[0], place[1], place[2]),
-        heading_deg=args.heading_deg,
-    )
+    overrides = overrides_from_arguments(args)
+    options = survey_from_tables({}, Path.cwd(), overrides).export
     if args.apply_to is not None:
+        if "export.formats" in overrides:
+            raise InputError("--apply_to writes files in their own formats: leave out --formats")
         return _apply(source, args, options)
     images_path = None if args.images is None else Path(args.images)
-    written = export_result(source, formats, Path(args.output_path or source), options=options, images_path=images_path)
+    written = export_result(
+        source, options.formats, Path(args.output_path or source), options=options, images_path=images_path
+    )
     return Outcome([*map(str, written), *_frame_note(options, source)])
 
 
 def _apply(source: Path, args: argparse.Namespace, options: ExportOptions) -> Outcome:
-    from rangesfm.export import apply_result
+    from rangesfm.workflows.export_result import apply_result
 
-    if args.formats is not None:
-        raise InputError("--apply_to writes files in their own formats: leave out --formats")
     destination = Path(args.output_path or source / "applied")
     paths, residual_m = apply_result(source, [Path(path) for path in args.apply_to], destination, options=options)
     note = f"cameras of the refined map are {residual_m:.3f} m (rms) from where the similarity puts them"
@@ -84,9 +64,9 @@ def _apply(source: Path, args: argparse.Namespace, options: ExportOptions) -> Ou
 
 
 def _is_site(source: Path) -> bool:
-    from rangesfm.result_folder import read_result_folder
+    from rangesfm.result.folder import read_result_folder
 
-    return read_result_folder(source).frame == "site"
+    return read_result_folder(source).summary.frame == "site"
 
 
 def _frame_note(options: ExportOptions, result_folder: Path) -> list[str]:

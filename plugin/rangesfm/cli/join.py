@@ -6,14 +6,14 @@ import argparse
 from pathlib import Path
 
 from rangesfm.cli.arguments import Commands, Outcome
-from rangesfm.cli.survey_flags import (
-    JOIN_FLAGS,
-    OUTPUT_FLAGS,
-    REFINE_FLAGS,
-    add_flags,
-    survey_from_arguments,
-)
+from rangesfm.cli.survey_flags import add_flags, survey_from_arguments
 from rangesfm.progress import Progress
+
+_KEYS = (
+    *("ranges.range_stddev_m", "ranges.range_bias_stddev_m", "ranges.common_bias_stddev_m", "anchors", "scale"),
+    *("mapper.num_threads", "refine", "export", "report", "output"),
+)
+_OF_A_SURVEY = ("scale.up_in_first_camera", "scale.distances", "scale.markers")
 
 
 def add_command(commands: Commands) -> None:
@@ -29,14 +29,12 @@ def add_command(commands: Commands) -> None:
         example="rangesfm join monday/out tuesday/out --output_path site",
     )
     parser.add_argument("results", nargs="*", metavar="RESULT", help="output folders of runs, two or more")
-    for group in (JOIN_FLAGS, REFINE_FLAGS, OUTPUT_FLAGS):
-        add_flags(parser, group)
+    add_flags(parser, *_KEYS, without=_OF_A_SURVEY)
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
-    args.images = None
     survey = survey_from_arguments(args)
-    from rangesfm.join_surveys import join_surveys
+    from rangesfm.workflows.join_surveys import join_surveys
 
     folders = [Path(result) for result in args.results]
     return Outcome(join_surveys(survey, folders, progress=progress).summary_lines())

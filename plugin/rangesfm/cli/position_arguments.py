@@ -45,8 +45,8 @@ def add_position_arguments(parser: argparse.ArgumentParser, *, max_interpolation
 
 def read_tag_positions(args: argparse.Namespace, log: RangeLog) -> npt.NDArray[np.float64]:
     """(n, 3) where the tag was at each range of ``log``, by the file that the arguments name; NaN: not known."""
+    from rangesfm.geometry.reference import read_reference
     from rangesfm.ranging.tag_positions import tag_positions
-    from rangesfm.reference import read_reference
 
     return tag_positions(
         log,

@@ -6,7 +6,6 @@ import argparse
 
 from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.cli.survey_flags import (
-    RECONSTRUCTION_FLAGS,
     add_restart_argument,
     add_survey_arguments,
     require_images,
@@ -23,14 +22,13 @@ def add_command(commands: Commands) -> None:
         description="Photos to an unscaled COLMAP model: keyframes, features, matching, incremental mapping.",
         example="rangesfm reconstruct --images photos --image_times images.csv --output_path out",
     )
-    add_survey_arguments(parser, RECONSTRUCTION_FLAGS)
+    add_survey_arguments(parser, "images", "camera", "mapper", "output")
     add_restart_argument(parser)
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     survey = survey_from_arguments(args)
     require_images(survey)
-    from rangesfm.pipeline import reconstruct_survey
+    from rangesfm.workflows.run import reconstruct_survey
 
-    result = reconstruct_survey(survey, progress=progress, restart=args.restart)
-    return Outcome(result.summary_lines())
+    return Outcome(reconstruct_survey(survey, progress=progress, restart=args.restart))

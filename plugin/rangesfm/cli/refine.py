@@ -6,8 +6,7 @@ import argparse
 
 from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.cli.survey_flags import (
-    RANGE_FLAGS,
-    REFINE_FLAGS,
+    SCALE_KEYS,
     add_model_argument,
     add_survey_arguments,
     require_model,
@@ -28,7 +27,7 @@ def add_command(commands: Commands) -> None:
             "    --images images.csv --tag_in_cam -0.0012,-0.09,-0.0663 --output_path out"
         ),
     )
-    add_survey_arguments(parser, RANGE_FLAGS, REFINE_FLAGS)
+    add_survey_arguments(parser, *SCALE_KEYS, "camera.refine_intrinsics", "refine")
     add_model_argument(parser)
 
 
@@ -36,7 +35,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     survey = survey_from_arguments(args)
     require_model(survey)
     require_ranges(survey)
-    from rangesfm.pipeline import refine_model
+    from rangesfm.workflows.run import refine_model
 
     result = refine_model(survey, progress=progress)
     return Outcome(result.summary_lines())

@@ -21,7 +21,7 @@ def add_command(commands: Commands) -> None:
     )
     add_result_argument(parser)
     parser.add_argument("--images", metavar="FOLDER", help="the photos, for thumbnails (default: as in the run)")
-    parser.add_argument("--png", action="store_true", help="write the figures as pictures for a paper too (matplotlib)")
+    parser.add_argument("--png", action="store_true", help="write the figures for a paper too, as PNG and SVG")
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:

@@ -7,10 +7,6 @@ from typing import TYPE_CHECKING
 
 from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.cli.survey_flags import (
-    MAPPING_FLAGS,
-    RANGE_FLAGS,
-    RECONSTRUCTION_FLAGS,
-    REFINE_FLAGS,
     add_model_argument,
     add_restart_argument,
     add_survey_arguments,
@@ -22,8 +18,8 @@ from rangesfm.cli.survey_flags import (
 from rangesfm.progress import Progress
 
 if TYPE_CHECKING:
-    from rangesfm.config import Survey
-    from rangesfm.pipeline import RunResult
+    from rangesfm.survey.settings import Survey
+    from rangesfm.workflows.results import RunResult
 
 
 def add_command(commands: Commands) -> None:
@@ -34,7 +30,7 @@ def add_command(commands: Commands) -> None:
         description="Photos and ranges to a metric model. Stages that an earlier run has done are used again.",
         example="rangesfm run survey.toml --every_nth 3 --output_path out",
     )
-    add_survey_arguments(parser, RECONSTRUCTION_FLAGS, MAPPING_FLAGS, RANGE_FLAGS, REFINE_FLAGS)
+    add_survey_arguments(parser)
     add_model_argument(parser)
     add_restart_argument(parser)
     parser.add_argument("--live", action="store_true", help="keep live.html, a page to watch, in the output folder")
@@ -49,18 +45,18 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     require_ranges(survey)
     if not args.live:
         return Outcome(_run(survey, progress, args.restart).summary_lines())
+    from rangesfm.files.sole_writer import sole_writer
     from rangesfm.report.live import live_page
-    from rangesfm.sole_writer import sole_writer
 
-    with sole_writer(survey.output_path), live_page(progress, survey.output_path) as page:
+    with sole_writer(survey.output.path), live_page(progress, survey.output.path) as page:
         page.message(f"this run can be watched in {page.path}")
         result = _run(survey, page, args.restart)
-        page.finish(survey.output_path / "report.html" if survey.report_enabled else None)
+        page.finish(survey.output.path / "report.html" if survey.report.enabled else None)
     return Outcome(result.summary_lines())
 
 
 def _run(survey: Survey, progress: Progress, restart: bool) -> RunResult:
-    from rangesfm.pipeline import refine_model, run_survey
+    from rangesfm.workflows.run import refine_model, run_survey
 
     if survey.model_path is None:
         return run_survey(survey, progress=progress, restart=restart)

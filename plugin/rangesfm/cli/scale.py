@@ -6,7 +6,7 @@ import argparse
 
 from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.cli.survey_flags import (
-    RANGE_FLAGS,
+    SCALE_KEYS,
     add_model_argument,
     add_survey_arguments,
     require_model,
@@ -24,7 +24,7 @@ def add_command(commands: Commands) -> None:
         description="The scale of a COLMAP model (points are not needed) from ranges, and the rescaled model.",
         example="rangesfm scale --input_path sparse/0 --ranges uwb.csv --images images.csv --output_path out",
     )
-    add_survey_arguments(parser, RANGE_FLAGS)
+    add_survey_arguments(parser, *SCALE_KEYS)
     add_model_argument(parser)
 
 
@@ -32,7 +32,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     survey = survey_from_arguments(args)
     require_model(survey)
     require_ranges(survey)
-    from rangesfm.pipeline import scale_model
+    from rangesfm.workflows.run import scale_model
 
     result = scale_model(survey, progress=progress)
     return Outcome(result.summary_lines())

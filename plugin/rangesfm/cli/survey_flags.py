@@ -1,41 +1,125 @@
-"""Flags that stand for keys of a survey file, shared by the commands that run stages."""
+"""Flags that stand for keys of a survey file, made from the keys themselves; shared by the commands that run stages."""
 
 from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+import types
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin
 
+from rangesfm.cli.arguments import Parser
 from rangesfm.errors import InputError
-from rangesfm.options import ANCHOR_FRAMES, CAMERA_SIDES, MATCHING_METHODS, SCALE_METHODS, STAMP_UNITS
 
 if TYPE_CHECKING:
-    from rangesfm.config import Survey
+    from rangesfm.option_model import Key
+    from rangesfm.survey.settings import Survey
+
+LOG_KEYS = (
+    *("ranges.format", "ranges.columns", "ranges.timestamp_unit", "ranges.range_unit", "ranges.separator"),
+    *("ranges.ranging_interval_s", "ranges.stamp_unit", "ranges.stamp_bits", "ranges.propagation_speed"),
+    "ranges.t_off_s",
+)
+SCALE_KEYS = (
+    *("images.path", "images.times", "ranges", "anchors", "tag", "mapper.num_threads", "scale"),
+    *("export", "report", "output"),
+)
+_WORDS = {"m": "METRES", "s": "SECONDS"}
 
 
-@dataclass(frozen=True)
-class Flag:
-    """A flag that overrides one key of the survey file.
+def add_survey_arguments(parser: Parser, *keys: str) -> None:
+    """The survey file, and flags for its keys, as ``add_flags`` has them."""
+    parser.add_argument("survey", nargs="?", metavar="SURVEY.toml", help="survey file; flags override its keys")
+    parser.add_argument(
+        "--base_path", metavar="FOLDER", help="what the file's paths are relative to (default: its folder)"
+    )
+    add_flags(parser, *keys)
 
-    Attributes:
-        name: without the dashes.
-        key: dotted key of the survey file.
-        convert: from the text to the key's value.
-        repeated: whether it may be given several times; its value is the list of all.
-        is_switch: it takes no value, and makes the key true.
+
+def add_flags(parser: Parser, *keys: str, without: tuple[str, ...] = (), by_own_names: bool = False) -> None:
+    """Flags whose values ``overrides_from_arguments`` finds again.
+
+    Args:
+        keys: dotted keys of a survey file, and tables for all of their keys; none for all there are.
+        without: keys that have no flag here.
+        by_own_names: whether the flags are called as the keys, for a command that is about one table.
     """
+    # What the keys are made of takes longer to import than all else, and only the command that runs needs its flags.
+    parser.add_later(partial(_add_flags, keys=keys, without=without, by_own_names=by_own_names))
 
-    name: str
-    key: str
-    help: str
-    convert: Callable[[str], Any] = str
-    choices: tuple[str, ...] | None = None
-    metavar: str | None = None
-    repeated: bool = False
-    is_switch: bool = False
+
+def _add_flags(parser: Parser, *, keys: tuple[str, ...], without: tuple[str, ...], by_own_names: bool) -> None:
+    from rangesfm.survey.settings import TABLES, chosen_keys
+
+    for table, model in TABLES.items():
+        # The two forms of a lever arm are one flag.
+        left_out = (*without, "tag.lever_arms_m")
+        if chosen := [item for item in chosen_keys(keys) if item.table == table and item.dotted not in left_out]:
+            group = parser.add_argument_group(f"[{table}] in a survey file", model.__doc__)
+            for item in chosen:
+                _add_flag(group, item, item.name if by_own_names else item.flag)
+
+
+def _add_flag(group: argparse._ArgumentGroup, item: Key, flag: str) -> None:
+    meaning = item.meaning.replace("%", "%%")
+    if item.type is bool:
+        group.add_argument(f"--{flag}", f"--no_{flag}", dest=item.dotted, action=_Switch, help=meaning)
+        return
+    choices = get_args(item.type) if get_origin(item.type) is Literal else None
+    is_lever_arm = item.dotted == "tag.tag_in_cam_m"
+    group.add_argument(
+        f"--{flag}",
+        dest=item.dotted,
+        action="append" if is_lever_arm else "store",
+        type=_lever_arm if is_lever_arm else type(choices[0]) if choices else _converter(item.type),
+        choices=choices,
+        help=meaning,
+        metavar=None if choices else item.metavar or _metavar(item),
+    )
+
+
+class _Switch(argparse.Action):
+    """Takes no value: true, or false by the name that begins with ``no_``."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, help: str):
+        super().__init__(option_strings, dest, nargs=0, help=help)
+
+    def __call__(self, parser: object, namespace: argparse.Namespace, values: object, name: str | None = None) -> None:
+        setattr(namespace, self.dest, name == self.option_strings[0])
+
+
+def _metavar(item: Key) -> str:
+    hint = item.type
+    if item.role is not None:
+        return "CSV" if item.role == "file" else "FOLDER"
+    if get_origin(hint) is tuple:
+        return "A,B,.." if get_args(hint)[-1] is Ellipsis else "X,Y,Z"
+    if hint is int or int in get_args(hint):
+        return "N"
+    last = item.name.rpartition("_")[2]
+    return "KEY=VALUE,.." if get_origin(hint) is dict else _WORDS.get(last, last.upper())
+
+
+def _converter(hint: Any) -> Callable[[str], Any]:
+    """From the text of a flag to a value of a type; what it may be is for the key to say."""
+    origin, args = get_origin(hint), get_args(hint)
+    if origin in (Union, types.UnionType):
+        words = [word for arg in args for word in get_args(arg) if isinstance(word, str)]
+        return partial(_word_or_number, words) if words else int
+    if origin is tuple:
+        return _numbers if args[0] is float else _names
+    if origin is dict:
+        return _columns if args[1] is str else _options
+    return str if hint is Path else hint
+
+
+def _word_or_number(words: list[str], text: str) -> str | float:
+    try:
+        return text if text in words else float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is neither {', '.join(words)} nor a number") from None
 
 
 def _numbers(text: str) -> list[float]:
@@ -65,13 +149,6 @@ def _lever_arm(text: str) -> tuple[str | None, list[float]]:
     return tag_id or None, position(lever_arm)
 
 
-def _offset(text: str) -> str | float:
-    try:
-        return text if text == "auto" else float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is neither auto nor a number of seconds") from None
-
-
 def _columns(text: str) -> dict[str, str]:
     pairs = [pair.partition("=") for pair in text.split(",")]
     if not all(quantity and name for quantity, _, name in pairs):
@@ -79,234 +156,65 @@ def _columns(text: str) -> dict[str, str]:
     return {quantity.strip(): name.strip() for quantity, _, name in pairs}
 
 
-def _speed(text: str) -> str | float:
+def _options(text: str) -> dict[str, Any]:
+    from rangesfm.survey.toml_source import parse_inline_table
+
     try:
-        return float(text)
+        return parse_inline_table(text)
     except ValueError:
-        return text
-
-
-_LEVER_ARMS = "tag.by_id"
-
-IMAGE_FLAGS = (
-    Flag("image_times", "images.times", "CSV image_name,timestamp_s (default: EXIF, else file names)", metavar="CSV"),
-)
-RECONSTRUCTION_FLAGS = (
-    Flag("every_nth", "images.every_nth", "use every n-th photo", int, metavar="N"),
-    Flag("min_interval_s", "images.min_interval_s", "least time between keyframes", float, metavar="SECONDS"),
-    Flag("max_num_keyframes", "images.max_num_keyframes", "thin evenly to this many", int, metavar="N"),
-    Flag("camera_model", "camera.model", "COLMAP camera model, as OPENCV", metavar="MODEL"),
-    Flag("camera_params", "camera.params", "its parameters in COLMAP's order", _numbers, metavar="A,B,.."),
-    Flag("matching", "mapper.matching", "which photos are matched", choices=MATCHING_METHODS),
-    Flag(
-        "submap_size",
-        "mapper.submap_size",
-        "map stretches of so many photos each on its own, and join them (default: all in one piece)",
-        int,
-        metavar="N",
-    ),
-    Flag("submap_overlap", "mapper.submap_overlap", "photos that two of them share (default: 20)", int, metavar="N"),
-    Flag(
-        "num_submaps_at_once",
-        "mapper.num_submaps_at_once",
-        "each in a process of its own; they share the threads (default: 1)",
-        int,
-        metavar="N",
-    ),
-)
-LOG_FLAGS = (
-    Flag(
-        "columns",
-        "ranges.columns",
-        "names of its columns for timestamp (or image_name), anchor_id, range, tag_id, range_stddev, los; without "
-        "range, the time stamps tx1, rx1, tx2, rx2 and possibly tx3, rx3 of two-way ranging",
-        _columns,
-        metavar="QUANTITY=NAME,..",
-    ),
-    Flag("timestamp_unit", "ranges.timestamp_unit", "s, ms, us, ns or iso (default: by format)", metavar="UNIT"),
-    Flag("range_unit", "ranges.range_unit", "m, cm or mm (default: by format)", metavar="UNIT"),
-    Flag("separator", "ranges.separator", "between cells (default: told from the header row)", metavar="CHARACTER"),
-    Flag(
-        "ranging_interval_s",
-        "ranges.ranging_interval_s",
-        "between two rounds, for a Qorvo log without the host's times (default: 0.2)",
-        float,
-        metavar="S",
-    ),
-    Flag(
-        "stamp_unit", "ranges.stamp_unit", "of time stamps, in a log without ranges (default: ns)", choices=STAMP_UNITS
-    ),
-    Flag(
-        "stamp_bits", "ranges.stamp_bits", "32 or 40: their counter's (default: 32, up to 67 ms)", int, metavar="BITS"
-    ),
-    Flag(
-        "propagation_speed",
-        "ranges.propagation_speed",
-        "air (default), vacuum or m/s, for stamps",
-        _speed,
-        metavar="SPEED",
-    ),
-    Flag("t_off_s", "ranges.t_off_s", "what all delays together add to a round trip of stamps", float, metavar="S"),
-)
-RANGE_FLAGS = (
-    Flag("ranges", "ranges.path", "the radio's log", metavar="LOG"),
-    Flag("ranges_format", "ranges.format", "its format (default: recognised by content)", metavar="FORMAT"),
-    *LOG_FLAGS,
-    Flag("ranges_time_offset", "ranges.time_offset", "image time minus range time", _offset, metavar="auto|SECONDS"),
-    Flag("range_stddev_m", "ranges.range_stddev_m", "noise of a range (default: estimated)", float, metavar="METRES"),
-    Flag("error_curve", "ranges.error_curve", "the radio's, by rangesfm ranges calibrate", metavar="CSV"),
-    Flag("anchors", "anchors.path", "CSV anchor_id,x_m,y_m,z_m (default: all unknown)", metavar="CSV"),
-    Flag("anchor_frame", "anchors.frame", "what their coordinates refer to", choices=ANCHOR_FRAMES),
-    Flag("anchor_crs", "anchors.crs", "coordinate system of their positions, as EPSG:2056", metavar="CRS"),
-    Flag("use_anchors", "anchors.use", "only these anchors' ranges are used", _names, metavar="ID,ID"),
-    Flag(
-        "tag_in_cam",
-        _LEVER_ARMS,
-        "the tag's antenna in the camera frame, metres; of several tags, once for each with its ID",
-        _lever_arm,
-        metavar="[ID:]X,Y,Z",
-        repeated=True,
-    ),
-    Flag("tag_id", "tag.tag_id", "the tag that counts, if the log has others", metavar="ID"),
-    Flag("check_share", "ranges.check_share", "share of the ranges held out as checks", float, metavar="SHARE"),
-    Flag("check_anchors", "ranges.check_anchors", "anchors whose ranges are all held out", _names, metavar="ID,ID"),
-    Flag("check_times_s", "ranges.check_times_s", "times between which ranges are held out", _numbers, metavar="A,B"),
-    Flag(
-        "up_in_first_camera",
-        "scale.up_in_first_camera",
-        "upward in the first photo's camera frame; 0,-1,0 if it was level",
-        position,
-        metavar="X,Y,Z",
-    ),
-    Flag(
-        "camera_side",
-        "scale.camera_side",
-        "where the camera went, seen from anchors all in one plane",
-        choices=CAMERA_SIDES,
-    ),
-    Flag("scale_method", "scale.method", "how the scale is found", choices=SCALE_METHODS),
-    Flag("distances", "scale.distances", "CSV from,to,distance_m[,stddev_m,kind]: taped distances", metavar="CSV"),
-    Flag("markers", "scale.markers", "CSV marker,image_name,x_px,y_px: marks that they refer to", metavar="CSV"),
-    Flag("reference", "report.reference", "true positions, for comparison", metavar="FILE"),
-)
-_OF_A_RUN = ("check_share", "check_anchors", "check_times_s", "scale_method", "reference")
-COMPARE_FLAGS = tuple(flag for flag in RANGE_FLAGS if flag.name not in _OF_A_RUN)
-# Of surveys that are finished: the rest is theirs.
-_JOINED_ANCHORS = "CSV anchor_id,x_m,y_m,z_m (default: as the surveys had them)"
-_OF_A_JOIN = ("range_stddev_m", "anchor_frame", "anchor_crs", "use_anchors", "camera_side", "scale_method", "reference")
-JOIN_FLAGS = (
-    Flag("anchors", "anchors.path", _JOINED_ANCHORS, metavar="CSV"),
-    *(flag for flag in RANGE_FLAGS if flag.name in _OF_A_JOIN),
-)
-REFINE_FLAGS = (
-    Flag("max_num_iterations", "refine.max_num_iterations", "of the refinement's solver", int, metavar="N"),
-    Flag(
-        "lever_arm_stddev_m",
-        "refine.lever_arm_stddev_m",
-        "of the tag's place in the camera frame, which is then refined (default: 0, it is exact)",
-        float,
-        metavar="METRES",
-    ),
-    Flag(
-        "time_offset_stddev_s",
-        "refine.time_offset_stddev_s",
-        "of the clocks' offset, which is then refined (default: 0)",
-        float,
-        metavar="SECONDS",
-    ),
-    Flag(
-        "short_range_stddev_m",
-        "refine.short_range_stddev_m",
-        "of what the shortest ranges err all alike, which is then refined (default: 0, they are trusted less instead)",
-        float,
-        metavar="METRES",
-    ),
-)
-MAPPING_FLAGS = (
-    Flag(
-        "ranges_in_mapping",
-        "mapper.ranges_in_mapping",
-        "ranges take part while the map grows, not only at the end; takes much longer",
-        is_switch=True,
-    ),
-)
-OUTPUT_FLAGS = (
-    Flag("output_path", "output.path", "folder of the results (default: out)", metavar="FOLDER"),
-    Flag("num_threads", "mapper.num_threads", "-1 for all cores", int, metavar="N"),
-    Flag("seed", "output.seed", "of everything random", int, metavar="N"),
-)
-
-
-def add_survey_arguments(parser: argparse.ArgumentParser, *groups: tuple[Flag, ...]) -> None:
-    """The survey file, the photos and the flags of some groups."""
-    parser.add_argument("survey", nargs="?", metavar="SURVEY.toml", help="survey file; flags override its keys")
-    parser.add_argument(
-        "--base_path", metavar="FOLDER", help="what the file's paths are relative to (default: its folder)"
-    )
-    parser.add_argument("--images", metavar="PATH", help="folder of the photos, or CSV of their times")
-    for group in (IMAGE_FLAGS, *groups, OUTPUT_FLAGS):
-        add_flags(parser, group)
-
-
-def add_flags(parser: argparse.ArgumentParser, flags: tuple[Flag, ...]) -> None:
-    """Flags whose values ``overrides_from_arguments`` finds again."""
-    for flag in flags:
-        if flag.is_switch:
-            parser.add_argument(f"--{flag.name}", dest=flag.key, action="store_const", const=True, help=flag.help)
-            continue
-        parser.add_argument(
-            f"--{flag.name}",
-            dest=flag.key,
-            action="append" if flag.repeated else "store",
-            type=flag.convert,
-            choices=flag.choices,
-            help=flag.help,
-            metavar=flag.metavar,
-        )
+        message = f"'{text}' is no table of TOML, expected as max_image_size=1200,sift.num_octaves=3"
+        raise argparse.ArgumentTypeError(message) from None
 
 
 def overrides_from_arguments(args: argparse.Namespace) -> dict[str, Any]:
     """The values of all flags that were given, by their keys in a survey file."""
     overrides = {key: value for key, value in vars(args).items() if "." in key and value is not None}
-    lever_arms = dict(overrides.pop(_LEVER_ARMS, []))
+    lever_arms = dict(overrides.pop("tag.tag_in_cam_m", []))
     if None in lever_arms and len(lever_arms) > 1:
         raise InputError("--tag_in_cam is given with an ID and without, expected X,Y,Z once, or ID:X,Y,Z for each tag")
     if None in lever_arms:
         overrides["tag.tag_in_cam_m"] = lever_arms[None]
     elif lever_arms:
         overrides["tag.lever_arms_m"] = lever_arms
+    if "images.path" in overrides and _is_table(overrides["images.path"]):
+        overrides["images.times"] = overrides.pop("images.path")
     return overrides
 
 
-def add_model_argument(parser: argparse.ArgumentParser) -> None:
+def flags_given(args: argparse.Namespace, *keys: str) -> list[str]:
+    """The flags of some keys that were given, with their dashes."""
+    from rangesfm.survey.settings import chosen_keys
+
+    return [f"--{item.flag}" for item in chosen_keys(keys) if getattr(args, item.dotted, None) is not None]
+
+
+def add_model_argument(parser: Parser) -> None:
     parser.add_argument("--input_path", metavar="MODEL", help="existing COLMAP model, as sparse/0")
 
 
-def add_restart_argument(parser: argparse.ArgumentParser) -> None:
+def add_restart_argument(parser: Parser) -> None:
     parser.add_argument("--restart", action="store_true", help="do anew what an earlier run has done")
 
 
 def survey_from_arguments(args: argparse.Namespace) -> Survey:
     """The survey file, if any, with the flags in place of its keys."""
-    from rangesfm.config import read_survey, survey_from_tables
+    from rangesfm.survey.settings import read_survey, survey_from_tables
 
     overrides = overrides_from_arguments(args)
-    if args.images is not None:
-        overrides["images.times" if _is_table(args.images) else "images.path"] = args.images
     if getattr(args, "survey", None) is None:
         survey = survey_from_tables({}, Path.cwd(), overrides)
     else:
         survey = read_survey(args.survey, overrides, args.base_path)
     model = getattr(args, "input_path", None)
-    return survey if model is None else replace(survey, model_path=Path.cwd() / model)
+    return survey if model is None else survey.model_copy(update={"model_path": Path.cwd() / model})
 
 
 def require_images(survey: Survey) -> None:
     """Raise InputError unless there is a folder of photos."""
-    if survey.images_path is None:
+    if survey.images.path is None:
         raise InputError("no photos: give [images] path in a survey file, or --images FOLDER")
-    if not os.path.isdir(survey.images_path):
-        raise InputError("no such folder of photos", survey.images_path)
+    if not os.path.isdir(survey.images.path):
+        raise InputError("no such folder of photos", survey.images.path)
 
 
 def require_model(survey: Survey) -> None:

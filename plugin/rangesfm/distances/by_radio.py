@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.distances.ends import LocatedDistances
+from rangesfm.ranging.errors.noise import shared_stddev
 from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.noise import shared_stddev
 
 Array = npt.NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rangesfm.distances.tape import CONTROL, TapedDistance
-from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.anchors.anchor import Anchor
 
 # So that it can be divided by.
 _MIN_STDDEV_M = 1e-3

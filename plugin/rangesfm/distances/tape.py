@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import InputError
-from rangesfm.tables import Table, read_table
+from rangesfm.files.tables import Table, read_table
 
 CONTROL, CHECK = "control", "check"
 # What a steel tape and a steady hand are good for.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,27 +23,23 @@ from rangesfm.export.pose_covariance import COVARIANCE_FORMATS, write_kitti_cova
 from rangesfm.export.transform import write_transform
 from rangesfm.export.tum import write_trajectory
 from rangesfm.export.undistorted import write_undistorted
-from rangesfm.files import make_output_folder
+from rangesfm.files.atomic import make_output_folder
 from rangesfm.options import ExportOptions
-from rangesfm.result_folder import ResultFolder, read_result_folder
-from rangesfm.sole_writer import sole_writer
 
 if TYPE_CHECKING:
     import pycolmap
 
     from rangesfm.export.metric_map import Array
-    from rangesfm.geometry import Similarity
+    from rangesfm.geometry.similarity import Similarity
 
 __all__ = [
     "COVARIANCE_FORMATS",
     "EXPORTERS",
     "MetricMap",
-    "apply_result",
     "apply_to",
     "best_similarity",
     "export_map",
     "export_model",
-    "export_result",
     "write_anchors",
     "write_cameras",
     "write_features",
@@ -127,75 +122,3 @@ def check_formats(formats: Iterable[str]) -> None:
     for name in formats:
         if name not in EXPORTERS:
             raise InputError(f"unknown export format {name!r}, expected one of: {', '.join(EXPORTERS)}")
-
-
-def export_result(
-    output_path: Path,
-    formats: Iterable[str],
-    destination: Path,
-    *,
-    options: ExportOptions | None = None,
-    images_path: Path | None = None,
-) -> tuple[Path, ...]:
-    """Export the best metric model of a run's output folder: the refined one, else the scaled one.
-
-    Args:
-        options: all but the formats.
-        images_path: folder of the photos; None: where the run found them.
-
-    Raises:
-        InputError: as ``export_model``, the folder is not a result with a metric model, or a run is writing to the
-            destination.
-    """
-    options = replace(options or ExportOptions(), formats=tuple(formats))
-    check_formats(options.formats)
-    result = read_result_folder(output_path)
-    with sole_writer(destination):
-        return export_map(_read_map(result, images_path), destination, options)
-
-
-def apply_result(
-    output_path: Path, paths: Iterable[Path], destination: Path, *, options: ExportOptions | None = None
-) -> tuple[tuple[Path, ...], float]:
-    """Carry what was made from a run's unscaled model into the frame of its metric one.
-
-    Args:
-        paths: meshes and clouds (PLY, OBJ), camera files (JSON), folders of COLMAP models.
-        options: of the frame.
-
-    Returns:
-        The files written, and by how much the refined cameras are off what any similarity gives (root mean square,
-        metres): a refinement bends the map, and a mesh cannot follow.
-
-    Raises:
-        InputError: a file cannot be carried over, or the result lacks its models.
-    """
-    result = read_result_folder(output_path)
-    map_ = _read_map(result, None)
-    residual_m = 0.0
-    sfm = result.read_model("sparse")
-    if result.read_model("sparse_metric") is not None and sfm is not None:
-        similarity, residual_m = best_similarity(sfm, map_.reconstruction)
-        map_ = replace(map_, metric_from_sfm=similarity)
-    similarity_in_frame = in_frame(map_, options or ExportOptions()).metric_from_sfm
-    if similarity_in_frame is None:
-        raise InputError("the result does not say how its metric model follows from the unscaled one", output_path)
-    with sole_writer(destination):
-        return apply_to(list(paths), similarity_in_frame, destination), residual_m
-
-
-def _read_map(result: ResultFolder, images_path: Path | None) -> MetricMap:
-    reconstruction = result.read_model("sparse_metric") or result.read_model("sparse_scaled")
-    if reconstruction is None:
-        raise InputError("there is no metric model (sparse_metric/0 or sparse_scaled/0) to export", result.path)
-    return MetricMap(
-        reconstruction,
-        timestamps_s=result.timestamps_s,
-        anchors_m=result.anchor_positions_m,
-        metric_from_sfm=result.metric_from_sfm,
-        relative_scale_stddev=result.relative_scale_stddev,
-        images_path=images_path or result.images_path,
-        is_site=result.frame == "site",
-        georeference=result.georeference,
-        center_covariance_m2=result.read_center_covariance_m2(),
-    )

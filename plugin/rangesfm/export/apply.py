@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from rangesfm.colmap.model_files import read_model
+from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
 from rangesfm.export.colmap import write_model
 from rangesfm.export.metric_map import Array
 from rangesfm.export.ply_transform import transform_ply
-from rangesfm.files import make_output_folder, new_file
-from rangesfm.geometry import Similarity, align_points, overflow_raised, rmse
-from rangesfm.json_files import read_json
-from rangesfm.model_files import read_model
-from rangesfm.model_transform import rescale
-from rangesfm.tables import read_text
+from rangesfm.files.atomic import make_output_folder, new_file
+from rangesfm.files.json_files import read_json
+from rangesfm.files.tables import read_text
+from rangesfm.geometry.similarity import Similarity, align_points, overflow_raised, rmse
 
 Json = Any
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pycolmap
 
-from rangesfm.files import new_folder
-from rangesfm.model_files import write_binary_model
+from rangesfm.colmap.model_files import write_binary_model
+from rangesfm.files.atomic import new_folder
 
 
 def write_model(reconstruction: pycolmap.Reconstruction, path: Path, *, as_text: bool = False) -> Path:

@@ -9,8 +9,8 @@ import numpy as np
 
 from rangesfm.errors import InputError
 from rangesfm.export.metric_map import Array, MetricMap
-from rangesfm.files import new_file
-from rangesfm.georeference import GEOGRAPHIC
+from rangesfm.files.atomic import new_file
+from rangesfm.geometry.georeference import GEOGRAPHIC
 
 _WKB_POINT_Z = 1001
 

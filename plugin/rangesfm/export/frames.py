@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
 from rangesfm.export.metric_map import Array, MetricMap
-from rangesfm.geometry import Similarity, path_shape
-from rangesfm.georeference import check_crs, georeference_of_anchor
-from rangesfm.model_transform import rescale
+from rangesfm.geometry.georeference import check_crs, georeference_of_anchor
+from rangesfm.geometry.similarity import Similarity, path_shape
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import ExportOptions
-from rangesfm.trajectory import Trajectory
 
 # Extent of a path across its plane, in its second extent: above this there is no plane to speak of.
 _MAX_ROUGHNESS = 0.3

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.files import new_file
-from rangesfm.trajectory import Trajectory
+from rangesfm.files.atomic import new_file
+from rangesfm.geometry.trajectory import Trajectory
 
 
 def write_kitti(trajectory: Trajectory, path: Path) -> Path:

@@ -8,8 +8,8 @@ import numpy as np
 
 from rangesfm.errors import InputError
 from rangesfm.export.metric_map import Array, MetricMap
-from rangesfm.files import new_file
-from rangesfm.georeference import is_geographic
+from rangesfm.files.atomic import new_file
+from rangesfm.geometry.georeference import is_geographic
 
 _STEP_M = 1e-4
 _STEP_DEG = 1e-9

@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from rangesfm.geometry import Similarity
-from rangesfm.georeference import Georeference
-from rangesfm.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.geometry.georeference import Georeference
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
 Array = npt.NDArray[np.float64]
 

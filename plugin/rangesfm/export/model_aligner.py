@@ -7,7 +7,7 @@ from pathlib import Path
 import pycolmap
 
 from rangesfm.errors import InputError
-from rangesfm.files import new_file
+from rangesfm.files.atomic import new_file
 
 
 def write_positions(reconstruction: pycolmap.Reconstruction, path: Path) -> Path:

@@ -17,7 +17,7 @@ from rangesfm.errors import InputError
 from rangesfm.export.intrinsics import distortion_params
 from rangesfm.export.metric_map import Array, MetricMap
 from rangesfm.export.ply import write_points
-from rangesfm.files import new_file
+from rangesfm.files.atomic import new_file
 
 _POINTS_NAME = "transforms_points.ply"
 # By COLMAP's camera model: nerfstudio's name, and what the parameters after focal lengths and principal point are.

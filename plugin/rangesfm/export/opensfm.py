@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.errors import InputError
 from rangesfm.export.intrinsics import distortion_params
 from rangesfm.export.metric_map import MetricMap
-from rangesfm.files import new_file
+from rangesfm.files.atomic import new_file
 
 # By COLMAP's camera model: OpenSfM's projection, and the names of the distortion parameters.
 _PROJECTIONS = {

@@ -16,7 +16,7 @@ import pycolmap
 
 from rangesfm.errors import InputError
 from rangesfm.export.metric_map import MetricMap
-from rangesfm.files import new_folder
+from rangesfm.files.atomic import new_folder
 
 _NUM_CONSTRAINTS = 10
 _MIN_TRACK_LENGTH = 3

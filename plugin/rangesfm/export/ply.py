@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from rangesfm.files import new_file
-from rangesfm.trajectory import Trajectory
+from rangesfm.files.atomic import new_file
+from rangesfm.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

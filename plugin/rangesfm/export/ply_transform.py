@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import InputError
-from rangesfm.files import new_file
-from rangesfm.geometry import Similarity, overflow_raised
+from rangesfm.files.atomic import new_file
+from rangesfm.geometry.similarity import Similarity, overflow_raised
 
 Array = npt.NDArray[np.float64]
 Vertices = npt.NDArray[np.void]

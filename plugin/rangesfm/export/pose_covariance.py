@@ -13,7 +13,7 @@ from rangesfm.errors import InputError
 from rangesfm.export.kitti import kitti_poses
 from rangesfm.export.metric_map import Array, MetricMap
 from rangesfm.export.tum import TUM_HEADER, tum_lines
-from rangesfm.files import new_file
+from rangesfm.files.atomic import new_file
 
 # Formats that cannot do without covariances.
 COVARIANCE_FORMATS = ("tum_covariance", "kitti_covariance")

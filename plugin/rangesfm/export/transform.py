@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
-from rangesfm.files import new_file
-from rangesfm.geometry import Similarity
+from rangesfm.files.atomic import new_file
+from rangesfm.geometry.similarity import Similarity
 
 
 def write_transform(metric_from_sfm: Similarity | None, path: Path) -> Path:

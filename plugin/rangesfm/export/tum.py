@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rangesfm.files import new_file
-from rangesfm.trajectory import Trajectory
+from rangesfm.files.atomic import new_file
+from rangesfm.geometry.trajectory import Trajectory
 
 TUM_HEADER = "# world_from_cam: timestamp tx ty tz qx qy qz qw (seconds, metres)"
 

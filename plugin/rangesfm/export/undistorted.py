@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pycolmap
 
-from rangesfm.colmap_log import colmap_log
+from rangesfm.colmap.log import colmap_log
+from rangesfm.colmap.model_files import write_binary_model
 from rangesfm.errors import InputError
 from rangesfm.export.metric_map import MetricMap
-from rangesfm.files import new_folder, stays_inside
-from rangesfm.model_files import write_binary_model
+from rangesfm.files.atomic import new_folder, stays_inside
 
 
 def write_undistorted(map_: MetricMap, folder: Path) -> Path:

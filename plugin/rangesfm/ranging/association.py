@@ -10,11 +10,12 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
+from rangesfm.geometry.trajectory import ROUNDING_S, Trajectory
 from rangesfm.options import AssociationOptions
+from rangesfm.ranging.clock.time_resolution import time_resolution_s
+from rangesfm.ranging.errors.noise import robust_stddev
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
-from rangesfm.ranging.time_resolution import time_resolution_s
-from rangesfm.trajectory import ROUNDING_S, Trajectory
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -84,9 +85,9 @@ def associate(
     return _observe(log, trajectory, tags, status, before, after, weight, options)
 
 
-def is_too_long(gaps_s: Array, options: AssociationOptions) -> Mask:
+def is_too_long(gaps_s: npt.ArrayLike, options: AssociationOptions) -> Mask:
     """(n,) gaps between keyframes across which no pose is interpolated; photos every 2 s are 2 s apart at any date."""
-    return np.asarray(gaps_s > options.max_interpolation_gap_s + ROUNDING_S)
+    return np.asarray(gaps_s) > options.max_interpolation_gap_s + ROUNDING_S
 
 
 def lever_arms(log: RangeLog, tag_in_cam_m: npt.ArrayLike) -> Array:
@@ -175,13 +176,13 @@ def _camera_is_still(
     for burst in np.split(log.range_m[order], starts[1:]):
         if len(burst) >= 6:
             early, late = np.array_split(burst, 2)
-            noise = 1.4826 * float(np.median(np.concatenate([_deviations(early), _deviations(late)])))
+            noise = robust_stddev(np.concatenate([_deviations(early), _deviations(late)]))
             drifts.append((np.median(late) - np.median(early)) * np.sqrt(len(burst) / 4))
             noises.append(noise)
     if not drifts:
         return still
     # 1.25 is the price of a median over a mean.
-    drift_stddev = 1.4826 * float(np.median(np.abs(drifts)))
+    drift_stddev = robust_stddev(drifts)
     noise_stddev = 1.25 * max(float(np.median(noises)), 1e-3)
     still[near] = drift_stddev <= _MAX_STILL_DRIFT_STDDEVS * noise_stddev
     return still

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.geometry import Similarity
+from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
 
 Indices = npt.NDArray[np.int64]
@@ -44,24 +45,23 @@ def joined_observations(
         joined_from_part: world of each path to that of the joined one.
         keyframes: where the keyframes of each path are in the joined one.
     """
-    first = parts[0]
-    joined = {
-        "status": np.min([part.status for part in parts], axis=0),
-        **{name: getattr(first, name).copy() for name in ("before", "after", "weight", "centers", "center_offsets")},
-        "tag_from_center": first.tag_from_center.copy(),
-        "center_stddev": first.center_stddev.copy(),
-    }
     number = path_of_each(parts)
+    joined: dict[str, npt.NDArray[Any]] = {"status": np.min([part.status for part in parts], axis=0)}
     for k, (part, similarity, keyframe) in enumerate(zip(parts, joined_from_part, keyframes, strict=True)):
         rows = number == k
-        joined["status"][rows] = part.status[rows]
-        joined["before"][rows], joined["after"][rows] = keyframe[part.before[rows]], keyframe[part.after[rows]]
-        joined["weight"][rows] = part.weight[rows]
-        joined["centers"][rows] = similarity.apply(part.centers[rows])
-        joined["center_offsets"][rows] = similarity.scale * part.center_offsets[rows] @ similarity.rotation.T
-        joined["tag_from_center"][rows] = part.tag_from_center[rows] @ similarity.rotation.T
-        joined["center_stddev"][rows] = similarity.scale * part.center_stddev[rows]
-    return RangeObservations(first.log, **joined)
+        moved: dict[str, npt.NDArray[Any]] = {
+            "status": part.status,
+            "before": keyframe[part.before],
+            "after": keyframe[part.after],
+            "weight": part.weight,
+            "centers": similarity.apply(part.centers),
+            "center_offsets": similarity.scale * part.center_offsets @ similarity.rotation.T,
+            "tag_from_center": part.tag_from_center @ similarity.rotation.T,
+            "center_stddev": similarity.scale * part.center_stddev,
+        }
+        for name, values in moved.items():
+            joined.setdefault(name, getattr(part, name).copy())[rows] = values[rows]
+    return RangeObservations(parts[0].log, **joined)
 
 
 def _is_placed(part: RangeObservations) -> npt.NDArray[np.bool_]:

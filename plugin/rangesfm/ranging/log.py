@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.tables import Categories
+from rangesfm.files.tables import Categories
 
 DEFAULT_TAG_ID = "tag"
 

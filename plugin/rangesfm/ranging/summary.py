@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.ranging.errors.noise_of_log import estimate_noise_m
+from rangesfm.ranging.errors.quantization import find_quantization_m, quantization_stddev_m
 from rangesfm.ranging.log import PeerRanges, RangeKind, RangeLog
-from rangesfm.ranging.noise_of_log import estimate_noise_m
-from rangesfm.ranging.quantization import find_quantization_m, quantization_stddev_m
 
 
 @dataclass(frozen=True)

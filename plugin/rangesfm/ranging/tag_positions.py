@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.errors import InputError
+from rangesfm.errors import InputError, printable
+from rangesfm.geometry.reference import Reference
 from rangesfm.ranging.log import RangeLog
-from rangesfm.reference import Reference
-from rangesfm.tables import printable
 
 Array = npt.NDArray[np.float64]
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rangesfm.files import new_file
+from rangesfm.files.atomic import new_file
+from rangesfm.files.sole_writer import sole_writer
 from rangesfm.report.content import gather
 from rangesfm.report.figures import all_figures
-from rangesfm.report.page import render
+from rangesfm.report.page import render_report
 from rangesfm.report.pictures import write_pictures
-from rangesfm.result_folder import read_result_folder
-from rangesfm.sole_writer import sole_writer
+from rangesfm.result.folder import read_result_folder
 
 __all__ = ["write_report", "write_report_pictures"]
 
@@ -35,16 +35,16 @@ def write_report(result_folder: Path, *, images_path: Path | None = None) -> Pat
     result = read_result_folder(result_folder)
     path = result_folder / "report.html"
     with sole_writer(result_folder), new_file(path) as temporary:
-        page = render(gather(result, images_path=images_path))
+        page = render_report(gather(result, images_path=images_path))
         temporary.write_text(page, encoding="utf-8", errors="xmlcharrefreplace")
     return path
 
 
 def write_report_pictures(result_folder: Path) -> list[Path]:
-    """Write the report's figures as PNG files into ``figures`` in a run's output folder; returns their paths.
+    """Write the report's figures as PNG and SVG files into ``figures`` in a run's output folder; returns their paths.
 
     Raises:
-        InputError: as ``write_report``, or matplotlib is not installed.
+        InputError: as ``write_report``.
     """
     result = read_result_folder(result_folder)
     with sole_writer(result_folder):

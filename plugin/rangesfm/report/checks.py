@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rangesfm.report.content import Summary, as_number
-from rangesfm.report.text import sentence
+from rangesfm.report.text import fixed, sentence
+from rangesfm.result.entries import ScaleEntry, TimeOffsetEntry
+from rangesfm.result.summary import ResultSummary
 
 
 @dataclass(frozen=True)
@@ -46,14 +47,41 @@ class Check:
             return "green"
         return "amber" if sign * self.value <= sign * self.amber_limit else "red"
 
+    @property
+    def text(self) -> str:
+        return fixed(self.value, self.decimals, self.unit, nothing="not measured")
 
-def quality_checks(summary: Summary) -> tuple[Check, ...]:
+    @property
+    def limits(self) -> str:
+        """What the value is measured against."""
+        relation = "≥" if self.larger_is_better else "≤"
+        green, amber = (fixed(x, 0 if x >= 1 else 2, self.unit) for x in (self.green_limit, self.amber_limit))
+        return f"green {relation} {green} · amber {relation} {amber}"
+
+    @property
+    def zones(self) -> list[tuple[str, float]]:
+        """Colour and width, in percent of the gauge, of each stretch from zero to its end."""
+        low, high = sorted(100.0 * limit / self._gauge_end for limit in (self.green_limit, self.amber_limit))
+        colors = ("red", "amber", "green") if self.larger_is_better else ("green", "amber", "red")
+        return list(zip(colors, (low, high - low, 100.0 - high)))
+
+    @property
+    def needle_percent(self) -> float | None:
+        """Where on the gauge the value is."""
+        return None if self.value is None else min(max(100.0 * self.value / self._gauge_end, 0.0), 100.0)
+
+    @property
+    def _gauge_end(self) -> float:
+        return 100.0 if self.larger_is_better else 1.5 * self.amber_limit
+
+
+def quality_checks(summary: ResultSummary) -> tuple[Check, ...]:
     """The checks of a result, in the order in which they matter."""
     return (
         Check(
             "Scale uncertainty",
             "The larger of the formal and the empirical standard deviation.",
-            _relative_percent(larger_stddev(summary), summary.number("scale", "value")),
+            _relative_percent(summary.scale.larger_stddev, summary.scale.value),
             "%",
             1.0,
             5.0,
@@ -62,7 +90,7 @@ def quality_checks(summary: Summary) -> tuple[Check, ...]:
         Check(
             "Anchor agreement",
             "Farthest that the scale from one anchor alone is from the joint one.",
-            _anchor_spread_percent(summary),
+            _anchor_spread_percent(summary.scale),
             "%",
             2.0,
             5.0,
@@ -71,17 +99,17 @@ def quality_checks(summary: Summary) -> tuple[Check, ...]:
         Check(
             "Check ranges",
             "RMS of ranges that no estimate has seen.",
-            summary.number("check_ranges", "rms_m") if summary.number("check_ranges", "num") else None,
+            summary.check_ranges.rms_m,
             "m",
             0.20,
             0.40,
             3,
         ),
-        Check("Range residuals", "RMS of the ranges used.", summary.number("ranges", "rms_m"), "m", 0.15, 0.30, 3),
+        Check("Range residuals", "RMS of the ranges used.", summary.ranges.rms_m, "m", 0.15, 0.30, 3),
         Check(
             "Ranges used",
             "Share of all ranges in the log that had a say.",
-            _relative_percent(summary.number("ranges", "num_used"), summary.number("ranges", "num")),
+            _relative_percent(summary.ranges.num_used, summary.ranges.num),
             "%",
             70.0,
             40.0,
@@ -91,17 +119,17 @@ def quality_checks(summary: Summary) -> tuple[Check, ...]:
         Check(
             "Clock offset",
             "Standard deviation of the offset between the camera's and the radio's clock.",
-            summary.number("time_offset", "stddev_s"),
+            summary.time_offset.stddev_s,
             "s",
             0.02,
             0.10,
             4,
-            no_matter=_why_no_offset_matters(summary),
+            no_matter=_why_no_offset_matters(summary.time_offset),
         ),
         Check(
             "Reprojection",
             "RMS distance of the map's points from where the photos show them.",
-            summary.number("refine", "reprojection_rms_px"),
+            None if summary.refine is None else summary.refine.reprojection_rms_px,
             "px",
             1.0,
             2.0,
@@ -110,24 +138,16 @@ def quality_checks(summary: Summary) -> tuple[Check, ...]:
     )
 
 
-def larger_stddev(summary: Summary) -> float | None:
-    """The larger of the scale's formal and empirical stddev: formal ones are far too small on real logs."""
-    both = (summary.number("scale", "stddev_formal"), summary.number("scale", "stddev_empirical"))
-    return max((stddev for stddev in both if stddev is not None), default=None)
-
-
-def _why_no_offset_matters(summary: Summary) -> str | None:
-    if summary.get("time_offset", "offset_matters") is not False:
+def _why_no_offset_matters(offset: TimeOffsetEntry) -> str | None:
+    if offset.offset_matters is not False:
         return None
-    return sentence(str(summary.get("time_offset", "note") or "any offset near this one gives the same result"))
+    return sentence(offset.note or "any offset near this one gives the same result")
 
 
-def _relative_percent(part: float | None, whole: float | None) -> float | None:
+def _relative_percent(part: float | None, whole: float) -> float | None:
     return None if part is None or not whole else 100.0 * part / whole
 
 
-def _anchor_spread_percent(summary: Summary) -> float | None:
-    joint = summary.number("scale", "value")
-    alone = [as_number(value) for value in summary.table("scale", "per_anchor").values()]
-    known = [value for value in alone if value is not None]
-    return None if not joint or len(known) < 2 else max(100.0 * abs(value / joint - 1.0) for value in known)
+def _anchor_spread_percent(scale: ScaleEntry) -> float | None:
+    known = [value for value in scale.per_anchor.values() if value is not None]
+    return None if not scale.value or len(known) < 2 else max(100.0 * abs(one / scale.value - 1.0) for one in known)

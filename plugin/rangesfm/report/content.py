@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeGuard
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.errors import InputError
-from rangesfm.reference import read_reference
+from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.report.true_ranges import true_ranges_m
-from rangesfm.result_folder import RangesAsUsed, ResultFolder
-from rangesfm.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.result.folder import ResultFolder
+from rangesfm.result.ranges_as_used import RangesAsUsed
+from rangesfm.result.summary import ResultSummary
+from rangesfm.result.tables import ScaleBootstrap, ScaleCandidates, ScaleConsensus, TimeOffsetCurve
 
 if TYPE_CHECKING:
     import pycolmap
@@ -25,41 +25,6 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 DEFAULT_FOLDER = "out"
-TABLES = {
-    "scale_candidates": ("timestamp_s", "alpha0", "alpha1"),
-    "scale_consensus": ("scale", "num_agreeing"),
-    "scale_bootstrap": ("scale",),
-    "time_offset_curve": ("time_offset_s", "cost"),
-}
-"""Columns of numbers of the files of these names, which a run leaves for the figures."""
-
-
-class Summary:
-    """``result.json``, read so that a missing or odd part is None instead of an error."""
-
-    def __init__(self, values: dict[str, Any]):
-        self.values = values
-
-    def get(self, *keys: str) -> Any:
-        """The value under nested keys; None if there is none."""
-        value: Any = self.values
-        for key in keys:
-            value = value.get(key) if isinstance(value, dict) else None
-        return value
-
-    def number(self, *keys: str) -> float | None:
-        """A finite number."""
-        return as_number(self.get(*keys))
-
-    def table(self, *keys: str) -> dict[str, Any]:
-        """A nested object, empty if there is none."""
-        value = self.get(*keys)
-        return value if isinstance(value, dict) else {}
-
-    def texts(self, *keys: str) -> list[str]:
-        """A list as strings, empty if there is none."""
-        value = self.get(*keys)
-        return [str(item) for item in value] if isinstance(value, list) else []
 
 
 @dataclass(frozen=True)
@@ -99,11 +64,11 @@ class Content:
         true_scale: the path before the refinement with the reference's scale; None if that is not known.
         reference_by_photo: (3,) by name, in the map's frame.
         images_path: folder of the photos; None where it is not known.
-        tables: columns of the small tables beside the result (see TABLES), by name; those there are.
+        candidates, consensus, bootstrap, clock_curve: how scale and clock offset came about, as far as it is there.
     """
 
     title: str
-    summary: Summary
+    summary: ResultSummary
     ranges: RangesAsUsed | None
     tags_in_cam_m: Array | None
     range_times_s: Array | None
@@ -117,7 +82,10 @@ class Content:
     true_scale: Trajectory | None
     reference_by_photo: dict[str, Array]
     images_path: Path | None
-    tables: dict[str, dict[str, Array]]
+    candidates: ScaleCandidates | None
+    consensus: ScaleConsensus | None
+    bootstrap: ScaleBootstrap | None
+    clock_curve: TimeOffsetCurve | None
 
     @cached_property
     def true_ranges_m(self) -> Array | None:
@@ -132,10 +100,6 @@ class Content:
         """The best path there is."""
         return self.refined if self.refined is not None else self.scaled
 
-    @property
-    def frame(self) -> str:
-        return str(self.summary.get("frame") or "first_camera")
-
 
 def gather(result: ResultFolder, *, images_path: Path | None = None) -> Content:
     """Read what the report needs.
@@ -146,20 +110,17 @@ def gather(result: ResultFolder, *, images_path: Path | None = None) -> Content:
     Raises:
         InputError: a file of the result is there but cannot be read.
     """
-    ranges = result.read_ranges()
+    ranges = result.read(RangesAsUsed)
     scaled, refined = result.read_model("sparse_scaled"), result.read_model("sparse_metric")
     final = refined or scaled
     path_scaled = None if scaled is None else trajectory_from_reconstruction(scaled, result.timestamps_s)
     points_m, points_rgb = (None, None) if final is None else points_of(final)
-    reference_path = result.path / "reference.csv"
-    reference = read_reference(reference_path) if reference_path.is_file() else None
-    summary = Summary(result.summary)
-    known = summary.get("settings", "images_path")
+    reference = result.read_reference()
     return Content(
         title=_title(result.path.resolve()),
-        summary=summary,
+        summary=result.summary,
         ranges=ranges,
-        tags_in_cam_m=None if ranges is None else _tags_in_cam_m(result, ranges),
+        tags_in_cam_m=None if ranges is None else result.lever_arms_m(ranges.tag_id),
         range_times_s=None if ranges is None else _range_times(ranges, result.timestamps_s or {}),
         scaled=path_scaled,
         refined=None if refined is None else trajectory_from_reconstruction(refined, result.timestamps_s),
@@ -168,18 +129,14 @@ def gather(result: ResultFolder, *, images_path: Path | None = None) -> Content:
         points_m=points_m,
         points_rgb=points_rgb,
         cameras=() if final is None else _cameras(scaled, refined, final),
-        true_scale=None if path_scaled is None else _with_true_scale(path_scaled, summary),
+        true_scale=None if path_scaled is None else _with_true_scale(path_scaled, result.summary),
         reference_by_photo={} if reference is None else dict(zip(reference.image_names or (), reference.positions_m)),
-        images_path=images_path or (Path(known) if isinstance(known, str) else None),
-        tables={name: table for name, columns in TABLES.items() if (table := result.read_numbers(name, columns))},
+        images_path=images_path or result.images_path,
+        candidates=result.read(ScaleCandidates),
+        consensus=result.read(ScaleConsensus),
+        bootstrap=result.read(ScaleBootstrap),
+        clock_curve=result.read(TimeOffsetCurve),
     )
-
-
-def _tags_in_cam_m(result: ResultFolder, ranges: RangesAsUsed) -> Array:
-    """At the camera itself where the settings do not say."""
-    with suppress(InputError):
-        return result.lever_arms_m(ranges.tag_id)
-    return np.zeros((len(ranges.tag_id), 3))
 
 
 def _title(folder: Path) -> str:
@@ -187,13 +144,11 @@ def _title(folder: Path) -> str:
     return folder.parent.name if folder.name == DEFAULT_FOLDER and folder.parent.name else folder.name
 
 
-def _with_true_scale(path: Trajectory, summary: Summary) -> Trajectory | None:
+def _with_true_scale(path: Trajectory, summary: ResultSummary) -> Trajectory | None:
     """By the error that the comparison found: the reference itself may know no more than a few photos."""
-    rows = summary.get("comparison")
-    for row in rows if isinstance(rows, list) else []:
-        percent = as_number(row.get("scale_error_percent")) if isinstance(row, dict) else None
-        if percent is not None and row.get("name") == "estimated scale":
-            return path.resized(1.0 / (1.0 + percent / 100.0), str(summary.get("frame")))
+    for row in summary.comparison:
+        if row.name == "estimated scale" and row.scale_error_percent is not None:
+            return path.resized(1.0 / (1.0 + row.scale_error_percent / 100.0), summary.frame)
     return None
 
 
@@ -228,17 +183,6 @@ def _intrinsics(
         parameters=tuple(zip(names, *columns)),
         half_angles=(camera.width / (2 * focal), camera.height / (2 * focal)),
     )
-
-
-def is_position(value: Any) -> TypeGuard[list[float]]:
-    """Whether a value is a list of three numbers."""
-    return isinstance(value, list) and len(value) == 3 and all(as_number(item) is not None for item in value)
-
-
-def as_number(value: Any) -> float | None:
-    """A finite number, or None."""
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return float(value) if is_number and math.isfinite(value) else None
 
 
 def in_natural_order(ids: Iterable[str]) -> list[str]:

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.geometry import align_points
+from rangesfm.geometry.similarity import align_points
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.report.content import Content
-from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Panel, Picture, Series
-from rangesfm.report.svg import equal_chart
+from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Panel, Pixels, Range, Series, equal_view
 from rangesfm.report.text import count
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 
 MAX_NUM_POINTS_DRAWN = 6000
 PICTURE_WIDTH_PX = 900
-VIEW_SIZE = (460, 400)
 AXES = ("x", "y", "z")
 
 _SEEN_QUANTILE = 0.02
@@ -31,7 +27,9 @@ def trajectory_views(content: Content) -> Figure | None:
     if content.final is None or len(content.final) == 0:
         return None
     views = tuple(_trajectory_view(content, *of_view) for of_view in _views(content))
-    caption = f"The camera's path in metres, in the {'site' if content.frame == 'site' else 'first camera'} frame."
+    caption = (
+        f"The camera's path in metres, in the {'site' if content.summary.frame == 'site' else 'first camera'} frame."
+    )
     if content.points_m is not None and len(content.points_m):
         drawn = min(len(content.points_m), MAX_NUM_POINTS_DRAWN)
         caption += f" {count(drawn)} of the map's {count(len(content.points_m))} points are drawn, those that are near."
@@ -51,11 +49,11 @@ def local_scale(content: Content) -> Figure | None:
     """How the scale of the scaled map changes along the path: what one similarity cannot take away."""
     if content.scaled is None or content.refined is None:
         return None
-    series = [_local_scale_series("refined over scaled", "after", content.scaled, content.refined.centers)]
+    series = [_local_scale_series("refined over scaled", "after", "line", content.scaled, content.refined.centers)]
     if content.reference_by_photo:
         known = [content.reference_by_photo.get(name, [np.nan] * 3) for name in content.scaled.image_names]
         truth = np.array(known, dtype=np.float64)
-        series.append(_local_scale_series("reference over scaled", "reference", content.scaled, truth))
+        series.append(_local_scale_series("reference over scaled", "reference", "dashed", content.scaled, truth))
     known_series = tuple(one for one in series if len(one.points))
     if not known_series:
         return None
@@ -75,7 +73,7 @@ def _views(content: Content) -> list[tuple[str, tuple[int, int], tuple[int, int]
     path = content.final
     assert path is not None
     extents = np.ptp(path.centers, axis=0)
-    if content.frame == "site":
+    if content.summary.frame == "site":
         along = 0 if extents[0] >= extents[1] else 1
         return [("Plan", (0, 1), (1, 1)), ("Elevation", (along, 2), (1, 1))]
     # A camera looks along +z and its y axis points down.
@@ -95,36 +93,36 @@ def _trajectory_view(content: Content, name: str, axes: tuple[int, int], signs: 
     paths = [("true scale", "true-scale", content.true_scale), ("estimated scale", "before", content.scaled)]
     paths.append(("refined", "after", content.refined))
     lines = [
-        Series(label, style, _seen(path.centers, axes, signs), "line")
-        for label, style, path in paths
+        Series(label, color, _seen(path.centers, axes, signs), "line")
+        for label, color, path in paths
         if path is not None
     ]
     if content.reference_m is not None:
-        lines.append(Series("reference", "reference", _seen(content.reference_m, axes, signs), "line"))
-    marks = tuple(
-        Mark("anchor", float(x), float(y), "anchor", anchor_id, f"anchor {anchor_id}")
-        for anchor_id, (x, y) in (
-            (anchor_id, _seen(position[None], axes, signs)[0]) for anchor_id, position in content.anchors_m.items()
-        )
+        lines.append(Series("reference", "reference", _seen(content.reference_m, axes, signs), "dashed"))
+    places = {anchor_id: _seen(position[None], axes, signs)[0] for anchor_id, position in content.anchors_m.items()}
+    x_range, y_range, size = equal_view(
+        np.concatenate([*(line.points for line in lines), *map(np.atleast_2d, places.values())])
     )
-    panel = Panel(
+    if content.points_m is not None:
+        near = _inside(_seen(_thinned(content.points_m), axes, signs), x_range, y_range)
+        lines.insert(0, Series("map", "map", near, is_data=False))
+    return Panel(
         name,
         f"{name} of the camera's path with the anchors",
         *_labels(axes, signs),
         tuple(lines),
-        marks,
-        is_equal=True,
-        size=VIEW_SIZE,
+        tuple(
+            Mark("anchor", "anchor", "triangle", float(x), float(y), anchor_id, f"anchor {anchor_id}")
+            for anchor_id, (x, y) in places.items()
+        ),
+        x_range,
+        y_range,
+        size,
+        keeps_shape=True,
     )
-    if content.points_m is None:
-        return panel
-    chart = equal_chart(panel.all_points, VIEW_SIZE[0], max_height=VIEW_SIZE[1])
-    near = _inside(_seen(_thinned(content.points_m), axes, signs), chart.x_range, chart.y_range)
-    points = Series("map", "map-point", near, is_data=False)
-    return replace(panel, series=(points, *lines))
 
 
-def _inside(points: Array, x_range: tuple[float, float], y_range: tuple[float, float]) -> Array:
+def _inside(points: Array, x_range: Range, y_range: Range) -> Array:
     low, high = np.transpose([x_range, y_range])
     return np.asarray(points[np.all((points > low) & (points < high), axis=1)])
 
@@ -142,20 +140,19 @@ def _map_view(content: Content, name: str, axes: tuple[int, int], signs: tuple[i
     assert content.final is not None
     points, path = _seen(content.points_m, axes, signs), _seen(content.final.centers, axes, signs)
     corners = np.quantile(points, [_SEEN_QUANTILE, 1 - _SEEN_QUANTILE], axis=0)
-    shown = np.concatenate([corners, path])
-    chart = equal_chart(shown, VIEW_SIZE[0], max_height=VIEW_SIZE[1])
-    aspect = (chart.bottom - chart.top) / (chart.right - chart.left)
+    x_range, y_range, size = equal_view(np.concatenate([corners, path]))
     order = np.argsort(_depth(content, axes))
-    pixels = _raster(points[order], content.points_rgb[order], chart.x_range, chart.y_range, aspect)
+    pixels = _raster(points[order], content.points_rgb[order], x_range, y_range, size[1] / size[0])
     return Panel(
         name,
         f"{name} of the map's points",
         *_labels(axes, signs),
         (Series("path", "after", path, "line"),),
-        x_range=chart.x_range,
-        y_range=chart.y_range,
-        size=(VIEW_SIZE[0], chart.height),
-        picture=Picture(pixels, chart.x_range, chart.y_range),
+        x_range=x_range,
+        y_range=y_range,
+        size=size,
+        keeps_shape=True,
+        picture=pixels,
     )
 
 
@@ -163,17 +160,17 @@ def _depth(content: Content, axes: tuple[int, int]) -> Array:
     """What is nearer to the reader comes last: from above, what is higher."""
     assert content.points_m is not None
     (across,) = {0, 1, 2} - set(axes)
-    towards_reader = 1.0 if content.frame == "site" and across == 2 else -1.0
+    towards_reader = 1.0 if content.summary.frame == "site" and across == 2 else -1.0
     return np.asarray(towards_reader * content.points_m[:, across])
 
 
 def _raster(
     points: Array,
-    colors: npt.NDArray[np.uint8],
-    x_range: tuple[float, float],
-    y_range: tuple[float, float],
+    colors: Pixels,
+    x_range: Range,
+    y_range: Range,
     aspect: float,
-) -> npt.NDArray[np.uint8]:
+) -> Pixels:
     """(h, w, 4) pixels with each point two pixels wide."""
     width, height = PICTURE_WIDTH_PX, max(round(PICTURE_WIDTH_PX * aspect), 1)
     pixels = np.zeros((height, width, 4), dtype=np.uint8)
@@ -192,7 +189,7 @@ def _window(path: Trajectory) -> int:
     return max(_MIN_WINDOW, len(path) // _NUM_WINDOWS)
 
 
-def _local_scale_series(name: str, style: str, path: Trajectory, target: Array) -> Series:
+def _local_scale_series(name: str, color: str, kind: str, path: Trajectory, target: Array) -> Series:
     """Percent by which stretches of the path are too short for the target; none where it stands still."""
     half, points = _window(path), []
     along = (
@@ -201,7 +198,7 @@ def _local_scale_series(name: str, style: str, path: Trajectory, target: Array) 
         else path.timestamps_s - path.timestamps_s[0]
     )
     if len(target) != len(path):
-        return Series(name, style, np.zeros((0, 2)), "line")
+        return Series(name, color, np.zeros((0, 2)), kind)
     least = 0.02 * float(np.linalg.norm(np.ptp(path.centers, axis=0)))
     for middle in range(len(path)):
         inside = slice(max(middle - half, 0), middle + half + 1)
@@ -209,4 +206,4 @@ def _local_scale_series(name: str, style: str, path: Trajectory, target: Array) 
         source, goal = path.centers[inside][known], target[inside][known]
         if len(source) > _MIN_WINDOW and np.linalg.norm(np.ptp(source, axis=0)) > least:
             points.append([along[middle], 100.0 * (align_points(source, goal).scale - 1.0)])
-    return Series(name, style, np.array(points, dtype=np.float64).reshape(-1, 2), "line")
+    return Series(name, color, np.array(points, dtype=np.float64).reshape(-1, 2), kind)

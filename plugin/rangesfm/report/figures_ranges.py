@@ -7,15 +7,17 @@ import numpy.typing as npt
 
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.report.content import Content, in_natural_order
-from rangesfm.report.plot import WIDE_SIZE, Figure, Panel, Series
-from rangesfm.report.svg import running_median
-from rangesfm.result_folder import RangesAsUsed
+from rangesfm.report.plot import WIDE_SIZE, Figure, Panel, Series, running_median
+from rangesfm.result.ranges_as_used import RangesAsUsed
 
 Array = npt.NDArray[np.float64]
 
 NUM_HISTOGRAM_BINS = 60
 NUM_MEDIAN_BINS = 48
-PANEL_SIZE = (360, 172)
+MAX_NUM_DRAWN = 6_000
+"""Ranges that a figure has a dot for; medians and histograms are of all."""
+
+PANEL_SIZE = (270.0, 125.0)
 
 
 def residuals_over_time(content: Content) -> Figure | None:
@@ -28,6 +30,7 @@ def residuals_over_time(content: Content) -> Figure | None:
         "Range residuals over time, predicted minus measured, with their running median. A steady offset is a bias; "
         "a slow wave is drift or a clock. What lies beyond an axis is drawn at its edge."
     )
+    caption += _thinned(len(ranges.status))
     return Figure("range_residuals", caption, panels, layout="panels", table="ranges")
 
 
@@ -39,11 +42,11 @@ def residual_histogram(content: Content) -> Figure | None:
     limit = _residual_limit(ranges)
     edges = np.linspace(-limit, limit, NUM_HISTOGRAM_BINS + 1)
     outlines = []
-    for name, style, residuals in _both(ranges):
+    for name, color, residuals in _both(ranges):
         known = residuals[ranges.is_used & np.isfinite(residuals)]
         heights = np.histogram(np.clip(known, -limit, limit), edges)[0].astype(float)
         if heights.any():
-            outlines.append(Series(name, style, outline(edges, heights), "filled"))
+            outlines.append(Series(name, color, outline(edges, heights), "filled"))
     highest = max(float(series.points[:, 1].max()) for series in outlines)
     panel = Panel(
         "",
@@ -53,7 +56,7 @@ def residual_histogram(content: Content) -> Figure | None:
         tuple(outlines),
         x_range=(-limit, limit),
         y_range=(0.0, 1.08 * highest),
-        verticals=((0.0, "zero"),),
+        verticals=((0.0, "ink"),),
     )
     caption = "Residuals of the ranges used. Real radios lean to long measurements, which here are negative."
     return Figure("range_residual_histogram", caption, (panel,))
@@ -72,16 +75,17 @@ def absolute_errors(content: Content) -> Figure | None:
     rows = np.flatnonzero(np.isfinite(true_m))
     if len(rows) == 0:
         return None
+    stride = _stride(len(rows))
     times, time_label = _times(content, ranges)
-    errors = [("measured", "measured", ranges.range_m)]
-    errors += [(name, style, residuals + ranges.range_m) for name, style, residuals in _both(ranges)]
+    errors = [("measured", "rejected", ranges.range_m)]
+    errors += [(name, color, residuals + ranges.range_m) for name, color, residuals in _both(ranges)]
     x_range = (float(times[rows].min()), float(times[rows].max()))
     dots, lines = [], []
-    for name, style, values in errors:
+    for name, color, values in errors:
         points = np.column_stack([times[rows], np.abs(values - true_m)[rows]])
         if np.isfinite(points[:, 1]).any():
-            dots.append(Series(name, style, points))
-            lines.append(Series(name, style, running_median(points, x_range, NUM_MEDIAN_BINS), "line", is_data=False))
+            dots.append(Series(name, color, points[::stride]))
+            lines.append(Series(name, color, running_median(points, x_range, NUM_MEDIAN_BINS), "line", is_data=False))
     sizes = np.concatenate([series.points[:, 1] for series in dots])
     panel = Panel(
         "",
@@ -97,6 +101,7 @@ def absolute_errors(content: Content) -> Figure | None:
         "How far ranges are from those of the reference: as measured, by the scaled map, and by the refined one, with "
         "their running medians. Ranges taken at a photo, to anchors where this map has them."
     )
+    caption += _thinned(len(rows))
     return Figure("absolute_range_errors", caption, (panel,), table="range_errors")
 
 
@@ -105,14 +110,17 @@ def _residual_panel(content: Content, ranges: RangesAsUsed, anchor_id: str) -> P
     time_range = (float(np.nanmin(times)), float(np.nanmax(times)))
     limit = _residual_limit(ranges)
     is_mine = np.array(ranges.anchor_id, dtype=str) == anchor_id
+    is_used = is_mine & ranges.is_used
     is_rejected = is_mine & (np.array(ranges.status, dtype=str) == RangeStatus.OUTLIER.label)
     final = _both(ranges)[-1][2]
-    series = [Series("rejected", "rejected", np.column_stack([times, final])[is_rejected])]
+    is_drawn = np.arange(len(times)) % _stride(len(times)) == 0
+    series = [Series("rejected", "rejected", np.column_stack([times, final])[is_rejected & is_drawn])]
     medians = []
-    for name, style, residuals in _both(ranges):
-        points = np.column_stack([times, residuals])[is_mine & ranges.is_used]
-        series.append(Series(name, style, points))
-        medians.append(Series(name, style, running_median(points, time_range, NUM_MEDIAN_BINS), "line", is_data=False))
+    for name, color, residuals in _both(ranges):
+        points = np.column_stack([times, residuals])
+        series.append(Series(name, color, points[is_used & is_drawn]))
+        line = running_median(points[is_used], time_range, NUM_MEDIAN_BINS)
+        medians.append(Series(name, color, line, "line", is_data=False))
     return Panel(
         f"Anchor {anchor_id}",
         f"Range residuals of anchor {anchor_id} over time",
@@ -126,8 +134,18 @@ def _residual_panel(content: Content, ranges: RangesAsUsed, anchor_id: str) -> P
     )
 
 
+def _stride(num: int) -> int:
+    """Every how many-th range is drawn."""
+    return max(1, -(-num // MAX_NUM_DRAWN))
+
+
+def _thinned(num: int) -> str:
+    """What a caption says where not all are drawn."""
+    return "" if _stride(num) == 1 else f" One range in {_stride(num)} is drawn; the medians are of all."
+
+
 def _both(ranges: RangesAsUsed) -> list[tuple[str, str, Array]]:
-    """Name, style and residuals before and, where there are any, after the refinement."""
+    """Name, color and residuals before and, where there are any, after the refinement."""
     both = [("scaled", "before", ranges.residual_scaled_m), ("refined", "after", ranges.residual_refined_m)]
     return both if np.isfinite(ranges.residual_refined_m).any() else both[:1]
 

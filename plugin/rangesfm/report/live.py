@@ -7,11 +7,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from rangesfm.files import make_output_folder, new_file
+from rangesfm.files.atomic import make_output_folder, new_file
 from rangesfm.progress import Progress
-from rangesfm.report.markup import Child, Markup, element
-from rangesfm.report.page import document
-from rangesfm.report.text import count, duration
+from rangesfm.report.page import render
+from rangesfm.report.text import duration
 
 PAGE_NAME = "live.html"
 RELOAD_S = 2
@@ -71,37 +70,20 @@ class LivePage:
 
     def _write(self, headline: str, *, reload: str | None) -> None:
         self._last_written = self._clock()
-        page = document(
-            "rangesfm run",
-            self.path.parent.resolve().name,
-            element("section", element("h2", headline), self._stages(), self._notes(), class_="card", id="progress"),
-            has_script=False,
+        page = render(
+            "live.html",
+            title="rangesfm run",
+            heading=self.path.parent.resolve().name,
+            headline=headline,
             reload=reload,
+            done=self._done,
+            stage=self._stage,
+            counts=self._counts,
+            seconds=self._clock() - self._stage_start,
+            messages=self._messages,
         )
         with new_file(self.path) as temporary:
             temporary.write_text(page, encoding="utf-8", errors="xmlcharrefreplace")
-
-    def _stages(self) -> Markup:
-        rows = [element("tr", element("th", name, scope="row"), element("td", duration(s))) for name, s in self._done]
-        if self._stage is not None:
-            rows.append(element("tr", element("th", self._stage, scope="row"), element("td", self._progress())))
-        return element("table", element("tbody", rows))
-
-    def _progress(self) -> list[Child]:
-        seconds = self._clock() - self._stage_start
-        if self._counts is None:
-            return ["..."]
-        num_done, num_total = self._counts
-        if num_total is None or num_total <= 0:
-            return [count(num_done)]
-        text = f"{count(num_done)} of {count(num_total)}"
-        if 0 < num_done < num_total:
-            text += f", {duration(seconds * (num_total - num_done) / num_done)} left"
-        return [text, element("progress", value=num_done, max=num_total, aria_label=self._stage)]
-
-    def _notes(self) -> Markup | None:
-        notes = [element("li", message) for message in self._messages]
-        return element("div", element("ul", notes), class_="warnings") if notes else None
 
 
 @contextmanager

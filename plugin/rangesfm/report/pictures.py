@@ -1,126 +1,99 @@
-"""The report's figures as pictures for a paper, through the optional package matplotlib."""
+"""Figures as pictures for a paper, from the definitions that the page draws."""
 
 from __future__ import annotations
 
-from importlib.util import find_spec
+import re
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from rangesfm.errors import InputError
-from rangesfm.files import make_output_folder, new_file
-from rangesfm.report.plot import Figure, Panel, Series
+from rangesfm.files.atomic import make_output_folder, new_file
+from rangesfm.report.chart import Color, Spec, config, panel_spec, rows_of
+from rangesfm.report.plot import Figure, LegendEntry, Panel
+from rangesfm.report.script import ASSETS
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+PNG_SCALE = 2.5
+MAX_WIDTH_PX = 660.0
+"""Of a panel: text is to have the size that papers have."""
 
-PIXELS_PER_INCH = 220
-_PAGE_PIXELS_PER_INCH = 96
+FORMATS = ("png", "svg")
 _NUM_COLUMNS = {"single": 1, "views": 2, "panels": 3}
-_COLORS = {
-    "before": "#c2570c",
-    "after": "#1d5fd1",
-    "reference": "#17202b",
-    "true-scale": "#0f766e",
-    "measured": "#7b8794",
-    "rejected": "#7b8794",
-    "map-point": "#c3ccd6",
-    "anchor": "#a21caf",
-    "interval": "#dce8fb",
-}
-_INK = "#17202b"
+_SYMBOLS = {"dots": "circle", "disc": "circle", "triangle": "triangle-up"}
 
 
 def write_pictures(figures: list[Figure], folder: Path) -> list[Path]:
-    """Write each figure as ``NAME.png`` into a folder; returns their paths.
+    """Write each figure as ``NAME.png`` and ``NAME.svg`` into a folder; returns their paths.
 
     Raises:
-        InputError: matplotlib is not installed, or the folder cannot be written to.
+        InputError: the folder cannot be written to.
     """
-    if find_spec("matplotlib") is None:
-        raise InputError("pictures need the package matplotlib: python -m pip install 'rangesfm[plot]'")
     make_output_folder(folder)
-    from matplotlib import rc_context
-
-    with rc_context({"text.parse_math": False}):  # names may hold dollars
-        return [_write(figure, folder / f"{figure.name}.png") for figure in figures]
-
-
-def _write(figure: Figure, path: Path) -> Path:
-    from matplotlib.figure import Figure as Sheet
-
-    num_columns = min(_NUM_COLUMNS[figure.layout], len(figure.panels))
-    num_rows = -(-len(figure.panels) // num_columns)
-    width, height = (size / _PAGE_PIXELS_PER_INCH for size in figure.panels[0].size)
-    # Text of the size that papers have, whatever the width on the page.
-    sheet = Sheet(figsize=(min(width, 7.2) * num_columns, height * num_rows), layout="constrained")
-    grid: Any = sheet.subplots(num_rows, num_columns, squeeze=False)
-    for place, axes in enumerate(grid.flat):
-        if place < len(figure.panels):
-            _draw(figure.panels[place], axes)
-        else:
-            axes.axis("off")
-    labels = {label: handle for axes in grid.flat for handle, label in zip(*axes.get_legend_handles_labels())}
-    if len(labels) > 1:
-        sheet.legend(
-            labels.values(),
-            labels.keys(),
-            loc="outside upper center",
-            ncols=min(len(labels), 6),
-            fontsize=8,
-            markerscale=4,
-        )
-    with new_file(path) as temporary:
-        sheet.savefig(temporary, format="png", dpi=PIXELS_PER_INCH, metadata={"Software": None})
-    return path
+    paths = []
+    for figure in figures:
+        for format in FORMATS:
+            paths.append(folder / f"{figure.name}.{format}")
+            write_picture(figure, paths[-1])
+    return paths
 
 
-def _draw(panel: Panel, axes: Axes) -> None:
-    if panel.picture is not None:
-        extent = (*panel.picture.x_range, *panel.picture.y_range)
-        axes.imshow(panel.picture.pixels, extent=extent, interpolation="nearest", aspect="auto")
-    for low, high, style in panel.bands:
-        axes.axvspan(low, high, color=_COLORS.get(style, _INK), lw=0)
-    if panel.zero_line:
-        axes.axhline(0.0, color=_INK, lw=0.6)
-    for x, _ in panel.verticals:
-        axes.axvline(x, color=_INK, lw=0.8)
-    for series in panel.series:
-        _draw_series(series, axes)
-    for mark in panel.marks:
-        is_anchor = mark.shape == "anchor"
-        axes.plot(mark.x, mark.y, "^" if is_anchor else "o", ms=5, color=_COLORS["anchor" if is_anchor else "after"])
-        axes.annotate(mark.label, (mark.x, mark.y), xytext=(4, 3), textcoords="offset points", fontsize=7)
-    if panel.rows:
-        axes.set_yticks([y for y, _, _ in panel.rows], [left for _, left, _ in panel.rows])
-    _frame(panel, axes)
+def write_picture(figure: Figure, path: Path) -> None:
+    """Write a figure in the format that the file's name says.
 
+    Raises:
+        InputError: the file cannot be written, or the format is none of FORMATS.
+    """
+    format = path.suffix[1:].lower()
+    if format not in FORMATS:
+        raise InputError(f"no figure format is named '{format}', expected one of {', '.join(FORMATS)}", path)
+    import vl_convert  # 90 MB with a browser's script engine: only where a picture is drawn
 
-def _draw_series(series: Series, axes: Axes) -> None:
-    x, y = series.points.T
-    color = _COLORS.get(series.style, _INK)
-    label = series.name if series.is_data or series.style == "map-point" else None
-    if series.kind == "dots":
-        # Thousands of dots are faint, a dozen are not.
-        axes.plot(x, y, ".", ms=1.5, alpha=0.5 if len(x) > 100 else 1.0, color=color, label=label)
-    elif series.kind == "line":
-        axes.plot(x, y, "--" if series.style == "reference" else "-", lw=1.0, color=color, label=label)
+    spec = figure_spec(figure)
+    if format == "png":
+        data = vl_convert.vegalite_to_png(spec, scale=PNG_SCALE)
     else:
-        axes.plot(x, y, lw=1.0, color=color, label=label)
-        axes.fill_between(x, y, color=color, alpha=0.15, lw=0)
+        data = vl_convert.vegalite_to_svg(spec).encode("utf-8")
+    try:
+        with new_file(path) as temporary:
+            temporary.write_bytes(data)
+    except OSError as error:
+        raise InputError(f"cannot be written ({error.strerror})", path) from error
 
 
-def _frame(panel: Panel, axes: Axes) -> None:
-    if panel.title:
-        axes.set_title(panel.title, fontsize=9)
-    axes.set_xlabel(panel.x_label, fontsize=8)
-    axes.set_ylabel(panel.y_label, fontsize=8)
-    axes.tick_params(labelsize=7)
-    axes.grid(alpha=0.3, lw=0.5)
-    if panel.is_equal:
-        axes.set_aspect("equal", adjustable="datalim")
-        return
-    if panel.picture is not None:
-        axes.set_aspect("equal")
-    x_range, y_range = panel.limits
-    axes.set_xlim(*x_range)
-    axes.set_ylim(*y_range)
+def figure_spec(figure: Figure) -> Spec:
+    """All panels of a figure with its legend, in the page's light colours."""
+    colors = light_colors()
+
+    def color(name: str) -> str:
+        return colors.get(name, name)
+
+    def sheet(panel: Panel) -> Spec:
+        panel = replace(panel, size=(min(panel.size[0], MAX_WIDTH_PX), panel.size[1]))
+        return panel_spec(panel, color, lambda i: {"values": rows_of(panel.series[i])}) | {"title": panel.title}
+
+    panels = [sheet(panel) for panel in figure.panels]
+    if len(figure.entries) > 1:
+        panels[0]["layer"].append(_legend(figure.entries, color))
+    columns = min(_NUM_COLUMNS[figure.layout], len(panels))
+    return {"background": "white", "padding": 8, "config": config(color), "concat": panels, "columns": columns}
+
+
+def light_colors() -> dict[str, str]:
+    """The page's colours by name, of its light theme."""
+    light, _ = re.findall(r":root \{(.*?)\}", (ASSETS / "page.css").read_text(encoding="utf-8"), flags=re.DOTALL)
+    return dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", light))
+
+
+def _legend(entries: list[LegendEntry], color: Color) -> Spec:
+    """A layer of which nothing is seen but its legend."""
+    texts = [entry.text for entry in entries]
+    legend = {"title": None, "orient": "top", "columns": 6, "symbolOpacity": 1}
+    ranges = {
+        "color": [color(entry.color) for entry in entries],
+        "shape": [_SYMBOLS.get(entry.shape, "square") for entry in entries],
+    }
+    encoding = {
+        channel: {"field": "text", "scale": {"domain": texts, "range": values}, "legend": legend}
+        for channel, values in ranges.items()
+    }
+    data = {"values": [{"text": text} for text in texts]}
+    return {"data": data, "mark": {"type": "point", "filled": True, "opacity": 0}, "encoding": encoding}

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.report.content import Content, Summary, as_number, is_position
-from rangesfm.report.head import scale_interval
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.report.content import Content
 from rangesfm.report.scene import Scene, SceneAnchor, ScenePath
-from rangesfm.trajectory import Trajectory
+from rangesfm.result.summary import ResultSummary
 
 Array = npt.NDArray[np.float64]
 
@@ -21,13 +21,13 @@ def scene_of(content: Content) -> Scene | None:
     paths = _paths(content)
     if content.final is None or len(content.final) == 0:
         return None
-    interval, value = scale_interval(content.summary), content.summary.number("scale", "value")
+    interval, value = content.summary.scale.interval_95, content.summary.scale.value
     return Scene(
-        frame=content.frame,
+        frame=content.summary.frame,
         paths=paths,
         points_m=_or_empty(content.points_m, np.float64),
         points_rgb=_or_empty(content.points_rgb, np.uint8),
-        anchors=anchors_in_scene(content.summary.values, content.anchors_m),
+        anchors=anchors_in_scene(content.summary, content.anchors_m),
         ranges=content.ranges,
         range_times_s=content.range_times_s,
         true_ranges_m=content.true_ranges_m,
@@ -55,22 +55,15 @@ def _of_positions(positions_m: Array) -> Trajectory:
     return Trajectory(np.arange(n), tuple(map(str, range(n))), None, positions_m, nowhere)
 
 
-def anchors_in_scene(summary: dict[str, Any], positions_m: Mapping[str, Array]) -> tuple[SceneAnchor, ...]:
-    """Anchors at their positions, with what ``result.json`` says of their errors and mirror images."""
-    reader = Summary(summary)
+def anchors_in_scene(summary: ResultSummary, positions_m: Mapping[str, Array]) -> tuple[SceneAnchor, ...]:
+    """Anchors at their positions, with what is known of their errors and mirror images."""
     found = []
     for anchor_id, position_m in positions_m.items():
-        stddev = reader.get("anchors", anchor_id, "stddev_m")
-        mirror = reader.get("anchors", anchor_id, "mirror_position_m")
-        stddev_m = np.array(stddev if is_position(stddev) else [_number_or_nan(stddev)] * 3, dtype=np.float64)
-        mirror_m = np.array(mirror, dtype=np.float64) if is_position(mirror) else None
+        entry = summary.anchors[anchor_id]
+        stddev_m = np.full(3, np.nan if entry.stddev_m is None else entry.stddev_m)
+        mirror_m = None if entry.mirror_position_m is None else np.array(entry.mirror_position_m)
         found.append(SceneAnchor(anchor_id, position_m, stddev_m, mirror_m))
     return tuple(found)
-
-
-def _number_or_nan(value: Any) -> float:
-    number = as_number(value)
-    return float("nan") if number is None else number
 
 
 def _or_empty(values: Any, kind: Any) -> Any:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 ASSETS = Path(__file__).with_name("assets")
 
-_VIEW_FILES = (
+_FILES = (
     "data.js",
     "theme.js",
     "stage.js",
@@ -22,16 +22,17 @@ _VIEW_FILES = (
     "measuring.js",
     "photo_panel.js",
     "print.js",
+    "charts.js",
     "csv.js",
     "main.js",
 )
 
 
-def view_script() -> str:
-    """three.js, then the view's files in one scope of their own."""
-    library = (ASSETS / "vendor" / "three.min.js").read_text(encoding="utf-8")
-    files = [(ASSETS / "view" / name).read_text(encoding="utf-8") for name in _VIEW_FILES]
-    return f'{library}\n(() => {{\n"use strict";\n{"".join(files)}}})();\n'
+def page_script() -> str:
+    """three.js and Vega, then the page's own files in one scope of their own."""
+    libraries = [(ASSETS / "vendor" / name).read_text(encoding="utf-8") for name in ("three.min.js", "vega.min.js")]
+    files = [(ASSETS / "view" / name).read_text(encoding="utf-8") for name in _FILES]
+    return f'{"".join(libraries)}\n(() => {{\n"use strict";\n{"".join(files)}}})();\n'
 
 
 def policy_source(script: str) -> str:

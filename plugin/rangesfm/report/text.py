@@ -5,29 +5,33 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from rangesfm.report.content import as_number
+from markupsafe import Markup
 
 NOTHING = "–"
 
 
-def fixed(value: Any, decimals: int, unit: str = "", *, nothing: str = NOTHING) -> str:
-    """With so many decimals and a unit; ``nothing`` for what is not a number."""
-    number = as_number(value)
+def _known(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+def fixed(value: float | None, decimals: int, unit: str = "", *, nothing: str = NOTHING) -> str:
+    """With so many decimals and a unit; ``nothing`` for what is not known."""
+    number = _known(value)
     if number is None:
         return nothing
     text = f"{round(number, decimals) + 0.0:.{decimals}f}"  # no minus before what rounds to zero
     return text.replace("-", "−") + (f"\u00a0{unit}" if unit else "")
 
 
-def signed(value: Any, decimals: int, unit: str = "") -> str:
+def signed(value: float | None, decimals: int, unit: str = "") -> str:
     """As ``fixed``, with a sign before positive numbers too."""
-    number = as_number(value)
+    number = _known(value)
     return ("+" if number is not None and number > 0 else "") + fixed(value, decimals, unit)
 
 
-def count(value: Any) -> str:
+def count(value: float | None) -> str:
     """A whole number with thin spaces between thousands."""
-    number = as_number(value)
+    number = _known(value)
     return NOTHING if number is None else f"{round(number):,}".replace(",", "\u202f")
 
 
@@ -38,9 +42,9 @@ def decimals_for(stddev: float | None, *, default: int) -> int:
     return min(max(1 - math.floor(math.log10(stddev)), 0), 12)
 
 
-def duration(seconds: Any) -> str:
+def duration(seconds: float | None) -> str:
     """As hours, minutes and seconds, no finer than needed."""
-    number = as_number(seconds)
+    number = _known(seconds)
     if number is None:
         return NOTHING
     if number < 60:
@@ -67,3 +71,13 @@ def plain(value: Any) -> str:
     if isinstance(value, list):
         return ", ".join(map(plain, value)) or NOTHING
     return str(value)
+
+
+def keyed(key: str, value: Any, text: str) -> str:
+    """A number of ``result.json`` as the reader sees it, marked with its key (joined by dots) and its full value.
+
+    What is no number stands as it is.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return text
+    return Markup('<data value="{}" data-key="{}">{}</data>').format(repr(float(value)), key, text)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageOps
 
-from rangesfm.files import stays_inside
+from rangesfm.files.atomic import stays_inside
 
 MAX_NUM_THUMBNAILS = 160
 MAX_BYTES = 600_000

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.result_folder import RangesAsUsed
-from rangesfm.trajectory import Trajectory
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.result.ranges_as_used import RangesAsUsed
 
 Array = npt.NDArray[np.float64]
 

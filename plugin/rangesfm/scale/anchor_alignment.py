@@ -11,8 +11,9 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import Similarity, align_points, path_shape, rmse
-from rangesfm.ranging.robust_loss import CAUCHY
+from rangesfm.geometry.rotations import cross_matrices
+from rangesfm.geometry.similarity import Similarity, align_points, path_shape, rmse
+from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.scale.anchor_plane import is_line
 
 Array = npt.NDArray[np.float64]
@@ -206,7 +207,8 @@ def _refined(pairs: Sequence[_Pair], fit: _Fit) -> _Fit:
         for pair, side, weight in zip(pairs, fit.sides, weights, strict=True):
             weighted = weight * pair.information(fit.motion)
             difference = pair.difference(fit.motion, side)
-            jacobian = _motion_jacobian(difference + pair.target.places_m[side[0]] - middle)
+            place = difference + pair.target.places_m[side[0]] - middle
+            jacobian = np.hstack([-cross_matrices(place), np.eye(3)])  # by a small turn and a shift
             normal = normal + jacobian.T @ weighted @ jacobian
             right = right - jacobian.T @ weighted @ difference
         step = np.linalg.solve(normal, right)
@@ -217,10 +219,3 @@ def _refined(pairs: Sequence[_Pair], fit: _Fit) -> _Fit:
             break
         fit = better
     return fit
-
-
-def _motion_jacobian(place: Array) -> Array:
-    """(3, 6) of a place by a small turn about the origin and a shift."""
-    x, y, z = place
-    turn = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])
-    return np.hstack([turn, np.eye(3)])

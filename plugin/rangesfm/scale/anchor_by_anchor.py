@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.geometry import IDENTITY, Similarity
-from rangesfm.ranging.anchors import AnchorEstimate
-from rangesfm.ranging.robust_loss import GEMAN_MCCLURE
-from rangesfm.scale.problem import SurveyProblem
+from rangesfm.geometry.similarity import IDENTITY, Similarity
+from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE
 from rangesfm.scale.range_equation import RangeProblem, RangeState, solve
 from rangesfm.scale.solution import MIN_COST_GAP, Solution
 from rangesfm.scale.starts import anchor_alone, choose_sides, mirrored, spread_subset
@@ -35,7 +34,7 @@ def scale_per_anchor(solution: Solution, anchor_ids: tuple[str, ...]) -> dict[st
         if len(problem.range_m) < _MIN_RANGES_ALONE:
             continue
         fit = solve(problem, start, loss=GEMAN_MCCLURE)
-        if fit.log_scale_stddev * solution.inflation < _MAX_LOG_SCALE_STDDEV:
+        if fit.log_scale_stddev * solution.errors.inflation < _MAX_LOG_SCALE_STDDEV:
             scales[anchor_id] = fit.state.metric_from_model.scale
     return scales
 
@@ -44,18 +43,8 @@ def _one_anchor(solution: Solution, k: int) -> tuple[RangeProblem, RangeState]:
     problem, state = solution.problem, solution.fit.state
     placed = state.metric_from_model
     middle = problem.centers.mean(axis=0) if problem.frame_is_free else np.zeros(3)
-    part = problem.subset(np.flatnonzero(problem.anchor_index == k))
-    alone = replace(
-        part,
-        centers=part.centers - middle,
-        anchor_index=np.zeros(len(part.range_m), dtype=np.int64),
-        anchor_mean_m=problem.anchor_mean_m[k : k + 1],
-        anchor_stddev_m=problem.anchor_stddev_m[k : k + 1],
-        bias_mean_m=problem.bias_mean_m[k : k + 1],
-        bias_stddev_m=problem.bias_stddev_m[k : k + 1],
-        frame_is_free=False,
-        distances=None,
-    )
+    part = problem.of_anchor(k)
+    alone = replace(part, centers=part.centers - middle)
     start = RangeState(
         Similarity(placed.scale, placed.rotation, placed.apply(middle)),
         state.anchors_m[k : k + 1],
@@ -64,12 +53,10 @@ def _one_anchor(solution: Solution, k: int) -> tuple[RangeProblem, RangeState]:
     return spread_subset(alone, _MAX_RANGES_ALONE), start
 
 
-def anchor_estimates(
-    survey: SurveyProblem, solution: Solution, anchor_ids: tuple[str, ...]
-) -> tuple[AnchorEstimate, ...]:
+def anchor_estimates(solution: Solution, anchor_ids: tuple[str, ...]) -> tuple[AnchorEstimate, ...]:
     """All anchors of the log, with stddev widened by the errors' correlation, and mirror places."""
     problem, state = solution.problem, solution.fit.state
-    covariance = solution.fit.anchor_covariance_m2() * solution.inflation**2
+    covariance = solution.fit.anchor_covariance_m2() * solution.errors.inflation**2
     stddev = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 3)
     mirrors = _mirror_places(solution)
     common_bias_m = _common_bias(problem, state)
@@ -86,7 +73,7 @@ def anchor_estimates(
                 prior_position_stddev_m=float(problem.anchor_stddev_m[k]),
                 range_bias_m=float(state.bias_m[k] if heard else problem.bias_mean_m[k] + common_bias_m),
                 prior_bias_m=float(problem.bias_mean_m[k]),
-                prior_bias_stddev_m=float(problem.bias_stddev_m[k] * solution.inflation),
+                prior_bias_stddev_m=float(problem.bias_stddev_m[k] * solution.errors.inflation),
                 mirror_position_m=mirrors.get(k),
                 position_covariance_m2=covariance[k],
             )
@@ -109,7 +96,7 @@ def _mirror_places(solution: Solution) -> dict[int, Array]:
     problem, state = solution.problem, solution.fit.state
     _, rise = choose_sides(spread_subset(problem, _MAX_RANGES_ALONE), state)
     places: dict[int, Array] = {}
-    for k in np.flatnonzero(rise / solution.inflation**2 < MIN_COST_GAP):
+    for k in np.flatnonzero(rise / solution.errors.inflation**2 < MIN_COST_GAP):
         alone = anchor_alone(problem, int(k), state.metric_from_model)
         start = RangeState(IDENTITY, mirrored(problem, state, int(k))[None], state.bias_m[k : k + 1])
         places[int(k)] = solve(alone, start).state.anchors_m[0]

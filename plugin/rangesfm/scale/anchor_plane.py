@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import PathShape, Similarity, path_shape
-from rangesfm.gravity import UP_IN_SITE
+from rangesfm.geometry.gravity import UP_IN_SITE
+from rangesfm.geometry.similarity import PathShape, Similarity, path_shape
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, RangeState
 
 Array = npt.NDArray[np.float64]

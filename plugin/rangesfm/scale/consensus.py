@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import off_origin
+from rangesfm.geometry.similarity import off_origin
 from rangesfm.scale.range_equation import RangeProblem
 
 Array = npt.NDArray[np.float64]

@@ -24,19 +24,16 @@ _SIGNIFICANT = 2.58
 _MIN_NEW_SHARE = 0.2
 
 
-def cutoff_test(solution: Solution, shared_stddev_m: Array) -> tuple[CutoffTest, ...]:
+def cutoff_test(solution: Solution) -> tuple[CutoffTest, ...]:
     """The scale for each least range, as long as enough ranges are left.
 
     Short ranges weigh as much as others here, so that their error shows.
-
-    Args:
-        shared_stddev_m: (n,) what made short ranges weigh less in the solution.
     """
-    noise = np.sqrt(np.maximum(solution.problem.stddev_m**2 - shared_stddev_m**2, 1e-18))
+    noise = np.sqrt(np.maximum(solution.errors.stddev_m**2 - solution.errors.shared_m**2, 1e-18))
     problem = spread_subset(replace(solution.problem, stddev_m=noise), _MAX_RANGES_PER_ANCHOR)
     thinning = len(solution.problem.range_m) / len(problem.range_m)
     # Thinned ranges are less correlated by as much as there are fewer of them.
-    inflation = max(solution.inflation / np.sqrt(thinning), 1.0)
+    inflation = max(solution.errors.inflation / np.sqrt(thinning), 1.0)
     tests: list[CutoffTest] = []
     for cutoff in _CUTOFFS_M:
         rows = np.flatnonzero(problem.range_m >= cutoff)

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.scale.consensus import TOLERANCE_STDDEVS, agreeing_intervals
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.two_candidate import two_candidate
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 
@@ -46,7 +46,7 @@ def scale_diagnostics(estimate: ScaleEstimate, trajectory: Trajectory) -> ScaleD
     """
     anchors = np.array([anchor.position_m for anchor in estimate.anchors], dtype=np.float64)
     anchor_of_range = anchors[estimate.observations.log.anchor_index]
-    rows = np.flatnonzero(np.isfinite(estimate.range_stddev_m) & np.isfinite(anchor_of_range).all(axis=1))
+    rows = np.flatnonzero(np.isfinite(estimate.errors.stddev_m) & np.isfinite(anchor_of_range).all(axis=1))
     candidate_rows, candidates = _candidates(estimate, trajectory, rows, anchor_of_range[rows])
     scales = estimate.value * np.geomspace(1 / CURVE_FACTOR, CURVE_FACTOR, NUM_CURVE_POINTS)
     return ScaleDiagnostics(
@@ -77,7 +77,7 @@ def _num_agreeing(
     centers, tags, anchors = _about(estimate, held, rows, anchor_m)
     log = estimate.observations.log
     bias = np.array([anchor.range_bias_m for anchor in estimate.anchors])[log.anchor_index[rows]]
-    tolerance = TOLERANCE_STDDEVS * estimate.range_stddev_m[rows]
+    tolerance = TOLERANCE_STDDEVS * estimate.errors.stddev_m[rows]
     starts, ends = agreeing_intervals(centers, tags - anchors, log.range_m[rows] - bias, tolerance)
     begun = np.searchsorted(np.sort(starts), scales, side="right")
     return np.asarray(begun - np.searchsorted(np.sort(ends), scales, side="left"))

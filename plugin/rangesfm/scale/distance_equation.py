@@ -6,10 +6,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.distances.ends import LocatedDistances
+from rangesfm.ranging.range_gradient import RangeGradient
 
 Array = npt.NDArray[np.float64]
-
-_TINY_DISTANCE_M = 1e-9
 
 
 def distance_residuals(distances: LocatedDistances, scale: float, anchors_m: Array) -> Array:
@@ -34,12 +33,11 @@ def distance_jacobian(
     jacobian = np.zeros((len(distances), num_columns))
     between_points = distances.anchor_pair[:, 0] < 0
     jacobian[between_points, 0] = (scale * distances.model_length / distances.stddev_m)[between_points]
-    for row in np.flatnonzero(~between_points):
-        first, second = distances.anchor_pair[row]
-        along = anchors_m[first] - anchors_m[second]
-        along = along / (max(float(np.linalg.norm(along)), _TINY_DISTANCE_M) * distances.stddev_m[row])
-        for anchor, direction in ((first, along), (second, -along)):
-            column = anchor_column[anchor]
-            if column >= 0:
-                jacobian[row, column : column + 3] = direction
+    rows = np.flatnonzero(~between_points)
+    first, second = distances.anchor_pair[rows].T
+    by = RangeGradient.of(anchors_m[first] - anchors_m[second])
+    for anchor, slopes in ((first, by.by_tag), (second, by.by_anchor)):
+        free = anchor_column[anchor] >= 0
+        columns = anchor_column[anchor[free], None] + np.arange(3)
+        jacobian[rows[free, None], columns] = slopes[free] / distances.stddev_m[rows[free], None]
     return jacobian

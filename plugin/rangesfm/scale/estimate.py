@@ -8,8 +8,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from rangesfm.geometry import Similarity
-from rangesfm.ranging.anchors import AnchorEstimate
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.two_candidate import TwoCandidate
 
@@ -122,9 +123,7 @@ class ScaleEstimate:
         two_candidate: the paper's table; None where no range has candidates.
         anchors: in the order of the log.
         observations: all ranges, with status by their final weight.
-        range_stddev_m: (n,) noise of each range as weighted; NaN without a place.
-        range_share: (n,) by how much each counts beside that, as ranges from one place err alike; 1 without a place.
-        correlation_inflation: by how much the errors' correlation in time widens the formal stddev.
+        errors: of all n ranges of the log, as weighted; their inflation widens the formal stddev.
         noise_stddev_m: stddev of a range away from all special cases.
         resampled_scales: (k,) the robust scale from blocks of time drawn anew, metres per SfM unit.
     """
@@ -142,9 +141,7 @@ class ScaleEstimate:
     two_candidate: TwoCandidate | None
     anchors: tuple[AnchorEstimate, ...]
     observations: RangeObservations
-    range_stddev_m: Array
-    range_share: Array
-    correlation_inflation: float
+    errors: RangeErrors
     noise_stddev_m: float
     resampled_scales: Array
 

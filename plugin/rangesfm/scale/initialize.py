@@ -10,24 +10,23 @@ import numpy.typing as npt
 
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import Similarity
-from rangesfm.gravity import gravity_of
+from rangesfm.geometry.gravity import gravity_of
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import RangeModelOptions, ScaleOptions
-from rangesfm.ranging.anchors import Anchor
-from rangesfm.ranging.noise import shared_stddev, stretch_labels
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.errors.shared_errors import curve_stddev
 from rangesfm.ranging.observations import RangeObservations, RangeStatus, status_by_weight
-from rangesfm.ranging.shared_errors import CURVE_STDDEV_M
 from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
 from rangesfm.scale.cutoff import cutoff_test
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.levelled_places import levelled_places
-from rangesfm.scale.problem import SurveyProblem, survey_problem
+from rangesfm.scale.problem import ScaleProblem, scale_problem
 from rangesfm.scale.sensitivity import scale_sensitivity
-from rangesfm.scale.solution import Solution, solve_survey
+from rangesfm.scale.solution import Solution, solve_scale
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
 from rangesfm.scale.uncertainty import resampled_log_scales, scale_uncertainty
 from rangesfm.scale.verdict import judge
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 
@@ -60,41 +59,30 @@ def initialize_scale(
     """
     options, range_model = options or ScaleOptions(), range_model or RangeModelOptions()
     gravity = gravity_of(options.up_in_first_camera)
-    survey = survey_problem(observations, trajectory, anchors, anchor_frame, range_model, distances, gravity)
-    blocks = _time_blocks(observations, survey.rows, options.bootstrap_block_s)
-    shared = shared_stddev(observations.log)[survey.rows]
-    solution = solve_survey(
-        survey.ranges,
-        anchors_are_known=survey.anchors_are_known,
-        center_stddev=observations.center_stddev[survey.rows],
-        noise_stddev_m=_given_noise(observations, survey.rows, range_model),
-        shared_stddev_m=shared,
-        groups=blocks * survey.ranges.num_anchors + survey.ranges.anchor_index,
-        camera_side=options.camera_side,
-        seed=seed,
-    )
+    block_s = options.bootstrap_block_s
+    problem = scale_problem(observations, trajectory, anchors, anchor_frame, range_model, block_s, distances, gravity)
+    solution = solve_scale(problem, camera_side=options.camera_side, seed=seed)
     table = _paper_table(solution)
-    curve_stddev = shared if observations.log.shared_stddev_m is not None else np.full(len(shared), CURVE_STDDEV_M)
-    uncertainty = scale_uncertainty(solution, blocks, curve_stddev, num_bootstrap=options.num_bootstrap, seed=seed)
+    uncertainty = scale_uncertainty(
+        solution, curve_stddev(observations.log)[problem.rows], num_bootstrap=options.num_bootstrap, seed=seed
+    )
     per_anchor = scale_per_anchor(solution, observations.log.anchor_ids)
-    found = anchor_estimates(survey, solution, observations.log.anchor_ids)
-    tests = cutoff_test(solution, shared)
-    judged = judge(survey, solution, uncertainty, per_anchor, found, tests, options)
+    found = anchor_estimates(solution, observations.log.anchor_ids)
+    tests = cutoff_test(solution)
+    judged = judge(problem, solution, uncertainty, per_anchor, found, tests, options)
     verdict, reasons = judged.verdict, judged.reasons
-    if gravity is not None and survey.frame == "first_camera" and anchor_frame == "site":
+    if gravity is not None and problem.frame == "first_camera" and anchor_frame == "site":
         reasons = (*reasons, *levelled_places(gravity, anchors, found))
     if options.method == "two-candidate":
         robust = solution.fit.state.metric_from_model.scale
         verdict = "doubtful"
         reasons = (f"two-candidate, as asked for; the stddevs are of the robust scale, {robust:.6g}", *reasons)
-    status, stddev = observations.status.copy(), np.full(len(observations.log), np.nan)
+    status = observations.status.copy()
     status[observations.has_place] = RangeStatus.UNKNOWN_ANCHOR
-    status[survey.rows] = status_by_weight(solution.fit.weights)
-    stddev[survey.rows], share = solution.problem.stddev_m, np.ones(len(observations.log))
-    share[survey.rows] = solution.problem.share_or_1
+    status[problem.rows] = status_by_weight(solution.fit.weights)
     return ScaleEstimate(
-        metric_from_sfm=_by_method(options.method, solution, table) @ survey.first_camera_from_sfm,
-        frame=survey.frame,
+        metric_from_sfm=_by_method(options.method, solution, table) @ problem.first_camera_from_sfm,
+        frame=problem.frame,
         method=options.method,
         uncertainty=uncertainty,
         verdict=verdict,
@@ -102,45 +90,28 @@ def initialize_scale(
         advice=judged.advice,
         cutoff_test=tests,
         sensitivity=scale_sensitivity(
-            solution, _model_from_cam(observations, trajectory, survey), observations.log.anchor_ids
+            solution, _model_from_cam(observations, trajectory, problem), observations.log.anchor_ids
         ),
         per_anchor=per_anchor,
         two_candidate=table,
         anchors=found,
         observations=replace(observations, status=status),
-        range_stddev_m=stddev,
-        range_share=share,
-        correlation_inflation=solution.inflation,
+        errors=solution.errors.spread(problem.rows, len(observations.log)),
         noise_stddev_m=solution.noise_stddev_m,
-        resampled_scales=_resampled_scales(solution, blocks, options.num_bootstrap, seed),
+        resampled_scales=_resampled_scales(solution, options.num_bootstrap, seed),
     )
 
 
-def _resampled_scales(solution: Solution, blocks: npt.NDArray[np.int64], num: int, seed: int) -> Array:
-    steps = resampled_log_scales(solution.fit, blocks, num=num, seed=seed)
+def _resampled_scales(solution: Solution, num: int, seed: int) -> Array:
+    steps = resampled_log_scales(solution.fit, solution.errors.block, num=num, seed=seed)
     return np.asarray(solution.fit.state.metric_from_model.scale * np.exp(steps))
 
 
-def _model_from_cam(observations: RangeObservations, trajectory: Trajectory, survey: SurveyProblem) -> Array:
+def _model_from_cam(observations: RangeObservations, trajectory: Trajectory, problem: ScaleProblem) -> Array:
     """(k, 3, 3) rotation at the keyframe nearest to each range, into the first camera's frame."""
-    nearest = np.where(observations.weight < 0.5, observations.before, observations.after)[survey.rows]
-    turned: Array = survey.first_camera_from_sfm.rotation @ trajectory.world_from_cam[nearest]
+    nearest = np.where(observations.weight < 0.5, observations.before, observations.after)[problem.rows]
+    turned: Array = problem.first_camera_from_sfm.rotation @ trajectory.world_from_cam[nearest]
     return turned
-
-
-def _time_blocks(observations: RangeObservations, rows: npt.NDArray[np.int64], block_s: float) -> npt.NDArray[np.int64]:
-    """(k,) labels of stretches of time; photos, where ranges are tied to photos by name."""
-    times = observations.log.timestamp_s
-    if times is None:
-        return observations.before[rows]
-    return stretch_labels(times[rows], block_s)
-
-
-def _given_noise(observations: RangeObservations, rows: npt.NDArray[np.int64], range_model: RangeModelOptions) -> Array:
-    """(k,) stddev from the log, else from the options, else NaN: to be estimated."""
-    given = observations.log.range_stddev_m[rows]
-    default = np.nan if range_model.range_stddev_m is None else range_model.range_stddev_m
-    return np.where(np.isfinite(given), given, default)
 
 
 def _paper_table(solution: Solution) -> TwoCandidate | None:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rangesfm.gravity import Gravity
-from rangesfm.ranging.anchors import Anchor, AnchorEstimate
+from rangesfm.geometry.gravity import Gravity
+from rangesfm.ranging.anchors.anchor import Anchor, AnchorEstimate
 
 
 def levelled_places(gravity: Gravity, surveyed: Sequence[Anchor], found: Sequence[AnchorEstimate]) -> tuple[str, ...]:

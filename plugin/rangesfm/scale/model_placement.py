@@ -9,15 +9,16 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import Similarity, path_shape, rmse
-from rangesfm.ranging.anchors import AnchorEstimate
+from rangesfm.geometry.rotations import cross_matrices
+from rangesfm.geometry.similarity import Similarity, path_shape, rmse
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.errors.robust_loss import wider
 from rangesfm.scale.anchor_alignment import PlacedAnchor, align_by_anchors
 from rangesfm.scale.estimate import ScaleEstimate
-from rangesfm.scale.joint_models import JointFit, JointState, solve_together
-from rangesfm.scale.range_equation import RangeProblem
+from rangesfm.scale.range_equation import RangeFit, RangeProblem, RangeState, solve
 from rangesfm.scale.solution import MIN_COST_GAP
 from rangesfm.scale.starts import spread_subset
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 
@@ -62,16 +63,14 @@ class Placements:
     notes: tuple[str, ...]
 
 
-def place_models(models: Sequence[ScaledModel], common_bias_stddev_m: float) -> Placements:
+def place_models(models: Sequence[ScaledModel]) -> Placements:
     """Lay each model that the anchors hold into the world of the first, whichever models stand between.
 
     Every model has a scale and a place of its own, all have one set of anchors; where the anchors would let a model
-    lie in several ways, all ranges together decide, or it is left out.
-
-    Args:
-        common_bias_stddev_m: of the bias that all anchors share (mean 0), of which their priors say nothing.
+    lie in several ways, all ranges together decide, or it is left out. Each range weighs as it does where its model is
+    alone.
     """
-    world = _World(models, common_bias_stddev_m)
+    world = _World(models)
     reasons = [""] * len(models)
     waiting, num_before = list(range(1, len(models))), len(models)
     while len(waiting) < num_before:
@@ -99,8 +98,8 @@ class _World:
         notes: of anchors that stand elsewhere for another model.
     """
 
-    def __init__(self, models: Sequence[ScaledModel], common_bias_stddev_m: float):
-        self._models, self._common_bias_stddev_m = models, common_bias_stddev_m
+    def __init__(self, models: Sequence[ScaledModel]):
+        self._models = models
         self.metric_from_sfm = {0: models[0].estimate.metric_from_sfm}
         self.anchors = _placed_anchors(models[0])
         self.notes: list[str] = []
@@ -127,31 +126,31 @@ class _World:
             ]
             elsewhere_m = found[0].elsewhere_m
         fit = self._best(k, starts)
-        moved = fit.state.metric_from_model[-1] @ own.inverse()
+        moved = fit.state.similarities[-1] @ own.inverse()
         rigid = replace(moved, scale=1.0)
-        self.metric_from_sfm = dict(zip((*self.metric_from_sfm, k), fit.state.metric_from_model, strict=True))
+        self.metric_from_sfm = dict(zip((*self.metric_from_sfm, k), fit.state.similarities, strict=True))
         for id_, anchor in anchors.items():
             known = self.anchors.get(id_)
             if known is None or _rank(anchor) < _rank(known):
                 self.anchors[id_] = anchor.moved(rigid)
         self.notes += [f"anchor {id_} is {off:.2g} m elsewhere by another model" for id_, off in elsewhere_m.items()]
 
-    def _best(self, k: int, starts: Sequence[tuple[Similarity, Mapping[str, Array]]]) -> JointFit:
+    def _best(self, k: int, starts: Sequence[tuple[Similarity, Mapping[str, Array]]]) -> RangeFit:
         """The ranges of all models decide between the ways to lay one more; GeometryError if they cannot."""
         members = [*self.metric_from_sfm, k]
-        group = _Group([self._models[j] for j in members], self._common_bias_stddev_m, _MAX_RANGES_PER_ANCHOR)
+        group = _Group([self._models[j] for j in members], _MAX_RANGES_PER_ANCHOR)
         fits = sorted(
             (group.solve([*self.metric_from_sfm.values(), metric], at) for metric, at in starts),
             key=lambda fit: fit.cost,
         )
         path, best = self._models[k].trajectory.centers, fits[0]
-        extent = float(np.linalg.norm(best.state.metric_from_model[-1].scale * path_shape(path).stddevs))
+        placed = best.state.similarities[-1]
+        extent = float(np.linalg.norm(placed.scale * path_shape(path).stddevs))
         for rival in fits[1:]:
-            apart = best.state.metric_from_model[-1].apply(path) - rival.state.metric_from_model[-1].apply(path)
-            gap = (rival.cost - best.cost) / group.inflation**2
-            if rmse(apart) > _SAME_SHARE * extent and gap < MIN_COST_GAP:
+            apart = placed.apply(path) - rival.state.similarities[-1].apply(path)
+            if rmse(apart) > _SAME_SHARE * extent and rival.cost - best.cost < MIN_COST_GAP:
                 raise GeometryError(f"it can be laid in two ways, {rmse(apart):.2g} m apart, that fit all ranges alike")
-        stddev = group.inflation * best.path_stddev_m(len(members) - 1, path)
+        stddev = _path_stddev_m(best, path)
         if stddev > _MAX_OPEN * extent:
             raise GeometryError(
                 f"the anchors place it only to {stddev:.2g} m, of an extent of {extent:.2g} m: those it shares are too "
@@ -163,34 +162,45 @@ class _World:
         """metric_from_sfm of all placed models, by all their ranges."""
         if len(self.metric_from_sfm) == 1:
             return self.metric_from_sfm
-        group = _Group([self._models[k] for k in self.metric_from_sfm], self._common_bias_stddev_m, None)
+        group = _Group([self._models[k] for k in self.metric_from_sfm], None)
         fit = group.solve(list(self.metric_from_sfm.values()), _chosen(self.anchors))
-        return dict(zip(self.metric_from_sfm, fit.state.metric_from_model, strict=True))
+        return dict(zip(self.metric_from_sfm, fit.state.similarities, strict=True))
 
 
 class _Group:
-    """The joint problem of some models, the first of which holds them all, unless given anchors do.
+    """The joint problem of some models, the first of which holds them all, unless given anchors do."""
 
-    Attributes:
-        inflation: of formal stddevs, by the errors' correlation.
-    """
-
-    def __init__(self, models: Sequence[ScaledModel], common_bias_stddev_m: float, num_per_anchor: int | None):
-        self.inflation = max(model.estimate.correlation_inflation for model in models)
+    def __init__(self, models: Sequence[ScaledModel], num_per_anchor: int | None):
         self._anchors = _common_anchors(models)
-        parts = [_problem(model, self._anchors, common_bias_stddev_m) for model in models]
+        self._loss = models[0].estimate.errors.loss
+        parts = [_problem(model, self._anchors) for model in models]
         if num_per_anchor is not None:
             parts = [spread_subset(part, num_per_anchor) for part in parts]
         frames_are_given = models[0].is_in_anchor_frame
         held = [model.frame_is_given if frames_are_given else k == 0 for k, model in enumerate(models)]
         self._parts = [replace(part, frame_is_free=not stays) for part, stays in zip(parts, held, strict=True)]
 
-    def solve(self, metric_from_sfm: Sequence[Similarity], anchors_m: Mapping[str, Array]) -> JointFit:
+    def solve(self, metric_from_sfm: Sequence[Similarity], anchors_m: Mapping[str, Array]) -> RangeFit:
         """From a start; anchors without a place in it take no part."""
         start_m = np.array([anchors_m.get(a.anchor_id, np.full(3, np.nan)) for a in self._anchors]).reshape(-1, 3)
         has_place = np.isfinite(start_m).all(axis=1)
-        parts = [part.subset(np.flatnonzero(has_place[part.anchor_index])) for part in self._parts]
-        return solve_together(parts, JointState(tuple(metric_from_sfm), start_m, parts[0].bias_mean_m))
+        first, *others = (part.subset(np.flatnonzero(has_place[part.anchor_index])) for part in self._parts)
+        state = RangeState(metric_from_sfm[0], start_m, first.bias_mean_m, tuple(metric_from_sfm[1:]))
+        # As for a model alone: the wide loss leads there from further off, the bounded one decides.
+        for loss in (wider(self._loss), self._loss):
+            fit = solve(first, state, others=others, loss=loss)
+            state = fit.state
+        return fit
+
+
+def _path_stddev_m(fit: RangeFit, centers: Array) -> float:
+    """Formal, root mean square, of the places (n, 3; in the model's unit) of the last model, whose frame is free."""
+    similarity, first = fit.state.similarities[-1], fit.columns[-1].scale
+    grown = similarity.scale * centers @ similarity.rotation.T
+    identity = np.broadcast_to(np.eye(3), (len(centers), 3, 3))
+    jacobian = np.concatenate([grown[:, :, None], -cross_matrices(grown), identity], axis=2)
+    covariance = fit.covariance[first : first + 7, first : first + 7]
+    return float(np.sqrt(np.mean(np.einsum("nij,jk,nik->n", jacobian, covariance, jacobian))))
 
 
 def _common_anchors(models: Sequence[ScaledModel]) -> list[AnchorEstimate]:
@@ -211,23 +221,27 @@ def _common_anchors(models: Sequence[ScaledModel]) -> list[AnchorEstimate]:
     return anchors
 
 
-def _problem(model: ScaledModel, anchors: Sequence[AnchorEstimate], common_bias_stddev_m: float) -> RangeProblem:
-    """The ranges that its own estimate used, in the model's unit."""
-    estimate = model.estimate
-    observations, log = estimate.observations, estimate.observations.log
-    rows = np.flatnonzero(observations.has_place & np.isfinite(estimate.range_stddev_m))
-    no_place = np.full(3, np.nan)
+def _problem(model: ScaledModel, anchors: Sequence[AnchorEstimate]) -> RangeProblem:
+    """The ranges that its own estimate used, in the model's unit, weighed as there.
+
+    Models' errors hang together by different amounts, and the priors are common to all: so it is the ranges that weigh
+    less here, where in a model alone the priors gain.
+    """
+    observations, log = model.estimate.observations, model.estimate.observations.log
+    rows = np.flatnonzero(observations.has_place & np.isfinite(model.estimate.errors.stddev_m))
+    errors, no_place = model.estimate.errors.subset(rows), np.full(3, np.nan)
     return RangeProblem(
         centers=observations.centers[rows],
         tag_from_center=observations.tag_from_center[rows],
         anchor_index=log.anchor_index[rows],
         range_m=log.range_m[rows],
-        stddev_m=estimate.range_stddev_m[rows],
+        stddev_m=errors.stddev_m,
+        share=errors.weight,
         anchor_mean_m=np.array([no_place if a.prior_position_m is None else a.prior_position_m for a in anchors]),
         anchor_stddev_m=np.array([anchor.prior_position_stddev_m for anchor in anchors]),
         bias_mean_m=np.array([anchor.prior_bias_m for anchor in anchors]),
-        bias_stddev_m=np.array([anchor.prior_bias_stddev_m for anchor in anchors]) / estimate.correlation_inflation,
-        common_bias_stddev_m=common_bias_stddev_m / estimate.correlation_inflation,
+        bias_stddev_m=np.array([anchor.prior_bias_stddev_m for anchor in anchors]),
+        common_bias_stddev_m=errors.common_bias_stddev_m,
         frame_is_free=True,
     )
 

@@ -12,15 +12,16 @@ from rangesfm.distances.by_radio import distances_by_radio
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.distances.surveyed import surveyed_distances
 from rangesfm.errors import GeometryError, InputError
-from rangesfm.geometry import Similarity, path_shape, rounding_of
-from rangesfm.gravity import Gravity
+from rangesfm.geometry.gravity import Gravity
+from rangesfm.geometry.similarity import Similarity, path_shape, rounding_of
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import RangeModelOptions
-from rangesfm.ranging.anchors import Anchor
-from rangesfm.ranging.noise import START_STDDEV_M, shared_stddev
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.errors.noise import START_STDDEV_M
+from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.anchor_plane import is_line, is_steep
 from rangesfm.scale.range_equation import RangeProblem
-from rangesfm.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 
@@ -31,11 +32,13 @@ _MIN_RANGES_OF_UNKNOWN = 5
 
 
 @dataclass(frozen=True)
-class SurveyProblem:
+class ScaleProblem:
     """A RangeProblem and how it hangs on the survey.
 
     Attributes:
         ranges: the problem; its model world is the first camera's frame, unscaled.
+        errors: of its ranges, before anything is estimated.
+        center_stddev: (k,) of their interpolated centres, each coordinate, model units.
         rows: (k,) which observations its ranges are.
         first_camera_from_sfm: rigid motion from the world of the unscaled model.
         frame: "site" or "first_camera": the metric world of the solution.
@@ -45,6 +48,8 @@ class SurveyProblem:
     """
 
     ranges: RangeProblem
+    errors: RangeErrors
+    center_stddev: Array
     rows: npt.NDArray[np.int64]
     first_camera_from_sfm: Similarity
     frame: str
@@ -53,18 +58,20 @@ class SurveyProblem:
     left_out: tuple[str, ...]
 
 
-def survey_problem(
+def scale_problem(
     observations: RangeObservations,
     trajectory: Trajectory,
     anchors: Sequence[Anchor],
     anchor_frame: str,
     range_model: RangeModelOptions,
+    block_s: float,
     distances: LocatedDistances | None = None,
     gravity: Gravity | None = None,
-) -> SurveyProblem:
+) -> ScaleProblem:
     """Set up the estimation.
 
     Args:
+        block_s: length of the stretches of time in which errors may go together.
         distances: taped ones, with the anchors of the log in its order; those between anchors that the log holds
             are added.
         gravity: as somebody told it.
@@ -85,13 +92,13 @@ def survey_problem(
     left_out = tuple(a.anchor_id for a, k in zip(in_log, heard | placed, strict=True) if not k)
     first_camera_from_sfm = _first_camera_from_sfm(trajectory)
     noise = range_model.range_stddev_m or START_STDDEV_M
-    stddev = np.where(np.isfinite(log.range_stddev_m), log.range_stddev_m, noise)
+    errors = RangeErrors.begin(observations, rows, range_model, block_s)
     ranges = RangeProblem(
         centers=_centers_in_first_camera(observations.centers[rows], trajectory),
         tag_from_center=observations.tag_from_center[rows] @ first_camera_from_sfm.rotation.T,
         anchor_index=log.anchor_index[rows],
         range_m=log.range_m[rows],
-        stddev_m=np.hypot(stddev, shared_stddev(log))[rows],
+        stddev_m=errors.stddev_m,
         anchor_mean_m=np.array(
             [_position(a) if k else np.full(3, np.nan) for a, k in zip(in_log, placed, strict=True)]
         ),
@@ -104,7 +111,17 @@ def survey_problem(
         gravity=gravity if anchor_frame == "site" and bool(known.any()) else None,
     )
     frame = "site" if ranges.frame_is_free else "first_camera"
-    return SurveyProblem(ranges, rows, first_camera_from_sfm, frame, bool(known.any()), tuple(notes), left_out)
+    return ScaleProblem(
+        ranges,
+        errors,
+        observations.center_stddev[rows],
+        rows,
+        first_camera_from_sfm,
+        frame,
+        bool(known.any()),
+        tuple(notes),
+        left_out,
+    )
 
 
 def _all_distances(

@@ -5,11 +5,13 @@
 c: camera centre in the model's unit; r: lever arm turned into the model's world, metres;
 R, t, scale: metric world from model world; a: anchor; b: range bias of the anchor.
 This is the model of Lee, Zhu, Giorgi and Günther (2018) with a bias and an anchor that may
-be unknown; the lever arm is metric and so never scaled.
+be unknown; the lever arm is metric and so never scaled. Several models, each with a metric world from model world of
+its own, may have one set of anchors and biases.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,15 +20,15 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from rangesfm.distances.ends import LocatedDistances
-from rangesfm.geometry import Similarity
-from rangesfm.gravity import Gravity
-from rangesfm.ranging.noise import bias_whitening
-from rangesfm.ranging.robust_loss import CAUCHY, RobustLoss
+from rangesfm.geometry.gravity import Gravity
+from rangesfm.geometry.rotations import left_jacobian
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.ranging.errors.noise import bias_whitening
+from rangesfm.ranging.errors.robust_loss import CAUCHY, RobustLoss
+from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.scale.distance_equation import distance_jacobian, distance_residuals
 
 Array = npt.NDArray[np.float64]
-
-_TINY_DISTANCE_M = 1e-9
 
 
 @dataclass(frozen=True)
@@ -85,19 +87,44 @@ class RangeProblem:
             share=None if self.share is None else self.share[rows],
         )
 
+    def of_anchor(self, k: int) -> RangeProblem:
+        """The ranges to one anchor alone, in a frame that stays."""
+        part, one = self.subset(np.flatnonzero(self.anchor_index == k)), slice(k, k + 1)
+        return replace(
+            part,
+            anchor_index=np.zeros(len(part.range_m), dtype=np.int64),
+            anchor_mean_m=self.anchor_mean_m[one],
+            anchor_stddev_m=self.anchor_stddev_m[one],
+            bias_mean_m=self.bias_mean_m[one],
+            bias_stddev_m=self.bias_stddev_m[one],
+            frame_is_free=False,
+            distances=None,
+        )
+
 
 @dataclass(frozen=True)
 class RangeState:
-    """Values of all unknowns of a RangeProblem."""
+    """Values of all unknowns of a RangeProblem; with ``others``, the similarities of further models, of several."""
 
     metric_from_model: Similarity
     anchors_m: Array
     bias_m: Array
+    others: tuple[Similarity, ...] = ()
+
+    @property
+    def similarities(self) -> tuple[Similarity, ...]:
+        """metric_from_model of each."""
+        return self.metric_from_model, *self.others
+
+    @property
+    def of_models(self) -> tuple[RangeState, ...]:
+        """As each model has it."""
+        return tuple(RangeState(each, self.anchors_m, self.bias_m) for each in self.similarities)
 
 
 @dataclass(frozen=True)
 class RangeFit:
-    """A solution.
+    """A solution; of several models, the n ranges are those of each in turn.
 
     Attributes:
         state: the estimate.
@@ -106,12 +133,12 @@ class RangeFit:
         pulls: (n,) the same times the ranges' shares.
         curvatures: (n,) its second derivative times the shares; negative for outliers.
         cost: half the robust sum of squares, priors included.
-        information: (p, p) Gauss-Newton approximation with the robust weights, in ``free``'s parameters.
+        information: (p, p) Gauss-Newton approximation with the robust weights, in the parameters of ``columns``.
         gradients: (n, p) of each range's weighted residual, for resampling.
         prior_information: (p, p) the part of ``information`` that comes from priors.
         scaled_residuals: (n,) residuals in stddevs.
         prior_gradient: (p,) of the priors at the estimate.
-        columns: which of the p parameters is what; the first is the logarithm of the scale.
+        columns: which of the p parameters is what, for each model; the very first is the logarithm of the scale.
     """
 
     state: RangeState
@@ -125,7 +152,7 @@ class RangeFit:
     scaled_residuals: Array
     prior_information: Array
     prior_gradient: Array
-    columns: Columns
+    columns: tuple[Columns, ...]
 
     @property
     def log_scale_stddev(self) -> float:
@@ -139,9 +166,9 @@ class RangeFit:
 
     def anchor_covariance_m2(self) -> Array:
         """(m, 3, 3) formal covariance of each anchor; 0 of one that is not estimated."""
-        covariance, columns = self.covariance, self.columns
+        covariance = self.covariance
         of_anchors = np.zeros((len(self.state.anchors_m), 3, 3))
-        for k, column in enumerate(columns.anchor):
+        for k, column in enumerate(self.columns[0].anchor):
             if column >= 0:
                 of_anchors[k] = covariance[column : column + 3, column : column + 3]
         return of_anchors
@@ -149,29 +176,31 @@ class RangeFit:
 
 @dataclass(frozen=True)
 class Columns:
-    """Where each unknown stands in the parameter vector; -1: not estimated.
+    """Where each unknown of a model stands in the parameter vector; -1: not estimated.
 
-    First the logarithm of the scale, then the frame (6), the anchors (3 each), the biases.
+    First, of each model in turn, the logarithm of the scale and the frame (6); then the anchors (3 each), the biases.
     """
 
+    scale: int
     frame: int
     anchor: npt.NDArray[np.int64]
     bias: npt.NDArray[np.int64]
     num: int
 
 
-def columns_of(problem: RangeProblem) -> Columns:
-    """Of all that a problem leaves open."""
-    next_column = 1 + (6 if problem.frame_is_free else 0)
-    anchor = np.full(problem.num_anchors, -1, dtype=np.int64)
-    bias = np.full(problem.num_anchors, -1, dtype=np.int64)
-    for k in range(problem.num_anchors):
-        if problem.anchor_stddev_m[k] > 0:
-            anchor[k], next_column = next_column, next_column + 3
-    for k in range(problem.num_anchors):
-        if problem.bias_stddev_m[k] > 0:
-            bias[k], next_column = next_column, next_column + 1
-    return Columns(1 if problem.frame_is_free else -1, anchor, bias, next_column)
+def columns_of(parts: Sequence[RangeProblem]) -> tuple[Columns, ...]:
+    """Of all that one problem, or those of several models, leave open."""
+    of_own, next_column = [], 0
+    for part in parts:
+        of_own.append((next_column, next_column + 1 if part.frame_is_free else -1))
+        next_column += 7 if part.frame_is_free else 1
+    anchor = np.full(parts[0].num_anchors, -1, dtype=np.int64)
+    bias = anchor.copy()
+    for k in np.flatnonzero(parts[0].anchor_stddev_m > 0):
+        anchor[k], next_column = next_column, next_column + 3
+    for k in np.flatnonzero(parts[0].bias_stddev_m > 0):
+        bias[k], next_column = next_column, next_column + 1
+    return tuple(Columns(scale, frame, anchor, bias, next_column) for scale, frame in of_own)
 
 
 def tag_positions(problem: RangeProblem, metric_from_model: Similarity) -> Array:
@@ -180,11 +209,10 @@ def tag_positions(problem: RangeProblem, metric_from_model: Similarity) -> Array
     return metric_from_model.apply(problem.centers) + turned
 
 
-def directions_to_tag(problem: RangeProblem, state: RangeState) -> Array:
-    """(n, 3) unit vectors from anchor to tag in the metric world; zero where one lies on the other."""
-    from_anchor = tag_positions(problem, state.metric_from_model) - state.anchors_m[problem.anchor_index]
-    directions: Array = from_anchor / np.maximum(np.linalg.norm(from_anchor, axis=1), _TINY_DISTANCE_M)[:, None]
-    return directions
+def range_gradient(problem: RangeProblem, state: RangeState) -> RangeGradient:
+    """Of the n distances."""
+    tags = tag_positions(problem, state.metric_from_model)
+    return RangeGradient.of(tags - state.anchors_m[problem.anchor_index])
 
 
 def predicted_ranges(problem: RangeProblem, state: RangeState) -> Array:
@@ -198,6 +226,7 @@ def solve(
     problem: RangeProblem,
     start: RangeState,
     *,
+    others: Sequence[RangeProblem] = (),
     loss: RobustLoss = CAUCHY,
     tolerance: float = 1e-12,
     max_num_evaluations: int = 100,
@@ -205,34 +234,18 @@ def solve(
     """Robust least squares from a start, by scipy's trust region solver with an analytic Jacobian.
 
     Args:
+        others: of further models, each in its own unit, with its own say whether its frame is free. Anchors, biases and
+            what is known of anything beforehand are those of the first, and the same for all.
+        start: anchors that have no place have no ranges.
         loss: of the ranges.
         tolerance: relative change of cost and of parameters at which it stops.
     """
-    columns = columns_of(problem)
-    num_ranges = len(problem.range_m)
-
-    def rho_with_derivatives(z: Array) -> Array:
-        # Priors are believed as they are; only ranges have outliers.
-        rho = np.stack([z, np.ones_like(z), np.zeros_like(z)])
-        rho[:, :num_ranges] = problem.share_or_1 * loss.rho(z[:num_ranges])
-        return rho
-
-    def residuals(x: Array) -> Array:
-        state = state_after(problem, columns, start, x)
-        ranges = (predicted_ranges(problem, state) - problem.range_m) / problem.stddev_m
-        return np.concatenate([ranges, prior_residuals(problem, columns, state)])
-
-    def jacobian(x: Array) -> Array:
-        state = state_after(problem, columns, start, x)
-        return np.concatenate(
-            [range_jacobian(problem, columns, start, state), prior_jacobian(problem, columns, start, state)]
-        )
-
+    system = _System((problem, *others), columns_of((problem, *others)), start, loss)
     result = least_squares(
-        residuals,
-        np.zeros(columns.num),
-        jac=jacobian,
-        loss=rho_with_derivatives,
+        lambda x: np.concatenate(system.residuals(system.state_after(x))),
+        np.zeros(system.columns[0].num),
+        jac=lambda x: np.concatenate(system.jacobian(system.state_after(x))),
+        loss=system.rho_with_derivatives,
         x_scale="jac",
         method="trf",
         ftol=tolerance,
@@ -240,92 +253,109 @@ def solve(
         gtol=None,
         max_nfev=max_num_evaluations,
     )
-    return _fit(problem, columns, start, state_after(problem, columns, start, result.x), float(result.cost), loss)
+    return system.fit(system.state_after(result.x), float(result.cost))
 
 
-def _fit(
-    problem: RangeProblem, columns: Columns, start: RangeState, state: RangeState, cost: float, loss: RobustLoss
-) -> RangeFit:
-    residuals_m = predicted_ranges(problem, state) - problem.range_m
-    scaled = residuals_m / problem.stddev_m
-    weights = loss.weights(scaled)
-    pulls = problem.share_or_1 * weights
-    jacobian = range_jacobian(problem, columns, start, state)
-    of_priors = prior_jacobian(problem, columns, start, state)
-    prior_information = of_priors.T @ of_priors
-    return RangeFit(
-        state=state,
-        residuals_m=residuals_m,
-        weights=weights,
-        pulls=pulls,
-        curvatures=problem.share_or_1 * loss.curvatures(scaled),
-        cost=cost,
-        information=(jacobian * pulls[:, None]).T @ jacobian + prior_information,
-        gradients=jacobian * pulls[:, None],
-        scaled_residuals=scaled,
-        prior_information=prior_information,
-        prior_gradient=of_priors.T @ prior_residuals(problem, columns, state),
-        columns=columns,
-    )
+@dataclass(frozen=True)
+class _System:
+    """Residuals and derivatives of one problem or several, as functions of a state."""
+
+    parts: tuple[RangeProblem, ...]
+    columns: tuple[Columns, ...]
+    start: RangeState
+    loss: RobustLoss
+
+    def state_after(self, x: Array) -> RangeState:
+        return state_after(self.columns, self.start, x)
+
+    @property
+    def share(self) -> Array:
+        return np.concatenate([part.share_or_1 for part in self.parts])
+
+    def rho_with_derivatives(self, z: Array) -> Array:
+        # Priors are believed as they are; only ranges have outliers.
+        rho = np.stack([z, np.ones_like(z), np.zeros_like(z)])
+        share = self.share
+        rho[:, : len(share)] = share * self.loss.rho(z[: len(share)])
+        return rho
+
+    def residuals(self, state: RangeState) -> tuple[Array, Array]:
+        """Of ranges and of priors, in stddevs."""
+        of_parts = zip(self.parts, state.of_models, strict=True)
+        ranges = [(predicted_ranges(part, own) - part.range_m) / part.stddev_m for part, own in of_parts]
+        return np.concatenate(ranges), prior_residuals(self.parts[0], self.columns[0], state)
+
+    def jacobian(self, state: RangeState) -> tuple[Array, Array]:
+        """Likewise."""
+        of_parts = zip(self.parts, self.columns, self.start.of_models, state.of_models, strict=True)
+        priors = prior_jacobian(self.parts[0], self.columns[0], self.start, state)
+        return np.concatenate([range_jacobian(*each) for each in of_parts]), priors
+
+    def fit(self, state: RangeState, cost: float) -> RangeFit:
+        (scaled, off_priors), (jacobian, of_priors) = self.residuals(state), self.jacobian(state)
+        weights, share = self.loss.weights(scaled), self.share
+        pulls, prior_information = share * weights, of_priors.T @ of_priors
+        return RangeFit(
+            state=state,
+            residuals_m=scaled * np.concatenate([part.stddev_m for part in self.parts]),
+            weights=weights,
+            pulls=pulls,
+            curvatures=share * self.loss.curvatures(scaled),
+            cost=cost,
+            information=(jacobian * pulls[:, None]).T @ jacobian + prior_information,
+            gradients=jacobian * pulls[:, None],
+            scaled_residuals=scaled,
+            prior_information=prior_information,
+            prior_gradient=of_priors.T @ off_priors,
+            columns=self.columns,
+        )
 
 
-def state_after(problem: RangeProblem, columns: Columns, start: RangeState, x: Array) -> RangeState:
+def state_after(columns: Sequence[Columns], start: RangeState, x: Array) -> RangeState:
     """The start moved by a parameter vector (p,)."""
-    similarity = start.metric_from_model
-    scale = similarity.scale * float(np.exp(np.clip(x[0], -20, 20)))
-    rotation, translation = similarity.rotation, similarity.translation
-    if columns.frame >= 0:
-        rotation = Rotation.from_rotvec(x[1:4]).as_matrix() @ rotation
-        translation = translation + x[4:7]
     anchors, bias = start.anchors_m.copy(), start.bias_m.copy()
-    for k in range(problem.num_anchors):
-        if columns.anchor[k] >= 0:
-            anchors[k] += x[columns.anchor[k] : columns.anchor[k] + 3]
-        if columns.bias[k] >= 0:
-            bias[k] += x[columns.bias[k]]
-    return RangeState(Similarity(scale, rotation, translation), anchors, bias)
+    first, *others = (
+        _moved(own.metric_from_model, each, x) for each, own in zip(columns, start.of_models, strict=True)
+    )
+    for k, (anchor, own_bias) in enumerate(zip(columns[0].anchor, columns[0].bias, strict=True)):
+        if anchor >= 0:
+            anchors[k] += x[anchor : anchor + 3]
+        if own_bias >= 0:
+            bias[k] += x[own_bias]
+    return RangeState(first, anchors, bias, tuple(others))
+
+
+def _moved(similarity: Similarity, columns: Columns, x: Array) -> Similarity:
+    scale = similarity.scale * float(np.exp(np.clip(x[columns.scale], -20, 20)))
+    if columns.frame < 0:
+        return replace(similarity, scale=scale)
+    turn, shift = x[columns.frame : columns.frame + 6].reshape(2, 3)
+    rotation = Rotation.from_rotvec(turn).as_matrix() @ similarity.rotation
+    return Similarity(scale, rotation, similarity.translation + shift)
 
 
 def range_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, state: RangeState) -> Array:
-    """(n, p) of the ranges' residuals in stddevs."""
+    """(n, p) of the residuals, in stddevs, of one model's ranges."""
     similarity, index = state.metric_from_model, problem.anchor_index
-    turned_centers = problem.centers @ similarity.rotation.T
-    turned_levers = problem.tag_from_center @ similarity.rotation.T
-    from_anchor = similarity.scale * turned_centers + similarity.translation + turned_levers - state.anchors_m[index]
-    distance = np.linalg.norm(from_anchor, axis=1)
-    # On the anchor the distance has no derivative; zero keeps the step finite.
-    direction = from_anchor / np.maximum(distance, _TINY_DISTANCE_M)[:, None]
-    direction /= problem.stddev_m[:, None]
-
-    jacobian = np.zeros((len(distance), columns.num))
-    jacobian[:, 0] = np.sum(direction * similarity.scale * turned_centers, axis=1)
+    grown = similarity.scale * problem.centers @ similarity.rotation.T
+    by = range_gradient(problem, state)
+    jacobian = np.zeros((len(index), columns.num))
+    jacobian[:, columns.scale] = by.by_log_scale(grown)
     if columns.frame >= 0:
-        arm = similarity.scale * turned_centers + turned_levers
-        # The rotation vector is applied before the start's rotation; its derivative away
-        # from zero is taken at the current rotation, through the left Jacobian.
-        left = _left_jacobian(Rotation.from_matrix(similarity.rotation @ start.metric_from_model.rotation.T))
-        jacobian[:, 1:4] = np.cross(arm, direction) @ left
-        jacobian[:, 4:7] = direction
-    for k in range(problem.num_anchors):
-        rows = index == k
-        if columns.anchor[k] >= 0:
-            jacobian[rows, columns.anchor[k] : columns.anchor[k] + 3] = -direction[rows]
-        if columns.bias[k] >= 0:
-            jacobian[rows, columns.bias[k]] = 1 / problem.stddev_m[rows]
+        arms = grown + problem.tag_from_center @ similarity.rotation.T
+        turn = by.by_turn_of_world(arms) @ _left_of_step(start, state)
+        jacobian[:, columns.frame : columns.frame + 6] = np.hstack([turn, by.by_tag])
+    rows = np.flatnonzero(columns.anchor[index] >= 0)
+    jacobian[rows[:, None], columns.anchor[index[rows], None] + np.arange(3)] = by.by_anchor[rows]
+    rows = np.flatnonzero(columns.bias[index] >= 0)
+    jacobian[rows, columns.bias[index[rows]]] = 1.0
+    jacobian /= problem.stddev_m[:, None]
     return jacobian
 
 
-def _left_jacobian(rotation: Rotation) -> Array:
-    """d Exp(w) = [J dw]x Exp(w). Solà et al., "A micro Lie theory for state estimation in robotics", eq. 145."""
-    vector = rotation.as_rotvec()
-    angle = float(np.linalg.norm(vector))
-    cross = np.array([[0, -vector[2], vector[1]], [vector[2], 0, -vector[0]], [-vector[1], vector[0], 0]])
-    if angle < 1e-4:
-        series: Array = np.eye(3) + cross / 2 + cross @ cross / 6
-        return series
-    first, second = (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
-    closed: Array = np.eye(3) + first * cross + second * cross @ cross
-    return closed
+def _left_of_step(start: RangeState, state: RangeState) -> Array:
+    """The rotation vector acts before the start's rotation: its derivative away from zero is at the current one."""
+    return left_jacobian(Rotation.from_matrix(state.metric_from_model.rotation @ start.metric_from_model.rotation.T))
 
 
 def _prior_rows(problem: RangeProblem, columns: Columns) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
@@ -349,7 +379,7 @@ def prior_residuals(problem: RangeProblem, columns: Columns, state: RangeState) 
 
 def prior_cost(problem: RangeProblem, state: RangeState) -> float:
     """Half the sum of squares of what priors, distances and gravity have against a state."""
-    off = prior_residuals(problem, columns_of(problem), state)
+    off = prior_residuals(problem, columns_of([problem])[0], state)
     return 0.5 * float(off @ off)
 
 
@@ -368,8 +398,8 @@ def prior_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, s
         )
     if problem.gravity is not None and columns.frame >= 0:
         block = np.zeros((3, columns.num))
-        left = _left_jacobian(Rotation.from_matrix(similarity.rotation @ start.metric_from_model.rotation.T))
-        block[:, 1:4] = problem.gravity.jacobian(similarity.rotation, left)
+        turn = problem.gravity.jacobian(similarity.rotation, _left_of_step(start, state))
+        block[:, columns.frame : columns.frame + 3] = turn
         blocks.append(block)
     return np.concatenate(blocks)
 

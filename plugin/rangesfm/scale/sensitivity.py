@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.scale.estimate import ScaleSensitivity
-from rangesfm.scale.range_equation import directions_to_tag, predicted_ranges
+from rangesfm.scale.range_equation import predicted_ranges, range_gradient
 from rangesfm.scale.solution import Solution
 from rangesfm.scale.uncertainty import scale_influence
 
@@ -31,8 +31,8 @@ def scale_sensitivity(solution: Solution, model_from_cam: Array, anchor_ids: tup
         return 100 * float(influence @ range_error_m)
 
     distance = predicted_ranges(problem, state)
-    in_model = directions_to_tag(problem, state) @ state.metric_from_model.rotation
-    along_axes = np.einsum("ni,nij->nj", in_model, model_from_cam)
+    world_from_cam = state.metric_from_model.rotation @ model_from_cam
+    along_x, along_y, along_z = range_gradient(problem, state).by_tag_in_cam(world_from_cam).T
     return ScaleSensitivity(
         common_bias_per_cm=percent(np.full(len(distance), _CM)),
         short_range_per_cm=percent(np.where(distance < _SHORTER * np.median(distance), _CM, 0.0)),
@@ -40,10 +40,6 @@ def scale_sensitivity(solution: Solution, model_from_cam: Array, anchor_ids: tup
             anchor_id: percent(np.where(problem.anchor_index == k, _CM, 0.0)) for k, anchor_id in enumerate(anchor_ids)
         },
         range_slope_per_percent=percent(0.01 * distance),
-        lever_arm_per_cm=(
-            # A tag further out lengthens the ranges; taken for nearer, they stretch the map.
-            percent(_CM * along_axes[:, 0]),
-            percent(_CM * along_axes[:, 1]),
-            percent(_CM * along_axes[:, 2]),
-        ),
+        # A tag further out lengthens the ranges; taken for nearer, they stretch the map.
+        lever_arm_per_cm=(percent(_CM * along_x), percent(_CM * along_y), percent(_CM * along_z)),
     )

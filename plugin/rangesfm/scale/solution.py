@@ -10,12 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import NEARLY_STRAIGHT, path_kind, path_shape
-from rangesfm.ranging.inlier_noise import InlierNoise, inlier_noise
-from rangesfm.ranging.noise import correlation_inflation
-from rangesfm.ranging.place import place_labels, shares_by_residuals
-from rangesfm.ranging.robust_loss import GEMAN_MCCLURE
+from rangesfm.geometry.similarity import NEARLY_STRAIGHT, path_kind, path_shape
+from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors
 from rangesfm.scale.anchor_plane import camera_side_of, mirrored_map, on_side
+from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import (
     RangeFit,
     RangeProblem,
@@ -39,7 +37,6 @@ Array = npt.NDArray[np.float64]
 _SUBSET_PER_ANCHOR = 300
 _NUM_NOISE_ROUNDS = 3
 _NUM_ALTERNATIVES = 4
-_MIN_ORDINARY = 0.3
 _SAME_LOG_SCALE = 0.03
 _SAME_ROTATION_DEG = 5.0
 # Of the path's middle, in extents of the path.
@@ -70,83 +67,42 @@ class Solution:
     Attributes:
         problem: with the final stddevs; the bias priors weigh as against independent errors.
         fit: the estimate.
-        inflation: of every formal stddev, by the errors' correlation.
-        noise_stddev_m: of a range without special cases.
+        errors: of the problem's ranges; every formal stddev is to be inflated.
+        noise_stddev_m: of a range without special cases, as the fit shows it.
     """
 
     problem: RangeProblem
     fit: RangeFit
-    inflation: float
+    errors: RangeErrors
     noise_stddev_m: float
 
 
-def solve_survey(
-    problem: RangeProblem,
-    *,
-    anchors_are_known: bool,
-    center_stddev: Array,
-    noise_stddev_m: Array,
-    shared_stddev_m: Array,
-    groups: npt.NDArray[np.int64],
-    camera_side: str | None,
-    seed: int,
-) -> Solution:
+def solve_scale(posed: ScaleProblem, *, camera_side: str | None, seed: int) -> Solution:
     """Solve from all starts, estimate the noise, and refuse where two answers fit alike.
 
     Args:
-        problem: as set up.
-        anchors_are_known: whether starts may lean on given positions.
-        center_stddev: (n,) of interpolated centres, model units.
-        noise_stddev_m: (n,) NaN where it is to be estimated.
-        shared_stddev_m: (n,) what ranges of about this length may be off together.
-        groups: (n,) labels of stretches of one anchor's ranges whose errors go together.
         camera_side: as of the scale options.
 
     Raises:
         GeometryError: nothing fits, or two different maps do.
     """
-    errors = _ErrorModel(center_stddev, noise_stddev_m, shared_stddev_m, groups)
+    problem, errors = posed.ranges, posed.errors
     camera_side = camera_side if problem.frame_is_free else None
-    fits = on_side(problem, _distinct_fits(problem, anchors_are_known, seed), camera_side)
+    fits = on_side(problem, _distinct_fits(problem, posed.anchors_are_known, seed), camera_side)
     starts = [fit.state for fit in fits]
-    if anchors_are_known and not problem.frame_is_free:
+    if posed.anchors_are_known and not problem.frame_is_free:
         starts += _consensus_states(problem)
-    solutions = [_with_own_noise(problem, errors, start) for start in _likeliest_each_once(problem, errors, starts)]
-    solutions.sort(key=lambda solution: _view(problem, errors, solution.fit.state).unlikeliness)
+    solutions = [_with_own_errors(posed, start) for start in _likeliest_each_once(problem, errors, starts)]
+    solutions.sort(key=lambda solution: _unlikeliness(problem, errors, solution.fit.state))
     on_side(problem, [solutions[0].fit], camera_side)
     _refuse_ambiguity(solutions[0], [solution.fit.state for solution in solutions[1:]], camera_side)
     return solutions[0]
 
 
-@dataclass(frozen=True)
-class _ErrorModel:
-    """What is known of the ranges' errors; the arrays are those of ``solve_survey``."""
-
-    center_stddev: Array
-    noise_stddev_m: Array
-    shared_stddev_m: Array
-    groups: npt.NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class _View:
-    """A state as its residuals show it.
-
-    Attributes:
-        noise: of the ranges without special cases.
-        unlikeliness: negative logarithm of the posterior, up to a constant.
-    """
-
-    noise: InlierNoise
-    unlikeliness: float
-
-
-def _view(problem: RangeProblem, errors: _ErrorModel, state: RangeState) -> _View:
+def _unlikeliness(problem: RangeProblem, errors: RangeErrors, state: RangeState) -> float:
+    """Negative logarithm of the posterior, up to a constant."""
     residuals = predicted_ranges(problem, state) - problem.range_m
-    # Ranges that are off together for being short say nothing on the noise of the others.
-    ordinary = errors.shared_stddev_m**2 < 0.5 * problem.stddev_m**2
-    noise = inlier_noise(residuals[ordinary] if np.mean(ordinary) > _MIN_ORDINARY else residuals)
-    return _View(noise, prior_cost(problem, state) - noise.log_likelihood)
+    return prior_cost(problem, state) - errors.noise_of_all(residuals).log_likelihood
 
 
 def _consensus_states(problem: RangeProblem) -> list[RangeState]:
@@ -157,9 +113,9 @@ def _consensus_states(problem: RangeProblem) -> list[RangeState]:
     return starts
 
 
-def _likeliest_each_once(problem: RangeProblem, errors: _ErrorModel, states: list[RangeState]) -> list[RangeState]:
+def _likeliest_each_once(problem: RangeProblem, errors: RangeErrors, states: list[RangeState]) -> list[RangeState]:
     """The likeliest states, best first, of each map one."""
-    ranked = sorted(states, key=lambda state: _view(problem, errors, state).unlikeliness)
+    ranked = sorted(states, key=lambda state: _unlikeliness(problem, errors, state))
     return [ranked[i] for i in _first_of_each_map(problem, ranked)]
 
 
@@ -230,38 +186,40 @@ def _differ(problem: RangeProblem, first: RangeState, second: RangeState) -> boo
     return bool(turn > _SAME_ROTATION_DEG or shift > _SAME_SHIFT)
 
 
-def _with_own_noise(given: RangeProblem, errors: _ErrorModel, start: RangeState) -> Solution:
-    """Alternate between the fit and the noise it shows.
+def _with_own_errors(posed: ScaleProblem, start: RangeState) -> Solution:
+    """Alternate between the fit and the errors it shows."""
+    given = posed.ranges
 
-    Where most ranges are wrong, a fit can follow them, find the noise larger, take in more of them, and so on. Such a
-    fit is less likely than the state that it came from, and then the noise stays as that showed it.
-    """
-    likeliest, state, inflation = _view(given, errors, start), start, 1.0
-    for _ in range(_NUM_NOISE_ROUNDS):
-        problem = _weighted(given, errors, state, likeliest.noise.stddev, inflation)
-        fit = solve(problem, state, loss=GEMAN_MCCLURE)
-        inflation = correlation_inflation(fit.scaled_residuals, fit.weights, errors.groups, problem.share_or_1)
-        state = fit.state
-        likeliest = min(likeliest, _view(given, errors, state), key=lambda view: view.unlikeliness)
-    return Solution(problem, fit, inflation, likeliest.noise.stddev)
+    def seen(errors: RangeErrors, state: RangeState) -> RangeErrors:
+        placed = state.metric_from_model
+        errors = errors.at(tag_positions(given, placed), placed.scale * posed.center_stddev)
+        return errors.seen_by_rigid_map(predicted_ranges(given, state) - given.range_m, prior_cost(given, state))
+
+    def fit(errors: RangeErrors, before: RangeFit | None) -> RangeFit:
+        state = start if before is None else before.state
+        return solve(_weighted(given, errors), state, loss=errors.loss)
+
+    fitted, used, shown = fit_with_own_errors(
+        fit,
+        lambda errors, fitted: seen(errors.inflated(fitted.residuals_m), fitted.state),
+        seen(posed.errors, start),
+        max_num_rounds=_NUM_NOISE_ROUNDS,
+    )
+    errors = replace(used, inflation=shown.inflation)
+    return Solution(_weighted(given, used), fitted, errors, shown.noise_m)
 
 
-def _weighted(
-    problem: RangeProblem, errors: _ErrorModel, state: RangeState, noise: float, inflation: float
-) -> RangeProblem:
-    """The problem as set up, weighted by the noise.
+def _weighted(problem: RangeProblem, errors: RangeErrors) -> RangeProblem:
+    """The problem as set up, weighted by the errors.
 
     Correlated errors are worth fewer ranges; the ranges keep their nominal weight among themselves and the priors gain
     by as much instead.
     """
-    base = np.where(np.isfinite(errors.noise_stddev_m), errors.noise_stddev_m, noise)
-    interpolation = state.metric_from_model.scale * errors.center_stddev
-    stddev = np.sqrt(base**2 + interpolation**2 + errors.shared_stddev_m**2)
-    distances, gravity = problem.distances, problem.gravity
+    distances, gravity, inflation = problem.distances, problem.gravity, errors.inflation
     return replace(
         problem,
-        stddev_m=stddev,
-        share=_shares(problem, state, stddev),
+        stddev_m=errors.stddev_m,
+        share=errors.share,
         bias_stddev_m=problem.bias_stddev_m / inflation,
         common_bias_stddev_m=problem.common_bias_stddev_m / inflation,
         distances=None if distances is None else replace(distances, stddev_m=distances.stddev_m / inflation),
@@ -269,20 +227,14 @@ def _weighted(
     )
 
 
-def _shares(problem: RangeProblem, state: RangeState, stddev_m: Array) -> Array:
-    """(n,) of the ranges, by how much those of one place err alike."""
-    places = place_labels(tag_positions(problem, state.metric_from_model), problem.anchor_index)
-    return shares_by_residuals(places, (predicted_ranges(problem, state) - problem.range_m) / stddev_m, GEMAN_MCCLURE)
-
-
 def _refuse_ambiguity(solution: Solution, rivals: list[RangeState], camera_side: str | None) -> None:
     problem = solution.problem
     for rival in rivals:
-        other = solve(solution.problem, rival, loss=GEMAN_MCCLURE, tolerance=1e-8)
+        other = solve(solution.problem, rival, loss=solution.errors.loss, tolerance=1e-8)
         is_elsewhere = camera_side is not None and camera_side_of(problem, other.state) not in (camera_side, None)
         if is_elsewhere or not _differ(solution.problem, other.state, solution.fit.state):
             continue
-        gap = (other.cost - solution.fit.cost) / solution.inflation**2
+        gap = (other.cost - solution.fit.cost) / solution.errors.inflation**2
         if gap < MIN_COST_GAP:
             ours, theirs = solution.fit.state.metric_from_model.scale, other.state.metric_from_model.scale
             extent = float(np.linalg.norm(path_shape(solution.problem.centers).stddevs))

@@ -14,11 +14,12 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import IDENTITY, Similarity, path_shape, round_middle, rounding_of
-from rangesfm.ranging.multilateration import multilaterate
-from rangesfm.ranging.robust_loss import SAME_COST
+from rangesfm.geometry.similarity import IDENTITY, Similarity, path_shape, round_middle, rounding_of
+from rangesfm.ranging.anchors.multilateration import multilaterate
+from rangesfm.ranging.errors.noise import robust_stddevs
+from rangesfm.ranging.errors.robust_loss import SAME_COST
 from rangesfm.scale.consensus import consensus_scales
-from rangesfm.scale.range_equation import RangeProblem, RangeState, solve
+from rangesfm.scale.range_equation import RangeProblem, RangeState, solve, tag_positions
 
 Array = npt.NDArray[np.float64]
 
@@ -200,21 +201,14 @@ def complete_unknown_anchors(problem: RangeProblem, state: RangeState) -> RangeS
 
 def anchor_alone(problem: RangeProblem, k: int, metric_from_model: Similarity) -> RangeProblem:
     """The problem of one anchor with the path given: centres already metric, scale practically fixed."""
-    rows = np.flatnonzero(problem.anchor_index == k)
-    part = problem.subset(rows)
-    tags = metric_from_model.apply(part.centers) + part.tag_from_center @ metric_from_model.rotation.T
+    part = problem.of_anchor(k)
+    tags = tag_positions(part, metric_from_model)
     return replace(
         part,
         centers=np.zeros_like(tags),
         tag_from_center=tags,
-        anchor_index=np.zeros(len(rows), dtype=np.int64),
-        anchor_mean_m=problem.anchor_mean_m[k : k + 1],
-        anchor_stddev_m=problem.anchor_stddev_m[k : k + 1],
-        bias_mean_m=problem.bias_mean_m[k : k + 1],
         bias_stddev_m=np.zeros(1),
         common_bias_stddev_m=0.0,
-        frame_is_free=False,
-        distances=None,
     )
 
 
@@ -269,8 +263,7 @@ def _translations(problem: RangeProblem, scale: float, rotations: Array) -> tupl
         normal = normal + ridge * np.trace(normal, axis1=1, axis2=2)[:, None, None]
         solution = np.linalg.solve(normal, right[..., None])[..., 0]
         residuals = weights * ((design @ solution[..., None])[..., 0] - squared)
-        unit = 1.4826 * np.median(np.abs(residuals), axis=1, keepdims=True) + 1e-12
-        robust = 1 / (1 + (residuals / (2 * unit)) ** 2)
+        robust = 1 / (1 + (residuals / (2 * robust_stddevs(residuals))) ** 2)
     translation = solution[:, :3]
     distance = np.linalg.norm(q - translation[:, None], axis=2)
     off = np.abs(distance - ranges)

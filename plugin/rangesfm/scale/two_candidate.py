@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.geometry import off_origin
+from rangesfm.geometry.similarity import off_origin
 
 Array = npt.NDArray[np.float64]
 

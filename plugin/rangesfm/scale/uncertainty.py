@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.ranging.noise import inflation_before_fit
-from rangesfm.ranging.shared_errors import antenna_modes, curve_modes
+from rangesfm.ranging.errors.noise import inflation_before_fit
+from rangesfm.ranging.errors.shared_errors import antenna_modes, curve_modes
 from rangesfm.scale.estimate import ScaleUncertainty
-from rangesfm.scale.range_equation import RangeFit, RangeProblem, directions_to_tag, predicted_ranges
+from rangesfm.scale.range_equation import RangeFit, RangeProblem, predicted_ranges, range_gradient
 from rangesfm.scale.solution import Solution
 
 Array = npt.NDArray[np.float64]
@@ -21,24 +21,16 @@ Array = npt.NDArray[np.float64]
 _MIN_CURVATURE = 0.3
 
 
-def scale_uncertainty(
-    solution: Solution,
-    blocks: npt.NDArray[np.int64],
-    curve_stddev_m: Array,
-    *,
-    num_bootstrap: int,
-    seed: int,
-) -> ScaleUncertainty:
+def scale_uncertainty(solution: Solution, curve_stddev_m: Array, *, num_bootstrap: int, seed: int) -> ScaleUncertainty:
     """Relative stddevs of the scale.
 
     Args:
-        blocks: (n,) labels of stretches of time.
         curve_stddev_m: (n,) what ranges of about this length may be off together.
     """
-    problem, fit = solution.problem, solution.fit
+    problem, fit, blocks = solution.problem, solution.fit, solution.errors.block
     anchor_blocks = problem.anchor_index
     present = np.unique(anchor_blocks)
-    correlated, correlated_dof = _correlated(solution, blocks)
+    correlated, correlated_dof = _correlated(solution)
     return ScaleUncertainty(
         formal=fit.log_scale_stddev,
         bootstrap=_bootstrap(fit, blocks, num_bootstrap, seed),
@@ -52,13 +44,12 @@ def scale_uncertainty(
     )
 
 
-def _correlated(solution: Solution, blocks: npt.NDArray[np.int64]) -> tuple[float, float]:
+def _correlated(solution: Solution) -> tuple[float, float]:
     """Formal, widened by errors that go together, and the degrees of freedom that show how much they do."""
-    problem, fit = solution.problem, solution.fit
-    num_groups = len(np.unique(blocks * problem.num_anchors + problem.anchor_index))
+    fit, num_groups = solution.fit, len(np.unique(solution.errors.group))
     from_ranges = fit.information - fit.prior_information
     num_fitted = float(np.trace(np.linalg.lstsq(fit.information, from_ranges, rcond=1e-12)[0]))
-    stddev = fit.log_scale_stddev * inflation_before_fit(solution.inflation, num_groups, num_fitted)
+    stddev = fit.log_scale_stddev * inflation_before_fit(solution.errors.inflation, num_groups, num_fitted)
     return stddev, num_groups - num_fitted
 
 
@@ -139,6 +130,6 @@ def _range_model_stddev(problem: RangeProblem, fit: RangeFit, curve_stddev_m: Ar
 
 def _antennas_stddev(problem: RangeProblem, fit: RangeFit) -> float:
     """What antennas do to the scale, each anchor's for itself."""
-    modes, influence = antenna_modes(directions_to_tag(problem, fit.state)), scale_influence(fit, problem)
+    modes, influence = antenna_modes(range_gradient(problem, fit.state).by_tag), scale_influence(fit, problem)
     of_anchors = [(problem.anchor_index == k) * influence @ modes for k in range(problem.num_anchors)]
     return float(np.linalg.norm(of_anchors))

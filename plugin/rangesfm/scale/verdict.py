@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesfm.errors import GeometryError
-from rangesfm.geometry import NEARLY_FLAT, NEARLY_STRAIGHT, path_kind, path_shape
+from rangesfm.geometry.similarity import NEARLY_FLAT, NEARLY_STRAIGHT, path_kind, path_shape
 from rangesfm.options import ScaleOptions
-from rangesfm.ranging.anchors import AnchorEstimate
+from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.scale.cutoff import scale_drift
 from rangesfm.scale.estimate import NORMAL_95, CutoffTest, ScaleUncertainty
-from rangesfm.scale.problem import SurveyProblem
+from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import RangeFit
 from rangesfm.scale.solution import WHY_SCALE_IS_OPEN, Solution
 
@@ -51,7 +51,7 @@ class _Doubt:
 
 
 def judge(
-    survey: SurveyProblem,
+    problem: ScaleProblem,
     solution: Solution,
     uncertainty: ScaleUncertainty,
     per_anchor: dict[str, float],
@@ -69,8 +69,8 @@ def judge(
     narrower = weak[0].advice if weak else _what_narrows_it(solution, uncertainty)
     doubts = [
         *weak,
-        *(_Doubt(note, "survey three anchors or more that are not on one line") for note in survey.notes),
-        *_left_out_doubts(survey.left_out),
+        *(_Doubt(note, "survey three anchors or more that are not on one line") for note in problem.notes),
+        *_left_out_doubts(problem.left_out),
         *_path_doubts(solution, anchors),
         *_range_doubts(solution.fit),
         *_anchor_doubts(per_anchor),

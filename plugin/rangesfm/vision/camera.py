@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pycolmap
 
-from rangesfm.errors import InputError
+from rangesfm.errors import InputError, nearest_known
 from rangesfm.options import CameraOptions
-from rangesfm.passthrough import nearest_known
 
 _MODELS = {name: model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pycolmap
 
+from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import ReconstructionError
 from rangesfm.options import MapperOptions
-from rangesfm.passthrough import apply_options
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import num_photos_with_features

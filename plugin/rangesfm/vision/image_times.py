@@ -16,8 +16,8 @@ import numpy.typing as npt
 from PIL import Image
 
 from rangesfm.errors import InputError
-from rangesfm.files import is_plain_name
-from rangesfm.tables import Table, read_table
+from rangesfm.files.atomic import is_plain_name
+from rangesfm.files.tables import Table, read_table
 
 IMAGE_EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 

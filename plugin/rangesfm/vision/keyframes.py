@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from rangesfm.errors import InputError
+from rangesfm.geometry.trajectory import ROUNDING_S
 from rangesfm.options import KeyframeOptions
-from rangesfm.trajectory import ROUNDING_S
 from rangesfm.vision.image_times import ImageTimes
 
 MIN_NUM_KEYFRAMES = 3
@@ -22,9 +21,8 @@ def select_keyframes(photos: ImageTimes | Sequence[str], options: KeyframeOption
     as are allowed; the first photo always is a keyframe.
 
     Raises:
-        InputError: an option that makes no sense, or fewer than three keyframes left.
+        InputError: fewer than three keyframes left, or a least time between photos that have no times.
     """
-    _check(options)
     names = photos.image_names if isinstance(photos, ImageTimes) else tuple(photos)
     kept = np.arange(0, len(names), options.every_nth)
     if options.min_interval_s > 0:
@@ -47,12 +45,3 @@ def _far_enough_apart(timestamps_s: np.typing.NDArray[np.float64], min_interval_
         if time - timestamps_s[kept[-1]] >= min_interval_s - ROUNDING_S:
             kept.append(index)
     return kept
-
-
-def _check(options: KeyframeOptions) -> None:
-    if options.every_nth < 1:
-        raise InputError(f"every_nth is {options.every_nth}, expected 1 or more")
-    if not (math.isfinite(options.min_interval_s) and options.min_interval_s >= 0):
-        raise InputError(f"min_interval_s is {options.min_interval_s:g}, expected 0 or more seconds")
-    if options.max_num_keyframes is not None and options.max_num_keyframes < MIN_NUM_KEYFRAMES:
-        raise InputError(f"max_num_keyframes is {options.max_num_keyframes}, expected {MIN_NUM_KEYFRAMES} or more")

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pycolmap
 
+from rangesfm.colmap.model_files import read_model, write_binary_model
+from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import ReconstructionError
-from rangesfm.files import new_folder, scratch_folder
-from rangesfm.model_files import read_model, write_binary_model
+from rangesfm.files.atomic import new_folder, scratch_folder
 from rangesfm.options import CameraOptions, MapperOptions
-from rangesfm.passthrough import apply_options
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import num_matching_pairs

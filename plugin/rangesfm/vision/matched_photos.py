@@ -11,9 +11,9 @@ from typing import Any
 
 import pycolmap
 
-from rangesfm.colmap_log import colmap_log
+from rangesfm.colmap.log import colmap_log
 from rangesfm.errors import ReconstructionError
-from rangesfm.files import make_output_folder
+from rangesfm.files.atomic import make_output_folder
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import Progress
 from rangesfm.vision.camera import camera_of_photos, check_camera

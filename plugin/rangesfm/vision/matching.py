@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pycolmap
 
-from rangesfm.errors import InputError, ReconstructionError
-from rangesfm.options import MATCHING_METHODS, MapperOptions
-from rangesfm.passthrough import apply_options
+from rangesfm.colmap.passthrough import apply_options
+from rangesfm.errors import ReconstructionError
+from rangesfm.options import MapperOptions
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import named_by_place, num_compared_pairs, num_matching_pairs
@@ -44,9 +44,7 @@ class MatchingOptions:
 
 
 def matching_options(mapper: MapperOptions, num_photos: int, seed: int) -> MatchingOptions:
-    """Raises InputError for a method that does not exist, and for keys or values that are not COLMAP's."""
-    if mapper.matching not in MATCHING_METHODS:
-        raise InputError(f"[mapper] matching is '{mapper.matching}', expected {', '.join(MATCHING_METHODS)}")
+    """Raises InputError for keys or values that are not COLMAP's."""
     is_sequential = mapper.matching == "sequential" or (mapper.matching == "auto" and num_photos > _MAX_NUM_EXHAUSTIVE)
     num_threads = mapper.num_threads if pycolmap.has_cuda else _NUM_CPU_THREADS
     sequential, exhaustive = pycolmap.SequentialPairingOptions(), pycolmap.ExhaustivePairingOptions()

@@ -11,7 +11,7 @@ from typing import Any
 from PIL import Image
 
 from rangesfm.errors import ReconstructionError
-from rangesfm.files import sha256_of
+from rangesfm.files.atomic import sha256_of
 
 MIN_NUM_PHOTOS = 2
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pycolmap
 
-from rangesfm.files import new_file
+from rangesfm.files.atomic import new_file
 from rangesfm.progress import Progress
 from rangesfm.vision.database import clear_matches, create_database, remove_database, restore_names
 from rangesfm.vision.matching import MatchingOptions, pairs_to_match

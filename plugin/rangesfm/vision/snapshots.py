@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from rangesfm.colmap.model_files import read_model
 from rangesfm.errors import InputError
-from rangesfm.model_files import read_model
 
 # Writing a model after each photo takes a few percent of the time of mapping up to a few hundred photos, and beyond
 # grows with their number.

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rangesfm.files import new_file
+from rangesfm.files.atomic import new_file
 from rangesfm.progress import Progress
 
 

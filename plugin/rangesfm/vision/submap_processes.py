@@ -10,8 +10,8 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
 from rangesfm.errors import ReconstructionError
+from rangesfm.processes.supervision import Ended, child_command, supervise
 from rangesfm.progress import Progress
-from rangesfm.supervision import Ended, child_command, supervise
 from rangesfm.vision.submaps import Submap
 
 _POLL_INTERVAL_S = 0.2

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 from scipy.sparse import csr_array
 
-from rangesfm.linear_solver import max_num_images_direct, overlaps_of
+from rangesfm.ceres.linear_solver import max_num_images_direct, overlaps_of
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
 

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pycolmap
 
-from rangesfm.colmap_log import colmap_log
+from rangesfm.colmap.log import colmap_log
 from rangesfm.errors import OptionError
-from rangesfm.files import new_file
+from rangesfm.files.atomic import new_file
+from rangesfm.files.sole_writer import sole_writer
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import Progress, SilentProgress
-from rangesfm.sole_writer import sole_writer
 from rangesfm.vision.database import copy_stretch, remove_database
 from rangesfm.vision.mapping import NoModelError, map_incrementally, pipeline_options, read_models, remove_models
 from rangesfm.vision.matched_photos import MatchedPhotos
@@ -56,7 +56,7 @@ class Submap:
 
     def with_threads(self, num_threads: int) -> Submap:
         """The same, mapped with so many threads."""
-        return replace(self, mapper=replace(self.mapper, num_threads=num_threads))
+        return replace(self, mapper=self.mapper.changed(num_threads=num_threads))
 
     def models(self) -> tuple[pycolmap.Reconstruction, ...]:
         """Those that its photos gave, with the ids of the whole survey's database; there may be none."""

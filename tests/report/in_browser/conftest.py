@@ -51,7 +51,12 @@ class Browser:
         for kind in ("browser", "performance"):
             self._driver.get_log(kind)
         self._driver.get(page.as_uri())
+        self.wait_for("!document.querySelector('#figures') || window.rangesfmFigures")
         self.wait_for("!document.querySelector('#view') || window.rangesfmView")
+
+    def draw_figures(self) -> None:
+        """All of them, not only those near the window."""
+        self.run("for (const charts of Object.values(rangesfmFigures)) for (const chart of charts) chart.draw()")
 
     def run(self, script: str, *arguments: Any) -> Any:
         """What a script in the page returns."""

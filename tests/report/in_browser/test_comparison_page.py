@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rangesfm.comparison_page import write_comparison
-from rangesfm.model_comparison import compare_many, read_models
+from rangesfm.comparison.models import compare_many, read_models
+from rangesfm.comparison.page import write_comparison
 
 if TYPE_CHECKING:
     from tests.report.in_browser.conftest import Browser

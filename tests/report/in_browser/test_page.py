@@ -67,9 +67,10 @@ def test_an_error_on_the_console_and_a_request_are_noticed(browser: Browser, tmp
 
 def test_it_opens_with_all_figures_a_silent_console_and_no_request(browser: Browser, page: Path) -> None:
     browser.open(page)
+    browser.draw_figures()
     assert browser.console() == []
     assert {url for url in browser.requests() if not url.startswith("data:")} == {page.as_uri()}
-    assert browser.run("return document.querySelectorAll('svg.chart').length") == NUM_CHARTS
+    assert browser.run("return document.querySelectorAll('.chart svg').length") == NUM_CHARTS
     assert browser.run("return document.title").startswith("a survey & more")
 
 
@@ -80,6 +81,7 @@ def test_it_draws_in_the_readers_theme(browser: Browser, page: Path) -> None:
     }
     for theme, other in (("light", "dark"), ("dark", "light")):
         browser.open(page, theme=theme)
+        browser.draw_figures()
         picture = browser.picture("#trajectory")
         assert all(num_pixels(picture, color) > 50 for color in colors[theme])
         assert not any(num_pixels(picture, color) > 10 for color in colors[other])
@@ -94,6 +96,7 @@ def num_pixels(picture: Pixels, color: tuple[int, int, int]) -> int:
 @pytest.mark.parametrize("theme", ["light", "dark"])
 def test_every_text_is_readable(browser: Browser, page: Path, theme: str) -> None:
     browser.open(page, theme=theme)
+    browser.draw_figures()
     assert browser.run(CONTRASTS) == []
 
 
@@ -107,13 +110,14 @@ def test_unreadable_text_is_noticed(browser: Browser, tmp_path: Path) -> None:
 @pytest.mark.parametrize("width", WIDTHS_PX)
 def test_it_never_scrolls_sideways(browser: Browser, page: Path, width: int) -> None:
     browser.open(page, width=width)
+    browser.draw_figures()
     assert browser.run("return [innerWidth, document.documentElement.scrollWidth]") == [width, width]
 
 
 def test_every_control_has_a_name(browser: Browser, page: Path) -> None:
     browser.open(page)
     nameless = """
-    return [...document.querySelectorAll("button, a, input, img, canvas, svg.chart")].filter(node =>
+    return [...document.querySelectorAll("button, a, input, img, canvas, .chart")].filter(node =>
       !(node.ariaLabel || node.alt || node.textContent.trim() || (node.labels && node.labels[0].textContent.trim()))
     ).filter(node => node.checkVisibility()).map(node => node.outerHTML)
     """
@@ -125,43 +129,122 @@ def test_names_from_files_cannot_break_out(browser: Browser, make_result: MakeRe
     for table in ("ranges.csv", "scale_candidates.csv"):
         assert EVIL in (folder / table).read_text()
     browser.open(write_report(folder))
+    browser.draw_figures()
     assert browser.console() == []
     assert "broken out" not in browser.run("return document.title")
     assert browser.run("return [...document.querySelectorAll('.label.anchor')].map(x => x.textContent)")[0] == EVIL
 
 
-def test_the_data_of_figures_are_downloads(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    for figure, header in (
-        ("scale_candidates", "panel,series,time_s,candidate_m_per_unit"),
-        ("scale_consensus", "panel,series,scale_m_per_unit,ranges"),
-        ("trajectory", "panel,series,x_m,y_m"),
-    ):
-        link = f"document.querySelector('#{figure} a.csv')"
-        text = browser.run(f"return decodeURIComponent({link}.href.slice({link}.href.indexOf(',') + 1))")
-        assert text.splitlines()[0] == header
-        assert len(text.splitlines()) > 100
-        assert browser.run(f"return {link}.download") == f"{figure}.csv"
-
-
 @pytest.mark.parametrize(
-    ("figure", "header"),
+    ("figure", "header", "min_num_rows"),
     [
-        ("range_residuals", "time_s,anchor_id,range_m,residual_scaled_m,residual_refined_m,status"),
-        ("absolute_range_errors", "time_s,anchor_id,range_m,range_by_reference_m,error_scaled_m,error_refined_m"),
-        ("map_points", "x_m,y_m,z_m,red,green,blue"),
+        ("scale_candidates", "panel,series,time_s,candidate_m_per_unit", 100),
+        ("scale_consensus", "panel,series,scale_m_per_unit,ranges", 100),
+        ("trajectory", "panel,series,x_m,y_m", 100),
+        ("range_residuals", "time_s,anchor_id,range_m,residual_scaled_m,residual_refined_m,status", 1000),
+        ("absolute_range_errors", "time_s,anchor_id,range_m,range_by_reference_m,error_scaled_m,error_refined_m", 1000),
+        ("map_points", "x_m,y_m,z_m,red,green,blue", 1000),
     ],
 )
-def test_large_data_are_made_when_asked_for(browser: Browser, page: Path, figure: str, header: str) -> None:
+def test_the_data_of_figures_are_downloads(
+    browser: Browser, page: Path, figure: str, header: str, min_num_rows: int
+) -> None:
     browser.open(page)
     # What the button makes is caught where it is handed to the browser.
-    browser.run("URL.createObjectURL = blob => { blob.text().then(text => { window.made = text; }); return '#'; }")
+    browser.run(
+        "URL.createObjectURL = blob => { blob.text().then(text => { window.made = text; }); return '#'; };"
+        "HTMLAnchorElement.prototype.click = function () { window.fileName = this.download; };"
+    )
     browser.run(f"document.querySelector('#{figure} button.csv').click()")
     browser.wait_for("window.made")
     lines = browser.run("return window.made").splitlines()
     assert lines[0] == header
-    assert len(lines) > 1000
+    assert len(lines) > min_num_rows
+    assert browser.run("return window.fileName") == f"{figure}.csv"
     assert browser.console() == []
+
+
+def test_a_figures_data_are_those_of_the_result(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    rows = browser.run("return [...rangesfmFigures.scale_consensus[0].rows()]")
+    lines = (page.parent / "scale_consensus.csv").read_text().splitlines()[1:]
+    expected = [[float(cell) for cell in line.split(",")] for line in lines]
+    np.testing.assert_allclose([row[1:] for row in rows], expected, rtol=1e-6)
+
+
+def place_in(browser: Browser, chart: str, x: float, y: float) -> tuple[float, float]:
+    """Where in the window a place of a chart is."""
+    browser.run(f"{chart}.node.scrollIntoView({{block: 'center'}})")
+    browser.wait_for(f"{chart}.view")
+    left, top = browser.run(
+        f"const {{node, view, spec}} = {chart}, box = node.getBoundingClientRect(), {{left, top}} = spec.padding;"
+        "return [box.x + left + view.scale('x')(arguments[0]), box.y + top + view.scale('y')(arguments[1])]",
+        x,
+        y,
+    )
+    return float(left), float(top)
+
+
+def test_the_pointer_tells_the_values_of_what_is_nearest(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    chart = "rangesfmFigures.scale_consensus[0]"
+    _, scale, num_agreeing = browser.run(f"return [...{chart}.rows()][50]")
+    x, y = place_in(browser, chart, scale, num_agreeing)
+    browser.command("Input.dispatchMouseEvent", type="mouseMoved", x=x + 2, y=y - 2)
+    said = browser.run(f"return {chart}.tip.checkVisibility() && {chart}.tip.textContent")
+    assert said == f"ranges that agree · scale m per unit {scale:.5g} · ranges {num_agreeing:.0f}"
+    browser.command("Input.dispatchMouseEvent", type="mouseMoved", x=1, y=1)
+    assert not browser.run(f"return {chart}.tip.checkVisibility()")
+
+
+def test_the_pointer_names_the_mark_that_is_drawn_under_it(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    browser.run("document.querySelector('#trajectory').scrollIntoView({block: 'center'})")
+    browser.wait_for("rangesfmFigures.trajectory[0].view")
+    for i in (0, 3, 7):
+        x, y = browser.run(
+            "const mark = document.querySelectorAll('#trajectory .chart')[1].querySelectorAll('.mark-symbol path');"
+            "const box = mark[arguments[0]].getBoundingClientRect();"
+            "return [box.x + box.width / 2, box.y + box.height / 2]",
+            i,
+        )
+        browser.command("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+        tip, shown_x, shown_y = browser.run(
+            "const {tip, node} = rangesfmFigures.trajectory[1], box = node.getBoundingClientRect();"
+            "return [tip.textContent, box.x + parseFloat(tip.style.left), box.y + parseFloat(tip.style.top)]"
+        )
+        assert tip.startswith("anchor ")
+        assert (shown_x, shown_y) == pytest.approx((x, y), abs=2.0)
+
+
+def test_a_wheel_with_a_key_zooms_a_drag_moves_and_a_double_click_goes_back(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    chart = "rangesfmFigures.scale_candidates[0]"
+
+    def domain() -> list[float]:
+        browser.picture("#scale_candidates")
+        low, high = browser.run(f"return {chart}.view.scale('x').domain()")
+        return [low, high]
+
+    browser.draw_figures()
+    whole = domain()
+    x, y = place_in(browser, chart, 95.0, 1.0)
+    wheel = {"type": "mouseWheel", "x": x, "y": y, "deltaX": 0, "deltaY": -240}
+    browser.command("Input.dispatchMouseEvent", **wheel, modifiers=2)  # Ctrl
+    near = domain()
+    assert near[1] - near[0] < 0.8 * (whole[1] - whole[0])
+    browser.drag((x, y), (x + 80, y))
+    moved = domain()
+    assert moved[0] < near[0]
+    assert moved[1] - moved[0] == pytest.approx(near[1] - near[0])
+    for clicks in (1, 2):
+        for kind in ("mousePressed", "mouseReleased"):
+            browser.command("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=clicks)
+    assert domain() == pytest.approx(whole)
+    top = browser.run("return scrollY")
+    browser.command("Input.dispatchMouseEvent", **(wheel | {"deltaY": 240}))
+    browser.wait_for(f"scrollY > {top}")
+    assert domain() == pytest.approx(whole)
 
 
 def test_on_paper_a_picture_stands_for_the_view(browser: Browser, page: Path) -> None:
@@ -169,6 +252,7 @@ def test_on_paper_a_picture_stands_for_the_view(browser: Browser, page: Path) ->
     pdf = base64.b64decode(browser.command("Page.printToPDF", printBackground=True)["data"])
     assert len(re.findall(rb"/Type */Page\b", pdf)) >= 3
     assert browser.run("return document.querySelector('.printed').naturalWidth") > 300
+    assert browser.run("return document.querySelectorAll('.chart svg').length") == NUM_CHARTS
     browser.command("Emulation.setEmulatedMedia", media="print")
     hidden: Any = browser.run("return getComputedStyle(document.querySelector('.stage canvas')).display")
     browser.command("Emulation.setEmulatedMedia", media="")
@@ -177,8 +261,9 @@ def test_on_paper_a_picture_stands_for_the_view(browser: Browser, page: Path) ->
 
 def test_without_webgl_the_page_says_so_and_the_rest_works(browser_without_webgl: Browser, page: Path) -> None:
     browser_without_webgl.open(page)
+    browser_without_webgl.draw_figures()
     assert browser_without_webgl.console() == []
     shown = "return document.querySelector('.without-webgl').checkVisibility()"
     assert browser_without_webgl.run(shown)
     assert not browser_without_webgl.run("return document.querySelector('.stage').checkVisibility()")
-    assert browser_without_webgl.run("return document.querySelectorAll('svg.chart').length") == NUM_CHARTS
+    assert browser_without_webgl.run("return document.querySelectorAll('.chart svg').length") == NUM_CHARTS

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesfm.errors import InputError
-from rangesfm.ranging.anchors import Anchor
+from rangesfm.errors import InputError, printable
+from rangesfm.files.tables import read_head
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.errors.quantization import find_quantization_m, quantization_stddev_m
 from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.quantization import find_quantization_m, quantization_stddev_m
 from rangesfm.ranging.readers import ros
 from rangesfm.ranging.readers.canonical import write_ranges_csv
 from rangesfm.ranging.readers.not_ranges import reason_without_ranges
@@ -19,7 +20,6 @@ from rangesfm.ranging.readers.reader import Reader, ReadOptions
 from rangesfm.ranging.readers.registry import READERS, find_reader, reader_names, recognize
 from rangesfm.ranging.readers.roles import tell_roles
 from rangesfm.ranging.twr import StampOptions
-from rangesfm.tables import printable, read_head
 
 __all__ = ["read_anchors_in_log", "read_ranges", "reader_names", "write_ranges_csv"]
 

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.errors import InputError
-from rangesfm.files import new_file
+from rangesfm.files.atomic import new_file
+from rangesfm.files.tables import header_names, read_head
 from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.columns import Columns, read_columns
 from rangesfm.ranging.readers.reader import Reader, ReadOptions
-from rangesfm.tables import header_names, read_head
 
 _BY_TIME = Columns(
     required={"timestamp": "timestamp_s", "anchor_id": "anchor_id", "range": "range_m"},

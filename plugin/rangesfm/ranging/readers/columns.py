@@ -11,15 +11,16 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import InputError
+from rangesfm.files.tables import Table, read_table
 from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.time_units import SECONDS_PER_UNIT, seconds_from_iso
 from rangesfm.ranging.twr import StampOptions, double_sided_range, single_sided_range
-from rangesfm.tables import Table, read_table
 
 UNITS_PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 STAMPS = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
 QUANTITIES = ("timestamp", "image_name", "anchor_id", "range", "tag_id", "range_stddev", "los", *STAMPS)
 
+_TEXTS = ("image_name", "anchor_id", "tag_id")
 _EXPECTED_RANGE = "a positive number{unit}; 0 means no measurement"
 
 
@@ -58,14 +59,16 @@ def read_columns(path: Path, columns: Columns, format: str) -> RangeLog:
     Raises:
         InputError: with the line, for whatever is not a time, an id or a range; also if no range is left.
     """
+    named = {**columns.optional, **columns.required}
     table = read_table(
         path,
         [*columns.required.values()],
         [*columns.optional.values()],
+        text=[named[key] for key in _TEXTS if key in named],
         separator=columns.separator,
         header=columns.header,
     )
-    name = {key: column for key, column in {**columns.optional, **columns.required}.items() if column in table}
+    name = {key: column for key, column in named.items() if column in table}
     ranges = _ranges(table, name["range"], columns) if "range" in name else _ranges_by_stamps(table, name, columns)
     timestamps = _timestamps(table, name["timestamp"], columns.timestamp_unit) if "timestamp" in name else None
     image_name = table.text(name["image_name"]) if timestamps is None else None

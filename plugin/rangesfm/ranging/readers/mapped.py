@@ -6,7 +6,8 @@ from collections.abc import Collection, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 
-from rangesfm.errors import InputError
+from rangesfm.errors import InputError, printable
+from rangesfm.files.tables import header_names, read_head
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers.columns import (
     QUANTITIES,
@@ -18,7 +19,6 @@ from rangesfm.ranging.readers.columns import (
 from rangesfm.ranging.readers.reader import Reader, ReadOptions
 from rangesfm.ranging.readers.roles import Sides
 from rangesfm.ranging.readers.time_units import TIMESTAMP_UNITS
-from rangesfm.tables import header_names, printable, read_head
 
 _PRESETS = {
     "starloc": ("STAR-loc CSV", {"timestamp": "time_s", "range": "range", "tag_id": "from_id", "anchor_id": "to_id"}),

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.errors import InputError
-from rangesfm.ranging.anchors import Anchor
+from rangesfm.files.tables import read_text
+from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers.host_time import HostClock
 from rangesfm.ranging.readers.reader import Reader, ReadOptions
 from rangesfm.ranging.readers.records import Records
-from rangesfm.tables import read_text
 
 
 @dataclass(frozen=True)

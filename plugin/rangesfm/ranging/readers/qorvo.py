@@ -7,12 +7,12 @@ from bisect import bisect_right
 from pathlib import Path
 
 from rangesfm.errors import InputError
+from rangesfm.files.tables import read_text
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers.host_time import HostClock
 from rangesfm.ranging.readers.printed import check_only_time_is_described
 from rangesfm.ranging.readers.reader import Reader, ReadOptions
 from rangesfm.ranging.readers.records import Records
-from rangesfm.tables import read_text
 
 _DEFAULT_RANGING_INTERVAL_S = 0.2
 _BEGIN = re.compile(r'SESSION_INFO_NTF:?\s{0,9}\{|\{\s{0,9}"Block"\s{0,9}:', re.ASCII)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rangesfm.ranging.anchors import Anchor
+from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers.roles import Sides
 from rangesfm.ranging.twr import StampOptions

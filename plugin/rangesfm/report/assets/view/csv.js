@@ -48,13 +48,15 @@ const CSV_TABLES = {
     ]),
 };
 
-function attachDownloads(scene) {
-  for (const button of document.querySelectorAll("button[data-csv]")) {
+/** A figure's button gives the table it names, or else what its charts draw. */
+function attachDownloads(scene, figures) {
+  for (const button of document.querySelectorAll("button[data-figure]")) {
     button.addEventListener("click", () => {
-      const blob = new Blob([CSV_TABLES[button.dataset.csv](scene)], { type: "text/csv" });
+      const { csv, figure } = button.dataset;
+      const text = csv ? CSV_TABLES[csv](scene) : csvOfFigure(figures[figure]);
       const link = document.createElement("a");
-      link.href = URL.createObjectURL(blob);
-      link.download = button.dataset.file;
+      link.href = URL.createObjectURL(new Blob([text], { type: "text/csv" }));
+      link.download = `${figure}.csv`;
       link.click();
       setTimeout(() => URL.revokeObjectURL(link.href), 10000);
     });

@@ -148,13 +148,12 @@ class View {
   }
 }
 
-const scene = readBlock("scene");
-if (scene !== null) {
-  if (scene.ranges !== null) scene.ranges.residual = scene.ranges[scene.ranges.final];
-  attachDownloads(scene);
-  // The page is there to read before the view is: setting up WebGL may take longer than all the rest.
-  const start = () => {
-    window.rangesfmView = new View(document.getElementById("view"), scene);
-  };
-  addEventListener("load", () => requestAnimationFrame(() => setTimeout(start)));
-}
+// The page is there to read before its figures and the view are: setting up WebGL may take longer than all the rest.
+const start = () => {
+  const scene = readBlock("scene");
+  if (scene?.ranges) scene.ranges.residual = scene.ranges[scene.ranges.final];
+  window.rangesfmFigures = makeFigures(readBlock("figures"));
+  attachDownloads(scene, rangesfmFigures);
+  if (scene !== null) window.rangesfmView = new View(document.getElementById("view"), scene);
+};
+addEventListener("load", () => requestAnimationFrame(() => setTimeout(start)));

@@ -1,0 +1,28 @@
+"""Print the reference of all keys of a survey file: python examples/keys.py > examples/keys.md"""
+
+from rangesfm.survey.settings import KEYS, TABLES
+
+HEAD = """# Keys of a survey file
+
+Made by `python examples/keys.py > examples/keys.md`. Every key is optional; `rangesfm run` takes each also as the flag
+beside it, in place of the file's. Paths are relative to the survey file, those of flags to the working directory.
+"""
+
+
+def cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("\n", " ")
+
+
+def main() -> None:
+    print(HEAD)
+    for table, model in TABLES.items():
+        print(f"## [{table}]\n\n{model.__doc__}\n\n| key | flag | value | meaning |\n|---|---|---|---|")
+        for key in KEYS:
+            if key.table == table:
+                flag = f"`--{key.flag}`" + (f", `--no_{key.flag}`" if key.type is bool else "")
+                print(f"| `{key.name}` | {flag} | {cell(key.expected)} | {cell(key.meaning)} |")
+        print()
+
+
+if __name__ == "__main__":
+    main()

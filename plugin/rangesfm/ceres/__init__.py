@@ -1,0 +1,64 @@
+"""The compiled cost functions, and Ceres as pyceres shows it. No other package touches either.
+
+A range residual goes into the problem of one of pycolmap's bundle adjusters::
+
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, reconstruction)
+    cost = range_cost(range_m=4.2, tag_in_cam_m=[0, -0.09, -0.066], stddev_m=0.1, loss_scale=2.4)
+    pose = reconstruction.frame(frame_id).rig_from_world.params
+    add_residual_block(adjuster, cost, None, [pose, anchor_in_world, range_bias])
+    adjuster.solve()
+
+and a whole log of them in one call by ``add_ranges``. Poses are COLMAP's blocks: rig_from_world as
+[qx qy qz qw tx ty tz], and "cam" is the rig frame (the rig's reference camera). Metres throughout, residuals in
+stddevs; every value is checked where a cost is made.
+
+pycolmap, pyceres and the compiled part exchange C++ objects, which works only between the versions that
+``pyproject.toml`` pins. Whatever is first used here checks it, by a residual whose cost is known.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from rangesfm.ceres.compatibility import check_compatibility, compiled_part_version, pyceres_ceres_version
+from rangesfm.ceres.jacobian import num_columns, tangent_jacobian
+from rangesfm.ceres.many_ranges import PlacedRanges, RangeBlocks, add_ranges
+from rangesfm.ceres.problem import add_normal_prior, add_residual_block, keep_from_elimination
+from rangesfm.ceres.solving import Step, solve
+
+if TYPE_CHECKING:
+    from rangesfm._cpp import direction_cost, distance_cost, interpolated_range_cost, joint_prior_cost, range_cost
+
+__all__ = [
+    "PlacedRanges",
+    "RangeBlocks",
+    "Step",
+    "add_normal_prior",
+    "add_ranges",
+    "add_residual_block",
+    "check_compatibility",
+    "compiled_part_version",
+    "direction_cost",
+    "distance_cost",
+    "interpolated_range_cost",
+    "joint_prior_cost",
+    "keep_from_elimination",
+    "num_columns",
+    "pyceres_ceres_version",
+    "range_cost",
+    "solve",
+    "tangent_jacobian",
+]
+
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> Any:
+        """A compiled cost function, which is documented where it is bound, once its types are known to be shared.
+
+        Raises:
+            SolverError: see ``check_compatibility``.
+        """
+        if name not in __all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        check_compatibility()
+        from rangesfm import _cpp
+
+        return getattr(_cpp, name)

@@ -1,0 +1,376 @@
+"""How uncertain a bundle adjustment with ranges is: covariances of poses, anchors, biases, scale."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+from scipy import linalg
+from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix, diags
+from scipy.sparse.linalg import splu
+from scipy.spatial.transform import Rotation
+
+from rangesfm.ceres import num_columns, tangent_jacobian
+from rangesfm.errors import GeometryError
+from rangesfm.geometry.rotations import cross_matrices
+from rangesfm.geometry.trajectory import pose_of
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+# A motion of the whole world that changes the residuals by less than this part of what its parts would do alone
+# changes nothing: rounding leaves some 1e-15, a single weak range some 1e-5.
+_FREE_MOTION = 1e-9
+# Pivots of the normal equations, their diagonal scaled to 1, below which a direction is not determined.
+_MIN_PIVOT = 1e-13
+# From this share of nonzeros on, a dense inverse is faster than a sparse one.
+_DENSE_FROM = 0.15
+_BLOCKS_AT_ONCE = 64
+
+
+@dataclass(frozen=True)
+class ResidualErrors:
+    """How some residuals err otherwise than each on its own with the problem's residual stddev.
+
+    Attributes:
+        rows: (k,) which residuals, in the order of the problem; 3-D points have no part in them.
+        variance: of each, in squares of the residual stddev.
+        modes: (k, m) sparse: what they do together, in residual stddevs for each of m independent errors of stddev 1.
+    """
+
+    rows: npt.NDArray[np.int64]
+    variance: float
+    modes: csr_matrix
+
+
+@dataclass(frozen=True)
+class JointCovariance:
+    """Covariances from the joint normal equations, of everything that the problem estimates at once.
+
+    Attributes:
+        frame_ids: (n,) registered frames, ascending.
+        rig_from_world: (n, 6, 6) of a rotation from the left (rotation vector, rad) and the translation (metres).
+        centers: (n, 3, 3) of the rig frames' origins in the world, square metres.
+        anchors: (num_anchors, 3, 3) square metres.
+        others: of each other block, (k, k) in its unit.
+        relative_scale_stddev: of the map about its middle: of the similarity between true and estimated centres.
+        num_free_directions: how many motions of the whole map nothing holds (7 without ranges and gauge); along
+            these, covariances are those of the map that moves least (inner constraints). Blocks that are held
+            constant have covariance 0.
+    """
+
+    frame_ids: npt.NDArray[np.int64]
+    rig_from_world: Array
+    centers: Array
+    anchors: Array
+    others: tuple[Array, ...]
+    relative_scale_stddev: float
+    num_free_directions: int
+
+
+def joint_covariance(
+    problem: Any,
+    reconstruction: pycolmap.Reconstruction,
+    *,
+    anchors: Sequence[Array] = (),
+    others: Sequence[Array] = (),
+    residual_stddev: float = 1.0,
+    errors: ResidualErrors | None = None,
+) -> JointCovariance:
+    """Covariances at a problem's present parameters, by first order: the inverse of J^T J.
+
+    Where errors S of the residuals are not independent of stddev 1 it is (J^T J)^-1 J^T S J (J^T J)^-1.
+
+    3-D points are eliminated first (Schur complement), but for those that share a residual with another.
+
+    Args:
+        problem: of an adjuster over ``reconstruction``, with whatever residuals were added.
+        anchors: (3,) blocks that are points of the world.
+        others: further blocks: biases, lever arms, a time shift.
+        residual_stddev: of the residuals, which the covariances scale with: 1 if they are in stddevs.
+        errors: of residuals that err otherwise; None: none does.
+
+    Raises:
+        ValueError: the problem has blocks that are neither the reconstruction's nor given.
+        GeometryError: residuals do not determine some block.
+    """
+    columns = _Columns.of(problem, reconstruction, anchors, others)
+    jacobian = tangent_jacobian(problem, columns.variable).tocsc()
+    normal, kept = _schur_complement(jacobian, columns)
+    free = _free_motions(jacobian, _world_motions(columns))[kept]
+    inverse = _Inverse(normal, free, columns, _excess(jacobian[:, kept], errors))
+    blocks = inverse.diagonal_blocks([columns.span(i) for i in range(columns.num_kept_blocks)])
+    variance = residual_stddev**2
+    frames = columns.frames
+    poses = np.array([variance * columns.covariance(pose, blocks) for pose in columns.poses]).reshape(-1, 6, 6)
+    turn = np.diag([2.0, 2, 2, 1, 1, 1])  # Ceres turns by twice its step
+    to_center = np.array([_center_from_step(pose) for pose in columns.poses]).reshape(-1, 3, 6)
+    return JointCovariance(
+        frame_ids=frames,
+        rig_from_world=turn @ poses @ turn,
+        centers=to_center @ poses @ np.swapaxes(to_center, 1, 2),
+        anchors=np.array([variance * columns.covariance(anchor, blocks) for anchor in anchors]).reshape(-1, 3, 3),
+        others=tuple(variance * columns.covariance(block, blocks) for block in others),
+        relative_scale_stddev=residual_stddev * _scale_stddev(columns, inverse, len(kept)),
+        num_free_directions=free.shape[1],
+    )
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """The variable blocks in the order of the Jacobian's columns: poses, rigs, cameras, anchors, others, points.
+
+    Attributes:
+        frames: ids of registered frames; ``poses`` are their blocks, constant ones too.
+        variable: all blocks that are estimated.
+        kinds: of these: "pose", "sensor", "anchor", "point" or "other".
+        starts: first column of each, and the number of columns.
+        index_of: place in ``variable`` by address.
+    """
+
+    frames: npt.NDArray[np.int64]
+    poses: list[Array]
+    variable: list[Array]
+    kinds: list[str]
+    starts: npt.NDArray[np.int64]
+    index_of: dict[int, int]
+
+    @classmethod
+    def of(
+        cls, problem: Any, reconstruction: pycolmap.Reconstruction, anchors: Sequence[Array], others: Sequence[Array]
+    ) -> _Columns:
+        frames = sorted(reconstruction.reg_frame_ids())
+        poses = [pose_of(reconstruction.frame(frame)).params for frame in frames]
+        blocks = [("pose", pose) for pose in poses]
+        for rig in reconstruction.rigs.values():
+            blocks += [("sensor", rig.sensor_from_rig(sensor).params) for sensor in rig.non_ref_sensors]
+        blocks += [("other", camera.params) for camera in reconstruction.cameras.values()]
+        blocks += [("anchor", anchor) for anchor in anchors]
+        blocks += [("other", other) for other in others]
+        blocks += [("point", point.xyz) for point in reconstruction.points3D.values()]
+        known = [(kind, block) for kind, block in blocks if problem.has_parameter_block(block)]
+        if len(known) != problem.num_parameter_blocks():
+            raise ValueError(
+                f"the problem has {problem.num_parameter_blocks()} blocks, expected {len(known)}: those of the "
+                "reconstruction, of anchors and others"
+            )
+        variable = [(kind, block) for kind, block in known if not problem.is_parameter_block_constant(block)]
+        sizes = [num_columns(problem, block) for _, block in variable]
+        return cls(
+            np.array(frames, dtype=np.int64),
+            poses,
+            [block for _, block in variable],
+            [kind for kind, _ in variable],
+            np.concatenate([[0], np.cumsum(sizes, dtype=np.int64)]),
+            {_address(block): i for i, (_, block) in enumerate(variable)},
+        )
+
+    @property
+    def num_kept_blocks(self) -> int:
+        """All but the points, which come last."""
+        return self.kinds.index("point") if "point" in self.kinds else len(self.kinds)
+
+    @property
+    def num_kept_columns(self) -> int:
+        return int(self.starts[self.num_kept_blocks])
+
+    def span(self, index: int) -> slice:
+        return slice(int(self.starts[index]), int(self.starts[index + 1]))
+
+    def covariance(self, block: Array, inverse_blocks: list[Array]) -> Array:
+        """Its part of the inverse; 0 where it is constant or no part of the problem."""
+        index = self.index_of.get(_address(block))
+        size = 6 if len(block) == 7 else len(block)
+        return np.zeros((size, size)) if index is None else inverse_blocks[index]
+
+    def name(self, column: int) -> str:
+        """What a column belongs to, for messages."""
+        index = int(np.searchsorted(self.starts, column, side="right")) - 1
+        kind = self.kinds[index]
+        return f"{kind} number {self.kinds[:index].count(kind)}"
+
+
+class _Excess:
+    """J^T (S - 1) J, in the columns that are kept."""
+
+    def __init__(self, weighted: csc_matrix, modes: Array) -> None:
+        self._weighted, self._modes = weighted, modes
+
+    def between(self, left: Array, right: Array) -> Array:
+        """(a, b) left^T (...) right, of (size, a) and (size, b)."""
+        shared: Array = (left.T @ self._modes) @ (self._modes.T @ right)
+        shared += left.T @ (self._weighted @ right)
+        return shared
+
+
+def _excess(kept: csc_matrix, errors: ResidualErrors | None) -> _Excess:
+    if errors is None:
+        return _Excess(csc_matrix((kept.shape[1], kept.shape[1])), np.zeros((kept.shape[1], 0)))
+    rows = csr_matrix(kept)[errors.rows]
+    return _Excess(csc_matrix((errors.variance - 1) * (rows.T @ rows)), (rows.T @ errors.modes).toarray())
+
+
+def _address(block: Array) -> int:
+    return int(block.__array_interface__["data"][0])
+
+
+def _schur_complement(jacobian: csc_matrix, columns: _Columns) -> tuple[csc_matrix, npt.NDArray[np.int64]]:
+    """Normal equations of what is kept once the points are eliminated, and which columns are kept."""
+    first = columns.num_kept_columns
+    stays = np.repeat(_tied_points(jacobian[:, first:]), 3)
+    kept_columns = np.concatenate([np.arange(first), first + np.flatnonzero(stays)])
+    kept, points = jacobian[:, kept_columns], jacobian[:, first + np.flatnonzero(~stays)]
+    num_points = points.shape[1] // 3
+    squares = (points.T @ points).tocoo()
+    blocks = np.zeros((num_points, 3, 3))
+    blocks[squares.row // 3, squares.row % 3, squares.col % 3] = squares.data
+    # A point on the horizon has no depth to speak of; so little holds it without being felt elsewhere.
+    blocks += 1e-12 * np.maximum(np.trace(blocks, axis1=1, axis2=2), 1e-300)[:, None, None] * np.eye(3)
+    whitener = np.swapaxes(np.linalg.inv(np.linalg.cholesky(blocks)), 1, 2)
+    indices = np.arange(num_points)
+    whiten = bsr_matrix((whitener, indices, np.arange(num_points + 1)), shape=(3 * num_points, 3 * num_points))
+    coupling = (kept.T @ points) @ whiten
+    return csc_matrix(kept.T @ kept - coupling @ coupling.T), kept_columns
+
+
+def _tied_points(points: csc_matrix) -> Mask:
+    """(num_points,) which share a residual with another, as two markers with a taped distance do."""
+    entries = points.tocoo()
+    shape = points.shape[0], points.shape[1] // 3
+    meets = csr_matrix((np.ones(entries.nnz), (entries.row, entries.col // 3)), shape=shape)
+    tied = np.zeros(shape[1], dtype=bool)
+    of_row = np.repeat(np.diff(meets.indptr), np.diff(meets.indptr))
+    tied[meets.indices[of_row > 1]] = True
+    return tied
+
+
+def _world_motions(columns: _Columns) -> Array:
+    """(num_columns, 7) how small turns, shifts and a change of scale of the world move everything in it."""
+    motions = np.zeros((int(columns.starts[-1]), 7))
+    for i, (kind, block) in enumerate(zip(columns.kinds, columns.variable, strict=True)):
+        rows = motions[columns.span(i)]
+        if kind == "pose":
+            rotation, translation = _matrix(block), block[4:]
+            center = -rotation.T @ translation
+            rows[:3, :3] = -0.5 * rotation
+            rows[3:, 3:] = -rotation @ np.column_stack([np.eye(3), center])
+        elif kind == "sensor" and len(rows) == 6:
+            rows[3:, 6] = block[4:]
+        elif kind in ("anchor", "point"):
+            rows[:, :3] = -cross_matrices(block)
+            rows[:, 3:] = np.column_stack([np.eye(3), block])
+    return motions
+
+
+def _free_motions(jacobian: csc_matrix, motions: Array) -> Array:
+    """(num_columns, k) a basis of the motions of the world that change no residual."""
+    alone = np.sqrt(np.square(abs(jacobian) @ np.abs(motions)).sum(axis=0))
+    moves = alone > _FREE_MOTION * alone.max()
+    scaled = motions[:, moves] / alone[moves]
+    _, strengths, directions = np.linalg.svd(jacobian @ scaled, full_matrices=False)
+    free: Array = scaled @ directions[strengths < _FREE_MOTION].T
+    return free
+
+
+class _Inverse:
+    """The pseudo-inverse of the normal equations, orthogonal to the free motions."""
+
+    def __init__(self, normal: csc_matrix, free: Array, columns: _Columns, excess: _Excess) -> None:
+        self._excess = excess
+        self._free = linalg.orth(free) if free.shape[1] else free
+        scale = 1.0 / np.sqrt(np.maximum(normal.diagonal(), 1e-300))
+        # Holding as many coordinates as there are free motions makes the rest regular; which ones makes no difference.
+        held = np.zeros(len(scale))
+        held[linalg.qr(self._free.T, mode="r", pivoting=True)[1][: free.shape[1]]] = 1.0
+        scaled = csc_matrix(diags(scale) @ normal @ diags(scale) + diags(held))
+        self._scale = scale[:, None]
+        self._solve_scaled = (_dense_solver if scaled.nnz > _DENSE_FROM * len(scale) ** 2 else _sparse_solver)(
+            scaled, columns
+        )
+
+    def solve(self, right: Array) -> Array:
+        """(size, k) for (size, k)."""
+        right = right - self._free @ (self._free.T @ right)
+        solution = self._scale * self._solve_scaled(self._scale * right)
+        projected: Array = solution - self._free @ (self._free.T @ solution)
+        return projected
+
+    def diagonal_blocks(self, spans: Sequence[slice]) -> list[Array]:
+        """The blocks of the covariance at these rows and columns."""
+        blocks: list[Array] = []
+        for first in range(0, len(spans), _BLOCKS_AT_ONCE):
+            some = spans[first : first + _BLOCKS_AT_ONCE]
+            start, stop = some[0].start, some[-1].stop
+            right = np.zeros((len(self._scale), stop - start))
+            right[np.arange(start, stop), np.arange(stop - start)] = 1.0
+            solution = self.solve(right)
+            for span in some:
+                of_block = solution[:, span.start - start : span.stop - start]
+                blocks.append(of_block[span] + self._excess.between(of_block, of_block))
+        return blocks
+
+    def variance(self, gradient: Array) -> float:
+        """Of the linear function with this (size, 1) gradient."""
+        solution = self.solve(gradient)
+        return float((gradient.T @ solution + self._excess.between(solution, solution)).item())
+
+
+def _dense_solver(normal: csc_matrix, columns: _Columns) -> Callable[[Array], Array]:
+    try:
+        factor = linalg.cho_factor(normal.toarray(), lower=True, overwrite_a=True, check_finite=False)
+    except linalg.LinAlgError as error:
+        column = int(str(error).split("-th")[0]) - 1
+        raise _not_determined(columns, column) from error
+    _check_pivots(np.square(np.diag(factor[0])), np.arange(normal.shape[0]), columns)
+    return lambda right: np.asarray(linalg.cho_solve(factor, right, check_finite=False))
+
+
+def _sparse_solver(normal: csc_matrix, columns: _Columns) -> Callable[[Array], Array]:
+    try:
+        factor = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    except RuntimeError as error:  # exactly singular
+        raise _not_determined(columns, int(np.argmin(normal.diagonal()))) from error
+    _check_pivots(np.abs(factor.U.diagonal()), np.argsort(factor.perm_c), columns)
+    return lambda right: np.asarray(factor.solve(right))
+
+
+def _check_pivots(pivots: Array, columns_of_pivots: npt.NDArray[np.int64], columns: _Columns) -> None:
+    worst = int(np.argmin(pivots))
+    if not pivots[worst] > _MIN_PIVOT:
+        raise _not_determined(columns, int(columns_of_pivots[worst]))
+
+
+def _not_determined(columns: _Columns, column: int) -> GeometryError:
+    return GeometryError(f"the residuals do not determine the problem's {columns.name(column)}: no covariance")
+
+
+def _scale_stddev(columns: _Columns, inverse: _Inverse, num_rows: int) -> float:
+    """Of the scale in a similarity fitted, by least squares, to how the centres of all frames err."""
+    centers = np.array([-_matrix(pose).T @ pose[4:] for pose in columns.poses])
+    if len(centers) < 2:
+        return float("nan")
+    middle = centers.mean(axis=0)
+    spread = np.square(centers - middle).sum()
+    gradient = np.zeros((num_rows, 1))
+    for pose, center in zip(columns.poses, centers, strict=True):
+        index = columns.index_of.get(_address(pose))
+        if index is not None:
+            gradient[columns.span(index), 0] = _center_from_step(pose).T @ ((center - middle) / spread)
+    return float(np.sqrt(max(inverse.variance(gradient), 0.0)))
+
+
+def _center_from_step(pose: Array) -> Array:
+    """(3, 6) how the centre -R^T t moves with a step in the tangent space of Ceres, which turns by twice the step."""
+    rotation = _matrix(pose)
+    moved: Array = -rotation.T @ np.column_stack([2.0 * cross_matrices(pose[4:]), np.eye(3)])
+    return moved
+
+
+def _matrix(pose: Array) -> Array:
+    """(3, 3) rotation of [qx qy qz qw tx ty tz]."""
+    matrix: Array = Rotation.from_quat(pose[:4]).as_matrix()
+    return matrix

@@ -1,0 +1,67 @@
+"""Solving a bundle adjuster's problem, with a say in when it is enough."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from rangesfm.ceres.compatibility import check_compatibility
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+@dataclass(frozen=True)
+class Step:
+    """What the solver just did.
+
+    Attributes:
+        is_successful: whether the parameters moved. trust_region_radius: with which the step was found.
+        cost: after it. gain: by how much it fell.
+    """
+
+    is_successful: bool
+    trust_region_radius: float
+    cost: float
+    gain: float
+
+
+def solve(adjuster: pycolmap.CeresBundleAdjuster, is_enough: Callable[[Step], bool]) -> Any:
+    """Solve as ``adjuster.solve`` does, asking after each step whether that is enough.
+
+    Args:
+        is_enough: called with the parameters where the step left them; True ends the solve. What it raises ends it
+            too, and is raised here.
+
+    Returns:
+        Ceres' summary, a ``pyceres.SolverSummary``.
+    """
+    check_compatibility()
+    import pyceres
+
+    class AfterStep(pyceres.IterationCallback):  # type: ignore[misc]
+        def __init__(self) -> None:
+            super().__init__()
+            self.radius = 0.0
+            self.error: BaseException | None = None
+
+        def __call__(self, summary: Any) -> Any:
+            # An exception must not pass through the solver.
+            try:
+                step = Step(summary.step_is_successful, self.radius, summary.cost, summary.cost_change)
+                self.radius = summary.trust_region_radius
+                if summary.iteration == 0 or not is_enough(step):
+                    return pyceres.CallbackReturnType.SOLVER_CONTINUE
+                return pyceres.CallbackReturnType.SOLVER_TERMINATE_SUCCESSFULLY
+            except BaseException as error:
+                self.error = error
+                return pyceres.CallbackReturnType.SOLVER_ABORT
+
+    after_step, summary = AfterStep(), pyceres.SolverSummary()
+    options = pyceres.SolverOptions(adjuster.options.ceres.create_solver_options(adjuster.config, adjuster.problem))
+    options.callbacks, options.update_state_every_iteration = [after_step], True
+    pyceres.solve(options, adjuster.problem, summary)
+    if after_step.error is not None:
+        raise after_step.error
+    return summary

@@ -1,0 +1,1 @@
+"""COLMAP models on disk and in memory, its options and its log."""

@@ -1,0 +1,88 @@
+"""Keys of a survey file straight into pycolmap's option objects, checked one by one."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rangesfm.colmap.log import colmap_log
+from rangesfm.errors import OptionError, nearest_known, printable, shown
+
+_EXPECTED = {
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    str: "text",
+    set: "a list",
+    list: "a list",
+}
+_ACCEPTED: dict[type, tuple[type, ...]] = {float: (int, float), set: (list, tuple, set), list: (list, tuple)}
+
+
+def apply_options(options: Any, values: Mapping[str, Any], table: str) -> None:
+    """Set attributes of a pycolmap option object from a table of plain values.
+
+    Args:
+        options: any pycolmap ``*Options`` object; changed in place.
+        values: by COLMAP's own names; an object inside takes a table, an enumeration the name of a member.
+        table: what the user calls this table, for messages (for example ``"mapper.pipeline"``).
+
+    Raises:
+        OptionError: an unknown key (names the nearest known one), a value of another type, or
+            values that COLMAP itself refuses (with its reason).
+    """
+    _assign(options, values, table)
+    if values and hasattr(type(options), "check"):
+        _check(options, table)
+
+
+def _assign(options: Any, values: Mapping[str, Any], table: str) -> None:
+    known = options.todict(recursive=False)
+    for key, value in values.items():
+        if key not in known:
+            nearest = nearest_known(key, known)
+            message = f"unknown key '{printable(key)}' in [{table}]; the nearest known one is '{nearest}'"
+            raise OptionError(message, table, key)
+        # On the type: asking a pycolmap object for an attribute that it lacks writes to its log.
+        if hasattr(type(known[key]), "todict"):
+            if not isinstance(value, Mapping):
+                raise _wrong_value(table, key, value, "a table")
+            # The attribute is the object inside; todict made a copy.
+            _assign(getattr(options, key), value, f"{table}.{key}")
+        else:
+            _assign_value(options, key, value, type(known[key]), table)
+
+
+def _assign_value(options: Any, key: str, value: Any, kind: Any, table: str) -> None:
+    """Set one attribute; stricter than pybind11, which takes True for 1 and 1 for True."""
+    if hasattr(kind, "__members__"):
+        if not isinstance(value, str) or value not in kind.__members__:
+            raise _wrong_value(table, key, value, "one of " + ", ".join(kind.__members__))
+        setattr(options, key, kind.__members__[value])
+        return
+    kind = str if issubclass(kind, Path) else kind
+    expected = _EXPECTED.get(kind, f"pycolmap.{kind.__name__}")
+    if not isinstance(value, _ACCEPTED.get(kind, (kind,))) or (isinstance(value, bool) and kind is not bool):
+        raise _wrong_value(table, key, value, expected)
+    try:
+        setattr(options, key, kind(value))
+    except TypeError:  # the items of a list, or a number too large
+        raise _wrong_value(table, key, value, f"{expected} that COLMAP takes") from None
+
+
+def _check(options: Any, table: str) -> None:
+    """Let COLMAP look at its values; the reason of a refusal it only logs."""
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder) / "check.log"
+        with colmap_log(log):
+            accepted = options.check()
+        if not accepted:
+            found = re.search(r"Check failed: (.*)", log.read_text(errors="replace"))
+            raise OptionError(f"[{table}] COLMAP refuses a value" + (f", expected {found[1]}" if found else ""), table)
+
+
+def _wrong_value(table: str, key: str, value: Any, expected: str) -> OptionError:
+    return OptionError(f"[{table}] {key} is {shown(value)}, expected {expected}", table, key)

@@ -1,0 +1,1 @@
+"""Models against a reference and against each other."""

@@ -1,0 +1,341 @@
+"""Any number of models of the same photos against the first of them: what is where, how long, how well it fits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+from scipy.spatial.transform import Rotation
+
+from rangesfm.colmap.model_files import read_model
+from rangesfm.comparison.ranges import ModelRanges, ranges_of_result
+from rangesfm.comparison.with_reference import MIN_NUM_ALIGNED, reprojection_rms_px
+from rangesfm.distances.ends import locate_distances
+from rangesfm.distances.tape import Tape
+from rangesfm.errors import InputError
+from rangesfm.geometry.reference import read_reference
+from rangesfm.geometry.similarity import Similarity, rmse, similarity_between
+from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.result.folder import ResultFolder, read_result_folder
+from rangesfm.result.summary import ResultSummary
+from rangesfm.text_table import align_rows
+
+Array = npt.NDArray[np.float64]
+
+NUM_DISTANCES = 6
+
+
+@dataclass(frozen=True)
+class NamedModel:
+    """One of the models.
+
+    Attributes:
+        name: as the user gave it.
+        path: the keyframes in the model's own world.
+        model: None where only positions are known.
+        result: the result folder it comes from; None where it does not.
+        has_orientations: whether the path's rotations are the cameras'.
+    """
+
+    name: str
+    path: Trajectory
+    model: pycolmap.Reconstruction | None
+    result: ResultFolder | None
+    has_orientations: bool = True
+
+
+@dataclass(frozen=True)
+class ModelRow:
+    """One model against the first.
+
+    Attributes:
+        name: of the model.
+        num_photos, num_common: in it, and in the first as well.
+        base_from_model: the similarity that carries it onto the first; None with fewer than three common photos.
+        common_names: the photos in both, in the first's order.
+        moved, moved_aligned: (num_common,) distance of each camera from where the first has it, as it is and after
+            that similarity, in the first's unit; the latter None without one.
+        reprojection_rms_px: None without points.
+        range_rms_m: of the ranges given, else of those that the first result folder used: of the cameras as they are,
+            and carried by a similarity onto the path that the ranges themselves have placed; None without ranges.
+    """
+
+    name: str
+    num_photos: int
+    num_common: int
+    base_from_model: Similarity | None
+    common_names: tuple[str, ...]
+    moved: Array
+    moved_aligned: Array | None
+    reprojection_rms_px: float | None
+    range_rms_m: tuple[float, float] | None
+
+    @property
+    def rotation_deg(self) -> float | None:
+        """Angle by which the similarity turns."""
+        if self.base_from_model is None:
+            return None
+        return float(np.rad2deg(Rotation.from_matrix(self.base_from_model.rotation).magnitude()))
+
+
+@dataclass(frozen=True)
+class TapedRow:
+    """One taped distance.
+
+    Attributes:
+        ends: between what.
+        measured_m: by tape.
+        lengths: in each model, in its own unit; None where there is only a path.
+        lengths_m: the same, with the scale that carries the model onto the placed path; None without ranges.
+    """
+
+    ends: tuple[str, str]
+    measured_m: float
+    lengths: tuple[float | None, ...]
+    lengths_m: tuple[float | None, ...] | None
+
+
+@dataclass(frozen=True)
+class ModelsComparison:
+    """Models of the same photos.
+
+    Attributes:
+        models: as given; the first is what the others are compared with.
+        rows: one for each.
+        distances: of a few pairs of photos that all models have: both names, and the length in each model's unit.
+        taped: taped distances; empty without.
+    """
+
+    models: tuple[NamedModel, ...]
+    rows: tuple[ModelRow, ...]
+    distances: tuple[tuple[str, str, tuple[float, ...]], ...]
+    taped: tuple[TapedRow, ...] = ()
+
+    def __str__(self) -> str:
+        tables = [_similarity_table(self), _distance_table(self)]
+        if self.taped:
+            tables.append(align_rows([taped_header(self), *(tuple(taped_cells(row)) for row in self.taped)]))
+        return "\n\n".join(tables)
+
+
+def read_models(paths: Sequence[Path]) -> tuple[NamedModel, ...]:
+    """Read COLMAP models, result folders (their final model) and files of camera positions (CSV or TUM).
+
+    Raises:
+        InputError: one of them is none of these; or the first is a file, which says too little.
+    """
+    if paths[0].is_file():
+        raise InputError("the first must be a model or a result folder, the others may be files of positions", paths[0])
+    models: list[NamedModel] = []
+    for path in paths:
+        models.append(_read_positions(path, models[0].path) if path.is_file() else _read_model(path))
+    return tuple(models)
+
+
+def compare_many(
+    models: Sequence[NamedModel], ranges: ModelRanges | None = None, tape: Tape | None = None
+) -> ModelsComparison:
+    """Compare models with the first of them.
+
+    Args:
+        ranges: to hold the models against; None: those of the first result folder among them, if there is one.
+        tape: taped distances to look up in each model.
+
+    Raises:
+        InputError: one has no photo in common with the first, or lacks the end of a taped distance.
+    """
+    ranges = ranges or _ranges_of_first_result(models)
+    rows = tuple(_row(models[0], model, ranges) for model in models)
+    taped = () if tape is None else _taped(models, ranges, tape)
+    return ModelsComparison(tuple(models), rows, _distances(models), taped)
+
+
+def _ranges_of_first_result(models: Sequence[NamedModel]) -> ModelRanges | None:
+    found = (None if model.result is None else ranges_of_result(model.result, model.path) for model in models)
+    return next((ranges for ranges in found if ranges is not None), None)
+
+
+def _read_model(path: Path) -> NamedModel:
+    if (path / ResultSummary.NAME).is_file():
+        result = read_result_folder(path)
+        model = result.read_metric_model()
+        if model is None:
+            raise InputError("the result holds no metric model", path)
+        return NamedModel(str(path), trajectory_from_reconstruction(model, result.timestamps_s), model, result)
+    model = read_model(path)
+    return NamedModel(str(path), trajectory_from_reconstruction(model), model, None)
+
+
+def _read_positions(path: Path, base: Trajectory) -> NamedModel:
+    reference = read_reference(path)
+    positions, rotations = reference.positions_at(base)
+    known = np.flatnonzero(np.isfinite(positions).all(axis=1))
+    if len(known) == 0:
+        raise InputError(reference.why_nothing_is_known(base), path)
+    trajectory = Trajectory(
+        frame_ids=base.frame_ids[known],
+        image_names=tuple(base.image_names[i] for i in known),
+        timestamps_s=None if base.timestamps_s is None else base.timestamps_s[known],
+        centers=positions[known],
+        world_from_cam=np.tile(np.eye(3), (len(known), 1, 1)) if rotations is None else rotations[known],
+    )
+    return NamedModel(str(path), trajectory, None, None, has_orientations=rotations is not None)
+
+
+def _row(base: NamedModel, other: NamedModel, ranges: ModelRanges | None) -> ModelRow:
+    names, ours, theirs = _common(base.path, other.path)
+    if not names:
+        raise InputError(f"it has no photo in common with {base.name}", other.name)
+    similarity = _similarity(theirs, ours)
+    return ModelRow(
+        name=other.name,
+        num_photos=len(other.path),
+        num_common=len(names),
+        base_from_model=similarity,
+        common_names=names,
+        moved=np.linalg.norm(theirs - ours, axis=1),
+        moved_aligned=None if similarity is None else np.linalg.norm(similarity.apply(theirs) - ours, axis=1),
+        reprojection_rms_px=_reprojection(other.model),
+        range_rms_m=None if ranges is None else _range_rms(ranges, other),
+    )
+
+
+def _reprojection(model: pycolmap.Reconstruction | None) -> float | None:
+    value = None if model is None else reprojection_rms_px(model)
+    return None if value is None or np.isnan(value) else value
+
+
+def _common(first: Trajectory, second: Trajectory) -> tuple[tuple[str, ...], Array, Array]:
+    """Names of the photos in both, and their centres in each."""
+    index = {name: i for i, name in enumerate(second.image_names)}
+    rows = [(i, index[name]) for i, name in enumerate(first.image_names) if name in index]
+    ours, theirs = np.array(rows, dtype=np.int64).reshape(-1, 2).T
+    return tuple(first.image_names[i] for i in ours), first.centers[ours], second.centers[theirs]
+
+
+def _similarity(source: Array, target: Array) -> Similarity | None:
+    return similarity_between(source, target) if len(source) >= MIN_NUM_ALIGNED else None
+
+
+def _onto_ranges(ranges: ModelRanges, path: Trajectory) -> Similarity | None:
+    """What carries a path onto the one that the ranges have placed."""
+    _, goal, source = _common(ranges.metric_path, path)
+    return _similarity(source, goal)
+
+
+def _scale_onto(ranges: ModelRanges, path: Trajectory) -> float | None:
+    similarity = _onto_ranges(ranges, path)
+    return None if similarity is None else similarity.scale
+
+
+def _range_rms(ranges: ModelRanges, model: NamedModel) -> tuple[float, float] | None:
+    """RMS of the residuals with a model's cameras, as they are and carried."""
+    similarity = _onto_ranges(ranges, model.path)
+    if similarity is None or not model.has_orientations:
+        return None
+    carried = model.path.transformed(similarity.scale, similarity.rotation, similarity.translation)
+    both = [ranges.residuals_m(path) for path in (model.path, carried)]
+    if not len(both[0]):
+        return None
+    return float(np.sqrt(np.mean(both[0] ** 2))), float(np.sqrt(np.mean(both[1] ** 2)))
+
+
+def _taped(models: Sequence[NamedModel], ranges: ModelRanges | None, tape: Tape) -> tuple[TapedRow, ...]:
+    anchors = {} if ranges is None else ranges.anchors_m
+    own = [_taped_lengths(model, tape, 1.0, anchors) for model in models]
+    placed = None
+    if ranges is not None:
+        scales = [_scale_onto(ranges, model.path) for model in models]
+        placed = [_taped_lengths(model, tape, scale, anchors) for model, scale in zip(models, scales)]
+    return tuple(
+        TapedRow(
+            taped.ends,
+            taped.distance_m,
+            tuple(lengths[row] for lengths in own),
+            None if placed is None else tuple(lengths[row] for lengths in placed),
+        )
+        for row, taped in enumerate(tape.distances)
+    )
+
+
+def _taped_lengths(
+    model: NamedModel, tape: Tape, scale: float | None, anchors_m: Mapping[str, Array]
+) -> list[float | None]:
+    if model.model is None or scale is None:
+        return [None] * len(tape.distances)
+    try:
+        located = locate_distances(tape, model.model, list(anchors_m))
+    except InputError as error:
+        raise InputError(f"{error} (model {model.name})") from None
+    return [float(length) for length in located.lengths_m(scale, np.array(list(anchors_m.values())).reshape(-1, 3))]
+
+
+def _distances(models: Sequence[NamedModel]) -> tuple[tuple[str, str, tuple[float, ...]], ...]:
+    """Between photos spread over the path that all models have."""
+    places = [dict(zip(model.path.image_names, model.path.centers)) for model in models]
+    names = [name for name in models[0].path.image_names if all(name in place for place in places)]
+    last = len(names) - 1
+    quarters = [round(last * share / 4) for share in range(5)]
+    pairs = [(quarters[i], quarters[j]) for i, j in ((0, 4), (0, 2), (2, 4), (1, 3), (0, 1), (3, 4))]
+    distinct = dict.fromkeys((names[a], names[b]) for a, b in pairs[:NUM_DISTANCES] if names and a != b)
+    return tuple((a, b, tuple(float(np.linalg.norm(place[a] - place[b])) for place in places)) for a, b in distinct)
+
+
+def taped_header(comparison: ModelsComparison) -> tuple[str, ...]:
+    """Titles of the columns of ``taped_cells``."""
+    names = [model.name for model in comparison.models]
+    placed = [f"{name} after Sim(3)" for name in names] if comparison.taped[0].lengths_m is not None else []
+    return ("taped distance", "tape m", *names, *placed)
+
+
+def taped_cells(row: TapedRow) -> list[str]:
+    """The row as text."""
+    lengths = (*row.lengths, *(row.lengths_m or ()))
+    return ["{} to {}".format(*row.ends), *(_text(length, ".4f") for length in (row.measured_m, *lengths))]
+
+
+def similarity_cells(row: ModelRow) -> list[str]:
+    """The row as text, but for its name: what ``SIMILARITY_HEADER`` names."""
+    similarity, aligned = row.base_from_model, row.moved_aligned
+    return [
+        f"{row.num_common} of {row.num_photos}",
+        _text(None if similarity is None else similarity.scale, ".6g"),
+        _text(row.rotation_deg, ".3f"),
+        _text(rmse(row.moved[:, None]), ".4f"),
+        _text(None if aligned is None else rmse(aligned[:, None]), ".4f"),
+        _text(None if aligned is None else float(aligned.max()), ".4f"),
+        _text(row.reprojection_rms_px, ".4f"),
+        *(_text(None if row.range_rms_m is None else value, ".4f") for value in row.range_rms_m or (0.0, 0.0)),
+    ]
+
+
+SIMILARITY_HEADER = (
+    "model",
+    "photos in common",
+    "scale",
+    "turn deg",
+    "moved",
+    "after Sim(3)",
+    "most",
+    "reproj. px",
+    "range RMS m",
+    "after Sim(3)",
+)
+
+
+def _similarity_table(comparison: ModelsComparison) -> str:
+    return align_rows([SIMILARITY_HEADER, *((row.name, *similarity_cells(row)) for row in comparison.rows)])
+
+
+def _distance_table(comparison: ModelsComparison) -> str:
+    header = ("distance", *(model.name for model in comparison.models))
+    rows = [(f"{a} to {b}", *(f"{length:.4f}" for length in lengths)) for a, b, lengths in comparison.distances]
+    return align_rows([header, *rows])
+
+
+def _text(value: float | None, spec: str) -> str:
+    return "-" if value is None else f"{value:{spec}}"

@@ -1,0 +1,169 @@
+"""Ranges that any model of the same photos can be held against."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from rangesfm.errors import InputError
+from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.options import AssociationOptions
+from rangesfm.ranging.association import associate
+from rangesfm.ranging.clock.estimate import estimate_time_offset
+from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.observations import RangeObservations
+from rangesfm.result.folder import ResultFolder
+from rangesfm.result.metric_result import USED
+from rangesfm.result.ranges_as_used import RangesAsUsed
+from rangesfm.scale.initialize import initialize_scale
+from rangesfm.survey.inputs import RangingInputs, times_of_model
+from rangesfm.survey.settings import Survey
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ModelRanges:
+    """n ranges, and the metric world in which their anchors stand.
+
+    Attributes:
+        log: the ranges, at times of the camera's clock or by photo.
+        tags_in_cam_m: (3,) lever arm by tag id.
+        anchors_m: (3,) position by anchor id, in the metric world.
+        biases_m: what its ranges read too long, by anchor id.
+        image_times_s: of the photos by name; None where the log names them.
+        metric_path: a path in the metric world, onto which others can be carried.
+        association: how ranges are put on a path.
+    """
+
+    log: RangeLog
+    tags_in_cam_m: Mapping[str, Array]
+    anchors_m: Mapping[str, Array]
+    biases_m: Mapping[str, float]
+    image_times_s: Mapping[str, float] | None
+    metric_path: Trajectory
+    association: AssociationOptions
+
+    def residuals_m(self, path: Trajectory) -> Array:
+        """(k,) predicted minus measured, of the ranges that have a place on a path in the metric world."""
+        timed = path if self.image_times_s is None else path.timed(self.image_times_s)
+        tags = np.array([self.tags_in_cam_m[id_] for id_ in self.log.tag_ids]).reshape(-1, 3)
+        anchors = np.array([self.anchors_m[id_] for id_ in self.log.anchor_ids]).reshape(-1, 3)
+        biases = np.array([self.biases_m[id_] for id_ in self.log.anchor_ids])
+        if len(timed) == 0 or len(self.log) == 0:
+            return np.zeros(0)
+        at = associate(self.log, timed, tags, options=self.association)
+        index = self.log.anchor_index
+        predicted = np.linalg.norm(at.centers + at.tag_from_center - anchors[index], axis=1) + biases[index]
+        return np.asarray((predicted - self.log.range_m)[at.has_place])
+
+
+def ranges_of_result(result: ResultFolder, metric_path: Trajectory) -> ModelRanges | None:
+    """The ranges that a run used, its anchors and their biases; None where it left none.
+
+    Args:
+        metric_path: of the run's final model.
+    """
+    ranges, anchors = result.read(RangesAsUsed), result.anchor_positions_m
+    if ranges is None:
+        return None
+    index = {name: i for i, name in enumerate(metric_path.image_names)}
+    ends = [
+        np.array([index.get(name, -1) for name in names], dtype=np.int64)
+        for names in (ranges.keyframe_before, ranges.keyframe_after)
+    ]
+    is_placed = (ends[0] >= 0) & (ends[1] >= 0) & np.isfinite(ranges.weight)
+    rows = np.flatnonzero(ranges.is_used & is_placed & np.isin(np.array(ranges.anchor_id, dtype=str), list(anchors)))
+    times, names = _times_of_places(metric_path, ends[0][rows], ends[1][rows], ranges.weight[rows])
+    tag_ids = [ranges.tag_id[row] for row in rows]
+    log = RangeLog.from_arrays(
+        [ranges.anchor_id[row] for row in rows],
+        ranges.range_m[rows],
+        timestamp_s=times,
+        image_name=names,
+        tag_id=tag_ids,
+        source=result.path / RangesAsUsed.NAME,
+    )
+    return ModelRanges(
+        log=log,
+        tags_in_cam_m=dict(zip(tag_ids, result.lever_arms_m(tag_ids), strict=True)),
+        anchors_m=anchors,
+        biases_m={id_: result.summary.anchors[id_].range_bias_m or 0.0 for id_ in anchors},
+        image_times_s=result.timestamps_s,
+        metric_path=metric_path,
+        association=result.summary.settings.ranges.association,
+    )
+
+
+def _times_of_places(
+    path: Trajectory, before: npt.NDArray[np.int64], after: npt.NDArray[np.int64], weight: Array
+) -> tuple[Array | None, list[str] | None]:
+    """When the camera was there by its own clock; the photos' names where they have no times."""
+    if path.timestamps_s is None:
+        return None, [path.image_names[row] for row in before]
+    return (1 - weight) * path.timestamps_s[before] + weight * path.timestamps_s[after], None
+
+
+def ranges_of_survey(
+    survey: Survey, inputs: RangingInputs, model: pycolmap.Reconstruction, model_path: Path
+) -> ModelRanges:
+    """Ranges of a log, placed by a model: those that its scale estimate believes, and the anchors as it has them.
+
+    Args:
+        survey: the log, the anchors, the tag and the photos' times.
+        inputs: the same, as read.
+        model: in any unit; metric or not, it is scaled by the ranges.
+        model_path: where it was read from.
+
+    Raises:
+        InputError: the photos have no times, or no range has a place.
+        GeometryError: the ranges do not determine the time offset or the model's scale.
+    """
+    times = None if inputs.log.image_name is not None else times_of_model(survey, model, model_path).by_name()
+    path = trajectory_from_reconstruction(model, times)
+    log = inputs.log
+    if log.timestamp_s is not None:
+        log = replace(log, timestamp_s=log.timestamp_s + _offsets_s(survey, inputs, path))
+    observations = associate(log, path, inputs.tag_in_cam_m, options=survey.ranges)
+    if not observations.has_place.any():
+        raise InputError("no range is at a photo of the model: are --images and the time offset theirs?", log.source)
+    estimate = initialize_scale(
+        observations,
+        path,
+        inputs.anchors,
+        anchor_frame=inputs.anchor_frame,
+        options=survey.scale,
+        range_model=survey.ranges,
+        seed=survey.output.seed,
+    )
+    metric = estimate.metric_from_sfm
+    to_site = inputs.site.offset_m if estimate.frame == "site" else np.zeros(3)
+    anchors = {anchor.anchor_id: anchor for anchor in estimate.anchors if np.isfinite(anchor.position_m).all()}
+    return ModelRanges(
+        log=_believed(estimate.observations),
+        tags_in_cam_m=dict(zip(log.tag_ids, inputs.tag_in_cam_m, strict=True)),
+        anchors_m={id_: anchor.position_m + to_site for id_, anchor in anchors.items()},
+        biases_m={id_: anchor.range_bias_m for id_, anchor in anchors.items()},
+        image_times_s=times,
+        metric_path=path.transformed(metric.scale, metric.rotation, metric.translation + to_site),
+        association=survey.ranges,
+    )
+
+
+def _believed(observations: RangeObservations) -> RangeLog:
+    return observations.log.subset(np.isin(observations.status, USED))
+
+
+def _offsets_s(survey: Survey, inputs: RangingInputs, path: Trajectory) -> float | Array:
+    """(n,) image time minus range time, or one for all."""
+    if survey.ranges.time_offset_s is not None or inputs.log.timestamp_s is None:
+        return survey.ranges.time_offset_s or 0.0
+    offset = estimate_time_offset(
+        inputs.log, path, inputs.tag_in_cam_m, association=survey.ranges, seed=survey.output.seed
+    )
+    return offset.at(inputs.log.timestamp_s)

@@ -1,0 +1,116 @@
+"""A radio's log along a path with known truth: noise, bias, obstructed and lost ranges, another clock."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.demo.path import CameraPath
+from rangesfm.ranging.log import RangeLog
+
+FloatArray = npt.NDArray[np.float64]
+
+# A radio cannot measure less than this; the log's ranges are positive.
+_MIN_RANGE_M = 0.01
+
+
+@dataclass(frozen=True)
+class Radio:
+    """How the radio measures.
+
+    Attributes:
+        rate_hz: ranges to each anchor in a second; the anchors take turns.
+        range_stddev_m: Gaussian noise.
+        range_bias_m: what an anchor's ranges read too long, by its id; 0 where not given.
+        obstructed_share: share of ranges without line of sight.
+        obstructed_mean_m: mean of the exponential distribution of what these read too long.
+        lost_share: share of ranges that never arrive.
+        time_offset_s: image time = range time + offset.
+        resolution_m: ranges are multiples of it; 0: not rounded.
+    """
+
+    rate_hz: float = 10.0
+    range_stddev_m: float = 0.0
+    range_bias_m: Mapping[str, float] = field(default_factory=dict)
+    obstructed_share: float = 0.0
+    obstructed_mean_m: float = 1.0
+    lost_share: float = 0.0
+    time_offset_s: float = 0.0
+    resolution_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class SimulatedRanges:
+    """n ranges and the truth about them, in the order of the log.
+
+    Attributes:
+        log: as the radio gives it.
+        image_time_s: (n,) when each was taken, on the camera's clock.
+        distance_m: (n,) true distance between the antennas.
+        is_obstructed: (n,) whether it had no line of sight.
+    """
+
+    log: RangeLog
+    image_time_s: FloatArray
+    distance_m: FloatArray
+    is_obstructed: npt.NDArray[np.bool_]
+
+
+def simulate_ranges(
+    path: CameraPath,
+    anchors_m: Mapping[str, Sequence[float] | FloatArray],
+    tag_in_cam_m: Sequence[float] | FloatArray,
+    radio: Radio,
+    seed: int = 0,
+) -> SimulatedRanges:
+    """Ranges at the radio's rate all along a path.
+
+    Args:
+        path: the camera's.
+        anchors_m: (3,) position in the world by id.
+        tag_in_cam_m: (3,) lever arm.
+        radio: how it measures.
+        seed: of noise, obstruction and loss.
+    """
+    num_rounds = int((path.end_s - path.start_s) * radio.rate_hz)
+    turn = np.arange(num_rounds * len(anchors_m))
+    times = path.start_s + turn / (radio.rate_hz * len(anchors_m))
+    tags = path.centers(times) + path.world_from_cam(times) @ np.asarray(tag_in_cam_m, dtype=np.float64)
+    return measure_ranges(times, tags, turn % len(anchors_m), anchors_m, radio, seed)
+
+
+def measure_ranges(
+    times_s: FloatArray,
+    tags_m: FloatArray,
+    anchor_index: npt.NDArray[np.int64],
+    anchors_m: Mapping[str, Sequence[float] | FloatArray],
+    radio: Radio,
+    seed: int,
+) -> SimulatedRanges:
+    """What the radio makes of n distances; its rate is not used.
+
+    Args:
+        times_s: (n,) on the camera's clock.
+        tags_m: (n, 3) the moving antenna in the world.
+        anchor_index: (n,) which of ``anchors_m`` each is to.
+        anchors_m, radio, seed: as for ``simulate_ranges``.
+    """
+    rng = np.random.default_rng(seed)
+    ids = np.array(list(anchors_m))
+    positions = np.array([anchors_m[name] for name in anchors_m], dtype=np.float64)
+    biases = np.array([radio.range_bias_m.get(name, 0.0) for name in anchors_m])
+    distances = np.linalg.norm(tags_m - positions[anchor_index], axis=1)
+    is_obstructed = rng.random(len(times_s)) < radio.obstructed_share
+    ranges = distances + biases[anchor_index] + radio.range_stddev_m * rng.standard_normal(len(times_s))
+    ranges += is_obstructed * rng.exponential(radio.obstructed_mean_m, len(times_s))
+    if radio.resolution_m > 0:
+        ranges = np.round(radio.resolution_m * np.rint(ranges / radio.resolution_m), 12)
+    ranges = np.maximum(ranges, max(_MIN_RANGE_M, radio.resolution_m))
+    arrived = rng.random(len(times_s)) >= radio.lost_share
+    log = RangeLog.from_arrays(
+        ids[anchor_index[arrived]], ranges[arrived], timestamp_s=times_s[arrived] - radio.time_offset_s
+    )
+    return SimulatedRanges(log, times_s[arrived], distances[arrived], is_obstructed[arrived])

@@ -1,0 +1,201 @@
+"""A whole survey to try the pipeline on: photos of a yard, a radio's log, surveyed anchors, the truth, the survey file.
+
+The photos ship with the package, and so does the way of their camera, along which the radio is simulated: ``path.csv``
+has its pose at each photo and at three moments before the first and after the last. It is in the site frame: metres,
+x east, y north, z up, origin on the ground in the south-west corner of the yard.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from rangesfm.demo.path import CameraPath
+from rangesfm.demo.ranges import Radio, SimulatedRanges, simulate_ranges
+from rangesfm.errors import InputError
+from rangesfm.files.atomic import LEFTOVER, new_file, new_folder
+from rangesfm.files.sole_writer import LOCK_NAME, sole_writer
+from rangesfm.geometry.reference import Reference, write_reference
+from rangesfm.ranging.readers.canonical import write_ranges_csv
+
+FloatArray = npt.NDArray[np.float64]
+
+PHOTOS = Path(__file__).with_name("photos")
+PATH_FILE = PHOTOS / "path.csv"
+
+CAMERA_MODEL = "SIMPLE_RADIAL"
+CAMERA_PARAMS = (748.8, 480.0, 320.0, -0.04)
+ANCHORS_M = {  # on the walls and on a container; not in one plane
+    "A1": (0.05, 6.90, 2.55),
+    "A2": (4.60, 9.60, 2.15),
+    "A3": (13.95, 9.60, 2.90),
+    "A4": (9.60, 0.05, 0.62),
+    "A5": (13.95, 2.10, 1.15),
+}
+ANCHOR_STDDEV_M = 0.01
+TAG_IN_CAM_M = (0.03, -0.12, -0.05)
+TIME_OFFSET_S = 2.35
+
+# The radio is on before the first photo and after the last: rows of ``path.csv``, a second each.
+NUM_ROWS_AROUND = 3
+_RADIO = Radio(
+    rate_hz=8.0,
+    range_stddev_m=0.06,
+    range_bias_m={"A1": 0.08, "A2": 0.04, "A3": 0.06, "A4": 0.08, "A5": 0.05},
+    obstructed_share=0.10,
+    obstructed_mean_m=0.8,
+    lost_share=0.05,
+    time_offset_s=TIME_OFFSET_S,
+    resolution_m=0.001,
+)
+
+
+@dataclass(frozen=True)
+class DemoSurvey:
+    """Where the survey is, and the truth about it.
+
+    Attributes:
+        folder: holds ``survey.toml``, ``images``, ``uwb.csv``, ``anchors.csv`` and ``reference.csv``.
+        image_names: n photos in time order.
+        timestamps_s: (n,) camera clock, seconds since 1970.
+        centers_m: (n, 3) projection centres in the site frame.
+        world_from_cam: (n, 3, 3).
+        ranges: the log, on the radio's clock, and its truth.
+    """
+
+    folder: Path
+    image_names: tuple[str, ...]
+    timestamps_s: FloatArray
+    centers_m: FloatArray
+    world_from_cam: FloatArray
+    ranges: SimulatedRanges
+
+    @property
+    def survey_path(self) -> Path:
+        return self.folder / "survey.toml"
+
+
+def make_demo_survey(folder: Path, *, num_photos: int = 40, seed: int = 0) -> DemoSurvey:
+    """Write what somebody brought home who walked through the yard with a camera and a radio.
+
+    A folder that already holds this very survey is left as it is.
+
+    Args:
+        folder: where to write; new or empty.
+        num_photos: the first so many of those that ship, about one a second; all 40 go around the yard once.
+        seed: of the radio's errors and of those of the surveyed anchors.
+
+    Raises:
+        InputError: the folder holds something else or cannot be written to.
+    """
+    survey = _plan(folder, num_photos, seed)
+    text = _survey_file(num_photos, seed)
+    if _is_there(survey, text):
+        return survey
+    if folder.exists() and (not folder.is_dir() or any(_names_of_others(folder))):
+        raise InputError("expected a new or an empty folder, or one that holds the same demo", folder)
+    with sole_writer(folder):
+        with new_folder(folder / "images") as images:
+            for name in survey.image_names:
+                shutil.copyfile(PHOTOS / name, images / name)
+        write_ranges_csv(survey.ranges.log, folder / "uwb.csv")
+        _write_text(folder / "anchors.csv", _anchor_file(seed))
+        write_reference(Reference(survey.centers_m, image_names=survey.image_names), folder / "reference.csv")
+        # Last: where it is, all is.
+        _write_text(survey.survey_path, text)
+    return survey
+
+
+def _plan(folder: Path, num_photos: int, seed: int) -> DemoSurvey:
+    """Everything about the survey but the photos themselves."""
+    with PATH_FILE.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))[: num_photos + 2 * NUM_ROWS_AROUND]
+    columns = ("timestamp_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+    values = np.array([[float(row[column]) for column in columns] for row in rows])
+    times, centers, world_from_cam = values[:, 0], values[:, 1:4], Rotation.from_quat(values[:, 4:]).as_matrix()
+    path = CameraPath.through(times, centers, world_from_cam)
+    taken = slice(NUM_ROWS_AROUND, -NUM_ROWS_AROUND)
+    return DemoSurvey(
+        folder=folder,
+        image_names=tuple(row["image_name"] for row in rows[taken]),
+        timestamps_s=times[taken],
+        centers_m=centers[taken],
+        world_from_cam=world_from_cam[taken],
+        ranges=simulate_ranges(path, ANCHORS_M, TAG_IN_CAM_M, _RADIO, seed),
+    )
+
+
+def _is_there(survey: DemoSurvey, text: str) -> bool:
+    try:
+        return survey.survey_path.read_text(encoding="utf-8") == text and all(
+            (survey.folder / "images" / name).is_file() for name in survey.image_names
+        )
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _names_of_others(folder: Path) -> Iterator[str]:
+    """What is in a folder but for what a demo that is being made, or was killed, has there."""
+    names = (path.name for path in folder.iterdir())
+    return (name for name in names if name != LOCK_NAME and not re.fullmatch(LEFTOVER, name))
+
+
+def _anchor_file(seed: int) -> str:
+    """The anchors as somebody surveyed them."""
+    rng = np.random.default_rng([seed, 1])
+    lines = ["anchor_id,x_m,y_m,z_m,position_stddev_m"]
+    for name, position in ANCHORS_M.items():
+        x, y, z = position + ANCHOR_STDDEV_M * rng.standard_normal(3)
+        lines.append(f"{name},{x:.3f},{y:.3f},{z:.3f},{ANCHOR_STDDEV_M}")
+    return "\n".join(lines) + "\n"
+
+
+def _survey_file(num_photos: int, seed: int) -> str:
+    return f"""\
+# A survey of a simulated yard: {num_photos} photos, a radio with seed {seed}.
+# Paths are relative to this file.
+
+[images]
+path = "images"                 # when each was taken stands in its EXIF data
+
+[camera]
+model = "{CAMERA_MODEL}"         # f, cx, cy, k; leave the table out if the camera is not calibrated
+params = [{_listed(CAMERA_PARAMS)}]
+
+[ranges]
+path = "uwb.csv"                # timestamp_s,anchor_id,range_m
+time_offset = "auto"            # the radio's clock is not the camera's: image time = range time + offset
+
+[anchors]
+path = "anchors.csv"            # surveyed in the yard: x east, y north, z up
+frame = "site"
+
+[tag]
+tag_in_cam_m = [{_listed(TAG_IN_CAM_M)}]   # antenna: x right, y down, z forward
+
+[mapper.features.sift]
+max_num_features = 2000         # plenty here, and matching stays quick
+
+[report]
+reference = "reference.csv"     # the truth, only to compare with
+
+[output]
+path = "out"
+"""
+
+
+def _listed(values: tuple[float, ...]) -> str:
+    return ", ".join(f"{value:g}" for value in values)
+
+
+def _write_text(path: Path, text: str) -> None:
+    with new_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")

@@ -1,0 +1,111 @@
+"""Records: JSON whose keys stand once, as the fields of a frozen pydantic model that it is written and read by."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, InstanceOf, Strict, ValidationError
+
+from rangesfm.errors import InputError, one_line
+from rangesfm.files.atomic import new_file
+from rangesfm.files.json_files import read_json
+
+_Kind = TypeVar("_Kind", bound="Record")
+_MAX_SHOWN = 60
+# Errors of pydantic whose own words are about Python.
+_EXPECTED = {
+    "dict_type": "a JSON object",
+    "model_type": "a JSON object",
+    "model_attributes_type": "a JSON object",
+    "tuple_type": "a JSON array",
+    "too_long": "{max_length} items",
+    "is_instance_of": "text",
+}
+
+
+def _plain(value: Any) -> Any:
+    """What numpy holds as Python has it; None for numbers that are not finite, as JSON has no others."""
+    value = value.tolist() if hasattr(value, "tolist") else value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _as_json(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _as_json(item) for key, item in value.items()}
+    return [_as_json(item) for item in value] if isinstance(value, (list, tuple)) else _plain(value)
+
+
+def _whole(value: Any) -> Any:
+    value = _plain(value)
+    return None if isinstance(value, (list, tuple)) and None in map(_plain, value) else value
+
+
+Text = InstanceOf[str]  # not ``str``, which refuses paths that are no UTF-8
+Flag = Annotated[bool, Strict(), BeforeValidator(_plain)]
+Count = Annotated[int, Strict(), BeforeValidator(_plain)]
+Number = Annotated[float, Strict(), BeforeValidator(_plain)]
+NumberOrNull = Annotated[Annotated[float, Strict()] | None, BeforeValidator(_plain)]
+"""Null where the number is not known, or not finite."""
+Vector = Annotated[tuple[Number, Number, Number], BeforeValidator(_plain)]
+VectorOrNull = Annotated[tuple[Number, Number, Number] | None, BeforeValidator(_whole)]
+IntervalOrNull = Annotated[tuple[Number, Number] | None, BeforeValidator(_whole)]
+
+
+class Record(BaseModel):
+    """A JSON object, made from keywords or from any value with attributes of these names.
+
+    Keys that it does not know, of a later version perhaps, are passed over in reading. A field with a default is left
+    out of the JSON where nothing was said of it.
+    """
+
+    model_config = ConfigDict(frozen=True, from_attributes=True)
+
+    def to_json(self) -> dict[str, Any]:
+        """What ``json.loads`` makes of the file, in the order of the fields."""
+        values: dict[str, Any] = _as_json(self.model_dump(by_alias=True, exclude_unset=True))
+        return values
+
+    def write(self, path: Path) -> None:
+        """Write the file, whole or not at all."""
+        write_json(self.to_json(), path)
+
+    @classmethod
+    def read(cls: type[_Kind], path: Path) -> _Kind:
+        """Read the file.
+
+        Raises:
+            InputError: it is not there, no JSON, or not what ``write`` leaves; with the key.
+        """
+        content = read_json(path)
+        if not isinstance(content, dict):
+            raise InputError("expected a JSON object", path, 1)
+        try:
+            return cls.model_validate(content)
+        except ValidationError as error:
+            raise InputError(_what_is_wrong(error), path) from None
+
+
+def _what_is_wrong(error: ValidationError) -> str:
+    first = error.errors(include_url=False)[0]
+    key = ".".join(map(str, first["loc"]))
+    if first["type"] == "missing":
+        return f"'{key}' is missing"
+    ours = _EXPECTED.get(first["type"])
+    expected = first["msg"] if ours is None else ours.format(**first.get("ctx", {}))
+    for prefix in ("Input should be ", "Value error, "):
+        expected = expected.removeprefix(prefix)
+    found = one_line(json.dumps(first["input"]))
+    return f"'{key}' is {found[:_MAX_SHOWN]}{'...' * (len(found) > _MAX_SHOWN)}, expected {expected}"
+
+
+def write_json(value: Any, path: Path) -> None:
+    """Write plain values.
+
+    Of paths that are no UTF-8, what is none becomes JSON's own escapes, by which they are read as they were.
+    """
+    with new_file(path) as temporary:
+        text = json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False)
+        temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")

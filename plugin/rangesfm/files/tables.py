@@ -1,0 +1,348 @@
+"""Tables in text files: the one place that reads CSV and its relatives, and writes it.
+
+A table has a header row; ``#`` comments and blank lines may stand anywhere; a byte order mark, any
+line ending and quoted cells are understood. Whatever is wrong is an InputError with its line.
+"""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import os
+import stat
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.errors import InputError, printable
+from rangesfm.files.atomic import new_file
+
+_HEAD_BYTES = 1 << 16
+_CHUNK_ROWS = 20_000  # split at once: wide tables would otherwise hold every cell in memory
+_UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
+_UNPACKED = (".gz", ".bz2", ".xz")  # by numpy, whatever such a file holds
+
+
+@dataclass(frozen=True)
+class Categories:
+    """n texts of which few differ.
+
+    Attributes:
+        names: the different ones, in order of first appearance.
+        index: (n,) which of them each is.
+    """
+
+    names: tuple[str, ...]
+    index: npt.NDArray[np.int64]
+
+    @classmethod
+    def of(cls, texts: Sequence[str]) -> Categories:
+        index_of = {text: index for index, text in enumerate(dict.fromkeys(texts))}
+        return cls(tuple(index_of), np.fromiter(map(index_of.__getitem__, texts), np.int64, len(texts)))
+
+    def subset(self, rows: npt.NDArray[np.bool_]) -> Categories:
+        """Some of the texts; names without any are forgotten."""
+        if rows.all():
+            return self
+        chosen = self.index[rows]
+        used, first = np.unique(chosen, return_index=True)
+        order = used[np.argsort(first)]
+        rank = np.zeros(len(self.names), dtype=np.int64)
+        rank[order] = np.arange(len(order))
+        return Categories(tuple(self.names[k] for k in order.tolist()), rank[chosen])
+
+
+@dataclass(frozen=True)
+class Table:
+    """The asked-for columns of a file, n rows.
+
+    Attributes:
+        path: the file.
+        columns: all names of the header row, in order.
+        line: (n,) 1-based line of each row.
+        cells: of each asked-for column that the file has; a column that was read as numbers has these instead.
+        reread: gives this table with all cells as text; None where they are.
+    """
+
+    path: Path
+    columns: tuple[str, ...]
+    line: npt.NDArray[np.int64]
+    cells: Mapping[str, list[str] | npt.NDArray[np.float64]]
+    reread: Callable[[], Table] | None = None
+
+    def __len__(self) -> int:
+        return len(self.line)
+
+    def __contains__(self, column: str) -> bool:
+        return column in self.cells
+
+    def text(self, column: str, *, empty: str | None = None) -> list[str]:
+        """The cells without surrounding blanks; ``empty`` stands for empty ones, which are refused if it is None."""
+        texts = list(map(str.strip, self._raw(column)))
+        if "" in texts:
+            if empty is None:
+                raise self.error(texts.index(""), column, "some text")
+            texts = [text or empty for text in texts]
+        return texts
+
+    def categories(self, column: str, *, empty: str | None = None) -> Categories:
+        """The cells as ``text`` has them, told apart: fast where they are few."""
+        raw = Categories.of(self._raw(column))
+        names = [name.strip() for name in raw.names]
+        if "" in names and empty is None:
+            raise self.error(int(np.argmax(raw.index == names.index(""))), column, "some text")
+        kinds = Categories.of([name or str(empty) for name in names])
+        return Categories(kinds.names, kinds.index[raw.index])
+
+    def numbers(
+        self, column: str, *, empty: float | None = None, expected: str = "a number"
+    ) -> npt.NDArray[np.float64]:
+        """The cells as finite numbers, (n,).
+
+        Args:
+            empty: stands for empty cells, which are refused if it is None.
+            expected: what the message calls a good cell.
+        """
+        cells = self.cells[column]
+        values = np.array(list(map(_number, cells)), np.float64) if isinstance(cells, list) else cells
+        for row in np.flatnonzero(~np.isfinite(values)).tolist():
+            if empty is None or self._raw(column)[row].strip():
+                raise self.error(row, column, expected)
+            values[row] = empty
+        return values
+
+    def error(self, row: int, column: str, expected: str) -> InputError:
+        """The error that says what stands in ``column`` of the 0-based ``row`` instead of ``expected``."""
+        cell = self._raw(column)[row].strip()
+        found = "empty" if not cell else cell if _number(cell) is not None else f"'{printable(cell)}'"
+        return InputError(f"{column} is {found}, expected {expected}", self.path, int(self.line[row]))
+
+    def _raw(self, column: str) -> list[str]:
+        cells = self.cells[column]
+        if isinstance(cells, list):
+            return cells
+        assert self.reread is not None
+        return self.reread()._raw(column)
+
+
+def read_table(
+    path: str | Path,
+    required: Sequence[str],
+    optional: Sequence[str] = (),
+    *,
+    text: Sequence[str] = (),
+    aliases: Mapping[str, str] | None = None,
+    separator: str | None = ",",
+    header: Sequence[str] | None = None,
+) -> Table:
+    """Read the named columns of a file; others are ignored.
+
+    Args:
+        required: columns that the file must have.
+        optional: columns that it may have.
+        text: those of them that are not numbers. Any column can be had as either; this way it is fast.
+        aliases: other names by which a file may call them, ``{name in the file: name}``.
+        separator: one character; a blank means any run of blanks; None: told from the header row.
+        header: names of all columns, of a file that has no header row, or one that is a comment.
+
+    Raises:
+        InputError: the file is missing, empty or not text, lacks a column, or has a row with too
+            few or too many cells.
+    """
+    path = Path(path)
+    content = read_text(path)
+    header_row, header_line, body = _split_header(content)
+    if header is not None and separator is not None:
+        header_row, header_line, body = separator.join(header), 0, content
+    if not header_row:
+        raise InputError(f"the file is empty, expected a header row with {_listed(required)}", path)
+    if separator is None:
+        separator = guess_separator(header_row)
+    if len(separator) != 1 or separator in '"\r\n\0#':
+        raise InputError(f"separator is {separator!r}, expected one character", path)
+    header = _split_row(header_row, separator, path, header_line)
+    names = _canonical_names(header, [*required, *optional], aliases or {})
+    _check_header(names, required, optional, path, header_line)
+    wanted = {name: names.index(name) for name in (*required, *optional) if name in names}
+    reread = partial(_table_of_texts, path, names, wanted, header_line, body, separator)
+    rows = None
+    if body and not body.isspace() and separator != " " and not any(character in body for character in '"#'):
+        # Of the columns that nobody asked for only their number matters.
+        types = ["U1" if name not in wanted else "O" if name in text else "f8" for name in names]
+        rows = _plain_rows(path, header_line, types, separator)
+    if rows is None or len(rows) != body.count("\n") + (not body.endswith("\n")):
+        return reread()
+    cells = {name: rows[f"f{k}"].tolist() if name in text else rows[f"f{k}"].copy() for name, k in wanted.items()}
+    return Table(path, tuple(names), header_line + 1 + np.arange(len(rows)), cells, reread)
+
+
+def _plain_rows(path: Path, num_skipped: int, types: list[str], separator: str) -> npt.NDArray[np.void] | None:
+    """All rows, fast: fields f0, f1 ... of the given types; None if any cell is of another, or too much or missing."""
+    if path.suffix in _UNPACKED:
+        return None
+    try:
+        fields = [(f"f{k}", type) for k, type in enumerate(types)]
+        return np.loadtxt(path, fields, None, separator, skiprows=num_skipped, ndmin=1, encoding="utf-8-sig")
+    except ValueError:  # the reader of all tables knows what to say
+        return None
+
+
+def _table_of_texts(
+    path: Path, names: list[str], wanted: Mapping[str, int], header_line: int, body: str, separator: str
+) -> Table:
+    """Whatever the rows hold: quoted cells, comments, blank lines."""
+    lines = body.split("\n")
+    keep = list(map(_has_content, lines))
+    rows = list(itertools.compress(lines, keep))
+    line = header_line + 1 + np.flatnonzero(keep)
+    cells: dict[str, list[str]] = {name: [] for name in wanted}
+    for chunk in _chunks_of_cells(rows, line, len(names), separator, path):
+        for name, index in wanted.items():
+            cells[name] += chunk[index :: len(names)]
+    return Table(path, tuple(names), line, cells)
+
+
+def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Write a CSV file, whole or not at all."""
+    with new_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows(rows)
+
+
+def read_text(path: str | Path, *, errors: str = "strict") -> str:
+    """A whole UTF-8 file (or UTF-16 with its mark) with ``\\n`` line endings and without a byte order mark.
+
+    Args:
+        errors: "strict": bytes that are not text are an InputError; "replace": they are replaced.
+    """
+    data = _read_bytes(path)
+    try:
+        text = data.decode(_encoding(data), errors)
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise InputError(f"not UTF-8 text (byte 0x{data[error.start]:02x})", path, line) from None
+    return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
+
+
+def read_head(path: str | Path) -> str:
+    """The first part of a file, as ``read_text`` would give it; bytes that are not text are replaced."""
+    data = _read_bytes(path, _HEAD_BYTES)
+    return data.decode(_encoding(data), errors="replace").replace("\r\n", "\n").replace("\r", "\n")
+
+
+def header_names(text: str, separator: str | None = None) -> list[str]:
+    """The cells of the first line that is neither blank nor a comment, as far as it is a row of cells at all."""
+    row = next(filter(_has_content, text.split("\n")), "")
+    try:
+        return _split_row(row, separator or guess_separator(row))
+    except InputError:
+        return []
+
+
+def guess_separator(row: str) -> str:
+    """The most frequent of comma, semicolon and tab in a row; a blank if there is none of them."""
+    separator = max(",;\t", key=row.count)
+    return separator if separator in row else " "
+
+
+def _read_bytes(path: str | Path, num: int = -1) -> bytes:
+    try:
+        mode = os.stat(path).st_mode
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # a device may never end, a pipe never begin
+            raise InputError("is no regular file", path)
+        with open(path, "rb") as file:
+            return file.read(num)
+    except FileNotFoundError:
+        raise InputError("no such file", path) from None
+    except IsADirectoryError:
+        raise InputError("is a folder, expected a file", path) from None
+    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+        raise InputError(f"cannot be read ({getattr(error, 'strerror', None) or error})", path) from None
+
+
+def _encoding(data: bytes) -> str:
+    return "utf-16" if data.startswith(_UTF16_MARKS) else "utf-8-sig"
+
+
+def _has_content(line: str) -> bool:
+    return line.lstrip()[:1] not in "#"  # the empty string is in every string
+
+
+def _split_header(text: str) -> tuple[str, int, str]:
+    """The first row with content (empty if there is none), its 1-based line, and all that comes after."""
+    start, line = 0, 1
+    while start < len(text):
+        end = text.find("\n", start)
+        end = len(text) if end < 0 else end
+        if _has_content(text[start:end]):
+            return text[start:end], line, text[end + 1 :]
+        start, line = end + 1, line + 1
+    return "", line, ""
+
+
+def _split_row(row: str, separator: str, path: Path | None = None, line: int | None = None) -> list[str]:
+    if separator == " " and '"' not in row:
+        return row.split()
+    try:
+        cells = next(csv.reader([row], delimiter=separator, skipinitialspace=True, strict=True))
+    except csv.Error as error:
+        raise InputError(f"not a row of cells ({error})", path, line) from None
+    return [cell.strip() for cell in cells]
+
+
+def _chunks_of_cells(
+    rows: list[str], line: npt.NDArray[np.int64], num_columns: int, separator: str, path: Path
+) -> Iterator[list[str]]:
+    """The cells of some thousand rows after the other, each row's ``num_columns`` in turn."""
+    for start in range(0, len(rows), _CHUNK_ROWS):
+        chunk = rows[start : start + _CHUNK_ROWS]
+        joined = "\n".join(chunk)
+        if separator == " " or '"' in joined:
+            split = [_split_row(row, separator, path, int(line[start + i])) for i, row in enumerate(chunk)]
+            num_cells = list(map(len, split))
+            cells = list(itertools.chain.from_iterable(split))
+        else:
+            num_cells = [row.count(separator) + 1 for row in chunk]
+            cells = joined.replace("\n", separator).split(separator)
+        if num_cells.count(num_columns) != len(chunk):
+            row = next(row for row, num in enumerate(num_cells) if num != num_columns)
+            message = f"has {_counted(num_cells[row], 'cell')}, the header row has {num_columns}"
+            raise InputError(message, path, int(line[start + row]))
+        yield cells
+
+
+def _canonical_names(header: list[str], known: Sequence[str], aliases: Mapping[str, str]) -> list[str]:
+    return [name if name in known else aliases.get(name, name) for name in header]
+
+
+def _check_header(names: list[str], required: Sequence[str], optional: Sequence[str], path: Path, line: int) -> None:
+    expected = _listed(required) + (f" (and possibly {_listed(optional)})" if optional else "")
+    if all(_number(name) is not None for name in names):
+        raise InputError(f"no header row, expected {expected}", path, line)
+    for name in required:
+        if name not in names:
+            raise InputError(f"no column {name}; found {_listed(names)}; expected {expected}", path, line)
+    for name in (*required, *optional):
+        if names.count(name) > 1:
+            raise InputError(f"{names.count(name)} columns are {name}, expected one", path, line)
+
+
+def _number(cell: str) -> float | None:
+    """float(), without Python's own ``1_000``; None if it is no number."""
+    try:
+        return None if "_" in cell else float(cell)
+    except ValueError:
+        return None
+
+
+def _listed(names: Iterable[str]) -> str:
+    return printable(", ".join(names))
+
+
+def _counted(num: int, noun: str) -> str:
+    return f"{num} {noun}" if num == 1 else f"{num} {noun}s"

@@ -1,0 +1,1 @@
+"""Similarities, paths, which way is up, and where on the Earth."""

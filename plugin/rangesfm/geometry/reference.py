@@ -1,0 +1,229 @@
+"""Reference: where the camera really was, for comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation, Slerp
+
+from rangesfm.errors import InputError, printable
+from rangesfm.files.tables import Table, header_names, read_head, read_table, read_text, write_table
+from rangesfm.geometry.trajectory import ROUNDING_S, Trajectory
+
+Array = npt.NDArray[np.float64]
+
+POSITION_COLUMNS = ("x_m", "y_m", "z_m")
+QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
+QUATERNION_TOLERANCE = 1e-2
+MAX_TIME_DIFFERENCE_S = 0.01
+"""A sample this close in time is taken as it is: half a centimetre at walking pace."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """n known camera poses, by photo or by time.
+
+    Attributes:
+        positions_m: (n, 3) projection centres in the reference's frame, metres.
+        image_names: n photos; or None.
+        timestamps_s: (n,) on the camera's clock, strictly increasing; or None. Exactly one of the two is given.
+        world_from_cam: (n, 3, 3) rotations of the camera frame as COLMAP has it (x right, y down, z forward); or None.
+    """
+
+    positions_m: Array
+    image_names: tuple[str, ...] | None = None
+    timestamps_s: Array | None = None
+    world_from_cam: Array | None = None
+
+    def __post_init__(self) -> None:
+        if (self.image_names is None) == (self.timestamps_s is None):
+            raise ValueError("a reference has either image names or timestamps")
+        if self.timestamps_s is not None and not np.all(np.diff(self.timestamps_s) > 0):
+            raise ValueError("timestamps increase strictly")
+
+    def __len__(self) -> int:
+        return len(self.positions_m)
+
+    def positions_at(self, trajectory: Trajectory, max_gap_s: float = 0.05) -> tuple[Array, Array | None]:
+        """Reference poses of the keyframes.
+
+        By photo: those of the same name. By time: interpolated linearly (rotations on the
+        shortest arc) between two samples at most ``max_gap_s`` apart; in longer gaps and at
+        the ends, the nearest sample if it is within MAX_TIME_DIFFERENCE_S.
+
+        Returns:
+            (n, 3) positions, NaN where unknown, and (n, 3, 3) rotations likewise; None if the reference has none.
+
+        Raises:
+            InputError: the reference is by time and the trajectory has no times.
+        """
+        if self.image_names is not None:
+            return self.poses_of(trajectory.image_names)
+        if trajectory.timestamps_s is None:
+            raise InputError("the reference is by time, but the photos have no times (images.csv)")
+        return self.poses_at(trajectory.timestamps_s, max_gap_s)
+
+    def poses_of(self, image_names: Sequence[str]) -> tuple[Array, Array | None]:
+        """Poses of n photos, NaN where unknown, as ``positions_at`` returns them; only of a reference by photo."""
+        assert self.image_names is not None
+        index_of = {name: i for i, name in enumerate(self.image_names)}
+        return self._at_index(np.array([index_of.get(name, -1) for name in image_names], dtype=np.int64))
+
+    def poses_at(self, times: Array, max_gap_s: float) -> tuple[Array, Array | None]:
+        """Poses at (n,) times, as ``positions_at`` finds them; only of a reference by time."""
+        assert self.timestamps_s is not None
+        known = self.timestamps_s
+        after = np.clip(np.searchsorted(known, times, side="right"), 1, max(len(known) - 1, 1))
+        after = np.minimum(after, len(known) - 1)
+        before = np.maximum(after - 1, 0)
+        nearest = np.where(times - known[before] <= known[after] - times, before, after)
+        nearest[np.abs(times - known[nearest]) > MAX_TIME_DIFFERENCE_S] = -1
+        positions, rotations = self._at_index(nearest)
+
+        gap = known[after] - known[before]
+        between = (gap > 0) & (gap <= max_gap_s + ROUNDING_S) & (times >= known[before]) & (times <= known[after])
+        weight = ((times - known[before])[between] / gap[between])[:, None]
+        positions[between] = (1 - weight) * self.positions_m[before[between]] + weight * self.positions_m[
+            after[between]
+        ]
+        if rotations is not None and between.any():
+            assert self.world_from_cam is not None
+            rotations[between] = Slerp(known, Rotation.from_matrix(self.world_from_cam))(times[between]).as_matrix()
+        return positions, rotations
+
+    def why_nothing_is_known(self, trajectory: Trajectory, max_gap_s: float = 0.05) -> str:
+        """One line for the user whose reference knows no keyframe of the trajectory."""
+        if len(trajectory) == 0 or len(self) == 0:
+            return f"nothing to compare: {len(trajectory)} keyframes, {len(self)} reference poses"
+        if self.image_names is not None:
+            return (
+                "the reference knows none of the keyframes: its first photo is "
+                f"'{printable(self.image_names[0])}', the model's '{printable(trajectory.image_names[0])}'"
+            )
+        assert self.timestamps_s is not None
+        assert trajectory.timestamps_s is not None
+        times, spacing = trajectory.timestamps_s, np.diff(self.timestamps_s)
+        return (
+            "the reference knows none of the keyframes: its times are "
+            f"{self.timestamps_s[0]:.3f} to {self.timestamps_s[-1]:.3f} s, the photos' {times[0]:.3f} to "
+            f"{times[-1]:.3f} s; it is interpolated across at most {max_gap_s:g} s"
+            + (f", its samples are {np.median(spacing):.3f} s apart" if len(spacing) else "")
+        )
+
+    def _at_index(self, index: npt.NDArray[np.int64]) -> tuple[Array, Array | None]:
+        rotations = None if self.world_from_cam is None else _rows(self.world_from_cam, index)
+        return _rows(self.positions_m, index), rotations
+
+
+def read_reference(path: str | Path) -> Reference:
+    """Read ``reference.csv`` or a TUM trajectory.
+
+    The CSV has a header row: ``image_name`` or ``timestamp_s``, then ``x_m,y_m,z_m`` and
+    perhaps ``qx,qy,qz,qw`` (world from camera). A TUM file has no header row:
+    ``timestamp tx ty tz qx qy qz qw``, separated by blanks.
+
+    Raises:
+        InputError: with the line, for whatever is wrong.
+    """
+    path = Path(path)
+    names = header_names(read_head(path))
+    if path.suffix == ".tum" or _are_numbers(names):
+        return _from_table(_read_tum(path), "timestamp_s")
+    if names and not {"image_name", "timestamp_s"} & set(names):
+        found = printable(", ".join(names))
+        raise InputError(f"no column image_name or timestamp_s; found {found}; expected one of them", path)
+    key = "image_name" if "image_name" in names else "timestamp_s"
+    return _from_table(read_table(path, [key, *POSITION_COLUMNS], QUATERNION_COLUMNS, separator=None), key)
+
+
+def write_reference(reference: Reference, path: Path) -> Path:
+    """Write a ``reference.csv`` that ``read_reference`` reads."""
+    columns = [np.asarray(reference.positions_m)]
+    names: tuple[str, ...] = POSITION_COLUMNS
+    if reference.world_from_cam is not None:
+        columns.append(Rotation.from_matrix(reference.world_from_cam).as_quat())
+        names += QUATERNION_COLUMNS
+    is_by_image = reference.image_names is not None
+    keys = reference.image_names or [f"{time:.9f}" for time in np.asarray(reference.timestamps_s)]
+    rows = ([key, *(f"{value:.9f}" for value in row)] for key, row in zip(keys, np.hstack(columns)))
+    write_table(path, ["image_name" if is_by_image else "timestamp_s", *names], rows)
+    return path
+
+
+def _are_numbers(cells: list[str]) -> bool:
+    """Whether the first row holds a TUM pose rather than names."""
+    try:
+        return len([float(cell) for cell in cells]) == 1 + len(POSITION_COLUMNS) + len(QUATERNION_COLUMNS)
+    except ValueError:
+        return False
+
+
+def _read_tum(path: Path) -> Table:
+    columns = ("timestamp_s", *POSITION_COLUMNS, *QUATERNION_COLUMNS)
+    rows = [(line, text.split()) for line, text in enumerate(read_text(path).split("\n"), start=1)]
+    rows = [(line, cells) for line, cells in rows if cells and not cells[0].startswith("#")]
+    if not rows:
+        raise InputError("no pose in the file, expected lines of timestamp tx ty tz qx qy qz qw", path)
+    for line, cells in rows:
+        if len(cells) != len(columns):
+            expected = f"{len(columns)} (timestamp tx ty tz qx qy qz qw, separated by blanks)"
+            raise InputError(f"{len(cells)} numbers, expected {expected}", path, line)
+    lines = np.array([line for line, _ in rows], dtype=np.int64)
+    return Table(path, columns, lines, {name: [cells[i] for _, cells in rows] for i, name in enumerate(columns)})
+
+
+def _from_table(table: Table, key: str) -> Reference:
+    if len(table) == 0:
+        raise InputError("no pose in the file, only its header row", table.path)
+    positions = np.column_stack([table.numbers(column) for column in POSITION_COLUMNS])
+    rotations = _rotations(table)
+    if key == "image_name":
+        names = table.text(key)
+        _refuse_repeated(table, key, names)
+        return Reference(positions, image_names=tuple(names), world_from_cam=rotations)
+    times = table.numbers(key)
+    _refuse_repeated(table, key, times.tolist())
+    order = np.argsort(times)
+    return Reference(
+        positions[order],
+        timestamps_s=times[order],
+        world_from_cam=None if rotations is None else rotations[order],
+    )
+
+
+def _rotations(table: Table) -> Array | None:
+    missing = [column for column in QUATERNION_COLUMNS if column not in table]
+    if len(missing) == len(QUATERNION_COLUMNS):
+        return None
+    if missing:
+        raise InputError(
+            f"no column {missing[0]}; expected all of {', '.join(QUATERNION_COLUMNS)}, or none", table.path
+        )
+    quaternions = np.column_stack([table.numbers(column) for column in QUATERNION_COLUMNS])
+    with np.errstate(over="ignore"):
+        lengths = np.linalg.norm(quaternions, axis=1)
+    wrong = np.flatnonzero(np.abs(lengths - 1.0) > QUATERNION_TOLERANCE)
+    if len(wrong):
+        message = f"the quaternion qx,qy,qz,qw has length {lengths[wrong[0]]:.4g}, expected 1"
+        raise InputError(message, table.path, int(table.line[wrong[0]]))
+    rotations: Array = Rotation.from_quat(quaternions).as_matrix()
+    return rotations
+
+
+def _refuse_repeated(table: Table, column: str, keys: Sequence[str] | Sequence[float]) -> None:
+    seen: set[object] = set()
+    for row, key in enumerate(keys):
+        if key in seen:
+            raise table.error(row, column, "one not said before")
+        seen.add(key)
+
+
+def _rows(values: Array, index: npt.NDArray[np.int64]) -> Array:
+    """Rows of ``values``; NaN where the index is -1."""
+    rows = np.full((len(index), *values.shape[1:]), np.nan)
+    rows[index >= 0] = values[index[index >= 0]]
+    return rows

@@ -1,0 +1,28 @@
+"""Small turns, as rotation vectors."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+Array = npt.NDArray[np.float64]
+
+
+def cross_matrices(vectors: Array) -> Array:
+    """(..., 3, 3): v x, as matrices."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*vectors.shape, 3)
+
+
+def left_jacobian(rotation: Rotation) -> Array:
+    """d Exp(w) = [J dw]x Exp(w). Solà et al., "A micro Lie theory for state estimation in robotics", eq. 145."""
+    vector = rotation.as_rotvec()
+    angle, cross = float(np.linalg.norm(vector)), cross_matrices(vector)
+    if angle < 1e-4:
+        series: Array = np.eye(3) + cross / 2 + cross @ cross / 6
+        return series
+    first, second = (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+    closed: Array = np.eye(3) + first * cross + second * cross @ cross
+    return closed

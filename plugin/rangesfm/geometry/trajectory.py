@@ -1,0 +1,160 @@
+"""Trajectory: the camera's path through one model's world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    import pycolmap
+
+ROUNDING_S = 1e-6
+"""Of a difference of two times that are seconds since 1970."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses of the registered keyframes (COLMAP frames), sorted by time where times are known.
+
+    A rig's pose is that of its reference camera, so ``cam`` means the rig frame.
+
+    Attributes:
+        frame_ids: (n,) int, COLMAP's frame ids.
+        image_names: n names, the reference camera's photo of each frame.
+        timestamps_s: (n,) seconds on the camera's clock, strictly increasing; None if unknown.
+        centers: (n, 3) projection centres in the world, in the world's unit.
+        world_from_cam: (n, 3, 3) rotations.
+        time_resolution_s: step to which each of the times was rounded or cut; 0: they are exact.
+    """
+
+    frame_ids: npt.NDArray[np.int64]
+    image_names: tuple[str, ...]
+    timestamps_s: npt.NDArray[np.float64] | None
+    centers: npt.NDArray[np.float64]
+    world_from_cam: npt.NDArray[np.float64]
+    time_resolution_s: float = 0.0
+
+    def __len__(self) -> int:
+        return len(self.image_names)
+
+    def transformed(
+        self, scale: float, rotation: npt.NDArray[np.float64], translation: npt.NDArray[np.float64]
+    ) -> Trajectory:
+        """The same path in the world ``x_new = scale * rotation @ x + translation``."""
+        return Trajectory(
+            self.frame_ids,
+            self.image_names,
+            self.timestamps_s,
+            scale * self.centers @ rotation.T + translation,
+            rotation @ self.world_from_cam,
+            self.time_resolution_s,
+        )
+
+    def as_in(self, model: pycolmap.Reconstruction) -> Trajectory:
+        """The same keyframes as another model has them."""
+        times = self.timestamps_s
+        by_name = None if times is None else dict(zip(self.image_names, times.tolist(), strict=True))
+        return trajectory_from_reconstruction(model, by_name)
+
+    def timed(self, timestamps_s: Mapping[str, float]) -> Trajectory:
+        """The keyframes whose photo has a time by its name, in the order of these times."""
+        known = [row for row, name in enumerate(self.image_names) if name in timestamps_s]
+        rows = sorted(known, key=lambda row: timestamps_s[self.image_names[row]])
+        names = tuple(self.image_names[row] for row in rows)
+        return Trajectory(
+            self.frame_ids[rows],
+            names,
+            np.array([timestamps_s[name] for name in names], dtype=np.float64),
+            self.centers[rows],
+            self.world_from_cam[rows],
+        )
+
+    def resized(self, factor: float, frame: str) -> Trajectory:
+        """The path with another scale, otherwise placed as it is.
+
+        What stays in place: in the first camera's frame the first keyframe, which defines it
+        (the paper); in a site frame the middle of the path, which is what ranges to surveyed
+        anchors hold on to whatever the scale.
+        """
+        fixed_point = self.centers[0] if frame == "first_camera" else self.centers.mean(axis=0)
+        return self.transformed(factor, np.eye(3), (1.0 - factor) * fixed_point)
+
+
+def trajectory_from_reconstruction(
+    reconstruction: pycolmap.Reconstruction,
+    timestamps_s: Mapping[str, float] | None = None,
+    *,
+    time_resolution_s: float = 0.0,
+) -> Trajectory:
+    """Read the path off a model.
+
+    Args:
+        reconstruction: a COLMAP model with registered frames.
+        timestamps_s: camera-clock time of each photo by name; frames whose photo has
+            no time are left out. None: the path has no times and is ordered by name.
+        time_resolution_s: step to which each of the times was rounded or cut.
+    """
+    rows = []
+    for frame_id in reconstruction.reg_frame_ids():
+        frame = reconstruction.frame(frame_id)
+        name = _reference_image_name(reconstruction, frame)
+        time = 0.0 if timestamps_s is None else timestamps_s.get(name)
+        if time is not None:
+            rig_from_world = pose_of(frame)
+            world_from_cam = rig_from_world.rotation.matrix().T
+            center = -world_from_cam @ rig_from_world.translation
+            rows.append((time, name, frame_id, center, world_from_cam))
+    rows.sort(key=lambda row: row[:2])
+    return Trajectory(
+        frame_ids=np.array([row[2] for row in rows], dtype=np.int64),
+        image_names=tuple(row[1] for row in rows),
+        timestamps_s=None if timestamps_s is None else np.array([row[0] for row in rows], dtype=np.float64),
+        centers=np.array([row[3] for row in rows], dtype=np.float64).reshape(-1, 3),
+        world_from_cam=np.array([row[4] for row in rows], dtype=np.float64).reshape(-1, 3, 3),
+        time_resolution_s=time_resolution_s,
+    )
+
+
+def joined_trajectory(parts: Sequence[Trajectory]) -> tuple[Trajectory, list[npt.NDArray[np.int64]]]:
+    """One path of several parts in one world, in the order of ``trajectory_from_reconstruction``.
+
+    Args:
+        parts: all with times, or none.
+
+    Returns:
+        the path, and for each part where its keyframes are in it.
+    """
+    names = np.array([name for part in parts for name in part.image_names], dtype=object)
+    times = [part.timestamps_s for part in parts if part.timestamps_s is not None]
+    order = np.lexsort((names.astype(str), *([np.concatenate(times)] if times else [])))
+    place = np.empty(len(order), dtype=np.int64)
+    place[order] = np.arange(len(order))
+    ends = np.cumsum([len(part) for part in parts])
+    path = Trajectory(
+        np.concatenate([part.frame_ids for part in parts])[order],
+        tuple(names[order].tolist()),
+        np.concatenate(times)[order] if times else None,
+        np.concatenate([part.centers for part in parts])[order],
+        np.concatenate([part.world_from_cam for part in parts])[order],
+        max(part.time_resolution_s for part in parts),
+    )
+    return path, np.split(place, ends[:-1])
+
+
+def pose_of(frame: pycolmap.Frame) -> pycolmap.Rigid3d:
+    """rig_from_world of a registered frame: a view, so that what is written to its params moves the frame."""
+    pose = frame.rig_from_world
+    if pose is None:
+        raise ValueError(f"frame {frame.frame_id} has no pose")
+    return pose
+
+
+def _reference_image_name(reconstruction: pycolmap.Reconstruction, frame: pycolmap.Frame) -> str:
+    """The photo of the rig's reference camera; of a frame that lacks it, the first by name."""
+    images = [reconstruction.image(data_id.id) for data_id in frame.image_ids]
+    reference = [image for image in images if image.is_ref_in_frame()]
+    return str(min(image.name for image in reference or images))

@@ -1,0 +1,1 @@
+"""Models without a common photo, joined through the anchors that they hear."""

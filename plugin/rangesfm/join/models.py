@@ -1,0 +1,188 @@
+"""Models without a common photo, joined through the anchors that they hear: one model, one path, one set of ranges."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+
+from rangesfm.colmap.merge import joined_model
+from rangesfm.colmap.transform import rescale
+from rangesfm.distances.ends import distances_within, locate_distances
+from rangesfm.distances.tape import Tape
+from rangesfm.errors import GeometryError
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.geometry.trajectory import Trajectory, joined_trajectory
+from rangesfm.options import RangeModelOptions, ScaleOptions
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.joined_observations import each_on_one_path, joined_observations
+from rangesfm.ranging.observations import RangeObservations
+from rangesfm.scale.estimate import ScaleEstimate
+from rangesfm.scale.initialize import initialize_scale
+from rangesfm.scale.model_placement import ScaledModel, place_models
+
+
+@dataclass(frozen=True)
+class ModelVerdict:
+    """One of the models that were to be joined.
+
+    Attributes:
+        name: for people, as "sparse/0".
+        num_images: photos in it.
+        estimate: of its scale by its own ranges; None if they do not determine it.
+        joined_from_sfm: its unscaled world to that of the joined unscaled model; None if it is left out.
+        reason: why it is left out; empty if it is not.
+    """
+
+    name: str
+    num_images: int
+    estimate: ScaleEstimate | None
+    joined_from_sfm: Similarity | None
+    reason: str
+
+
+@dataclass(frozen=True)
+class PathOfModel:
+    """A model, its path and the ranges on it.
+
+    Attributes:
+        name: for people, as "sparse/0".
+        sfm: unscaled.
+        trajectory: of its photos that have a time.
+        observations: on it, of the log that all models share.
+    """
+
+    name: str
+    sfm: pycolmap.Reconstruction
+    trajectory: Trajectory
+    observations: RangeObservations
+
+
+@dataclass(frozen=True)
+class Ranging:
+    """What the estimates of all models go by; as in ``initialize_scale``."""
+
+    anchors: Sequence[Anchor]
+    anchor_frame: str
+    scale: ScaleOptions
+    range_model: RangeModelOptions
+    tape: Tape | None
+    seed: int
+
+
+@dataclass(frozen=True)
+class JoinedModels:
+    """The models that could be joined, as one in the world and the unit of the first.
+
+    Attributes:
+        path: of all of them.
+        verdicts: on each model that there was.
+        notes: what the user should know.
+    """
+
+    path: PathOfModel
+    verdicts: tuple[ModelVerdict, ...]
+    notes: tuple[str, ...]
+
+
+def join_models(parts: Sequence[PathOfModel], ranging: Ranging) -> JoinedModels:
+    """Scale each model on its own, and lay them into one world by all their ranges with one set of anchors.
+
+    Args:
+        parts: to the first one the others are joined. No photo is in two of them.
+
+    Raises:
+        GeometryError: not even the scale of the first one is determined.
+    """
+    exclusive = each_on_one_path([part.observations for part in parts])
+    parts = [replace(part, observations=of) for part, of in zip(parts, exclusive, strict=True)]
+    first = _first_in_time(parts)
+    scaled, reasons = _scaled_alone(parts, ranging, first)
+    placements = place_models(list(scaled.values()))
+    reasons |= {k: reason for k, reason in zip(scaled, placements.reasons, strict=True) if reason}
+    if first in reasons and ranging.anchor_frame == "first_camera":
+        why = f"the anchors are given in the frame of the first photo, and {parts[first].name}, which has it, "
+        reasons = {k: reasons.get(k, f"{why}has no place") for k in range(1, len(parts))}
+    first_from_sfm = dict(zip(scaled, placements.first_from_sfm, strict=True))
+    placed = {k: motion for k, motion in first_from_sfm.items() if motion is not None and k not in reasons}
+    verdicts = (
+        ModelVerdict(
+            part.name,
+            part.sfm.num_reg_images(),
+            scaled[k].estimate if k in scaled else None,
+            placed.get(k),
+            reasons.get(k, ""),
+        )
+        for k, part in enumerate(parts)
+    )
+    path = _assembled([parts[k] for k in placed], list(placed.values()))
+    return JoinedModels(path, tuple(verdicts), placements.notes)
+
+
+def _first_in_time(parts: Sequence[PathOfModel]) -> int:
+    """Which of them has the first photo; without times, the first by name."""
+    starts = [
+        (0.0 if path.timestamps_s is None else float(path.timestamps_s[0]), path.image_names[0])
+        for path in (part.trajectory for part in parts)
+    ]
+    return starts.index(min(starts))
+
+
+def _scaled_alone(
+    parts: Sequence[PathOfModel], ranging: Ranging, first: int
+) -> tuple[dict[int, ScaledModel], dict[int, str]]:
+    """The models whose scale their own ranges determine, and why those of others do not."""
+    scaled: dict[int, ScaledModel] = {}
+    reasons: dict[int, str] = {}
+    for k, part in enumerate(parts):
+        try:
+            scaled[k] = _alone(part, ranging, has_first_camera=k == first)
+        except GeometryError as error:
+            if k == 0:
+                raise
+            reasons[k] = str(error)
+    return scaled, reasons
+
+
+def _alone(part: PathOfModel, ranging: Ranging, *, has_first_camera: bool) -> ScaledModel:
+    """A model by its own ranges. For one without the first camera, anchors given in its frame are those of a site."""
+    frame, options = ranging.anchor_frame, ranging.scale
+    if not has_first_camera:
+        frame = "site" if frame == "first_camera" else frame
+        options = options.changed(up_in_first_camera=None)
+    anchor_ids = part.observations.log.anchor_ids
+    distances = None
+    if ranging.tape is not None:
+        distances = locate_distances(distances_within(ranging.tape, part.sfm, anchor_ids), part.sfm, anchor_ids)
+    estimate = initialize_scale(
+        part.observations,
+        part.trajectory,
+        ranging.anchors,
+        anchor_frame=frame,
+        options=options,
+        range_model=ranging.range_model,
+        distances=distances,
+        seed=ranging.seed,
+    )
+    is_given = frame == "first_camera"
+    return ScaledModel(
+        part.trajectory, estimate, is_in_anchor_frame=is_given or estimate.frame == "site", frame_is_given=is_given
+    )
+
+
+def _assembled(parts: Sequence[PathOfModel], first_from_sfm: Sequence[Similarity]) -> PathOfModel:
+    """All of them in the world of the first."""
+    if len(parts) == 1:
+        return parts[0]
+    moved = [
+        part.trajectory.transformed(motion.scale, motion.rotation, motion.translation)
+        for part, motion in zip(parts, first_from_sfm, strict=True)
+    ]
+    trajectory, keyframes = joined_trajectory(moved)
+    observations = joined_observations([part.observations for part in parts], first_from_sfm, keyframes)
+    model = joined_model([rescale(part.sfm, motion) for part, motion in zip(parts, first_from_sfm, strict=True)])
+    frame_of = {image.name: image.frame_id for image in model.images.values()}
+    frame_ids = np.array([frame_of[name] for name in trajectory.image_names], dtype=np.int64)
+    return PathOfModel(parts[0].name, model, replace(trajectory, frame_ids=frame_ids), observations)

@@ -1,0 +1,157 @@
+"""What the tables of options are made of: models whose keys are checked and explain themselves."""
+
+from __future__ import annotations
+
+import difflib
+import types
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic.fields import FieldInfo
+
+from rangesfm.errors import OptionError, nearest_known, printable, shown
+
+Same = TypeVar("Same", bound="Options")
+PathRole = Literal["file", "photos", "model", "output"]
+_NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "text", Path: "a path", dict: "a table"}
+_TABLE_OF = "a table in which each value is "
+_UNITS = {"m": "metres", "s": "seconds", "deg": "degrees"}
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a key is told by its annotation, where its name and type do not say it.
+
+    Attributes:
+        flag: its name on the command line, without dashes; None: the key's own.
+        metavar: how its value is shown there; None: by its type.
+        expected: what it may be, for messages; None: by its type and bounds.
+        role: of a path, what stands there.
+    """
+
+    flag: str | None = None
+    metavar: str | None = None
+    expected: str | None = None
+    role: PathRole | None = None
+
+
+@dataclass(frozen=True)
+class Key:
+    """A key of a survey file: where it stands, what its annotation says, and what its docstring says.
+
+    Attributes:
+        type: of its value, without None for one that is not given.
+        meaning: with its default.
+    """
+
+    table: str
+    name: str
+    flag: str
+    metavar: str | None
+    type: Any
+    expected: str
+    meaning: str
+    role: PathRole | None
+
+    @property
+    def dotted(self) -> str:
+        return f"{self.table}.{self.name}"
+
+
+class Options(BaseModel):
+    """A table of options, or a part of one: values that hold by themselves and never change.
+
+    Raises:
+        OptionError: an unknown key (names the nearest known one), or a value of another type or out of bounds.
+    """
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
+
+    table: ClassVar[str]  # its name in a survey file
+
+    def __init__(self, /, **values: Any):
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            raise self._error(error.errors()[0]["loc"], values) from None
+
+    def changed(self: Same, **values: Any) -> Same:
+        """The same with other values of some keys, which are checked."""
+        given = {name: getattr(self, name) for name in self.model_fields_set}
+        return type(self)(**{**given, **values})
+
+    @classmethod
+    @cache
+    def keys(cls) -> Mapping[str, Key]:
+        """All keys by their names."""
+        bare, hints = get_type_hints(cls), get_type_hints(cls, include_extras=True)
+        keys = {}
+        for name, field in cls.model_fields.items():
+            told = next((item for item in field.metadata if isinstance(item, Told)), Told())
+            expected = told.expected or _described(hints[name], _UNITS.get(name.rpartition("_")[2]))
+            meaning = " ".join((field.description or "").split()).removesuffix(".")
+            meaning += _default(field.get_default(call_default_factory=True))
+            type_ = _without_none(bare[name])
+            keys[name] = Key(cls.table, name, told.flag or name, told.metavar, type_, expected, meaning, told.role)
+        return keys
+
+    @classmethod
+    def _error(cls, where: tuple[int | str, ...], values: Mapping[str, Any]) -> OptionError:
+        name = str(where[0])
+        if name not in cls.model_fields:
+            nearest = nearest_known(name, cls.model_fields)
+            return OptionError(
+                f"unknown key {shown(name)} in [{cls.table}]; the nearest known one is '{nearest}'", cls.table, name
+            )
+        value, expected = values[name], cls.keys()[name].expected
+        if len(where) > 1 and isinstance(value, Mapping) and where[1] in value:
+            name, value, expected = f"{name}.{where[1]}", value[where[1]], expected.removeprefix(_TABLE_OF)
+        return OptionError(f"[{cls.table}] {printable(name)} is {shown(value)}, expected {expected}", cls.table, name)
+
+
+def looks_like(name: str, known: Iterable[str], min_likeness: float) -> bool:
+    """Whether a name is as like a known one as that, from 0 to 1."""
+    return bool(difflib.get_close_matches(name, list(known), 1, min_likeness))
+
+
+def _default(value: Any) -> str:
+    """What a key is if it is not given, where the meaning does not say it."""
+    if value is None or value in ((), {}):
+        return ""
+    parts = value if isinstance(value, tuple) else (value,)
+    words = (f"{part:g}" if isinstance(part, float) else str(part).lower() for part in parts)
+    return f" (default: {','.join(words)})"
+
+
+def _without_none(hint: Any) -> Any:
+    if get_origin(hint) not in (Union, types.UnionType):
+        return hint
+    return Union[tuple(arg for arg in get_args(hint) if arg is not types.NoneType)]  # noqa: UP007 (a tuple of types)
+
+
+def _described(hint: Any, unit: str | None) -> str:
+    """What values a type has, with their bounds."""
+    origin, args = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        constraints = [item for info in args[1:] if isinstance(info, FieldInfo) for item in info.metadata]
+        bounds = {name: getattr(item, name) for item in constraints for name in ("ge", "le") if hasattr(item, name)}
+        if not bounds:
+            return _described(args[0], unit)
+        low, high = (f"{bounds[name]:.10g}" for name in ("ge", "le"))
+        return low if low == high else f"{_described(args[0], unit)} from {low} to {high}"
+    if origin in (Union, types.UnionType):
+        return ", or ".join(_described(arg, unit) for arg in args if arg is not types.NoneType)
+    if origin is Literal:
+        return "one of " + ", ".join(map(str, args))
+    if origin is tuple:
+        item = _described(args[0], unit).removeprefix("a ").replace("number", "numbers", 1).replace("text", "texts", 1)
+        return f"a list of {item}" if args[-1] is Ellipsis else f"a list of {len(args)} {item}"
+    if origin is dict and args[1] is not Any:
+        return f"{_TABLE_OF}{_described(args[1], unit)}"
+    return _NAMES[origin or hint] + (f" of {unit}" if unit and hint in (int, float) else "")

@@ -1,0 +1,1 @@
+"""Processes of our own, watched from their start to their end."""

@@ -1,0 +1,164 @@
+"""A process that is watched from its start to its end: what it says, what memory it takes, and why it ended."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import IO, Any
+
+import psutil
+
+_POLL_INTERVAL_S = 0.2
+_MAX_STOP_S = 20.0  # until a process that was interrupted is killed
+_MAX_LINE = 200
+_STACK_TRACE = ("***", "@", "PC:")  # as glog begins its lines
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How it ended.
+
+    Attributes:
+        last: the last message it sent; None if it sent none.
+        signal: the signal that killed it, if one did.
+        needed_bytes: more memory than it might have, for which it was killed; None: it was not.
+        stopped: it was interrupted, as was wanted.
+        errors: the last line it wrote to stderr.
+    """
+
+    last: dict[str, Any] | None
+    signal: signal.Signals | None
+    needed_bytes: int | None
+    stopped: bool
+    errors: str
+
+
+def child_command(module: str) -> list[str]:
+    """Of a module that works for its parent (``child_process``)."""
+    return [sys.executable, "-m", module, str(os.getpid())]
+
+
+def supervise(
+    command: Sequence[str],
+    given: bytes,
+    listen: Callable[[dict[str, Any]], None],
+    *,
+    environment: Mapping[str, str],
+    memory_limit_bytes: int | None,
+    is_stopped: Callable[[], bool],
+) -> Ended:
+    """Run a process that reads ``given`` and writes JSON objects, one a line.
+
+    Args:
+        listen: called with each message.
+        memory_limit_bytes: it is killed if it takes more; None: there is no limit.
+        is_stopped: asked several times a second; once it says so, the process is interrupted.
+    """
+    with tempfile.TemporaryFile() as errors:
+        process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            env=environment,
+            start_new_session=True,  # a Ctrl-C in the terminal is not for it
+        )
+        try:
+            watched = _Watched(process, memory_limit_bytes, is_stopped)
+            last = _talk(process, given, listen, watched)
+        finally:
+            process.kill()  # no harm if it has ended
+            process.wait()
+        died_of = signal.Signals(-process.returncode) if process.returncode < 0 else None
+        return Ended(last, died_of, watched.needed_bytes, watched.stopped_at is not None, _last_line(errors))
+
+
+class _Watched:
+    """Interrupts or kills a process where that is due."""
+
+    def __init__(
+        self, process: subprocess.Popen[bytes], memory_limit_bytes: int | None, is_stopped: Callable[[], bool]
+    ):
+        self._process = process
+        self._limit = memory_limit_bytes
+        self._is_stopped = is_stopped
+        self.needed_bytes: int | None = None
+        self.stopped_at: float | None = None
+
+    def look(self) -> None:
+        if self._limit is not None and self.needed_bytes is None:
+            self._look_at_memory(self._limit)
+        if self.stopped_at is None and self._is_stopped():
+            self.stopped_at = time.monotonic()
+            self._process.send_signal(signal.SIGINT)
+        if self.stopped_at is not None and time.monotonic() - self.stopped_at > _MAX_STOP_S:
+            self._process.kill()
+
+    def _look_at_memory(self, limit_bytes: int) -> None:
+        try:
+            used = psutil.Process(self._process.pid).memory_info().rss
+        except psutil.Error:  # it has ended
+            return
+        if used > limit_bytes:
+            self.needed_bytes = used
+            self._process.kill()
+
+
+def _talk(
+    process: subprocess.Popen[bytes], given: bytes, listen: Callable[[dict[str, Any]], None], watched: _Watched
+) -> dict[str, Any] | None:
+    """Hand over and listen until the process closes its stdout; returns its last message."""
+    assert process.stdin is not None
+    assert process.stdout is not None
+    lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+    threading.Thread(target=_read_lines, args=(process.stdout, lines), daemon=True).start()
+    try:
+        with suppress(BrokenPipeError):  # it died; what it said before counts
+            process.stdin.write(given)
+            process.stdin.flush()
+        last = _hear(lines, listen, watched)
+    finally:
+        with suppress(BrokenPipeError):
+            process.stdin.close()  # not sooner: that it is open says that we live
+    process.wait()
+    return last
+
+
+def _hear(
+    lines: queue.SimpleQueue[bytes | None], listen: Callable[[dict[str, Any]], None], watched: _Watched
+) -> dict[str, Any] | None:
+    last = None
+    while True:
+        watched.look()
+        try:
+            line = lines.get(timeout=_POLL_INTERVAL_S)
+        except queue.Empty:
+            continue
+        if line is None:
+            return last
+        last = json.loads(line)
+        listen(last)
+
+
+def _read_lines(stream: IO[bytes], lines: queue.SimpleQueue[bytes | None]) -> None:
+    with stream:
+        for line in stream:
+            if line.endswith(b"\n"):  # one without was being written when the process was killed
+                lines.put(line)
+    lines.put(None)
+
+
+def _last_line(errors: IO[bytes]) -> str:
+    errors.seek(0)
+    lines = [line.strip() for line in errors.read().decode(errors="replace").split("\n")]
+    return next((line[:_MAX_LINE] for line in reversed(lines) if line and not line.startswith(_STACK_TRACE)), "")

@@ -1,0 +1,68 @@
+"""The frame in which a site's anchors are worked with: metres around them, whatever coordinates they were given in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.errors import InputError
+from rangesfm.geometry.georeference import Georeference, georeference_at
+from rangesfm.ranging.anchors.anchor import Anchor
+
+Array = npt.NDArray[np.float64]
+
+# Anchors further from their origin are moved there: least squares lose digits to large coordinates.
+_FAR_M = 1000.0
+
+
+@dataclass(frozen=True)
+class Site:
+    """The local frame of a survey's anchors.
+
+    Attributes:
+        offset_m: (3,) what the anchors' own coordinates are larger than local ones.
+        georeference: of the local frame; None if the coordinates are those of a frame of their own.
+    """
+
+    offset_m: Array
+    georeference: Georeference | None = None
+
+
+def local_site(
+    anchors: tuple[Anchor, ...], frame: str, crs: str | None, path: Path | None = None
+) -> tuple[Site, tuple[Anchor, ...]]:
+    """The local frame around anchors, and the anchors in it.
+
+    Args:
+        frame: what their positions refer to, one of ANCHOR_FRAMES; only "site" is moved.
+        crs: coordinate system of the positions, for which the local frame is east, north, up; None: metres.
+        path: of the anchors' file, for messages.
+
+    Raises:
+        InputError: a coordinate system without positions, for another frame, or that does not hold there.
+    """
+    given = np.array([np.full(3, np.nan) if a.position_m is None else a.position_m for a in anchors]).reshape(-1, 3)
+    known = np.isfinite(given).all(axis=1)
+    if crs is not None:
+        if frame != "site" or not known.any():
+            what = "no anchor has a position" if frame == "site" or not known.any() else f"the frame is {frame!r}"
+            raise InputError(f"[anchors] crs is {crs}, which is for anchors surveyed in a site frame, but {what}", path)
+        try:
+            georeference, local = georeference_at(given, crs)
+        except InputError as error:
+            raise InputError(str(error), path) from None
+        return Site(np.zeros(3), georeference), _at(anchors, local)
+    middle = given[known].mean(axis=0) if frame == "site" and known.any() else np.zeros(3)
+    # Whole metres, so that adding them again restores every digit.
+    offset = np.round(middle) if np.linalg.norm(middle) > _FAR_M else np.zeros(3)
+    return Site(offset), _at(anchors, given - offset)
+
+
+def _at(anchors: tuple[Anchor, ...], positions: Array) -> tuple[Anchor, ...]:
+    return tuple(
+        anchor if anchor.position_m is None else replace(anchor, position_m=position)
+        for anchor, position in zip(anchors, positions, strict=True)
+    )

@@ -1,0 +1,1 @@
+"""The offset between the radio's clock and the camera's."""

@@ -1,0 +1,193 @@
+"""The offset of the clocks in a stop-and-go survey: a burst of ranges around each photo."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import f as f_distribution
+
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.ranging.clock.curve import CostCurve
+from rangesfm.ranging.clock.search import TimedRanges
+from rangesfm.ranging.clock.squares import MIN_RESIDUAL_M, fit_squares
+
+Array = npt.NDArray[np.float64]
+Rows = npt.NDArray[np.int64]
+
+# Shares of the usual time between photos: a pause this long ends a burst; a photo's burst is this near.
+_PAUSE_SHARE = 0.25
+_REACH_SHARE = 0.25
+# A burst with fewer ranges than this share of the usual number is a stray.
+_MIN_SIZE_SHARE = 0.25
+# Fewer bursts than this share of the photos: the log is not one of bursts.
+_MIN_BURST_SHARE = 0.5
+# An offset that pairs fewer bursts than this share of the most possible is not tried.
+_MIN_PAIRED_SHARE = 0.75
+# Medians of bursts are nearly Gaussian, and too few to give one up lightly.
+_LOSS_SCALE = 5.0
+_MIN_NUM_SPARE = 4.0
+_MAX_CHANCE = 1e-3
+
+
+class Bursts(NamedTuple):
+    """B groups of ranges between pauses of the log.
+
+    Attributes:
+        start_s, end_s: (B,) first and last range, radio's clock.
+        num_ranges: (B,)
+        range_m: (B, L) median range of each link (an anchor and a tag); NaN where there is none.
+        anchor, tag: (L,) of each link.
+    """
+
+    start_s: Array
+    end_s: Array
+    num_ranges: Rows
+    range_m: Array
+    anchor: Rows
+    tag: Rows
+
+    @property
+    def middle_s(self) -> Array:
+        return 0.5 * (self.start_s + self.end_s)
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """Which burst belongs to which photo, and how well its ranges suit the path then.
+
+    Attributes:
+        offset_s: centres the bursts on their photos.
+        burst, photo: (k,) the pairs.
+        variance: of the medians' residuals, m^2.
+        num_spare: how many medians there are beyond the unknowns.
+        variation: variance of the medians of each anchor, m^2.
+        num_varying: how many medians there are beyond the anchors.
+    """
+
+    offset_s: float
+    burst: Rows
+    photo: Rows
+    variance: float
+    num_spare: float
+    variation: float
+    num_varying: float
+
+    @property
+    def is_testable(self) -> bool:
+        return self.num_spare >= _MIN_NUM_SPARE
+
+    def explains(self) -> bool:
+        """Whether the path explains the ranges better than no motion at all (F test)."""
+        return self._chance_of(self.variation, self.num_varying) < _MAX_CHANCE
+
+    def beats(self, rival: Pairing) -> bool:
+        """Whether the residuals are smaller than those of another pairing, beyond doubt (F test)."""
+        return self._chance_of(rival.variance, rival.num_spare) < _MAX_CHANCE
+
+    def _chance_of(self, variance: float, num: float) -> float:
+        return float(f_distribution.sf(variance / self.variance, num, self.num_spare))
+
+
+def find_bursts(ranges: TimedRanges, photo_times_s: Array) -> Bursts | None:
+    """Cut the log at its pauses; None if it does not pause between photos."""
+    ranges = ranges.take(np.argsort(ranges.times_s, kind="stable"))
+    pause_s = _PAUSE_SHARE * float(np.median(np.diff(photo_times_s)))
+    starts = np.flatnonzero(np.diff(ranges.times_s, prepend=-np.inf) > pause_s)
+    ends = np.append(starts[1:], len(ranges.times_s))
+    kept = ends - starts >= _MIN_SIZE_SHARE * np.median(ends - starts)
+    if kept.sum() < _MIN_BURST_SHARE * len(photo_times_s):
+        return None
+    starts, ends = starts[kept], ends[kept]
+    (anchor, tag), link = np.unique(np.stack([ranges.anchor, ranges.tag]), axis=1, return_inverse=True)
+    link = link.ravel()
+    medians = np.full((len(starts), len(anchor)), np.nan)
+    for burst, (start, end) in enumerate(zip(starts, ends)):
+        range_m, links = ranges.range_m[start:end], link[start:end]
+        for number in np.unique(links):
+            medians[burst, number] = np.median(range_m[links == number])
+    return Bursts(ranges.times_s[starts], ranges.times_s[ends - 1], ends - starts, medians, anchor, tag)
+
+
+def pair_bursts(bursts: Bursts, trajectory: Trajectory, tags_in_cam_m: Array) -> list[Pairing]:
+    """Every way to lay the bursts on the photos that pairs most of them; the best first.
+
+    Args:
+        bursts, trajectory: of the same survey.
+        tags_in_cam_m: (num_tags, 3) lever arms, metres.
+    """
+    photo_times = trajectory.timestamps_s
+    assert photo_times is not None, "a path in time needs times"
+    reach_s = _REACH_SHARE * float(np.median(np.diff(photo_times)))
+    pairings = []
+    for offset_s in _offsets(bursts.middle_s, photo_times, reach_s):
+        times = bursts.middle_s + offset_s
+        nearest = np.searchsorted(0.5 * (photo_times[1:] + photo_times[:-1]), times)
+        burst = np.flatnonzero(np.abs(times - photo_times[nearest]) <= reach_s)
+        pairings.append(_fit(bursts, trajectory, tags_in_cam_m, burst, nearest[burst]))
+    return sorted(pairings, key=lambda pairing: (not pairing.is_testable, pairing.variance))
+
+
+def offsets_that_keep(pairing: Pairing, bursts: Bursts, trajectory: Trajectory) -> tuple[float, float]:
+    """The first and the last offset at which every burst is nearest to its photo; in wrong order if none is."""
+    assert trajectory.timestamps_s is not None
+    gaps = np.diff(trajectory.timestamps_s)
+    before = np.minimum(np.concatenate([[np.inf], gaps]), np.median(gaps)) / 2
+    after = np.minimum(np.concatenate([gaps, [np.inf]]), np.median(gaps)) / 2
+    photo_times = trajectory.timestamps_s[pairing.photo]
+    return (
+        float(np.max(photo_times - before[pairing.photo] - bursts.start_s[pairing.burst])),
+        float(np.min(photo_times + after[pairing.photo] - bursts.end_s[pairing.burst])),
+    )
+
+
+def curve_of(pairings: list[Pairing], bursts: Bursts, trajectory: Trajectory) -> CostCurve:
+    """What all pairings cost: each the same wherever its bursts stay nearest to their photos."""
+    offsets, costs = [], []
+    for pairing in sorted(pairings, key=lambda pairing: pairing.offset_s):
+        earliest_s, latest_s = offsets_that_keep(pairing, bursts, trajectory)
+        plateau = {earliest_s, pairing.offset_s, latest_s} if earliest_s < latest_s else {pairing.offset_s}
+        offsets += sorted(plateau)
+        costs += [float(np.sqrt(pairing.variance))] * len(plateau)
+    order = np.argsort(offsets, kind="stable")
+    return CostCurve(np.array(offsets)[order], np.array(costs)[order])
+
+
+def _offsets(burst_times: Array, photo_times: Array, reach_s: float) -> list[float]:
+    """The offsets that bring most bursts within reach of a photo."""
+    differences = np.sort((photo_times[:, None] - burst_times).ravel())
+    first = np.searchsorted(differences, differences - reach_s)
+    last = np.searchsorted(differences, differences + reach_s, side="right")
+    offsets: list[float] = []
+    for best in np.argsort(first - last, kind="stable"):
+        if last[best] - first[best] < _MIN_PAIRED_SHARE * (last - first).max():
+            break
+        if all(abs(differences[best] - offset) > 2 * reach_s for offset in offsets):
+            offsets.append(float(np.median(differences[first[best] : last[best]])))
+    return offsets
+
+
+def _fit(bursts: Bursts, trajectory: Trajectory, tags_in_cam_m: Array, burst: Rows, photo: Rows) -> Pairing:
+    assert trajectory.timestamps_s is not None
+    pair, link = np.nonzero(np.isfinite(bursts.range_m[burst]))
+    anchor = bursts.anchor[link]
+    range_m = bursts.range_m[burst[pair], link]
+    centers = trajectory.centers[photo[pair]]
+    lever_arms = tags_in_cam_m[bursts.tag[link]]
+    tag_from_center = np.einsum("nij,nj->ni", trajectory.world_from_cam[photo[pair]], lever_arms)
+    without_lever = fit_squares(centers, range_m, anchor, _LOSS_SCALE)
+    squares = fit_squares(centers + tag_from_center / without_lever.scale, range_m, anchor, _LOSS_SCALE)
+    num_spare = float(squares.weights.sum()) - squares.num_unknowns
+    num_varying = float(len(range_m) - len(np.unique(anchor)))
+    means = np.bincount(anchor, range_m) / np.maximum(np.bincount(anchor), 1)
+    return Pairing(
+        offset_s=float(np.median(trajectory.timestamps_s[photo] - bursts.middle_s[burst])),
+        burst=burst,
+        photo=photo,
+        variance=max(float(np.sum(squares.weighted_residuals**2)) / max(num_spare, 1.0), MIN_RESIDUAL_M**2),
+        num_spare=num_spare,
+        variation=float(np.sum((range_m - means[anchor]) ** 2)) / max(num_varying, 1.0),
+        num_varying=num_varying,
+    )

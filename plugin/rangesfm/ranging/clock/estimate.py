@@ -1,0 +1,257 @@
+"""The offset between the camera's and the radio's clock, from the motion that both have seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.errors import GeometryError, InputError
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.options import AssociationOptions
+from rangesfm.progress import Progress, SilentProgress
+from rangesfm.ranging.association import associate, is_too_long, lever_arms
+from rangesfm.ranging.clock.bursts import Bursts, curve_of, find_bursts, offsets_that_keep, pair_bursts
+from rangesfm.ranging.clock.curve import CostCurve, cost_curve
+from rangesfm.ranging.clock.drift import drift_note, fit_clocks, without_drift
+from rangesfm.ranging.clock.fit import OffsetFit, refine_offset
+from rangesfm.ranging.clock.path import PathSamples, moving_path
+from rangesfm.ranging.clock.search import TimedRanges, ranges_on_path, scan_offsets
+from rangesfm.ranging.log import RangeKind, RangeLog
+from rangesfm.ranging.observations import RangeStatus
+
+Array = npt.NDArray[np.float64]
+
+_REMEDY = "give the time offset (--ranges_time_offset)"
+_MIN_NUM_KEYFRAMES = 4
+_MAX_NUM_CANDIDATES = 12
+_CANDIDATE_SEPARATION_S = 0.5
+# Enough ranges to tell candidates apart; enough to leave nothing to gain.
+_NUM_RANGES_PER_CANDIDATE = 3000
+_NUM_RANGES_OF_FINAL = 40000
+# Ranges to one anchor within a second say much the same where people carry the camera.
+_CELL_S = 1.0
+# Two descents that end this close, or within their stddevs, have found the same offset.
+_SAME_OFFSET_S = 0.25
+_SAME_OFFSET_STDDEVS = 5.0
+# An offset that puts fewer ranges on the path than this share of the best one's leaves much alone.
+_COVERING_SHARE = 0.7
+# So many of the ranges in bursts must stay at their photos for the offset not to matter.
+_MIN_SAME_SHARE = 0.95
+# Photos too far apart for ranges to be interpolated still show the motion: up to this many times their usual gap.
+_MAX_GAPS = 1.5
+
+
+@dataclass(frozen=True)
+class TimeOffset:
+    """The clocks' offset: image time = range time + ``value_s``.
+
+    Attributes:
+        value_s: where the clocks drift, at ``reference_s``.
+        stddev_s: of the value, with allowance for correlated residuals.
+        curve: what all offsets cost, for the report.
+        num_ranges_on_path: ranges that the offset puts where the path is known.
+        offset_matters: False where any offset near the value puts the ranges at the same photos.
+        drift: what camera time gains on radio time, seconds a second.
+        drift_stddev: of the drift; infinite where it was not looked for.
+        drift_is_followed: whether the drift is beyond doubt, so that ``at`` follows it.
+        reference_s: radio's time at which the clocks differ by ``value_s``.
+        note: what the user should know; None if nothing.
+    """
+
+    value_s: float
+    stddev_s: float
+    curve: CostCurve
+    num_ranges_on_path: int
+    offset_matters: bool
+    drift: float
+    drift_stddev: float
+    drift_is_followed: bool
+    reference_s: float
+    note: str | None
+
+    def at(self, radio_times_s: Array) -> Array:
+        """(n,) offsets at times of the radio's clock."""
+        drift = self.drift if self.drift_is_followed else 0.0
+        return self.value_s + drift * (radio_times_s - self.reference_s)
+
+
+def estimate_time_offset(
+    log: RangeLog,
+    trajectory: Trajectory,
+    tag_in_cam_m: npt.ArrayLike,
+    *,
+    association: AssociationOptions | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> TimeOffset:
+    """Find the offset at which the ranges follow the camera's path.
+
+    Neither the anchors nor the path's scale need be known: at every offset the ranges are
+    held against the path with the anchors and the scale that suit it best. The clocks may
+    be years apart.
+
+    Args:
+        log: ranges with timestamps, to one anchor or more.
+        trajectory: keyframes with times, in any unit.
+        tag_in_cam_m: (3,) antenna in the camera (rig) frame, metres; or (num_tags, 3), as ``log.tag_ids``.
+        association: how ranges will be put on the path.
+        seed: of the choice of ranges where there are more than needed.
+        progress: told of the offsets looked into.
+
+    Raises:
+        InputError: log or photos have no times, or the log has more tags than lever arms.
+        GeometryError: the motion does not determine the offset.
+    """
+    if log.timestamp_s is None:
+        raise InputError("the log has no timestamps, so that there is no time offset to find", log.source)
+    if trajectory.timestamps_s is None:
+        raise InputError("the photos have no times, so that there is no time offset to find: give image times")
+    if len(trajectory) < _MIN_NUM_KEYFRAMES or not len(log):
+        raise GeometryError(
+            f"{len(trajectory)} photos and {len(log)} ranges are too few to find the time offset by: {_REMEDY}"
+        )
+    association = association or AssociationOptions()
+    tags = lever_arms(log, tag_in_cam_m)
+    ranges = TimedRanges(log.timestamp_s, log.range_m, log.anchor_index, log.tag_index)
+    ranges = ranges.take(log.own_order[log.kind[log.own_order] == RangeKind.TAG_ANCHOR])
+    gap_s = float(np.median(np.diff(trajectory.timestamps_s)))
+    if is_too_long(gap_s, association):
+        bursts = find_bursts(ranges, trajectory.timestamps_s)
+        if bursts is not None:
+            found = _offset_of_bursts(bursts, log, trajectory, tags, association)
+            if found is not None:
+                return found
+        association = association.model_copy(update={"max_interpolation_gap_s": _MAX_GAPS * gap_s})
+    return _offset_of_motion(ranges, trajectory, tags, association, seed, progress or SilentProgress())
+
+
+def _offset_of_motion(
+    ranges: TimedRanges,
+    trajectory: Trajectory,
+    tags_in_cam_m: Array,
+    association: AssociationOptions,
+    seed: int,
+    progress: Progress,
+) -> TimeOffset:
+    """Scan all offsets, descend from the best few, and make sure that one stands out."""
+    path = moving_path(trajectory, tags_in_cam_m, association)
+    if np.count_nonzero(path.is_known) < 2:
+        raise GeometryError(f"no part of the path and the log can be compared to find the time offset: {_REMEDY}")
+    scanned = scan_offsets(ranges, path)
+    candidates = scanned.peaks(_CANDIDATE_SEPARATION_S, _MAX_NUM_CANDIDATES)
+    fits = []
+    for num_done, offset_s in enumerate(candidates):
+        progress.update(num_done, len(candidates))
+        near = ranges_on_path(ranges, path, offset_s, _NUM_RANGES_PER_CANDIDATE, seed)
+        if len(near.range_m):
+            fits.append(refine_offset(near, path, offset_s, _CELL_S))
+    progress.update(len(candidates), len(candidates))
+    best = _the_one_that_stands_out(fits, [_num_on_path(ranges, path, fit.offset_s) for fit in fits])
+    near = ranges_on_path(ranges, path, best.offset_s, _NUM_RANGES_OF_FINAL, seed)
+    clocks = fit_clocks(near, path, best.offset_s, _CELL_S)
+    final, timing = clocks.fit, clocks.timing
+    if not timing.stddev_s * timing.range_rate < final.residual_stddev_m:
+        raise GeometryError(
+            f"the motion is too even to tell the time offset (about {final.offset_s:+.2f} s, "
+            f"stddev {timing.stddev_s:.2g} s): {_REMEDY}"
+        )
+    drifts = clocks.followed_drift != 0
+    ranges = without_drift(ranges, clocks.followed_drift, clocks.reference_s)
+    return TimeOffset(
+        value_s=final.offset_s,
+        stddev_s=timing.stddev_s,
+        curve=cost_curve(ranges, path, scanned, final, timing.stddev_s, _CELL_S),
+        num_ranges_on_path=_num_on_path(ranges, path, final.offset_s),
+        offset_matters=True,
+        drift=clocks.drift,
+        drift_stddev=timing.drift_stddev,
+        drift_is_followed=drifts,
+        reference_s=clocks.reference_s,
+        note=drift_note(clocks.drift, timing.drift_stddev, near.times_s) if drifts else None,
+    )
+
+
+def _num_on_path(ranges: TimedRanges, path: PathSamples, offset_s: float) -> int:
+    return int(np.count_nonzero(path.knows(ranges.times_s + offset_s)))
+
+
+def _the_one_that_stands_out(fits: list[OffsetFit], num_on_path: list[int]) -> OffsetFit:
+    """The fit that explains most, if it does so beyond doubt.
+
+    Log and photos are usually meant to cover each other: an offset that leaves much more of
+    them alone is believed only if it fits better.
+    """
+    testable = [number for number, fit in enumerate(fits) if fit.is_testable]
+    if not testable:
+        raise GeometryError(f"too few ranges along the camera's path to find the time offset by: {_REMEDY}")
+    chosen = max(testable, key=lambda number: fits[number].score * num_on_path[number])
+    best = fits[chosen]
+    if not best.explains():
+        raise GeometryError(
+            "at no time offset do the ranges follow the camera's path (it hardly moves, its photos are "
+            f"too far apart, or the log belongs to other photos): {_REMEDY}"
+        )
+    same_s = max(_SAME_OFFSET_S, _SAME_OFFSET_STDDEVS * min(best.timing().stddev_s, 1.0))
+    for rival, num in zip(fits, num_on_path):
+        if abs(rival.offset_s - best.offset_s) > same_s:
+            covers = num >= _COVERING_SHARE * num_on_path[chosen]
+            if not (best.beats(rival) if covers else best.fits_better_than(rival)):
+                raise _ambiguity(best.offset_s, best.residual_stddev_m, rival.offset_s, rival.residual_stddev_m)
+    return best
+
+
+def _ambiguity(offset_s: float, stddev_m: float, other_offset_s: float, other_stddev_m: float) -> GeometryError:
+    return GeometryError(
+        f"the motion does not tell apart time offsets of {offset_s:+.2f} s and {other_offset_s:+.2f} s "
+        f"(residuals of {stddev_m:.2f} m and {other_stddev_m:.2f} m): {_REMEDY}"
+    )
+
+
+def _offset_of_bursts(
+    bursts: Bursts, log: RangeLog, trajectory: Trajectory, tags_in_cam_m: Array, association: AssociationOptions
+) -> TimeOffset | None:
+    """The offset that centres each burst on its photo; None if the camera did not stand still meanwhile."""
+    pairings = pair_bursts(bursts, trajectory, tags_in_cam_m)
+    best = pairings[0]
+    if not (best.is_testable and best.explains()):
+        raise GeometryError(
+            f"at no time offset do the {len(bursts.start_s)} bursts of ranges suit the {len(trajectory)} photos "
+            f"better than by chance: {_REMEDY}"
+        )
+    for rival in pairings[1:]:
+        if rival.is_testable and not best.beats(rival):
+            raise _ambiguity(best.offset_s, np.sqrt(best.variance), rival.offset_s, np.sqrt(rival.variance))
+    earliest_s, latest_s = offsets_that_keep(best, bursts, trajectory)
+    if earliest_s >= latest_s:
+        return None
+    value_s = float(np.clip(best.offset_s, earliest_s, latest_s))
+    num_in_bursts = int(bursts.num_ranges[best.burst].sum())
+    num_staying = _num_at_same_photo(log, trajectory, association, value_s, earliest_s, latest_s)
+    if num_staying < _MIN_SAME_SHARE * num_in_bursts:
+        return None
+    return TimeOffset(
+        value_s=value_s,
+        stddev_s=(latest_s - earliest_s) / np.sqrt(12),
+        curve=curve_of(pairings, bursts, trajectory),
+        num_ranges_on_path=num_in_bursts,
+        offset_matters=False,
+        drift=0.0,
+        drift_stddev=np.inf,
+        drift_is_followed=False,
+        reference_s=float(np.mean(bursts.middle_s)),
+        note=f"the camera stands still at every photo: any time offset from {earliest_s:+.2f} s to {latest_s:+.2f} s "
+        f"gives the same result; {value_s:+.2f} s centres the ranges on the photos",
+    )
+
+
+def _num_at_same_photo(
+    log: RangeLog, trajectory: Trajectory, association: AssociationOptions, *offsets_s: float
+) -> int:
+    """How many ranges are taken to be at the same photo with all the offsets."""
+    photos = []
+    for offset_s in offsets_s:
+        places = associate(log, trajectory, np.zeros(3), time_offset_s=offset_s, options=association)
+        photos.append(np.where(places.status == RangeStatus.USED, places.before, -1))
+    return int(np.count_nonzero(np.all([photo == photos[0] for photo in photos], axis=0) & (photos[0] >= 0)))

@@ -1,0 +1,248 @@
+"""The robust fit of ranges to the path at one offset of the clocks, and how well it fixes the offset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import norm
+from scipy.stats import t as student
+
+from rangesfm.ranging.clock.path import PathSamples
+from rangesfm.ranging.clock.search import TimedRanges
+from rangesfm.ranging.clock.squares import MIN_RESIDUAL_M, SquaresFit, fit_squares, residual_stddev, rows_by_anchor
+
+Array = npt.NDArray[np.float64]
+
+_MAX_NUM_STEPS = 12
+_MAX_STEP_S = 1.0
+_CONVERGED_STEP_S = 1e-4
+# A descent that leaves more of its ranges than this off the path leads nowhere.
+_MIN_KEPT_SHARE = 0.5
+# If the other unknowns explain all but this share of the ranges' rate of change, the rest is round-off.
+_MIN_OWN_RATE = 1e-3
+# Residuals of real radios stay correlated for seconds: blocks this long count as independent.
+_BLOCK_S = 10.0
+_MIN_NUM_BLOCKS = 12
+# How long they stay so is not known: the stddev is that of the mean variance with so many blocks of time.
+_JACKKNIFE_NUM_BLOCKS = (6, 12, 24)
+# In longer logs than this there are more of them, of 40, 20 and 10 s.
+_LONG_LOG_S = 240.0
+# Without one block the others must still determine everything: of columns of length one.
+_MIN_LEFT_CURVATURE = 1e-6
+# The tag's delay makes all ranges read too long or too short by about this.
+_RANGE_BIAS_STDDEV_M = 0.05
+# A rival's mean log residual must exceed the best one's by this and by this many stddevs.
+_MIN_LEAD = 0.05
+_MIN_LEAD_STDDEVS = 3.0
+
+
+class Timing(NamedTuple):
+    """What ranges say of the clocks near an offset.
+
+    Attributes:
+        stddev_s: of the offset; infinite where the motion does not determine it.
+        drift: what camera time gains on radio time, seconds a second.
+        drift_stddev: of the drift.
+        range_rate: root mean square of the ranges' rate of change, m/s.
+    """
+
+    stddev_s: float
+    drift: float
+    drift_stddev: float
+    range_rate: float
+
+
+class _MeanLoss(NamedTuple):
+    """Mean Cauchy loss of residuals, and its variance if chance acts on blocks of time."""
+
+    mean: float
+    variance: float
+
+    def is_below(self, other: _MeanLoss) -> bool:
+        lead = other.mean - self.mean
+        return lead > _MIN_LEAD and lead > _MIN_LEAD_STDDEVS * np.sqrt(self.variance + other.variance)
+
+
+@dataclass(frozen=True)
+class OffsetFit:
+    """Ranges fitted to the path at one offset.
+
+    Attributes:
+        offset_s: image time - range time.
+        ranges: the n on the path.
+        squares: the fit of their squares.
+        residuals_m: (n,) of that fit, enlarged by what its unknowns took from them.
+        num_spare: how many independent ranges there are beyond the unknowns.
+        deviations_m: (n,) of the ranges from their anchor's median.
+        rates: (n,) change of each predicted range with the offset, m/s.
+    """
+
+    offset_s: float
+    ranges: TimedRanges
+    squares: SquaresFit
+    residuals_m: Array
+    num_spare: int
+    deviations_m: Array
+    rates: Array
+
+    @property
+    def score(self) -> float:
+        """Natural log of how many times smaller the residuals are than the deviations (geometric means)."""
+        return float(np.mean(np.log(_at_least_tiny(self.deviations_m) / _at_least_tiny(self.residuals_m))))
+
+    @property
+    def residual_stddev_m(self) -> float:
+        return residual_stddev(self.residuals_m)
+
+    @property
+    def is_testable(self) -> bool:
+        """Whether there are enough ranges to tell a fit from a coincidence."""
+        return self.num_spare >= self.squares.num_unknowns
+
+    def explains(self) -> bool:
+        """Whether the path explains the ranges better than no motion at all."""
+        stddev_m = self.residual_stddev_m
+        return self._loss(self.residuals_m, stddev_m).is_below(self._loss(self.deviations_m, stddev_m))
+
+    def beats(self, rival: OffsetFit) -> bool:
+        """Whether, beyond doubt, the residuals are smaller than the rival's, or no larger while they explain more."""
+        stddev_m = self.residual_stddev_m
+        mine, other = self._loss(self.residuals_m, stddev_m), rival._loss(rival.residuals_m, stddev_m)
+        my_gain = self._loss(self.deviations_m, stddev_m, self.residuals_m)
+        other_gain = rival._loss(rival.deviations_m, stddev_m, rival.residuals_m)
+        return mine.is_below(other) or (mine.mean <= other.mean and other_gain.is_below(my_gain))
+
+    def fits_better_than(self, rival: OffsetFit) -> bool:
+        """Whether the residuals are smaller than the rival's, be it by chance."""
+        stddev_m = self.residual_stddev_m
+        return self._loss(self.residuals_m, stddev_m).mean < rival._loss(rival.residuals_m, stddev_m).mean
+
+    def _loss(self, errors_m: Array, stddev_m: float, less_errors_m: Array | None = None) -> _MeanLoss:
+        loss = 0.5 * np.log1p((errors_m / stddev_m) ** 2)
+        if less_errors_m is not None:
+            loss -= 0.5 * np.log1p((less_errors_m / stddev_m) ** 2)
+        block = _blocks(self.ranges.times_s)
+        mean = float(loss.mean())
+        excess = np.bincount(block, loss - mean)
+        return _MeanLoss(mean, float(excess @ excess) / len(loss) ** 2 * len(excess) / max(len(excess) - 1, 1))
+
+    def timing(self) -> Timing:
+        """Offset and drift with stddevs that allow for residuals correlated within blocks of time."""
+        times = self.ranges.times_s - self.ranges.times_s.mean()
+        own = self.squares.unexplained(np.stack([self.rates, self.rates * times], axis=1))
+        range_rate = float(np.sqrt(np.mean(self.rates**2)))
+        if not _is_determined(own[:, 0], self.rates):
+            return Timing(np.inf, 0.0, np.inf, range_rate)
+        residuals = self.squares.weighted_residuals
+        change = np.linalg.lstsq(own, residuals, rcond=None)[0]
+        alone = self._variances(own[:, :1], residuals, times)
+        both = self._variances(own, residuals - own @ change, times)
+        return Timing(float(np.sqrt(alone[0])), float(change[1]), float(np.sqrt(both[1])), range_rate)
+
+    def _variances(self, own: Array, residuals: Array, times: Array) -> Array:
+        """(k,) of the unknowns with columns ``own``, from chance and from a constant bias of all ranges."""
+        span_s = float(np.ptp(times))
+        by_chance = [
+            _jackknife_variances(own, residuals, self.squares, times, max(num, round(num * span_s / _LONG_LOG_S)))
+            for num in _JACKKNIFE_NUM_BLOCKS
+        ]
+        by_bias = np.linalg.lstsq(own, _RANGE_BIAS_STDDEV_M * np.sqrt(self.squares.weights), rcond=None)[0]
+        return np.asarray(np.mean(by_chance, axis=0) + by_bias**2)
+
+
+def refine_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, cell_s: float) -> OffsetFit:
+    """Descend from an offset to the nearest one that explains the ranges best (Gauss-Newton).
+
+    Args:
+        ranges: (nearly) all are on the path at that offset.
+        path: of a moving camera.
+        offset_s: to start from.
+        cell_s: ranges to one anchor within such a time count as one measurement.
+    """
+    found = fit_at_offset(ranges, path, offset_s, cell_s)
+    for num_steps in range(_MAX_NUM_STEPS):
+        own = found.squares.unexplained(found.rates[:, None])[:, 0]
+        if not _is_determined(own, found.rates):
+            break
+        step_s = float(own @ found.squares.weighted_residuals / (own @ own))
+        # The first steps also bring in the lever arm, which needs the scale.
+        if abs(step_s) < _CONVERGED_STEP_S and num_steps >= 2:
+            break
+        offset_s = found.offset_s + float(np.clip(step_s, -_MAX_STEP_S, _MAX_STEP_S))
+        if np.mean(path.knows(ranges.times_s + offset_s)) < _MIN_KEPT_SHARE:
+            break
+        found = fit_at_offset(ranges, path, offset_s, cell_s, found.squares.scale)
+    return found
+
+
+def fit_at_offset(
+    ranges: TimedRanges, path: PathSamples, offset_s: float, cell_s: float, scale: float = np.inf
+) -> OffsetFit:
+    """Fit the ranges that an offset puts on the path.
+
+    Args:
+        scale: metres per model unit, for the lever arm; infinite to leave it out.
+    """
+    ranges = ranges.take(path.knows(ranges.times_s + offset_s))
+    points, velocities = path.tag(ranges.times_s + offset_s, ranges.tag, scale)
+    squares = fit_squares(points, ranges.range_m, ranges.anchor)
+    deviations = ranges.range_m.copy()
+    for rows in rows_by_anchor(ranges.anchor):
+        deviations[rows] -= np.median(deviations[rows])
+    num_cells = np.unique(np.stack([np.floor(ranges.times_s / cell_s), ranges.anchor]), axis=1).shape[1]
+    num_spare = num_cells - squares.num_unknowns - 1
+    residuals = squares.residuals_m * np.sqrt(num_cells / max(num_spare, 0.5))
+    rates = np.einsum("ni,ni->n", squares.gradient, velocities)
+    return OffsetFit(offset_s, ranges, squares, residuals, num_spare, deviations, rates)
+
+
+def _at_least_tiny(values: Array) -> Array:
+    return np.maximum(np.abs(values), MIN_RESIDUAL_M)
+
+
+def _is_determined(own: Array, rates: Array) -> bool:
+    """Whether the offset changes the ranges in a way that nothing else could."""
+    return bool(own @ own > _MIN_OWN_RATE**2 * (rates @ rates))
+
+
+def _blocks(times: Array) -> npt.NDArray[np.int64]:
+    """(n,) number of the block of time each range falls into, without gaps."""
+    block_s = max(min(_BLOCK_S, float(np.ptp(times)) / _MIN_NUM_BLOCKS), 1e-9)
+    return np.unique(np.floor((times - times.min()) / block_s), return_inverse=True)[1]
+
+
+def _jackknife_variances(own: Array, residuals: Array, squares: SquaresFit, times: Array, num_blocks: int) -> Array:
+    """(k,) variances of an M-estimate whose residuals are correlated within blocks of time.
+
+    The delete-one-block jackknife, each time by one Newton step with everything that the fit adjusts
+    (Bell and McCaffrey, Survey Methodology 2002). Sums of residuals over blocks, without the step, are
+    too small where a block's own ranges pull the fit: on short logs by half. With Student's quantile in
+    place of the Gaussian one, as there are few blocks.
+
+    Args:
+        own: (n, k) columns of the unknowns in question, which nothing else explains.
+        residuals: (n,) weighted, metres.
+        squares: the fit.
+        times: (n,)
+        num_blocks: of equal length.
+    """
+    columns = np.column_stack([squares.basis, own / np.linalg.norm(own, axis=0)])
+    curved = columns * (2 * squares.weights - 1)[:, None]
+    gradients = columns * residuals[:, None]
+    curvature = columns.T @ curved
+    length_s = max(float(np.ptp(times)) / num_blocks, 1e-9)
+    block = np.unique(np.minimum((times - times.min()) // length_s, num_blocks - 1), return_inverse=True)[1]
+    num = int(block.max()) + 1
+    changes = np.zeros((num, own.shape[1]))
+    for number in range(num):
+        rows = np.flatnonzero(block == number)
+        left = curvature - columns[rows].T @ curved[rows]
+        if np.linalg.eigvalsh(left)[0] < _MIN_LEFT_CURVATURE:
+            return np.full(own.shape[1], np.inf)
+        changes[number] = np.linalg.solve(left, gradients[rows].sum(axis=0))[-own.shape[1] :]
+    quantile = float(student.ppf(0.975, num - 1) / norm.ppf(0.975)) if num > 1 else np.inf
+    variances = (num - 1) / num * np.sum((changes / np.linalg.norm(own, axis=0)) ** 2, axis=0)
+    return np.asarray(quantile**2 * variances)

@@ -1,0 +1,155 @@
+"""Ranges against antenna positions when neither the anchors nor the scale are known.
+
+With the anchor at a, the scale alpha and the antenna at p (model units), the squared range is
+linear in what is unknown: rho^2 = alpha^2 |p|^2 - 2 alpha a.p + |a|^2. The relation between
+its coefficients is not used, so that there is one solution and no need of a start.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.ranging.errors.noise import robust_stddev
+
+Array = npt.NDArray[np.float64]
+Rows = npt.NDArray[np.int64]
+
+# Ranges shorter than this say as little of the squared distance as one of this length.
+MIN_RANGE_M = 0.3
+# A residual below this is as good as none (radios resolve a centimetre).
+MIN_RESIDUAL_M = 1e-3
+# Of 95 % efficiency on Gaussian noise.
+_CAUCHY_LOSS_SCALE = 2.385
+_NUM_REWEIGHTINGS = 6
+# The curvature of |p|^2 must be seen this clearly before it tells the scale.
+_MIN_CURVATURE_STDDEVS = 5.0
+
+
+@dataclass(frozen=True)
+class SquaresFit:
+    """Robust fit of ``rho^2 = alpha^2 |p|^2 + b.p + k``: b and k of each anchor, alpha of all.
+
+    Attributes:
+        weights: (n,) Cauchy, in [0, 1].
+        residuals_m: (n,) measured minus fitted range.
+        gradient: (n, 3) of the fitted range at each point, metres per model unit.
+        scale: alpha, metres per model unit; infinite where the path is too small to tell.
+    """
+
+    weights: Array
+    residuals_m: Array
+    gradient: Array
+    scale: float
+    _columns: _LinearColumns
+
+    @property
+    def num_unknowns(self) -> int:
+        """Four of each anchor, and the scale."""
+        return 4 * self._columns.num_anchors + 1
+
+    @property
+    def weighted_residuals(self) -> Array:
+        """(n,) metres."""
+        return np.asarray(np.sqrt(self.weights) * self.residuals_m)
+
+    @property
+    def basis(self) -> Array:
+        """(n, p) orthonormal weighted columns of all that the fit adjusts."""
+        curvature = self._columns.curvature
+        norm = max(float(np.linalg.norm(curvature)), 1e-300)
+        return np.column_stack([self._columns.anchors_basis(), curvature / norm])
+
+    def unexplained(self, values: Array) -> Array:
+        """(n, k) weighted columns of small changes of the ranges, less what anchors and scale could explain."""
+        left = self._columns.without_anchors(np.sqrt(self.weights)[:, None] * values)
+        curvature = self._columns.curvature
+        return np.asarray(left - np.outer(curvature, curvature @ left) / max(float(curvature @ curvature), 1e-300))
+
+
+def fit_squares(points: Array, range_m: Array, anchor: Rows, loss_scale: float = _CAUCHY_LOSS_SCALE) -> SquaresFit:
+    """Iteratively reweighted least squares from equal weights.
+
+    Args:
+        points: (n, 3) antenna, model units.
+        range_m: (n,)
+        anchor: (n,) number of each one's anchor.
+        loss_scale: in stddevs, from which a residual is down-weighted.
+    """
+    middle = points.mean(axis=0)
+    unit = max(float(np.sqrt(np.mean((points - middle) ** 2))), 1e-300)
+    points = (points - middle) / unit
+    groups = rows_by_anchor(anchor)
+    # Dividing by the derivative of rho^2 turns residuals back into metres.
+    metres = 1 / (2 * np.maximum(range_m, MIN_RANGE_M))
+    residuals_m = np.zeros(len(points))
+    for _ in range(_NUM_REWEIGHTINGS + 1):
+        weights = 1 / (1 + (residuals_m / (loss_scale * residual_stddev(residuals_m))) ** 2)
+        columns = _LinearColumns(points, metres * np.sqrt(weights), groups)
+        alpha_squared, coefficients, residuals = columns.solve(range_m**2)
+        residuals_m = residuals / np.sqrt(weights)
+    is_curved = alpha_squared * np.linalg.norm(columns.curvature) > _MIN_CURVATURE_STDDEVS * np.std(residuals)
+    gradient = metres[:, None] * (2 * alpha_squared * points + coefficients) / unit
+    scale = float(np.sqrt(alpha_squared)) / unit if is_curved else np.inf
+    return SquaresFit(weights, residuals_m, gradient, scale, columns)
+
+
+class _LinearColumns:
+    """The weighted columns of the linear model, with those of each anchor made orthonormal.
+
+    Attributes:
+        num_anchors: that have ranges.
+        curvature: (n,) the column |p|^2, less what the anchors' own unknowns explain of it.
+    """
+
+    def __init__(self, points: Array, row_weights: Array, groups: list[Rows]):
+        self._row_weights = row_weights
+        self._squared_norm = np.sum(points**2, axis=1)
+        self.num_anchors = len(groups)
+        self._factors = []
+        for rows in groups:
+            own = row_weights[rows, None] * np.column_stack([points[rows], np.ones(len(rows))])
+            squared_lengths, directions = np.linalg.eigh(own.T @ own)
+            # A flat or straight path leaves columns that only round-off fills.
+            kept = squared_lengths > 1e-10 * squared_lengths[-1]
+            solution = directions[:, kept] / np.sqrt(squared_lengths[kept])
+            self._factors.append((rows, own @ solution, solution))
+        self.curvature = self.without_anchors((row_weights * self._squared_norm)[:, None])[:, 0]
+
+    def without_anchors(self, values: Array) -> Array:
+        """(n, k) columns less their part that the anchors' own unknowns explain."""
+        left_over = values.copy()
+        for rows, basis, _ in self._factors:
+            left_over[rows] -= basis @ (basis.T @ values[rows])
+        return left_over
+
+    def anchors_basis(self) -> Array:
+        """(n, <= 4 num_anchors) the anchors' own columns; each is zero for ranges to the others."""
+        padded = []
+        for rows, basis, _ in self._factors:
+            padded.append(np.zeros((len(self._row_weights), basis.shape[1])))
+            padded[-1][rows] = basis
+        return np.column_stack(padded)
+
+    def solve(self, squared_ranges: Array) -> tuple[float, Array, Array]:
+        """alpha^2 (not negative), (n, 3) the vector b of each range's anchor, (n,) weighted residuals."""
+        weighted = self._row_weights * squared_ranges
+        left_over = self.without_anchors(weighted[:, None])[:, 0]
+        curvature = self.curvature
+        alpha_squared = max(float(curvature @ left_over) / max(float(curvature @ curvature), 1e-300), 0.0)
+        weighted = weighted - alpha_squared * self._row_weights * self._squared_norm
+        coefficients = np.empty((len(weighted), 3))
+        for rows, basis, solution in self._factors:
+            coefficients[rows] = (solution @ (basis.T @ weighted[rows]))[:3]
+        return alpha_squared, coefficients, left_over - alpha_squared * curvature
+
+
+def residual_stddev(residuals_m: Array) -> float:
+    """Robust, of residuals of which none is better than a radio resolves."""
+    return max(robust_stddev(residuals_m), MIN_RESIDUAL_M)
+
+
+def rows_by_anchor(anchor: Rows) -> list[Rows]:
+    return [np.flatnonzero(anchor == number) for number in np.unique(anchor)]

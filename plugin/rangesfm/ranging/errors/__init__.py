@@ -1,0 +1,1 @@
+"""What ranges get wrong."""

@@ -1,0 +1,238 @@
+"""The error curve of a radio, learnt from ranges of known length."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.errors import GeometryError, InputError
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.errors.error_curve import ErrorCurve
+from rangesfm.ranging.errors.noise import correlation_inflation, robust_stddev
+from rangesfm.ranging.errors.range_errors import fit_with_own_errors
+from rangesfm.ranging.errors.robust_loss import CAUCHY
+from rangesfm.ranging.log import RangeLog
+
+Array = npt.NDArray[np.float64]
+
+# Knots a sixth of an e-fold apart follow every curve that antennas and received power make.
+_LOG_SPACING = 1 / 6
+# Change of the slope over one e-fold of distance, stddev; and of an anchor's own delay.
+_BEND_STDDEV_M = 0.15
+_BIAS_STDDEV_M = 0.05
+# The level and the slope of the curve: next to nothing is assumed.
+_LEVEL_STDDEV_M = 10.0
+# A tag that is no further away stands on the anchor, where a distance has no logarithm to speak of.
+_AT_ANCHOR_M = 1e-3
+_MIN_RANGES = 100
+_MIN_RANGES_OF_KNOT = 20
+_EDGE_SHARE = 0.001
+_BLOCK_S = 10.0
+_NUM_ROUNDS = 20
+_MIN_ANCHORS_TO_LEAVE_OUT = 3
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What was learnt about a radio.
+
+    Attributes:
+        curve: its error by distance.
+        num_ranges: that the curve rests on.
+        noise_stddev_m: scatter of a range about the curve and its anchor's bias.
+        outlier_share: ranges that do not fit, as those without line of sight.
+        anchor_bias_m: what each anchor reads too long beyond the curve.
+        correlation_inflation: by how much the errors' correlation in time widens stddevs.
+        distance_m, error_m: (n,) of each range: true length, and measured minus true.
+    """
+
+    curve: ErrorCurve
+    num_ranges: int
+    noise_stddev_m: float
+    outlier_share: float
+    anchor_bias_m: dict[str, float]
+    correlation_inflation: float
+    distance_m: Array
+    error_m: Array
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Linear in knot values and anchor biases.
+
+    Attributes:
+        design: (n, k + m).
+        error_m: (n,) measured minus true.
+        prior: (p, k + m) rows with stddev 1 about zero.
+        groups: (n,) labels of stretches of one anchor's ranges whose errors go together.
+    """
+
+    design: Array
+    error_m: Array
+    prior: Array
+    groups: npt.NDArray[np.int64]
+
+
+def calibrate_ranges(log: RangeLog, tags_m: Array, anchors: Sequence[Anchor]) -> Calibration:
+    """Learn the mean error of a radio as a smooth function of distance.
+
+    A piecewise linear curve in the logarithm of distance with a penalty on its bends, common to all
+    anchors, and a bias of each anchor, under a Cauchy loss, so that ranges without line of sight have
+    little say. The stddev is the larger of two: by the curve's covariance, widened by the errors'
+    correlation in time; and by leaving out each anchor in turn.
+
+    Args:
+        log: n ranges.
+        tags_m: (n, 3) the tag's antenna at each of them, in the anchors' frame; NaN where unknown.
+        anchors: with positions.
+
+    Raises:
+        InputError: an anchor of the log has no position.
+        GeometryError: there are too few ranges of known length, or all are of one length.
+    """
+    distance, error = _errors(log, tags_m, anchors)
+    used = np.flatnonzero(np.isfinite(error) & (distance > _AT_ANCHOR_M))
+    if len(used) < _MIN_RANGES:
+        raise GeometryError(f"{len(used)} ranges of known length, expected {_MIN_RANGES} or more to learn from")
+    distance, error, index = distance[used], error[used], log.anchor_index[used]
+    knots = _knots(distance)
+    problem = _problem(log, used, distance, error, index, knots)
+    fitted, scatter = _fit(problem)
+    covariance = np.linalg.inv(_information(problem, fitted.weights, scatter.stddev_m))[: len(knots), : len(knots)]
+    stddev = np.maximum(np.sqrt(np.diag(covariance)), _spread_by_anchor(problem, index, len(knots)))
+    noise = _noise_by_knot(problem, fitted.residuals_m, len(knots), scatter.noise_m)
+    curve = ErrorCurve(knots, fitted.values[: len(knots)], stddev, noise)
+    biases = dict(zip(log.anchor_ids, fitted.values[len(knots) :].tolist(), strict=True))
+    outliers = float(np.mean(fitted.weights < 0.1))
+    return Calibration(curve, len(used), scatter.noise_m, outliers, biases, scatter.inflation, distance, error)
+
+
+def _errors(log: RangeLog, tags_m: Array, anchors: Sequence[Anchor]) -> tuple[Array, Array]:
+    """(n,) true distances, and measured minus true; NaN where unknown."""
+    by_id = {anchor.anchor_id: anchor.position_m for anchor in anchors}
+    positions = []
+    for anchor_id in log.anchor_ids:
+        position = by_id.get(anchor_id)
+        if position is None:
+            raise InputError(f"anchor {anchor_id} of the log has no position, expected all to be surveyed", log.source)
+        positions.append(position)
+    distance: Array = np.linalg.norm(tags_m - np.array(positions)[log.anchor_index], axis=1)
+    return distance, log.range_m - distance
+
+
+def _knots(distance: Array) -> Array:
+    """(k,) distances evenly spaced by their logarithm, over all but the few shortest and longest ranges."""
+    ends = np.quantile(distance, [_EDGE_SHARE, 1 - _EDGE_SHARE])
+    low, high = np.log(ends)
+    if not high - low > 2 * _LOG_SPACING:
+        raise GeometryError(
+            f"the ranges are {ends[0]:.2f} to {ends[1]:.2f} m long: a curve needs ranges of different lengths"
+        )
+    knots: Array = np.exp(np.linspace(low, high, int(np.ceil((high - low) / _LOG_SPACING)) + 1))
+    return knots
+
+
+def _problem(
+    log: RangeLog,
+    used: npt.NDArray[np.int64],
+    distance: Array,
+    error: Array,
+    index: npt.NDArray[np.int64],
+    knots: Array,
+) -> _Problem:
+    num_anchors = len(log.anchor_ids)
+    # Linear in the distance between knots, as the curve is applied.
+    hats = np.column_stack([np.interp(distance, knots, unit) for unit in np.eye(len(knots))])
+    is_anchor = np.eye(num_anchors)[index]
+    if log.timestamp_s is None:
+        block = np.unique(np.array(log.image_name)[used], return_inverse=True)[1]
+    else:
+        block = np.floor((log.timestamp_s[used] - log.timestamp_s[used].min()) / _BLOCK_S).astype(np.int64)
+    return _Problem(np.hstack([hats, is_anchor]), error, _prior(knots, num_anchors), block * num_anchors + index)
+
+
+def _prior(knots: Array, num_anchors: int) -> Array:
+    """Rows of stddev 1: bends of the curve as of a slope that walks at random, its ends, and the biases."""
+    step = np.log(knots[1] / knots[0])
+    bends = np.diff(np.eye(len(knots)), 2, axis=0) / (_BEND_STDDEV_M * step**1.5)
+    ends = np.eye(len(knots))[[0, -1]] / _LEVEL_STDDEV_M
+    curve = np.vstack([bends, ends])
+    biases = np.eye(num_anchors) / _BIAS_STDDEV_M
+    return np.vstack(
+        [
+            np.hstack([curve, np.zeros((len(curve), num_anchors))]),
+            np.hstack([np.zeros((num_anchors, len(knots))), biases]),
+        ]
+    )
+
+
+def _information(problem: _Problem, weights: Array, stddev: float) -> Array:
+    data: Array = (problem.design * weights[:, None]).T @ problem.design / stddev**2
+    return data + problem.prior.T @ problem.prior
+
+
+@dataclass(frozen=True)
+class _Scatter:
+    """Of ranges about a curve: stddev, and by how much their correlation widens stddevs."""
+
+    noise_m: float
+    inflation: float
+
+    @property
+    def stddev_m(self) -> float:
+        """Correlated errors are worth fewer ranges, so that the curve does not follow each of them."""
+        return self.noise_m * self.inflation
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Values of all unknowns (k + m,), the robust weights (n,) they were found with, and what they leave (n,)."""
+
+    values: Array
+    weights: Array
+    residuals_m: Array
+
+
+def _fit(problem: _Problem) -> tuple[_Fit, _Scatter]:
+    """Values and robust weights, and the scatter that they leave."""
+
+    def fit(scatter: _Scatter, before: _Fit | None) -> _Fit:
+        start_m = problem.error_m - np.median(problem.error_m) if before is None else before.residuals_m
+        weights = CAUCHY.weights(start_m / scatter.noise_m)
+        right = problem.design.T @ (weights * problem.error_m) / scatter.stddev_m**2
+        information = _information(problem, weights, scatter.stddev_m)
+        values = np.asarray(np.linalg.solve(information, right), np.float64)
+        return _Fit(values, weights, problem.error_m - problem.design @ values)
+
+    def estimate(_: _Scatter, fitted: _Fit) -> _Scatter:
+        noise = robust_stddev(fitted.residuals_m)
+        return _Scatter(noise, correlation_inflation(fitted.residuals_m / noise, fitted.weights, problem.groups))
+
+    start = _Scatter(robust_stddev(problem.error_m - np.median(problem.error_m)), 1.0)
+    fitted, _, seen = fit_with_own_errors(fit, estimate, start, max_num_rounds=_NUM_ROUNDS)
+    return fitted, seen
+
+
+def _spread_by_anchor(problem: _Problem, index: npt.NDArray[np.int64], num_knots: int) -> Array:
+    """(k,) jackknife stddev of the curve over anchors; 0 with too few of them."""
+    present = np.unique(index)
+    if len(present) < _MIN_ANCHORS_TO_LEAVE_OUT:
+        return np.zeros(num_knots)
+    curves = []
+    for k in present:
+        rest = index != k
+        part = _Problem(problem.design[rest], problem.error_m[rest], problem.prior, problem.groups[rest])
+        curves.append(_fit(part)[0].values[:num_knots])
+    num = len(present)
+    spread: Array = np.sqrt((num - 1) / num * np.sum((np.array(curves) - np.mean(curves, axis=0)) ** 2, axis=0))
+    return spread
+
+
+def _noise_by_knot(problem: _Problem, residuals: Array, num_knots: int, noise: float) -> Array:
+    """(k,) scatter about the curve of the ranges nearest to each knot; that of all where they are few."""
+    nearest = np.argmax(problem.design[:, :num_knots], axis=1)
+    parts = [residuals[nearest == k] for k in range(num_knots)]
+    return np.array([robust_stddev(part) if len(part) >= _MIN_RANGES_OF_KNOT else noise for part in parts])

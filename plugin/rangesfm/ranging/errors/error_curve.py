@@ -1,0 +1,106 @@
+"""ErrorCurve: by how much a radio reads long or short at each distance, and ranges freed from it."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.errors import InputError
+from rangesfm.files.atomic import new_file
+from rangesfm.files.tables import Table, read_table
+from rangesfm.ranging.log import RangeLog
+
+Array = npt.NDArray[np.float64]
+
+COLUMNS = ("distance_m", "error_m", "stddev_m", "noise_stddev_m")
+# How fast a curve may run away beyond where it was learnt, for each e-fold of distance. The DW1000's own
+# error changes by 0.05 to 0.1 m for each (Decawave application note APS011).
+DRIFT_STDDEV_M = 0.1
+_MUCH_OUTSIDE = 0.02
+
+
+@dataclass(frozen=True)
+class ErrorCurve:
+    """Mean error of a radio by distance, piecewise linear between k knots.
+
+    Attributes:
+        distance_m: (k,) true distances, ascending, k >= 2.
+        error_m: (k,) measured minus true there.
+        stddev_m: (k,) of ``error_m``: an error that all ranges of this length share.
+        noise_stddev_m: (k,) scatter of single ranges about the curve.
+    """
+
+    distance_m: Array
+    error_m: Array
+    stddev_m: Array
+    noise_stddev_m: Array
+
+    def true_distance(self, range_m: Array) -> tuple[Array, Array]:
+        """Invert ``range = distance + error(distance)``.
+
+        Beyond its ends the curve keeps its last value, and is less and less certain.
+
+        Returns:
+            (n,) distances, not less than a tenth of the range, and (n,) stddevs of the correction.
+        """
+        knots = self.distance_m + self.error_m
+        error = np.interp(range_m, knots, self.error_m)
+        distance = np.maximum(range_m - error, 0.1 * range_m)
+        beyond = np.abs(np.log(distance / np.clip(distance, self.distance_m[0], self.distance_m[-1])))
+        return distance, np.hypot(np.interp(range_m, knots, self.stddev_m), DRIFT_STDDEV_M * beyond)
+
+    def share_outside(self, range_m: Array) -> float:
+        """Share of ranges of lengths at which the curve was not learnt."""
+        knots = self.distance_m + self.error_m
+        return float(np.mean((range_m < knots[0]) | (range_m > knots[-1]))) if len(range_m) else 0.0
+
+
+def correct_ranges(log: RangeLog, curve: ErrorCurve) -> tuple[RangeLog, list[str]]:
+    """The log as a radio without this error would have written it, and what the user should know."""
+    distance, stddev = curve.true_distance(log.range_m)
+    notes = []
+    if (outside := curve.share_outside(log.range_m)) > _MUCH_OUTSIDE:
+        notes.append(
+            f"{100 * outside:.0f} % of the ranges are shorter or longer than the {curve.distance_m[0]:.2f} to "
+            f"{curve.distance_m[-1]:.2f} m at which the error curve was learnt: they weigh less"
+        )
+    return replace(log, range_m=distance, shared_stddev_m=stddev), notes
+
+
+def write_error_curve(curve: ErrorCurve, path: str | Path) -> None:
+    """Write ``distance_m,error_m,stddev_m,noise_stddev_m``."""
+    rows = np.column_stack([curve.distance_m, curve.error_m, curve.stddev_m, curve.noise_stddev_m])
+    with new_file(Path(path)) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        writer.writerows([f"{value:.5f}" for value in row] for row in rows.tolist())
+
+
+def read_error_curve(path: str | Path) -> ErrorCurve:
+    """Read what ``write_error_curve`` writes.
+
+    Raises:
+        InputError: with the line, for distances that do not ascend, negative stddevs, and a curve so steep
+            that two distances would give the same range.
+    """
+    table = read_table(path, COLUMNS[:3], COLUMNS[3:], separator=None)
+    if len(table) < 2:
+        raise InputError(f"has {len(table)} distances, expected two or more", path)
+    distance, error = table.numbers("distance_m"), table.numbers("error_m")
+    stddev = table.numbers("stddev_m")
+    noise = table.numbers("noise_stddev_m", empty=0.0) if "noise_stddev_m" in table else np.zeros(len(table))
+    _refuse(table, "distance_m", distance <= 0, "more than 0")
+    _refuse(table, "distance_m", np.diff(distance, prepend=0.0) <= 0, "more than the distance before it")
+    _refuse(table, "stddev_m", stddev < 0, "0 or more")
+    too_steep = np.diff(distance + error, prepend=0.0) <= 0
+    _refuse(table, "error_m", too_steep, "one at which a longer distance gives a longer range")
+    return ErrorCurve(distance, error, stddev, noise)
+
+
+def _refuse(table: Table, column: str, wrong: npt.NDArray[np.bool_], expected: str) -> None:
+    if wrong.any():
+        raise table.error(int(np.argmax(wrong)), column, expected)

@@ -1,0 +1,103 @@
+"""How noisy the ranges are, found from their own residuals."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.ranging.log import RangeLog
+
+Array = npt.NDArray[np.float64]
+
+# Radios read up to 0.15 m short below about 2 m, every anchor alike, by an amount that depends
+# on the antennas (Decawave application note APS011). An error common to all short ranges does
+# not average out, so they are trusted far less than their scatter says.
+_SHORT_RANGE_STDDEV_M = 2.0
+SHORT_RANGE_LENGTH_M = 1.0
+# Of a range of which nothing is known yet. Ranges that may be off together by more say nothing on the noise of others.
+START_STDDEV_M = 0.1
+MIN_STDDEV_M = 1e-9
+# Of a Gaussian distribution over the median of its absolute values.
+_STDDEV_PER_MAD = 1.4826
+# In stddevs, root mean square: where residuals are no larger, rounding and the solver's last step are all that they
+# have in common.
+NO_ERROR = 1e-3
+_MAX_INFLATION = 30.0
+# Of fewer there is nothing to resample.
+_MIN_NUM_STRETCHES = 8
+
+
+def robust_stddev(residuals: npt.ArrayLike) -> float:
+    """Stddev of the Gaussian bulk of (n,): median absolute deviation from zero, scaled; never quite 0."""
+    return float(robust_stddevs(np.reshape(residuals, (1, -1)))[0, 0]) if np.size(residuals) else MIN_STDDEV_M
+
+
+def robust_stddevs(residuals: Array) -> Array:
+    """(m, 1) the same of each row of (m, n)."""
+    stddevs: Array = _STDDEV_PER_MAD * np.median(np.abs(residuals), axis=1, keepdims=True)
+    return np.maximum(stddevs, MIN_STDDEV_M)
+
+
+def short_range_stddev(range_m: Array) -> Array:
+    """(n,) how far a range of this length may be off for being short, metres."""
+    stddev: Array = _SHORT_RANGE_STDDEV_M * np.exp(-range_m / SHORT_RANGE_LENGTH_M)
+    return stddev
+
+
+def shared_stddev(log: RangeLog) -> Array:
+    """(n,) what all ranges of about this length may be off together: as the error curve says, else for being short."""
+    return short_range_stddev(log.range_m) if log.shared_stddev_m is None else log.shared_stddev_m
+
+
+def bias_whitening(own_stddev_m: Array, common_stddev_m: float) -> Array:
+    """(m, m) turns range biases, each of its own stddev and a part that all share, into independent ones of stddev 1.
+
+    Args:
+        own_stddev_m: (m,) more than 0.
+    """
+    covariance = np.diag(own_stddev_m**2) + common_stddev_m**2
+    whitening: Array = np.linalg.inv(np.linalg.cholesky(covariance)) if len(own_stddev_m) else np.zeros((0, 0))
+    return whitening
+
+
+def stretch_labels(times_s: Array, length_s: float) -> npt.NDArray[np.int64]:
+    """(n,) labels of stretches of time, in which errors may go together: at least eight."""
+    since = times_s - times_s.min()
+    length_s = max(min(length_s, float(since.max()) / _MIN_NUM_STRETCHES), 1e-9)
+    labels: npt.NDArray[np.int64] = np.floor(since / length_s).astype(np.int64)
+    return labels
+
+
+def correlation_inflation(
+    scaled_residuals: Array, weights: Array, groups: npt.NDArray[np.int64], shares: Array | None = None
+) -> float:
+    """How much larger the stddev of a mean is than independent errors would make it.
+
+    Residuals of one anchor and one stretch of time (a group) tend to err together. The
+    variance of the groups' sums over the sum of variances is the square of what is returned.
+
+    Args:
+        scaled_residuals: (n,) in stddevs. weights: (n,) robust. groups: (n,) int labels.
+        shares: (n,) by how much each counts besides, if not all alike: formally, one with half of it has twice the
+            variance.
+    """
+    influence = scaled_residuals * weights
+    shares = np.ones(len(influence)) if shares is None else shares
+    _, index = np.unique(groups, return_inverse=True)
+    sums = np.bincount(index, shares * influence)
+    squares = float(np.sum(shares * influence**2))
+    if squares <= NO_ERROR**2 * np.sum(shares) or len(sums) < 2:
+        return 1.0
+    return float(np.clip(np.sqrt(np.sum(sums**2) / squares), 1.0, _MAX_INFLATION))
+
+
+def inflation_before_fit(inflation: float, num_groups: int, num_fitted: float) -> float:
+    """The inflation of errors that go together, of which a fit has taken its share out of the residuals.
+
+    Args:
+        inflation: as the residuals show it.
+        num_groups: of ranges that err together.
+        num_fitted: parameters that the ranges determine.
+    """
+    excess = (inflation**2 - 1) * num_groups / max(num_groups - num_fitted, 1.0)
+    return float(np.sqrt(1 + excess))

@@ -1,0 +1,295 @@
+"""RangeErrors: how far ranges are to be trusted, found from their own residuals (variance components)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.options import RangeModelOptions
+from rangesfm.ranging.errors.inlier_noise import InlierNoise, inlier_noise
+from rangesfm.ranging.errors.noise import (
+    START_STDDEV_M,
+    correlation_inflation,
+    robust_stddev,
+    shared_stddev,
+    stretch_labels,
+)
+from rangesfm.ranging.errors.place import place_labels, shares_by_residuals
+from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE, RobustLoss
+from rangesfm.ranging.observations import RangeObservations
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
+_Errors = TypeVar("_Errors")
+_Fit = TypeVar("_Fit")
+
+_MIN_STDDEV_M = 1e-3
+# In stddevs: an anchor whose noise differs less from that of all has the noise of all.
+_SIGNIFICANT = 3.0
+# Of fewer ranges of one anchor its noise is not told from outliers.
+_MIN_NUM_OF_ANCHOR = 20
+_NUM_MEAN_ROUNDS = 10
+_MIN_ORDINARY = 0.3
+
+
+@dataclass(frozen=True)
+class RangeErrors:
+    """How n ranges err, and so what each of them weighs: the scale stage finds it and hands it to the refinement.
+
+    To the cost of a map a range adds half of ``weight * loss(residual / stddev)``.
+
+    Attributes:
+        stddev_m: (n,) of each range, as weighted; NaN of one without a place.
+        share: (n,) by how much each counts beside its stddev, as ranges from one place err alike.
+        inflation: of the stddev of whatever many ranges say, by their errors' correlation in time.
+        given_m: (n,) noise as the log or the survey states it; NaN where it is estimated.
+        shared_m: (n,) what ranges of about this length may be off together.
+        placing_m: (n,) how well the place is known at which each was taken, each coordinate.
+        anchor_index: (n,). block: (n,) label of each range's stretch of time. place: (n,) label of where it was taken.
+        loss: of single ranges, in their stddevs. With a wide one the noise is what all residuals show, so that what
+            drifts away is no outlier; with a bounded one that of the ranges that fit.
+        common_bias_stddev_m: of the bias that all anchors share (mean 0), of which their own priors say nothing.
+        noise_m: of a range without special cases, as a map shows it that may only grow, turn and move; one that may
+            bend shows no more.
+        log_likelihood: of the likeliest residuals that the bounded loss has seen of these ranges.
+    """
+
+    stddev_m: Array
+    share: Array
+    inflation: float
+    given_m: Array
+    shared_m: Array
+    placing_m: Array
+    anchor_index: Indices
+    block: Indices
+    place: Indices
+    loss: RobustLoss
+    common_bias_stddev_m: float
+    noise_m: float = np.inf
+    log_likelihood: float = -np.inf
+
+    @classmethod
+    def begin(
+        cls, observations: RangeObservations, rows: Indices, range_model: RangeModelOptions, block_s: float
+    ) -> RangeErrors:
+        """Of some of the ranges, before any map is looked at.
+
+        Args:
+            rows: (n,) of the observations, all with a place.
+            block_s: length of the stretches of time in which errors may go together; where the log names photos, the
+                ranges of a photo do.
+        """
+        log = observations.log
+        given = log.range_stddev_m[rows]
+        if range_model.range_stddev_m is not None:
+            given = np.where(np.isfinite(given), given, range_model.range_stddev_m)
+        times = None if log.timestamp_s is None else log.timestamp_s[rows]
+        shared, nothing = shared_stddev(log)[rows], np.zeros(len(rows), dtype=np.int64)
+        return cls(
+            stddev_m=np.hypot(np.where(np.isfinite(given), given, START_STDDEV_M), shared),
+            share=np.ones(len(rows)),
+            inflation=1.0,
+            given_m=given,
+            shared_m=shared,
+            placing_m=np.zeros(len(rows)),
+            anchor_index=log.anchor_index[rows],
+            block=observations.before[rows] if times is None else stretch_labels(times, block_s),
+            place=nothing,
+            loss=GEMAN_MCCLURE,
+            common_bias_stddev_m=range_model.common_bias_stddev_m,
+        )
+
+    @property
+    def weight(self) -> Array:
+        """(n,) by how much each counts against all that is no range, beside its stddev."""
+        return self.share / self.inflation**2
+
+    @property
+    def group(self) -> Indices:
+        """(n,) label of the stretch of one anchor's ranges that err together."""
+        groups: Indices = self.block * (self.anchor_index.max() + 1) + self.anchor_index
+        return groups
+
+    @property
+    def is_estimated(self) -> Mask:
+        """(n,) whose noise is found from the residuals."""
+        return np.isnan(self.given_m)
+
+    def robust_weights(self, residuals_m: Array) -> Array:
+        """(n,) in (0, 1], 1 for a range that fits."""
+        return self.loss.weights(residuals_m / self.stddev_m)
+
+    def subset(self, rows: Indices) -> RangeErrors:
+        """Of some of the ranges."""
+        part: dict[str, Any] = {name: values[rows] for name, values in self._of_each_range()}
+        part["place"] = np.unique(part["place"], return_inverse=True)[1]
+        return replace(self, **part)
+
+    def spread(self, rows: Indices, num: int) -> RangeErrors:
+        """The same as ``rows`` of ``num`` ranges, of which the others have no place: NaN, or label 0."""
+        spread: dict[str, Any] = {}
+        for name, values in self._of_each_range():
+            spread[name] = np.full(num, np.nan if values.dtype == np.float64 else 0, dtype=values.dtype)
+            spread[name][rows] = values
+        return replace(self, **spread)
+
+    def _of_each_range(self) -> list[tuple[str, npt.NDArray[Any]]]:
+        values = ((field.name, getattr(self, field.name)) for field in fields(self))
+        return [(name, value) for name, value in values if isinstance(value, np.ndarray)]
+
+    def at(self, tags_m: Array, placing_m: Array) -> RangeErrors:
+        """Of ranges that were taken at these places (n, 3) in the metric world, known to (n,) metres."""
+        return replace(self, place=place_labels(tags_m, self.anchor_index), placing_m=placing_m)
+
+    def without_shared(self) -> RangeErrors:
+        """Of a map with which what short ranges share is estimated as a number of its own."""
+        stddev = np.sqrt(np.maximum(self.stddev_m**2 - self.shared_m**2, _MIN_STDDEV_M**2))
+        return replace(self, stddev_m=stddev, shared_m=np.zeros_like(self.shared_m))
+
+    def for_bending_map(self, loss: RobustLoss) -> RangeErrors:
+        """To begin with, under another loss, where a map may bend: it explains the ranges no worse than it did."""
+        beyond = (self.stddev_m**2 - self.shared_m**2 - self.placing_m**2)[self.is_estimated]
+        noise_m = float(np.sqrt(max(np.median(beyond), _MIN_STDDEV_M**2))) if len(beyond) else np.inf
+        return replace(self, loss=loss, noise_m=noise_m, log_likelihood=-np.inf)
+
+    def noise_of_all(self, residuals_m: Array) -> InlierNoise:
+        """Of the ranges without special cases, as a map that may not bend shows it."""
+        return inlier_noise(residuals_m[self._ordinary(np.ones(len(residuals_m), dtype=bool), self.shared_m)])
+
+    def noise_of_estimated(self, residuals_m: Array) -> InlierNoise:
+        """Likewise, of those that do not state their noise."""
+        return inlier_noise(residuals_m[self._ordinary_estimated()])
+
+    def _ordinary_estimated(self) -> Indices:
+        return self._ordinary(self.is_estimated, np.hypot(self.shared_m, self.placing_m))
+
+    def _ordinary(self, among: Mask, together_m: Array) -> Indices:
+        """Ranges that may be off together by little, and so tell the noise of others."""
+        among = among if among.any() else np.ones(len(among), dtype=bool)
+        usual = np.where(self.is_estimated, START_STDDEV_M, self.given_m)
+        ordinary = among & (together_m < usual)
+        is_enough = np.count_nonzero(ordinary) > _MIN_ORDINARY * np.count_nonzero(among)
+        return np.flatnonzero(ordinary if is_enough else among)
+
+    def seen_by_rigid_map(self, residuals_m: Array, prior_cost: float) -> RangeErrors:
+        """As the residuals of a map show them that may only grow, turn and move: all anchors have one noise.
+
+        What one anchor's residuals have beyond the others' is mostly the map's own bend. Where most ranges are wrong, a
+        fit can follow them, find the noise larger, take in more of them, and so on. Such a fit is less likely than the
+        state that it came from, and then the noise stays as that showed it.
+
+        Args:
+            residuals_m: (n,). prior_cost: what priors have against the map, which counts in its likelihood.
+        """
+        seen = self.noise_of_all(residuals_m)
+        likelihood, noise_m = seen.log_likelihood - prior_cost, seen.stddev
+        if likelihood <= self.log_likelihood:
+            likelihood, noise_m = self.log_likelihood, self.noise_m
+        base = np.where(self.is_estimated, noise_m, self.given_m)
+        stddev = np.sqrt(base**2 + self.placing_m**2 + self.shared_m**2)
+        share = shares_by_residuals(self.place, residuals_m / stddev, self.loss)
+        return replace(self, stddev_m=stddev, share=share, noise_m=noise_m, log_likelihood=likelihood)
+
+    def seen_by_bending_map(self, residuals_m: Array, num_absorbed: float) -> RangeErrors:
+        """As the residuals of a map show them that follows the ranges: each anchor may have a noise of its own.
+
+        While drift is large, so are residuals, and with the wide loss the noise is what all of them show. With the
+        bounded loss it is that of the bulk; a fit that is less likely than the one before leaves all as it is.
+
+        Args:
+            residuals_m: (n,). num_absorbed: degrees of freedom that the fit took from them.
+        """
+        if not self.is_estimated.any():
+            return self
+        if not self.loss.is_bounded:
+            of_all_m = robust_stddev(residuals_m[self._ordinary_estimated()])
+            return self._with_noise(np.full(len(residuals_m), of_all_m), residuals_m, num_absorbed)
+        seen = self.noise_of_estimated(residuals_m)
+        if seen.log_likelihood < self.log_likelihood:
+            return self
+        of_all_m = min(seen.stddev, self.noise_m)
+        noise_m = of_all_m * self._noise_ratios(residuals_m, of_all_m)[self.anchor_index]
+        return replace(self._with_noise(noise_m, residuals_m, num_absorbed), log_likelihood=seen.log_likelihood)
+
+    def _with_noise(self, noise_m: Array, residuals_m: Array, num_absorbed: float) -> RangeErrors:
+        """With this noise (n,) of the residuals, and the correlation that it leaves in them."""
+        n = len(residuals_m)
+        widening = np.sqrt(n / max(n - num_absorbed, 0.1 * n))
+        noise_m = np.maximum(widening * noise_m, _MIN_STDDEV_M)
+        stddev = np.where(self.is_estimated, np.hypot(noise_m, np.hypot(self.shared_m, self.placing_m)), self.stddev_m)
+        share = shares_by_residuals(self.place, residuals_m / stddev, self.loss)
+        return replace(self, stddev_m=stddev, share=share).inflated(residuals_m)
+
+    def inflated(self, residuals_m: Array) -> RangeErrors:
+        """With what is left of the correlation in time once the places count for what they are worth."""
+        scaled = residuals_m / self.stddev_m
+        inflation = correlation_inflation(scaled, self.loss.weights(scaled), self.group, self.share)
+        return replace(self, inflation=inflation)
+
+    def _noise_ratios(self, residuals_m: Array, noise_m: float) -> Array:
+        """(m,) noise of each anchor over that of all; 1 where the difference may be chance.
+
+        Noise is what scatters about the anchor's own mean: what its ranges have in common is no noise, and taken for
+        it would silence whoever disagrees.
+        """
+        rows = self._ordinary_estimated()
+        index, own = self.anchor_index[rows], residuals_m[rows].copy()
+        ratios = np.ones(self.anchor_index.max() + 1)
+        for k in range(len(ratios)):
+            own[index == k] -= self._bulk_mean(own[index == k], noise_m)
+        together = inlier_noise(own)
+        for k in range(len(ratios)):
+            if np.count_nonzero(index == k) < _MIN_NUM_OF_ANCHOR:
+                continue
+            alone = inlier_noise(own[index == k])
+            # What tells outliers from noise takes some 2.7 times as many values as the variance to be as certain.
+            chance = self.inflation * np.sqrt(2.7 / (2 * max(alone.num, 1.0)))
+            ratio = alone.stddev / together.stddev
+            ratios[k] = ratio if abs(np.log(ratio)) > _SIGNIFICANT * chance else 1.0
+        return ratios
+
+    def _bulk_mean(self, residuals_m: Array, noise_m: float) -> float:
+        """Of the residuals that fit, found from zero."""
+        mean = 0.0
+        for _ in range(_NUM_MEAN_ROUNDS if len(residuals_m) else 0):
+            mean = float(np.average(residuals_m, weights=self.loss.weights((residuals_m - mean) / noise_m)))
+        return mean
+
+    def change(self, other: RangeErrors) -> float:
+        """Largest relative change of a weight from these to others."""
+        ratio = np.sqrt(self.weight / other.weight) * other.stddev_m / self.stddev_m
+        return float(np.max(np.abs(np.log(ratio)), initial=0.0))
+
+
+def fit_with_own_errors(
+    fit: Callable[[_Errors, _Fit | None], _Fit],
+    estimate: Callable[[_Errors, _Fit], _Errors],
+    errors: _Errors,
+    *,
+    max_num_rounds: int,
+    is_last: Callable[[_Errors, _Errors, _Fit], bool] = lambda before, seen, fitted: False,
+) -> tuple[_Fit, _Errors, _Errors]:
+    """Alternate between a fit by what is known of the errors, and the errors that its residuals show.
+
+    Args:
+        fit: by these errors, from the fit before (None at first).
+        estimate: the errors that a fit shows, given those it was made by.
+        errors: to begin with.
+        is_last: whether a fit is good enough, by its errors, by those that it shows, and by itself.
+
+    Returns:
+        the last fit, the errors that it was made by, and those that it shows.
+    """
+    fitted = fit(errors, None)
+    seen = estimate(errors, fitted)
+    for _ in range(max_num_rounds - 1):
+        if is_last(errors, seen, fitted):
+            break
+        errors, fitted = seen, fit(seen, fitted)
+        seen = estimate(errors, fitted)
+    return fitted, errors, seen

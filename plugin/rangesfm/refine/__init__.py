@@ -1,0 +1,1 @@
+"""The refinement: bundle adjustment with ranges."""

@@ -1,0 +1,237 @@
+"""The full problem: COLMAP's bundle adjustment, with ranges."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from rangesfm import ceres
+from rangesfm.ceres.linear_solver import max_num_images_direct, overlaps_in
+from rangesfm.colmap.passthrough import apply_options
+from rangesfm.errors import SolverError
+from rangesfm.geometry.trajectory import pose_of
+from rangesfm.options import CameraOptions, RefineOptions
+from rangesfm.ranging.errors.noise import robust_stddev
+from rangesfm.refine.stillness import Stillness, farthest, keyframe_centers
+
+Array = npt.NDArray[np.float64]
+
+# Ceres' default of 1e4 damps the scale, which all poses share, so strongly that it creeps and is then taken for
+# converged; 1e8 does the same to the bends of a path of 2000 keyframes.
+_INITIAL_TRUST_REGION_RADIUS = 1e10
+# Relative, of the cost: all that rounding leaves. When it is enough, the keyframes tell, not the cost.
+_FUNCTION_TOLERANCE = 1e-12
+# No feature is located better; weighed against a smaller one, ranges lose all say in a model without noise.
+_MIN_PIXEL_STDDEV = 0.05
+_MAX_NUM_TIE_POINTS = 500
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What the solver did.
+
+    Attributes:
+        num_iterations: successful and not. initial_cost, final_cost: half the sum of squares, in pixels.
+        seconds: of the solver.
+        converged: whether it stopped because nothing was left to gain.
+        is_still: whether the keyframes had come to rest by then, in steps as free as the first.
+        message: the solver's own words.
+    """
+
+    num_iterations: int
+    initial_cost: float
+    final_cost: float
+    seconds: float
+    converged: bool
+    is_still: bool
+    message: str
+
+
+@dataclass(frozen=True)
+class BundleAdjustment:
+    """COLMAP's own problem over all photos of a model, to which ranges can be added once.
+
+    Attributes:
+        metric: the model, adjusted in place.
+        adjuster: COLMAP's.
+        num_reprojections: residuals of features.
+        pixel_stddev: of one coordinate of a feature, estimated from the residuals before.
+        tie_points: blocks of 3-D points that few images see, for ``keep_from_elimination``.
+    """
+
+    metric: pycolmap.Reconstruction
+    adjuster: pycolmap.CeresBundleAdjuster
+    num_reprojections: int
+    pixel_stddev: float
+    tie_points: Iterator[Array]
+
+    @property
+    def reprojection_rms_px(self) -> float:
+        """Root mean square length of the present reprojection errors."""
+        residuals = np.asarray(self.adjuster.problem.evaluate_residuals())[: self.num_reprojections]
+        return float(np.sqrt(2 * np.mean(residuals**2)))
+
+    def keep_from_elimination(self, block: Array) -> None:
+        """Have Ceres eliminate the map's points only; see ``keep_from_elimination`` of the costs."""
+        tie_point = next(self.tie_points, None)
+        if tie_point is not None:
+            ceres.keep_from_elimination(self.adjuster, block, tie_point)
+
+
+def bundle_adjustment(
+    metric: pycolmap.Reconstruction,
+    camera: CameraOptions,
+    options: RefineOptions,
+    *,
+    fixed_frame_id: int | None,
+    max_num_iterations: int,
+    num_threads: int,
+    marker_ids: Collection[int] = (),
+    left_out_ids: Collection[int] = (),
+) -> BundleAdjustment:
+    """Set it up, with a gauge that leaves the scale to the ranges.
+
+    Args:
+        marker_ids: 3-D points that will have other residuals than their reprojections.
+        left_out_ids: 3-D points that take no part, and stay where they are.
+
+    Raises:
+        SolverError: nothing takes part.
+        InputError: an unknown key among the options passed through.
+    """
+    adjuster = _bundle_adjuster(metric, camera, options, fixed_frame_id, max_num_iterations, num_threads)
+    for point_id in left_out_ids:
+        if adjuster.problem.has_parameter_block(xyz := metric.point3D(point_id).xyz):
+            adjuster.problem.remove_parameter_block(xyz)
+    num_reprojections = adjuster.problem.num_residuals()
+    if num_reprojections == 0:
+        raise SolverError("no point of the model takes part in the bundle adjustment")
+    pixel_stddev = _pixel_stddev(adjuster, num_reprojections)
+    tie_points = _tie_points(metric, adjuster, marker_ids)
+    return BundleAdjustment(metric, adjuster, num_reprojections, pixel_stddev, tie_points)
+
+
+def _tie_points(
+    metric: pycolmap.Reconstruction, adjuster: pycolmap.CeresBundleAdjuster, marker_ids: Collection[int]
+) -> Iterator[Array]:
+    """Points in turn, those of few images first: one that held many ties would itself have many neighbours."""
+    by_track_length = sorted(metric.points3D.items(), key=lambda item: (item[1].track.length(), item[0]))
+    own = (point.xyz for point_id, point in by_track_length if point_id not in marker_ids)
+    return itertools.cycle(itertools.islice(filter(adjuster.problem.has_parameter_block, own), _MAX_NUM_TIE_POINTS))
+
+
+def solve(problem: BundleAdjustment, tolerance_m: float) -> Solution:
+    """Solve, in place, until keyframes stay where they are.
+
+    A cost of which a millionth part is left to gain may still move a map by metres, and points on the horizon may run
+    on forever without moving anything else.
+
+    Args:
+        tolerance_m: how far any keyframe would still go.
+
+    Raises:
+        SolverError: the solver failed.
+    """
+    start = time.monotonic()
+    stillness = Stillness(problem.metric, problem.pixel_stddev, tolerance_m)
+    summary = ceres.solve(problem.adjuster, stillness.is_over)
+    if not summary.IsSolutionUsable():
+        raise SolverError(f"the bundle adjustment with ranges failed: {summary.message}")
+    return Solution(
+        num_iterations=summary.num_successful_steps + summary.num_unsuccessful_steps,
+        initial_cost=summary.initial_cost,
+        final_cost=summary.final_cost,
+        seconds=time.monotonic() - start,
+        converged=summary.termination_type.name in ("CONVERGENCE", "USER_SUCCESS"),
+        is_still=stillness.is_still,
+        message=f"What is left to gain moves nothing that matters ({tolerance_m:.2g} m)."
+        if stillness.is_still
+        else summary.message,
+    )
+
+
+def solve_until_still(
+    problem: BundleAdjustment, before: Solution, tolerance_m: float, num_left: int
+) -> tuple[list[Solution], bool]:
+    """Solve again from where the solver stopped, with its trust region opened, until keyframes stay where they are.
+
+    A solver whose steps have become small says that it has converged; whether it has, a free step tells. What often
+    keeps steps small is an unknown anchor far from where the ranges want it: it is put there first, the map held.
+
+    Args:
+        before: the solution so far. num_left: iterations after which to give up.
+
+    Returns:
+        what was done, and whether the keyframes came to rest.
+    """
+    solutions: list[Solution] = []
+    is_still, centers = before.is_still, keyframe_centers(problem.metric)
+    while not is_still and num_left > 0:
+        _settle_radio(problem)
+        solutions.append(solve(problem, tolerance_m))
+        num_left -= max(solutions[-1].num_iterations, 1)
+        last, centers = centers, keyframe_centers(problem.metric)
+        is_still = solutions[-1].is_still or farthest(last, centers) <= tolerance_m
+    return solutions, is_still
+
+
+def _settle_radio(problem: BundleAdjustment) -> None:
+    """Solve for what is estimated beside the map alone."""
+    metric, ceres_problem = problem.metric, problem.adjuster.problem
+    blocks = [pose_of(metric.frame(frame_id)).params for frame_id in metric.reg_frame_ids()]
+    blocks += [rig.sensor_from_rig(sensor).params for rig in metric.rigs.values() for sensor in rig.non_ref_sensors]
+    blocks += [camera.params for camera in metric.cameras.values()]
+    blocks += [point.xyz for point in metric.points3D.values()]
+    held = [
+        b for b in blocks if ceres_problem.has_parameter_block(b) and not ceres_problem.is_parameter_block_constant(b)
+    ]
+    for block in held:
+        ceres_problem.set_parameter_block_constant(block)
+    ceres.solve(problem.adjuster, lambda _: False)
+    for block in held:
+        ceres_problem.set_parameter_block_variable(block)
+
+
+def _bundle_adjuster(
+    metric: pycolmap.Reconstruction,
+    camera: CameraOptions,
+    options: RefineOptions,
+    fixed_frame_id: int | None,
+    max_num_iterations: int,
+    num_threads: int,
+) -> pycolmap.CeresBundleAdjuster:
+    ba = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    ba.refine_focal_length = ba.refine_extra_params = camera.refine_intrinsics is True
+    solver = ba.ceres.solver_options
+    solver.initial_trust_region_radius = _INITIAL_TRUST_REGION_RADIUS
+    solver.function_tolerance = _FUNCTION_TOLERANCE
+    # Steps are compared with all parameters, of which points on the horizon may be millions of metres.
+    solver.gradient_tolerance = solver.parameter_tolerance = 0.0
+    solver.max_num_iterations = max_num_iterations
+    solver.num_threads = num_threads
+    ba.ceres.solver_options = solver
+    limit = ba.ceres.max_num_images_direct_sparse_cpu_solver
+    if metric.num_reg_images() > limit:
+        ba.ceres.max_num_images_direct_sparse_cpu_solver = max_num_images_direct(overlaps_in(metric), limit)
+    apply_options(ba, options.bundle_adjustment, "refine.bundle_adjustment")
+
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in metric.reg_image_ids():
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.UNSPECIFIED)
+    if fixed_frame_id is not None:
+        config.set_constant_rig_from_world_pose(fixed_frame_id)
+    return pycolmap.create_default_ceres_bundle_adjuster(ba, config, metric)
+
+
+def _pixel_stddev(adjuster: pycolmap.CeresBundleAdjuster, num_residuals: int) -> float:
+    """Stddev of a feature's coordinate from the residuals, which the parameters have already absorbed in part."""
+    residuals = np.asarray(adjuster.problem.evaluate_residuals())
+    degrees_of_freedom = max(num_residuals - adjuster.problem.num_parameters(), 1)
+    return max(robust_stddev(residuals) * float(np.sqrt(num_residuals / degrees_of_freedom)), _MIN_PIXEL_STDDEV)

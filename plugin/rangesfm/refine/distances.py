@@ -1,0 +1,154 @@
+"""Measured distances as residuals of the full problem: by tape, and between anchors by radio."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from rangesfm import ceres
+from rangesfm.distances.ends import LocatedDistances, images_by_name, triangulate_markers
+from rangesfm.distances.tape import Tape
+from rangesfm.geometry.trajectory import pose_of
+from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.errors.range_errors import RangeErrors
+from rangesfm.refine.bundle_adjustment import BundleAdjustment
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MeasuredDistances:
+    """Distances that the map keeps to.
+
+    Attributes:
+        tape: the control distances.
+        marker_ids: by name, the markers among their ends as 3-D points of the model.
+        by_radio: between anchors; their stddevs without what all of them share.
+    """
+
+    by_radio: LocatedDistances
+    tape: Tape = field(default_factory=Tape)
+    marker_ids: Mapping[str, int] = field(default_factory=dict)
+
+
+def add_marker_points(model: pycolmap.Reconstruction, tape: Tape) -> dict[str, int]:
+    """Make each marker a 3-D point of the model, its marks features; returns their ids by name.
+
+    Raises:
+        InputError: as ``locate_distances`` does.
+    """
+    places, images = triangulate_markers(tape, model), images_by_name(model)
+    ids = {}
+    for name, marker in (tape.markers or {}).items():
+        if name not in places:
+            continue
+        track = pycolmap.Track()
+        for image_name, pixel in zip(marker.image_names, marker.pixels, strict=True):
+            if image_name in images:
+                image = images[image_name]
+                image.points2D.append(pycolmap.Point2D(pixel))
+                track.add_element(image.image_id, len(image.points2D) - 1)
+        ids[name] = int(model.add_point3D(places[name], track, np.zeros(3, dtype=np.uint8)))
+    return ids
+
+
+def remove_marker_points(model: pycolmap.Reconstruction, marker_ids: Mapping[str, int]) -> None:
+    """Leave the model without the points and features that ``add_marker_points`` gave it."""
+    marked = [
+        element.image_id for point_id in marker_ids.values() for element in model.point3D(point_id).track.elements
+    ]
+    for point_id in marker_ids.values():
+        model.delete_point3D(point_id)
+    for image_id in marked:
+        model.image(image_id).points2D.pop()
+
+
+def add_distances(
+    bundle: BundleAdjustment,
+    distances: MeasuredDistances,
+    anchors: Sequence[AnchorEstimate],
+    anchor_blocks: Sequence[Array],
+    errors: RangeErrors,
+) -> list[Array]:
+    """Add them in units of pixels.
+
+    Args:
+        anchors, anchor_blocks: in the order of the log; distances to one without a place are left out.
+        errors: of ranges, of which those between anchors have the loss and the common bias.
+
+    Returns:
+        the parameter blocks that came with them.
+    """
+    placed = {
+        anchor.anchor_id: _End(block, None)
+        for anchor, block in zip(anchors, anchor_blocks, strict=True)
+        if np.isfinite(block).all()
+    }
+    _add_taped(bundle, distances, placed)
+    return _add_by_radio(bundle, distances.by_radio, anchor_blocks, errors)
+
+
+@dataclass(frozen=True)
+class _End:
+    """One end of a distance: a parameter block, and where on it; None where the block is the point itself."""
+
+    block: Array
+    in_rig_m: Array | None
+
+
+def _add_taped(bundle: BundleAdjustment, distances: MeasuredDistances, anchors: Mapping[str, _End]) -> None:
+    ends = dict(anchors)
+    for name, point_id in distances.marker_ids.items():
+        ends[name] = _End(bundle.metric.point3D(point_id).xyz, None)
+        bundle.keep_from_elimination(ends[name].block)
+    if distances.tape.distances:
+        ends |= {name: _camera(bundle.metric, image) for name, image in images_by_name(bundle.metric).items()}
+    for taped in distances.tape.distances:
+        if not set(taped.ends) <= ends.keys():
+            continue
+        a, b = (ends[name] for name in taped.ends)
+        if a.block is b.block or np.shares_memory(a.block, b.block):
+            continue  # two cameras of one rig, which is as it is
+        cost = ceres.distance_cost(
+            distance_m=taped.distance_m,
+            stddev_m=taped.stddev_m / bundle.pixel_stddev,
+            a_in_cam_m=a.in_rig_m,
+            b_in_cam_m=b.in_rig_m,
+        )
+        ceres.add_residual_block(bundle.adjuster, cost, None, [a.block, b.block])
+
+
+def _camera(metric: pycolmap.Reconstruction, image: pycolmap.Image) -> _End:
+    """A photo's projection centre, which hangs on its rig."""
+    pose = pose_of(metric.frame(image.frame_id))
+    return _End(pose.params, pose * image.projection_center())
+
+
+def _add_by_radio(
+    bundle: BundleAdjustment, by_radio: LocatedDistances, anchor_blocks: Sequence[Array], errors: RangeErrors
+) -> list[Array]:
+    bias, bias_stddev_m = np.zeros(1), errors.common_bias_stddev_m
+    rows = [
+        row for row, pair in enumerate(by_radio.anchor_pair) if all(np.isfinite(anchor_blocks[k]).all() for k in pair)
+    ]
+    if not rows:
+        return []
+    for row in rows:
+        cost = ceres.distance_cost(
+            distance_m=by_radio.distance_m[row],
+            stddev_m=by_radio.stddev_m[row] / bundle.pixel_stddev,
+            has_bias=True,
+            loss_scale=errors.loss.width * bundle.pixel_stddev,
+        )
+        pair = [anchor_blocks[k] for k in by_radio.anchor_pair[row]]
+        ceres.add_residual_block(bundle.adjuster, cost, None, [*pair, bias])
+    if bias_stddev_m == 0:
+        bundle.adjuster.problem.set_parameter_block_constant(bias)
+    else:
+        ceres.add_normal_prior(bundle.adjuster, bias, mean=[0.0], stddev=bias_stddev_m / bundle.pixel_stddev)
+        bundle.keep_from_elimination(bias)
+    return [bias]

@@ -1,0 +1,336 @@
+"""The keyframe graph: poses bound by what the photos say about neighbours, and drawn by ranges.
+
+It is the joint problem with the points eliminated once, and stated so that a bent map costs what its local
+deformation costs. Solved before the full bundle adjustment it unbends drift in cheap steps, which the full problem,
+whose points have to follow every turn of the world, takes only in many.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+from scipy.sparse.linalg import SuperLU, splu
+from scipy.spatial.transform import Rotation
+
+from rangesfm.geometry.gravity import Gravity
+from rangesfm.geometry.rotations import cross_matrices
+from rangesfm.geometry.similarity import rounding_of
+from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.errors.range_errors import RangeErrors
+from rangesfm.ranging.range_gradient import RangeGradient
+from rangesfm.refine.antennas import Antennas
+from rangesfm.refine.vision_information import Poses, VisionInformation
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+_MAX_NUM_STEPS = 60
+_INITIAL_DAMPING = 1e-8
+_MAX_DAMPING = 1e6
+# For the number of parameters that the ranges determine: random vectors to estimate a trace with.
+_NUM_PROBES = 12
+
+
+@dataclass(frozen=True)
+class GraphState:
+    """Values of all unknowns.
+
+    Attributes:
+        poses: of n keyframes.
+        anchors_m: (m, 3). biases_m: (m,).
+        common_bias_m: by how much the mean of all free biases' priors has moved.
+    """
+
+    poses: Poses
+    anchors_m: Array
+    biases_m: Array
+    common_bias_m: float
+
+    def range_gradient(self, antennas: Antennas, anchor_index: Indices) -> RangeGradient:
+        """Of the k distances."""
+        at = antennas.positions(self.poses.centers, self.poses.world_from_rig)
+        return RangeGradient.of(at - self.anchors_m[anchor_index])
+
+
+@dataclass(frozen=True)
+class KeyframeGraph:
+    """The problem.
+
+    Attributes:
+        vision: what the photos say.
+        antennas: of the k ranges that take part, by indices of the graph's keyframes.
+        range_m: (k,) measured. errors: of these.
+        anchors: m, with priors as for ``refine_with_ranges``.
+        held_frame: a keyframe that stays where it is; None: none does.
+        gravity: which way is up in the first keyframe; None: nobody knows.
+    """
+
+    vision: VisionInformation
+    antennas: Antennas
+    range_m: Array
+    errors: RangeErrors
+    anchors: tuple[AnchorEstimate, ...]
+    held_frame: int | None
+    gravity: Gravity | None
+
+    def start(self) -> GraphState:
+        """The map as it was given."""
+        positions = np.array([anchor.position_m for anchor in self.anchors])
+        biases = np.array([anchor.range_bias_m for anchor in self.anchors])
+        return GraphState(self.vision.origin, positions, biases, 0.0)
+
+    def residuals_m(self, state: GraphState) -> Array:
+        """(k,) predicted minus measured."""
+        index = self.errors.anchor_index
+        return state.range_gradient(self.antennas, index).distance_m + state.biases_m[index] - self.range_m
+
+
+@dataclass(frozen=True)
+class GraphSolution:
+    """Where the steps ended.
+
+    Attributes:
+        state: the estimate. num_steps: accepted and not.
+        num_absorbed: how many of the ranges' degrees of freedom the parameters take up.
+    """
+
+    state: GraphState
+    num_steps: int
+    num_absorbed: float
+
+
+def solve_graph(graph: KeyframeGraph, start: GraphState, *, tolerance_m: float) -> GraphSolution:
+    """Levenberg-Marquardt on the graph.
+
+    Args:
+        tolerance_m: it stops once no keyframe moves further in a step that succeeds.
+    """
+    layout = _Layout.of(graph)
+    state, damping = start, _INITIAL_DAMPING
+    terms = _Terms.at(graph, layout, state)
+    step_count = 0
+    while step_count < _MAX_NUM_STEPS and damping < _MAX_DAMPING:
+        step_count += 1
+        step = _factor(terms.hessian, layout, damping).solve(-terms.gradient[layout.free])
+        trial = _moved(state, layout, step)
+        trial_terms = _Terms.at(graph, layout, trial)
+        if not trial_terms.cost < terms.cost:
+            damping *= 10
+            continue
+        movement = np.linalg.norm(trial.poses.centers - state.poses.centers, axis=1).max()
+        state, terms, damping = trial, trial_terms, max(damping / 10, 1e-12)
+        if movement < tolerance_m:
+            break
+    return GraphSolution(state, step_count, _num_absorbed(terms, layout))
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Columns: 6 for each pose (turn in its own frame, shift of its centre), 3 for each anchor, biases, their common.
+
+    Attributes:
+        num: of all. free: which take part.
+        rows: what the rows of the priors are: (prior column, mean, stddev) of single numbers.
+    """
+
+    num_frames: int
+    num_anchors: int
+    free: Indices
+
+    @property
+    def num(self) -> int:
+        return 6 * self.num_frames + 4 * self.num_anchors + 1
+
+    @property
+    def first_anchor(self) -> int:
+        return 6 * self.num_frames
+
+    @property
+    def first_bias(self) -> int:
+        return 6 * self.num_frames + 3 * self.num_anchors
+
+    @classmethod
+    def of(cls, graph: KeyframeGraph) -> _Layout:
+        n, m = len(graph.vision.origin), len(graph.anchors)
+        is_free = np.ones(6 * n + 4 * m + 1, dtype=bool)
+        if graph.held_frame is not None:
+            is_free[6 * graph.held_frame : 6 * graph.held_frame + 6] = False
+        heard = np.isin(np.arange(m), graph.errors.anchor_index)
+        anchor_is_free = heard & [anchor.prior_position_stddev_m > 0 for anchor in graph.anchors]
+        bias_is_free = heard & [anchor.prior_bias_stddev_m > 0 for anchor in graph.anchors]
+        is_free[6 * n : 6 * n + 3 * m] = np.repeat(anchor_is_free, 3)
+        is_free[6 * n + 3 * m : -1] = bias_is_free
+        is_free[-1] = graph.errors.common_bias_stddev_m > 0 and bool(bias_is_free.any())
+        return cls(n, m, np.flatnonzero(is_free))
+
+
+@dataclass(frozen=True)
+class _Terms:
+    """Cost (half the sum of squares, robust), gradient and Gauss-Newton Hessian over all columns.
+
+    Attributes:
+        whitened: (k, columns) derivative of the ranges' residuals, robust weights included.
+    """
+
+    cost: float
+    gradient: Array
+    hessian: sparse.csc_array
+    whitened: sparse.csr_array
+
+    @classmethod
+    def at(cls, graph: KeyframeGraph, layout: _Layout, state: GraphState) -> _Terms:
+        residuals, jacobian = _relative_poses(graph.vision, state.poses)
+        bound = graph.vision.matrix @ residuals
+        cost = 0.5 * float(residuals @ bound)
+        gradient = np.zeros(layout.num)
+        gradient[: layout.first_anchor] = jacobian.T @ bound
+        hessian = (jacobian.T @ (graph.vision.matrix @ jacobian)).tocsr()
+        hessian.resize(layout.num, layout.num)
+
+        scaled, derivative = _range_rows(graph, layout, state)
+        rho, weights, _ = graph.errors.weight * graph.errors.loss.rho(scaled**2)
+        whitened = sparse.diags_array(np.sqrt(weights)) @ derivative
+        cost += 0.5 * float(rho.sum())
+        gradient = gradient + derivative.T @ (weights * scaled)
+
+        off, prior = _prior_rows(graph, layout, state)
+        cost += 0.5 * float(off @ off)
+        gradient = gradient + prior.T @ off
+        hessian = hessian + whitened.T @ whitened + prior.T @ prior
+        return cls(cost, gradient, hessian.tocsc(), whitened.tocsr())
+
+
+def _relative_poses(vision: VisionInformation, poses: Poses) -> tuple[Array, sparse.bsr_array]:
+    """(6 u,) turn and shift of each relative pose from its origin, in the reference's frame, and their derivative.
+
+    The derivative is by the n poses, in blocks of 6 by 6, whose products are several times faster than number by
+    number. Shifts are measured in the local scale of the map around the reference, which the photos do not see.
+    """
+    r, k = vision.reference, vision.frame
+    turn, shift = _relative(poses, r, k)
+    turn_before, shift_before = _relative(vision.origin, r, k)
+    scale = _local_scale(vision, shift, shift_before)[r][:, None]
+    angles = Rotation.from_matrix(np.swapaxes(turn_before, 1, 2) @ turn).as_rotvec()
+    residuals = np.concatenate([angles, shift / scale - shift_before], axis=1)
+    # d log(Exp(a) Exp(d)) to first order in a: Solà et al., "A micro Lie theory", eq. 144.
+    spread = np.eye(3) + 0.5 * cross_matrices(angles)
+    to_reference, to_frame = np.zeros((2, len(r), 6, 6))
+    to_frame[:, :3, :3] = spread
+    to_reference[:, :3, :3] = -spread @ np.swapaxes(turn, 1, 2)
+    to_frame[:, 3:, 3:] = np.swapaxes(poses.world_from_rig[r], 1, 2) / scale[:, :, None]
+    to_reference[:, 3:, 3:] = -to_frame[:, 3:, 3:]
+    to_reference[:, 3:, :3] = cross_matrices(shift) / scale[:, :, None]
+    blocks = np.stack([to_reference, to_frame], axis=1).reshape(-1, 6, 6)
+    columns, starts = np.stack([r, k], axis=1).ravel(), np.arange(0, 2 * len(r) + 1, 2)
+    return residuals.ravel(), sparse.bsr_array((blocks, columns, starts), shape=(6 * len(r), 6 * len(poses)))
+
+
+def _relative(poses: Poses, reference: Indices, frame: Indices) -> tuple[Array, Array]:
+    """Turn and shift of keyframes as seen from others."""
+    to_reference = np.swapaxes(poses.world_from_rig[reference], 1, 2)
+    shift = np.einsum("uij,uj->ui", to_reference, poses.centers[frame] - poses.centers[reference])
+    return to_reference @ poses.world_from_rig[frame], shift
+
+
+def _local_scale(vision: VisionInformation, shift: Array, shift_before: Array) -> Array:
+    """(n,) how much larger the map has become around each keyframe."""
+    n = len(vision.origin)
+    now = np.bincount(vision.reference, np.sum(shift**2, axis=1), minlength=n)
+    before = np.bincount(vision.reference, np.sum(shift_before**2, axis=1), minlength=n)
+    least = rounding_of(vision.origin.centers) ** 2  # all of one place have no scale
+    known = (now > least) & (before > least)
+    return np.sqrt(np.divide(now, before, where=known, out=np.ones(n)))
+
+
+def local_scales(vision: VisionInformation, poses: Poses) -> Array:
+    """(n,) how much larger than at the origin the map is around each keyframe, by its neighbours."""
+    _, shift = _relative(poses, vision.reference, vision.frame)
+    _, shift_before = _relative(vision.origin, vision.reference, vision.frame)
+    return _local_scale(vision, shift, shift_before)
+
+
+def _range_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tuple[Array, sparse.csr_array]:
+    """(k,) residuals in stddevs, and their derivative."""
+    antennas, index, stddev_m = graph.antennas, graph.errors.anchor_index, graph.errors.stddev_m
+    by = state.range_gradient(antennas, index)
+    residuals = (by.distance_m + state.biases_m[index] - graph.range_m) / stddev_m
+    values, columns = [], []
+    for frame, weight in ((antennas.before, 1 - antennas.weight), (antennas.after, antennas.weight)):
+        turned = by.by_turn_of_cam(antennas.tag_in_cam_m, state.poses.world_from_rig[frame])
+        values.append(weight[:, None] * np.concatenate([turned, by.by_tag], axis=1))
+        columns.append(6 * frame[:, None] + np.arange(6))
+    values += [by.by_anchor, np.ones((len(index), 1))]
+    columns += [layout.first_anchor + 3 * index[:, None] + np.arange(3), layout.first_bias + index[:, None]]
+    value, column = np.concatenate(values, axis=1) / stddev_m[:, None], np.concatenate(columns, axis=1)
+    rows = np.repeat(np.arange(len(value)), value.shape[1])
+    shape = (len(value), layout.num)
+    return residuals, sparse.coo_array((value.ravel(), (rows, column.ravel())), shape=shape).tocsr()
+
+
+def _prior_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tuple[Array, sparse.csr_array]:
+    """Residuals of the priors in stddevs, and their derivative."""
+    residuals: list[float] = []
+    entries: list[tuple[int, int, float]] = []
+    free = set(layout.free.tolist())
+    for k, anchor in enumerate(graph.anchors):
+        mean, stddev = anchor.prior_position_m, anchor.prior_position_stddev_m
+        for axis in range(3):
+            column = layout.first_anchor + 3 * k + axis
+            if mean is not None and column in free and np.isfinite(stddev):
+                entries.append((len(residuals), column, 1 / stddev))
+                residuals.append((state.anchors_m[k, axis] - mean[axis]) / stddev)
+        column, stddev = layout.first_bias + k, anchor.prior_bias_stddev_m
+        if column in free and np.isfinite(stddev):
+            entries += [(len(residuals), column, 1 / stddev), (len(residuals), layout.num - 1, -1 / stddev)]
+            residuals.append((state.biases_m[k] - anchor.prior_bias_m - state.common_bias_m) / stddev)
+    if layout.num - 1 in free:
+        entries.append((len(residuals), layout.num - 1, 1 / graph.errors.common_bias_stddev_m))
+        residuals.append(state.common_bias_m / graph.errors.common_bias_stddev_m)
+    if graph.gravity is not None:
+        rotation = state.poses.world_from_rig[0]
+        slopes = graph.gravity.jacobian(rotation, rotation)
+        entries += [(len(residuals) + row, column, float(slopes[row, column])) for row, column in np.ndindex(3, 3)]
+        residuals += graph.gravity.residuals(rotation).tolist()
+    rows, columns, values = zip(*entries, strict=True) if entries else ((), (), ())
+    shape = (len(residuals), layout.num)
+    return np.array(residuals), sparse.coo_array((values, (rows, columns)), shape=shape).tocsr()
+
+
+def _factor(hessian: sparse.csc_array, layout: _Layout, damping: float) -> SuperLU:
+    part = hessian[layout.free][:, layout.free]
+    diagonal = part.diagonal()
+    # The floor keeps a pose that nothing holds in place.
+    damped = part + sparse.diags_array(damping * diagonal + 1e-12 * diagonal.max())
+    return splu(damped.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+def _moved(state: GraphState, layout: _Layout, free_step: Array) -> GraphState:
+    step = np.zeros(layout.num)
+    step[layout.free] = free_step
+    poses = step[: layout.first_anchor].reshape(-1, 6)
+    turns = Rotation.from_rotvec(poses[:, :3]).as_matrix()
+    moved = Poses(state.poses.world_from_rig @ turns, state.poses.centers + poses[:, 3:])
+    anchors = state.anchors_m + step[layout.first_anchor : layout.first_bias].reshape(-1, 3)
+    return GraphState(moved, anchors, state.biases_m + step[layout.first_bias : -1], state.common_bias_m + step[-1])
+
+
+def _num_absorbed(terms: _Terms, layout: _Layout) -> float:
+    """Trace of the ranges' hat matrix, by random probes (Hutchinson 1990)."""
+    rng = np.random.default_rng(0)
+    whitened = terms.whitened[:, layout.free]
+    probes = rng.choice([-1.0, 1.0], (whitened.shape[0], _NUM_PROBES))
+    back = whitened.T @ probes
+    solved = _factor(terms.hessian, layout, 0.0).solve(np.ascontiguousarray(back))
+    return float(np.sum(back * solved) / _NUM_PROBES)
+
+
+def moved_anchors(anchors: Sequence[AnchorEstimate], state: GraphState) -> tuple[AnchorEstimate, ...]:
+    """The anchors where the graph has them."""
+    return tuple(
+        replace(anchor, position_m=position, range_bias_m=float(bias))
+        for anchor, position, bias in zip(anchors, state.anchors_m, state.biases_m, strict=True)
+    )

@@ -1,0 +1,254 @@
+"""Ranges as residuals of the full problem, and what is estimated with them beside the map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from rangesfm import ceres
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.geometry.trajectory import Trajectory, pose_of
+from rangesfm.options import RefineOptions
+from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.association import lever_arms
+from rangesfm.ranging.errors.noise import SHORT_RANGE_LENGTH_M, bias_whitening
+from rangesfm.ranging.errors.range_errors import RangeErrors
+from rangesfm.ranging.observations import RangeObservations
+from rangesfm.refine.antennas import Antennas, antennas
+from rangesfm.refine.bundle_adjustment import BundleAdjustment
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class RadioEstimate:
+    """All that the ranges depend on beside the poses.
+
+    Attributes:
+        anchors: in the order of the log.
+        tags_in_cam_m: (num_tags, 3) antennas in the rig frame.
+        time_shift_s: how much later than thought the ranges were taken.
+        short_range_error_m: amplitude of ``exp(-distance / SHORT_RANGE_LENGTH_M)``, what short ranges read too long.
+    """
+
+    anchors: tuple[AnchorEstimate, ...]
+    tags_in_cam_m: Array
+    time_shift_s: float = 0.0
+    short_range_error_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class RadioRanges:
+    """The ranges that take part.
+
+    Attributes:
+        observations, trajectory: of the unscaled model.
+        antennas: of all ranges, by the lever arms as given.
+        rows: (k,) ranges that take part.
+    """
+
+    observations: RangeObservations
+    trajectory: Trajectory
+    antennas: Antennas
+    rows: Indices
+
+    @classmethod
+    def of(
+        cls,
+        trajectory: Trajectory,
+        observations: RangeObservations,
+        metric_from_sfm: Similarity,
+        tags_in_cam_m: Array,
+    ) -> RadioRanges:
+        """All that have a place; arguments as for ``antennas``."""
+        placed = antennas(trajectory, observations, metric_from_sfm, tags_in_cam_m)
+        return cls(observations, trajectory, placed, observations.placed_rows)
+
+    @property
+    def interval_s(self) -> Array:
+        """(n,) between the keyframes around each range; 0 at a keyframe."""
+        times = self.trajectory.timestamps_s
+        if times is None:
+            return np.zeros(len(self.antennas.before))
+        return times[self.antennas.after] - times[self.antennas.before]
+
+    def from_anchor_m(self, metric: pycolmap.Reconstruction, radio: RadioEstimate) -> Array:
+        """(n, 3) from the anchor to the tag in a metric model; without meaning where a range has no place."""
+        index = self.observations.log.anchor_index
+        weight, between = self.antennas.weight.copy(), self.antennas.before != self.antennas.after
+        if radio.time_shift_s:
+            weight[between] += radio.time_shift_s / self.interval_s[between]
+        tags = radio.tags_in_cam_m[self.observations.log.tag_index]
+        path = self.trajectory.as_in(metric)
+        at = replace(self.antennas, tag_in_cam_m=tags, weight=weight).positions(path.centers, path.world_from_cam)
+        from_anchor: Array = at - np.array([a.position_m for a in radio.anchors])[index]
+        return from_anchor
+
+    def predicted_m(self, metric: pycolmap.Reconstruction, radio: RadioEstimate) -> Array:
+        """(n,) ranges that a metric model predicts, as the residuals do; NaN without a place."""
+        index = self.observations.log.anchor_index
+        distance = np.linalg.norm(self.from_anchor_m(metric, radio), axis=1)
+        predicted = distance + np.array([a.range_bias_m for a in radio.anchors])[index]
+        predicted += radio.short_range_error_m * np.exp(-distance / SHORT_RANGE_LENGTH_M)
+        return np.where(self.observations.before >= 0, predicted, np.nan)
+
+
+def predicted_ranges(
+    metric: pycolmap.Reconstruction,
+    trajectory: Trajectory,
+    observations: RangeObservations,
+    metric_from_sfm: Similarity,
+    tag_in_cam_m: npt.ArrayLike,
+    anchors: Sequence[AnchorEstimate],
+) -> Array:
+    """(n,) ranges that a metric model predicts, interpolated as the residuals are; NaN without a place.
+
+    Arguments as for ``refine_with_ranges``.
+    """
+    tags_in_cam_m = lever_arms(observations.log, tag_in_cam_m)
+    ranges = RadioRanges.of(trajectory, observations, metric_from_sfm, tags_in_cam_m)
+    return ranges.predicted_m(metric, RadioEstimate(tuple(anchors), tags_in_cam_m))
+
+
+@dataclass(frozen=True)
+class RadioBlocks:
+    """The same as parameter blocks, which the solver changes in place; one that is not wanted is None.
+
+    ``others`` are blocks of further residuals.
+    """
+
+    positions: list[Array]
+    biases: list[Array]
+    tags_in_cam: list[Array]
+    time_shift: Array | None
+    short_range_error: Array | None
+    others: list[Array] = field(default_factory=list)
+
+    @property
+    def all_but_positions(self) -> list[Array]:
+        """Every block that is no point of the world."""
+        wanted = [block for block in (self.time_shift, self.short_range_error) if block is not None]
+        return [*self.biases, *self.tags_in_cam, *wanted, *self.others]
+
+    @classmethod
+    def at(cls, radio: RadioEstimate, options: RefineOptions) -> RadioBlocks:
+        """Blocks that start from an estimate."""
+        return cls(
+            [anchor.position_m.copy() for anchor in radio.anchors],
+            [np.array([anchor.range_bias_m]) for anchor in radio.anchors],
+            list(radio.tags_in_cam_m.copy()),
+            np.array([radio.time_shift_s]) if options.time_offset_stddev_s else None,
+            np.array([radio.short_range_error_m]) if options.short_range_stddev_m else None,
+        )
+
+    def estimate(self, before: RadioEstimate) -> RadioEstimate:
+        """As the solver left them."""
+        anchors = zip(before.anchors, self.positions, self.biases, strict=True)
+        return RadioEstimate(
+            tuple(replace(a, position_m=position, range_bias_m=float(bias[0])) for a, position, bias in anchors),
+            np.array(self.tags_in_cam),
+            before.time_shift_s if self.time_shift is None else float(self.time_shift[0]),
+            before.short_range_error_m if self.short_range_error is None else float(self.short_range_error[0]),
+        )
+
+
+def add_ranges(
+    bundle: BundleAdjustment, ranges: RadioRanges, errors: RangeErrors, blocks: RadioBlocks, options: RefineOptions
+) -> Indices:
+    """Ranges in units of pixels: one stddev of either weighs the same.
+
+    Args:
+        errors: of those that take part.
+
+    Returns:
+        (k,) where the residual of each range that takes part is among the problem's.
+    """
+    log, rows, at = ranges.observations.log, ranges.rows, ranges.antennas.subset(ranges.rows)
+    placed = ceres.PlacedRanges(
+        range_m=log.range_m[rows],
+        stddev_m=errors.stddev_m,
+        before=at.before,
+        after=at.after,
+        weight=at.weight,
+        offset_in_world_m=at.offset_in_world_m,
+        anchor_index=log.anchor_index[rows],
+        tag_index=log.tag_index[rows],
+        interval_s=ranges.interval_s[rows],
+        share=bundle.pixel_stddev**2 * errors.weight,
+    )
+    range_blocks = ceres.RangeBlocks(
+        poses=[pose_of(bundle.metric.frame(int(frame_id))).params for frame_id in ranges.trajectory.frame_ids],
+        anchors=blocks.positions,
+        biases=blocks.biases,
+        tags_in_cam=blocks.tags_in_cam,
+        lever_arms_are_free=options.lever_arm_stddev_m > 0,
+        time_shift=blocks.time_shift,
+        amplitude=blocks.short_range_error,
+    )
+    return ceres.add_ranges(
+        bundle.adjuster,
+        placed,
+        range_blocks,
+        short_range_length_m=None if blocks.short_range_error is None else SHORT_RANGE_LENGTH_M,
+        loss_scale=errors.loss.width,
+        loss_is_bounded=errors.loss.is_bounded,
+    )
+
+
+def add_radio_priors(
+    bundle: BundleAdjustment,
+    radio: RadioEstimate,
+    tags_in_cam_m: Array,
+    common_bias_stddev_m: float,
+    blocks: RadioBlocks,
+    options: RefineOptions,
+) -> None:
+    """Hold, draw or free whatever has residuals; stddevs in the unit of pixels.
+
+    Args:
+        tags_in_cam_m: (num_tags, 3) as given, on which the prior is centred.
+        common_bias_stddev_m: of what all biases share.
+    """
+    for anchor, position in zip(radio.anchors, blocks.positions, strict=True):
+        _add_prior(bundle, position, anchor.prior_position_m, anchor.prior_position_stddev_m)
+    _add_bias_priors(bundle, radio.anchors, blocks.biases, common_bias_stddev_m)
+    for block, given in zip(blocks.tags_in_cam, tags_in_cam_m, strict=True):
+        _add_prior(bundle, block, given, options.lever_arm_stddev_m)
+    _add_prior(bundle, blocks.time_shift, np.zeros(1), options.time_offset_stddev_s)
+    _add_prior(bundle, blocks.short_range_error, np.zeros(1), options.short_range_stddev_m)
+
+
+def _add_bias_priors(
+    bundle: BundleAdjustment, anchors: tuple[AnchorEstimate, ...], biases: list[Array], common_stddev_m: float
+) -> None:
+    """One of all biases that are estimated, as they share the tag's."""
+    drawn = []
+    for anchor, bias in zip(anchors, biases, strict=True):
+        _add_prior(bundle, bias, None, anchor.prior_bias_stddev_m)
+        if bundle.adjuster.problem.has_parameter_block(bias) and 0 < anchor.prior_bias_stddev_m < np.inf:
+            drawn.append((anchor, bias))
+    if drawn:
+        own_stddev_m = np.array([anchor.prior_bias_stddev_m for anchor, _ in drawn])
+        cost = ceres.joint_prior_cost(
+            mean=np.array([anchor.prior_bias_m for anchor, _ in drawn]),
+            whitening=bundle.pixel_stddev * bias_whitening(own_stddev_m, common_stddev_m),
+        )
+        ceres.add_residual_block(bundle.adjuster, cost, None, [bias for _, bias in drawn])
+
+
+def _add_prior(bundle: BundleAdjustment, block: Array | None, mean: Array | None, stddev: float) -> None:
+    """Of a block, if it is part of the problem; a stddev of 0 holds it, no mean frees it."""
+    problem = bundle.adjuster.problem
+    if block is None or not problem.has_parameter_block(block):
+        return
+    if stddev == 0:
+        problem.set_parameter_block_constant(block)
+        return
+    if mean is not None:
+        ceres.add_normal_prior(bundle.adjuster, block, mean, stddev / bundle.pixel_stddev)
+    bundle.keep_from_elimination(block)

@@ -1,0 +1,287 @@
+"""What the photos say about how neighbouring keyframes lie to each other, and how firmly.
+
+The points are eliminated, track by track, at the map as it is. What remains binds the poses of the keyframes that see
+a point *relative to the first of them*. Said in that keyframe's own frame it stays true while the map bends: turns
+and shifts that all of them share cost nothing, nor does a common scale, which the points' depths follow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+from scipy import sparse
+
+from rangesfm.errors import SolverError
+from rangesfm.geometry.rotations import cross_matrices
+from rangesfm.geometry.trajectory import pose_of
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+# A long track is cut into overlapping pieces: what lies further apart hangs together through what is between.
+_MAX_PIECE = 8
+_PIECE_STEP = 4
+# More pieces say nothing new about neighbouring keyframes; a share of them, weighing as much, is enough.
+_MAX_NUM_PIECES = 20000
+_BATCH = 2000
+# In stddevs: from here on an observation has half the say.
+_ROBUST_WIDTH = 3.0
+# Of the median depth: a point so near lies in the camera. What a point says goes by the square.
+_MIN_DEPTH = 1e-4
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Rig poses of n keyframes in a metric world.
+
+    Attributes:
+        world_from_rig: (n, 3, 3) rotations.
+        centers: (n, 3) origins of the rig frames (of the projection centre, for a single camera).
+    """
+
+    world_from_rig: Array
+    centers: Array
+
+    def __len__(self) -> int:
+        return len(self.centers)
+
+
+@dataclass(frozen=True)
+class Observations:
+    """n observations of p points, by point and then by keyframe, as rays: no camera model is left in them.
+
+    Attributes:
+        frame, point: (n,) indices of keyframe and point.
+        ray: (n, 2) point over depth in the camera.
+        weight: (n,) focal length over the stddev of a pixel coordinate.
+        cam_from_rig: (n, 3, 3) rotation and (n, 3) translation of the camera in its rig.
+        points: (p, 3) in the world.
+        point_ids: (p,) of the model.
+    """
+
+    frame: Indices
+    point: Indices
+    ray: Array
+    weight: Array
+    cam_from_rig_rotation: Array
+    cam_from_rig_translation: Array
+    points: Array
+    point_ids: Indices
+
+    def of_points(self, taken: npt.NDArray[np.bool_]) -> Observations:
+        """Those of some of the points; the others are there still, seen by nobody."""
+        return self.subset(np.flatnonzero(taken[self.point]))
+
+    def with_pixel_stddev(self, pixel_stddev: float) -> Observations:
+        """Of features whose coordinates are known to so many of what they were taken to be known to."""
+        return replace(self, weight=self.weight / pixel_stddev)
+
+    def subset(self, rows: Indices) -> Observations:
+        """Some of the observations, of all points."""
+        return Observations(
+            self.frame[rows],
+            self.point[rows],
+            self.ray[rows],
+            self.weight[rows],
+            self.cam_from_rig_rotation[rows],
+            self.cam_from_rig_translation[rows],
+            self.points,
+            self.point_ids,
+        )
+
+
+@dataclass(frozen=True)
+class VisionInformation:
+    """Gaussian information on u relative poses (6 numbers each: turn, shift), linearised at ``origin``.
+
+    Attributes:
+        origin: the poses at which the photos fit best.
+        reference, frame: (u,) keyframe ``frame`` seen from keyframe ``reference``.
+        matrix: (6 u, 6 u) sparse information, in blocks of 6 by 6.
+    """
+
+    origin: Poses
+    reference: Indices
+    frame: Indices
+    matrix: sparse.bsr_array
+
+
+def model_poses(metric: pycolmap.Reconstruction, frame_ids: Indices) -> Poses:
+    """Poses of these frames."""
+    rigid = [pose_of(metric.frame(int(frame_id))) for frame_id in frame_ids]
+    world_from_rig = np.array([pose.rotation.matrix().T for pose in rigid])
+    translations = np.array([pose.translation for pose in rigid])
+    return Poses(world_from_rig, -np.einsum("nij,nj->ni", world_from_rig, translations))
+
+
+def model_observations(metric: pycolmap.Reconstruction, frame_ids: Indices) -> Observations:
+    """All observations of 3-D points in these frames, each coordinate taken to be known to a pixel.
+
+    Raises:
+        SolverError: there is none.
+    """
+    index_of_frame = {int(frame_id): index for index, frame_id in enumerate(frame_ids)}
+    point_ids = np.array(sorted(metric.points3D.keys()), dtype=np.int64)
+    columns: list[tuple[npt.NDArray[Any], ...]] = []
+    for image_id in metric.reg_image_ids():
+        image = metric.image(image_id)
+        seen = [(p.point3D_id, p.xy) for p in image.points2D if p.has_point3D()]
+        if image.frame_id not in index_of_frame or not seen:
+            continue
+        camera = metric.camera(image.camera_id)
+        rays = np.asarray(camera.cam_from_img(np.array([xy for _, xy in seen])), dtype=np.float64)
+        cam_from_rig = image.cam_from_world() * pose_of(metric.frame(image.frame_id)).inverse()
+        n = len(seen)
+        columns.append(
+            (
+                np.full(n, index_of_frame[image.frame_id]),
+                np.searchsorted(point_ids, [point_id for point_id, _ in seen]),
+                rays,
+                np.full(n, camera.mean_focal_length()),
+                np.tile(cam_from_rig.rotation.matrix(), (n, 1, 1)),
+                np.tile(cam_from_rig.translation, (n, 1)),
+            )
+        )
+    if not columns:
+        raise SolverError("no photo of the model sees any of its points")
+    frame, point, ray, weight, rotation, translation = (np.concatenate(column) for column in zip(*columns, strict=True))
+    points = np.array([metric.point3D(int(point_id)).xyz for point_id in point_ids])
+    all_of_them = Observations(frame, point, ray, weight, rotation, translation, points, point_ids)
+    valid = np.isfinite(ray).all(axis=1)
+    return all_of_them.subset(np.flatnonzero(valid)[np.lexsort((frame[valid], point[valid]))])
+
+
+def project(observations: Observations, poses: Poses, points: Array) -> tuple[Array, Array, Array]:
+    """(n, 3) points in the rig and (n, 3) in the camera, and (n, 2, 3) whitened derivative of the ray by the latter."""
+    frame = observations.frame
+    in_rig = np.einsum("nji,nj->ni", poses.world_from_rig[frame], points[observations.point] - poses.centers[frame])
+    in_cam = np.einsum("nij,nj->ni", observations.cam_from_rig_rotation, in_rig)
+    in_cam = in_cam + observations.cam_from_rig_translation
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse_depth = 1 / in_cam[:, 2]
+    derivative = np.zeros((len(frame), 2, 3))
+    derivative[:, 0, 0] = derivative[:, 1, 1] = inverse_depth
+    derivative[:, :, 2] = -in_cam[:, :2] * inverse_depth[:, None] ** 2
+    return in_rig, in_cam, derivative * observations.weight[:, None, None]
+
+
+def points_in_cameras(observations: Observations, poses: Poses) -> npt.NDArray[np.bool_]:
+    """(p,) whether a point lies in a camera that sees it: what a mapper makes, now and then, of wrong matches of photos
+    from one place.
+
+    A feature goes by its point's place over the depth. At next to no depth, what such a point says about one photo is
+    so much more than all else that rounding it makes a solver's matrix indefinite in all but timid steps; one of 50 000
+    does.
+    """
+    depth = project(observations, poses, observations.points)[1][:, 2]
+    in_camera: npt.NDArray[np.bool_] = np.zeros(len(observations.points), dtype=np.bool_)
+    in_camera[observations.point[np.abs(depth) < _MIN_DEPTH * np.median(np.abs(depth))]] = True
+    return in_camera
+
+
+def ray_residuals(observations: Observations, in_cam: Array) -> Array:
+    """(n, 2) in stddevs; infinite behind the camera."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        residuals = (in_cam[:, :2] / in_cam[:, 2:] - observations.ray) * observations.weight[:, None]
+    return np.where(in_cam[:, 2:] > 0, residuals, np.inf)
+
+
+def robust_root_weights(residuals: Array) -> Array:
+    """(n,) roots of Cauchy weights of (n, 2) residuals in stddevs."""
+    weights: Array = 1 / np.sqrt(1 + np.sum(residuals**2, axis=1) / _ROBUST_WIDTH**2)
+    return weights
+
+
+def vision_information(observations: Observations, poses: Poses) -> VisionInformation:
+    """Eliminate the points of a map."""
+    in_rig, in_cam, derivative = project(observations, poses, observations.points)
+    root_weight = robust_root_weights(ray_residuals(observations, in_cam))
+    to_rig = root_weight[:, None, None] * np.nan_to_num(derivative) @ observations.cam_from_rig_rotation
+    pieces, share = _thinned(_pieces(observations.point))
+    n = len(poses)
+    keys, blocks = [], []
+    for rows in pieces:
+        for batch in np.array_split(rows, max(len(rows) // _BATCH, 1)):
+            key, block = _eliminate(batch, observations.frame, in_rig, to_rig, poses)
+            unique, where = np.unique(key, return_inverse=True)
+            adder = sparse.csr_array((np.ones(len(key)), (where, np.arange(len(key)))), shape=(len(unique), len(key)))
+            keys.append(unique)
+            blocks.append(adder @ block.reshape(len(key), 36))
+    key = np.concatenate(keys)
+    reference, first, second = key // n**2, key // n % n, key % n
+    pairs, place = np.unique(np.concatenate([reference * n + first, reference * n + second]), return_inverse=True)
+    rows, columns = place[: len(key)], place[len(key) :]
+    values = np.concatenate(blocks).reshape(-1, 6, 6) / share
+    inside = np.arange(6)
+    matrix = sparse.coo_array(
+        (
+            values.ravel(),
+            (
+                np.broadcast_to(6 * rows[:, None, None] + inside[:, None], values.shape).ravel(),
+                np.broadcast_to(6 * columns[:, None, None] + inside, values.shape).ravel(),
+            ),
+        ),
+        shape=(6 * len(pairs), 6 * len(pairs)),
+    )
+    return VisionInformation(poses, pairs // n, pairs % n, matrix.tocsr().tobsr((6, 6)))
+
+
+def _pieces(point: Indices) -> dict[int, Indices]:
+    """Rows of the pieces of all tracks, (k, length) by length; observations come by point."""
+    starts = np.flatnonzero(np.diff(point, prepend=-1))
+    lengths = np.diff(np.append(starts, len(point)))
+    pieces: dict[int, Indices] = {}
+    for length in range(2, _MAX_PIECE + 1):
+        whole = starts[lengths == length]
+        pieces[length] = whole[:, None] + np.arange(length)
+    long = [
+        start + min(first, length - _MAX_PIECE)
+        for start, length in zip(starts, lengths, strict=True)
+        if length > _MAX_PIECE
+        for first in range(0, length - _MAX_PIECE + _PIECE_STEP, _PIECE_STEP)
+    ]
+    more = np.array(long, dtype=np.int64)[:, None] + np.arange(_MAX_PIECE)
+    pieces[_MAX_PIECE] = np.concatenate([pieces[_MAX_PIECE], more])
+    return pieces
+
+
+def _thinned(pieces: dict[int, Indices]) -> tuple[Iterator[Indices], float]:
+    """The pieces by length, evenly thinned where there are very many, and the share that is left."""
+    num = sum(len(rows) for rows in pieces.values())
+    step = max(-(-num // _MAX_NUM_PIECES), 1)
+    return (rows[::step] for rows in pieces.values() if len(rows)), 1 / step
+
+
+def _eliminate(rows: Indices, frame: Indices, in_rig: Array, to_rig: Array, poses: Poses) -> tuple[Indices, Array]:
+    """Information on relative poses from pieces of one length.
+
+    Args:
+        rows: (k, m) observations of each piece.
+        in_rig: (n, 3). to_rig: (n, 2, 3) whitened derivative of a ray by the point in the rig.
+
+    Returns:
+        (l,) keys (reference, first, second keyframe) and (l, 6, 6) blocks.
+    """
+    frames = frame[rows]
+    reference = frames[:, 0]
+    # Rotation from the reference's rig to each keyframe's.
+    turn = np.einsum("kmji,kjl->kmil", poses.world_from_rig[frames], poses.world_from_rig[reference])
+    to_pose = np.concatenate([to_rig[rows] @ cross_matrices(in_rig[rows]), -to_rig[rows] @ turn], axis=3)
+    to_pose[frames == reference[:, None]] = 0.0
+    to_point = to_rig[rows] @ turn
+    information = np.einsum("kmai,kmaj->kij", to_point, to_point)
+    ridge = 1e-12 * np.trace(information, axis1=1, axis2=2)[:, None, None] + 1e-200
+    coupling = np.einsum("kmai,kmaj->kmij", to_point, to_pose)
+    inverse = np.linalg.inv(information + ridge * np.eye(3))
+    blocks = -np.einsum("kmia,kij,knjb->kmnab", coupling, inverse, coupling, optimize=True)
+    own = np.arange(rows.shape[1])
+    blocks[:, own, own] += np.einsum("kmai,kmaj->kmij", to_pose, to_pose)
+    n = len(poses)
+    keys = reference[:, None, None] * n**2 + frames[:, :, None] * n + frames[:, None, :]
+    both_move = (frames != reference[:, None])[:, :, None] & (frames != reference[:, None])[:, None, :]
+    return keys[both_move], blocks[both_move]

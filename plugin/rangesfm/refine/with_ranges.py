@@ -1,0 +1,320 @@
+"""COLMAP's bundle adjustment with ranges: fixes the scale and bends drift back."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from rangesfm.ceres.covariance import JointCovariance, joint_covariance
+from rangesfm.ceres.linear_solver import inverse_is_affordable, overlaps_in
+from rangesfm.distances.by_radio import distances_by_radio
+from rangesfm.distances.ends import LocatedDistances
+from rangesfm.distances.tape import Tape
+from rangesfm.errors import GeometryError, InputError
+from rangesfm.geometry.gravity import Gravity
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.options import CameraOptions, RefineOptions
+from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.association import lever_arms
+from rangesfm.ranging.errors.misfits import misfits
+from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors
+from rangesfm.ranging.errors.robust_loss import RobustLoss
+from rangesfm.ranging.observations import RangeObservations, status_by_weight
+from rangesfm.refine.bundle_adjustment import BundleAdjustment, Solution, solve, solve_until_still
+from rangesfm.refine.distances import MeasuredDistances, add_marker_points, remove_marker_points
+from rangesfm.refine.problem import AddedBlocks, RefinementProblem
+from rangesfm.refine.radio import RadioEstimate, RadioRanges
+from rangesfm.refine.unbend import SAME_ERRORS, Unbent, unbend
+from rangesfm.refine.vision_information import model_observations, model_poses, points_in_cameras
+
+Array = npt.NDArray[np.float64]
+
+# Solutions of the full problem, with the weights of ranges and pixels estimated anew in between.
+_MAX_NUM_ROUNDS = 3
+# What is still to be gained at the end, as a share of the smallest range stddev.
+_MAX_LAST_MOVEMENT = 0.01
+# Covariances of so many photos that all see the same take a minute, of twice as many ten.
+_MAX_NUM_IMAGES_FOR_COVARIANCE = 1500
+
+
+@dataclass(frozen=True)
+class RefineSummary:
+    """What the refinement did.
+
+    Attributes:
+        num_iterations: of the solver on the full problem, successful and not.
+        num_graph_steps: of the solver on the keyframe graph before.
+        bend_m: by how much (root mean square) the keyframe graph saw the map bend, beyond any similarity.
+        initial_cost, final_cost: half the sum of squares, pixels at unit weight; at the start, with the weights of
+            then, and at the end.
+        reprojection_rms_px: root mean square length of the final reprojection errors.
+        pixel_stddev: of one coordinate of a feature, estimated from the residuals before.
+        errors: of all n ranges of the log, as weighted at the end.
+        seconds: of the solver.
+        converged: whether it stopped because nothing was left to gain.
+        message: the solver's own words.
+        misfits: why the ranges do not fit as their noise lets expect; empty if they do.
+        anchors: with refined positions and biases, and their stddevs by the covariance, if there is one.
+        tags_in_cam_m: (num_tags, 3) lever arms, as given or estimated.
+        time_shift_s: how much later than thought the ranges were taken; None if that was not estimated.
+        short_range_error_m: of very short ranges, what they read too long, which dies out with a length of 1 m; None
+            if it was not estimated.
+        covariance: of poses, anchors and scale; None if it was not asked for, the model is too large or ranges and
+            photos leave something undetermined.
+        observations: with status by the final weight of each range.
+        predicted_m: (n,) ranges by the refined model; NaN without a place.
+        weights: (n,) robust weights in [0, 1]; NaN without a place.
+    """
+
+    num_iterations: int
+    num_graph_steps: int
+    bend_m: float
+    initial_cost: float
+    final_cost: float
+    reprojection_rms_px: float
+    pixel_stddev: float
+    errors: RangeErrors
+    seconds: float
+    converged: bool
+    message: str
+    misfits: tuple[str, ...]
+    anchors: tuple[AnchorEstimate, ...]
+    tags_in_cam_m: Array
+    time_shift_s: float | None
+    short_range_error_m: float | None
+    covariance: JointCovariance | None
+    observations: RangeObservations
+    predicted_m: Array
+    weights: Array
+
+
+def refine_with_ranges(
+    reconstruction: pycolmap.Reconstruction,
+    trajectory: Trajectory,
+    observations: RangeObservations,
+    metric_from_sfm: Similarity,
+    anchors: Sequence[AnchorEstimate],
+    errors: RangeErrors,
+    *,
+    tag_in_cam_m: npt.ArrayLike,
+    first_pose_is_fixed: bool,
+    gravity: Gravity | None = None,
+    camera: CameraOptions | None = None,
+    options: RefineOptions | None = None,
+    tape: Tape | None = None,
+    num_threads: int = -1,
+) -> tuple[pycolmap.Reconstruction, RefineSummary]:
+    """Bundle adjustment of a scaled model with range residuals.
+
+    Points that lie in a camera which sees them take no part.
+
+    Args:
+        reconstruction: in the metric world; it is copied, not changed.
+        trajectory, observations: of the unscaled model, as the scale stage had them.
+        metric_from_sfm: from the world of ``observations`` to that of ``reconstruction``.
+        anchors: in the order of the log, in the metric world. One with a prior stddev of 0 is
+            held, one with a finite prior is drawn to it, others are free.
+        errors: of all ranges of the log, as the scale stage found them. Where they do not state their noise it is
+            estimated anew, each anchor's for itself, and shares and inflation with it.
+        tag_in_cam_m: (3,) antenna in the camera (rig) frame; or (num_tags, 3), in the order of the log's tags.
+        first_pose_is_fixed: the gauge: True in the first camera's frame, False where
+            surveyed anchors hold the map.
+        gravity: which way is up in the first camera; counts where its pose is not fixed.
+        tape: taped distances, of which the map keeps to the control ones; as it does to the ranges between anchors
+            that the log holds.
+
+    Returns:
+        the refined model and the summary.
+
+    Raises:
+        SolverError: the solver failed.
+        InputError: an unknown key among the options passed through, a clock offset to estimate without times, or a
+            distance's end that is not in the model.
+    """
+    options = options or RefineOptions()
+    if options.time_offset_stddev_s and trajectory.timestamps_s is None:
+        raise InputError("[refine] time_offset_stddev_s needs a log with times, this one names photos")
+    metric = pycolmap.Reconstruction(reconstruction)
+    tape = (tape or Tape()).control()
+    marker_ids = add_marker_points(metric, tape)
+    tags_in_cam_m = lever_arms(observations.log, tag_in_cam_m)
+    ranges = RadioRanges.of(trajectory, observations, metric_from_sfm, tags_in_cam_m)
+    problem = RefinementProblem(
+        metric,
+        tuple(anchors),
+        ranges,
+        tags_in_cam_m,
+        MeasuredDistances(_between_anchors(observations, anchors, errors), tape, marker_ids),
+        camera or CameraOptions(),
+        options,
+        first_pose_is_fixed,
+        None if first_pose_is_fixed else gravity,
+        num_threads,
+    )
+    summary = _refine(problem, _errors_to_begin_with(problem, errors, metric_from_sfm.scale))
+    remove_marker_points(metric, marker_ids)
+    return metric, summary
+
+
+def _errors_to_begin_with(problem: RefinementProblem, errors: RangeErrors, metres_per_unit: float) -> RangeErrors:
+    """Of the ranges that take part, on the map as it was given."""
+    ranges, options = problem.ranges, problem.options
+    path = ranges.trajectory.as_in(problem.metric)
+    tags_m = ranges.antennas.positions(path.centers, path.world_from_cam)
+    placing_m = metres_per_unit * ranges.observations.center_stddev
+    placed = errors.subset(ranges.rows).at(tags_m[ranges.rows], placing_m[ranges.rows])
+    if options.short_range_stddev_m > 0:
+        placed = placed.without_shared()
+    return placed.for_bending_map(RobustLoss(options.range_loss_scale, is_bounded=True))
+
+
+def _between_anchors(
+    observations: RangeObservations, anchors: Sequence[AnchorEstimate], errors: RangeErrors
+) -> LocatedDistances:
+    return distances_by_radio(
+        observations.log,
+        float(np.median(errors.stddev_m[observations.has_place])),
+        np.array([anchor.prior_bias_m for anchor in anchors]),
+        np.array([anchor.prior_bias_stddev_m for anchor in anchors]),
+        common_bias_stddev_m=0.0,
+    )
+
+
+def _refine(problem: RefinementProblem, errors: RangeErrors) -> RefineSummary:
+    """Unbend the map, then solve the full problem, both without the points that lie in a camera."""
+    frame_ids = problem.frame_ids
+    rays = model_observations(problem.metric, frame_ids)
+    in_camera = points_in_cameras(rays, model_poses(problem.metric, frame_ids))
+    problem = replace(problem, left_out_ids=frozenset(rays.point_ids[in_camera].tolist()))
+    bundle = problem.of_photos(problem.options.max_num_iterations)
+    start = unbend(problem, rays.with_pixel_stddev(bundle.pixel_stddev), in_camera, errors)
+    return _adjust(problem, bundle, start)
+
+
+@dataclass(frozen=True)
+class _Round:
+    """Where a solution of the full problem ended, all solutions so far, and iterations that are left."""
+
+    radio: RadioEstimate
+    solutions: tuple[Solution, ...]
+    num_left: int
+
+
+def _adjust(problem: RefinementProblem, bundle: BundleAdjustment, start: Unbent) -> RefineSummary:
+    """Alternate between the full problem and the errors that its residuals show."""
+    added: AddedBlocks
+
+    def fit(errors: RangeErrors, before: _Round | None) -> _Round:
+        nonlocal bundle, added
+        if before is None:
+            before = _Round(RadioEstimate(start.anchors, problem.tags_in_cam_m), (), problem.options.max_num_iterations)
+        else:
+            bundle = problem.of_photos(before.num_left)
+        added = problem.add_to(bundle, errors, before.radio)
+        solution = solve(bundle, _tolerance_m(errors))
+        num_left = before.num_left - solution.num_iterations
+        return _Round(added.blocks.estimate(before.radio), (*before.solutions, solution), num_left)
+
+    def is_last(errors: RangeErrors, seen: RangeErrors, done: _Round) -> bool:
+        return errors.change(seen) < SAME_ERRORS or not done.solutions[-1].converged or done.num_left <= 0
+
+    last, errors, _ = fit_with_own_errors(
+        fit,
+        lambda errors, done: errors.seen_by_bending_map(
+            problem.residuals_m(done.radio)[problem.ranges.rows], start.num_absorbed
+        ),
+        start.errors,
+        max_num_rounds=_MAX_NUM_ROUNDS,
+        is_last=is_last,
+    )
+    more, is_still = solve_until_still(bundle, last.solutions[-1], _tolerance_m(errors), last.num_left)
+    last = replace(last, radio=added.blocks.estimate(last.radio), solutions=(*last.solutions, *more))
+    covariance = _covariance(problem, bundle, added, errors, start.num_absorbed)
+    problem.metric.update_point_3d_errors()
+    return _summary(problem, start, bundle, last, errors, covariance, is_still=is_still)
+
+
+def _tolerance_m(errors: RangeErrors) -> float:
+    return _MAX_LAST_MOVEMENT * float(np.min(errors.stddev_m))
+
+
+def _covariance(
+    problem: RefinementProblem, bundle: BundleAdjustment, added: AddedBlocks, errors: RangeErrors, num_absorbed: float
+) -> JointCovariance | None:
+    metric, limit = problem.metric, _MAX_NUM_IMAGES_FOR_COVARIANCE
+    if not problem.options.covariance:
+        return None
+    if metric.num_reg_images() > limit and not inverse_is_affordable(overlaps_in(metric), limit):
+        return None
+    try:
+        return joint_covariance(
+            bundle.adjuster.problem,
+            metric,
+            anchors=added.blocks.positions,
+            others=added.blocks.all_but_positions,
+            residual_stddev=bundle.pixel_stddev,
+            errors=problem.residual_errors(added, errors, num_absorbed),
+        )
+    except GeometryError as error:
+        logging.getLogger(__name__).info("%s", error)
+        return None
+
+
+def _summary(
+    problem: RefinementProblem,
+    start: Unbent,
+    bundle: BundleAdjustment,
+    done: _Round,
+    errors: RangeErrors,
+    covariance: JointCovariance | None,
+    *,
+    is_still: bool,
+) -> RefineSummary:
+    """Of what was done; ``is_still``: whether nothing was left to gain."""
+    observations, rows = problem.ranges.observations, problem.ranges.rows
+    log, radio, options = observations.log, done.radio, problem.options
+    residuals_m, weights, status = problem.residuals_m(radio), np.full(len(log), np.nan), observations.status.copy()
+    weights[rows] = errors.robust_weights(residuals_m[rows])
+    status[rows] = status_by_weight(weights[rows])
+    times = observations.before + observations.weight if log.timestamp_s is None else log.timestamp_s
+    last = done.solutions[-1]
+    return RefineSummary(
+        num_iterations=sum(solution.num_iterations for solution in done.solutions),
+        num_graph_steps=start.num_steps,
+        bend_m=start.bend_m,
+        initial_cost=done.solutions[0].initial_cost,
+        final_cost=last.final_cost,
+        reprojection_rms_px=bundle.reprojection_rms_px,
+        pixel_stddev=bundle.pixel_stddev,
+        errors=errors.spread(rows, len(log)),
+        seconds=sum(solution.seconds for solution in done.solutions),
+        converged=last.converged and is_still,
+        message=last.message,
+        misfits=misfits(errors, residuals_m[rows], times[rows]),
+        anchors=_with_stddevs(radio.anchors, covariance),
+        tags_in_cam_m=radio.tags_in_cam_m,
+        time_shift_s=radio.time_shift_s if options.time_offset_stddev_s else None,
+        short_range_error_m=radio.short_range_error_m if options.short_range_stddev_m else None,
+        covariance=covariance,
+        observations=replace(observations, status=status),
+        predicted_m=residuals_m + log.range_m,
+        weights=weights,
+    )
+
+
+def _with_stddevs(
+    anchors: tuple[AnchorEstimate, ...], covariance: JointCovariance | None
+) -> tuple[AnchorEstimate, ...]:
+    if covariance is None:
+        return anchors
+    variances = np.trace(covariance.anchors, axis1=1, axis2=2) / 3
+    return tuple(
+        replace(anchor, position_stddev_m=float(np.sqrt(variance))) if np.isfinite(anchor.position_m).all() else anchor
+        for anchor, variance in zip(anchors, variances, strict=True)
+    )

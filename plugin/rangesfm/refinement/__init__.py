@@ -1,1 +1,0 @@
-"""What the refinement is made of; ``rangesfm.refine`` puts it together."""

@@ -1,0 +1,364 @@
+"""The entries of ``result.json``: their keys, and how they follow from what a run found."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import AfterValidator, AliasChoices, AliasPath, ConfigDict, Field
+from scipy.spatial.transform import Rotation
+
+from rangesfm.files.records import Count, Flag, IntervalOrNull, Number, NumberOrNull, Record, Text, Vector, VectorOrNull
+from rangesfm.geometry.georeference import Georeference
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.join.models import ModelVerdict
+from rangesfm.options import AssociationOptions
+from rangesfm.ranging.log import RangeKind
+from rangesfm.ranging.observations import RangeStatus
+from rangesfm.result.metric_result import USED, MetricResult
+from rangesfm.scale.estimate import CutoffTest, ScaleSensitivity, ScaleUncertainty
+from rangesfm.scale.two_candidate import Branch
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+
+def _unit(quaternion: tuple[float, ...]) -> tuple[float, ...]:
+    if not abs(np.linalg.norm(quaternion) - 1.0) < 1e-6:
+        raise ValueError("a unit quaternion")
+    return quaternion
+
+
+Quaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_unit)]
+
+
+class SimilarityEntry(Record):
+    """``x -> scale * R x + translation_m``, with R as a unit quaternion, the real part last."""
+
+    scale: Number
+    rotation_xyzw: Quaternion
+    translation_m: Vector
+
+    @classmethod
+    def of(cls, similarity: Similarity) -> SimilarityEntry:
+        return cls(
+            scale=similarity.scale,
+            rotation_xyzw=Rotation.from_matrix(similarity.rotation).as_quat().tolist(),
+            translation_m=similarity.translation.tolist(),
+        )
+
+    @property
+    def similarity(self) -> Similarity:
+        return Similarity(
+            self.scale, Rotation.from_quat(self.rotation_xyzw).as_matrix(), np.array(self.translation_m, np.float64)
+        )
+
+
+class TwoCandidateEntry(Record):
+    """The paper's table; see TwoCandidate."""
+
+    alpha0: Branch
+    alpha1: Branch
+    chosen: Text
+    num_without_root: Count
+
+
+class ScaleEntry(Record):
+    """The scale and how far to trust it, metres per unit of the unscaled model; see ScaleEstimate."""
+
+    value: Number
+    stddev_formal: NumberOrNull
+    stddev_empirical: NumberOrNull
+    interval_95: IntervalOrNull
+    relative_stddev: ScaleUncertainty = Field(validation_alias=AliasChoices("relative_stddev", "uncertainty"))
+    method: Text
+    verdict: Literal["good", "doubtful"]
+    reasons: tuple[Text, ...]
+    advice: tuple[Text, ...]
+    cutoff_test: tuple[CutoffTest, ...]
+    sensitivity: ScaleSensitivity
+    per_anchor: dict[Text, NumberOrNull]
+    range_noise_stddev_m: NumberOrNull = Field(validation_alias=AliasChoices("range_noise_stddev_m", "noise_stddev_m"))
+    correlation_inflation: NumberOrNull = Field(
+        validation_alias=AliasChoices("correlation_inflation", AliasPath("errors", "inflation"))
+    )
+    two_candidate: TwoCandidateEntry | None
+
+    @property
+    def larger_stddev(self) -> float | None:
+        """Formal or empirical, as far as they are known: formal ones are far too small on real logs."""
+        known = (stddev for stddev in (self.stddev_formal, self.stddev_empirical) if stddev is not None)
+        return max(known, default=None)
+
+    @property
+    def relative_stddev_empirical(self) -> float | None:
+        """Of every length in the metric models, by the scale alone; None if not known."""
+        return self.stddev_empirical / self.value if self.stddev_empirical is not None and self.value else None
+
+
+class ModelScaleEntry(Record):
+    """The scale of one of several models by its own ranges; without values where they do not determine it."""
+
+    value: NumberOrNull
+    stddev_empirical: NumberOrNull
+    interval_95: IntervalOrNull
+    verdict: Literal["good", "doubtful", "refused"]
+    reasons: tuple[Text, ...]
+
+
+class ModelEntry(Record):
+    """One of several models: its own scale, and its place in the joined map."""
+
+    name: Text
+    num_images: Count
+    joined: Flag
+    reason: Text | None
+    scale: ModelScaleEntry
+    metric_from_sfm: SimilarityEntry | None
+
+    @classmethod
+    def of(cls, model: ModelVerdict, metric_from_joined: Similarity) -> ModelEntry:
+        refused = {"value": None, "stddev_empirical": None, "interval_95": None, "verdict": "refused"}
+        joined = model.joined_from_sfm
+        return cls(
+            name=model.name,
+            num_images=model.num_images,
+            joined=joined is not None,
+            reason=model.reason or None,
+            scale=ModelScaleEntry.model_validate(model.estimate or {**refused, "reasons": [model.reason]}),
+            metric_from_sfm=None if joined is None else SimilarityEntry.of(metric_from_joined @ joined),
+        )
+
+
+class MapEntry(Record):
+    """The size of the final model."""
+
+    num_photos: Count
+    num_points3D: Count  # noqa: N815 (as COLMAP has it)
+
+
+class AnchorEntry(Record):
+    """An anchor in the metric models' world; see AnchorEstimate. Null: not known, or there is none."""
+
+    position_m: VectorOrNull
+    stddev_m: NumberOrNull = Field(validation_alias=AliasChoices("stddev_m", "position_stddev_m"))
+    range_bias_m: NumberOrNull
+    mirror_position_m: VectorOrNull
+    surveyed_position_m: VectorOrNull = Field(validation_alias=AliasChoices("surveyed_position_m", "prior_position_m"))
+
+
+class TimeOffsetEntry(Record):
+    """Image time = range time + ``value_s``; null where the log names photos. The rest if it was estimated."""
+
+    value_s: NumberOrNull
+    stddev_s: NumberOrNull
+    estimated: Flag
+    offset_matters: Flag | None = None
+    drift_ppm: NumberOrNull = None
+    drift_stddev_ppm: NumberOrNull = None
+    drift_is_followed: Flag | None = None
+    note: Text | None
+
+    @classmethod
+    def of(cls, found: MetricResult) -> TimeOffsetEntry:
+        offset, given_s = found.time_offset, found.time_offset_s
+        if offset is None:
+            return cls(value_s=given_s, stddev_s=None if given_s is None else 0.0, estimated=False, note=None)
+        in_ppm = {"drift_ppm": 1e6 * offset.drift, "drift_stddev_ppm": 1e6 * offset.drift_stddev}
+        return cls.model_validate({**vars(offset), **in_ppm, "estimated": True})
+
+
+class ResidualEntry(Record):
+    """Ranges between tag and anchor, and the residuals of those used by the final model."""
+
+    num: Count
+    num_used: Count
+    num_rejected: Count
+    rms_m: NumberOrNull
+    median_abs_m: NumberOrNull
+
+
+class RangesEntry(ResidualEntry):
+    """All ranges; those between two anchors or two tags are only counted."""
+
+    num_anchor_anchor: Count
+    num_tag_tag: Count
+    per_anchor: dict[Text, ResidualEntry]
+
+    @classmethod
+    def of(cls, found: MetricResult) -> RangesEntry:
+        log, used = found.observations.log, np.isin(found.observations.status, USED)
+
+        def residuals(of: Mask) -> dict[str, Any]:
+            chosen = found.residuals_m[used & of]
+            nums = {"num": of.sum(), "num_used": (used & of).sum(), "num_rejected": (~used & of).sum()}
+            return {**nums, "rms_m": _rms(chosen), "median_abs_m": _median(np.abs(chosen))}
+
+        is_of_camera = log.kind == RangeKind.TAG_ANCHOR
+        by_anchor = {id_: is_of_camera & (log.anchor_index == k) for k, id_ in enumerate(log.anchor_ids)}
+        return cls.model_validate(
+            {
+                **residuals(is_of_camera),
+                "num_anchor_anchor": np.count_nonzero(log.kind == RangeKind.ANCHOR_ANCHOR),
+                "num_tag_tag": np.count_nonzero(log.kind == RangeKind.TAG_TAG),
+                "per_anchor": {id_: residuals(of) for id_, of in by_anchor.items()},
+            }
+        )
+
+
+class CheckEntry(Record):
+    """Ranges that no estimate has seen, and their residuals by the final model."""
+
+    num: Count
+    rms_m: NumberOrNull
+    median_m: NumberOrNull
+
+
+class CheckRangesEntry(CheckEntry):
+    """All of them, and by anchor."""
+
+    per_anchor: dict[Text, CheckEntry]
+
+    @classmethod
+    def of(cls, found: MetricResult) -> CheckRangesEntry:
+        log, held_out = found.observations.log, found.observations.status == RangeStatus.CHECK
+
+        def residuals(of: Mask) -> dict[str, Any]:
+            chosen = found.residuals_m[of & np.isfinite(found.residuals_m)]
+            return {"num": len(chosen), "rms_m": _rms(chosen), "median_m": _median(chosen)}
+
+        by_anchor = {id_: held_out & (log.anchor_index == k) for k, id_ in enumerate(log.anchor_ids)}
+        per_anchor = {id_: residuals(of) for id_, of in by_anchor.items() if of.any()}
+        return cls.model_validate({**residuals(held_out), "per_anchor": per_anchor})
+
+
+def _rms(residuals_m: Array) -> float | None:
+    return float(np.sqrt(np.mean(residuals_m**2))) if len(residuals_m) else None
+
+
+def _median(residuals_m: Array) -> float | None:
+    return float(np.median(residuals_m)) if len(residuals_m) else None
+
+
+class RefineEntry(Record):
+    """What the refinement did; see RefineSummary. What was not estimated is null."""
+
+    iterations: Count
+    keyframe_graph_steps: Count
+    bend_m: NumberOrNull
+    initial_cost: NumberOrNull
+    final_cost: NumberOrNull
+    reprojection_rms_px: NumberOrNull
+    pixel_stddev: NumberOrNull
+    correlation_inflation: NumberOrNull
+    seconds: NumberOrNull
+    converged: Flag
+    message: Text
+    scale_value: NumberOrNull
+    relative_scale_stddev: NumberOrNull
+    tag_in_cam_m: dict[Text, Vector]
+    time_offset_change_s: NumberOrNull
+    short_range_error_m: NumberOrNull
+
+    @classmethod
+    def of(cls, found: MetricResult) -> RefineEntry | None:
+        summary = found.refinement
+        if summary is None:
+            return None
+        tag_ids, covariance = found.observations.log.tag_ids, summary.covariance
+        others = {
+            "iterations": summary.num_iterations,
+            "keyframe_graph_steps": summary.num_graph_steps,
+            "correlation_inflation": summary.errors.inflation,
+            "converged": summary.converged and not summary.misfits,
+            "message": "; ".join(summary.misfits) or summary.message,
+            "scale_value": found.refined_scale,
+            "relative_scale_stddev": None if covariance is None else covariance.relative_scale_stddev,
+            "tag_in_cam_m": dict(zip(tag_ids, summary.tags_in_cam_m, strict=True)),
+            "time_offset_change_s": summary.time_shift_s,
+        }
+        return cls.model_validate({**vars(summary), **others})
+
+
+class ComparisonRow(Record):
+    """One path against the reference: a row of the paper's table.
+
+    Attributes:
+        name: what the path is.
+        num_keyframes: keyframes whose reference position is known; the numbers are over these.
+        rmse_m: of keyframe centres, without any alignment; None where the path's
+            frame is not the reference's and cannot be tied to it.
+        rmse_se3_m: after the best rigid motion; None below three keyframes.
+        rmse_sim3_m: after the best similarity; None below three keyframes.
+        scale_error_percent: scale of the path relative to the reference, minus one:
+            positive when the map is too large; None below three keyframes or without motion.
+    """
+
+    name: Text
+    num_keyframes: Count
+    rmse_m: NumberOrNull
+    rmse_se3_m: NumberOrNull
+    rmse_sim3_m: NumberOrNull
+    scale_error_percent: NumberOrNull
+
+
+class GeoreferenceEntry(Record):
+    """Where the metric models' world lies on the Earth; see Georeference."""
+
+    lat_deg: Number
+    lon_deg: Number
+    height_m: Number
+    crs: Text
+
+    @property
+    def georeference(self) -> Georeference:
+        return Georeference(self.lat_deg, self.lon_deg, self.height_m, self.crs)
+
+
+class _Table(Record):
+    """A table of a survey; named are the keys that are read again."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+class ImageSettings(_Table):
+    path: Text | None
+
+
+class RangesSettings(_Table):
+    max_interpolation_gap_s: Number
+    max_time_difference_s: Number
+
+    @property
+    def association(self) -> AssociationOptions:
+        return AssociationOptions(**{name: getattr(self, name) for name in AssociationOptions.model_fields})
+
+
+class AnchorSettings(_Table):
+    path: Text | None
+    frame: Text | None
+    crs: Text | None
+
+
+class TagSettings(_Table):
+    tag_in_cam_m: Vector
+    lever_arms_m: dict[Text, Vector]
+
+
+class Settings(_Table):
+    """The survey as the run had it, by tables and keys."""
+
+    images: ImageSettings
+    ranges: RangesSettings
+    anchors: AnchorSettings
+    tag: TagSettings
+
+
+class InputEntry(Record):
+    """An input with its SHA-256, so that a result can be checked later; see ``input_hashes``."""
+
+    path: Text
+    sha256: Text
+    bytes: Count
+    hashed: Text

@@ -1,0 +1,152 @@
+"""MetricResult: all that the stages after the reconstruction found, in memory; what is written follows from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from rangesfm.colmap.transform import rescale
+from rangesfm.geometry.similarity import Similarity, align_points
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.join.models import ModelVerdict
+from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.clock.estimate import TimeOffset
+from rangesfm.ranging.observations import RangeObservations, RangeStatus
+from rangesfm.refine.with_ranges import RefineSummary
+from rangesfm.scale.diagnostics import ScaleDiagnostics, scale_diagnostics
+from rangesfm.scale.estimate import ScaleEstimate
+
+Array = npt.NDArray[np.float64]
+
+USED = (RangeStatus.USED, RangeStatus.DOWN_WEIGHTED)
+"""Of ranges with a say in the final model, however small."""
+
+
+@dataclass(frozen=True)
+class MetricResult:
+    """A scaled and perhaps refined map with its ranges.
+
+    Attributes:
+        trajectory: keyframes of the unscaled model.
+        time_offset: as estimated; None where it was given or is not needed.
+        time_offset_s: as used; None where the log names photos.
+        estimate: of the scale.
+        scaled: the model after rescaling.
+        predicted_scaled_m: (n,) ranges by that model; NaN without a place.
+        scaled_weights: (n,) robust weights by it.
+        refined: the model after refinement; None without.
+        refinement: its summary; None without.
+        models: that were to be joined to what is one model here; empty where there was only one.
+    """
+
+    trajectory: Trajectory
+    time_offset: TimeOffset | None
+    time_offset_s: float | None
+    estimate: ScaleEstimate
+    scaled: pycolmap.Reconstruction
+    predicted_scaled_m: Array
+    scaled_weights: Array
+    refined: pycolmap.Reconstruction | None = None
+    refinement: RefineSummary | None = None
+    models: tuple[ModelVerdict, ...] = ()
+
+    @property
+    def final(self) -> pycolmap.Reconstruction:
+        """The best metric model there is."""
+        return self.scaled if self.refined is None else self.refined
+
+    @property
+    def anchors(self) -> tuple[AnchorEstimate, ...]:
+        return self.estimate.anchors if self.refinement is None else self.refinement.anchors
+
+    @property
+    def observations(self) -> RangeObservations:
+        """With the final status of each range."""
+        return self.estimate.observations if self.refinement is None else self.refinement.observations
+
+    @property
+    def predicted_m(self) -> Array:
+        """(n,) ranges by the final model."""
+        return self.predicted_scaled_m if self.refinement is None else self.refinement.predicted_m
+
+    @property
+    def weights(self) -> Array:
+        """(n,) robust weights by the final model."""
+        return self.scaled_weights if self.refinement is None else self.refinement.weights
+
+    @property
+    def range_stddev_m(self) -> Array:
+        """(n,) noise of each range as weighted last; NaN without a place."""
+        return (self.estimate if self.refinement is None else self.refinement).errors.stddev_m
+
+    @property
+    def residuals_m(self) -> Array:
+        """(n,) predicted minus measured, by the final model."""
+        return self.predicted_m - self.observations.log.range_m
+
+    @property
+    def center_covariance_m2(self) -> dict[str, Array]:
+        """(3, 3) of each keyframe's projection centre, by its photo; empty where it was not found."""
+        found = None if self.refinement is None else self.refinement.covariance
+        if found is None:
+            return {}
+        index = np.searchsorted(found.frame_ids, self.trajectory.frame_ids)
+        return dict(zip(self.trajectory.image_names, found.centers[index], strict=True))
+
+    @cached_property
+    def diagnostics(self) -> ScaleDiagnostics:
+        """How the scale came about."""
+        return scale_diagnostics(self.estimate, self.trajectory)
+
+    @property
+    def refined_scale(self) -> float | None:
+        """Metres per SfM unit after refinement, by the keyframe centres."""
+        if self.refined is None:
+            return None
+        return align_points(self.trajectory.centers, self.path_of(self.refined).centers).scale
+
+    def moved(self, offset_m: Array) -> MetricResult:
+        """The same in a world whose coordinates are larger by ``offset_m`` (3,)."""
+        if not offset_m.any():
+            return self
+        shift = Similarity(1.0, np.eye(3), offset_m)
+        estimate = replace(
+            self.estimate,
+            metric_from_sfm=shift @ self.estimate.metric_from_sfm,
+            anchors=tuple(_moved_anchor(anchor, offset_m) for anchor in self.estimate.anchors),
+        )
+        refinement = self.refinement and replace(
+            self.refinement, anchors=tuple(_moved_anchor(anchor, offset_m) for anchor in self.refinement.anchors)
+        )
+        return replace(
+            self,
+            estimate=estimate,
+            scaled=rescale(self.scaled, shift),
+            refined=None if self.refined is None else rescale(self.refined, shift),
+            refinement=refinement,
+        )
+
+    def doubted(self, reasons: tuple[str, ...]) -> MetricResult:
+        """The same with further reasons to doubt it, if there are any."""
+        if not reasons:
+            return self
+        kept = self.estimate.reasons if self.estimate.verdict == "doubtful" else ()
+        return replace(self, estimate=replace(self.estimate, verdict="doubtful", reasons=(*reasons, *kept)))
+
+    def path_of(self, model: pycolmap.Reconstruction) -> Trajectory:
+        """The keyframes as another model has them."""
+        return self.trajectory.as_in(model)
+
+
+def _moved_anchor(anchor: AnchorEstimate, offset_m: Array) -> AnchorEstimate:
+    prior, mirror = anchor.prior_position_m, anchor.mirror_position_m
+    return replace(
+        anchor,
+        position_m=anchor.position_m + offset_m,
+        prior_position_m=None if prior is None else prior + offset_m,
+        mirror_position_m=None if mirror is None else mirror + offset_m,
+    )

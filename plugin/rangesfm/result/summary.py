@@ -1,0 +1,143 @@
+"""``result.json``, and what it says in words.
+
+    python -m rangesfm.result.summary > examples/result.schema.json
+
+prints its JSON schema.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from rangesfm.distances.rows import DistanceRow
+from rangesfm.files.records import NumberOrNull, Record, Text
+from rangesfm.result.entries import (
+    AnchorEntry,
+    CheckRangesEntry,
+    ComparisonRow,
+    GeoreferenceEntry,
+    InputEntry,
+    MapEntry,
+    ModelEntry,
+    RangesEntry,
+    RefineEntry,
+    ScaleEntry,
+    Settings,
+    SimilarityEntry,
+    TimeOffsetEntry,
+)
+from rangesfm.result.metric_result import MetricResult
+from rangesfm.scale.estimate import ScaleSensitivity
+
+# Percents of the scale for a centimetre that the summary mentions.
+_NOTABLE_PERCENT = 0.5
+
+
+class ResultSummary(Record):
+    """``result.json``: what a run found, what it was made from and how it was made.
+
+    Attributes:
+        metric_from_sfm: world of ``sparse/0`` to world of ``sparse_scaled/0``.
+        frame: the world of the metric models.
+        anchors: by id.
+        refine: null without a refinement.
+        models: that were to be joined to what is one model here; empty where there was only one.
+        distances: that were taped.
+        comparison: only there where a reference was given.
+        georeference: null if the anchors did not say.
+        versions: of the software, by name.
+        seconds: by stage, and in all ("total").
+    """
+
+    NAME: ClassVar = "result.json"
+
+    scale: ScaleEntry
+    metric_from_sfm: SimilarityEntry
+    frame: Literal["site", "first_camera"]
+    map: MapEntry
+    anchors: dict[Text, AnchorEntry]
+    time_offset: TimeOffsetEntry
+    ranges: RangesEntry
+    check_ranges: CheckRangesEntry
+    refine: RefineEntry | None
+    models: tuple[ModelEntry, ...]
+    distances: tuple[DistanceRow, ...]
+    comparison: tuple[ComparisonRow, ...] = ()
+    georeference: GeoreferenceEntry | None
+    versions: dict[Text, Text]
+    settings: Settings
+    inputs: tuple[InputEntry, ...]
+    seconds: dict[Text, NumberOrNull]
+    warnings: tuple[Text, ...]
+
+    @classmethod
+    def of(cls, found: MetricResult, **others: Any) -> ResultSummary:
+        """Of what the stages found, and of ``others``: entries from ``distances`` on, which do not follow from that."""
+        estimate = found.estimate
+        return cls(
+            scale=ScaleEntry.model_validate(estimate),
+            metric_from_sfm=SimilarityEntry.of(estimate.metric_from_sfm),
+            frame="site" if estimate.frame == "site" else "first_camera",
+            map=MapEntry(num_photos=found.final.num_reg_images(), num_points3D=found.final.num_points3D()),
+            anchors={anchor.anchor_id: AnchorEntry.model_validate(anchor) for anchor in found.anchors},
+            time_offset=TimeOffsetEntry.of(found),
+            ranges=RangesEntry.of(found),
+            check_ranges=CheckRangesEntry.of(found),
+            refine=RefineEntry.of(found),
+            models=tuple(ModelEntry.of(model, estimate.metric_from_sfm) for model in found.models),
+            **others,
+        )
+
+    def lines(self, folder: Path, table: str | None) -> Iterator[str]:
+        """What a user wants to know at the end of a run, with the comparison's table, if there is one."""
+        scale, ranges, offset = self.scale, self.ranges, self.time_offset
+        low, high = scale.interval_95 or (None, None)
+        interval = f"{_text(low, '.6g')} to {_text(high, '.6g')}"
+        yield f"scale: {scale.value:.6g} m per SfM unit, 95 % interval {interval}"
+        yield f"verdict: {scale.verdict}: {'; '.join(scale.reasons)}"
+        for advice in scale.advice:
+            yield f"next time: {advice}"
+        yield from _notable(scale.sensitivity)
+        if self.refine is not None:
+            refined = _text(self.refine.scale_value, ".6g")
+            yield f"refined: {refined} m per SfM unit after {self.refine.iterations} iterations"
+        rms, median = (_text(value, ".3f") for value in (ranges.rms_m, ranges.median_abs_m))
+        residuals = f", rms {rms} m, median {median} m" if ranges.num_used else ""
+        yield f"ranges: {ranges.num_used} of {ranges.num} used{residuals}"
+        if offset.estimated:
+            value, stddev = _text(offset.value_s, "+.3f"), _text(offset.stddev_s, ".3f")
+            yield f"time offset: image time = range time {value} s, +- {stddev} s"
+        yield f"map: {self.map.num_photos} photos, {self.map.num_points3D} points, frame {self.frame}"
+        if table is not None:
+            yield from ("", *table.splitlines(), "")
+        yield f"metric model: {folder / ('sparse_scaled/0' if self.refine is None else 'sparse_metric/0')}"
+        yield f"all results: {folder / self.NAME}"
+
+
+def _notable(sensitivity: ScaleSensitivity) -> Iterator[str]:
+    """What to measure to the centimetre: where one is worth much of the scale."""
+    values = {
+        "of bias in short ranges": sensitivity.short_range_per_cm,
+        "of bias in all ranges": sensitivity.common_bias_per_cm,
+        **{f"of lever arm in {axis}": value for axis, value in zip("xyz", sensitivity.lever_arm_per_cm)},
+    }
+    notable = [f"{v:+.2f} % per cm {what}" for what, v in values.items() if abs(v) > _NOTABLE_PERCENT]
+    if notable:
+        yield f"the scale is sensitive: {', '.join(notable)}"
+
+
+def _text(value: float | None, spec: str) -> str:
+    return "unknown" if value is None else f"{value:{spec}}"
+
+
+def schema() -> str:
+    """JSON schema of ``result.json``."""
+    return json.dumps(ResultSummary.model_json_schema(mode="serialization"), indent=1) + "\n"
+
+
+if __name__ == "__main__":
+    sys.stdout.write(schema())

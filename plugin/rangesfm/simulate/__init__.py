@@ -1,1 +1,0 @@
-"""Scenes, photos, paths, radios and models with a known truth, for the demo, tests and studies."""

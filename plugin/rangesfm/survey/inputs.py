@@ -1,0 +1,260 @@
+"""What a run reads before it works: the log, the anchors, the reference; checked against each other."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.distances.tape import Tape, read_tape
+from rangesfm.errors import InputError
+from rangesfm.geometry.reference import Reference, read_reference
+from rangesfm.options import LogOptions
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.anchor_file import default_anchor_frame, read_anchors
+from rangesfm.ranging.anchors.site import Site, local_site
+from rangesfm.ranging.clock.time_resolution import time_resolution_s
+from rangesfm.ranging.errors.error_curve import correct_ranges, read_error_curve
+from rangesfm.ranging.log import RangeKind, RangeLog
+from rangesfm.ranging.readers import read_anchors_in_log, read_ranges
+from rangesfm.ranging.readers.time_units import SECONDS_PER_UNIT
+from rangesfm.ranging.twr import AIR_M_PER_S, DW1000_TICK_S, VACUUM_M_PER_S, StampOptions
+from rangesfm.survey.settings import Survey
+from rangesfm.vision.image_times import ImageTimes, find_image_times, read_image_times_csv
+
+if TYPE_CHECKING:
+    import pycolmap
+
+# Beyond it a unit is wrong, or the file: no such radio reaches so far.
+_MAX_RANGE_M = 1e6
+# Times in coarser steps than this are worth a word.
+_COARSE_STEP_S = 0.1
+
+
+@dataclass(frozen=True)
+class RangingInputs:
+    """The radio's side of a survey.
+
+    Attributes:
+        log: ranges of the wanted tags to the wanted anchors, and those between two of a kind.
+        tag_in_cam_m: (num_tags, 3) lever arms in the order of ``log.tag_ids``; NaN for a tag that ranges with
+            tags only.
+        anchors: every anchor of the log.
+        anchor_frame: "site", "first_camera" or "unknown".
+        site: the frame of the anchors' positions.
+        tape: taped distances, if given.
+        reference: true positions, if given.
+        notes: what the user should know.
+    """
+
+    log: RangeLog
+    tag_in_cam_m: npt.NDArray[np.float64]
+    anchors: tuple[Anchor, ...]
+    anchor_frame: str
+    site: Site
+    tape: Tape | None
+    reference: Reference | None
+    notes: tuple[str, ...]
+
+
+def read_ranging_inputs(survey: Survey) -> RangingInputs:
+    """Read and check all but the photos.
+
+    Raises:
+        InputError: a file is missing or wrong, or the log has an anchor or tags that nobody explained.
+    """
+    given = read_anchors(survey.anchors.path) if survey.anchors.path is not None else None
+    tag_ids = [*survey.tag.lever_arms_m, *([] if survey.tag.tag_id is None else [survey.tag.tag_id])]
+    log = read_log(survey.ranges, [anchor.anchor_id for anchor in given or ()], tag_ids)
+    _check_lengths(log)
+    log = _of_wanted_anchors(_of_wanted_tag(log, survey.tag.tag_id), survey.anchors.use)
+    _check_camera_is_heard(log)
+    tag_in_cam_m = _lever_arms_of_log(log, survey)
+    anchors = _anchors_of_log(log) if given is None else given
+    _check_anchors_known(log, anchors, survey)
+    frame = survey.anchors.frame or default_anchor_frame(anchors)
+    site, anchors = local_site(anchors, frame, survey.anchors.crs, survey.anchors.path)
+    if frame != "unknown" and all(anchor.position_m is None for anchor in anchors):
+        raise InputError(
+            f"anchor frame {frame!r} needs anchor positions and there are none: give anchors.csv, or frame unknown",
+            survey.anchors.path,
+        )
+    _check_held_out(survey, anchors, frame)
+    log, curve_notes = _without_known_errors(log, survey)
+    tape = None if survey.scale.distances is None else read_tape(survey.scale.distances, survey.scale.markers)
+    reference = None if survey.report.reference is None else read_reference(survey.report.reference)
+    notes = (*_notes(log, anchors, survey, anchors_are_of_log=given is None), *curve_notes)
+    return RangingInputs(log, tag_in_cam_m, anchors, frame, site, tape, reference, notes)
+
+
+def _check_held_out(survey: Survey, anchors: Sequence[Anchor], frame: str) -> None:
+    surveyed = [anchor.anchor_id for anchor in anchors if anchor.position_m is not None and frame != "unknown"]
+    for anchor_id in survey.ranges.check_anchors:
+        if anchor_id not in surveyed:
+            raise InputError(
+                f"check_anchors: the position of anchor {anchor_id!r} is not known, so that its ranges can check "
+                f"nothing; expected of: {', '.join(surveyed) or 'none'}",
+                survey.anchors.path,
+            )
+
+
+def _without_known_errors(log: RangeLog, survey: Survey) -> tuple[RangeLog, list[str]]:
+    curve_path = survey.ranges.error_curve
+    return (log, []) if curve_path is None else correct_ranges(log, read_error_curve(curve_path))
+
+
+def read_log(options: LogOptions, anchor_ids: Collection[str] = (), tag_ids: Collection[str] = ()) -> RangeLog:
+    """The radio's log as a survey describes it; see ``read_ranges``."""
+    if options.path is None:
+        raise InputError("no ranges: give [ranges] path in a survey file, or --ranges LOG")
+    return read_ranges(
+        options.path,
+        format=options.format,
+        columns=options.columns or None,
+        timestamp_unit=options.timestamp_unit,
+        range_unit=options.range_unit,
+        separator=options.separator,
+        anchor_ids=anchor_ids,
+        tag_ids=tag_ids,
+        ranging_interval_s=options.ranging_interval_s,
+        stamps=stamp_options(options),
+    )
+
+
+def stamp_options(options: LogOptions) -> StampOptions:
+    """How a survey's time stamps of two-way ranging become ranges."""
+    named: dict[str | float, float] = {"air": AIR_M_PER_S, "vacuum": VACUUM_M_PER_S}
+    speed = options.propagation_speed
+    return StampOptions(
+        unit_s=DW1000_TICK_S if options.stamp_unit == "ticks" else SECONDS_PER_UNIT[options.stamp_unit],
+        wrap_s=2**options.stamp_bits * DW1000_TICK_S,
+        propagation_speed_m_per_s=named[speed] if speed in named else float(speed),
+        t_off_s=options.t_off_s,
+    )
+
+
+def _check_camera_is_heard(log: RangeLog) -> None:
+    if not np.any(log.kind == RangeKind.TAG_ANCHOR):
+        raise InputError(
+            f"none of the {len(log)} ranges is between a tag and an anchor: say who is what by anchors.csv, or by a "
+            "lever arm for each tag",
+            log.source,
+        )
+
+
+def _lever_arms_of_log(log: RangeLog, survey: Survey) -> npt.NDArray[np.float64]:
+    """(num_tags, 3) as ``RangingInputs.tag_in_cam_m``; InputError for a tag that ranges with anchors and has none."""
+    given = survey.tag.lever_arms_m
+    heard = np.unique(log.tag_index[log.kind == RangeKind.TAG_ANCHOR]).tolist()
+    arms = np.full((len(log.tag_ids), 3), np.nan)
+    if not given:
+        if len(heard) > 1:
+            raise InputError(
+                f"the log has several tags ({', '.join(log.tag_ids[k] for k in heard)}): give each its lever arm "
+                "([tag.lever_arms_m], or --tag_in_cam ID:X,Y,Z for each), or say which is the camera's (--tag_id)",
+                log.source,
+            )
+        arms[heard] = survey.tag.tag_in_cam_m
+        return arms
+    for k in heard:
+        if log.tag_ids[k] not in given:
+            raise InputError(
+                f"tag {log.tag_ids[k]!r} has no lever arm, those given are of {', '.join(given)}: give "
+                "it one ([tag.lever_arms_m], or --tag_in_cam ID:X,Y,Z), or choose a tag (--tag_id)",
+                log.source,
+                int(log.line[np.argmax(log.tag_index == k)]),
+            )
+        arms[k] = given[log.tag_ids[k]]
+    return arms
+
+
+def _check_lengths(log: RangeLog) -> None:
+    if np.any(too_long := log.range_m > _MAX_RANGE_M):
+        first = int(np.argmax(too_long))
+        message = f"a range of {log.range_m[first]:g} m, expected at most {_MAX_RANGE_M:g}: is its unit right?"
+        raise InputError(message, log.source, int(log.line[first]))
+
+
+def _anchors_of_log(log: RangeLog) -> tuple[Anchor, ...]:
+    """All unknown, but for those whose positions the log itself gives, as the radios were configured."""
+    in_log = read_anchors_in_log(log.source, format=log.format) if log.source is not None else ()
+    by_id = {anchor.anchor_id: anchor for anchor in in_log}
+    return tuple(by_id.get(anchor_id, Anchor(anchor_id)) for anchor_id in log.anchor_ids)
+
+
+def times_of_model(survey: Survey, sfm: pycolmap.Reconstruction, model_path: Path) -> ImageTimes:
+    """Times of a model's photos; the table may list others, which did not become keyframes."""
+    if survey.images.times is not None:
+        return read_image_times_csv(survey.images.times)
+    names = tuple(sorted(image.name for image in sfm.images.values()))
+    return find_image_times(survey.images.path or model_path, names)
+
+
+def of_one_tag(log: RangeLog, tag_id: str | None) -> RangeLog:
+    """The ranges between one tag and anchors; InputError if it is not there, or if there are several and none named."""
+    log = _of_wanted_tag(log, tag_id)
+    log = log.subset(log.kind == RangeKind.TAG_ANCHOR)
+    if len(log.tag_ids) > 1:
+        raise InputError(f"the log has several tags ({', '.join(log.tag_ids)}): say which it is (--tag_id)", log.source)
+    return log
+
+
+def _of_wanted_tag(log: RangeLog, tag_id: str | None) -> RangeLog:
+    """Without the ranges of other tags; those between anchors stay."""
+    if tag_id is None:
+        return log
+    if tag_id not in log.tag_ids:
+        raise InputError(f"tag {tag_id!r} is not in the log, which has {', '.join(log.tag_ids)}", log.source)
+    is_wanted = log.tag_index == log.tag_ids.index(tag_id)
+    return log.subset(is_wanted | (log.kind == RangeKind.ANCHOR_ANCHOR))
+
+
+def _of_wanted_anchors(log: RangeLog, use_anchors: Sequence[str]) -> RangeLog:
+    if not use_anchors:
+        return log
+    for anchor_id in use_anchors:
+        if anchor_id not in log.anchor_ids:
+            raise InputError(
+                f"anchor {anchor_id!r} to be used is not in the log ({', '.join(log.anchor_ids)})", log.source
+            )
+    # The last entry stands for the index of no anchor.
+    wanted = np.array([*(anchor_id in use_anchors for anchor_id in log.anchor_ids), True])
+    peer_is_wanted = wanted[np.where(log.kind == RangeKind.ANCHOR_ANCHOR, log.peer_index, -1)]
+    return log.subset(wanted[log.anchor_index] & peer_is_wanted)
+
+
+def _check_anchors_known(log: RangeLog, anchors: Sequence[Anchor], survey: Survey) -> None:
+    known = {anchor.anchor_id for anchor in anchors}
+    for k, anchor_id in enumerate(log.anchor_ids):
+        if anchor_id not in known:
+            first = int(np.argmax((log.anchor_index == k) | ((log.tag_index < 0) & (log.peer_index == k))))
+            raise InputError(
+                f"anchor_id is {anchor_id!r}, expected one of {survey.anchors.path}: {', '.join(sorted(known))} "
+                "(--use_anchors leaves others out)",
+                log.source,
+                int(log.line[first]),
+            )
+
+
+def _notes(log: RangeLog, anchors: Sequence[Anchor], survey: Survey, *, anchors_are_of_log: bool) -> list[str]:
+    silent = [anchor.anchor_id for anchor in anchors if anchor.anchor_id not in log.anchor_ids]
+    notes = [f"no ranges to anchor {', '.join(silent)}"] if silent else []
+    silent = [tag_id for tag_id in survey.tag.lever_arms_m if tag_id not in log.tag_ids and survey.tag.tag_id is None]
+    notes += [f"no ranges of tag {', '.join(silent)}"] if silent else []
+    for kind, what in (
+        (RangeKind.ANCHOR_ANCHOR, "anchors: they are distances for the map to keep to"),
+        (RangeKind.TAG_TAG, "tags: they have no say"),
+    ):
+        if num := int(np.count_nonzero(log.kind == kind)):
+            notes.append(f"{num} ranges are between two {what}")
+    if anchors_are_of_log and any(anchor.position_m is not None for anchor in anchors):
+        notes.append("the anchor positions are those that the log gives")
+    if log.num_no_measurement:
+        notes.append(f"{log.num_no_measurement} records of the log say that there was no measurement")
+    if (step_s := time_resolution_s(log)) >= _COARSE_STEP_S:
+        notes.append(f"the log's times come in steps of {step_s:.2g} s: at walking pace that is as much in metres")
+    return notes

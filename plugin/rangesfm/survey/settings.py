@@ -1,0 +1,176 @@
+"""Survey: everything a run needs to know, from a TOML file, from flags or from both."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from rangesfm.errors import OptionError, nearest_known, printable, shown
+from rangesfm.files.atomic import path_of
+from rangesfm.option_model import Key, Options, PathRole
+from rangesfm.options import (
+    AnchorOptions,
+    CameraOptions,
+    ExportOptions,
+    ImageOptions,
+    MapperOptions,
+    OutputOptions,
+    RangesOptions,
+    RefineOptions,
+    ReportOptions,
+    ScaleAndTapeOptions,
+    TagOptions,
+)
+from rangesfm.survey.toml_source import Source, parse_toml
+
+# An override of the first takes the place of the other in the file.
+_INSTEAD_OF = {"tag.tag_in_cam_m": "lever_arms_m", "tag.lever_arms_m": "tag_in_cam_m"}
+
+
+class Survey(BaseModel):
+    """Inputs, options and output of one run, by the tables of a survey file. Paths are absolute.
+
+    Attributes:
+        model_path: an existing COLMAP model, for those who start from one; not a key of the file.
+        source: the survey file, for messages; no setting.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    images: ImageOptions = ImageOptions()
+    camera: CameraOptions = CameraOptions()
+    ranges: RangesOptions = RangesOptions()
+    anchors: AnchorOptions = AnchorOptions()
+    tag: TagOptions = TagOptions()
+    mapper: MapperOptions = MapperOptions()
+    scale: ScaleAndTapeOptions = ScaleAndTapeOptions()
+    refine: RefineOptions = RefineOptions()
+    export: ExportOptions = ExportOptions()
+    report: ReportOptions = ReportOptions()
+    output: OutputOptions = OutputOptions()
+    model_path: Path | None = None
+    source: Source = Field(default=Source(), exclude=True, repr=False)
+
+    def changed(self, values: Mapping[str, Any]) -> Survey:
+        """The same with other values by dotted key, as ``{"scale.method": "robust"}``, which are checked."""
+        tables: dict[str, Options] = {}
+        for dotted_key, value in values.items():
+            table, _, name = dotted_key.partition(".")
+            tables[table] = tables.get(table, getattr(self, table)).changed(**{name: value})
+        return self.model_copy(update=tables)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, fit for JSON."""
+        return self.model_dump(mode="json")
+
+    def input_paths(self) -> Iterator[InputPath]:
+        """Every path that is read: what must be there, what is hashed and what no result may overwrite."""
+        for dotted_key, role in _ROLE_OF_PATH.items():
+            table, _, name = dotted_key.partition(".")
+            path = getattr(getattr(self, table), name)
+            if path is not None and role != "output":
+                yield InputPath(dotted_key, role, path)
+        if self.model_path is not None:
+            yield InputPath("model_path", "model", self.model_path)
+
+
+@dataclass(frozen=True)
+class InputPath:
+    """A path that a survey reads, by its dotted key, and what stands there."""
+
+    key: str
+    role: PathRole
+    path: Path
+
+
+TABLES: dict[str, type[Options]] = {
+    name: field.annotation
+    for name, field in Survey.model_fields.items()
+    if isinstance(field.annotation, type) and issubclass(field.annotation, Options)
+}
+# Paths first: keys that a table takes over from a stage's options stand before its own.
+KEYS = tuple(
+    item for model in TABLES.values() for item in sorted(model.keys().values(), key=lambda item: item.role is None)
+)
+_ROLE_OF_PATH: dict[str, PathRole] = {item.dotted: item.role for item in KEYS if item.role is not None}
+
+
+def chosen_keys(chosen: Collection[str]) -> list[Key]:
+    """Of dotted keys, and tables for all of theirs; of none all there are."""
+    return [item for item in KEYS if not chosen or item.table in chosen or item.dotted in chosen]
+
+
+def read_survey(
+    path: str | Path, overrides: Mapping[str, object] | None = None, base_folder: str | Path | None = None
+) -> Survey:
+    """Read a survey file.
+
+    Args:
+        path: the TOML file.
+        base_folder: what relative paths in the file refer to; None: the file's own folder.
+        overrides: values by dotted key (``{"ranges.path": "uwb.csv"}``) that replace those of the file;
+            their paths are relative to the working directory.
+
+    Raises:
+        InputError: with the line where possible, for an unknown table or key, a value of the wrong
+            type or out of bounds, and a file that does not exist.
+    """
+    tables, source = parse_toml(Path(path))
+    folder = Path(path).absolute().parent if base_folder is None else Path(base_folder).absolute()
+    return _survey(tables, folder, overrides or {}, source)
+
+
+def survey_from_tables(
+    tables: Mapping[str, Any], base_folder: str | Path, overrides: Mapping[str, object] | None = None
+) -> Survey:
+    """The same from tables in memory, with paths relative to ``base_folder``."""
+    return _survey(tables, Path(base_folder).absolute(), overrides or {}, Source())
+
+
+def _survey(tables: Mapping[str, Any], folder: Path, overrides: Mapping[str, object], source: Source) -> Survey:
+    source = replace(source, overridden=tuple(overrides))
+    with source.naming_lines():
+        _refuse_unknown_tables(tables)
+        given: dict[str, dict[Any, Any]] = {name: dict(tables.get(name, {})) for name in TABLES}
+        given["output"].setdefault("path", "out")
+        for dotted_key in _ROLE_OF_PATH:
+            table, _, name = dotted_key.partition(".")
+            if name in given[table]:
+                given[table][name] = _absolute(given[table][name], folder)
+        for dotted_key, value in overrides.items():
+            table, _, name = dotted_key.partition(".")
+            given[table].pop(_INSTEAD_OF.get(dotted_key), None)
+            given[table][name] = _absolute(value, Path.cwd()) if dotted_key in _ROLE_OF_PATH else value
+        options: dict[str, Any] = {name: model(**given[name]) for name, model in TABLES.items()}
+        survey = Survey(**options, source=source)
+        _require_files(survey)
+    return survey
+
+
+def _refuse_unknown_tables(tables: Mapping[str, Any]) -> None:
+    for name, table in tables.items():
+        if name not in TABLES:
+            nearest = nearest_known(name, TABLES)
+            message = f"unknown table [{printable(name)}]; the nearest known one is '{nearest}'"
+            raise OptionError(message, "", name)
+        if not isinstance(table, Mapping):
+            raise OptionError(f"{name} is {shown(table)}, expected a table [{name}]", "", name)
+
+
+def _absolute(value: object, folder: Path) -> object:
+    """What stands for a path, as one; anything else as it is."""
+    return folder / path_of(str(value)) if isinstance(value, (str, Path)) and str(value) else value
+
+
+def _require_files(survey: Survey) -> None:
+    for item in survey.input_paths():
+        if item.role == "file" and not os.path.isfile(item.path):
+            is_folder = os.path.isdir(item.path)
+            found = f"{item.path} is a folder, expected a file" if is_folder else f"there is no file {item.path}"
+            table, _, name = item.key.partition(".")
+            raise OptionError(f"[{table}] {name}: {found}", table, name)

@@ -1,0 +1,109 @@
+"""What a finished run hands over: all files of the result folder, the report on them, and a summary."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rangesfm.ceres.doctor import versions
+from rangesfm.comparison.with_reference import format_table, papers_table, reference_in_frame
+from rangesfm.distances.ends import locate_distances
+from rangesfm.distances.rows import DistanceRow, disagreements, distance_rows
+from rangesfm.export import COVARIANCE_FORMATS
+from rangesfm.geometry.georeference import Georeference
+from rangesfm.geometry.reference import write_reference
+from rangesfm.report import write_report
+from rangesfm.result.entries import ComparisonRow
+from rangesfm.result.folder import REFERENCE_NAME, replacing_result
+from rangesfm.result.metric_result import MetricResult
+from rangesfm.result.summary import ResultSummary
+from rangesfm.result.write import write_models_and_tables
+from rangesfm.survey.input_hashes import input_hashes
+from rangesfm.survey.inputs import RangingInputs
+from rangesfm.survey.settings import Survey
+from rangesfm.workflows.journal import Journal
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run hands back; ``read_result_folder`` reads what it left.
+
+    Attributes:
+        output_path: its folder.
+        summary: ``result.json``.
+        lines: a summary for people.
+    """
+
+    output_path: Path
+    summary: ResultSummary
+    lines: tuple[str, ...]
+
+    def summary_lines(self) -> list[str]:
+        return list(self.lines)
+
+
+def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, journal: Journal) -> RunResult:
+    """All files of the result, ``result.json`` after all others, and the report on them."""
+    if not metric.center_covariance_m2 and (left_out := set(COVARIANCE_FORMATS) & set(survey.export.formats)):
+        journal.warn(f"without covariances of the poses there is no {', '.join(sorted(left_out))}")
+    if metric.estimate.frame == "site":
+        metric = metric.moved(inputs.site.offset_m)
+    distances = _distances(inputs, metric)
+    disagreeing = tuple(disagreements(distances, metric.estimate.uncertainty.empirical))
+    for note in disagreeing:
+        journal.warn(note)
+    metric = metric.doubted(disagreeing)
+    folder = survey.output.path
+    with replacing_result(folder):
+        with journal.stage("results"):
+            comparison = _comparison(survey, inputs, metric)
+            georeference = _georeference(inputs, metric)
+            write_models_and_tables(
+                metric, survey.export, folder, images_path=survey.images.path, georeference=georeference
+            )
+        summary = ResultSummary.of(
+            metric,
+            distances=distances,
+            **({"comparison": comparison} if comparison else {}),
+            georeference=georeference,
+            versions=versions(),
+            settings=survey.to_dict(),
+            inputs=input_hashes(survey),
+            seconds=journal.all_seconds(),
+            warnings=journal.warnings,
+        )
+        summary.write(folder / summary.NAME)
+    lines = [*summary.lines(folder, format_table(comparison) if comparison else None)]
+    if survey.report.enabled:
+        lines.append(f"report: {write_report(folder)}")
+    return RunResult(folder, summary, tuple(lines))
+
+
+def _georeference(inputs: RangingInputs, metric: MetricResult) -> Georeference | None:
+    """Of the final map: that of the anchors, if the map could be carried to them."""
+    return inputs.site.georeference if metric.estimate.frame == "site" else None
+
+
+def _distances(inputs: RangingInputs, metric: MetricResult) -> list[DistanceRow]:
+    """The table of control and check distances in the final map."""
+    if inputs.tape is None:
+        return []
+    located = locate_distances(inputs.tape, metric.final, [anchor.anchor_id for anchor in metric.anchors])
+    anchors_m = np.array([anchor.position_m for anchor in metric.anchors]).reshape(-1, 3)
+    return distance_rows(inputs.tape, located.lengths_m(1.0, anchors_m))
+
+
+def _comparison(survey: Survey, inputs: RangingInputs, metric: MetricResult) -> tuple[ComparisonRow, ...]:
+    """The paper's table; empty without a reference, which is left beside the result in its frame."""
+    if inputs.reference is None:
+        return ()
+    frame = metric.estimate.frame
+    scaled = metric.path_of(metric.scaled)
+    refined = None if metric.refined is None else metric.path_of(metric.refined)
+    rows = papers_table(scaled, refined, inputs.reference, frame=frame)
+    in_frame = reference_in_frame(refined or scaled, inputs.reference, frame=frame)
+    if in_frame is not None:
+        write_reference(in_frame, survey.output.path / REFERENCE_NAME)
+    return rows

@@ -1,0 +1,141 @@
+"""The method, stage by stage: photos, scale, rescaling, refinement, comparison, results.
+
+Lee, Zhu, Giorgi and Günther, "Fusion of Monocular Vision and Radio-based Ranging for Global
+Scale Estimation and Drift Mitigation", 2018, with other means where real radios ask for them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import pycolmap
+
+from rangesfm.errors import InputError
+from rangesfm.files.sole_writer import sole_writer
+from rangesfm.join.models import PathOfModel
+from rangesfm.progress import Progress
+from rangesfm.ranging.clock.estimate import TimeOffset
+from rangesfm.survey.inputs import RangingInputs, times_of_model
+from rangesfm.survey.settings import Survey
+from rangesfm.vision.image_times import ImageTimes
+from rangesfm.vision.reconstruct import prepare_submaps
+from rangesfm.vision.submaps import Submap
+from rangesfm.workflows.checked_inputs import check_times, checked_inputs, read_inputs, read_registered
+from rangesfm.workflows.journal import Journal
+from rangesfm.workflows.metric_map import join_by_survey, refine_map, scale_by_survey
+from rangesfm.workflows.photos import find_keyframes, map_keyframes, noted, with_photos
+from rangesfm.workflows.placed_ranges import find_time_offset, path_with_times, ranges_on_paths
+from rangesfm.workflows.ranges_in_mapping import AdjustmentWithRanges
+from rangesfm.workflows.results import RunResult, write_results
+
+
+def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> RunResult:
+    """Photos and ranges to a metric model. Steps of the reconstruction that are done are reused."""
+    journal = Journal(progress)
+    inputs, keyframes, times = checked_inputs(survey, journal)
+    with sole_writer(survey.output.path):
+        adjustment = AdjustmentWithRanges(survey, inputs, keyframes[0], times)
+        models = map_keyframes(
+            survey, keyframes, journal, restart, adjustment if survey.mapper.ranges_in_mapping else None
+        )
+        if note := adjustment.note():
+            journal.warn(note)
+        return to_metric(survey, inputs, models, times, journal, refine=survey.refine.enabled)
+
+
+def prepare_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> tuple[Submap, ...]:
+    """What ``run_survey`` does before it maps the photos.
+
+    Returns:
+        The submaps that are to be mapped yet; whoever has them mapped (``Submap.map``), wherever, in any order and at
+        once, saves ``run_survey`` doing it. None where the photos are mapped in one piece.
+    """
+    journal = Journal(progress)
+    _, keyframes, _ = checked_inputs(survey, journal)
+    with sole_writer(survey.output.path):
+        return with_photos(prepare_submaps, survey, keyframes, journal, restart)
+
+
+def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> list[str]:
+    """Photos to an unscaled model; returns a summary for people."""
+    journal = Journal(progress)
+    if survey.mapper.ranges_in_mapping:
+        journal.warn("ranges_in_mapping: nothing has been said of ranges here, they take part in a whole run")
+    keyframes, _ = find_keyframes(survey, journal)
+    with sole_writer(survey.output.path):
+        sfm = map_keyframes(survey, keyframes, journal, restart)[0]
+    path = survey.output.path / "sparse" / "0"
+    return [f"unscaled model: {sfm.num_reg_images()} photos, {sfm.num_points3D()} points, in {path}"]
+
+
+def refine_model(survey: Survey, *, progress: Progress) -> RunResult:
+    """An existing model and ranges to the refined metric model."""
+    return _from_model(survey, progress, refine=True)
+
+
+def scale_model(survey: Survey, *, progress: Progress) -> RunResult:
+    """An existing model, or only its trajectory, and ranges to the scaled model."""
+    return _from_model(survey, progress, refine=False)
+
+
+def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResult:
+    journal = Journal(progress)
+    inputs = read_inputs(survey, journal)
+    if survey.model_path is None:
+        raise InputError("no model: give --input_path MODEL, a COLMAP model as sparse/0")
+    sfm = read_registered(survey.model_path)
+    if refine and not sfm.num_points3D():
+        raise InputError("the model has no 3-D points to refine: a trajectory can only be scaled", survey.model_path)
+    times = None
+    if inputs.log.image_name is None:
+        times = noted(times_of_model(survey, sfm, survey.model_path), journal)
+    with sole_writer(survey.output.path):
+        return to_metric(survey, inputs, [sfm], times, journal, refine=refine)
+
+
+def to_metric(
+    survey: Survey,
+    inputs: RangingInputs,
+    models: Sequence[pycolmap.Reconstruction],
+    times: ImageTimes | None,
+    journal: Journal,
+    *,
+    refine: bool,
+) -> RunResult:
+    """From the unscaled models on: the same for photos just mapped and for a model brought along."""
+    trajectory = path_with_times(survey, models[0], times, journal)
+    check_times(survey, inputs, trajectory)
+    # Clocks: where on the path each range was taken.
+    offset = find_time_offset(survey, inputs, trajectory, journal)
+    paths = ranges_on_paths(survey, inputs, models, trajectory, times, offset, journal)
+    return map_in_metres(survey, inputs, paths, offset, journal, refine=refine)
+
+
+def map_in_metres(
+    survey: Survey,
+    inputs: RangingInputs,
+    paths: Sequence[PathOfModel],
+    offset: TimeOffset | None,
+    journal: Journal,
+    *,
+    refine: bool,
+    must_join: bool = False,
+) -> RunResult:
+    """From the models and the ranges on their paths on: scale, refinement and results of all of them as one map.
+
+    Args:
+        paths: of the log in ``inputs``; to the first one the others are joined, or left out.
+        offset: of the clocks, if it was estimated.
+        must_join: whether it is an error if all others are left out.
+    """
+    # Scale, and the metric map that follows from it.
+    with journal.stage("scale"):
+        path, verdicts = join_by_survey(survey, inputs, paths, journal, must_join=must_join)
+        metric = replace(scale_by_survey(survey, inputs, path, offset, journal), models=verdicts)
+    # Global refinement: photos and ranges together.
+    if refine:
+        with journal.stage("refinement"):
+            metric = refine_map(survey, inputs, metric, journal)
+    # Comparison and results.
+    return write_results(survey, inputs, metric, journal)

@@ -1,0 +1,331 @@
+"""Covariances of the joint problem, against the inverse of all normal equations and against simulated surveys."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+import pytest
+from scipy.sparse import csr_matrix
+from scipy.spatial.transform import Rotation
+from tests.simulated.model import synthetic_model
+from tests.simulated.path import orbit_path
+
+from rangesfm.ceres import (
+    PlacedRanges,
+    RangeBlocks,
+    add_normal_prior,
+    add_ranges,
+    add_residual_block,
+    distance_cost,
+    keep_from_elimination,
+    range_cost,
+    tangent_jacobian,
+)
+from rangesfm.ceres.covariance import ResidualErrors, joint_covariance
+from rangesfm.errors import GeometryError
+from rangesfm.geometry.similarity import IDENTITY
+from rangesfm.geometry.trajectory import pose_of
+
+Array = npt.NDArray[np.float64]
+
+NUM_FRAMES = 8
+ANCHORS_M = np.array([[2.0, 1.0, 3.0], [-3.0, 2.0, -2.0], [1.0, -4.0, 2.0], [-1.0, 0.5, -3.0]])
+TAG_IN_CAM_M = np.array([0.05, -0.1, 0.02])
+RANGE_STDDEV_M = 0.02
+BIAS_STDDEV_M = 0.01
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A bundle adjustment with ranges from every frame to every anchor."""
+
+    reconstruction: pycolmap.Reconstruction
+    adjuster: pycolmap.CeresBundleAdjuster
+    anchors: list[Array]
+    biases: list[Array]
+
+    @property
+    def problem(self) -> Any:
+        return self.adjuster.problem
+
+    @property
+    def poses(self) -> list[Array]:
+        frames = sorted(self.reconstruction.reg_frame_ids())
+        return [pose_of(self.reconstruction.frame(i)).params for i in frames]
+
+
+def model(seed: int = 0, num_frames: int = NUM_FRAMES) -> pycolmap.Reconstruction:
+    times = np.arange(num_frames, dtype=np.float64)
+    path = orbit_path(1.4 * num_frames)
+    return synthetic_model(
+        times,
+        path.centers(times),
+        path.world_from_cam(times),
+        num_observations=30,
+        pixel_stddev=1.0,
+        metric_from_sfm=IDENTITY,
+        seed=seed,
+    ).reconstruction
+
+
+def bundle_adjuster(reconstruction: pycolmap.Reconstruction, *, hold_first: bool) -> pycolmap.CeresBundleAdjuster:
+    options = pycolmap.BundleAdjustmentOptions(
+        print_summary=False, refine_focal_length=False, refine_extra_params=False
+    )
+    solver = options.ceres.solver_options
+    solver.num_threads = 1
+    solver.initial_trust_region_radius = 1e8
+    solver.function_tolerance = solver.gradient_tolerance = solver.parameter_tolerance = 1e-10
+    options.ceres.solver_options = solver
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in reconstruction.reg_image_ids():
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.UNSPECIFIED)
+    if hold_first:
+        config.set_constant_rig_from_world_pose(min(reconstruction.reg_frame_ids()))
+    return pycolmap.create_default_ceres_bundle_adjuster(options, config, reconstruction)
+
+
+def joint(
+    reconstruction: pycolmap.Reconstruction,
+    *,
+    hold_first: bool = False,
+    num_anchors: int = len(ANCHORS_M),
+    hold_anchors: bool = False,
+    range_errors_m: Array | None = None,
+) -> Joint:
+    adjuster = bundle_adjuster(reconstruction, hold_first=hold_first)
+    survey = Joint(reconstruction, adjuster, list(ANCHORS_M[:num_anchors].copy()), [np.zeros(1) for _ in ANCHORS_M])
+    frame, anchor = (index.ravel() for index in np.meshgrid(np.arange(len(survey.poses)), np.arange(num_anchors)))
+    path = orbit_path(1.4 * len(survey.poses))
+    times = np.arange(len(survey.poses), dtype=np.float64)
+    tags = path.centers(times) + path.world_from_cam(times) @ TAG_IN_CAM_M
+    distances = np.linalg.norm(tags[frame] - ANCHORS_M[anchor], axis=1)
+    ranges = PlacedRanges(
+        range_m=distances + (0.0 if range_errors_m is None else range_errors_m[anchor, frame]),
+        stddev_m=np.full(len(frame), RANGE_STDDEV_M),
+        before=frame,
+        after=frame,
+        weight=np.zeros(len(frame)),
+        offset_in_world_m=np.zeros((len(frame), 3)),
+        anchor_index=anchor,
+        tag_index=np.zeros(len(frame), dtype=np.int64),
+    )
+    add_ranges(adjuster, ranges, RangeBlocks(survey.poses, survey.anchors, survey.biases, [TAG_IN_CAM_M]))
+    for position, bias in zip(survey.anchors, survey.biases, strict=False):
+        add_normal_prior(adjuster, bias, mean=[0.0], stddev=BIAS_STDDEV_M)
+        if hold_anchors:
+            survey.problem.set_parameter_block_constant(position)
+    return survey
+
+
+def covariance_of_all(problem: Any, blocks: Sequence[Array]) -> Array:
+    """The inverse of the whole normal equations."""
+    jacobian = tangent_jacobian(problem, blocks).toarray()
+    covariance: Array = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-14, hermitian=True)
+    return covariance
+
+
+def variable(survey: Joint) -> list[Array]:
+    blocks = [*survey.poses, *survey.anchors, *survey.biases, *(p.xyz for p in survey.reconstruction.points3D.values())]
+    problem = survey.problem
+    return [b for b in blocks if problem.has_parameter_block(b) and not problem.is_parameter_block_constant(b)]
+
+
+def test_it_is_the_same_of_blocks_that_are_kept_from_elimination() -> None:
+    free, kept = joint(model(), hold_first=True), joint(model(), hold_first=True)
+    for block in (*kept.anchors, *kept.biases):
+        keep_from_elimination(kept.adjuster, block, next(iter(kept.reconstruction.points3D.values())).xyz)
+    expected, found = (
+        joint_covariance(one.problem, one.reconstruction, anchors=one.anchors, others=one.biases)
+        for one in (free, kept)
+    )
+    np.testing.assert_allclose(found.anchors, expected.anchors, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(found.others, expected.others, rtol=1e-6)
+    np.testing.assert_allclose(found.centers, expected.centers, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("hold_anchors", [False, True], ids=["anchors free", "anchors held"])
+def test_it_is_the_inverse_of_all_normal_equations(hold_anchors: bool) -> None:
+    survey = joint(model(), hold_first=not hold_anchors, hold_anchors=hold_anchors)
+    found = joint_covariance(
+        survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases, residual_stddev=2.0
+    )
+    expected = 4.0 * covariance_of_all(survey.problem, variable(survey))
+    assert found.num_free_directions == 0
+    first = 0 if hold_anchors else 1
+    turn = np.diag([2.0, 2, 2, 1, 1, 1])
+    for i in range(first, NUM_FRAMES):
+        rows = slice(6 * (i - first), 6 * (i - first) + 6)
+        assert found.rig_from_world[i] == pytest.approx(turn @ expected[rows, rows] @ turn, rel=1e-5, abs=1e-12)
+    start = 6 * (NUM_FRAMES - first)
+    if hold_anchors:
+        assert np.all(found.anchors == 0)
+    else:
+        assert np.all(found.rig_from_world[0] == 0)
+        for k in range(len(ANCHORS_M)):
+            rows = slice(start + 3 * k, start + 3 * k + 3)
+            assert found.anchors[k] == pytest.approx(expected[rows, rows], rel=1e-5)
+        start += 3 * len(ANCHORS_M)
+    biases = [expected[start + k, start + k] for k in range(len(ANCHORS_M))]
+    assert np.ravel(found.others) == pytest.approx(biases, rel=1e-5)
+
+
+def test_residuals_that_err_together_count_as_their_covariance_says() -> None:
+    survey = joint(model(), hold_first=True)
+    num_ranges = NUM_FRAMES * len(ANCHORS_M)
+    num = survey.problem.num_residuals()
+    rows = np.arange(num - len(survey.biases) - num_ranges, num - len(survey.biases))
+    errors = ResidualErrors(rows, 1.7, csr_matrix(np.random.default_rng(0).standard_normal((num_ranges, 3))))
+    found = joint_covariance(
+        survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases, errors=errors
+    )
+    jacobian = tangent_jacobian(survey.problem, variable(survey)).toarray()
+    of_residuals = np.eye(num)
+    of_residuals[np.ix_(rows, rows)] = 1.7 * np.eye(num_ranges) + (errors.modes @ errors.modes.T).toarray()
+    gain = covariance_of_all(survey.problem, variable(survey)) @ jacobian.T
+    expected = gain @ of_residuals @ gain.T
+    first = 6 * (NUM_FRAMES - 1)
+    np.testing.assert_allclose(found.anchors[0], expected[first : first + 3, first : first + 3], rtol=1e-5)
+    np.testing.assert_allclose(np.diag(found.rig_from_world[1])[3:], np.diag(expected)[3:6], rtol=1e-5)
+    alone = joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases)
+    assert found.relative_scale_stddev > 1.1 * alone.relative_scale_stddev
+
+
+def test_centers_err_as_their_poses_do() -> None:
+    survey = joint(model(), hold_anchors=True)
+    found = joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases)
+    rng = np.random.default_rng(0)
+    rotation, translation = Rotation.from_quat(survey.poses[3][:4]), survey.poses[3][4:]
+    steps = rng.multivariate_normal(np.zeros(6), 1e-4 * found.rig_from_world[3], 20000)
+    turned = Rotation.from_rotvec(steps[:, :3]) * rotation
+    centers = -turned.inv().apply(translation + steps[:, 3:])
+    assert np.cov(centers.T) == pytest.approx(
+        1e-4 * found.centers[3], rel=0.1, abs=0.02 * 1e-4 * found.centers[3].max()
+    )
+
+
+@pytest.mark.parametrize(("num_anchors", "num_free"), [(0, 7), (1, 3), (2, 1), (3, 0)])
+def test_motions_of_the_map_that_nothing_holds_are_counted(num_anchors: int, num_free: int) -> None:
+    survey = joint(model(), num_anchors=num_anchors, hold_anchors=True)
+    biases = survey.biases[:num_anchors]
+    found = joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors, others=biases)
+    assert found.num_free_directions == num_free
+    assert np.all(np.linalg.eigvalsh(found.centers) > -1e-12)
+
+
+def test_a_free_map_errs_least_under_inner_constraints() -> None:
+    """The pseudo-inverse of what is left of the normal equations without the points."""
+    survey = joint(model(), num_anchors=1)
+    found = joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases[:1])
+    jacobian = tangent_jacobian(survey.problem, variable(survey)).toarray()
+    normal, kept = jacobian.T @ jacobian, 6 * NUM_FRAMES + 4
+    coupling = normal[:kept, kept:]
+    reduced = normal[:kept, :kept] - coupling @ np.linalg.solve(normal[kept:, kept:], coupling.T)
+    values, vectors = np.linalg.eigh(reduced)
+    assert found.num_free_directions == 6  # all but the scale
+    assert values[6] > 1e3 * abs(values[5])
+    expected = vectors[:, 6:] / values[6:] @ vectors[:, 6:].T
+    assert found.anchors[0] == pytest.approx(expected[-4:-1, -4:-1], rel=1e-3, abs=1e-9)
+
+
+def test_it_agrees_with_colmaps_own_where_there_are_no_ranges() -> None:
+    reconstruction = model()
+    adjuster = bundle_adjuster(reconstruction, hold_first=True)
+    frames = sorted(reconstruction.reg_frame_ids())
+    other = pose_of(reconstruction.frame(frames[4])).params
+    adjuster.problem.set_parameter_block_constant(other)  # the scale
+    found = joint_covariance(adjuster.problem, reconstruction)
+    options = pycolmap.BACovarianceOptions(damping=0.0)
+    theirs = pycolmap.estimate_ba_covariance_from_problem(options, reconstruction, adjuster.problem)
+    assert theirs is not None
+    for index in (1, 6):
+        (data,) = reconstruction.frame(frames[index]).image_ids
+        expected = theirs.get_cam_cov_from_world(data.id)
+        turn = np.diag([2.0, 2, 2, 1, 1, 1])
+        assert found.rig_from_world[index] == pytest.approx(turn @ expected @ turn, rel=1e-5, abs=1e-12)
+
+
+def test_two_points_with_a_taped_distance_are_eliminated_together() -> None:
+    survey = joint(model(), hold_anchors=True)
+    first, second = (point.xyz for point in list(survey.reconstruction.points3D.values())[:2])
+    distance = float(np.linalg.norm(first - second))
+    tape = distance_cost(distance_m=distance, stddev_m=1e-4)
+    add_residual_block(survey.adjuster, tape, None, [first, second])
+    found = joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases)
+    expected = covariance_of_all(survey.problem, variable(survey))
+    turn = np.diag([2.0, 2, 2, 1, 1, 1])
+    assert found.rig_from_world[2] == pytest.approx(turn @ expected[12:18, 12:18] @ turn, rel=1e-5, abs=1e-12)
+
+
+def test_large_problems_are_solved_sparsely_with_the_same_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    survey = joint(model(num_frames=20), hold_anchors=True)
+    answers = []
+    for dense_from in (0.0, 1.0):
+        monkeypatch.setattr("rangesfm.ceres.covariance._DENSE_FROM", dense_from)
+        monkeypatch.setattr("rangesfm.ceres.covariance._BLOCKS_AT_ONCE", 7)
+        answers.append(
+            joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases)
+        )
+    assert answers[0].rig_from_world == pytest.approx(answers[1].rig_from_world, rel=1e-6, abs=1e-12)
+    assert answers[0].relative_scale_stddev == pytest.approx(answers[1].relative_scale_stddev, rel=1e-6)
+
+
+def test_a_block_that_nobody_named_is_an_error() -> None:
+    survey = joint(model(), hold_anchors=True)
+    with pytest.raises(ValueError, match="the problem has"):
+        joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors)
+
+
+def test_an_anchor_that_its_ranges_do_not_determine_is_named() -> None:
+    survey = joint(model(), hold_anchors=True)
+    lonely = np.array([1.0, 2.0, 3.0])
+    cost = range_cost(range_m=3.0, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=0.1)
+    add_residual_block(survey.adjuster, cost, None, [survey.poses[0], lonely, survey.biases[0]])
+    with pytest.raises(GeometryError, match="do not determine the problem's anchor number 0"):
+        joint_covariance(survey.problem, survey.reconstruction, anchors=[*survey.anchors, lonely], others=survey.biases)
+
+
+def test_surveys_err_as_the_covariance_says() -> None:
+    """Monte Carlo: the errors of solved surveys, squared and in variances, average 1."""
+    rng = np.random.default_rng(7)
+    times = np.arange(NUM_FRAMES, dtype=np.float64)
+    truth = orbit_path(1.4 * NUM_FRAMES).centers(times)
+    centers, anchors, scales = [], [], []
+    for seed in range(60):
+        noise = RANGE_STDDEV_M * rng.standard_normal((len(ANCHORS_M), NUM_FRAMES))
+        biases = BIAS_STDDEV_M * rng.standard_normal((len(ANCHORS_M), 1))
+        survey = joint(model(seed), hold_first=True, range_errors_m=noise + biases)
+        assert survey.adjuster.solve().is_solution_usable()
+        found = joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases)
+        now = np.array([-Rotation.from_quat(pose[:4]).inv().apply(pose[4:]) for pose in survey.poses])
+        errors = now - truth
+        centers.append([e @ np.linalg.solve(c, e) / 3 for e, c in zip(errors[1:], found.centers[1:], strict=True)])
+        anchor_errors = np.array(survey.anchors) - ANCHORS_M
+        anchors.append([e @ np.linalg.solve(c, e) / 3 for e, c in zip(anchor_errors, found.anchors, strict=True)])
+        middle = truth - truth.mean(axis=0)
+        scales.append((np.sum(errors * middle) / np.sum(middle**2) / found.relative_scale_stddev) ** 2)
+    # 60 runs: about 180 degrees of freedom of each center and anchor, 60 of the scale.
+    assert np.mean(centers) == pytest.approx(1.0, abs=0.2)
+    assert np.mean(anchors) == pytest.approx(1.0, abs=0.2)
+    assert np.mean(scales) == pytest.approx(1.0, abs=0.4)
+
+
+def test_a_motion_that_only_rounding_keeps_from_moving_nothing_is_none() -> None:
+    """A turn moves no anchor at the origin, if this is all that can move."""
+    counts = []
+    for at in (np.zeros(3), np.array([1e-17, 2e-17, -1e-17])):
+        survey = joint(model(), num_anchors=0)
+        for block in (*survey.poses, *(point.xyz for point in survey.reconstruction.points3D.values())):
+            survey.problem.set_parameter_block_constant(block)
+        cost = range_cost(range_m=3.0, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=0.1)
+        add_residual_block(survey.adjuster, cost, None, [survey.poses[0], at, survey.biases[0]])
+        survey.problem.set_parameter_block_constant(survey.biases[0])
+        found = joint_covariance(survey.problem, survey.reconstruction, anchors=[at], others=survey.biases[:1])
+        counts.append(found.num_free_directions)
+    assert counts[0] == counts[1]

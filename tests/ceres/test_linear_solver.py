@@ -1,0 +1,83 @@
+"""The choice between a direct and an iterative linear solver."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csr_array
+from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.path import sequence_path
+
+from rangesfm.ceres.linear_solver import inverse_is_affordable, max_num_images_direct, overlaps_in, overlaps_of
+from rangesfm.geometry.similarity import IDENTITY
+from rangesfm.options import CameraOptions, RefineOptions
+from rangesfm.refine.bundle_adjustment import bundle_adjustment
+
+
+def walk(num: int, num_observations: int) -> SyntheticModel:
+    times = np.arange(float(num))
+    path = sequence_path(float(num), seed=1)
+    return synthetic_model(
+        times,
+        path.centers(times),
+        path.world_from_cam(times),
+        num_observations=num_observations,
+        max_track_length=3,
+        metric_from_sfm=IDENTITY,
+    )
+
+
+def each_with_the_next(num: int, num_next: int, seed: int | None = None) -> csr_array:
+    """Overlaps along a path, of which the photos may come in any order."""
+    first = np.repeat(np.arange(num), num_next)
+    second = first + np.tile(np.arange(1, num_next + 1), num)
+    pairs = np.stack([first, second], axis=1)[second < num]
+    names: npt.NDArray[np.int64] = np.arange(num) if seed is None else np.random.default_rng(seed).permutation(num)
+    return overlaps_of(names[pairs], num)
+
+
+def test_along_a_path_the_direct_solver_takes_any_number_of_photos() -> None:
+    assert max_num_images_direct(each_with_the_next(3000, 20), 200) == 3000
+
+
+def test_the_order_of_the_photos_does_not_matter() -> None:
+    assert max_num_images_direct(each_with_the_next(3000, 20, seed=1), 200) == 3000
+
+
+def test_photos_that_all_see_the_same_keep_colmaps_limit() -> None:
+    assert max_num_images_direct(csr_array(np.ones((101, 101))), 100) == 100
+
+
+def test_photos_that_see_others_here_and_there_keep_colmaps_limit() -> None:
+    pairs = np.random.default_rng(1).integers(0, 1000, (10_000, 2))
+    assert max_num_images_direct(overlaps_of(pairs[pairs[:, 0] != pairs[:, 1]], 1000), 200) == 200
+
+
+def test_below_the_limit_nothing_changes() -> None:
+    assert max_num_images_direct(each_with_the_next(50, 3), 100) == 100
+
+
+def test_the_inverse_is_affordable_along_a_path_but_not_of_photos_that_all_see_the_same() -> None:
+    assert inverse_is_affordable(each_with_the_next(1000, 5), 500)
+    assert inverse_is_affordable(csr_array(np.ones((100, 100))), 100)
+    assert not inverse_is_affordable(csr_array(np.ones((101, 101))), 100)
+
+
+def test_photos_overlap_by_the_points_they_have_in_common() -> None:
+    model = walk(20, 60).reconstruction
+    points = [{point.point3D_id for point in model.image(i).get_observation_points2D()} for i in model.reg_image_ids()]
+    common = [[len(a & b) for b in points] for a in points]
+    np.testing.assert_array_equal(overlaps_in(model).toarray(), common)
+    assert np.count_nonzero(common) < 20**2
+
+
+def test_the_refinement_of_a_long_path_is_direct() -> None:
+    problem = bundle_adjustment(
+        walk(1010, 6).reconstruction,
+        CameraOptions(),
+        RefineOptions(),
+        fixed_frame_id=None,
+        max_num_iterations=1,
+        num_threads=1,
+    )
+    assert problem.adjuster.options.ceres.max_num_images_direct_sparse_cpu_solver == 1010

@@ -1,0 +1,190 @@
+"""COLMAP models are read as they are, and damaged ones refused before they do harm."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pycolmap
+import pytest
+from tests.fuzz.model_bytes import ModelFile, parse
+
+from rangesfm.colmap.model_files import read_model
+from rangesfm.errors import InputError
+
+if TYPE_CHECKING:
+    from tests.conftest import WalkedSurvey
+
+
+@pytest.fixture(scope="module")
+def rigs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model of two rigs of three cameras each, with points."""
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=2,
+        num_cameras_per_rig=3,
+        num_frames_per_rig=4,
+        num_points3D=30,
+        camera_model_id=pycolmap.CameraModelId.OPENCV,
+        camera_params=[1280.0, 1280.0, 512.0, 384.0, 0.05, 0.0, 0.0, 0.0],
+    )
+    folder = tmp_path_factory.mktemp("rigs")
+    pycolmap.synthesize_dataset(options).write_binary(folder)
+    return folder
+
+
+def test_binary_and_text_models_are_read_whole(rigs: Path, tmp_path: Path) -> None:
+    model = read_model(rigs)
+    assert (model.num_rigs(), model.num_cameras(), model.num_reg_images(), model.num_points3D()) == (2, 6, 24, 30)
+    model.write_text(tmp_path)
+    text = read_model(tmp_path)
+    for image_id, image in model.images.items():
+        np.testing.assert_allclose(text.image(image_id).projection_center(), image.projection_center(), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "rigs.bin", "frames.bin", "images.bin", "points3D.bin"])
+def test_file_cut_off_anywhere_is_refused(name: str, rigs: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(rigs, tmp_path / "model")
+    data = (folder / name).read_bytes()
+    for length in np.linspace(0, len(data) - 1, 40).astype(int):
+        (folder / name).write_bytes(data[:length])
+        with pytest.raises(InputError, match="is damaged or cut off") as caught:
+            read_model(folder)
+        assert caught.value.path == folder / name
+
+
+def test_folder_above_the_model_is_told_from_the_model(rigs: Path, tmp_path: Path) -> None:
+    shutil.copytree(rigs, tmp_path / "sparse" / "0")
+    with pytest.raises(InputError, match=r"not a COLMAP model, .*; is it .*sparse/0\?"):
+        read_model(tmp_path / "sparse")
+    with pytest.raises(InputError, match=r"files that COLMAP wrote$"):
+        read_model(tmp_path)
+
+
+def test_pose_that_is_not_finite_is_named(walked_survey: WalkedSurvey, tmp_path: Path) -> None:
+    model = read_model(walked_survey.folder / "sparse" / "0")
+    model.frame(3).rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.full(3, np.nan))
+    model.write(tmp_path)
+    with pytest.raises(InputError, match=r"the pose of frame_00003\.jpg is not finite"):
+        read_model(tmp_path)
+
+
+class TestContent:
+    """What COLMAP would take, and stumble over later: one thing wrong at a time."""
+
+    @pytest.fixture
+    def refused(self, rigs: Path, tmp_path: Path) -> Callable[..., str]:
+        """Change a file, and tell what the refusal says of it."""
+
+        def read(name: str, change: Callable[[ModelFile], object]) -> str:
+            folder = shutil.copytree(rigs, tmp_path / "model")
+            file = parse(name, (folder / name).read_bytes())
+            change(file)
+            (folder / name).write_bytes(file.pack())
+            with pytest.raises(InputError) as caught:
+                read_model(folder)
+            assert str(caught.value).isprintable()
+            assert caught.value.path in (folder, folder / name)
+            return str(caught.value)
+
+        return read
+
+    @pytest.mark.parametrize(
+        ("name", "field", "value", "said"),
+        [
+            ("cameras.bin", "param", math.nan, "the parameters of camera 1 are not those of a camera"),
+            ("cameras.bin", "param", 1e308, "the parameters of camera 1 are not those of a camera"),
+            ("cameras.bin", "param", 0.0, "the parameters of camera 1 are not those of a camera"),
+            ("cameras.bin", "width", 2**63, f"camera 1 has photos of {2**63} x 768 pixels"),
+            ("cameras.bin", "height", 0, "camera 1 has photos of 1024 x 0 pixels"),
+            ("frames.bin", "tx", 1e300, r"the pose of \S+\.png is not finite"),
+            ("frames.bin", "qw", 3.0, r"the pose of \S+\.png has a quaternion of length 3\.\d+, expected 1"),
+            ("images.bin", "name", b"", "image 1 has no name of printable text"),
+            ("images.bin", "name", b"\xff.jpg", "image 1 has no name of printable text"),
+            ("images.bin", "name", b"two\nlines.jpg", "image 1 has no name of printable text"),
+            ("images.bin", "y", 1e308, "a feature has no finite pixel coordinates"),
+            ("points3D.bin", "x", math.inf, r"points3D.bin: point \d+ is at \(inf, .*\), expected finite coordinates"),
+        ],
+    )
+    def test_that_is_no_number_or_name_is_named(
+        self, name: str, field: str, value: float | bytes, said: str, refused: Callable[..., str]
+    ) -> None:
+        def change(file: ModelFile) -> None:
+            fields = itertools.chain(file.records[0], *file.groups[0])
+            next(item for item in fields if item.name == field).value = value
+
+        assert re.search(f"{said}$", refused(name, change))
+
+    def test_that_has_a_name_twice_is_named(self, refused: Callable[..., str]) -> None:
+        def change(file: ModelFile) -> None:
+            names = [item for record in file.records for item in record if item.name == "name"]
+            names[1].value = names[0].value
+
+        assert re.search(r"2 images are called \S+\.png, expected each name once", refused("images.bin", change))
+
+    @pytest.mark.parametrize("num_left", [0, 1, -1])
+    def test_whose_tracks_are_shorter_than_the_features_say_is_refused(
+        self, num_left: int, refused: Callable[..., str]
+    ) -> None:
+        def change(file: ModelFile) -> None:
+            del file.groups[0][num_left:]
+            file.records[0][-1].value = len(file.groups[0])
+
+        assert "the tracks are not those of the features in images.bin" in refused("points3D.bin", change)
+
+    def test_whose_points_are_gone_is_refused(self, refused: Callable[..., str]) -> None:
+        def change(file: ModelFile) -> None:
+            del file.records[3], file.groups[3]
+            file.count -= 1
+
+        assert "the tracks are not those of the features in images.bin" in refused("points3D.bin", change)
+
+    def test_that_sees_a_point_twice_at_one_feature_is_refused(self, refused: Callable[..., str]) -> None:
+        def change(file: ModelFile) -> None:
+            file.groups[0][1] = file.groups[0][0]
+
+        assert "the tracks are not those of the features in images.bin" in refused("points3D.bin", change)
+
+    def test_whose_image_is_gone_is_refused(self, rigs: Path, tmp_path: Path) -> None:
+        model = read_model(rigs)
+        model.delete_all_points2D_and_points3D()
+        model.write_binary(tmp_path)
+        images = parse("images.bin", (tmp_path / "images.bin").read_bytes())
+        del images.records[3], images.groups[3]
+        images.count -= 1
+        (tmp_path / "images.bin").write_bytes(images.pack())
+        with pytest.raises(InputError, match=r"frame \d+ has a pose and no image, or one that is not there"):
+            read_model(tmp_path)
+
+    def test_without_tracks_and_features_is_read(self, rigs: Path, tmp_path: Path) -> None:
+        model = read_model(rigs)
+        model.delete_all_points2D_and_points3D()
+        model.add_point3D_with_id(5, pycolmap.Point3D())
+        for write in (model.write_binary, model.write_text):
+            folder = tmp_path / write.__name__
+            folder.mkdir()
+            write(folder)
+            assert read_model(folder).num_points3D() == 1
+
+    def test_of_a_text_model_is_looked_at_too(self, rigs: Path, tmp_path: Path) -> None:
+        read_model(rigs).write_text(tmp_path)
+        text = (tmp_path / "points3D.txt").read_text().splitlines(keepends=True)
+        (tmp_path / "points3D.txt").write_text("".join(text[:-1]))
+        with pytest.raises(InputError, match="the tracks are not those of the features"):
+            read_model(tmp_path)
+
+    def test_with_quaternions_of_few_digits_has_rotations_all_the_same(self, rigs: Path, tmp_path: Path) -> None:
+        read_model(rigs).write_binary(tmp_path)
+        frames = parse("frames.bin", (tmp_path / "frames.bin").read_bytes())
+        for record in frames.records:
+            for item in record[2:6]:
+                item.value = round(float(item.value), 3)
+        (tmp_path / "frames.bin").write_bytes(frames.pack())
+        for frame in read_model(tmp_path).frames.values():
+            assert frame.rig_from_world is not None
+            assert np.linalg.norm(frame.rig_from_world.params[:4]) == pytest.approx(1, abs=1e-15)

@@ -1,0 +1,222 @@
+"""Tables are read whole or refused with the line that is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from rangesfm.errors import InputError
+from rangesfm.files.tables import Table, header_names, read_table, read_text
+
+
+def write(folder: Path, content: str | bytes) -> Path:
+    path = folder / "table.csv"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+def refusal(path: Path, required: tuple[str, ...] = ("a", "b")) -> InputError:
+    with pytest.raises(InputError) as caught:
+        np.column_stack(list(map(read_table(path, required).numbers, required)))
+    assert "\n" not in str(caught.value)
+    return caught.value
+
+
+def test_columns_are_found_by_name_whatever_their_order(tmp_path: Path) -> None:
+    table = read_table(write(tmp_path, "b,other,a\n2,x,1\n4,y,3\n"), ["a", "b"])
+    np.testing.assert_array_equal(table.numbers("a"), [1, 3])
+    np.testing.assert_array_equal(table.numbers("b"), [2, 4])
+    assert table.columns == ("b", "other", "a")
+    assert len(table) == 2
+
+
+def test_line_numbers_count_comments_and_blank_lines(tmp_path: Path) -> None:
+    table = read_table(write(tmp_path, "# made by hand\n\na,b\n1,2\n  # pause\n   \n3,4\n"), ["a", "b"])
+    np.testing.assert_array_equal(table.line, [4, 7])
+    np.testing.assert_array_equal(table.numbers("a"), [1, 3])
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"\xef\xbb\xbfa,b\n1,2\n3,4\n",
+        b"a,b\r\n1,2\r\n3,4\r\n",
+        b"a,b\r1,2\r3,4",
+        b" a , b \n 1 ,\t2\n3,4",
+        b'"a","b"\n"1","2"\n3,4\n',
+        "a,b\n1,2\n3,4\n".encode("utf-16"),
+    ],
+    ids=["byte order mark", "CRLF", "CR and no last line end", "blanks around cells", "quotes", "UTF-16"],
+)
+def test_the_same_table_in_another_dress(tmp_path: Path, content: bytes) -> None:
+    table = read_table(write(tmp_path, content), ["a", "b"])
+    np.testing.assert_array_equal(table.numbers("a"), [1, 3])
+    np.testing.assert_array_equal(table.numbers("b"), [2, 4])
+
+
+def test_quoted_cells_may_hold_the_separator(tmp_path: Path) -> None:
+    table = read_table(write(tmp_path, 'a,b\n"x, y",2\n'), ["a", "b"])
+    assert table.text("a") == ["x, y"]
+
+
+@pytest.mark.parametrize("content", ["a;b\n1;2\n", "a\tb\n1\t2\n", "a   b\n 1  2 \n"])
+def test_separator_is_told_from_the_header_row(tmp_path: Path, content: str) -> None:
+    table = read_table(write(tmp_path, content), ["a", "b"], separator=None)
+    np.testing.assert_array_equal(table.numbers("b"), [2])
+
+
+def test_aliases_rename_columns_unless_the_real_name_is_there(tmp_path: Path) -> None:
+    table = read_table(write(tmp_path, ",x\n7,1\n"), ["id", "x_m"], aliases={"": "id", "x": "x_m"})
+    assert table.text("id") == ["7"]
+    np.testing.assert_array_equal(table.numbers("x_m"), [1])
+
+
+def test_optional_columns_may_be_missing_and_empty(tmp_path: Path) -> None:
+    table = read_table(write(tmp_path, "a,b,c\n1,,\n2,5,z\n"), ["a"], ["b", "c", "d"])
+    np.testing.assert_array_equal(table.numbers("b", empty=np.nan), [np.nan, 5])
+    assert table.text("c", empty="none") == ["none", "z"]
+    assert "d" not in table
+
+
+def test_a_wrong_cell_far_down_is_named_with_its_line(tmp_path: Path) -> None:
+    lines = ["a,b"] + ["1,2"] * 30_000
+    lines[25_000] = "1,oops"
+    error = refusal(write(tmp_path, "\n".join(lines)))
+    assert error.line == 25_001
+    assert "b is 'oops', expected a number" in str(error)
+
+
+@pytest.mark.parametrize("cell", ["nan", "inf", "-Infinity", "1e999"])
+def test_numbers_are_finite(tmp_path: Path, cell: str) -> None:
+    error = refusal(write(tmp_path, f"a,b\n1,2\n1,{cell}\n"))
+    assert error.line == 3
+    assert f"b is {cell}" in str(error)
+
+
+def test_pythons_own_number_spelling_is_not_a_number(tmp_path: Path) -> None:
+    assert "'1_000'" in str(refusal(write(tmp_path, "a,b\n1,1_000\n")))
+
+
+def test_empty_cell_is_refused(tmp_path: Path) -> None:
+    error = refusal(write(tmp_path, "a,b\n1, \n"))
+    assert "b is empty" in str(error)
+
+
+@pytest.mark.parametrize(("row", "num"), [("1", "1 cell,"), ("1,2,3", "3 cells,")])
+def test_rows_have_as_many_cells_as_the_header(tmp_path: Path, row: str, num: str) -> None:
+    error = refusal(write(tmp_path, f"a,b\n1,2\n\n{row}\n1,2\n"))
+    assert error.line == 4
+    assert f"has {num} the header row has 2" in str(error)
+
+
+def test_missing_column_names_what_was_found_and_expected(tmp_path: Path) -> None:
+    error = refusal(write(tmp_path, "# c\na,c\n1,2\n"))
+    assert error.line == 2
+    assert "no column b; found a, c; expected a, b" in str(error)
+
+
+def test_column_that_stands_twice_is_refused(tmp_path: Path) -> None:
+    assert "2 columns are a" in str(refusal(write(tmp_path, "a,b,a\n1,2,3\n")))
+
+
+def test_table_without_header_row_is_refused(tmp_path: Path) -> None:
+    error = refusal(write(tmp_path, "1,2\n3,4\n"))
+    assert error.line == 1
+    assert "no header row" in str(error)
+
+
+@pytest.mark.parametrize("content", [b"", b"\n\n", b"# only a comment\n", b"\xef\xbb\xbf"])
+def test_empty_file_is_refused(tmp_path: Path, content: bytes) -> None:
+    assert "empty" in str(refusal(write(tmp_path, content)))
+
+
+def test_missing_file_and_folder_are_refused(tmp_path: Path) -> None:
+    assert "no such file" in str(refusal(tmp_path / "none.csv"))
+    assert "is a folder" in str(refusal(tmp_path))
+
+
+def test_bytes_that_are_no_text_are_named_with_their_line(tmp_path: Path) -> None:
+    error = refusal(write(tmp_path, b"a,b\n1,2\n1,\xff\n"))
+    assert error.line == 3
+    assert "0xff" in str(error)
+
+
+def test_quote_that_never_ends_is_refused(tmp_path: Path) -> None:
+    assert refusal(write(tmp_path, 'a,b\n1,2\n"1,2\n3,4\n')).line == 3
+
+
+def test_message_of_control_characters_stays_on_one_line(tmp_path: Path) -> None:
+    assert str(refusal(write(tmp_path, "a,b\n1,\x1b[2J\x0bx\n"))).isprintable()
+
+
+def test_header_names_of_no_table_at_all_are_empty() -> None:
+    assert header_names("") == []
+    assert header_names('"unfinished') == []
+
+
+def test_text_of_any_line_ending_is_the_same(tmp_path: Path) -> None:
+    assert read_text(write(tmp_path, b"\xef\xbb\xbfa\r\nb\rc\n")) == "a\nb\nc\n"
+
+
+class TestFastWay:
+    """Plain tables are read all at once; a comment, which is nothing to a table, leads around that."""
+
+    NUMBERS = (st.floats() | st.integers() | st.decimals(-1e7, 1e7, places=6)).map(str)
+    CELLS = NUMBERS | st.text("019.-+eE_ nainfx\u0661\u00e9\t\x0b\x85\0", max_size=5)
+
+    def said(self, table: Callable[[], Table]) -> list[object]:
+        """All that can be had of columns a (numbers) and b (text), or the errors."""
+        asked: list[Callable[[Table], object]] = [
+            lambda table: table.numbers("a").tobytes(),
+            lambda table: table.numbers("a", empty=7.0).tobytes(),
+            lambda table: table.text("a"),
+            lambda table: table.text("b", empty="none"),
+            lambda table: (table.categories("b").names, table.categories("b").index.tolist()),
+            lambda table: table.categories("a", empty="none").names,
+            lambda table: str(table.error(0, "a", "something else")),
+            lambda table: table.line.tolist(),
+        ]
+        answers: list[object] = []
+        for ask in asked:
+            try:
+                answers.append(ask(table()))
+            except InputError as error:
+                answers.append(str(error))
+        return answers
+
+    @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+    @given(st.lists(st.lists(CELLS, min_size=3, max_size=3), min_size=1), st.sampled_from(",;\t"), st.data())
+    def test_is_that_of_all_tables(
+        self, tmp_path: Path, rows: list[list[str]], separator: str, data: st.DataObject
+    ) -> None:
+        if data.draw(st.integers(0, 9)) == 0:
+            rows[data.draw(st.integers(0, len(rows) - 1))].pop()
+        text = "\n".join(separator.join(row) for row in [["a", "other", "b"], *rows])
+        read = partial(read_table, required=["a", "b"], text=["b"], separator=separator)
+        fast = self.said(lambda: read(write(tmp_path, text)))
+        assert fast == self.said(lambda: read(write(tmp_path, text + "\n#")))
+
+    def test_it_is_taken(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        path = write(tmp_path, "a,other,b\r\n-1.5,x,7\r\n2e3,,8\r\n")
+        monkeypatch.setattr("rangesfm.files.tables._table_of_texts", lambda *_: pytest.fail("it is not"))
+        table = read_table(path, ["a", "b"], text=["b"])
+        np.testing.assert_array_equal(table.numbers("a"), [-1.5, 2000])
+        assert table.text("b") == ["7", "8"]
+
+    def test_a_name_does_not_make_a_packed_file(self, tmp_path: Path) -> None:
+        path = write(tmp_path, "a,b\n1,2\n").rename(tmp_path / "table.gz")
+        assert read_table(path, ["a"]).numbers("a").tolist() == [1.0]
+
+
+@pytest.mark.parametrize("num_names", [1, 7, 400])
+def test_categories_are_the_texts_told_apart(num_names: int, tmp_path: Path) -> None:
+    texts = [f"n{k}" for k in np.random.default_rng(num_names).integers(0, num_names, 3000)]
+    found = read_table(write(tmp_path, "a,b\n" + "".join(f"{text} ,1\n" for text in texts)), ["a"]).categories("a")
+    assert [found.names[k] for k in found.index] == texts
+    assert list(found.names) == list(dict.fromkeys(texts))

@@ -1,0 +1,248 @@
+"""Models without a common photo, joined through anchors, as the truth has them; and what does not hold them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from tests.known import known
+from tests.simulated.model import random_similarity, synthetic_model
+from tests.simulated.path import loop_path
+from tests.simulated.ranges import simulate_ranges_at
+
+from rangesfm.cli import main
+from rangesfm.colmap.merge import without_photos
+from rangesfm.colmap.model_files import read_model
+from rangesfm.colmap.transform import rescale
+from rangesfm.demo.path import CameraPath
+from rangesfm.demo.ranges import Radio
+from rangesfm.errors import GeometryError
+from rangesfm.geometry.similarity import align_points
+from rangesfm.geometry.trajectory import trajectory_from_reconstruction
+from rangesfm.join.models import JoinedModels, PathOfModel, Ranging, join_models
+from rangesfm.options import RangeModelOptions, ScaleOptions
+from rangesfm.progress import SilentProgress
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.association import associate
+from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.readers.canonical import write_ranges_csv
+from rangesfm.survey.settings import Survey
+from rangesfm.vision.reconstruct import ReconstructionSummary
+from rangesfm.workflows.run import run_survey, scale_model
+
+Array = npt.NDArray[np.float64]
+
+TAG_IN_CAM_M = (0.03, -0.12, -0.05)
+ANCHORS_M = {"A1": (-6.0, -5.0, 0.5), "A2": (6.0, -5.0, 2.5), "A3": (6.0, 5.0, 0.7), "A4": (-6.0, 5.0, 2.2)}
+NUM_PHOTOS = 28
+HALF = NUM_PHOTOS // 2
+
+
+@dataclass(frozen=True)
+class Halves:
+    """One walk, mapped in two halves that know nothing of each other.
+
+    Attributes:
+        parts: each in a world and a unit of its own.
+        log: ranges of both.
+        centers_m: (n, 3) and first_camera: world_from_cam of the first, the truth.
+    """
+
+    parts: tuple[PathOfModel, ...]
+    log: RangeLog
+    centers_m: Array
+    first_camera: Array
+
+    def with_ranges(self, wanted: npt.NDArray[np.bool_]) -> Halves:
+        """The same where the other ranges never arrived."""
+        log = self.log.subset(wanted)
+        parts = (replace(p, observations=associate(log, p.trajectory, TAG_IN_CAM_M)) for p in self.parts)
+        return replace(self, log=log, parts=tuple(parts))
+
+    def join(self, frame: str, known: tuple[str, ...] = tuple(ANCHORS_M)) -> JoinedModels:
+        return join_models(self.parts, self.ranging(frame, known))
+
+    def ranging(self, frame: str, known: tuple[str, ...]) -> Ranging:
+        positions = {name: np.array(ANCHORS_M[name]) for name in known}
+        if frame == "first_camera":
+            positions = {name: (at - self.centers_m[0]) @ self.first_camera for name, at in positions.items()}
+        anchors = [Anchor(name, None if frame == "unknown" else positions.get(name)) for name in self.log.anchor_ids]
+        options = ScaleOptions(num_bootstrap=0, max_relative_stddev=0.2)
+        return Ranging(anchors, frame, options, RangeModelOptions(), None, 0)
+
+    def off_m(self, centers: Array, *, with_scale: bool = True) -> float:
+        """How far a photo is from the truth, at most, after the best similarity (or rigid motion) of all."""
+        aligned = align_points(centers, self.centers_m, with_scale=with_scale).apply(centers)
+        return float(np.linalg.norm(aligned - self.centers_m, axis=1).max())
+
+    def write(self, folder: Path) -> Survey:
+        """The log and the times of the photos, and a survey that needs nothing more than photos or a model."""
+        write_ranges_csv(self.log, folder / "uwb.csv")
+        rows = ["image_name,timestamp_s\n"]
+        for path in (part.trajectory for part in self.parts):
+            assert path.timestamps_s is not None
+            rows += [f"{name},{time!r}\n" for name, time in zip(path.image_names, path.timestamps_s.tolist())]
+        (folder / "images.csv").write_text("".join(rows))
+        return Survey().changed(
+            {
+                "images.times": folder / "images.csv",
+                "ranges.path": folder / "uwb.csv",
+                "ranges.time_offset": 0.0,
+                "anchors.frame": "unknown",
+                "tag.tag_in_cam_m": TAG_IN_CAM_M,
+                "scale.num_bootstrap": 0,
+                "scale.max_relative_stddev": 0.2,
+                "refine.enabled": False,
+                "export.formats": (),
+                "report.enabled": False,
+                "output.path": folder / "out",
+            }
+        )
+
+
+def walk() -> Halves:
+    """Up and down along a loop, ranges to four anchors at each photo."""
+    level = loop_path(NUM_PHOTOS + 2.0, start_s=99.0, seed=3)
+    knots = np.linspace(99.0, 101.0 + NUM_PHOTOS, NUM_PHOTOS + 3)
+    centers = level.centers(knots) + np.outer(0.8 * np.sin(0.9 * knots), [0, 0, 1])
+    path = CameraPath.through(knots, centers, level.world_from_cam(knots))
+    times = np.arange(100.0, 100.0 + NUM_PHOTOS)
+    made = synthetic_model(
+        times, path.centers(times), path.world_from_cam(times), num_observations=30, max_track_length=8, seed=1
+    )
+    at = np.repeat(times, 2)
+    log = simulate_ranges_at(at, path.centers(at), path.world_from_cam(at), ANCHORS_M, TAG_IN_CAM_M, Radio(), 5).log
+    names, rng, parts = list(made.timestamps_s), np.random.default_rng(0), []
+    for number, others in enumerate((names[HALF:], names[:HALF])):
+        model = rescale(without_photos(made.reconstruction, others), random_similarity(rng))
+        trajectory = trajectory_from_reconstruction(model, made.timestamps_s)
+        parts.append(PathOfModel(f"sparse/{number}", model, trajectory, associate(log, trajectory, TAG_IN_CAM_M)))
+    return Halves(tuple(parts), log, made.centers_m, made.world_from_cam[0])
+
+
+@pytest.fixture(scope="module")
+def exact() -> Halves:
+    return walk()
+
+
+def of_half(halves: Halves, number: int) -> npt.NDArray[np.bool_]:
+    """(n,) ranges taken in it."""
+    assert halves.log.timestamp_s is not None
+    in_second: npt.NDArray[np.bool_] = halves.log.timestamp_s >= 99.5 + HALF
+    return in_second if number == 1 else ~in_second
+
+
+def test_halves_of_a_walk_are_where_they_were_if_the_anchors_are_known(exact: Halves) -> None:
+    """In the frame of the first photo, which for the second half is a site's."""
+    joined = exact.join("first_camera")
+    assert exact.off_m(joined.path.trajectory.centers) < 1e-6
+    assert [verdict.joined_from_sfm is not None for verdict in joined.verdicts] == [True, True]
+    own = [verdict.estimate.value for verdict in joined.verdicts if verdict.estimate is not None]
+    assert own[1] != pytest.approx(own[0], rel=0.1)
+    assert joined.path.sfm.num_reg_images() == NUM_PHOTOS
+    assert joined.path.sfm.is_valid()
+    observations = joined.path.observations
+    assert observations.has_place.all()
+    predicted = observations.centers[observations.before == HALF + 3]
+    assert predicted == pytest.approx(np.tile(joined.path.trajectory.centers[HALF + 3], (len(predicted), 1)), abs=1e-9)
+
+
+def test_a_half_that_shares_too_few_anchors_is_left_out_and_nothing_invented(exact: Halves) -> None:
+    index = exact.log.anchor_ids.index("A1")
+    halves = exact.with_ranges(of_half(exact, 0) | (exact.log.anchor_index == index))
+    joined = halves.join("site", ("A1",))
+    first, second = joined.verdicts
+    assert (first.joined_from_sfm is not None, first.reason) == (True, "")
+    assert second.joined_from_sfm is None
+    assert "every turn about anchor A1 fits" in second.reason
+    assert joined.path.sfm is halves.parts[0].sfm
+
+
+def test_a_half_without_ranges_is_left_out_and_one_that_others_join_must_have_some(exact: Halves) -> None:
+    num = len(exact.log) // 2
+    second = exact.with_ranges(of_half(exact, 0)).join("unknown").verdicts[1]
+    assert second.estimate is None
+    assert f"0 of {num} ranges lie on the path" in second.reason
+    with pytest.raises(GeometryError, match=f"0 of {num} ranges lie on the path"):
+        exact.with_ranges(of_half(exact, 1)).join("unknown")
+
+
+def test_a_run_joins_what_the_mapper_left_in_pieces(
+    exact: Halves, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = [name for part in exact.parts for name in part.trajectory.image_names]
+    (tmp_path / "photos").mkdir()
+    for name in names:
+        (tmp_path / "photos" / name).touch()
+    models = tuple(part.sfm for part in exact.parts)
+
+    def reconstruct(*_: Any, **__: Any) -> ReconstructionSummary:
+        return ReconstructionSummary(models, len(names), HALF, {}, tmp_path / "mapper.log")
+
+    monkeypatch.setattr("rangesfm.workflows.photos.reconstruct", reconstruct)
+    survey = exact.write(tmp_path).changed({"images.path": tmp_path / "photos"})
+    result = run_survey(survey, progress=SilentProgress()).summary
+    path = trajectory_from_reconstruction(read_model(tmp_path / "out" / "sparse_scaled" / "0"))
+    assert path.image_names == tuple(names)
+    assert exact.off_m(path.centers, with_scale=False) < 1e-6
+    assert [(model.name, model.joined, model.num_images) for model in result.models] == [
+        ("sparse/0", True, HALF),
+        ("sparse/1", True, HALF),
+    ]
+    for part, model, first in zip(exact.parts, result.models, (0, HALF), strict=True):
+        own, motion = model.scale, known(model.metric_from_sfm)
+        low, high = known(own.interval_95)
+        assert low < known(own.value) < high
+        assert own.verdict in ("good", "doubtful")
+        at = motion.similarity.apply(part.trajectory.centers[0])
+        assert at == pytest.approx(path.centers[first], abs=1e-6)
+    assert result.metric_from_sfm.scale == pytest.approx(known(result.models[0].metric_from_sfm).scale)
+
+
+@pytest.fixture(scope="module")
+def finished(exact: Halves, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Both halves as surveys of their own."""
+    folder = tmp_path_factory.mktemp("surveys")
+    for part, day in zip(exact.parts, ("monday", "tuesday"), strict=True):
+        (folder / day).mkdir()
+        part.sfm.write(folder / day)
+        survey = exact.write(folder).changed({"output.path": folder / day / "out"})
+        survey = survey.model_copy(update={"model_path": folder / day})
+        scale_model(survey, progress=SilentProgress())
+    return folder
+
+
+def test_surveys_of_two_days_become_one_map(
+    exact: Halves, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(finished)
+    assert main(["join", "monday/out", "tuesday/out", "--output_path", str(tmp_path / "site")]) == 0
+    assert "verdict:" in capsys.readouterr().out
+    result = json.loads((tmp_path / "site" / "result.json").read_text())
+    assert [(model["name"], model["joined"]) for model in result["models"]] == [("monday", True), ("tuesday", True)]
+    path = trajectory_from_reconstruction(read_model(tmp_path / "site" / "sparse_metric" / "0"))
+    assert exact.off_m(path.centers, with_scale=False) < 1e-4
+    assert result["ranges"]["num_used"] == len(exact.log)
+    assert (tmp_path / "site" / "report.html").is_file()
+
+
+def test_a_survey_that_nothing_holds_is_refused_in_one_line_and_leaves_nothing(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(finished / "tuesday" / "out", tmp_path / "tuesday")
+    header, *rows = (tmp_path / "tuesday" / "ranges.csv").read_text().splitlines(keepends=True)
+    column = header.split(",").index("anchor_id")
+    kept = (row for row in rows if row.split(",")[column] in ("A1", "A2"))
+    (tmp_path / "tuesday" / "ranges.csv").write_text(header + "".join(kept))
+    monkeypatch.chdir(finished)
+    assert main(["join", "monday/out", str(tmp_path / "tuesday"), "--output_path", str(tmp_path / "site")]) == 3
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith("rangesfm: error: nothing can be joined to out: tuesday: ")
+    assert "every turn about the line through A1 and A2 fits" in line
+    assert not (tmp_path / "site").exists()

@@ -1,0 +1,43 @@
+"""Errors of ranges as if a scale stage had found them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.options import RangeModelOptions
+from rangesfm.ranging.errors.range_errors import RangeErrors
+from rangesfm.ranging.observations import RangeObservations
+
+Array = npt.NDArray[np.float64]
+_BLOCK_S = 10.0
+
+
+def known_errors(
+    observations: RangeObservations,
+    stddev_m: float | Array,
+    *,
+    is_estimated: bool = False,
+    inflation: float = 1.0,
+    common_bias_stddev_m: float = RangeModelOptions().common_bias_stddev_m,
+) -> RangeErrors:
+    """Of all ranges of the log.
+
+    Args:
+        stddev_m: of every range, or (n,) of each: all of it, also what short ranges share.
+        is_estimated: whether the refinement is to estimate the noise anew.
+    """
+    rows, num = observations.placed_rows, len(observations.log)
+    options = RangeModelOptions(common_bias_stddev_m=common_bias_stddev_m)
+    begun = RangeErrors.begin(observations, rows, options, _BLOCK_S)
+    stddev = np.broadcast_to(stddev_m, num)[rows]
+    noise = np.sqrt(np.maximum(stddev**2 - begun.shared_m**2, 1e-6))
+    found = replace(
+        begun,
+        stddev_m=stddev,
+        given_m=np.full(len(rows), np.nan) if is_estimated else noise,
+        inflation=inflation,
+    )
+    return found.spread(rows, num)

@@ -1,0 +1,84 @@
+"""Processes that speak, grow, crash and do not want to end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import psutil
+import pytest
+
+from rangesfm.processes.supervision import Ended, supervise
+
+
+def run(
+    code: str,
+    listen: Callable[[dict[str, Any]], None] = lambda _: None,
+    *,
+    given: bytes = b"given",
+    memory_limit_bytes: int = 1 << 40,
+    is_stopped: Callable[[], bool] = lambda: False,
+) -> Ended:
+    code = "import json, os, signal, sys, time\nsay = lambda **m: print(json.dumps(m), flush=True)\n" + code
+    return supervise(
+        [sys.executable, "-S", "-c", code],
+        given,
+        listen,
+        environment=os.environ,
+        memory_limit_bytes=memory_limit_bytes,
+        is_stopped=is_stopped,
+    )
+
+
+def test_messages_come_one_by_one_and_the_last_is_the_ending() -> None:
+    heard: list[dict[str, Any]] = []
+    ended = run("say(given=sys.stdin.buffer.read(5).decode())\nsay(n=2)", heard.append)
+    assert heard == [{"given": "given"}, {"n": 2}]
+    assert ended == Ended({"n": 2}, None, None, False, "")
+
+
+def test_one_that_needs_too_much_memory_is_killed() -> None:
+    ended = run("say(n=1)\ndata = b'x' * 200_000_000\ntime.sleep(60)", memory_limit_bytes=100_000_000)
+    assert ended.needed_bytes is not None
+    assert ended.needed_bytes > 100_000_000
+    assert ended.last == {"n": 1}
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGABRT])
+def test_a_crash_is_named(number: signal.Signals) -> None:
+    trace = "why it crashed\\n*** stack trace ***\\n    @ 0x5 f()"
+    code = f"print('{trace}', file=sys.stderr)\nos.kill(os.getpid(), {number.value})"
+    ended = run(code)
+    assert (ended.signal, ended.errors, ended.last) == (number, "why it crashed", None)
+
+
+def test_half_a_message_counts_for_nothing() -> None:
+    ended = run("say(n=1)\nprint('{\"n\": ', end='', flush=True)\nos.kill(os.getpid(), 9)")
+    assert ended.last == {"n": 1}
+
+
+def test_what_it_said_counts_also_if_it_died_before_it_heard() -> None:
+    ended = run("say(n=1)\nos.kill(os.getpid(), 9)", given=b"more than a pipe holds" * 100_000)
+    assert (ended.last, ended.signal) == ({"n": 1}, signal.SIGKILL)
+
+
+def test_one_that_is_stopped_may_tidy_up() -> None:
+    code = "try:\n    say(pid=os.getpid())\n    time.sleep(60)\nexcept KeyboardInterrupt:\n    say(tidy=True)"
+    heard: list[dict[str, Any]] = []
+    ended = run(code, heard.append, is_stopped=lambda: bool(heard))
+    assert (ended.last, ended.stopped) == ({"tidy": True}, True)
+
+
+def test_nothing_is_left_running_where_the_listener_fails() -> None:
+    heard: list[dict[str, Any]] = []
+
+    def fail(message: dict[str, Any]) -> None:
+        heard.append(message)
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        run("say(pid=os.getpid())\ntime.sleep(60)", fail)
+    assert not psutil.pid_exists(heard[0]["pid"])

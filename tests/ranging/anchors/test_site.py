@@ -1,0 +1,48 @@
+"""Anchors in large coordinates are worked with near their middle."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rangesfm.errors import InputError
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.site import local_site
+
+FAR = np.array([2_600_000.25, 1_200_000.5, 400.0])
+
+
+def anchors_at(*positions: list[float] | None) -> tuple[Anchor, ...]:
+    return tuple(
+        Anchor(str(k), None if position is None else np.array(position)) for k, position in enumerate(positions)
+    )
+
+
+def test_far_anchors_are_moved_by_whole_metres_and_unknown_ones_stay_unknown() -> None:
+    site, anchors = local_site(anchors_at([*FAR], None, [*(FAR + np.array([10.0, 0, 2]))]), "site", None)
+    np.testing.assert_array_equal(site.offset_m, [2_600_005, 1_200_000, 401])
+    assert anchors[1].position_m is None
+    assert anchors[2].position_m is not None
+    np.testing.assert_array_equal(anchors[2].position_m + site.offset_m, FAR + np.array([10.0, 0, 2]))
+
+
+@pytest.mark.parametrize("frame", ["site", "first_camera"])
+def test_near_anchors_and_those_of_other_frames_stay(frame: str) -> None:
+    at = [10.0, 20.0, 3.0] if frame == "site" else [*FAR]
+    site, anchors = local_site(anchors_at(at), frame, None)
+    assert not site.offset_m.any()
+    assert anchors[0].position_m is not None
+    np.testing.assert_array_equal(anchors[0].position_m, at)
+
+
+@pytest.mark.parametrize(
+    ("frame", "position", "said"),
+    [
+        ("first_camera", [1.0, 2.0, 3.0], "the frame is 'first_camera'"),
+        ("site", None, "no anchor has a position"),
+        ("site", [1.2e6, 2.6e6, 0.0], "lie outside of where EPSG:2056 holds"),
+    ],
+)
+def test_a_coordinate_system_needs_positions_on_the_earth(frame: str, position: list[float] | None, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        local_site(anchors_at(position), frame, "EPSG:2056")

@@ -1,0 +1,289 @@
+"""An anchor is found from ranges at known positions, with its mirror image, its error, or the reason why not."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.stats import chi2
+from tests.simulated.path import loop_path
+from tests.studies import anchor_initialization
+
+from rangesfm.errors import GeometryError
+from rangesfm.ranging.anchors.anchor_survey import trilaterate_anchors
+from rangesfm.ranging.anchors.trilateration import Trilateration, TrilaterationOptions, trilaterate
+from rangesfm.ranging.log import RangeLog
+
+Array = npt.NDArray[np.float64]
+
+ANCHOR_M = np.array([6.0, -4.0, 3.5])
+KNOWN_BIAS = TrilaterationOptions(range_bias_stddev_m=0.0)
+
+
+def flight(num: int = 100) -> Array:
+    """(n, 3) a loop of 8 x 6 m that rises and falls."""
+    return loop_path(60.0, height_amplitude_m=1.5, seed=1).centers(np.linspace(0.0, 60.0, num))
+
+
+def flat(num: int = 100) -> Array:
+    """(n, 3) the same loop at a height of 1 m."""
+    return flight(num) * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
+
+
+def distances(positions: Array, anchor: Array = ANCHOR_M) -> Array:
+    return np.asarray(np.linalg.norm(positions - anchor, axis=1))
+
+
+def noise(num: int, stddev: float = 0.1, seed: int = 0) -> Array:
+    return stddev * np.random.default_rng(seed).standard_normal(num)
+
+
+def squared_error(found: Trilateration, anchor: Array = ANCHOR_M) -> float:
+    """Over the covariance: 3 on average, if that is right."""
+    off = found.position_m - anchor
+    return float(off @ np.linalg.solve(found.covariance_m2, off))
+
+
+class TestWithoutNoise:
+    @pytest.mark.parametrize("num", [5, 20, 100, 1000])
+    @pytest.mark.parametrize("anchor", [(6.0, -4.0, 3.5), (0.2, 0.1, 1.0), (60.0, 20.0, -5.0), (-1.0, 2.0, 9.0)])
+    def test_the_anchor_is_exact(self, anchor: tuple[float, float, float], num: int) -> None:
+        positions = flight(num)
+        found = trilaterate(
+            positions, distances(positions, np.array(anchor)), options=TrilaterationOptions(max_position_stddev_m=20.0)
+        )
+        np.testing.assert_allclose(found.position_m, anchor, atol=1e-6)
+        assert found.range_bias_m == pytest.approx(0.0, abs=1e-6)
+        assert found.mirror_position_m is None
+
+    def test_it_moves_with_the_frame(self) -> None:
+        far = np.array([4.1e5, 5.6e6, 300.0])
+        found = trilaterate(flight() + far, distances(flight()), options=KNOWN_BIAS)
+        np.testing.assert_allclose(found.position_m, ANCHOR_M + far, atol=1e-6)
+
+    def test_a_known_bias_is_taken_off(self) -> None:
+        options = TrilaterationOptions(range_bias_m=0.4, range_bias_stddev_m=0.0)
+        found = trilaterate(flight(), distances(flight()) + 0.4, options=options)
+        np.testing.assert_allclose(found.position_m, ANCHOR_M, atol=1e-6)
+        assert found.range_bias_m == pytest.approx(0.4)
+        assert found.range_bias_stddev_m == 0.0
+
+    def test_an_unknown_bias_is_found_as_far_as_its_prior_lets_it(self) -> None:
+        options = TrilaterationOptions(range_bias_stddev_m=10.0, range_stddev_m=0.01)
+        found = trilaterate(flight(), distances(flight()) + 0.4, options=options)
+        np.testing.assert_allclose(found.position_m, ANCHOR_M, atol=1e-3)
+        assert found.range_bias_m == pytest.approx(0.4, abs=1e-3)
+
+
+class TestOutliers:
+    @pytest.mark.parametrize("share", [0.2, 0.4, 0.5])
+    def test_of_metres_do_not_move_the_anchor(self, share: float) -> None:
+        positions, rng = flight(), np.random.default_rng(3)
+        is_outlier = np.arange(100) < 100 * share
+        wrong = np.where(is_outlier, rng.uniform(1.0, 6.0, 100), noise(100, 0.05))
+        order = rng.permutation(100)
+        found = trilaterate(positions, distances(positions) + wrong[order], options=KNOWN_BIAS)
+        assert np.linalg.norm(found.position_m - ANCHOR_M) < 0.1
+        assert np.all(found.weights[is_outlier[order]] < 0.1)
+        assert found.noise_stddev_m == pytest.approx(0.05, rel=0.4)
+
+    def test_the_answer_is_the_same_every_time(self) -> None:
+        ranges = distances(flight()) + noise(100)
+        first, second = (trilaterate(flight(), ranges) for _ in range(2))
+        np.testing.assert_array_equal(first.position_m, second.position_m)
+        np.testing.assert_array_equal(first.covariance_m2, second.covariance_m2)
+
+
+class TestPositionsInAPlane:
+    def test_give_both_places(self) -> None:
+        found = trilaterate(flat(), distances(flat()) + noise(100, 0.02))
+        assert found.mirror_position_m is not None
+        np.testing.assert_allclose(sorted([found.position_m[2], found.mirror_position_m[2]]), [-1.5, 3.5], atol=0.1)
+        np.testing.assert_allclose(found.mirror_position_m[:2], ANCHOR_M[:2], atol=0.1)
+
+    @pytest.mark.parametrize(("toward", "height"), [((0, 0, 1), 3.5), ((0, 0, -1), -1.5)])
+    def test_give_the_one_that_is_asked_for(self, toward: tuple[float, float, float], height: float) -> None:
+        found = trilaterate(flat(), distances(flat()) + noise(100, 0.02), toward=toward)
+        assert found.mirror_position_m is None
+        assert found.position_m[2] == pytest.approx(height, abs=0.1)
+        assert squared_error(found, np.array([6.0, -4.0, height])) < chi2.ppf(0.999, 3)
+
+    def test_a_hint_does_not_turn_what_the_ranges_say(self) -> None:
+        found = trilaterate(flight(), distances(flight()), toward=(0.0, 0.0, -1.0))
+        np.testing.assert_allclose(found.position_m, ANCHOR_M, atol=1e-6)
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_an_anchor_in_the_plane_has_one_place_of_honest_width(self, seed: int) -> None:
+        anchor, options = np.array([6.0, -4.0, 1.0]), TrilaterationOptions(max_position_stddev_m=5.0)
+        found = trilaterate(flat(), distances(flat(), anchor) + noise(100, seed=seed), options=options)
+        assert found.mirror_position_m is None
+        height_stddev = np.sqrt(found.covariance_m2[2, 2])
+        assert abs(found.position_m[2] - 1.0) < 3 * height_stddev
+        assert 0.3 < height_stddev < 2.0
+
+
+class TestRefusal:
+    def refusal(self, positions: Array, **options: float) -> str:
+        with pytest.raises(GeometryError) as caught:
+            trilaterate(
+                positions, distances(positions) + noise(len(positions), 0.02), options=TrilaterationOptions(**options)
+            )
+        return str(caught.value)
+
+    def test_of_too_few_ranges(self) -> None:
+        assert "3 ranges at known positions of the tag, 4 are needed" in self.refusal(flight(3))
+
+    @pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (1.0, -2.0, 0.5)])
+    def test_of_positions_on_a_line(self, direction: tuple[float, float, float]) -> None:
+        line = np.outer(np.linspace(-4.0, 4.0, 100), direction)
+        assert "the tag's positions lie on a line, about which the anchor may stand anywhere" in self.refusal(line)
+
+    def test_of_positions_that_are_all_alike(self) -> None:
+        still = np.zeros((50, 3)) + noise(150, 0.01).reshape(50, 3)
+        assert "the tag's positions lie within" in self.refusal(still)
+
+    def test_of_an_anchor_whose_height_above_the_plane_is_not_seen(self) -> None:
+        assert "the anchor stands near the plane" in self.refusal(
+            flat() + np.array([0.0, 0.0, 2.5]), max_position_stddev_m=0.2
+        )
+
+    def test_of_an_anchor_less_certain_than_wanted(self) -> None:
+        assert "the position is not determined" in self.refusal(flight(), max_position_stddev_m=0.001)
+
+
+class TestCovariance:
+    """Over many draws of noise the squared errors over the covariance are those of three Gaussian numbers."""
+
+    NUM = 40
+
+    def squares(self, draw: str) -> Array:
+        positions, squares = flight(), []
+        for seed in range(self.NUM):
+            rng = np.random.default_rng(seed)
+            stddev = np.full(100, 0.1)
+            given = None
+            if draw == "heteroscedastic":
+                given = stddev = np.geomspace(0.02, 1.0, 100)[rng.permutation(100)]
+            ranges = distances(positions) + stddev * rng.standard_normal(100)
+            options = KNOWN_BIAS
+            if draw == "bias":
+                ranges += rng.normal(0.0, 0.2)
+                options = TrilaterationOptions(range_bias_stddev_m=0.2)
+            if draw == "outliers":
+                ranges[:20] += rng.choice([-1.0, 1.0], 20) * rng.uniform(1.0, 5.0, 20)
+            squares.append(squared_error(trilaterate(positions, ranges, range_stddev_m=given, options=options)))
+        return np.array(squares)
+
+    @pytest.mark.parametrize("draw", ["noise", "heteroscedastic", "bias", "outliers"])
+    def test_is_that_of_the_errors(self, draw: str) -> None:
+        low, high = chi2.ppf([5e-4, 1 - 5e-4], 3 * self.NUM) / self.NUM
+        # Given stddevs are a lower limit, and the rest has 96 degrees of freedom: some per cent either way.
+        assert 0.9 * low < self.squares(draw).mean() < 1.1 * high
+
+    def test_grows_where_errors_last(self) -> None:
+        positions, times = flight(400), np.linspace(0.0, 300.0, 400)
+        squares: dict[bool, list[float]] = {True: [], False: []}
+        for seed in range(20):
+            lasting = np.repeat(noise(100, 0.1, seed), 4)
+            ranges = distances(positions) + lasting + noise(400, 0.03, 99 + seed)
+            for timed, found in squares.items():
+                found.append(
+                    squared_error(
+                        trilaterate(positions, ranges, timestamp_s=times if timed else None, options=KNOWN_BIAS)
+                    )
+                )
+        # Four ranges in a row err alike, for 3 s: worth hardly more than one.
+        assert np.mean(squares[False]) > 6.0
+        assert 1.5 < np.mean(squares[True]) < 5.0
+
+
+def errors_over_seeds(stddevs: Array, *, given: bool) -> list[float]:
+    """How far off anchors are, by ranges as noisy as ``stddevs`` say in another order each time."""
+    positions, errors = flight(), []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        stddev = rng.permutation(stddevs)
+        ranges = distances(positions) + stddev * rng.standard_normal(100)
+        found = trilaterate(positions, ranges, range_stddev_m=stddev if given else None, options=KNOWN_BIAS)
+        errors.append(float(np.linalg.norm(found.position_m - ANCHOR_M)))
+    return errors
+
+
+def test_ranges_that_say_how_noisy_they_are_weigh_accordingly() -> None:
+    stddevs = np.geomspace(0.02, 1.0, 100)
+    assert np.median(errors_over_seeds(stddevs, given=True)) < 0.7 * np.median(errors_over_seeds(stddevs, given=False))
+
+
+@pytest.mark.parametrize(("given", "limit_m"), [(True, 0.03), (False, 0.05)])
+def test_three_good_ranges_in_ten_decide(given: bool, limit_m: float) -> None:
+    assert np.median(errors_over_seeds(np.repeat([0.02, 0.5], [30, 70]), given=given)) < limit_m
+
+
+@pytest.mark.parametrize("options", [TrilaterationOptions(), KNOWN_BIAS], ids=["defaults", "bias known"])
+def test_study_in_small_finds_every_anchor_among_15_percent_outliers(options: TrilaterationOptions) -> None:
+    summary = anchor_initialization.estimate(0.15, 40, options)
+    assert summary.num_refused == 0
+    assert np.median(summary.error_m) < 0.10
+    assert np.max(summary.error_m) < 0.30
+    low, high = chi2.ppf([5e-4, 1 - 5e-4], 3 * 40) / 40
+    assert (low if options is KNOWN_BIAS else 1.0) < np.mean(summary.squares) < high
+
+
+class TestErrorCurve:
+    def test_short_ranges_weigh_in_full_once_their_error_was_learnt(self) -> None:
+        positions = 0.2 * flight()
+        near = np.array([1.0, -0.8, 1.0])
+        ranges = distances(positions, near) + noise(100, 0.05)
+        unknown, learnt = (
+            trilaterate(positions, ranges, shared_stddev_m=shared, options=KNOWN_BIAS)
+            for shared in (None, np.full(100, 0.01))
+        )
+        assert learnt.position_stddev_m < 0.5 * unknown.position_stddev_m
+        assert squared_error(learnt, near) < chi2.ppf(0.999, 3)
+
+    def test_ranges_where_the_curve_was_not_learnt_count_for_less(self) -> None:
+        wrong = np.arange(100) % 2 == 0
+        ranges = distances(flight()) + noise(100, 0.05) + np.where(wrong, 0.3, 0.0)
+        equal, doubted = (
+            trilaterate(flight(), ranges, shared_stddev_m=np.where(wrong, stddev, 0.01), options=KNOWN_BIAS)
+            for stddev in (0.01, 1.0)
+        )
+        assert np.linalg.norm(doubted.position_m - ANCHOR_M) < 0.5 * np.linalg.norm(equal.position_m - ANCHOR_M)
+
+    def test_a_log_brings_what_its_curve_left_uncertain(self) -> None:
+        ranges = distances(flight()) + noise(100, 0.05)
+        shared = np.full(100, 0.2)
+        log = RangeLog.from_arrays(["A"] * 100, ranges, timestamp_s=np.arange(100.0), shared_stddev_m=shared)
+        (placement,) = trilaterate_anchors(log, flight())
+        alone = trilaterate(flight(), ranges, shared_stddev_m=shared, timestamp_s=np.arange(100.0))
+        assert placement.found is not None
+        np.testing.assert_allclose(placement.found.position_m, alone.position_m, atol=1e-9)
+        np.testing.assert_allclose(placement.found.covariance_m2, alone.covariance_m2, atol=1e-9)
+
+
+class TestRounding:
+    """What it would decide is decided otherwise, and the same on every machine."""
+
+    @pytest.mark.parametrize("seed", range(6))
+    def test_of_two_places_between_which_no_range_tells_the_upper_one_comes_first(self, seed: int) -> None:
+        for height in (3.5, -1.5):
+            ranges = distances(flat(), np.array([6.0, -4.0, height])) + noise(100, 0.02, seed)
+            found = trilaterate(flat(), ranges)
+            assert found.mirror_position_m is not None
+            assert found.position_m[2] > 3.0 > found.mirror_position_m[2]
+
+    @pytest.mark.parametrize("toward", [(1.0, 0.0, 0.0), (3.0, 4.0, 1e-15), (0.0, 0.0, 0.0)])
+    def test_a_direction_along_the_plane_of_the_positions_leaves_both_places(
+        self, toward: tuple[float, float, float]
+    ) -> None:
+        found = trilaterate(flat(), distances(flat()) + noise(100, 0.02), toward=toward)
+        assert found.mirror_position_m is not None
+
+    @pytest.mark.parametrize("away_m", [20.0, 60.0, 200.0])
+    @pytest.mark.parametrize("seed", range(3))
+    def test_a_bias_that_is_known_does_not_make_a_place_about_a_line_certain(self, away_m: float, seed: int) -> None:
+        """In metres its information is 1e12, and what is left of a direction beside it is rounding."""
+        line = np.outer(np.linspace(-4.0, 4.0, 100), [1.0, 0.0, 0.0])
+        ranges = distances(line, np.array([1.0, away_m, 3.0])) + noise(100, 0.02, seed)
+        with pytest.raises(GeometryError, match="on a line, about which the anchor may stand anywhere"):
+            trilaterate(line, ranges, options=KNOWN_BIAS)

@@ -1,0 +1,55 @@
+"""The losses: their derivatives, their limits and what they cost where there are no outliers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rangesfm.ranging.errors.robust_loss import CAUCHY, GEMAN_MCCLURE, RobustLoss
+
+BOTH = pytest.mark.parametrize("loss", [CAUCHY, GEMAN_MCCLURE], ids=["Cauchy", "Geman-McClure"])
+
+
+@BOTH
+def test_derivatives_are_those_of_the_loss(loss: RobustLoss) -> None:
+    squared, step = np.linspace(0.1, 60.0, 200), 1e-4
+    _, first, second = loss.rho(squared)
+    higher, lower = loss.rho(squared + step), loss.rho(squared - step)
+    np.testing.assert_allclose(first, (higher[0] - lower[0]) / (2 * step), rtol=1e-6)
+    np.testing.assert_allclose(second, (higher[1] - lower[1]) / (2 * step), rtol=1e-5, atol=1e-9)
+
+
+@BOTH
+def test_curvature_is_the_slope_of_the_weighted_residual(loss: RobustLoss) -> None:
+    residuals, step = np.linspace(-8.0, 8.0, 100), 1e-5
+    slope = [(residuals + h) * loss.weights(residuals + h) for h in (step, -step)]
+    np.testing.assert_allclose(loss.curvatures(residuals), (slope[0] - slope[1]) / (2 * step), atol=1e-7)
+
+
+@BOTH
+def test_slope_is_that_of_the_root_of_the_loss(loss: RobustLoss) -> None:
+    residuals, step = np.linspace(0.1, 12.0, 100), 1e-6
+    root = [np.sqrt(loss.rho((residuals + h) ** 2)[0]) for h in (step, -step)]
+    np.testing.assert_allclose(loss.slopes(residuals), (root[0] - root[1]) / (2 * step), atol=1e-7)
+    np.testing.assert_array_equal(loss.slopes(np.array([0.0])), [1.0])
+
+
+@BOTH
+def test_under_gaussian_noise_it_is_nearly_as_good_as_least_squares(loss: RobustLoss) -> None:
+    z, step = np.linspace(-9.0, 9.0, 20_001, retstep=True)
+    density = np.exp(-0.5 * z**2) / np.sqrt(2 * np.pi) * step
+    efficiency = (density @ loss.curvatures(z)) ** 2 / (density @ (z * loss.weights(z)) ** 2)
+    assert 0.93 < efficiency < 0.96
+
+
+def test_only_the_bounded_one_is_bounded() -> None:
+    assert GEMAN_MCCLURE.rho(np.array([1e12]))[0, 0] == pytest.approx(GEMAN_MCCLURE.width**2)
+    assert CAUCHY.rho(np.array([1e12]))[0, 0] > 100
+
+
+@BOTH
+def test_next_to_no_residual_the_loss_is_its_square(loss: RobustLoss) -> None:
+    """Down to what is nothing beside 1."""
+    residuals = np.geomspace(1e-12, 1e-5, 60)
+    np.testing.assert_allclose(loss.rho(residuals**2)[0], residuals**2, rtol=1e-9)
+    np.testing.assert_allclose(loss.slopes(residuals), 1.0, rtol=1e-9)

@@ -1,0 +1,171 @@
+"""The keyframe graph: what the photos bind and what they leave open, and ranges that unbend a map with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.optimize import approx_fprime
+from tests.refine.conftest import bent, poses_and_rays
+from tests.simulated.model import SyntheticModel
+
+from rangesfm.geometry.gravity import UP_IN_SITE, Gravity
+from rangesfm.geometry.similarity import align_points, rmse
+from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.errors.range_errors import RangeErrors
+from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE
+from rangesfm.refine import keyframe_graph
+from rangesfm.refine.antennas import Antennas
+from rangesfm.refine.keyframe_graph import KeyframeGraph, local_scales, solve_graph
+from rangesfm.refine.vision_information import Poses, vision_information
+
+Array = npt.NDArray[np.float64]
+ANCHORS_M = np.array([[-40.0, -28.0, 12.0], [-15.0, -28.0, 0.0], [-28.0, -42.0, 9.0], [-30.0, -20.0, 15.0]])
+TAG_IN_CAM_M = np.array([0.1, -0.2, 0.05])
+
+
+def make_graph(
+    model: SyntheticModel, origin: Poses, *, stddev_m: float, anchors_are_free: bool = False, held_frame: int | None = 0
+) -> KeyframeGraph:
+    """Exact ranges to four anchors, at every keyframe and half-way to the next."""
+    truth, rays = poses_and_rays(model)
+    n, m = len(truth), len(ANCHORS_M)
+    before = np.repeat(np.arange(n - 1), 2 * m)
+    between = np.tile(np.repeat([0, 1], m), n - 1)
+    antennas = Antennas(
+        before, before + between, 0.5 * between, np.tile(TAG_IN_CAM_M, (len(before), 1)), np.zeros((len(before), 3))
+    )
+    index = np.tile(np.arange(m), 2 * (n - 1))
+    at = antennas.positions(truth.centers, truth.world_from_rig)
+    return KeyframeGraph(
+        vision=replace(vision_information(rays, truth), origin=origin),
+        antennas=antennas,
+        range_m=np.linalg.norm(at - ANCHORS_M[index], axis=1) + 0.05,
+        errors=errors_of(index, stddev_m),
+        anchors=tuple(anchor(k, anchors_are_free) for k in range(m)),
+        gravity=None,
+        held_frame=held_frame,
+    )
+
+
+def errors_of(anchor_index: npt.NDArray[np.int64], stddev_m: float) -> RangeErrors:
+    """Independent ones, under no loss to speak of."""
+    n = len(anchor_index)
+    known, label = np.full(n, stddev_m), np.arange(n)
+    return RangeErrors(
+        stddev_m=known,
+        share=np.ones(n),
+        inflation=1.0,
+        given_m=known,
+        shared_m=np.zeros(n),
+        placing_m=np.zeros(n),
+        anchor_index=anchor_index,
+        block=label,
+        place=label,
+        loss=GEMAN_MCCLURE.scaled(1e6),
+        common_bias_stddev_m=0.1,
+    )
+
+
+def anchor(k: int, is_free: bool) -> AnchorEstimate:
+    return AnchorEstimate(
+        anchor_id=f"A{k}",
+        position_m=ANCHORS_M[k] + (0.3 if is_free else 0.0),
+        position_stddev_m=0.0,
+        prior_position_m=None if is_free else ANCHORS_M[k],
+        prior_position_stddev_m=np.inf if is_free else 0.0,
+        range_bias_m=0.0,
+        prior_bias_m=0.0,
+        prior_bias_stddev_m=0.01,
+    )
+
+
+def test_gradient_and_hessian_are_those_of_the_cost(chain: SyntheticModel) -> None:
+    truth, _ = poses_and_rays(chain)
+    graph = make_graph(chain, truth, stddev_m=0.1, anchors_are_free=True, held_frame=None)
+    graph = replace(graph, gravity=Gravity(truth.world_from_rig[0].T @ UP_IN_SITE, 0.05))
+    layout = keyframe_graph._Layout.of(graph)
+    rng = np.random.default_rng(0)
+    state = keyframe_graph._moved(graph.start(), layout, 1e-3 * rng.standard_normal(len(layout.free)))
+    terms = keyframe_graph._Terms.at(graph, layout, state)
+    direction = rng.standard_normal(len(layout.free))
+
+    def cost(t: Array) -> float:
+        return keyframe_graph._Terms.at(graph, layout, keyframe_graph._moved(state, layout, t[0] * direction)).cost
+
+    slope = approx_fprime(np.zeros(1), cost, 1e-8)[0]
+    assert terms.gradient[layout.free] @ direction == pytest.approx(slope, rel=1e-3)
+    # At the origin, where all residuals are small, Gauss-Newton's Hessian is the Hessian.
+    start = graph.start()
+    at_start = keyframe_graph._Terms.at(graph, layout, start)
+    full = np.zeros(layout.num)
+    full[layout.free] = 1e-5 * direction
+    moved = keyframe_graph._Terms.at(graph, layout, keyframe_graph._moved(start, layout, 1e-5 * direction))
+    change = at_start.gradient @ full + 0.5 * full @ (at_start.hessian @ full)
+    assert moved.cost - at_start.cost == pytest.approx(change, rel=1e-3)
+
+
+def test_photos_bind_neither_place_nor_turn_nor_scale_of_the_whole(chain: SyntheticModel) -> None:
+    truth, _ = poses_and_rays(chain)
+    graph = make_graph(chain, truth, stddev_m=1e6)
+    whole, _ = bent(truth, 0.0, 1.0)
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    moved = Poses(turn @ whole.world_from_rig, 1.7 * whole.centers @ turn.T + [3.0, -2.0, 5.0])
+
+    def cost(poses: Poses) -> float:
+        residuals, _ = keyframe_graph._relative_poses(graph.vision, poses)
+        return float(residuals @ (graph.vision.matrix @ residuals))
+
+    sideways = Poses(truth.world_from_rig, truth.centers + 0.01 * np.arange(len(truth))[:, None] % 2 * [0.0, 1.0, 0.0])
+    assert cost(sideways) > 100
+    assert cost(moved) < 1e-6 * cost(sideways)
+
+
+@pytest.mark.parametrize(
+    ("anchors_are_free", "held_frame"),
+    [(False, 0), (False, None), (True, 0)],
+    ids=["first pose held", "site", "unknown anchors"],
+)
+def test_ranges_unbend_a_drifted_chain(chain: SyntheticModel, anchors_are_free: bool, held_frame: int | None) -> None:
+    truth, _ = poses_and_rays(chain)
+    drifted, _ = bent(truth, 25.0, 1.4)
+    if held_frame is None:
+        drifted = aligned(drifted, truth)
+    drift = rmse(align_points(drifted.centers, truth.centers).apply(drifted.centers) - truth.centers)
+    assert drift > 0.5
+    graph = make_graph(chain, drifted, stddev_m=1e-3, anchors_are_free=anchors_are_free, held_frame=held_frame)
+    solution = solve_graph(graph, graph.start(), tolerance_m=1e-5)
+    # The relative poses of the bent map are wrong by nature; exact ranges to four anchors outvote them.
+    assert np.sqrt(np.mean(graph.residuals_m(solution.state) ** 2)) < 0.02
+    centers = solution.state.poses.centers
+    # Unknown anchors beside a way this straight would let it bend; known ones do not.
+    if not anchors_are_free:
+        assert rmse(centers - truth.centers) < 0.5 * drift
+    if held_frame is not None:
+        np.testing.assert_array_equal(centers[0], drifted.centers[0])
+
+
+def aligned(poses: Poses, truth: Poses) -> Poses:
+    """As the scale stage leaves a map in the site frame."""
+    similarity = align_points(poses.centers, truth.centers)
+    return Poses(similarity.rotation @ poses.world_from_rig, similarity.apply(poses.centers))
+
+
+def test_the_ranges_determine_no_more_than_there_is(chain: SyntheticModel) -> None:
+    truth, _ = poses_and_rays(chain)
+    graphs = [make_graph(chain, truth, stddev_m=stddev_m) for stddev_m in (100.0, 0.1)]
+    few, many = (solve_graph(graph, graph.start(), tolerance_m=1e-4).num_absorbed for graph in graphs)
+    assert 0 <= few < many < len(graphs[0].range_m)
+
+
+def test_neighbours_of_one_place_have_no_scale_of_their_own(chain: SyntheticModel) -> None:
+    """As where a camera turns on a tripod: its centres differ by rounding."""
+    truth, rays = poses_and_rays(chain)
+    still = Poses(truth.world_from_rig, truth.centers.copy())
+    still.centers[:12] = truth.centers[0]
+    rng = np.random.default_rng(0)
+    before, now = (Poses(still.world_from_rig, still.centers + 1e-14 * rng.normal(size=(60, 3))) for _ in range(2))
+    scales = local_scales(replace(vision_information(rays, truth), origin=before), now)
+    np.testing.assert_allclose(scales, 1.0, atol=1e-9)

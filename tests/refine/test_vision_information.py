@@ -1,0 +1,43 @@
+"""A point in a camera is told from one that is only near."""
+
+from __future__ import annotations
+
+import numpy as np
+import pycolmap
+import pytest
+from tests.simulated.model import SyntheticModel
+
+from rangesfm.colmap.transform import rescale
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.refine.vision_information import model_observations, model_poses, points_in_cameras
+
+
+def ids_in_cameras(model: pycolmap.Reconstruction) -> list[int]:
+    frame_ids = np.array(sorted(model.reg_frame_ids()))
+    rays = model_observations(model, frame_ids)
+    found: list[int] = rays.point_ids[points_in_cameras(rays, model_poses(model, frame_ids))].tolist()
+    return found
+
+
+def put_to_depth(model: pycolmap.Reconstruction, depth: float) -> int:
+    """Move a point on the ray of one of the photos that see it; its id."""
+    point_id = min(model.points3D)
+    point = model.point3D(point_id)
+    image = model.image(point.track.elements[0].image_id)
+    in_cam = image.cam_from_world() * point.xyz
+    point.xyz = image.cam_from_world().inverse() * (in_cam * depth / in_cam[2])
+    return int(point_id)
+
+
+@pytest.mark.parametrize(
+    ("depth_m", "is_in_camera"), [(0.0, True), (1e-10, True), (1e-4, True), (0.05, False), (1e8, False)]
+)
+@pytest.mark.parametrize("scale", [1.0, 1e-3])
+def test_it_is_found_by_its_depth_whatever_the_unit(
+    chain: SyntheticModel, depth_m: float, is_in_camera: bool, scale: float
+) -> None:
+    model = chain.reconstruction
+    assert ids_in_cameras(model) == []
+    point_id = put_to_depth(model, depth_m)
+    elsewhere = rescale(model, Similarity(scale, np.eye(3), np.array([3.0, -2.0, 5.0])))
+    assert ids_in_cameras(elsewhere) == ([point_id] if is_in_camera else [])

@@ -1,0 +1,120 @@
+"""result.json: one model, its published schema, and what it says of files that no run wrote."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jsonschema
+import numpy as np
+import pytest
+from tests.result_document import REFINE, anchor_entry, result_document
+
+from rangesfm.errors import InputError
+from rangesfm.result.summary import ResultSummary, schema
+
+if TYPE_CHECKING:
+    from tests.conftest import PhotoRun
+
+SCHEMA_PATH = Path(__file__).parents[2] / "examples" / "result.schema.json"
+GEOREFERENCE = {"lat_deg": 47.4, "lon_deg": 8.5, "height_m": 430.0, "crs": "EPSG:2056"}
+
+
+def test_published_schema_is_that_of_the_model() -> None:
+    """If not: ``python -m rangesfm.result.summary > examples/result.schema.json``."""
+    assert SCHEMA_PATH.read_text(encoding="utf-8") == schema()
+
+
+def test_a_run_leaves_what_the_schema_says(photo_run: PhotoRun) -> None:
+    text = (photo_run.output_path / "result.json").read_text(encoding="utf-8")
+    jsonschema.validate(json.loads(text, parse_constant=pytest.fail), json.loads(schema()))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"refine": REFINE, "georeference": GEOREFERENCE, "frame": "first_camera"},
+        {
+            "anchors": {
+                "A1": anchor_entry([1.0, 2.0, 3.0], mirror_position_m=[1.0, 2.0, -3.0]),
+                "A2": anchor_entry(None),
+            }
+        },
+        {"settings": {"output": {"seed": 0}, "mapper": {"matching": "auto"}, "images": {"path": "caf\udce9"}}},
+        {"time_offset": {"value_s": None, "stddev_s": None}},
+    ],
+)
+def test_what_is_read_is_written_again(changes: dict[str, Any], tmp_path: Path) -> None:
+    document = result_document(**changes)
+    path = tmp_path / "result.json"
+    path.write_text(json.dumps(document))
+    ResultSummary.read(path).write(path)
+    assert json.loads(path.read_text(encoding="utf-8")) == document
+    jsonschema.validate(document, json.loads(schema()))
+
+
+def test_a_key_of_a_later_version_is_passed_over(tmp_path: Path) -> None:
+    (tmp_path / "result.json").write_text(json.dumps(result_document(place={"verdict": "good"}, scale={"new": 1})))
+    assert ResultSummary.read(tmp_path / "result.json") == ResultSummary.model_validate(result_document())
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"scale": {"value": "wide"}}, "'scale.value' is \"wide\", expected a valid number"),
+        ({"scale": {"value": None}}, "'scale.value' is null, expected a valid number"),
+        ({"scale": None}, "'scale' is null, expected a JSON object"),
+        ({"scale": {"verdict": "fine"}}, "'scale.verdict' is \"fine\", expected 'good' or 'doubtful'"),
+        ({"frame": "moon"}, "'frame' is \"moon\", expected 'site' or 'first_camera'"),
+        ({"anchors": [1]}, "'anchors' is [1], expected a JSON object"),
+        ({"anchors": {"A1": anchor_entry([1, 2])}}, "'anchors.A1.position_m.2' is missing"),
+        ({"anchors": {"A1": {"position_m": None}}}, "'anchors.A1.stddev_m' is missing"),
+        (
+            {"metric_from_sfm": {"rotation_xyzw": [0, 0, 0, 0]}},
+            "'metric_from_sfm.rotation_xyzw' is [0, 0, 0, 0], expected a unit quaternion",
+        ),
+        ({"map": {"num_photos": 1.5}}, "'map.num_photos' is 1.5, expected a valid integer"),
+        ({"refine": {**REFINE, "converged": 1}}, "'refine.converged' is 1, expected a valid boolean"),
+        ({"warnings": "none"}, "'warnings' is \"none\", expected a JSON array"),
+        ({"warnings": [3]}, "'warnings.0' is 3, expected text"),
+        ({"warnings": [[1234567] * 9]}, f"'warnings.0' is [{6 * '1234567, '}12345..., expected text"),
+        (
+            {"settings": {"tag": {"lever_arms_m": {"T": [1, 2, 3, 4]}}}},
+            "'settings.tag.lever_arms_m.T' is [1, 2, 3, 4], expected 3 items",
+        ),
+    ],
+)
+def test_a_damaged_result_is_named_by_its_key(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
+    path = tmp_path / "result.json"
+    path.write_text(json.dumps(result_document(**changes)))
+    with pytest.raises(InputError) as caught:
+        ResultSummary.read(path)
+    assert str(caught.value) == f"{path}: {message}"
+
+
+def test_similarity_is_that_of_its_keys() -> None:
+    half_turn = {"scale": 2.0, "rotation_xyzw": [0.0, 0.0, 1.0, 0.0], "translation_m": [1.0, 2.0, 3.0]}
+    summary = ResultSummary.model_validate(result_document(metric_from_sfm=half_turn))
+    moved = summary.metric_from_sfm.similarity.apply(np.array([1.0, 0.0, 0.0]))
+    np.testing.assert_allclose(moved, [-1.0, 2.0, 3.0], atol=1e-12)
+    again = type(summary.metric_from_sfm).of(summary.metric_from_sfm.similarity)
+    np.testing.assert_allclose(again.rotation_xyzw, [0.0, 0.0, 1.0, 0.0], atol=1e-12)
+
+
+def test_lines_for_people_tell_what_is_known() -> None:
+    sensitive = {"sensitivity": {"short_range_per_cm": -0.6, "common_bias_per_cm": 0.5}, "interval_95": None}
+    document = result_document(scale=sensitive, refine=REFINE, ranges={"num": 9, "num_used": 7, "rms_m": 0.0512})
+    lines = list(ResultSummary.model_validate(document).lines(Path("out"), "a  b\nc  d"))
+    assert lines == [
+        "scale: 1.5 m per SfM unit, 95 % interval unknown to unknown",
+        "verdict: good: the scale is known to 2 % (95 % interval)",
+        "the scale is sensitive: -0.60 % per cm of bias in short ranges",
+        "refined: 1.501 m per SfM unit after 23 iterations",
+        "ranges: 7 of 9 used, rms 0.051 m, median unknown m",
+        "map: 40 photos, 900 points, frame site",
+        *("", "a  b", "c  d", ""),
+        f"metric model: {Path('out/sparse_metric/0')}",
+        f"all results: {Path('out/result.json')}",
+    ]

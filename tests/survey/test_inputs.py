@@ -1,0 +1,103 @@
+"""What a run reads is checked against each other: tags and their lever arms, anchors and who ranges with whom."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rangesfm.errors import InputError
+from rangesfm.options import AnchorOptions, RangesOptions
+from rangesfm.ranging.log import RangeKind
+from rangesfm.survey.inputs import read_ranging_inputs
+from rangesfm.survey.settings import Survey
+
+ROWS = "0,A,1,left\n1,B,2,left\n2,A,3,right\n3,B,4.5,A\n4,right,0.4,left\n"
+LEFT, RIGHT = (0.1, 0.0, 0.0), (-0.1, 0.0, 0.2)
+
+
+@pytest.fixture
+def survey(tmp_path: Path) -> Survey:
+    """Two tags, two anchors, and a range between two of each."""
+    (tmp_path / "uwb.csv").write_text("timestamp_s,anchor_id,range_m,tag_id\n" + ROWS)
+    (tmp_path / "anchors.csv").write_text("anchor_id,x_m,y_m,z_m\nA,0,0,0\nB,4.5,0,0\n")
+    return Survey(ranges=RangesOptions(path=tmp_path / "uwb.csv"), anchors=AnchorOptions(path=tmp_path / "anchors.csv"))
+
+
+def refusal(survey: Survey) -> InputError:
+    with pytest.raises(InputError) as caught:
+        read_ranging_inputs(survey)
+    assert "\n" not in str(caught.value)
+    return caught.value
+
+
+def test_each_tag_has_its_lever_arm_in_the_order_of_the_log(survey: Survey) -> None:
+    inputs = read_ranging_inputs(survey.changed({"tag.lever_arms_m": {"right": RIGHT, "left": LEFT}}))
+    assert inputs.log.tag_ids == ("left", "right")
+    np.testing.assert_array_equal(inputs.tag_in_cam_m, [LEFT, RIGHT])
+
+
+def test_all_ranges_are_kept_and_those_between_two_of_a_kind_are_told(survey: Survey) -> None:
+    inputs = read_ranging_inputs(survey.changed({"tag.lever_arms_m": {"right": RIGHT, "left": LEFT}}))
+    assert inputs.log.kind.tolist() == [0, 0, 0, RangeKind.ANCHOR_ANCHOR, RangeKind.TAG_TAG]
+    assert "1 ranges are between two anchors: they are distances for the map to keep to" in inputs.notes
+    assert "1 ranges are between two tags: they have no say" in inputs.notes
+
+
+def test_tag_without_lever_arm_is_named_with_its_line(survey: Survey) -> None:
+    error = refusal(survey.changed({"tag.lever_arms_m": {"left": LEFT}}))
+    assert "tag 'right' has no lever arm, those given are of left" in str(error)
+    assert error.line == 4
+    error = refusal(survey.changed({"tag.tag_in_cam_m": LEFT}))
+    assert "the log has several tags (left, right): give each its lever arm" in str(error)
+
+
+def test_tag_can_be_chosen(survey: Survey) -> None:
+    inputs = read_ranging_inputs(survey.changed({"tag.tag_id": "right", "tag.tag_in_cam_m": RIGHT}))
+    assert inputs.log.tag_ids == ("right",)
+    assert inputs.log.kind.tolist() == [RangeKind.TAG_ANCHOR, RangeKind.ANCHOR_ANCHOR]
+    np.testing.assert_array_equal(inputs.tag_in_cam_m, [RIGHT])
+    inputs = read_ranging_inputs(
+        survey.changed({"tag.tag_id": "left", "tag.lever_arms_m": {"right": RIGHT, "left": LEFT}})
+    )
+    np.testing.assert_array_equal(inputs.tag_in_cam_m[0], LEFT)
+    assert "'middle' is not in the log, which has left, right" in str(refusal(survey.changed({"tag.tag_id": "middle"})))
+
+
+def test_tag_that_only_ranges_with_tags_needs_no_lever_arm(survey: Survey, tmp_path: Path) -> None:
+    (tmp_path / "uwb.csv").write_text("timestamp_s,anchor_id,range_m,tag_id\n0,A,1,left\n1,left,0.4,right\n")
+    inputs = read_ranging_inputs(survey.changed({"tag.lever_arms_m": {"left": LEFT}}))
+    assert inputs.log.kind.tolist() == [RangeKind.TAG_ANCHOR, RangeKind.TAG_TAG]
+    np.testing.assert_array_equal(inputs.tag_in_cam_m, [LEFT, [np.nan] * 3])
+
+
+def test_lever_arm_of_a_tag_that_is_not_heard_is_noted(survey: Survey) -> None:
+    arms = {"right": RIGHT, "left": LEFT, "spare": LEFT}
+    assert "no ranges of tag spare" in read_ranging_inputs(survey.changed({"tag.lever_arms_m": arms})).notes
+
+
+def test_lever_arm_in_another_unit_is_refused(survey: Survey) -> None:
+    arms = {"left": LEFT, "right": (120.0, 0.0, 0.0)}
+    with pytest.raises(InputError, match=r"right is \(120.0, 0.0, 0.0\), .* 3 numbers of metres from -20 to 20"):
+        survey.changed({"tag.lever_arms_m": arms})
+
+
+def test_log_without_any_range_of_the_camera_is_refused(survey: Survey, tmp_path: Path) -> None:
+    (tmp_path / "uwb.csv").write_text("timestamp_s,anchor_id,range_m,tag_id\n0,A,4.5,B\n")
+    assert "none of the 1 ranges is between a tag and an anchor" in str(refusal(survey))
+
+
+def test_wanted_anchors_leave_out_ranges_with_others(survey: Survey) -> None:
+    chosen = survey.changed({"tag.lever_arms_m": {"right": RIGHT, "left": LEFT}, "anchors.use": ("A",)})
+    log = read_ranging_inputs(chosen).log
+    assert log.anchor_ids == ("A",)
+    assert log.kind.tolist() == [0, 0, RangeKind.TAG_TAG]
+
+
+def test_stranger_among_the_anchors_is_named_with_its_line(survey: Survey, tmp_path: Path) -> None:
+    with (tmp_path / "uwb.csv").open("a") as file:
+        file.write("5,C,7,A\n6,C,7,left\n")
+    error = refusal(survey.changed({"tag.lever_arms_m": {"right": RIGHT, "left": LEFT}}))
+    assert "anchor_id is 'C'" in str(error)
+    assert error.line == 7
