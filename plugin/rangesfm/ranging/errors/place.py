@@ -16,7 +16,7 @@ Indices = npt.NDArray[np.int64]
 _PLACE_SIZE_M = 0.2
 # In cells: paths at a height of 1.6 m, or of the first camera's 0, do not lie on the grid, where rounding would
 # choose the cell.
-_OFF_GRID = 1e-6
+_OFF_GRID = 1e-9
 # Of fewer ranges a correlation is a guess.
 _MIN_NUM = 20
 
