@@ -44,6 +44,18 @@ ANCHORS_M = {"A1": (-6.0, -5.0, 0.5), "A2": (6.0, -5.0, 2.5), "A3": (6.0, 5.0, 0
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_report_header() -> str:
+    return f"BLAS kernels: {', '.join(blas_kernels())}"
+
+
+def blas_kernels() -> list[str]:
+    """Those that numpy and scipy compute with, each with its own: as the processor or OPENBLAS_CORETYPE says."""
+    import scipy.linalg  # noqa: F401 (loads scipy's)
+    from threadpoolctl import threadpool_info
+
+    return [str(library.get("architecture")) for library in threadpool_info() if library["user_api"] == "blas"]
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest file first: of two processes, one would work on it alone at the end."""
     items.sort(key=lambda item: item.path.name != "test_style.py")

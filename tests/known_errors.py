@@ -21,7 +21,7 @@ def known_errors(
     *,
     is_estimated: bool = False,
     inflation: float = 1.0,
-    common_bias_stddev_m: float = RangeModelOptions.common_bias_stddev_m,
+    common_bias_stddev_m: float = RangeModelOptions().common_bias_stddev_m,
 ) -> RangeErrors:
     """Of all ranges of the log.
 
@@ -39,6 +39,5 @@ def known_errors(
         stddev_m=stddev,
         given_m=np.full(len(rows), np.nan) if is_estimated else noise,
         inflation=inflation,
-        noise_m=float(np.median(noise)),
     )
     return found.spread(rows, num)

@@ -314,3 +314,18 @@ def test_surveys_err_as_the_covariance_says() -> None:
     assert np.mean(centers) == pytest.approx(1.0, abs=0.2)
     assert np.mean(anchors) == pytest.approx(1.0, abs=0.2)
     assert np.mean(scales) == pytest.approx(1.0, abs=0.4)
+
+
+def test_a_motion_that_only_rounding_keeps_from_moving_nothing_is_none() -> None:
+    """A turn moves no anchor at the origin, if this is all that can move."""
+    counts = []
+    for at in (np.zeros(3), np.array([1e-17, 2e-17, -1e-17])):
+        survey = joint(model(), num_anchors=0)
+        for block in (*survey.poses, *(point.xyz for point in survey.reconstruction.points3D.values())):
+            survey.problem.set_parameter_block_constant(block)
+        cost = range_cost(range_m=3.0, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=0.1)
+        add_residual_block(survey.adjuster, cost, None, [survey.poses[0], at, survey.biases[0]])
+        survey.problem.set_parameter_block_constant(survey.biases[0])
+        found = joint_covariance(survey.problem, survey.reconstruction, anchors=[at], others=survey.biases[:1])
+        counts.append(found.num_free_directions)
+    assert counts[0] == counts[1]

@@ -54,9 +54,9 @@ def test_survey_file_is_valid_and_names_the_camera_that_took_the_photos(made: De
     survey = read_survey(made.survey_path, {})
     assert survey.camera.model == "SIMPLE_RADIAL"
     assert survey.camera.params == pytest.approx(CAMERA_PARAMS)
-    assert survey.anchor_frame == "site"
+    assert survey.anchors.frame == "site"
     assert survey.ranges.time_offset_s is None
-    assert survey.reference_path == made.folder / "reference.csv"
+    assert survey.report.reference == made.folder / "reference.csv"
 
 
 def test_exif_tells_the_time_of_each_photo_to_the_millisecond(made: DemoSurvey) -> None:

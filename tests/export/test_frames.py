@@ -231,3 +231,13 @@ def test_the_map_itself_is_not_touched(on_earth: MetricMap, tmp_path: Path) -> N
     export_map(on_earth, tmp_path, ExportOptions(formats=("ply",), frame="enu"))
     for point_id, point in before.points3D.items():
         np.testing.assert_array_equal(on_earth.reconstruction.point3D(point_id).xyz, point.xyz)
+
+
+def test_photos_that_do_not_lean_to_either_side_of_a_flat_path_do_not_say_which_is_up(map_: MetricMap) -> None:
+    """Photos straight down: rounding would turn the map upside down now and then."""
+    down = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    path = map_.trajectory
+    headings = Rotation.from_rotvec(np.arange(len(path))[:, None] * [0.0, 0.0, 0.3]).as_matrix()
+    flight = replace(path, centers=path.centers * [1.0, 1.0, 0.0], world_from_cam=headings @ down)
+    with pytest.raises(InputError, match=r"do not say which side of the path's plane is up.*--up X,Y,Z"):
+        up_in_world(flight, "path")

@@ -7,7 +7,18 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points, path_kind, path_shape, rmse, round_middle
+from rangesfm.geometry.similarity import (
+    IDENTITY,
+    Similarity,
+    align_points,
+    are_apart,
+    oriented,
+    path_kind,
+    path_shape,
+    rmse,
+    round_middle,
+    similarity_between,
+)
 from rangesfm.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
@@ -149,3 +160,33 @@ def test_the_middle_of_a_circle_and_of_a_sphere_is_found(rng: np.random.Generato
 @pytest.mark.parametrize("num_points", [1, 2, 3])
 def test_few_points_are_of_some_kind(num_points: int) -> None:
     assert path_kind(np.eye(3)[:num_points]) in ("straight", "flat", "circular")
+
+
+ONE_PLACE = np.tile([0.1, -7.3, 1.6], (7, 1))
+"""Whose mean is none of them."""
+
+
+def test_points_that_only_rounding_parts_are_one_place(rng: np.random.Generator) -> None:
+    shaken = ONE_PLACE + rng.choice([-1e-15, 0.0, 1e-15], (7, 3))
+    for one_place in (ONE_PLACE, shaken, 1e7 * shaken):
+        assert not are_apart(one_place)
+        assert align_points(one_place, rng.normal(size=(7, 3))).scale == 1.0
+        assert similarity_between(one_place, rng.normal(size=(7, 3))) is None
+        assert similarity_between(rng.normal(size=(7, 3)), one_place) is None
+    assert are_apart(ONE_PLACE + 1e-9 * rng.normal(size=(7, 3)))
+
+
+def test_points_without_anything_alike_have_no_scale_between_them() -> None:
+    there_and_back, left_and_right = np.zeros((8, 3)), np.zeros((8, 3))
+    there_and_back[:, 0], left_and_right[:, 0] = 0.1 * np.tile([-1, 1], 4), 0.1 * np.repeat([-1, 1], 4)
+    assert similarity_between(there_and_back, left_and_right + 0.3) is None
+
+
+def test_an_axis_points_to_the_same_side_whatever_a_decomposition_says(rng: np.random.Generator) -> None:
+    for _ in range(20):
+        axes = random_similarity(rng, 1.0).rotation
+        np.testing.assert_array_equal(oriented(axes), oriented(-axes))
+        np.testing.assert_array_equal(np.abs(oriented(axes)), np.abs(axes))
+    flat = rng.normal(size=(20, 3)) * [3.0, 1.0, 0.0]
+    for turned in (flat, -flat, flat[::-1] + 1e-14):
+        np.testing.assert_allclose(path_shape(turned).axes[:, 2], [0.0, 0.0, 1.0], atol=1e-9)

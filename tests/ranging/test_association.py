@@ -236,6 +236,14 @@ class TestLongGaps:
         alone = associate(log_at(range_times), trajectory_of(first, curved(first)), TAG_IN_CAM_M)
         np.testing.assert_allclose(whole.centers, alone.centers, atol=1e-12)
 
+    def test_a_gap_of_the_limit_is_none_whatever_the_date(self) -> None:
+        """Seconds since 1970 are 2.4e-7 s apart: photos every 2 s are now less, now more."""
+        times = 1.7e9 + 0.1 + 2.0 * np.arange(20) + 1e-7 * np.arange(20)
+        assert np.ptp(np.diff(times)) > 0
+        found = associate(log_at(times[:-1] + 1.0), trajectory_of(times, straight(times - times[0])), TAG_IN_CAM_M)
+        assert statuses(found) == ["used"] * 19
+        np.testing.assert_allclose(found.weight, 0.5, atol=1e-6)
+
     def test_the_limit_is_an_option(self) -> None:
         path = trajectory_of(self.TIMES, straight(self.TIMES))
         found = associate(log_at([12.0]), path, TAG_IN_CAM_M, options=AssociationOptions(max_interpolation_gap_s=5.0))

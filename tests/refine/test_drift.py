@@ -32,7 +32,7 @@ def test_drift_is_bent_back_in_few_iterations(lap: drift.Lap) -> None:
     assert run.summary.converged
     assert run.summary.misfits == ()
     # The noise that the scale stage saw was mostly drift.
-    assert run.summary.range_stddev_m[0] == pytest.approx(0.1, rel=0.25)
+    assert run.summary.errors.stddev_m[0] == pytest.approx(0.1, rel=0.25)
 
 
 def test_a_mixture_of_draws_drifts_as_asked_and_is_noise_of_the_same_stddev(lap: drift.Lap) -> None:

@@ -18,7 +18,7 @@ from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE
 from rangesfm.refine import keyframe_graph
 from rangesfm.refine.antennas import Antennas
-from rangesfm.refine.keyframe_graph import KeyframeGraph, solve_graph
+from rangesfm.refine.keyframe_graph import KeyframeGraph, local_scales, solve_graph
 from rangesfm.refine.vision_information import Poses, vision_information
 
 Array = npt.NDArray[np.float64]
@@ -158,3 +158,14 @@ def test_the_ranges_determine_no_more_than_there_is(chain: SyntheticModel) -> No
     graphs = [make_graph(chain, truth, stddev_m=stddev_m) for stddev_m in (100.0, 0.1)]
     few, many = (solve_graph(graph, graph.start(), tolerance_m=1e-4).num_absorbed for graph in graphs)
     assert 0 <= few < many < len(graphs[0].range_m)
+
+
+def test_neighbours_of_one_place_have_no_scale_of_their_own(chain: SyntheticModel) -> None:
+    """As where a camera turns on a tripod: its centres differ by rounding."""
+    truth, rays = poses_and_rays(chain)
+    still = Poses(truth.world_from_rig, truth.centers.copy())
+    still.centers[:12] = truth.centers[0]
+    rng = np.random.default_rng(0)
+    before, now = (Poses(still.world_from_rig, still.centers + 1e-14 * rng.normal(size=(60, 3))) for _ in range(2))
+    scales = local_scales(replace(vision_information(rays, truth), origin=before), now)
+    np.testing.assert_allclose(scales, 1.0, atol=1e-9)

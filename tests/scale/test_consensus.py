@@ -142,3 +142,14 @@ def test_a_camera_that_stands_still_is_refused(make_survey: MakeSurvey) -> None:
     survey = make_survey(centers_m=np.tile([[1.0, 2.0, 1.6]], (20, 1)))
     with pytest.raises(GeometryError, match="no scale explains"):
         consensus_scales(known_anchors(survey))
+
+
+def test_a_camera_that_only_rounding_keeps_from_the_origin_agrees_with_no_scale() -> None:
+    """As one that is there exactly: its range is the same at every scale."""
+    away = np.array([[1.0, 0.0, 0.0]])
+    offset, ranges, tolerance = np.tile([[-2.0, 0.0, 0.0]], (2, 1)), np.array([2.0, 1.0]), np.full(2, 0.5)
+    exact, rounded = (
+        agreeing_intervals(np.concatenate([first, away]), offset, ranges, tolerance)
+        for first in (np.zeros((1, 3)), np.array([[1e-16, -1e-17, 0.0]]))
+    )
+    np.testing.assert_array_equal(rounded, exact)

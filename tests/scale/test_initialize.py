@@ -160,6 +160,20 @@ class TestRefused:
     def test_a_camera_that_stands_still(self, make_survey: MakeSurvey, frame: str, known: str, match: str) -> None:
         self.refuse(make_survey(centers_m=np.tile([[1.0, 2.0, 1.6]], (40, 1))), frame, known, match)
 
+    def test_a_camera_that_stands_still_far_from_the_origin_of_its_world(self, make_survey: MakeSurvey) -> None:
+        """Where rounding spreads its centres over nanometres."""
+        survey = make_survey(centers_m=np.tile([[1.0, 2.0, 1.6]], (40, 1)))
+        shaken = survey.trajectory.transformed(1.0, np.eye(3), np.full(3, 1e7))
+        shaken.centers[:] += np.random.default_rng(0).choice([-2e-9, 0.0, 2e-9], (40, 3))
+        self.refuse(replace(survey, trajectory=shaken), "first_camera", "ABCDE", "no scale explains")
+
+    def test_a_circle_round_an_anchor(self, make_survey: MakeSurvey) -> None:
+        """Rounding changes the ranges, which are all alike."""
+        angles = np.linspace(0.0, 6.0, 40)
+        circle = np.stack([5.0 * np.cos(angles), 5.0 * np.sin(angles), np.zeros(40)], axis=1)
+        survey = make_survey(centers_m=circle, anchors_m={"A": (0.0, 0.0, 1.0)}, tag_in_cam_m=(0, 0, 0))
+        self.refuse(survey, "unknown", "", "no range changed")
+
     def test_a_camera_that_moves_less_than_the_noise(self, make_survey: MakeSurvey) -> None:
         shaking = np.array([1.0, 2.0, 1.6]) + 0.002 * np.random.default_rng(0).standard_normal((40, 3))
         self.refuse(make_survey(centers_m=shaking, radio=NOISE), "unknown", "", "that the camera moved|stands still")

@@ -53,3 +53,17 @@ def test_a_lever_arm_that_is_wrong_changes_the_scale_as_said(make_survey: MakeSu
 def test_ranges_one_percent_longer_make_a_map_of_unknown_anchors_one_percent_larger(make_survey: MakeSurvey) -> None:
     survey = make_survey(anchors_m=FAR_ANCHORS_M, num_epochs=2, tag_in_cam_m=(0.0, 0.0, 0.0))
     assert survey.scale("unknown", range_model=HELD).sensitivity.range_slope_per_percent == pytest.approx(1.0, abs=0.02)
+
+
+def test_of_ranges_as_long_as_most_none_is_short(make_survey: MakeSurvey) -> None:
+    """A circle has all its ranges to one anchor in common, and rounding puts some of them below their median."""
+    angles = np.linspace(0.0, 6.0, 40)
+    circle = np.stack([3.0 * np.cos(angles), 3.0 * np.sin(angles), np.zeros(40)], axis=1)
+    anchors_m = {"A": (0.0, 0.0, 4.0), "B": (6.0, 0.0, 0.0)}
+    in_many_worlds = [
+        make_survey(centers_m=circle, anchors_m=anchors_m, tag_in_cam_m=(0, 0, 0), seed=seed)
+        .scale("first_camera", "AB", range_model=HELD)
+        .sensitivity.short_range_per_cm
+        for seed in range(3)
+    ]
+    np.testing.assert_allclose(in_many_worlds, in_many_worlds[0], rtol=1e-6)

@@ -114,3 +114,12 @@ def test_the_distance_between_two_surveyed_anchors_steadies_the_scale(make_surve
     assert np.all(formal[0] < 0.8 * formal[1])
     errors = [survey.relative_error(e) / e.uncertainty.formal for survey, e in zip(surveys, with_distance, strict=True)]
     assert np.sqrt(np.mean(np.square(errors))) < 2.0
+
+
+def test_a_path_in_the_plane_of_the_anchors_is_on_neither_side(make_survey: MakeSurvey) -> None:
+    """Whatever rounding says of it, and whichever side was told."""
+    centers = make_survey().centers_m * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
+    survey = make_survey(centers_m=centers, anchors_m=FLAT_ANCHORS_M, tag_in_cam_m=(0, 0, 0))
+    for side in ("above", "below"):
+        estimate = survey.scale("site", "ABCD", options=ScaleOptions(camera_side=side))
+        np.testing.assert_allclose(estimate.metric_from_sfm.apply(survey.trajectory.centers), centers, atol=1e-6)

@@ -269,7 +269,8 @@ def _world_motions(columns: _Columns) -> Array:
 def _free_motions(jacobian: csc_matrix, motions: Array) -> Array:
     """(num_columns, k) a basis of the motions of the world that change no residual."""
     alone = np.sqrt(np.square(abs(jacobian) @ np.abs(motions)).sum(axis=0))
-    scaled = motions[:, alone > 0] / alone[alone > 0]
+    moves = alone > _FREE_MOTION * alone.max()
+    scaled = motions[:, moves] / alone[moves]
     _, strengths, directions = np.linalg.svd(jacobian @ scaled, full_matrices=False)
     free: Array = scaled @ directions[strengths < _FREE_MOTION].T
     return free

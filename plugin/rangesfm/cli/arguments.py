@@ -53,7 +53,7 @@ class Parser(argparse.ArgumentParser):
         """Have arguments added when this parser is the one that reads."""
         self._later.append(add)
 
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:  # type: ignore[override]
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
         while self._later:
             self._later.pop(0)(self)
         return super().parse_known_args(args, namespace)

@@ -11,7 +11,6 @@ from pathlib import Path
 from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.cli.batch_progress import BatchTerminal
 from rangesfm.cli.survey_flags import (
-    ALL_TABLES,
     add_flags,
     add_restart_argument,
     overrides_from_arguments,
@@ -61,7 +60,7 @@ def add_command(commands: Commands) -> None:
         "--memory_limit", type=_bytes, metavar="SIZE", help="of each survey, as 8GB (default: its share)"
     )
     add_restart_argument(parser)
-    add_flags(parser, *ALL_TABLES, without=_OF_A_SURVEY)
+    add_flags(parser, without=_OF_A_SURVEY)
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.cli.survey_flags import (
-    ALL_TABLES,
     add_model_argument,
     add_restart_argument,
     add_survey_arguments,
@@ -31,7 +30,7 @@ def add_command(commands: Commands) -> None:
         description="Photos and ranges to a metric model. Stages that an earlier run has done are used again.",
         example="rangesfm run survey.toml --every_nth 3 --output_path out",
     )
-    add_survey_arguments(parser, *ALL_TABLES)
+    add_survey_arguments(parser)
     add_model_argument(parser)
     add_restart_argument(parser)
     parser.add_argument("--live", action="store_true", help="keep live.html, a page to watch, in the output folder")

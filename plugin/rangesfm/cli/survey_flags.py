@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from rangesfm.option_model import Key
     from rangesfm.survey.settings import Survey
 
-ALL_TABLES = ("images", "camera", "ranges", "anchors", "tag", "mapper", "scale", "refine", "export", "report", "output")
 LOG_KEYS = (
     *("ranges.format", "ranges.columns", "ranges.timestamp_unit", "ranges.range_unit", "ranges.separator"),
     *("ranges.ranging_interval_s", "ranges.stamp_unit", "ranges.stamp_bits", "ranges.propagation_speed"),
@@ -31,7 +30,7 @@ _WORDS = {"m": "METRES", "s": "SECONDS"}
 
 
 def add_survey_arguments(parser: Parser, *keys: str) -> None:
-    """The survey file, and flags for keys and whole tables of it."""
+    """The survey file, and flags for its keys, as ``add_flags`` has them."""
     parser.add_argument("survey", nargs="?", metavar="SURVEY.toml", help="survey file; flags override its keys")
     parser.add_argument(
         "--base_path", metavar="FOLDER", help="what the file's paths are relative to (default: its folder)"
@@ -43,7 +42,7 @@ def add_flags(parser: Parser, *keys: str, without: tuple[str, ...] = (), by_own_
     """Flags whose values ``overrides_from_arguments`` finds again.
 
     Args:
-        keys: dotted keys of a survey file, and tables for all of their keys.
+        keys: dotted keys of a survey file, and tables for all of their keys; none for all there are.
         without: keys that have no flag here.
         by_own_names: whether the flags are called as the keys, for a command that is about one table.
     """
@@ -107,8 +106,8 @@ def _converter(hint: Any) -> Callable[[str], Any]:
     """From the text of a flag to a value of a type; what it may be is for the key to say."""
     origin, args = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
-        words = [word for arg in args if get_origin(arg) is Literal for word in get_args(arg)]
-        return partial(_word_or_number, words, float if float in args else int)
+        words = [word for arg in args for word in get_args(arg) if isinstance(word, str)]
+        return partial(_word_or_number, words) if words else int
     if origin is tuple:
         return _numbers if args[0] is float else _names
     if origin is dict:
@@ -116,12 +115,11 @@ def _converter(hint: Any) -> Callable[[str], Any]:
     return str if hint is Path else hint
 
 
-def _word_or_number(words: list[Any], number: Callable[[str], Any], text: str) -> Any:
+def _word_or_number(words: list[str], text: str) -> str | float:
     try:
-        return text if text in words else number(text)
+        return text if text in words else float(text)
     except ValueError:
-        choices = ", ".join(word for word in words if isinstance(word, str))
-        raise argparse.ArgumentTypeError(f"'{text}' is neither {choices} nor a number") from None
+        raise argparse.ArgumentTypeError(f"'{text}' is neither {', '.join(words)} nor a number") from None
 
 
 def _numbers(text: str) -> list[float]:

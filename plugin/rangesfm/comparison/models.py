@@ -13,15 +13,16 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.colmap.model_files import read_model
 from rangesfm.comparison.ranges import ModelRanges, ranges_of_result
-from rangesfm.comparison.with_reference import MIN_NUM_ALIGNED, align_rows, reprojection_rms_px
+from rangesfm.comparison.with_reference import MIN_NUM_ALIGNED, reprojection_rms_px
 from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
 from rangesfm.geometry.reference import read_reference
-from rangesfm.geometry.similarity import Similarity, align_points, rmse
+from rangesfm.geometry.similarity import Similarity, rmse, similarity_between
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.result.folder import ResultFolder, read_result_folder
 from rangesfm.result.summary import ResultSummary
+from rangesfm.text_table import align_rows
 
 Array = npt.NDArray[np.float64]
 
@@ -217,10 +218,7 @@ def _common(first: Trajectory, second: Trajectory) -> tuple[tuple[str, ...], Arr
 
 
 def _similarity(source: Array, target: Array) -> Similarity | None:
-    if len(source) < MIN_NUM_ALIGNED or np.ptp(source, axis=0).max() == 0 or np.ptp(target, axis=0).max() == 0:
-        return None
-    found = align_points(source, target)
-    return found if found.scale > 0 else None
+    return similarity_between(source, target) if len(source) >= MIN_NUM_ALIGNED else None
 
 
 def _onto_ranges(ranges: ModelRanges, path: Trajectory) -> Similarity | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,11 +12,12 @@ import pycolmap
 
 from rangesfm.errors import InputError
 from rangesfm.geometry.reference import Reference, read_reference
-from rangesfm.geometry.similarity import align_points, path_shape, rmse
+from rangesfm.geometry.similarity import align_points, rmse, similarity_between
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.result.entries import ComparisonRow
 from rangesfm.result.folder import ResultFolder, read_result_folder
 from rangesfm.result.ranges_as_used import RangesAsUsed
+from rangesfm.text_table import align_rows
 
 Array = npt.NDArray[np.float64]
 
@@ -138,15 +139,8 @@ def _aligned_rmse(source: Array, target: Array, *, with_scale: bool) -> float:
 
 def _scale_to(source: Array, target: Array) -> float | None:
     """Scale of the best similarity from source to target; None where there is none."""
-    if len(source) < MIN_NUM_ALIGNED or not (_moves(source) and _moves(target)):
-        return None
-    scale = align_points(source, target).scale
-    return scale if scale > 0 else None
-
-
-def _moves(points: Array) -> bool:
-    shape = path_shape(points)
-    return bool(shape.stddevs[0] > 1e-9 * (1.0 + np.abs(shape.centroid).max()))
+    found = similarity_between(source, target) if len(source) >= MIN_NUM_ALIGNED else None
+    return None if found is None else found.scale
 
 
 def format_table(rows: tuple[ComparisonRow, ...]) -> str:
@@ -356,13 +350,3 @@ def _of_both(pair: tuple[Array, Array] | None, measure: Callable[[Array], float]
 
 def _text(value: float | None, spec: str, unit: str = "") -> str:
     return "-" if value is None else f"{value:{spec}}{unit}"
-
-
-def align_rows(rows: Sequence[tuple[str, ...]]) -> str:
-    """Columns as wide as their longest cell: the first to the left, the others to the right."""
-    widths = [max(len(cell) for cell in column) for column in zip(*rows)]
-    lines = []
-    for first, *others in rows:
-        cells = [first.ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(others, widths[1:]))]
-        lines.append("  ".join(cells).rstrip())
-    return "\n".join(lines)

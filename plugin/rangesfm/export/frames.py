@@ -19,6 +19,8 @@ _MAX_ROUGHNESS = 0.3
 # Mean of the photos' up directions: of photos that agree it has length 1.
 _MIN_AGREEMENT = 0.3
 _NEARLY_VERTICAL = 0.1
+# Of the same mean along the normal of the path's plane: photos straight down, or of a wall, have none.
+_MIN_LEAN = 0.01
 
 
 def in_frame(map_: MetricMap, options: ExportOptions) -> MetricMap:
@@ -83,7 +85,8 @@ def up_in_world(trajectory: Trajectory, up: str, *, is_site: bool = False) -> Ar
     """(3,) unit vector against gravity, by the rule ``up`` of ExportOptions.
 
     Raises:
-        InputError: the photos disagree about it, the path is not flat, or it is no direction.
+        InputError: the photos disagree about it or are all level with the path's plane, the path is not flat, or it is
+            no direction.
     """
     if up == "auto" and is_site:
         return np.array([0.0, 0.0, 1.0])
@@ -97,7 +100,9 @@ def up_in_world(trajectory: Trajectory, up: str, *, is_site: bool = False) -> Ar
         if shape.stddevs[2] > _MAX_ROUGHNESS * shape.stddevs[1]:
             raise InputError("the path does not lie in a plane: say what is up (--up cameras, or --up X,Y,Z)")
         normal = shape.axes[:, 2]
-        return _unit(normal if normal @ photos_up >= 0 else -normal)
+        if abs(normal @ photos_up) < _MIN_LEAN:
+            raise InputError("the photos do not say which side of the path's plane is up: say it (--up X,Y,Z)")
+        return _unit(normal if normal @ photos_up > 0 else -normal)
     return _unit(np.array(direction(up)))
 
 

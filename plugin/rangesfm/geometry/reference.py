@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from rangesfm.errors import InputError, printable
 from rangesfm.files.tables import Table, header_names, read_head, read_table, read_text, write_table
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.geometry.trajectory import ROUNDING_S, Trajectory
 
 Array = npt.NDArray[np.float64]
 
@@ -85,7 +85,7 @@ class Reference:
         positions, rotations = self._at_index(nearest)
 
         gap = known[after] - known[before]
-        between = (gap > 0) & (gap <= max_gap_s) & (times >= known[before]) & (times <= known[after])
+        between = (gap > 0) & (gap <= max_gap_s + ROUNDING_S) & (times >= known[before]) & (times <= known[after])
         weight = ((times - known[before])[between] / gap[between])[:, None]
         positions[between] = (1 - weight) * self.positions_m[before[between]] + weight * self.positions_m[
             after[between]

@@ -43,6 +43,31 @@ def overflow_raised() -> np.errstate:
 
 IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 
+# Of coordinates, or of their unit where they are smaller: what some operations on numbers of sixteen digits may leave.
+_ROUNDING = 1e-12
+# Of the extent of a path: nearer to the origin is only a camera that stands there, however far from its own origin the
+# world was in which the path was computed.
+_AT_ORIGIN = 1e-6
+# Of a unit vector, which has one coordinate that is larger: far enough from 0 for its sign to be no accident.
+_OF_SOME_SIZE = 0.3
+
+
+def rounding_of(coordinates: Array) -> float:
+    """A length that may be nothing but the rounding of (n, 3) coordinates: what is decided by a length needs more."""
+    return _ROUNDING * (1.0 + float(np.abs(coordinates).max(initial=0.0)))
+
+
+def are_apart(points: Array) -> bool:
+    """Whether (n, 3) points are more than one place, computed again and again."""
+    return bool(np.ptp(points, axis=0).max() > rounding_of(points))
+
+
+def off_origin(centers: Array) -> npt.NDArray[np.bool_]:
+    """(n,) which cameras of a path are elsewhere than at its origin, where no scale moves them."""
+    distance = np.linalg.norm(centers, axis=1)
+    is_off: npt.NDArray[np.bool_] = distance > max(_AT_ORIGIN * float(distance.max(initial=0.0)), rounding_of(centers))
+    return is_off
+
 
 def align_points(source: Array, target: Array, weights: Array | None = None, *, with_scale: bool = True) -> Similarity:
     """The similarity (or rigid motion) target_from_source with least squared error.
@@ -53,7 +78,7 @@ def align_points(source: Array, target: Array, weights: Array | None = None, *, 
     Args:
         source, target: (n, 3) corresponding points, n >= 3 for a unique answer.
         weights: (n,) of the squared errors; None for equal ones.
-        with_scale: False keeps the scale at 1.
+        with_scale: False keeps the scale at 1, as do points that are all in one place.
     """
     w = np.ones(len(source)) if weights is None else weights
     w = w / w.sum()
@@ -63,8 +88,18 @@ def align_points(source: Array, target: Array, weights: Array | None = None, *, 
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = (u * signs) @ vt
     variance = float(w @ np.sum(centered_source**2, axis=1))
-    scale = float(singular_values @ signs) / variance if with_scale and variance > 0 else 1.0
+    has_scale = with_scale and variance > rounding_of(source) ** 2
+    scale = float(singular_values @ signs) / variance if has_scale else 1.0
     return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
+
+
+def similarity_between(source: Array, target: Array) -> Similarity | None:
+    """As ``align_points``; None where it has no scale: one of them is a single place, or they have nothing alike."""
+    if not (are_apart(source) and are_apart(target)):
+        return None
+    found = align_points(source, target)
+    extents = [float(np.linalg.norm(points.std(axis=0))) for points in (source, target)]
+    return found if found.scale * extents[0] > _ROUNDING * extents[1] else None
 
 
 def rmse(differences: Array) -> float:
@@ -78,7 +113,7 @@ class PathShape:
 
     Attributes:
         centroid: (3,).
-        axes: (3, 3), columns are the principal directions, longest first.
+        axes: (3, 3), columns are the principal directions, longest first; ``oriented``.
         stddevs: (3,) along them, in the unit of the points.
     """
 
@@ -93,7 +128,14 @@ def path_shape(points: Array) -> PathShape:
     _, singular_values, vt = np.linalg.svd(points - centroid, full_matrices=len(points) < 3)
     stddevs = np.zeros(3)
     stddevs[: len(singular_values)] = singular_values / np.sqrt(len(points))
-    return PathShape(centroid, vt.T, stddevs)
+    return PathShape(centroid, oriented(vt.T), stddevs)
+
+
+def oriented(axes: Array) -> Array:
+    """Columns (3, k), each turned so that its last coordinate of some size is positive: no decomposition tells."""
+    last = 2 - np.argmax(np.abs(axes[::-1]) > _OF_SOME_SIZE, axis=0)
+    turned: Array = axes * np.sign(np.take_along_axis(axes, last[None], axis=0))
+    return turned
 
 
 # Extents of a path across itself, in lengths, that ranges with noise of about a decimetre hardly see.

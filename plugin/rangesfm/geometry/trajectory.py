@@ -12,6 +12,9 @@ import numpy.typing as npt
 if TYPE_CHECKING:
     import pycolmap
 
+ROUNDING_S = 1e-6
+"""Of a difference of two times that are seconds since 1970."""
+
 
 @dataclass(frozen=True)
 class Trajectory:

@@ -10,7 +10,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.geometry.trajectory import ROUNDING_S, Trajectory
 from rangesfm.options import AssociationOptions
 from rangesfm.ranging.clock.time_resolution import time_resolution_s
 from rangesfm.ranging.errors.noise import robust_stddev
@@ -85,6 +85,11 @@ def associate(
     return _observe(log, trajectory, tags, status, before, after, weight, options)
 
 
+def is_too_long(gaps_s: npt.ArrayLike, options: AssociationOptions) -> Mask:
+    """(n,) gaps between keyframes across which no pose is interpolated; photos every 2 s are 2 s apart at any date."""
+    return np.asarray(gaps_s) > options.max_interpolation_gap_s + ROUNDING_S
+
+
 def lever_arms(log: RangeLog, tag_in_cam_m: npt.ArrayLike) -> Array:
     """(num_tags, 3) in the order of ``log.tag_ids``, from one lever arm for all or one for each.
 
@@ -124,7 +129,7 @@ def _places_by_time(
     inside = (times >= keyframe_times[0]) & (times <= keyframe_times[last])
 
     at_keyframe = distance <= options.max_time_difference_s
-    interpolated = inside & (gap <= options.max_interpolation_gap_s)
+    interpolated = inside & ~is_too_long(gap, options)
     of_camera = log.kind == RangeKind.TAG_ANCHOR
     lonely = of_camera & ~interpolated & _keyframe_is_isolated(keyframe_times, options)[nearest]
     still = lonely & _camera_is_still(log, nearest, distance, times, lonely, keyframe_times)
@@ -140,7 +145,7 @@ def _places_by_time(
 
 def _keyframe_is_isolated(keyframe_times: Array, options: AssociationOptions) -> Mask:
     """(n,) keyframes with a gap on both sides: only there can standing still matter."""
-    long_gap = np.concatenate([[True], np.diff(keyframe_times) > options.max_interpolation_gap_s, [True]])
+    long_gap = np.concatenate([[True], is_too_long(np.diff(keyframe_times), options), [True]])
     return np.asarray(long_gap[:-1] & long_gap[1:])
 
 
@@ -253,9 +258,7 @@ def _timing_stddev(
         return np.zeros(len(before))
     gaps = np.diff(times)
     # Where photos are far apart, ranges have a place only if the camera stood still.
-    speeds = np.where(
-        gaps <= options.max_interpolation_gap_s, np.linalg.norm(np.diff(centers, axis=0), axis=1) / gaps, 0
-    )
+    speeds = np.where(is_too_long(gaps, options), 0, np.linalg.norm(np.diff(centers, axis=0), axis=1) / gaps)
     around = np.concatenate([[0.0], speeds, [0.0]])
     speed = np.where(before == after, np.maximum(around[before], around[before + 1]), around[before + 1])
     photo_share = np.where(before == after, 1.0, np.hypot(1 - weight, weight))
@@ -267,7 +270,7 @@ def _curve_beyond_line(
 ) -> tuple[Array, Array]:
     """What a cubic spline has beyond the chord at each place, and how far the spline can be trusted."""
     offsets, stddev = np.zeros((len(before), 3)), np.zeros(len(before))
-    breaks = np.flatnonzero(np.diff(times) > options.max_interpolation_gap_s) + 1
+    breaks = np.flatnonzero(is_too_long(np.diff(times), options)) + 1
     for segment in np.split(np.arange(len(times)), breaks):
         here = (before >= segment[0]) & (before < segment[-1])
         if len(segment) < 4 or not here.any():

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.rotations import cross_matrices
+from rangesfm.geometry.similarity import rounding_of
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_gradient import RangeGradient
@@ -240,7 +241,8 @@ def _local_scale(vision: VisionInformation, shift: Array, shift_before: Array) -
     n = len(vision.origin)
     now = np.bincount(vision.reference, np.sum(shift**2, axis=1), minlength=n)
     before = np.bincount(vision.reference, np.sum(shift_before**2, axis=1), minlength=n)
-    known = (now > 0) & (before > 0)
+    least = rounding_of(vision.origin.centers) ** 2  # all of one place have no scale
+    known = (now > least) & (before > least)
     return np.sqrt(np.divide(now, before, where=known, out=np.ones(n)))
 
 

@@ -10,7 +10,7 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 from rangesfm.colmap.transform import transform
-from rangesfm.geometry.similarity import Similarity, align_points, rmse
+from rangesfm.geometry.similarity import Similarity, align_points, are_apart, rmse
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors
@@ -109,7 +109,8 @@ def _as_a_whole(before: Poses, after: Poses, held_frame: int | None) -> Similari
         turn, start, end = np.eye(3), before.centers[held_frame], after.centers[held_frame]
     turned = (before.centers - start) @ turn.T
     likeness = float(np.sum(turned * (after.centers - end)))
-    scale = likeness / float(np.sum(turned**2)) if likeness > 0 else 1.0  # of a point, or turned inside out: none
+    # Of a point, or turned inside out, there is none.
+    scale = likeness / float(np.sum(turned**2)) if likeness > 0 and are_apart(before.centers) else 1.0
     return Similarity(scale, turn, end - scale * turn @ start)
 
 

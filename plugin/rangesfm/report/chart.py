@@ -11,8 +11,8 @@ from typing import Any, TypeAlias
 
 from PIL import Image
 
-from rangesfm.report.packing import pack
-from rangesfm.report.plot import Figure, Mark, Panel, Picture, Range, Series
+from rangesfm.report.plot import Figure, Mark, Panel, Pixels, Range, Series
+from rangesfm.report.scene import pack
 
 Spec: TypeAlias = dict[str, Any]
 Color: TypeAlias = Callable[[str], str]
@@ -40,7 +40,7 @@ def page_chart(panel: Panel) -> Spec:
     spec = panel_spec(panel, color, lambda i: {"name": f"series{i}"})
     encodings = ["x"] if panel.rows else ["x", "y"]
     spec["layer"][0]["params"] = [ZOOM | {"select": ZOOM["select"] | {"encodings": encodings}}]
-    margins: Spec = {"top": 10, "bottom": 38, "left": 58, "right": 14}
+    margins: Spec = {"top": 10, "bottom": 38, "left": 64, "right": 14}
     if panel.rows:
         margins |= {"left": _LEFT_OF_ROWS_PX, "right": _RIGHT_OF_ROWS_PX}
     series = [
@@ -118,7 +118,7 @@ def config(color: Color) -> Spec:
         "font": "sans-serif",
         "view": {"stroke": None},
         "axis": axis,
-        "axisY": {"minExtent": 36, "maxExtent": 36},
+        "axisY": {"minExtent": 42, "maxExtent": 42},
     }
 
 
@@ -157,9 +157,9 @@ def _clamped(field: str, limits: Range) -> Spec:
     return {"calculate": f"isValid(datum.{field}) ? clamp(datum.{field}, {low!r}, {high!r}) : null", "as": field}
 
 
-def _image(picture: Picture, encoding: Spec) -> Spec:
+def _image(picture: Pixels, encoding: Spec) -> Spec:
     file = io.BytesIO()
-    colors = Image.fromarray(picture.pixels).quantize(_NUM_PICTURE_COLORS, method=Image.Quantize.FASTOCTREE)
+    colors = Image.fromarray(picture).quantize(_NUM_PICTURE_COLORS, method=Image.Quantize.FASTOCTREE)
     colors.save(file, "PNG", optimize=True)
     url = "data:image/png;base64," + base64.b64encode(file.getvalue()).decode("ascii")
     return _layer({"type": "image", "url": url, "aspect": False}, **encoding)

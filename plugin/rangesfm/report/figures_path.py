@@ -8,7 +8,7 @@ import numpy.typing as npt
 from rangesfm.geometry.similarity import align_points
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.report.content import Content
-from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Panel, Picture, Range, Series, equal_view
+from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Panel, Pixels, Range, Series, equal_view
 from rangesfm.report.text import count
 
 Array = npt.NDArray[np.float64]
@@ -152,7 +152,7 @@ def _map_view(content: Content, name: str, axes: tuple[int, int], signs: tuple[i
         y_range=y_range,
         size=size,
         keeps_shape=True,
-        picture=Picture(pixels),
+        picture=pixels,
     )
 
 
@@ -166,11 +166,11 @@ def _depth(content: Content, axes: tuple[int, int]) -> Array:
 
 def _raster(
     points: Array,
-    colors: npt.NDArray[np.uint8],
+    colors: Pixels,
     x_range: Range,
     y_range: Range,
     aspect: float,
-) -> npt.NDArray[np.uint8]:
+) -> Pixels:
     """(h, w, 4) pixels with each point two pixels wide."""
     width, height = PICTURE_WIDTH_PX, max(round(PICTURE_WIDTH_PX * aspect), 1)
     pixels = np.zeros((height, width, 4), dtype=np.uint8)

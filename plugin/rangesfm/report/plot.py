@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+Pixels = npt.NDArray[np.uint8]
 Range = tuple[float, float]
 
 VIEW_SIZE = (400.0, 350.0)
@@ -59,17 +60,6 @@ class Mark:
 
 
 @dataclass(frozen=True)
-class Picture:
-    """Pixels behind the series, all over the panel.
-
-    Attributes:
-        pixels: (h, w, 4) red, green, blue, opacity; the first row is the top.
-    """
-
-    pixels: npt.NDArray[np.uint8]
-
-
-@dataclass(frozen=True)
 class Panel:
     """One coordinate system.
 
@@ -83,6 +73,7 @@ class Panel:
         verticals: (x, color) lines over the whole height.
         bands: (low, high, color) strips over the whole height.
         rows: labels left and right of heights, instead of numbers on the y axis.
+        picture: (h, w, 4) red, green, blue, opacity, behind the series and all over the panel; top row first.
     """
 
     title: str
@@ -99,7 +90,7 @@ class Panel:
     verticals: tuple[tuple[float, str], ...] = ()
     bands: tuple[tuple[float, float, str], ...] = ()
     rows: tuple[tuple[float, str, str], ...] = ()
-    picture: Picture | None = None
+    picture: Pixels | None = None
 
     @property
     def limits(self) -> tuple[Range, Range]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,6 @@ import numpy.typing as npt
 
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.observations import RangeStatus
-from rangesfm.report.packing import pack
 from rangesfm.report.thumbnails import thumbnails
 from rangesfm.result.ranges_as_used import RangesAsUsed
 
@@ -255,3 +255,13 @@ def _residual_limit(residuals: Array) -> float:
     """The residual that has the full colour: all but a twentieth of the used are below."""
     known = np.abs(residuals[np.isfinite(residuals)])
     return max(float(np.quantile(known, 0.95)), 1e-3) if len(known) else 1.0
+
+
+def pack(values: npt.ArrayLike, kind: str) -> dict[str, str]:
+    """An array as the page's script reads it, row by row.
+
+    Args:
+        kind: "uint8", "uint16", "int32" or "float32".
+    """
+    array = np.ascontiguousarray(values, dtype=np.dtype(kind).newbyteorder("<"))
+    return {"type": kind, "data": base64.b64encode(array.tobytes()).decode("ascii")}

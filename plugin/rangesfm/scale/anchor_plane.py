@@ -21,6 +21,8 @@ _MIN_OFF_VERTICAL_DEG = 20.0
 _MAX_TILT_DEG = 60.0
 # Share of a path that makes a side its own.
 _ON_ONE_SIDE = 0.9
+# Of the path's length: what is so near to the plane is in it, as far as any ranges tell, and on neither side.
+_IN_PLANE = 1e-3
 
 
 def anchor_plane(problem: RangeProblem) -> tuple[Array, Array] | None:
@@ -73,7 +75,7 @@ def mirrored_map(problem: RangeProblem, state: RangeState) -> RangeState | None:
 
 
 def camera_side_of(problem: RangeProblem, state: RangeState) -> str | None:
-    """ "above" or "below" the anchors' plane, or "on both sides of" it; None where they have none.
+    """ "above" or "below" the anchors' plane, or "on both sides of" it; None where they have none or it is the path's.
 
     Raises:
         GeometryError: the plane stands upright.
@@ -84,14 +86,19 @@ def camera_side_of(problem: RangeProblem, state: RangeState) -> str | None:
     point, normal = plane
     if np.rad2deg(np.arccos(normal @ UP_IN_SITE)) > _MAX_TILT_DEG:
         raise GeometryError("the anchors stand in an upright plane, so that nothing is above or below it: camera_side")
-    share_above = float(np.mean((state.metric_from_model.apply(problem.centers) - point) @ normal > 0))
+    heights = (state.metric_from_model.apply(problem.centers) - point) @ normal
+    length = state.metric_from_model.scale * path_shape(problem.centers).stddevs[0]
+    off_plane = np.abs(heights) > _IN_PLANE * length
+    if not off_plane.any():
+        return None
+    share_above = float(np.mean(heights[off_plane] > 0))
     if share_above >= _ON_ONE_SIDE:
         return "above"
     return "below" if share_above <= 1 - _ON_ONE_SIDE else "on both sides of"
 
 
 def on_side(problem: RangeProblem, fits: list[RangeFit], camera_side: str | None) -> list[RangeFit]:
-    """The fits whose path runs above or below the anchors' plane, as told; all of them where there is no such plane.
+    """The fits whose path runs above or below the anchors' plane, as told, or in it; all of them where there is none.
 
     Raises:
         GeometryError: the plane stands upright, or no fit is on that side.

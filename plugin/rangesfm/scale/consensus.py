@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.similarity import off_origin
 from rangesfm.scale.range_equation import RangeProblem
 
 Array = npt.NDArray[np.float64]
@@ -65,7 +66,7 @@ def agreeing_intervals(centers: Array, offset: Array, ranges: Array, tolerance: 
     Returns:
         interval starts and ends, up to 2 n, in no particular order.
     """
-    a = np.sum(centers**2, axis=1)
+    a = np.where(off_origin(centers), np.sum(centers**2, axis=1), 0.0)
     b = np.sum(centers * offset, axis=1)
     d = np.sum(offset**2, axis=1)
     outer_low, outer_high, reaches = _roots(a, b, d - (ranges + tolerance) ** 2)

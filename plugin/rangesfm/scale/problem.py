@@ -13,7 +13,7 @@ from rangesfm.distances.ends import LocatedDistances
 from rangesfm.distances.surveyed import surveyed_distances
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.gravity import Gravity
-from rangesfm.geometry.similarity import Similarity, path_shape
+from rangesfm.geometry.similarity import Similarity, path_shape, rounding_of
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.anchors.anchor import Anchor
@@ -94,7 +94,7 @@ def scale_problem(
     noise = range_model.range_stddev_m or START_STDDEV_M
     errors = RangeErrors.begin(observations, rows, range_model, block_s)
     ranges = RangeProblem(
-        centers=first_camera_from_sfm.apply(observations.centers[rows]),
+        centers=_centers_in_first_camera(observations.centers[rows], trajectory),
         tag_from_center=observations.tag_from_center[rows] @ first_camera_from_sfm.rotation.T,
         anchor_index=log.anchor_index[rows],
         range_m=log.range_m[rows],
@@ -180,6 +180,14 @@ def _usable_ranges(
 def _first_camera_from_sfm(trajectory: Trajectory) -> Similarity:
     rotation = trajectory.world_from_cam[0].T
     return Similarity(1.0, rotation, -rotation @ trajectory.centers[0])
+
+
+def _centers_in_first_camera(centers: Array, trajectory: Trajectory) -> Array:
+    """(k, 3) of the first camera itself exactly 0, and not what rounding leaves: no scale moves it."""
+    off = centers - trajectory.centers[0]
+    off[np.linalg.norm(off, axis=1) <= rounding_of(trajectory.centers)] = 0.0
+    in_first_camera: Array = off @ trajectory.world_from_cam[0]
+    return in_first_camera
 
 
 def _require_enough(observations: RangeObservations, rows: npt.NDArray[np.int64]) -> None:

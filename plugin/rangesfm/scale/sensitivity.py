@@ -13,6 +13,8 @@ from rangesfm.scale.uncertainty import scale_influence
 Array = npt.NDArray[np.float64]
 
 _CM = 0.01
+# Of all ranges from one distance, which rounding spreads, none is shorter than the others.
+_SHORTER = 1 - 1e-9
 
 
 def scale_sensitivity(solution: Solution, model_from_cam: Array, anchor_ids: tuple[str, ...]) -> ScaleSensitivity:
@@ -33,7 +35,7 @@ def scale_sensitivity(solution: Solution, model_from_cam: Array, anchor_ids: tup
     along_x, along_y, along_z = range_gradient(problem, state).by_tag_in_cam(world_from_cam).T
     return ScaleSensitivity(
         common_bias_per_cm=percent(np.full(len(distance), _CM)),
-        short_range_per_cm=percent(np.where(distance < np.median(distance), _CM, 0.0)),
+        short_range_per_cm=percent(np.where(distance < _SHORTER * np.median(distance), _CM, 0.0)),
         anchor_bias_per_cm={
             anchor_id: percent(np.where(problem.anchor_index == k, _CM, 0.0)) for k, anchor_id in enumerate(anchor_ids)
         },

@@ -14,9 +14,10 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import GeometryError
-from rangesfm.geometry.similarity import IDENTITY, Similarity, path_shape, round_middle
+from rangesfm.geometry.similarity import IDENTITY, Similarity, path_shape, round_middle, rounding_of
 from rangesfm.ranging.anchors.multilateration import multilaterate
 from rangesfm.ranging.errors.noise import robust_stddevs
+from rangesfm.ranging.errors.robust_loss import SAME_COST
 from rangesfm.scale.consensus import consensus_scales
 from rangesfm.scale.range_equation import RangeProblem, RangeState, solve, tag_positions
 
@@ -33,6 +34,8 @@ _NUM_MINIMA = 4
 # Trials closer than this run into the same minimum.
 _BASIN_LOG_SCALE = 0.3
 _BASIN_ROTATION_RAD = 0.6
+# In radii: an anchor this near to the middle of a sphere has no distance from it that could be a radius.
+_IN_MIDDLE = 1e-6
 
 
 def spread_subset(problem: RangeProblem, max_num_per_anchor: int) -> RangeProblem:
@@ -58,8 +61,9 @@ def scale_candidates(problem: RangeProblem) -> Array:
         centers, ranges = small.centers[rows], small.range_m[rows]
         first, second = np.triu_indices(len(ranges), 1)
         moved = np.linalg.norm(centers[first] - centers[second], axis=1)
-        far = moved > 0.5 * moved.max() if len(moved) and moved.max() > 0 else np.zeros(len(moved), dtype=bool)
-        ratios.append(np.abs(ranges[first] - ranges[second])[far] / moved[far])
+        far = moved > max(0.5 * moved.max(initial=0.0), rounding_of(centers))
+        changed = np.abs(ranges[first] - ranges[second])
+        ratios.append(np.where(changed > rounding_of(ranges), changed, 0.0)[far] / moved[far])
     ratio = np.concatenate(ratios) if ratios else np.empty(0)
     lower = float(np.quantile(ratio, 0.75)) if len(ratio) else 0.0
     if not lower > 0:
@@ -141,14 +145,14 @@ def sphere_swaps(problem: RangeProblem, state: RangeState) -> list[RangeState]:
     from_middle = state.anchors_m - placed.apply(middle)
     swaps = []
     for growth in np.linalg.norm(from_middle[np.unique(problem.anchor_index)], axis=1) / (placed.scale * radius):
-        if growth > 0:
+        if growth > _IN_MIDDLE:
             grown = replace(placed, scale=float(placed.scale * growth))
             swaps.append(RangeState(grown, grown.apply(middle) + from_middle / growth, state.bias_m))
     return swaps
 
 
 def choose_sides(problem: RangeProblem, state: RangeState) -> tuple[RangeState, Array]:
-    """Put each unknown anchor on the better side of the path's plane, the scale kept.
+    """Put each unknown anchor on the better side of the path's plane, the scale kept; on the normal's if they tie.
 
     Returns:
         the state, and (m,) by how much the robust cost is higher on the other side; inf for
@@ -161,15 +165,16 @@ def choose_sides(problem: RangeProblem, state: RangeState) -> tuple[RangeState, 
         alone = anchor_alone(problem, int(k), state.metric_from_model)
         if not len(alone.range_m):
             continue
-        height = float((anchors[k] - shape.centroid) @ normal)
         # On the plane itself both sides start alike and could never part.
-        height = np.copysign(max(abs(height), 0.1 * float(np.median(alone.range_m))), height)
+        height = abs(float((anchors[k] - shape.centroid) @ normal))
+        height = max(height, 0.1 * float(np.median(alone.range_m)))
         on_plane = anchors[k] - ((anchors[k] - shape.centroid) @ normal) * normal
         fits = []
         for side in (height, -height):
             at = RangeState(IDENTITY, (on_plane + side * normal)[None], state.bias_m[k : k + 1])
             fits.append(solve(alone, at, tolerance=1e-8))
-        fits.sort(key=lambda fit: fit.cost)
+        if fits[0].cost - fits[1].cost > SAME_COST * (1 + fits[0].cost):
+            fits.reverse()
         anchors[k] = fits[0].state.anchors_m[0]
         rise[k] = fits[1].cost - fits[0].cost
     return replace(state, anchors_m=anchors), rise

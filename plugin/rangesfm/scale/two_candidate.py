@@ -13,7 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.geometry.similarity import off_origin
+
 Array = npt.NDArray[np.float64]
+
+# Of what a discriminant is the difference of: less may be its rounding.
+_ONE_ROOT = 1e-12
 
 
 @dataclass(frozen=True)
@@ -67,7 +72,10 @@ def two_candidate(centers: Array, tag_from_center: Array, anchor_m: Array, range
     c = np.sum(offset**2, axis=1) - range_m**2
     with np.errstate(divide="ignore", invalid="ignore"):
         center, discriminant = -b / a, (b / a) ** 2 - c / a
-    rows = np.flatnonzero((a > 0) & np.isfinite(discriminant) & (discriminant >= 0))
+        # Where its ray is nearest to the anchor a camera has one candidate, which rounding must not take.
+        has_one = np.abs(discriminant) < _ONE_ROOT * np.sum(offset**2, axis=1) / a
+    discriminant[has_one] = 0.0
+    rows = np.flatnonzero(off_origin(centers) & (discriminant >= 0))
     if len(rows) < 2:
         return None
     root = np.sqrt(discriminant[rows])

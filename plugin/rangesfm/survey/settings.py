@@ -101,8 +101,8 @@ _ROLE_OF_PATH: dict[str, PathRole] = {item.dotted: item.role for item in KEYS if
 
 
 def chosen_keys(chosen: Collection[str]) -> list[Key]:
-    """Of dotted keys, and tables for all of theirs."""
-    return [item for item in KEYS if item.table in chosen or item.dotted in chosen]
+    """Of dotted keys, and tables for all of theirs; of none all there are."""
+    return [item for item in KEYS if not chosen or item.table in chosen or item.dotted in chosen]
 
 
 def read_survey(

@@ -7,12 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from rangesfm.errors import InputError
+from rangesfm.geometry.trajectory import ROUNDING_S
 from rangesfm.options import KeyframeOptions
 from rangesfm.vision.image_times import ImageTimes
 
 MIN_NUM_KEYFRAMES = 3
-
-_ROUNDING_S = 1e-6  # of a difference of two times that are seconds since 1970
 
 
 def select_keyframes(photos: ImageTimes | Sequence[str], options: KeyframeOptions) -> tuple[str, ...]:
@@ -43,6 +42,6 @@ def select_keyframes(photos: ImageTimes | Sequence[str], options: KeyframeOption
 def _far_enough_apart(timestamps_s: np.typing.NDArray[np.float64], min_interval_s: float) -> list[int]:
     kept = [0]
     for index, time in enumerate(timestamps_s.tolist()):
-        if time - timestamps_s[kept[-1]] >= min_interval_s - _ROUNDING_S:
+        if time - timestamps_s[kept[-1]] >= min_interval_s - ROUNDING_S:
             kept.append(index)
     return kept

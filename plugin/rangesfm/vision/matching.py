@@ -52,8 +52,10 @@ def matching_options(mapper: MapperOptions, num_photos: int, seed: int) -> Match
     options = MatchingOptions(
         pairing=sequential if is_sequential else exhaustive,
         matcher=pycolmap.FeatureMatchingOptions(num_threads=num_threads),
-        verification=pycolmap.TwoViewGeometryOptions(ransac=pycolmap.RANSACOptions(random_seed=seed)),
+        verification=pycolmap.TwoViewGeometryOptions(),
     )
+    # Within COLMAP's own: what it asks of two views is not what its RANSAC asks by itself.
+    options.verification.ransac.random_seed = seed
     apply_options(options.pairing, mapper.pairing, "mapper.pairing")
     apply_options(options.matcher, mapper.matcher, "mapper.matcher")
     return options

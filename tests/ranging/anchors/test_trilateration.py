@@ -197,18 +197,26 @@ class TestCovariance:
         assert 1.5 < np.mean(squares[True]) < 5.0
 
 
-def test_ranges_that_say_how_noisy_they_are_weigh_accordingly() -> None:
-    positions = flight()
-    errors: dict[bool, list[float]] = {True: [], False: []}
+def errors_over_seeds(stddevs: Array, *, given: bool) -> list[float]:
+    """How far off anchors are, by ranges as noisy as ``stddevs`` say in another order each time."""
+    positions, errors = flight(), []
     for seed in range(20):
         rng = np.random.default_rng(seed)
-        stddev = np.where(rng.random(100) < 0.3, 0.02, 0.5)
+        stddev = rng.permutation(stddevs)
         ranges = distances(positions) + stddev * rng.standard_normal(100)
-        for given, found in errors.items():
-            result = trilaterate(positions, ranges, range_stddev_m=stddev if given else None, options=KNOWN_BIAS)
-            found.append(float(np.linalg.norm(result.position_m - ANCHOR_M)))
-    assert np.median(errors[True]) < 0.03
-    assert np.median(errors[True]) < 0.7 * np.median(errors[False])
+        found = trilaterate(positions, ranges, range_stddev_m=stddev if given else None, options=KNOWN_BIAS)
+        errors.append(float(np.linalg.norm(found.position_m - ANCHOR_M)))
+    return errors
+
+
+def test_ranges_that_say_how_noisy_they_are_weigh_accordingly() -> None:
+    stddevs = np.geomspace(0.02, 1.0, 100)
+    assert np.median(errors_over_seeds(stddevs, given=True)) < 0.7 * np.median(errors_over_seeds(stddevs, given=False))
+
+
+@pytest.mark.parametrize(("given", "limit_m"), [(True, 0.03), (False, 0.05)])
+def test_three_good_ranges_in_ten_decide(given: bool, limit_m: float) -> None:
+    assert np.median(errors_over_seeds(np.repeat([0.02, 0.5], [30, 70]), given=given)) < limit_m
 
 
 @pytest.mark.parametrize("options", [TrilaterationOptions(), KNOWN_BIAS], ids=["defaults", "bias known"])
@@ -251,3 +259,31 @@ class TestErrorCurve:
         assert placement.found is not None
         np.testing.assert_allclose(placement.found.position_m, alone.position_m, atol=1e-9)
         np.testing.assert_allclose(placement.found.covariance_m2, alone.covariance_m2, atol=1e-9)
+
+
+class TestRounding:
+    """What it would decide is decided otherwise, and the same on every machine."""
+
+    @pytest.mark.parametrize("seed", range(6))
+    def test_of_two_places_between_which_no_range_tells_the_upper_one_comes_first(self, seed: int) -> None:
+        for height in (3.5, -1.5):
+            ranges = distances(flat(), np.array([6.0, -4.0, height])) + noise(100, 0.02, seed)
+            found = trilaterate(flat(), ranges)
+            assert found.mirror_position_m is not None
+            assert found.position_m[2] > 3.0 > found.mirror_position_m[2]
+
+    @pytest.mark.parametrize("toward", [(1.0, 0.0, 0.0), (3.0, 4.0, 1e-15), (0.0, 0.0, 0.0)])
+    def test_a_direction_along_the_plane_of_the_positions_leaves_both_places(
+        self, toward: tuple[float, float, float]
+    ) -> None:
+        found = trilaterate(flat(), distances(flat()) + noise(100, 0.02), toward=toward)
+        assert found.mirror_position_m is not None
+
+    @pytest.mark.parametrize("away_m", [20.0, 60.0, 200.0])
+    @pytest.mark.parametrize("seed", range(3))
+    def test_a_bias_that_is_known_does_not_make_a_place_about_a_line_certain(self, away_m: float, seed: int) -> None:
+        """In metres its information is 1e12, and what is left of a direction beside it is rounding."""
+        line = np.outer(np.linspace(-4.0, 4.0, 100), [1.0, 0.0, 0.0])
+        ranges = distances(line, np.array([1.0, away_m, 3.0])) + noise(100, 0.02, seed)
+        with pytest.raises(GeometryError, match="on a line, about which the anchor may stand anywhere"):
+            trilaterate(line, ranges, options=KNOWN_BIAS)

@@ -101,3 +101,14 @@ def test_the_curve_takes_out_what_it_was_learnt_from() -> None:
     after = distance - calibration.distance_m
     assert np.mean(before[short]) < -0.05
     assert np.mean(after[short]) == pytest.approx(0.0, abs=0.02)
+
+
+def test_a_tag_that_stands_on_an_anchor_but_for_rounding_is_no_end_of_the_curve() -> None:
+    log, tags = simulated(np.zeros_like, seed=4)
+    on_it = np.arange(0, len(log), 40)
+    assert np.all(log.anchor_index[on_it] == 0)
+    assert ANCHORS[0].position_m is not None
+    tags[on_it] = ANCHORS[0].position_m + 1e-16
+    found = calibrate_ranges(log, tags, ANCHORS)
+    assert found.num_ranges == len(log) - len(on_it)
+    assert found.curve.distance_m[0] > 0.3

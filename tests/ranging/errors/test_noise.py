@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from rangesfm.ranging.errors.noise import stretch_labels
+from rangesfm.ranging.errors.noise import correlation_inflation, stretch_labels
 
 
 def test_a_stretch_is_as_long_as_asked() -> None:
@@ -20,3 +21,11 @@ def test_a_short_log_has_eight_all_the_same() -> None:
 
 def test_ranges_of_one_moment_are_one_stretch() -> None:
     np.testing.assert_array_equal(stretch_labels(np.full(5, 3.0), 10.0), 0)
+
+
+def test_errors_of_a_stretch_that_are_alike_widen_and_rounding_does_not() -> None:
+    groups = np.repeat(np.arange(20), 25)
+    alike = np.repeat(np.random.default_rng(0).normal(size=20), 25)
+    assert correlation_inflation(alike, np.ones(500), groups) == pytest.approx(5.0)
+    assert correlation_inflation(1e-12 * alike, np.ones(500), groups) == 1.0
+    assert correlation_inflation(0 * alike, np.ones(500), groups) == 1.0

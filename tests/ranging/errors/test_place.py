@@ -62,3 +62,19 @@ def test_the_formal_variance_holds_for_independent_errors() -> None:
     shares = shares_of_places(np.repeat([0, 1, 2], [50, 10, 1]), 0.5)
     variance_of_mean = np.sum(shares**2) / shares.sum() ** 2
     assert variance_of_mean == pytest.approx(1 / shares.sum())
+
+
+def test_rounding_does_not_part_a_place_on_round_coordinates() -> None:
+    """A level path at 1.6 m, in whole decimetres: every other value is a multiple of the grid."""
+    rng = np.random.default_rng(0)
+    tags = np.column_stack([0.1 * rng.integers(-50, 50, (400, 2)), np.full(400, 1.6)])
+    index = np.zeros(400, dtype=np.int64)
+    labels = place_labels(tags, index)
+    assert len(set(labels.tolist())) == len(np.unique(np.floor_divide(np.rint(10 * tags), 2), axis=0))
+    for _ in range(5):
+        np.testing.assert_array_equal(place_labels(tags + rng.choice([-1e-13, 1e-13], tags.shape), index), labels)
+
+
+def test_rounding_has_no_place() -> None:
+    labels = np.repeat(np.arange(20), 10)
+    assert correlation_in_place(1e-12 * np.repeat(np.random.default_rng(0).normal(size=20), 10), labels) == 0.0

@@ -45,3 +45,11 @@ def test_under_gaussian_noise_it_is_nearly_as_good_as_least_squares(loss: Robust
 def test_only_the_bounded_one_is_bounded() -> None:
     assert GEMAN_MCCLURE.rho(np.array([1e12]))[0, 0] == pytest.approx(GEMAN_MCCLURE.width**2)
     assert CAUCHY.rho(np.array([1e12]))[0, 0] > 100
+
+
+@BOTH
+def test_next_to_no_residual_the_loss_is_its_square(loss: RobustLoss) -> None:
+    """Down to what is nothing beside 1."""
+    residuals = np.geomspace(1e-12, 1e-5, 60)
+    np.testing.assert_allclose(loss.rho(residuals**2)[0], residuals**2, rtol=1e-9)
+    np.testing.assert_allclose(loss.slopes(residuals), 1.0, rtol=1e-9)

@@ -177,7 +177,7 @@ def place_in(browser: Browser, chart: str, x: float, y: float) -> tuple[float, f
     browser.run(f"{chart}.node.scrollIntoView({{block: 'center'}})")
     browser.wait_for(f"{chart}.view")
     left, top = browser.run(
-        f"const {{node, view}} = {chart}, box = node.getBoundingClientRect(), [left, top] = view.origin();"
+        f"const {{node, view, spec}} = {chart}, box = node.getBoundingClientRect(), {{left, top}} = spec.padding;"
         "return [box.x + left + view.scale('x')(arguments[0]), box.y + top + view.scale('y')(arguments[1])]",
         x,
         y,
@@ -195,6 +195,26 @@ def test_the_pointer_tells_the_values_of_what_is_nearest(browser: Browser, page:
     assert said == f"ranges that agree · scale m per unit {scale:.5g} · ranges {num_agreeing:.0f}"
     browser.command("Input.dispatchMouseEvent", type="mouseMoved", x=1, y=1)
     assert not browser.run(f"return {chart}.tip.checkVisibility()")
+
+
+def test_the_pointer_names_the_mark_that_is_drawn_under_it(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    browser.run("document.querySelector('#trajectory').scrollIntoView({block: 'center'})")
+    browser.wait_for("rangesfmFigures.trajectory[0].view")
+    for i in (0, 3, 7):
+        x, y = browser.run(
+            "const mark = document.querySelectorAll('#trajectory .chart')[1].querySelectorAll('.mark-symbol path');"
+            "const box = mark[arguments[0]].getBoundingClientRect();"
+            "return [box.x + box.width / 2, box.y + box.height / 2]",
+            i,
+        )
+        browser.command("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+        tip, shown_x, shown_y = browser.run(
+            "const {tip, node} = rangesfmFigures.trajectory[1], box = node.getBoundingClientRect();"
+            "return [tip.textContent, box.x + parseFloat(tip.style.left), box.y + parseFloat(tip.style.top)]"
+        )
+        assert tip.startswith("anchor ")
+        assert (shown_x, shown_y) == pytest.approx((x, y), abs=2.0)
 
 
 def test_a_wheel_with_a_key_zooms_a_drag_moves_and_a_double_click_goes_back(browser: Browser, page: Path) -> None:

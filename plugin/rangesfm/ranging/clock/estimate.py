@@ -11,7 +11,7 @@ from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import AssociationOptions
 from rangesfm.progress import Progress, SilentProgress
-from rangesfm.ranging.association import associate, lever_arms
+from rangesfm.ranging.association import associate, is_too_long, lever_arms
 from rangesfm.ranging.clock.bursts import Bursts, curve_of, find_bursts, offsets_that_keep, pair_bursts
 from rangesfm.ranging.clock.curve import CostCurve, cost_curve
 from rangesfm.ranging.clock.drift import drift_note, fit_clocks, without_drift
@@ -117,7 +117,7 @@ def estimate_time_offset(
     ranges = TimedRanges(log.timestamp_s, log.range_m, log.anchor_index, log.tag_index)
     ranges = ranges.take(log.own_order[log.kind[log.own_order] == RangeKind.TAG_ANCHOR])
     gap_s = float(np.median(np.diff(trajectory.timestamps_s)))
-    if gap_s > association.max_interpolation_gap_s:
+    if is_too_long(gap_s, association):
         bursts = find_bursts(ranges, trajectory.timestamps_s)
         if bursts is not None:
             found = _offset_of_bursts(bursts, log, trajectory, tags, association)

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.ndimage import maximum_filter1d
 
+from rangesfm.geometry.similarity import rounding_of
 from rangesfm.ranging.clock.path import PathSamples
 from rangesfm.ranging.clock.squares import MIN_RANGE_M
 
@@ -135,9 +136,10 @@ def _columns(path: PathSamples, stride: int) -> Array:
     known = path.is_known[::stride, None]
     num_known = max(int(np.count_nonzero(known)), 1)
     centers = path.centers[::stride]
+    least = rounding_of(centers)
     centers = np.where(known, centers - centers.sum(axis=0) / num_known, 0.0)
     spread = float(np.sqrt(np.sum(centers**2) / num_known))
-    centers = centers / spread if spread > 0 else centers
+    centers = centers / spread if spread > least else np.zeros_like(centers)
     return np.column_stack([np.sum(centers**2, axis=1, keepdims=True), centers, known])
 
 

@@ -25,6 +25,8 @@ _BEND_STDDEV_M = 0.15
 _BIAS_STDDEV_M = 0.05
 # The level and the slope of the curve: next to nothing is assumed.
 _LEVEL_STDDEV_M = 10.0
+# A tag that is no further away stands on the anchor, where a distance has no logarithm to speak of.
+_AT_ANCHOR_M = 1e-3
 _MIN_RANGES = 100
 _MIN_RANGES_OF_KNOT = 20
 _EDGE_SHARE = 0.001
@@ -92,7 +94,7 @@ def calibrate_ranges(log: RangeLog, tags_m: Array, anchors: Sequence[Anchor]) ->
         GeometryError: there are too few ranges of known length, or all are of one length.
     """
     distance, error = _errors(log, tags_m, anchors)
-    used = np.flatnonzero(np.isfinite(error) & (distance > 0))
+    used = np.flatnonzero(np.isfinite(error) & (distance > _AT_ANCHOR_M))
     if len(used) < _MIN_RANGES:
         raise GeometryError(f"{len(used)} ranges of known length, expected {_MIN_RANGES} or more to learn from")
     distance, error, index = distance[used], error[used], log.anchor_index[used]

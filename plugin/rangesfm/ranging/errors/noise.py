@@ -19,6 +19,9 @@ START_STDDEV_M = 0.1
 MIN_STDDEV_M = 1e-9
 # Of a Gaussian distribution over the median of its absolute values.
 _STDDEV_PER_MAD = 1.4826
+# In stddevs, root mean square: where residuals are no larger, rounding and the solver's last step are all that they
+# have in common.
+NO_ERROR = 1e-3
 _MAX_INFLATION = 30.0
 # Of fewer there is nothing to resample.
 _MIN_NUM_STRETCHES = 8
@@ -83,7 +86,7 @@ def correlation_inflation(
     _, index = np.unique(groups, return_inverse=True)
     sums = np.bincount(index, shares * influence)
     squares = float(np.sum(shares * influence**2))
-    if squares == 0 or len(sums) < 2:
+    if squares <= NO_ERROR**2 * np.sum(shares) or len(sums) < 2:
         return 1.0
     return float(np.clip(np.sqrt(np.sum(sums**2) / squares), 1.0, _MAX_INFLATION))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.ranging.errors.noise import NO_ERROR
 from rangesfm.ranging.errors.robust_loss import RobustLoss
 
 Array = npt.NDArray[np.float64]
@@ -13,6 +14,9 @@ Indices = npt.NDArray[np.int64]
 # Some wavelengths: the echoes that meet the direct path change at that scale. On real logs, anything from 0.1 to 0.5 m
 # gives scales within 0.7 % of each other.
 _PLACE_SIZE_M = 0.2
+# In cells: paths at a height of 1.6 m, or of the first camera's 0, do not lie on the grid, where rounding would
+# choose the cell.
+_OFF_GRID = 1e-6
 # Of fewer ranges a correlation is a guess.
 _MIN_NUM = 20
 
@@ -24,7 +28,7 @@ def place_labels(tags_m: Array, anchor_index: Indices) -> Indices:
         tags_m: (n, 3) antenna in the metric world. anchor_index: (n,).
     """
     labels = anchor_index
-    for axis in np.floor(tags_m / _PLACE_SIZE_M).astype(np.int64).T:
+    for axis in np.floor(tags_m / _PLACE_SIZE_M + _OFF_GRID).astype(np.int64).T:
         # One axis after the other, as one number of all of them would not hold a site of great extent.
         cells, row = np.unique(axis, return_inverse=True)
         labels = np.unique(labels * len(cells) + row, return_inverse=True)[1]
@@ -61,7 +65,7 @@ def correlation_in_place(errors: Array, labels: Indices) -> float:
     between = float(np.sum(counts * means**2)) / num_places
     typical_count = len(errors) / num_places
     total = between + (typical_count - 1) * within
-    return float(np.clip((between - within) / total, 0.0, 1.0)) if total > 0 else 0.0
+    return float(np.clip((between - within) / total, 0.0, 1.0)) if total > NO_ERROR**2 else 0.0
 
 
 def shares_of_places(labels: Indices, correlation: float) -> Array:

@@ -9,6 +9,9 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
+# Costs that two fits have alike, but for rounding and a solver's last step, differ by less.
+SAME_COST = 1e-6
+
 
 @dataclass(frozen=True)
 class RobustLoss:
@@ -32,7 +35,7 @@ class RobustLoss:
         ratio = 1 + squared / self.width**2
         if self.is_bounded:
             return np.stack([squared / ratio, 1 / ratio**2, -2 / (self.width**2 * ratio**3)])
-        return np.stack([self.width**2 * np.log(ratio), 1 / ratio, -1 / (self.width * ratio) ** 2])
+        return np.stack([self.width**2 * np.log1p(squared / self.width**2), 1 / ratio, -1 / (self.width * ratio) ** 2])
 
     def weights(self, scaled_residuals: Array) -> Array:
         """(n,) in (0, 1]: of the weighted least squares with the same gradient."""

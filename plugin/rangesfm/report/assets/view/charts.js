@@ -51,7 +51,7 @@ class Chart {
   /** What is nearest to the pointer tells its values. */
   #point(event) {
     const box = this.node.getBoundingClientRect();
-    const [left, top] = this.view.origin();
+    const { left, top } = this.spec.padding;
     const [toX, toY] = [this.view.scale("x"), this.view.scale("y")];
     const [low, high] = [this.view.height(), 0];
     let nearest = null;

@@ -1,0 +1,58 @@
+"""Where the range equation is started from, where symmetry leaves two answers that only rounding tells apart."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from rangesfm.demo.ranges import Radio
+from rangesfm.geometry.similarity import IDENTITY, path_shape
+from rangesfm.options import RangeModelOptions
+from rangesfm.scale.problem import scale_problem
+from rangesfm.scale.range_equation import RangeProblem, RangeState
+from rangesfm.scale.starts import choose_sides, sphere_swaps
+
+if TYPE_CHECKING:
+    from tests.scale.conftest import MakeSurvey, Survey
+
+
+def unknown_anchors(survey: Survey) -> RangeProblem:
+    anchors = survey.anchors("unknown", "")
+    return scale_problem(survey.observations(), survey.trajectory, anchors, "unknown", RangeModelOptions(), 10.0).ranges
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_on_which_side_of_a_flat_path_an_anchor_is_put_does_not_hang_on_rounding(
+    make_survey: MakeSurvey, seed: int
+) -> None:
+    """Both fit alike: it is that of the path's normal, wherever the anchor was thought to be."""
+    centers = make_survey(seed=seed).centers_m * [1.0, 1.0, 0.0]
+    survey = make_survey(
+        scale=1.0, centers_m=centers, tag_in_cam_m=(0, 0, 0), radio=Radio(range_stddev_m=0.05), seed=seed
+    )
+    problem = unknown_anchors(survey)
+    to_model = survey.frame_from_site("first_camera")
+    shape = path_shape(problem.centers)
+    for turned in (1.0, -1.0):
+        thought = np.array(list(survey.anchors_m.values())) * [1.0, 1.0, turned]
+        state, rise = choose_sides(problem, RangeState(IDENTITY, to_model.apply(thought), np.zeros(5)))
+        heights = (state.anchors_m - shape.centroid) @ shape.axes[:, 2]
+        assert heights.min() > -1e-3  # one is in the plane
+        assert heights.max() > 2.0
+        np.testing.assert_allclose(rise, 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("off_m", [0.0, 1e-15])
+def test_an_anchor_in_the_middle_of_a_sphere_swaps_places_with_no_radius(make_survey: MakeSurvey, off_m: float) -> None:
+    rng = np.random.default_rng(0)
+    on_sphere = rng.normal(size=(40, 3))
+    on_sphere *= 4.0 / np.linalg.norm(on_sphere, axis=1, keepdims=True)
+    survey = make_survey(
+        scale=1.0, centers_m=on_sphere, anchors_m={"A": (0, 0, 0), "B": (9, 0, 0)}, tag_in_cam_m=(0, 0, 0)
+    )
+    to_model = survey.frame_from_site("first_camera")
+    anchors = to_model.apply(np.array([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]])) + off_m
+    (swap,) = sphere_swaps(unknown_anchors(survey), RangeState(IDENTITY, anchors, np.zeros(2)))
+    assert swap.metric_from_model.scale == pytest.approx(9 / 4)

@@ -1,0 +1,143 @@
+"""COLMAP's options as they are handed over: its own defaults, but for what is written here.
+
+An options object that is built anew inside of another takes the place of defaults that COLMAP has set for there.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TypeGuard
+
+import numpy as np
+import pycolmap
+import pytest
+from tests.simulated.model import synthetic_model
+from tests.simulated.path import loop_path
+
+import rangesfm
+from rangesfm.geometry.similarity import IDENTITY
+from rangesfm.options import CameraOptions, MapperOptions, RefineOptions
+from rangesfm.refine.bundle_adjustment import bundle_adjustment
+from rangesfm.vision import submap_refinement
+from rangesfm.vision.camera import camera_of_photos
+from rangesfm.vision.features import feature_options
+from rangesfm.vision.mapping import pipeline_options
+from rangesfm.vision.matching import matching_options
+
+SEED = 3
+KNOWN_CAMERA = CameraOptions(model="SIMPLE_PINHOLE", params=(240.0, 128.0, 96.0))
+
+
+def changes(options: Any) -> dict[str, Any]:
+    """What is not as COLMAP has it, by its name; inner options as ``outer.inner``."""
+    return dict(_changes(options.todict(), type(options)().todict()))
+
+
+def _changes(found: dict[str, Any], default: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    assert found.keys() == default.keys()
+    for key, value in found.items():
+        if isinstance(value, dict):
+            yield from ((f"{key}.{inner}", changed) for inner, changed in _changes(value, default[key]))
+        elif value != default[key]:
+            yield key, value
+
+
+def test_features_are_found_as_colmap_finds_them() -> None:
+    assert changes(feature_options(MapperOptions())) == {}
+
+
+@pytest.mark.parametrize(("num_photos", "pairing"), [(60, {"block_size": 8}), (61, {})], ids=["all", "neighbours"])
+def test_photos_are_matched_as_colmap_matches_them(num_photos: int, pairing: dict[str, Any]) -> None:
+    options = matching_options(MapperOptions(), num_photos, SEED)
+    assert changes(options.pairing) == pairing
+    assert changes(options.matcher) == ({} if pycolmap.has_cuda else {"num_threads": 1})
+    assert changes(options.verification) == {"ransac.random_seed": SEED}
+
+
+SEEDS = {"random_seed": SEED, "mapper.random_seed": SEED, "triangulation.random_seed": SEED}
+AS_GIVEN = {
+    "ba_refine_focal_length": False,
+    "ba_refine_extra_params": False,
+    "mapper.abs_pose_refine_focal_length": False,
+    "mapper.abs_pose_refine_extra_params": False,
+}
+
+
+@pytest.mark.parametrize(
+    ("camera", "expected"),
+    [(CameraOptions(), SEEDS), (KNOWN_CAMERA, SEEDS | AS_GIVEN)],
+    ids=["camera open", "camera given"],
+)
+def test_models_are_mapped_as_colmap_maps_them(camera: CameraOptions, expected: dict[str, Any]) -> None:
+    assert changes(pipeline_options(camera, MapperOptions(), SEED)) == expected
+
+
+def test_a_camera_is_guessed_as_colmap_guesses_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    handed: list[Any] = []
+    monkeypatch.setattr(pycolmap, "infer_camera_from_image", lambda _, reader: handed.append(reader))
+    camera_of_photos(CameraOptions(model="OPENCV"), Path("photo.jpg"), 640, 480)
+    assert changes(handed[0]) == {"camera_model": "OPENCV"}
+
+
+def test_joined_submaps_see_the_database_as_colmap_does(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    class HandedError(Exception):
+        """Holds the options, before anything is done with them."""
+
+    class Cache:
+        @staticmethod
+        def create(_: pycolmap.Database, options: Any) -> None:
+            raise HandedError(options)
+
+    monkeypatch.setattr(pycolmap, "DatabaseCache", Cache)
+    options, token = pipeline_options(CameraOptions(), MapperOptions(), SEED), pycolmap.CancellationToken()
+    with pytest.raises(HandedError) as handed:
+        submap_refinement._refine(tmp_path / "database.db", tmp_path, pycolmap.Reconstruction(), options, token)
+    assert changes(handed.value.args[0]) == {"min_num_matches": options.min_num_matches}
+
+
+def test_a_model_is_adjusted_as_colmap_adjusts_it() -> None:
+    times = np.arange(4, dtype=np.float64)
+    path = loop_path(4.0)
+    model = synthetic_model(times, path.centers(times), path.world_from_cam(times), metric_from_sfm=IDENTITY)
+    bundle = bundle_adjustment(
+        model.reconstruction,
+        CameraOptions(),
+        RefineOptions(),
+        fixed_frame_id=None,
+        max_num_iterations=77,
+        num_threads=1,
+    )
+    assert changes(bundle.adjuster.options) == {
+        "print_summary": False,
+        "refine_focal_length": False,
+        "refine_extra_params": False,
+        "ceres.solver_options.initial_trust_region_radius": 1e10,
+        "ceres.solver_options.function_tolerance": 1e-12,
+        "ceres.solver_options.gradient_tolerance": 0.0,
+        "ceres.solver_options.max_num_iterations": 77,
+        "ceres.solver_options.num_threads": 1,
+    }
+
+
+def test_no_other_options_of_colmaps_are_made_and_none_inside_of_others() -> None:
+    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in Path(rangesfm.__file__).parent.rglob("*.py")]
+    made = [node for tree in trees for node in ast.walk(tree) if _makes_options(node)]
+    assert not [ast.unparse(node) for node in made if any(map(_makes_options, list(ast.walk(node))[1:]))]
+    assert {ast.unparse(node.func).removeprefix("pycolmap.") for node in made} == {
+        "BundleAdjustmentOptions",
+        "DatabaseCacheOptions",
+        "ExhaustivePairingOptions",
+        "FeatureExtractionOptions",
+        "FeatureMatchingOptions",
+        "ImageReaderOptions",
+        "IncrementalPipelineOptions",
+        "SequentialPairingOptions",
+        "TwoViewGeometryOptions",
+    }, "one that this file does not look at"
+
+
+def _makes_options(node: ast.AST) -> TypeGuard[ast.Call]:
+    return isinstance(node, ast.Call) and re.fullmatch(r"pycolmap\.\w*Options", ast.unparse(node.func)) is not None
