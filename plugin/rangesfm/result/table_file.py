@@ -71,7 +71,8 @@ class TableFile:
         path, columns = folder / cls.NAME, cls.columns()
         if not path.is_file():
             return None
-        table = read_table(path, list(columns))
+        texts = [name for name, column in columns.items() if column.format_spec == _TEXT]
+        table = read_table(path, list(columns), text=texts)
         return cls(**{name: _values(table, name, column) for name, column in columns.items()})
 
 
