@@ -20,11 +20,13 @@ LEVERS = WORLD_FROM_CAM @ TAG_IN_CAM
 
 
 def turned(vector: Array) -> Array:
-    return Rotation.from_rotvec(vector).as_matrix()
+    rotation: Array = Rotation.from_rotvec(vector).as_matrix()
+    return rotation
 
 
 def distance_after(from_anchor: Callable[[Array], Array], step: Array) -> Array:
-    return np.linalg.norm(from_anchor(step), axis=1)
+    distance: Array = np.linalg.norm(from_anchor(step), axis=1)
+    return distance
 
 
 @pytest.mark.parametrize(
