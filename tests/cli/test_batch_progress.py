@@ -5,17 +5,13 @@ from __future__ import annotations
 import io
 
 import pytest
+from tests.cli.screen import Terminal
 
 from rangesfm.batch.course import Course
 from rangesfm.batch.jobs import Job
 from rangesfm.batch.rows import Figures
 from rangesfm.cli.batch_progress import BatchTerminal
 from rangesfm.survey.settings import Survey
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
 
 
 class Clock:
@@ -70,14 +66,30 @@ def test_plain_lines_tell_each_stage_once(course: Course, clock: Clock) -> None:
     ]
 
 
-def test_a_terminal_shows_a_line_for_each_at_work_and_draws_over_it(course: Course, clock: Clock) -> None:
+def test_a_terminal_keeps_what_has_ended(course: Course, clock: Clock) -> None:
     stream = Terminal()
     go_on(course, BatchTerminal(stream, clock=clock), clock)
-    drawn = stream.getvalue()
-    assert "  a.toml: mapping 5/20, 25 %, 10.0 s\n" in drawn
-    assert "\033[3F\033[J" in drawn  # two surveys and the sum
-    lines = drawn.split("\033[J")[-1].splitlines()  # what stays
-    assert lines == ["b.toml: failed after 4.0 s: the scale is not known"]
+    assert stream.lines() == ["a.toml: good after 10.0 s", "b.toml: failed after 4.0 s: the scale is not known"]
+
+
+def test_a_terminal_shows_what_is_going_on(course: Course, clock: Clock) -> None:
+    stream = Terminal()
+    shown = BatchTerminal(stream, clock=clock)
+    for index in (0, 1):
+        course.tell(index, {"began_on": "here"})
+    course.tell(0, {"stage": "mapping"})
+    course.tell(0, {"num_done": 5, "num_total": 20})
+    clock.now_s = 10.0
+    shown.show(course)
+    shown.message("a worker is gone")
+    clock.now_s = 11.0
+    shown.show(course)
+    assert stream.lines() == [
+        "a worker is gone",
+        "  a.toml: mapping 5/20, 25 %, 11.0 s",
+        "  b.toml: begins, 11.0 s",
+        "0 of 2 surveys over, 11.0 s",
+    ]
 
 
 def test_quiet_is_quiet(course: Course, clock: Clock) -> None:

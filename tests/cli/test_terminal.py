@@ -5,12 +5,11 @@ from __future__ import annotations
 import contextlib
 import io
 
+import pytest
+from rich.cells import cell_len
+from tests.cli.screen import Terminal
+
 from rangesfm.cli.terminal import TerminalProgress, terminal_progress
-
-
-class FakeTerminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
 
 
 class Clock:
@@ -51,21 +50,38 @@ def test_plain_updates_are_sparse() -> None:
 
 
 def test_terminal_has_one_line_that_is_written_anew() -> None:
-    stream, clock = FakeTerminal(), Clock()
+    stream, clock = Terminal(), Clock()
     progress = TerminalProgress(stream, clock=clock)
     progress.stage("mapping")
+    assert stream.lines() == ["mapping"]
     clock.now = 2.0
     progress.update(10, 40)
+    assert stream.lines() == ["mapping 10/40, 25 %, 6.0 s left"]
     clock.now = 4.0
     progress.update(40, 40)
-    assert "\n" not in stream.getvalue()
-    assert stream.getvalue().split("\r\033[K")[1:] == [
-        "mapping",
-        "mapping 10/40, 25 %, 6.0 s left",
-        "mapping 40/40, 100 %",
-    ]
+    assert stream.lines() == ["mapping 40/40, 100 %"]
+    progress.message("two models")
+    clock.now = 5.0
+    progress.update(40, 40)
+    assert stream.lines() == ["two models", "mapping 40/40, 100 %"]
     progress.end_stage()
-    assert stream.getvalue().endswith("mapping: 4.0 s\n")
+    assert stream.lines() == ["two models", "mapping: 5.0 s"]
+    assert stream.getvalue().rfind("\033[?25h") > stream.getvalue().rfind("\033[?25l")
+
+
+@pytest.mark.parametrize("columns", [0, 12, 200])
+def test_names_are_shown_as_they_are_and_no_wider_than_the_terminal(
+    columns: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    stream, name = Terminal(), "[red]\x1b[31m :smile: [/] \u6e2c\u91cf " + "x" * 300
+    progress = TerminalProgress(stream)
+    progress.stage(name)
+    (shown,) = stream.lines()
+    assert name.replace("\x1b", "?").startswith(shown)
+    assert (columns or 80) - 2 < cell_len(shown) <= (columns or 80)
+    progress.message(name)
+    assert stream.lines()[0] == name.replace("\x1b", "?")
 
 
 def test_unknown_total_shows_the_count_alone() -> None:

@@ -7,9 +7,9 @@ from dataclasses import dataclass, fields
 from enum import Enum
 from typing import Any
 
-from rangesfm.comparison.with_reference import align_rows
 from rangesfm.failures import INTERNAL_ERROR
 from rangesfm.result.summary import ResultSummary
+from rangesfm.text_table import align_rows
 
 _FAILED = 4
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, TextIO
 
-from rangesfm.cli.terminal import counts, duration
-from rangesfm.errors import one_line
+from rangesfm.cli.terminal import Screen, counts, duration
 
 if TYPE_CHECKING:
     from rangesfm.batch.course import Course, SurveyState
@@ -21,11 +19,8 @@ class BatchTerminal:
     """Writes the course of a batch to ``stream``."""
 
     def __init__(self, stream: TextIO, *, quiet: bool = False, clock: Callable[[], float] = time.monotonic):
-        self._stream = stream
-        self._quiet = quiet
+        self._screen = Screen(stream, quiet=quiet)
         self._clock = clock
-        self._is_terminal = stream.isatty()
-        self._num_lines = 0
         self._last_drawn: float | None = None
         self._told: dict[int, str] = {}
         self._num_over = 0
@@ -34,42 +29,28 @@ class BatchTerminal:
         """Say what is new, and on a terminal draw again what is going on."""
         new = self._news(course)
         now = self._clock()
-        if not self._is_terminal:
-            self._write("".join(f"{line}\n" for line in new))
-        elif new or course.is_over or self._last_drawn is None or now - self._last_drawn >= _INTERVAL_S:
+        if new or course.is_over:
+            self._screen.say(new)
+        if not course.is_over and (new or self._last_drawn is None or now - self._last_drawn >= _INTERVAL_S):
             self._last_drawn = now
-            self._draw(new, [] if course.is_over else _going_on(course))
+            self._screen.draw(_going_on(course))
 
     def message(self, text: str) -> None:
-        text = one_line(text)
-        self._draw([text], []) if self._is_terminal else self._write(f"{text}\n")
+        self._screen.say([text])
 
     def _news(self, course: Course) -> list[str]:
         """Lines on the surveys of which there is something to say that has not been said."""
         lines = []
         for index, state in enumerate(course.states):
-            line = _ended(state) if state.row.status.is_final else "" if self._is_terminal else _stage(state)
+            line = _ended(state) if state.row.status.is_final else "" if self._screen.is_terminal else _stage(state)
             if line and self._told.get(index) != line:
                 self._told[index] = line
                 lines.append(line)
         num_over = sum(row.status.is_final for row in course.rows)
-        if num_over > self._num_over and not self._is_terminal:
+        if num_over > self._num_over and not self._screen.is_terminal:
             lines.append(_summary(course))
         self._num_over = num_over
         return lines
-
-    def _draw(self, above: list[str], below: list[str]) -> None:
-        """Lines that stay, and below them those that the next call draws over."""
-        width = shutil.get_terminal_size().columns - 1
-        up = f"\033[{self._num_lines}F" if self._num_lines else "\r"
-        self._num_lines = len(below)
-        lines = [*above, *(line[:width] for line in below)]
-        self._write(up + "\033[J" + "".join(f"{line}\n" for line in lines))
-
-    def _write(self, text: str) -> None:
-        if text and not self._quiet:
-            self._stream.write(text)
-            self._stream.flush()
 
 
 def _going_on(course: Course) -> list[str]:

@@ -7,6 +7,7 @@ import argparse
 from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.errors import SolverError
 from rangesfm.progress import Progress
+from rangesfm.text_table import align_rows
 
 
 def add_command(commands: Commands) -> None:
@@ -23,10 +24,9 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     from rangesfm.ceres.doctor import diagnose
 
     checks = diagnose()
-    width = max(len(check.name) for check in checks)
-    lines = []
+    rows = []
     for check in checks:
-        lines.append(f"{'ok ' if check.ok else 'BAD'}  {check.name:{width}}  {check.found}")
+        rows.append(("ok" if check.ok else "BAD", check.name, check.found))
         if not check.ok:
-            lines.append(f"     {'':{width}}  expected {check.expected}; {check.remedy}")
-    return Outcome(lines, 0 if all(check.ok for check in checks) else SolverError.exit_status)
+            rows.append(("", "", f"expected {check.expected}; {check.remedy}"))
+    return Outcome([align_rows(rows, num_left=3)], 0 if all(check.ok for check in checks) else SolverError.exit_status)

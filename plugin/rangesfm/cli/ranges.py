@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING
 from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.cli.log_arguments import add_log_arguments, read_log
 from rangesfm.progress import Progress
+from rangesfm.text_table import align_rows
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rangesfm.ranging.anchors.anchor import Anchor
-    from rangesfm.ranging.summary import RangeSummary
+    from rangesfm.ranging.summary import AnchorSummary, PairSummary, RangeSummary
+
+_LENGTHS = ("number", "min m", "median m", "max m")
 
 
 def add_command(commands: Commands) -> None:
@@ -65,7 +68,7 @@ def _lines(summary: RangeSummary) -> list[str]:
         f"time    {_time(summary)}",
         *(f"note    {note}" for note in _notes(summary)),
         "",
-        *_table(summary),
+        _table(summary),
         *_pairs(summary),
     ]
 
@@ -101,36 +104,32 @@ def _time(summary: RangeSummary) -> str:
     return span + rate + f", largest gap {_number(summary.largest_gap_s)} s"
 
 
-def _table(summary: RangeSummary) -> list[str]:
+def _table(summary: RangeSummary) -> str:
     """One row an anchor; the noise only where there are enough ranges to tell it."""
-    width = max(len("anchor"), *(len(anchor.anchor_id) for anchor in summary.anchors))
     has_noise = any(anchor.noise_stddev_m is not None for anchor in summary.anchors)
-    return [
-        f"{'anchor':{width}}  {'number':>8}  {'min m':>9}  {'median m':>9}  {'max m':>9}"
-        f"{'  noise m' if has_noise else ''}  {'largest gap s':>13}",
-        *(
-            f"{anchor.anchor_id:{width}}  {anchor.num:8}  {anchor.min_m:9.3f}  {anchor.median_m:9.3f}"
-            f"  {anchor.max_m:9.3f}{f'  {_number(anchor.noise_stddev_m):>7}' if has_noise else ''}"
-            f"  {_number(anchor.largest_gap_s):>13}"
-            for anchor in summary.anchors
-        ),
+    header = ["anchor", *_LENGTHS, *(["noise m"] if has_noise else []), "largest gap s"]
+    rows = [
+        [
+            anchor.anchor_id,
+            *_lengths(anchor),
+            *([_number(anchor.noise_stddev_m)] if has_noise else []),
+            _number(anchor.largest_gap_s),
+        ]
+        for anchor in summary.anchors
     ]
+    return align_rows([header, *rows])
 
 
 def _pairs(summary: RangeSummary) -> list[str]:
     """One row for each two of a kind that ranged with each other."""
     if not summary.pairs:
         return []
-    names = [" - ".join(pair.ids) for pair in summary.pairs]
-    width = max(map(len, names))
-    return [
-        "",
-        f"{'between':13}  {'':{width}}  {'number':>8}  {'min m':>9}  {'median m':>9}  {'max m':>9}",
-        *(
-            f"{pair.kind:13}  {name:{width}}  {pair.num:8}  {pair.min_m:9.3f}  {pair.median_m:9.3f}  {pair.max_m:9.3f}"
-            for name, pair in zip(names, summary.pairs)
-        ),
-    ]
+    rows = [[pair.kind, " - ".join(pair.ids), *_lengths(pair)] for pair in summary.pairs]
+    return ["", align_rows([["between", "", *_LENGTHS], *rows], num_left=2)]
+
+
+def _lengths(ranges: AnchorSummary | PairSummary) -> list[str]:
+    return [str(ranges.num), *map(_number, (ranges.min_m, ranges.median_m, ranges.max_m))]
 
 
 def _number(value: float | None) -> str:

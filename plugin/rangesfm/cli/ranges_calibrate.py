@@ -10,6 +10,7 @@ from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.cli.log_arguments import add_log_arguments, read_log
 from rangesfm.cli.position_arguments import add_position_arguments, read_tag_positions
 from rangesfm.progress import Progress
+from rangesfm.text_table import align_rows
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -62,14 +63,17 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 def _lines(calibration: Calibration, num_in_log: int) -> Sequence[str]:
     curve = calibration.curve
-    rows = zip(*(a.tolist() for a in (curve.distance_m, curve.error_m, curve.stddev_m, curve.noise_stddev_m)))
+    columns = (curve.distance_m, curve.error_m, curve.stddev_m, curve.noise_stddev_m)
+    rows = [
+        (f"{distance:.2f}", f"{error:+.3f}", f"{stddev:.3f}", f"{noise:.3f}")
+        for distance, error, stddev, noise in zip(*columns)
+    ]
     return [
         f"ranges  {calibration.num_ranges} of {num_in_log} have a known length, "
         f"{100 * calibration.outlier_share:.1f} % do not fit",
         f"noise   {calibration.noise_stddev_m:.3f} m about the curve",
         "",
-        f"{'distance m':>10}  {'error m':>8}  {'stddev m':>8}  {'noise m':>8}",
-        *(f"{distance:10.2f}  {error:+8.3f}  {stddev:8.3f}  {noise:8.3f}" for distance, error, stddev, noise in rows),
+        align_rows([("distance m", "error m", "stddev m", "noise m"), *rows], num_left=0),
         "",
         "anchors beyond the curve: "
         + ", ".join(f"{anchor_id} {bias:+.3f} m" for anchor_id, bias in calibration.anchor_bias_m.items()),

@@ -1,28 +1,76 @@
-"""Progress for people: one line that updates itself on a terminal, a few plain lines elsewhere."""
+"""Progress for people: lines that update themselves on a terminal, a few plain lines elsewhere."""
 
 from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from rangesfm.errors import one_line
 
-_ERASE_LINE = "\r\033[K"
+if TYPE_CHECKING:
+    from rich.live import Live
+
 _TERMINAL_INTERVAL_S = 0.1
 _PLAIN_INTERVAL_S = 10.0
+
+
+class Screen:
+    """Lines that stay and, on a terminal, below them lines that are drawn over."""
+
+    def __init__(self, stream: TextIO, *, quiet: bool):
+        self._stream = stream
+        self._quiet = quiet
+        self._live: Live | None = None
+        self.is_terminal = stream.isatty()
+
+    def say(self, lines: Sequence[str]) -> None:
+        """Lines that stay, in place of what is drawn."""
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+        if lines and not self._quiet:
+            self._stream.write("".join(f"{one_line(line)}\n" for line in lines))
+            self._stream.flush()
+
+    def draw(self, lines: Sequence[str]) -> None:
+        """Lines that stand until the next call, on a terminal only; each ends where that does."""
+        if self._quiet or not self.is_terminal:
+            return
+        from rich.text import Text
+
+        if self._live is None:
+            self._live = _live(self._stream)
+        self._live.update(Text("\n".join(map(one_line, lines)), no_wrap=True, overflow="crop"), refresh=True)
+
+
+def _live(stream: TextIO) -> Live:
+    from rich.console import Console
+    from rich.live import Live
+
+    size = shutil.get_terminal_size()
+    console = Console(file=stream, width=size.columns, height=size.lines)
+    live = Live(
+        console=console,
+        auto_refresh=False,
+        transient=True,
+        redirect_stdout=False,
+        redirect_stderr=False,
+        vertical_overflow="crop",
+    )
+    live.start()
+    console.show_cursor(True)  # nobody would if the process is killed
+    return live
 
 
 class TerminalProgress:
     """Writes the course of a run to ``stream``."""
 
     def __init__(self, stream: TextIO, *, quiet: bool = False, clock: Callable[[], float] = time.monotonic):
-        self._stream = stream
-        self._quiet = quiet
+        self._screen = Screen(stream, quiet=quiet)
         self._clock = clock
-        self._is_terminal = stream.isatty()
         self._stage: str | None = None
         self._stage_start = self._last_update = clock()
 
@@ -30,29 +78,26 @@ class TerminalProgress:
         self.end_stage()
         self._stage = name
         self._stage_start = self._last_update = self._clock()
-        self._write(name if self._is_terminal else f"{name} ...\n")
+        self._show(name if self._screen.is_terminal else f"{name} ...")
 
     def update(self, num_done: int, num_total: int | None = None) -> None:
         now = self._clock()
-        if now - self._last_update >= (_TERMINAL_INTERVAL_S if self._is_terminal else _PLAIN_INTERVAL_S):
+        if now - self._last_update >= (_TERMINAL_INTERVAL_S if self._screen.is_terminal else _PLAIN_INTERVAL_S):
             self._last_update = now
-            line = f"{self._stage or ''} {counts(num_done, num_total, now - self._stage_start)}".strip()
-            self._write(line[: shutil.get_terminal_size().columns - 1] if self._is_terminal else f"{line}\n")
+            self._show(f"{self._stage or ''} {counts(num_done, num_total, now - self._stage_start)}".strip())
 
     def message(self, text: str) -> None:
-        self._write(f"{one_line(text)}\n")
+        self._screen.say([text])
 
     def end_stage(self, *, failed: bool = False) -> None:
         """The current stage, if any, has ended."""
-        if self._stage is not None:
-            ending = "stopped after " if failed else ""
-            self._write(f"{self._stage}: {ending}{duration(self._clock() - self._stage_start)}\n")
-            self._stage = None
+        ending = "stopped after " if failed else ""
+        line = f"{self._stage}: {ending}{duration(self._clock() - self._stage_start)}"
+        self._screen.say([] if self._stage is None else [line])
+        self._stage = None
 
-    def _write(self, text: str) -> None:
-        if not self._quiet:
-            self._stream.write(f"{_ERASE_LINE}{text}" if self._is_terminal else text)
-            self._stream.flush()
+    def _show(self, line: str) -> None:
+        (self._screen.draw if self._screen.is_terminal else self._screen.say)([line])
 
 
 @contextmanager

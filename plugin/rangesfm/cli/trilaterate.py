@@ -9,6 +9,7 @@ from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.cli.log_arguments import add_log_arguments, read_log
 from rangesfm.cli.position_arguments import add_position_arguments, read_tag_positions
 from rangesfm.progress import Progress
+from rangesfm.text_table import align_rows
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -26,6 +27,9 @@ _TOWARD = {
     "z+": (0.0, 0.0, 1.0),
     "z-": (0.0, 0.0, -1.0),
 }
+
+_HEADER = ("anchor", "ranges", "fit", "x m", "y m", "z m", "stddev m", "bias m", "noise m")
+_NOTHING = ("",) * 7
 
 
 def add_command(commands: Commands) -> None:
@@ -136,28 +140,24 @@ def _not_negative(text: str) -> float:
 
 
 def _lines(log: RangeLog, placements: Sequence[AnchorPlacement]) -> list[str]:
-    width = max(len("anchor"), *(len(placement.anchor_id) for placement in placements))
     num_known = sum(placement.num_ranges for placement in placements)
-    head = f"{'anchor':{width}}  {'ranges':>7}  {'fit':>5}  {'x m':>9}  {'y m':>9}  {'z m':>9}  {'stddev m':>8}"
+    rows: list[Sequence[str]] = [_HEADER]
+    notes = [""]
+    for placement in placements:
+        found, name = placement.found, (placement.anchor_id, str(placement.num_ranges))
+        if found is None:
+            rows.append((*name, *_NOTHING))
+            notes.append(f"  {placement.why_not}")
+            continue
+        share = f"{100 * (found.weights > 0.5).mean():.0f} %"
+        stddevs = (found.position_stddev_m, found.range_bias_m, found.noise_stddev_m)
+        rows.append((*name, share, *(f"{value:.3f}" for value in (*found.position_m, *stddevs))))
+        notes.append("")
+        if found.mirror_position_m is not None:
+            rows.append(("", "", "or", *(f"{value:.3f}" for value in found.mirror_position_m), "", "", ""))
+            notes.append("  (the tag's positions lie in a plane: say which by --side)")
     return [
         f"{num_known} of {len(log)} ranges are at known positions of the tag",
         "",
-        f"{head}  {'bias m':>7}  {'noise m':>7}",
-        *(line for placement in placements for line in _rows(placement, width)),
+        *(line + note for line, note in zip(align_rows(rows).split("\n"), notes, strict=True)),
     ]
-
-
-def _rows(placement: AnchorPlacement, width: int) -> list[str]:
-    found, name = placement.found, f"{placement.anchor_id:{width}}  {placement.num_ranges:7}"
-    if found is None:
-        return [f"{name}  {placement.why_not}"]
-    share = 100 * float((found.weights > 0.5).mean())
-    coordinates = "  ".join(f"{value:9.3f}" for value in found.position_m)
-    row = f"{name}  {share:3.0f} %  {coordinates}  {found.position_stddev_m:8.3f}"
-    rows = [f"{row}  {found.range_bias_m:7.3f}  {found.noise_stddev_m:7.3f}"]
-    if found.mirror_position_m is not None:
-        other = "  ".join(f"{value:9.3f}" for value in found.mirror_position_m)
-        rows.append(
-            f"{'':{width}}  {'':7}  {'or':>5}  {other}  (the tag's positions lie in a plane: say which by --side)"
-        )
-    return rows

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.colmap.model_files import read_model
 from rangesfm.comparison.ranges import ModelRanges, ranges_of_result
-from rangesfm.comparison.with_reference import MIN_NUM_ALIGNED, align_rows, reprojection_rms_px
+from rangesfm.comparison.with_reference import MIN_NUM_ALIGNED, reprojection_rms_px
 from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
@@ -22,6 +22,7 @@ from rangesfm.geometry.similarity import Similarity, rmse, similarity_between
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.result.folder import ResultFolder, read_result_folder
 from rangesfm.result.summary import ResultSummary
+from rangesfm.text_table import align_rows
 
 Array = npt.NDArray[np.float64]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruct
 from rangesfm.result.entries import ComparisonRow
 from rangesfm.result.folder import ResultFolder, read_result_folder
 from rangesfm.result.ranges_as_used import RangesAsUsed
+from rangesfm.text_table import align_rows
 
 Array = npt.NDArray[np.float64]
 
@@ -349,13 +350,3 @@ def _of_both(pair: tuple[Array, Array] | None, measure: Callable[[Array], float]
 
 def _text(value: float | None, spec: str, unit: str = "") -> str:
     return "-" if value is None else f"{value:{spec}}{unit}"
-
-
-def align_rows(rows: Sequence[tuple[str, ...]]) -> str:
-    """Columns as wide as their longest cell: the first to the left, the others to the right."""
-    widths = [max(len(cell) for cell in column) for column in zip(*rows)]
-    lines = []
-    for first, *others in rows:
-        cells = [first.ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(others, widths[1:]))]
-        lines.append("  ".join(cells).rstrip())
-    return "\n".join(lines)

@@ -197,18 +197,26 @@ class TestCovariance:
         assert 1.5 < np.mean(squares[True]) < 5.0
 
 
-def test_ranges_that_say_how_noisy_they_are_weigh_accordingly() -> None:
-    positions = flight()
-    errors: dict[bool, list[float]] = {True: [], False: []}
+def errors_over_seeds(stddevs: Array, *, given: bool) -> list[float]:
+    """How far off anchors are, by ranges as noisy as ``stddevs`` say in another order each time."""
+    positions, errors = flight(), []
     for seed in range(20):
         rng = np.random.default_rng(seed)
-        stddev = np.where(rng.random(100) < 0.3, 0.02, 0.5)
+        stddev = rng.permutation(stddevs)
         ranges = distances(positions) + stddev * rng.standard_normal(100)
-        for given, found in errors.items():
-            result = trilaterate(positions, ranges, range_stddev_m=stddev if given else None, options=KNOWN_BIAS)
-            found.append(float(np.linalg.norm(result.position_m - ANCHOR_M)))
-    assert np.median(errors[True]) < 0.03
-    assert np.median(errors[True]) < 0.7 * np.median(errors[False])
+        found = trilaterate(positions, ranges, range_stddev_m=stddev if given else None, options=KNOWN_BIAS)
+        errors.append(float(np.linalg.norm(found.position_m - ANCHOR_M)))
+    return errors
+
+
+def test_ranges_that_say_how_noisy_they_are_weigh_accordingly() -> None:
+    stddevs = np.geomspace(0.02, 1.0, 100)
+    assert np.median(errors_over_seeds(stddevs, given=True)) < 0.7 * np.median(errors_over_seeds(stddevs, given=False))
+
+
+@pytest.mark.parametrize(("given", "limit_m"), [(True, 0.03), (False, 0.05)])
+def test_three_good_ranges_in_ten_decide(given: bool, limit_m: float) -> None:
+    assert np.median(errors_over_seeds(np.repeat([0.02, 0.5], [30, 70]), given=given)) < limit_m
 
 
 @pytest.mark.parametrize("options", [TrilaterationOptions(), KNOWN_BIAS], ids=["defaults", "bias known"])

@@ -1,4 +1,4 @@
-"""Robust least squares for a point and a range bias, from many starts at once.
+"""Robust least squares for a point and a range bias, also without a first guess.
 
     predicted = || p - a || + b
 
@@ -11,31 +11,36 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import least_squares
 
-from rangesfm.ranging.errors.robust_loss import CAUCHY
+from rangesfm.geometry.similarity import path_shape
+from rangesfm.ranging.anchors.multilateration import multilaterate
+from rangesfm.ranging.errors.inlier_noise import inlier_noise
+from rangesfm.ranging.errors.robust_loss import CAUCHY, RobustLoss
+from rangesfm.ranging.range_gradient import RangeGradient
 
 Array = npt.NDArray[np.float64]
 
-_TINY_M = 1e-9
-# Of all ranges, before any is looked at; spread over twice the usual length of a range.
-_OUTLIER_SHARE = 0.3
-_NUM_ITERATIONS = 60
-_CONVERGED_M = 1e-10
-_FIRST_DAMPING = 1e-3
-_MAX_DAMPING = 1e12
+_CONVERGED = 1e-13
+# Of a search: as many ranges and directions of starts, widths of the loss in units, and how far apart places are two.
+_MAX_NUM_RANGES = 300
+_NUM_DIRECTIONS = 20
+_WIDTHS = (30.0, 10.0, 3.0, 1.0, 0.3)
+_NEARLY_CONVERGED = 1e-5
+_DISTINCT_M = 0.01
 
 
 @dataclass(frozen=True)
 class PointProblem:
-    """n ranges to one point. Its unknowns are x = (a, b), four numbers.
+    """n ranges to one point. Its unknowns are x = (a, b), four numbers; a near the origin, or digits are lost.
 
     Attributes:
         positions_m: (n, 3) of the tag.
         range_m: (n,) measured.
-        stddev_m: (n,), or (k, n) if the k starts differ.
+        stddev_m: (n,).
         shared_stddev_m: (n,) the part of it that ranges of about this length have in common.
-        prior_mean: (4,) or (k, 4).
-        prior_information: (4, 4), symmetric; zero where nothing is known.
+        prior_mean: (4,).
+        prior: (k, 4) what is known of x: ``prior @ (x - prior_mean)`` is as large as a standard normal number.
     """
 
     positions_m: Array
@@ -43,86 +48,99 @@ class PointProblem:
     stddev_m: Array
     shared_stddev_m: Array
     prior_mean: Array
-    prior_information: Array
+    prior: Array
 
     def subset(self, rows: npt.NDArray[np.int64]) -> PointProblem:
         """The same problem with some of its ranges."""
-        return replace(
-            self,
-            positions_m=self.positions_m[rows],
-            range_m=self.range_m[rows],
-            stddev_m=self.stddev_m[..., rows],
-            shared_stddev_m=self.shared_stddev_m[rows],
-        )
+        names = ("positions_m", "range_m", "stddev_m", "shared_stddev_m")
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def residuals_m(self, x: Array) -> Array:
-        """(k, n) predicted minus measured for (k, 4) unknowns."""
-        residuals: Array = self._distances(x)[1] + x[:, 3:] - self.range_m
+        """(n,) predicted minus measured."""
+        residuals: Array = self._gradient(x).distance_m + x[3] - self.range_m
         return residuals
 
-    def cost(self, x: Array) -> Array:
-        """(k,) half the robust sum of squares, the prior included."""
-        squared = (self.residuals_m(x) / self.stddev_m) ** 2
-        cost: Array = np.sum(CAUCHY.rho(squared)[0], axis=1) / 2 + self._prior_cost(x)
-        return cost
+    def jacobian(self, x: Array) -> Array:
+        """(n, 4) derivatives of the residuals in stddevs."""
+        by_anchor = self._gradient(x).by_anchor
+        jacobian: Array = np.column_stack([by_anchor, np.ones(len(by_anchor))]) / self.stddev_m[:, None]
+        return jacobian
 
-    def unlikelihood(self, x: Array) -> Array:
-        """(k,) negative log-likelihood where any range may be an outlier of any length: to choose among rivals.
+    def _gradient(self, x: Array) -> RangeGradient:
+        return RangeGradient.of(self.positions_m - x[:3])
 
-        Outliers cost the same wherever the point is; under the Cauchy loss a place near to many of them
-        could win over the true one.
-        """
-        outlier_density = _OUTLIER_SHARE / (2 * float(np.median(self.range_m)))
-        squared = (self.residuals_m(x) / self.stddev_m) ** 2
-        density = (1 - _OUTLIER_SHARE) / (np.sqrt(2 * np.pi) * self.stddev_m) * np.exp(-squared / 2)
-        unlikelihood: Array = self._prior_cost(x) - np.sum(np.log(density + outlier_density), axis=1)
-        return unlikelihood
-
-    def linearized(self, x: Array) -> tuple[Array, Array]:
-        """(k, n) residuals in stddevs, and (k, n, 4) their derivatives."""
-        from_point, distances = self._distances(x)
-        jacobian = np.empty((*distances.shape, 4))
-        # On the point the distance has no derivative; zero keeps the step finite.
-        jacobian[..., :3] = -from_point / (np.maximum(distances, _TINY_M) * self.stddev_m)[..., None]
-        jacobian[..., 3] = 1 / self.stddev_m
-        return (distances + x[:, 3:] - self.range_m) / self.stddev_m, jacobian
-
-    def _prior_cost(self, x: Array) -> Array:
-        off = x - self.prior_mean
-        cost: Array = 0.5 * np.einsum("ki,ij,kj->k", off, self.prior_information, off)
-        return cost
-
-    def _distances(self, x: Array) -> tuple[Array, Array]:
-        from_point = self.positions_m[None] - x[:, None, :3]
-        return from_point, np.sqrt(np.einsum("kni,kni->kn", from_point, from_point))
+    def cost(self, x: Array, loss: RobustLoss = CAUCHY) -> float:
+        """Half the robust sum of squares, the prior included."""
+        rho = loss.rho((self.residuals_m(x) / self.stddev_m) ** 2)[0]
+        return float(np.sum(rho) + np.sum((self.prior @ (x - self.prior_mean)) ** 2)) / 2
 
 
-def improve(problem: PointProblem, x: Array, num_iterations: int = _NUM_ITERATIONS) -> tuple[Array, Array]:
-    """Levenberg-Marquardt with a Cauchy loss from (k, 4) starts, each on its own.
+def improve(problem: PointProblem, x: Array, tolerance: float = _CONVERGED) -> Array:
+    """(4,) the minimum of the cost near to ``x``, under a Cauchy loss that the prior is not subject to."""
+    num = len(problem.range_m)
+
+    def loss(squared: Array) -> Array:
+        prior = squared[num:]
+        return np.hstack([CAUCHY.rho(squared[:num]), [prior, np.ones(len(prior)), np.zeros(len(prior))]])
+
+    found = least_squares(
+        lambda x: np.append(problem.residuals_m(x) / problem.stddev_m, problem.prior @ (x - problem.prior_mean)),
+        x,
+        lambda x: np.vstack([problem.jacobian(x), problem.prior]),
+        loss=loss,
+        **dict.fromkeys(("ftol", "xtol", "gtol"), tolerance),
+    )
+    return np.asarray(found.x)
+
+
+def best_start(problem: PointProblem, unit_m: Array) -> tuple[Array, float]:
+    """The most likely point, whatever the outliers.
+
+    Starts all around the tag and a linear one follow the minima of a Cauchy loss while it narrows from metres to
+    centimetres; the likelihood chooses among all that they pass.
+
+    Args:
+        problem: of its stddevs only the shared ones are looked at.
+        unit_m: (n,) how the noise of the ranges compares.
 
     Returns:
-        (k, 4) unknowns and (k,) their cost, never above that of the start.
+        (4,) unknowns, and the noise there as a multiple of ``unit_m``.
     """
-    cost = problem.cost(x)
-    damping = np.full(len(x), _FIRST_DAMPING)
-    for _ in range(num_iterations):
-        gradient, information = _normal_equations(problem, x)
-        diagonal = np.einsum("kii->ki", information)
-        damped = information + (damping[:, None] * diagonal + 1e-12)[..., None] * np.eye(4)
-        trial = x - np.linalg.solve(damped, gradient[..., None])[..., 0]
-        trial_cost = problem.cost(trial)
-        better = trial_cost <= cost
-        moved = np.linalg.norm(trial - x, axis=1)
-        x, cost = np.where(better[:, None], trial, x), np.where(better, trial_cost, cost)
-        damping = np.clip(np.where(better, damping / 10, damping * 10), 1e-12, _MAX_DAMPING)
-        if np.all(moved < _CONVERGED_M):
-            break
-    return x, cost
+    rows = np.linspace(0, len(unit_m) - 1, min(len(unit_m), _MAX_NUM_RANGES)).astype(np.int64)
+    part, unit_m = problem.subset(rows), unit_m[rows]
+    now, passed = _starts(part), []
+    for width in _WIDTHS:
+        narrowed = replace(part, stddev_m=np.hypot(width * unit_m, part.shared_stddev_m))
+        now = _distinct([improve(narrowed, x, _NEARLY_CONVERGED) for x in now])
+        passed += now
+    noises = [inlier_noise(part.residuals_m(x) / np.hypot(unit_m, part.shared_stddev_m)) for x in passed]
+    best = int(np.argmax([noise.log_likelihood for noise in noises]))
+    return passed[best], noises[best].stddev
 
 
-def _normal_equations(problem: PointProblem, x: Array) -> tuple[Array, Array]:
-    """(k, 4) gradient of the cost and (k, 4, 4) its Gauss-Newton information."""
-    scaled, jacobian = problem.linearized(x)
-    weighted = jacobian * CAUCHY.weights(scaled)[..., None]
-    gradient = (scaled[:, None] @ weighted)[:, 0] + (x - problem.prior_mean) @ problem.prior_information
-    return gradient, np.swapaxes(weighted, 1, 2) @ jacobian + problem.prior_information
+def _distinct(points: list[Array]) -> list[Array]:
+    kept: list[Array] = []
+    for x in points:
+        if all(np.linalg.norm(x - other) > _DISTINCT_M for other in kept):
+            kept.append(x)
+    return kept
+
+
+def _starts(problem: PointProblem) -> list[Array]:
+    """All around the middle of the tag's positions, and the linear solution on either side."""
+    bias = problem.prior_mean[3]
+    ranges = problem.range_m - bias
+    shape = path_shape(problem.positions_m)
+    linear, _ = multilaterate(problem.positions_m, ranges)
+    normal = shape.axes[:, 2]
+    mirrored = linear - 2 * ((linear - shape.centroid) @ normal) * normal
+    around = shape.centroid + np.median(ranges) * _directions()
+    return [np.append(point, bias) for point in (*around, linear, mirrored)]
+
+
+def _directions() -> Array:
+    """(m, 3) unit vectors, evenly spread along a spiral from pole to pole."""
+    step = np.arange(_NUM_DIRECTIONS) + 0.5
+    height, turn = 1 - 2 * step / _NUM_DIRECTIONS, np.pi * (1 + 5**0.5) * step
+    flat = np.sqrt(1 - height**2)
+    return np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)

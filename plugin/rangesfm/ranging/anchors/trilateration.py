@@ -12,10 +12,10 @@ import numpy.typing as npt
 
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import PathShape, oriented, path_shape
-from rangesfm.ranging.anchors.point_fit import PointProblem, improve
-from rangesfm.ranging.anchors.point_search import best_start, inlier_noise
+from rangesfm.ranging.anchors.point_fit import PointProblem, best_start, improve
+from rangesfm.ranging.errors.inlier_noise import inlier_noise
 from rangesfm.ranging.errors.noise import correlation_inflation, inflation_before_fit, short_range_stddev
-from rangesfm.ranging.errors.robust_loss import CAUCHY, SAME_COST
+from rangesfm.ranging.errors.robust_loss import CAUCHY, GEMAN_MCCLURE, SAME_COST
 
 Array = npt.NDArray[np.float64]
 
@@ -32,7 +32,7 @@ _MIN_CURVATURE = 0.2
 # Formal stddevs beyond this share of the distance are checked against the cost itself.
 _NONLINEAR = 0.02
 _PROFILE_STEPS_M = np.geomspace(0.01, 100.0, 41)
-_HOLD = 1e4
+_HOLD = 100.0
 _MAX_RANGES_OF_PROFILE = 2000
 _NEARLY_STRAIGHT = 0.1
 _ACROSS = 0.9
@@ -108,8 +108,7 @@ class _Fit:
 
     @property
     def residuals_m(self) -> Array:
-        residuals: Array = self.problem.residuals_m(self.x[None])[0]
-        return residuals
+        return self.problem.residuals_m(self.x)
 
     @property
     def scaled_residuals(self) -> Array:
@@ -150,30 +149,33 @@ def trilaterate(
     if len(ranges) < MIN_NUM_RANGES:
         raise GeometryError(f"{len(ranges)} ranges at known positions of the tag, {MIN_NUM_RANGES} are needed")
     # A bias that is known is held by a prior far stronger than any ranges.
-    bias_information = 1 / max(options.range_bias_stddev_m, 1e-6) ** 2
+    bias_stddev_m = max(options.range_bias_stddev_m, 1e-6)
+    middle = positions.mean(axis=0)
     problem = PointProblem(
-        positions,
+        positions - middle,
         ranges,
         np.full(len(ranges), _USUAL_NOISE_M),
         short_range_stddev(ranges) if shared_stddev_m is None else np.asarray(shared_stddev_m, dtype=np.float64),
         np.array([0.0, 0.0, 0.0, options.range_bias_m]),
-        np.diag([0.0, 0.0, 0.0, bias_information]),
+        np.array([[0.0, 0.0, 0.0, 1 / bias_stddev_m]]),
     )
     fit = _fit_with_own_noise(problem, range_stddev_m, _groups(timestamp_s, options.block_s), options)
-    covariance, shape = _covariance(fit), path_shape(positions)
+    covariance, shape = _covariance(fit), path_shape(problem.positions_m)
     _refuse_uncertain(covariance, shape, options)
     mirror = _mirror(fit, covariance, shape)
     if mirror is not None:
         across = (mirror - fit.x)[:3]
         told = None if toward is None else _unless_along_plane(np.asarray(toward, dtype=np.float64), across)
-        if (told is not None or _fit_alike(fit, mirror)) and across @ (shape.axes[:, 2] if told is None else told) > 0:
+        # Where no range tells the two apart, rounding would choose.
+        is_free = told is not None or abs(_gap(fit, mirror)) < SAME_COST
+        if is_free and across @ (shape.axes[:, 2] if told is None else told) > 0:
             fit, mirror = replace(fit, x=mirror), fit.x
             covariance = _covariance(fit)
         mirror = mirror if told is None else None
     return Trilateration(
-        position_m=fit.x[:3],
+        position_m=middle + fit.x[:3],
         covariance_m2=covariance[:3, :3],
-        mirror_position_m=None if mirror is None else mirror[:3],
+        mirror_position_m=None if mirror is None else middle + mirror[:3],
         range_bias_m=float(fit.x[3]),
         range_bias_stddev_m=float(np.sqrt(covariance[3, 3])) if options.range_bias_stddev_m > 0 else 0.0,
         noise_stddev_m=fit.noise_m,
@@ -209,13 +211,13 @@ def _fit_with_own_noise(
     for _ in range(_NUM_NOISE_ROUNDS):
         noise = max(noise, 1.0) if is_given.all() else noise
         # Ranges keep their weight among themselves; the prior gains by what correlated errors cost them.
-        prior = problem.prior_information * inflation**2
-        now = replace(problem, stddev_m=np.hypot(noise * unit, problem.shared_stddev_m), prior_information=prior)
-        fit = _Fit(now, improve(now, x[None])[0][0], noise * float(np.median(unit)), inflation)
+        stddev = np.hypot(noise * unit, problem.shared_stddev_m)
+        now = replace(problem, stddev_m=stddev, prior=problem.prior * inflation)
+        fit = _Fit(now, improve(now, x), noise * float(np.median(unit)), inflation)
         x = fit.x
         ordinary = problem.shared_stddev_m < noise * unit
         rows = ordinary if np.mean(ordinary) > _MIN_ORDINARY else np.ones(num, dtype=np.bool_)
-        noise = _noise_of(fit.residuals_m[rows] / unit[rows], noise)
+        noise = _noise_of(fit.residuals_m[rows] / unit[rows])
         if groups is not None:
             inflation = _inflation(fit.scaled_residuals, groups)
     return replace(fit, inflation=inflation)
@@ -227,10 +229,10 @@ def _inflation(scaled: Array, groups: npt.NDArray[np.int64]) -> float:
     return inflation_before_fit(seen, len(np.unique(groups)), _NUM_UNKNOWNS)
 
 
-def _noise_of(scaled: Array, start: float) -> float:
+def _noise_of(scaled: Array) -> float:
     """Stddev of residuals in units, drawn to what is usual where there are few; four of them went into the fit."""
     freedom = max(len(scaled) - _NUM_UNKNOWNS, 0)
-    found = inlier_noise(scaled, start) ** 2 * len(scaled)
+    found = inlier_noise(scaled).stddev ** 2 * len(scaled)
     return float(np.sqrt((found + _USUAL_NOISE_COUNTS) / (freedom + _USUAL_NOISE_COUNTS)))
 
 
@@ -240,13 +242,13 @@ def _covariance(fit: _Fit) -> Array:
     Huber and Ronchetti, "Robust Statistics" (2009), section 7.6: for M-estimates the information is that of
     the weighted Jacobian, scaled by the loss' mean squared slope over its squared mean curvature.
     """
-    scaled, jacobian = (values[0] for values in fit.problem.linearized(fit.x[None]))
+    scaled, jacobian = fit.scaled_residuals, fit.problem.jacobian(fit.x)
     weights = CAUCHY.weights(scaled)
     curvature = max(float(np.mean(weights * (2 * weights - 1)) / np.mean(weights)), _MIN_CURVATURE)
     slope = float(np.mean((weights * scaled) ** 2) / np.mean(weights))
     shrinking = curvature**2 / max(slope, 1e-12) / fit.inflation**2
-    prior = fit.problem.prior_information / fit.inflation**2
-    information = (jacobian * weights[:, None]).T @ jacobian * min(shrinking, 1 / fit.inflation**2) + prior
+    prior = fit.problem.prior / fit.inflation
+    information = (jacobian * weights[:, None]).T @ jacobian * min(shrinking, 1 / fit.inflation**2) + prior.T @ prior
     covariance = _inverse(information)
     return _with_weak_direction(fit, covariance)
 
@@ -276,14 +278,16 @@ def _profile_stddev(fit: _Fit, along: Array) -> float:
     """How far the point moves ``along`` (4,) until the cost, all else adapted, has risen by that of one stddev."""
     num = len(fit.problem.range_m)
     part = fit.problem.subset(np.linspace(0, num - 1, min(num, _MAX_RANGES_OF_PROFILE)).astype(np.int64))
-    steps = np.concatenate([_PROFILE_STEPS_M, -_PROFILE_STEPS_M])
-    moved = fit.x + steps[:, None] * along
-    mean = np.column_stack([moved[:, :3], np.full(len(steps), part.prior_mean[3])])
-    stiff = _HOLD * float(np.sum(part.stddev_m**-2)) * np.outer(along, along)
-    held = replace(part, prior_mean=mean, prior_information=part.prior_information + stiff)
-    rise = improve(held, moved)[1] - part.cost(fit.x[None])[0]
-    far = (rise > 0.5 * fit.inflation**2 * len(part.range_m) / num).reshape(2, -1)
-    return float(np.max(np.where(far.any(axis=1), _PROFILE_STEPS_M[far.argmax(axis=1)], _PROFILE_STEPS_M[-1])))
+    hold = np.vstack([part.prior, _HOLD * np.sqrt(np.sum(part.stddev_m**-2)) * along])
+    allowed = part.cost(fit.x) + 0.5 * fit.inflation**2 * len(part.range_m) / num
+
+    def is_far(step: float) -> bool:
+        moved = fit.x + step * along
+        held = replace(part, prior_mean=np.append(moved[:3], part.prior_mean[3]), prior=hold)
+        return held.cost(improve(held, moved)) > allowed
+
+    last = _PROFILE_STEPS_M[-1]
+    return float(max(next((step for step in _PROFILE_STEPS_M if is_far(sign * step)), last) for sign in (1, -1)))
 
 
 def _refuse_uncertain(covariance: Array, shape: PathShape, options: TrilaterationOptions) -> None:
@@ -311,20 +315,19 @@ def _mirror(fit: _Fit, covariance: Array, shape: PathShape) -> Array | None:
     """(4,) the place on the other side of the tag's positions, if it is another one and fits as well."""
     normal = np.append(shape.axes[:, 2], 0.0)
     height = float((fit.x[:3] - shape.centroid) @ shape.axes[:, 2])
-    found, _ = improve(fit.problem, (fit.x - 2 * height * normal)[None])
-    apart = (found[0] - fit.x)[:3]
+    found = improve(fit.problem, fit.x - 2 * height * normal)
+    apart = (found - fit.x)[:3]
     distance = float(np.linalg.norm(apart))
     stddev = float(np.sqrt(apart @ covariance[:3, :3] @ apart)) / max(distance, 1e-12)
-    gap = float(np.diff(fit.problem.unlikelihood(np.stack([fit.x, found[0]])))[0]) / fit.inflation**2
-    return found[0] if distance > 2 * stddev and gap < _MIN_COST_GAP else None
+    return found if distance > 2 * stddev and _gap(fit, found) < _MIN_COST_GAP * fit.inflation**2 else None
+
+
+def _gap(fit: _Fit, mirror: Array) -> float:
+    """How much worse the mirror image fits, by a bounded loss: outliers cost the same wherever the point is."""
+    return fit.problem.cost(mirror, GEMAN_MCCLURE) - fit.problem.cost(fit.x, GEMAN_MCCLURE)
 
 
 def _unless_along_plane(direction: Array, across: Array) -> Array | None:
     """A direction that tells two places apart; of one along the plane between them, rounding would choose the sign."""
     least = _ALONG_PLANE * float(np.linalg.norm(direction) * np.linalg.norm(across))
     return direction if abs(direction @ across) > least else None
-
-
-def _fit_alike(fit: _Fit, mirror: Array) -> bool:
-    """Whether no range tells two places apart, so that rounding would choose."""
-    return bool(np.ptp(fit.problem.unlikelihood(np.stack([fit.x, mirror]))) < SAME_COST)

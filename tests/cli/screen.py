@@ -1,0 +1,34 @@
+"""A terminal that keeps what is written to it, and what somebody who looks at it sees."""
+
+from __future__ import annotations
+
+import io
+import re
+
+
+class Terminal(io.StringIO):
+    """Knows the control sequences of progress, and fails on any other."""
+
+    def isatty(self) -> bool:
+        return True
+
+    def lines(self) -> list[str]:
+        """What stands there now; blank lines at the end left out."""
+        rows, row, column = [""], 0, 0
+        for part in re.findall(r"\033\[[?\d]*[A-Za-z]|[\r\n]|[^\033\r\n]+", self.getvalue()):
+            if part == "\r":
+                column = 0
+            elif part == "\n":
+                row, column = row + 1, 0
+                rows += [""] * (row == len(rows))
+            elif part == "\033[2K":
+                rows[row] = ""
+            elif part == "\033[1A":
+                row -= 1
+            elif part not in ("\033[?25l", "\033[?25h"):
+                assert not part.startswith("\033"), part
+                rows[row] = rows[row][:column].ljust(column) + part + rows[row][column + len(part) :]
+                column += len(part)
+        while rows and not rows[-1].strip():
+            rows.pop()
+        return [line.rstrip() for line in rows]
