@@ -10,7 +10,7 @@ from rangesfm.batch.page import render
 from rangesfm.batch.rows import Status, SurveyRow
 from rangesfm.ceres.doctor import versions
 from rangesfm.files.atomic import new_file
-from rangesfm.files.records import write_json
+from rangesfm.files.json_files import write_json
 from rangesfm.files.tables import write_table
 
 TABLE_NAME, JSON_NAME, PAGE_NAME = "batch.csv", "batch.json", "batch.html"
