@@ -32,7 +32,8 @@ def main() -> None:
     points = positions(new)
     distance_m = KDTree(positions(old)).query(points)[0]
     # Both scales stretch the maps about their middle.
-    relative = np.hypot(before.relative_scale_stddev or 0.0, after.relative_scale_stddev or 0.0)
+    stddevs = [result.summary.scale.relative_stddev_empirical or 0.0 for result in (before, after)]
+    relative = np.hypot(stddevs[0], stddevs[1])
     spacing_m = float(np.median(KDTree(positions(old)).query(positions(old), k=2)[0][:, 1]))
     explained_m = 3 * (spacing_m + relative * np.linalg.norm(points - points.mean(axis=0), axis=1))
     has_changed = distance_m > explained_m

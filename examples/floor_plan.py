@@ -32,8 +32,8 @@ def main() -> None:
     if model is None:
         sys.exit(f"{folder}: no metric model")
     # A site frame has z up by custom; any other map is made level by what its cameras hold for up.
-    frame = "result" if result.summary.frame == "site" else "level"
-    map_ = in_frame(MetricMap(model, result.timestamps_s, result.anchor_positions_m), ExportOptions(frame=frame))
+    options = ExportOptions(frame="result" if result.summary.frame == "site" else "level")
+    map_ = in_frame(MetricMap(model, result.timestamps_s, result.anchor_positions_m), options)
     points = np.array([point.xyz for point in map_.reconstruction.points3D.values()])
     low, high = map(float, sys.argv[3:5]) if len(sys.argv) > 4 else np.quantile(points[:, 2], [0.25, 0.75])
     wall = points[(points[:, 2] >= low) & (points[:, 2] <= high)]

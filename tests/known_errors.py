@@ -39,6 +39,5 @@ def known_errors(
         stddev_m=stddev,
         given_m=np.full(len(rows), np.nan) if is_estimated else noise,
         inflation=inflation,
-        noise_m=float(np.median(noise)),
     )
     return found.spread(rows, num)

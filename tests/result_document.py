@@ -39,7 +39,7 @@ _SCALE = {
     "correlation_inflation": 1.0,
     "two_candidate": None,
 }
-_RESULT = {
+_RESULT: dict[str, Any] = {
     "scale": _SCALE,
     "metric_from_sfm": {"scale": 1.5, "rotation_xyzw": [0.0, 0.0, 0.0, 1.0], "translation_m": [1.0, 2.0, 3.0]},
     "frame": "site",

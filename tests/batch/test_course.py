@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import pytest
+from tests.result_document import result_document
 
 from rangesfm.batch.course import Course
 from rangesfm.batch.jobs import Job
 from rangesfm.batch.rows import Figures, Status, SurveyRow, exit_status_of, figures_of, format_rows
 from rangesfm.failures import Failure
+from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import Survey
 
 
@@ -88,14 +90,19 @@ def test_the_table_of_the_terminal_says_why_below() -> None:
     assert lines[3:] == ["", "b.toml: no such file"]
 
 
+def comparison_row(rmse_m: float) -> dict[str, object]:
+    after = {"rmse_se3_m": None, "rmse_sim3_m": None, "scale_error_percent": None}
+    return {"name": "path", "num_keyframes": 9, "rmse_m": rmse_m, **after}
+
+
 def test_figures_are_those_of_the_result() -> None:
-    result = {
-        "scale": {"verdict": "good", "value": 0.7, "stddev_formal": 0.01, "stddev_empirical": 0.02},
-        "frame": "site",
-        "map": {"num_photos": 14, "num_points3D": 900},
-        "ranges": {"num": 10, "num_used": 8, "rms_m": 0.08},
-        "refine": None,
-        "comparison": [{"rmse_m": 2.0}, {"rmse_m": 0.1}],
-        "warnings": ["one"],
-    }
-    assert figures_of(result) == Figures("good", 0.7, 0.02, "site", 14, 10, 8, 0.08, None, 0.1, 1)
+    result = result_document(
+        scale={"value": 0.7, "stddev_formal": 0.01, "stddev_empirical": 0.02},
+        map={"num_photos": 14},
+        ranges={"num": 10, "num_used": 8, "rms_m": 0.08},
+        comparison=[comparison_row(2.0), comparison_row(0.1)],
+        warnings=["one"],
+    )
+    assert figures_of(ResultSummary.model_validate(result)) == Figures(
+        "good", 0.7, 0.02, "site", 14, 10, 8, 0.08, None, 0.1, 1
+    )

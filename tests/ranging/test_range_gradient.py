@@ -20,11 +20,11 @@ LEVERS = WORLD_FROM_CAM @ TAG_IN_CAM
 
 
 def turned(vector: Array) -> Array:
-    return Rotation.from_rotvec(vector).as_matrix()
+    return np.asarray(Rotation.from_rotvec(vector).as_matrix())
 
 
 def distance_after(from_anchor: Callable[[Array], Array], step: Array) -> Array:
-    return np.linalg.norm(from_anchor(step), axis=1)
+    return np.asarray(np.linalg.norm(from_anchor(step), axis=1))
 
 
 @pytest.mark.parametrize(

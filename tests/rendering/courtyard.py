@@ -31,6 +31,8 @@ from rangesfm.demo.survey import ANCHORS_M
 WIDTH_M = 14.0
 DEPTH_M = 11.0
 
+_TEXEL_M = 0.006  # of the walls; smaller things are a little finer
+
 _FRESH_PLANKS = partial(materials.planks, palette=materials.FRESH_WOOD)
 _UPRIGHT_PLANKS = partial(materials.planks, palette=materials.FRESH_WOOD, upright=True)
 _GREY_PLANKS = partial(materials.planks, palette=materials.GREY_WOOD)
@@ -48,20 +50,15 @@ _NORTH_WINDOWS = ((6.2, 1.2, 1.1, 1.5), (8.2, 1.2, 1.1, 1.5), (12.0, 1.2, 1.1, 1
 _SOUTH_WINDOWS = ((2.0, 1.0, 1.3, 1.4), (7.9, 1.0, 1.3, 1.4))
 
 
-def courtyard(texel_m: float = 0.006, seed: int = 0) -> Scene:
-    """Build, paint and light the yard.
-
-    Args:
-        texel_m: resolution of the walls; smaller things are a little finer.
-        seed: of all textures; the layout is always the same.
-    """
+def courtyard() -> Scene:
+    """Build, paint and light the yard."""
     parts = (_ground, _walls, _on_the_walls, _houses_beyond, _along_the_walls, _middle, _radios)
     panels = [panel for part in parts for panel in part()]
     rectangles = [panel.rectangle for panel in panels]
     shown = [index for index, rectangle in enumerate(rectangles) if _faces_the_yard(rectangle)]
-    texels_m = [texel_m * _coarseness(rectangle) for rectangle in rectangles]
-    surfaces = light_panels(panels, shown, Light.afternoon(), texels_m, seed)
-    return Scene(surfaces, _cloudy_sky(np.random.default_rng(seed)))
+    texels_m = [_TEXEL_M * _coarseness(rectangle) for rectangle in rectangles]
+    surfaces = light_panels(panels, shown, Light.afternoon(), texels_m)
+    return Scene(surfaces, _cloudy_sky(np.random.default_rng(0)))
 
 
 def _coarseness(rectangle: Rectangle) -> float:

@@ -109,7 +109,7 @@ class Beam:
 
 
 def light_panels(
-    panels: Sequence[Panel], wanted: Sequence[int], light: Light, texel_m: Sequence[float], seed: int
+    panels: Sequence[Panel], wanted: Sequence[int], light: Light, texel_m: Sequence[float]
 ) -> list[Surface]:
     """Paint and light some of the panels; all of them cast shadows.
 
@@ -118,13 +118,12 @@ def light_panels(
         wanted: indices of those to paint.
         light: where light comes from.
         texel_m: resolution of each panel's texture.
-        seed: of all textures.
     """
     rectangles = [panel.rectangle for panel in panels]
     large = [rectangle for rectangle in rectangles if rectangle.width_m * rectangle.height_m > _MIN_SKY_OCCLUDER_M2]
     from_sun = [Beam(light.sun_direction + offset, rectangles) for offset in _SUN_DISC]
     from_sky = [Beam(direction, large) for direction in _directions(_NUM_SKY_DIRECTIONS)]
-    seeds = np.random.SeedSequence(seed).spawn(len(panels))
+    seeds = np.random.SeedSequence(0).spawn(len(panels))
 
     def finish(index: int) -> Surface:
         rectangle = rectangles[index]

@@ -111,7 +111,8 @@ def test_anchors_and_lever_arms_are_arrays(tmp_path: Path) -> None:
 def test_what_a_run_did_not_leave_is_none(tmp_path: Path) -> None:
     result = read_result_folder(write_document(tmp_path))
     assert [result.read(table) for table in TABLES] == [None] * len(TABLES)
-    assert result.read_reference() is result.read_metric_model() is result.timestamps_s is result.images_path is None
+    assert (result.read_reference(), result.read_metric_model()) == (None, None)
+    assert (result.timestamps_s, result.images_path) == (None, None)
 
 
 def test_times_and_ranges_are_read_as_they_stand(tmp_path: Path) -> None:

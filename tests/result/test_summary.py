@@ -100,7 +100,7 @@ def test_similarity_is_that_of_its_keys() -> None:
     moved = summary.metric_from_sfm.similarity.apply(np.array([1.0, 0.0, 0.0]))
     np.testing.assert_allclose(moved, [-1.0, 2.0, 3.0], atol=1e-12)
     again = type(summary.metric_from_sfm).of(summary.metric_from_sfm.similarity)
-    np.testing.assert_allclose(again.rotation_xyzw, half_turn["rotation_xyzw"], atol=1e-12)
+    np.testing.assert_allclose(again.rotation_xyzw, [0.0, 0.0, 1.0, 0.0], atol=1e-12)
 
 
 def test_lines_for_people_tell_what_is_known() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from rangesfm.result.tables import CenterCovariances, PhotoTimes, ScaleConsensus
 
 def example(kind: type[TableFile], num_rows: int) -> TableFile:
     """Rows of which every cell that may be empty is so in the second."""
-    columns = {}
+    columns: dict[str, Any] = {}
     for name, (format_spec, may_be_empty) in kind.columns().items():
         if format_spec == "s":
             texts = [f'{name},"{row}"' for row in range(num_rows)]

@@ -26,6 +26,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from tests.known import known
 
 from rangesfm.comparison.with_reference import compare, format_table
 from rangesfm.errors import InputError
@@ -156,7 +157,7 @@ def print_row(survey: Survey, sfm: pycolmap.Reconstruction) -> None:
     )
     result = refine_model(cut, progress=SilentProgress()).summary
     print(format_table((*unscaled, *result.comparison)))
-    print(f"{result['refine']['iterations']} iterations of the full problem\n", flush=True)
+    print(f"{known(result.refine).iterations} iterations of the full problem\n", flush=True)
 
 
 if __name__ == "__main__":

@@ -169,9 +169,9 @@ def _errors_to_begin_with(problem: RefinementProblem, errors: RangeErrors, metre
     tags_m = ranges.antennas.positions(path.centers, path.world_from_cam)
     placing_m = metres_per_unit * ranges.observations.center_stddev
     placed = errors.subset(ranges.rows).at(tags_m[ranges.rows], placing_m[ranges.rows])
-    loss = RobustLoss(options.range_loss_scale, is_bounded=True)
-    placed = replace(placed, loss=loss, log_likelihood=-np.inf)
-    return placed.without_shared() if options.short_range_stddev_m > 0 else placed
+    if options.short_range_stddev_m > 0:
+        placed = placed.without_shared()
+    return placed.for_bending_map(RobustLoss(options.range_loss_scale, is_bounded=True))
 
 
 def _between_anchors(

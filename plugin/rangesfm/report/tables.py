@@ -88,14 +88,15 @@ def comparison(content: Content) -> Table:
 def two_candidates(content: Content) -> Table:
     """Mean and standard deviation of the paper's two branches."""
     given = content.summary.scale.two_candidate
+    branches = [] if given is None else [("alpha0", given.alpha0), ("alpha1", given.alpha1)]
     rows = [
         [
             name,
             keyed(f"scale.two_candidate.{name}.mean", branch.mean, plain(branch.mean)),
             keyed(f"scale.two_candidate.{name}.std", branch.std, plain(branch.std)),
-            "chosen" if given.chosen == name else "",
+            "chosen" if given and given.chosen == name else "",
         ]
-        for name, branch in ([] if given is None else [("alpha0", given.alpha0), ("alpha1", given.alpha1)])
+        for name, branch in branches
     ]
     return Table(
         "The paper's two candidates",

@@ -17,5 +17,5 @@ def test_a_camera_that_stands_still_but_for_rounding_explains_no_range_at_any_of
     centers = np.array([1.0, 2.0, 3.0]) + rounding * wobble / np.abs(wobble).max()
     path = PathSamples(0.0, 0.025, centers, np.zeros((1, 400, 3)), np.ones(400, dtype=bool))
     zero = np.zeros(400, dtype=np.int64)
-    ranges = TimedRanges(0.025 * np.arange(400), 20.0 + wobble[:, 0], zero, zero)
+    ranges = TimedRanges(0.025 * np.arange(400, dtype=np.float64), 20.0 + wobble[:, 0], zero, zero)
     np.testing.assert_allclose(scan_offsets(ranges, path).scores, 0.0, atol=1e-3)

@@ -130,6 +130,17 @@ def test_a_map_that_may_bend_shows_no_more_noise_than_one_that_may_not() -> None
     assert free.stddev_m[0] == pytest.approx(0.1, rel=0.07)
 
 
+def test_it_begins_with_the_noise_that_the_rigid_map_showed() -> None:
+    """Whatever short ranges share and places are uncertain by is none of it; nor do stated stddevs say anything."""
+    shared, placing = np.full(3 * NUM_EACH, 0.2), np.full(3 * NUM_EACH, 0.05)
+    rigid = replace(make_errors(), shared_m=shared, placing_m=placing).seen_by_rigid_map(noise((0.1, 0.1, 0.1)), 0.0)
+    begun = rigid.for_bending_map(CAUCHY)
+    assert begun.noise_m == pytest.approx(rigid.noise_m, rel=1e-12)
+    assert (begun.loss, begun.log_likelihood) == (CAUCHY, -np.inf)
+    assert rigid.without_shared().for_bending_map(CAUCHY).noise_m == pytest.approx(rigid.noise_m, rel=1e-12)
+    assert make_errors(0.1, is_estimated=False).for_bending_map(CAUCHY).noise_m == np.inf
+
+
 def test_what_drifts_away_is_noise_to_the_wide_loss_alone() -> None:
     """Six of ten ranges are off by metres: outliers, or drift."""
     residuals = noise((0.1, 0.1, 0.1))

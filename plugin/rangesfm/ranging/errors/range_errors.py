@@ -54,8 +54,8 @@ class RangeErrors:
         loss: of single ranges, in their stddevs. With a wide one the noise is what all residuals show, so that what
             drifts away is no outlier; with a bounded one that of the ranges that fit.
         common_bias_stddev_m: of the bias that all anchors share (mean 0), of which their own priors say nothing.
-        noise_m: of a range without special cases, as a map shows it that may only grow, turn and move: one that may
-            bend explains the ranges no worse.
+        noise_m: of a range without special cases, as a map shows it that may only grow, turn and move; one that may
+            bend shows no more.
         log_likelihood: of the likeliest residuals that the bounded loss has seen of these ranges.
     """
 
@@ -150,6 +150,12 @@ class RangeErrors:
         """Of a map with which what short ranges share is estimated as a number of its own."""
         stddev = np.sqrt(np.maximum(self.stddev_m**2 - self.shared_m**2, _MIN_STDDEV_M**2))
         return replace(self, stddev_m=stddev, shared_m=np.zeros_like(self.shared_m))
+
+    def for_bending_map(self, loss: RobustLoss) -> RangeErrors:
+        """To begin with, under another loss, where a map may bend: it explains the ranges no worse than it did."""
+        beyond = (self.stddev_m**2 - self.shared_m**2 - self.placing_m**2)[self.is_estimated]
+        noise_m = float(np.sqrt(max(np.median(beyond), _MIN_STDDEV_M**2))) if len(beyond) else np.inf
+        return replace(self, loss=loss, noise_m=noise_m, log_likelihood=-np.inf)
 
     def noise_of_all(self, residuals_m: Array) -> InlierNoise:
         """Of the ranges without special cases, as a map that may not bend shows it."""
