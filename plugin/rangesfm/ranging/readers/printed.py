@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -58,7 +59,8 @@ def printed_reader(
     sides: Sides = Sides.TOLD,
 ) -> Reader:
     """The reader of lines with such phrases, given as patterns of ASCII."""
-    phrases = _Phrases(*(re.compile(pattern, re.ASCII) for pattern in (begin, each, whole)), add)
+    compiled = partial(re.compile, flags=re.ASCII)
+    phrases = _Phrases(compiled(begin), compiled(each), compiled(whole), add)
 
     def read(path: Path, options: ReadOptions) -> RangeLog:
         check_only_time_is_described(path, options)
