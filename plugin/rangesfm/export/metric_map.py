@@ -1,4 +1,4 @@
-"""MetricMap: all that an exporter may need."""
+"""What exporters share: the map with all that they may need, and parts of a camera that programs name one by one."""
 
 from __future__ import annotations
 
@@ -47,3 +47,9 @@ class MetricMap:
     @cached_property
     def trajectory(self) -> Trajectory:
         return trajectory_from_reconstruction(self.reconstruction, self.timestamps_s)
+
+
+def distortion_params(camera: pycolmap.Camera) -> list[float]:
+    """The parameters that are neither focal lengths nor principal point, in COLMAP's order."""
+    others = {*camera.focal_length_idxs(), *camera.principal_point_idxs()}
+    return [float(value) for index, value in enumerate(camera.params) if index not in others]

@@ -46,7 +46,7 @@ def write_ranges_csv(log: RangeLog, path: str | Path) -> None:
     if np.any(log.los >= 0):
         columns["los"] = ("" if los < 0 else str(los) for los in log.los)
     try:
-        write_table(Path(path), list(columns), zip(*columns.values()))
+        write_table(Path(path), [*columns], zip(*columns.values()))
     except OSError as error:
         raise InputError(f"cannot be written ({error.strerror})", path) from error
 
