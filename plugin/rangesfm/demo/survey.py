@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from rangesfm.arrays import Array
 from rangesfm.demo.path import CameraPath
 from rangesfm.demo.ranges import Radio, SimulatedRanges, simulate_ranges
 from rangesfm.errors import InputError
@@ -25,8 +25,6 @@ from rangesfm.files.atomic import LEFTOVER, new_folder, write_text
 from rangesfm.files.sole_writer import LOCK_NAME, sole_writer
 from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.ranging.readers.canonical import write_ranges_csv
-
-FloatArray = npt.NDArray[np.float64]
 
 PHOTOS = Path(__file__).with_name("photos")
 PATH_FILE = PHOTOS / "path.csv"
@@ -73,9 +71,9 @@ class DemoSurvey:
 
     folder: Path
     image_names: tuple[str, ...]
-    timestamps_s: FloatArray
-    centers_m: FloatArray
-    world_from_cam: FloatArray
+    timestamps_s: Array
+    centers_m: Array
+    world_from_cam: Array
     ranges: SimulatedRanges
 
     @property

@@ -31,7 +31,7 @@ from rangesfm.options import ExportOptions
 if TYPE_CHECKING:
     import pycolmap
 
-    from rangesfm.export.metric_map import Array
+    from rangesfm.arrays import Array
     from rangesfm.geometry.similarity import Similarity
 
 __all__ = [

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from rangesfm.arrays import Array
 from rangesfm.colmap.model_files import read_model
 from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
 from rangesfm.export.colmap import write_model
-from rangesfm.export.metric_map import Array
 from rangesfm.export.ply_transform import transform_ply
 from rangesfm.files.atomic import make_output_folder, write_text
 from rangesfm.files.json_files import read_json, write_json

@@ -7,15 +7,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
 import pycolmap
 
+from rangesfm.arrays import Array
 from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.export.metric_map import Array, MetricMap, distortion_params
+from rangesfm.export.metric_map import MetricMap, distortion_params
 from rangesfm.export.ply import write_points
 from rangesfm.files.json_files import write_json
 

@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.export.metric_map import Array, MetricMap
+from rangesfm.export.metric_map import MetricMap
 from rangesfm.files.atomic import new_file, write_text
 from rangesfm.geometry.trajectory import Trajectory
 

@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar, get_type_hints
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.files.tables import Table, read_table, write_table
 from rangesfm.result.metric_result import MetricResult
 
-Array = npt.NDArray[np.float64]
 _Kind = TypeVar("_Kind", bound="TableFile")
 _TEXT = "s"
 

@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.tables import Table, read_table, write_table
 from rangesfm.ranging.log import RangeLog
-
-Array = npt.NDArray[np.float64]
 
 COLUMNS = ("distance_m", "error_m", "stddev_m", "noise_stddev_m")
 # How fast a curve may run away beyond where it was learnt, for each e-fold of distance. The DW1000's own
