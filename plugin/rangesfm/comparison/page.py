@@ -6,15 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesfm.comparison.models import (
-    SIMILARITY_HEADER,
-    ModelRow,
-    ModelsComparison,
-    NamedModel,
-    similarity_cells,
-    taped_cells,
-    taped_header,
-)
+from rangesfm.comparison.models import ModelRow, ModelsComparison, NamedModel
 from rangesfm.files.atomic import new_file
 from rangesfm.files.sole_writer import sole_writer
 from rangesfm.geometry.trajectory import Trajectory
@@ -24,20 +16,10 @@ from rangesfm.report.page import render
 from rangesfm.report.plot import WIDE_SIZE, Figure, Panel, Series, equal_view
 from rangesfm.report.result_scene import anchors_in_scene
 from rangesfm.report.scene import Scene, ScenePath
-from rangesfm.report.tables import Table
 from rangesfm.report.view import view_of
 
 COLORS = ("after", "before", "third", "fourth")
 PAGE_NAME = "comparison.html"
-_SIMILARITY_NOTE = (
-    "Scale and turn carry a model onto the first. Moved: RMS distance of the cameras from where the first has "
-    "them, as they are and after that similarity, in the first's unit. Range RMS: of the ranges used, with the "
-    "cameras as they are, and carried onto the path that the ranges themselves have placed."
-)
-_TAPED_NOTE = (
-    "Each model's length in its own unit; after Sim(3): with the scale that carries its cameras onto those of the "
-    "first model that the ranges have placed."
-)
 
 
 def write_comparison(comparison: ModelsComparison, folder: Path) -> Path:
@@ -65,25 +47,7 @@ def render_comparison(comparison: ModelsComparison) -> str:
         view=view_of(_scene(comparison, aligned)),
         figures=figures,
         charts=page_charts(figures),
-        tables={
-            "similarity": Table(
-                "Each model against the first",
-                SIMILARITY_HEADER,
-                [[row.name, *similarity_cells(row)] for row in comparison.rows],
-                _SIMILARITY_NOTE,
-            ),
-            "distances": Table(
-                "Distances between photos, in each model's unit",
-                ["from and to", *(model.name for model in comparison.models)],
-                [[f"{a} to {b}", *(f"{length:.4f}" for length in lengths)] for a, b, lengths in comparison.distances],
-            ),
-            "taped": Table(
-                "Taped distances",
-                taped_header(comparison) if comparison.taped else [],
-                [taped_cells(row) for row in comparison.taped],
-                _TAPED_NOTE,
-            ),
-        },
+        tables=comparison.tables,
     )
 
 
