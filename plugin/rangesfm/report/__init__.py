@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rangesfm.files.atomic import new_file
 from rangesfm.files.sole_writer import sole_writer
-from rangesfm.report.content import gather
+from rangesfm.report.content import Content
 from rangesfm.report.figures import all_figures
 from rangesfm.report.page import render_report
 from rangesfm.report.pictures import write_pictures
@@ -35,7 +35,7 @@ def write_report(result_folder: Path, *, images_path: Path | None = None) -> Pat
     result = read_result_folder(result_folder)
     path = result_folder / "report.html"
     with sole_writer(result_folder), new_file(path) as temporary:
-        page = render_report(gather(result, images_path=images_path))
+        page = render_report(Content(result, images_path=images_path))
         temporary.write_text(page, encoding="utf-8", errors="xmlcharrefreplace")
     return path
 
@@ -48,4 +48,4 @@ def write_report_pictures(result_folder: Path) -> list[Path]:
     """
     result = read_result_folder(result_folder)
     with sole_writer(result_folder):
-        return write_pictures(all_figures(gather(result)), result_folder / PICTURES_FOLDER)
+        return write_pictures(all_figures(Content(result)), result_folder / PICTURES_FOLDER)

@@ -28,7 +28,7 @@ def tiles(content: Content) -> list[tuple[str, str, str]]:
     """Name, value and a note on it, of what one looks for first."""
     summary, path = content.summary, content.final
     length_m = None if path is None else float(np.linalg.norm(np.diff(path.centers, axis=0), axis=1).sum())
-    num_points = None if content.points_m is None else len(content.points_m)
+    num_points = None if path is None else len(content.points_m)
     offset_decimals = min(decimals_for(summary.time_offset.stddev_s, default=3), 6)
 
     def shown(key: str, write: Callable[..., str], *how: object) -> str:

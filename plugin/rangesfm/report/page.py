@@ -15,7 +15,7 @@ from rangesfm.report.chart import page_charts
 from rangesfm.report.checks import quality_checks
 from rangesfm.report.content import Content
 from rangesfm.report.figures import SECTIONS, figures_of
-from rangesfm.report.result_scene import scene_of
+from rangesfm.report.scene import scene_of
 from rangesfm.report.script import ASSETS, page_script, policy_source
 from rangesfm.report.view import view_of
 

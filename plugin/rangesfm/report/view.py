@@ -37,27 +37,29 @@ def view_of(scene: Scene) -> View:
     statuses = data["ranges"]["statuses"] if data["ranges"] else []
     layers = [("points", "Map points", "map", "dots")] if len(scene.points_m) else []
     layers += [(path.id, path.name, path.color, "line" if path.has_orientations else "dashed") for path in scene.paths]
-    layers += [("anchors", "Anchors", "anchor", "triangle")] if scene.anchors else []
+    layers += [("anchors", "Anchors", "anchor", "triangle")] if data["anchors"] else []
     layers += [("grid", "Grid", "muted", "box")]
     return View(
         data=data,
         layers=layers,
         statuses=[(name, name in SHOWN_STATUSES) for name in statuses],
         num_photos=len(scene.result) if scene.paths[-1].has_orientations else 0,
-        note=_note(scene, num_thumbnails=len(data["thumbnails"])),
+        note=_note(scene, data),
     )
 
 
-def _note(scene: Scene, *, num_thumbnails: int) -> str:
+def _note(scene: Scene, data: dict[str, Any]) -> str:
     sentences = [
         "Drag to turn, wheel or pinch to zoom, right drag or two fingers to move; click a camera for its photo."
     ]
     if num_left_out := len(scene.points_m) - num_points_drawn(scene):
         sentences.append(f"{count(num_left_out)} points far away or beyond the view's limit are not drawn.")
-    if scene.ranges is not None and (stride := range_stride(scene.ranges)) > 1:
+    ranges = None if scene.content is None else scene.content.ranges
+    if ranges is not None and (stride := range_stride(ranges)) > 1:
         sentences.append(f"One in {stride} ranges is drawn and listed; ranges.csv holds all.")
-    if 0 < num_thumbnails < (num_photos := len(scene.result)):
+    num_thumbnails, num_photos = len(data["thumbnails"]), len(scene.result)
+    if 0 < num_thumbnails < num_photos:
         sentences.append(f"{count(num_thumbnails)} of {count(num_photos)} photos have a picture: the page stays small.")
-    if scene.anchors:
+    if data["anchors"]:
         sentences.append("Ellipsoids around the anchors hold 95 %, at their true size.")
     return " ".join(sentences)
