@@ -7,8 +7,7 @@ from pathlib import Path
 from rangesfm.files.atomic import new_file
 from rangesfm.files.sole_writer import sole_writer
 from rangesfm.report.content import Content
-from rangesfm.report.figures import all_figures
-from rangesfm.report.page import render_report
+from rangesfm.report.page import figures_of, render_report
 from rangesfm.report.pictures import write_pictures
 from rangesfm.result.folder import read_result_folder
 
@@ -48,4 +47,5 @@ def write_report_pictures(result_folder: Path) -> list[Path]:
     """
     result = read_result_folder(result_folder)
     with sole_writer(result_folder):
-        return write_pictures(all_figures(Content(result)), result_folder / PICTURES_FOLDER)
+        figures = figures_of(Content(result)).values()
+        return write_pictures([one for of_section in figures for one in of_section], result_folder / PICTURES_FOLDER)

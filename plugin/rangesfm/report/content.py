@@ -32,16 +32,12 @@ class CameraIntrinsics:
     """One camera of the models.
 
     Attributes:
-        camera_id: COLMAP's.
-        model: COLMAP's name of the camera model.
-        size_px: width and height of its photos.
+        title: COLMAP's number and model of it, and the size of its photos.
         parameters: name, value before the refinement, value after it (NaN without).
         half_angles: half width and half height of its picture at unit distance.
     """
 
-    camera_id: int
-    model: str
-    size_px: tuple[int, int]
+    title: str
     parameters: tuple[tuple[str, float, float], ...]
     half_angles: tuple[float, float]
 
@@ -128,27 +124,16 @@ def points_of(model: pycolmap.Reconstruction | None) -> tuple[Array, npt.NDArray
 def _cameras(
     scaled: pycolmap.Reconstruction | None, refined: pycolmap.Reconstruction | None
 ) -> tuple[CameraIntrinsics, ...]:
-    before, after = ({} if model is None else dict(model.cameras.items()) for model in (scaled, refined))
-    return tuple(
-        _intrinsics(camera_id, camera, before.get(camera_id), after.get(camera_id))
-        for camera_id, camera in sorted((after or before).items())
-    )
-
-
-def _intrinsics(
-    camera_id: int, camera: pycolmap.Camera, before: pycolmap.Camera | None, after: pycolmap.Camera | None
-) -> CameraIntrinsics:
-    names = [name.strip() for name in camera.params_info.split(",")]
-    unknown = [math.nan] * len(names)
-    columns = [unknown if one is None else [float(value) for value in one.params] for one in (before, after)]
-    focal = camera.mean_focal_length()
-    return CameraIntrinsics(
-        camera_id=camera_id,
-        model=camera.model.name,
-        size_px=(camera.width, camera.height),
-        parameters=tuple(zip(names, *columns)),
-        half_angles=(camera.width / (2 * focal), camera.height / (2 * focal)),
-    )
+    both = [{} if model is None else dict(model.cameras.items()) for model in (scaled, refined)]
+    found = []
+    for camera_id, camera in sorted((both[1] or both[0]).items()):
+        names = [name.strip() for name in camera.params_info.split(",")]
+        values = [of_model[camera_id].params if camera_id in of_model else [math.nan] * len(names) for of_model in both]
+        title = f"{camera_id} {camera.model.name} {camera.width} × {camera.height}"
+        focal = camera.mean_focal_length()
+        half_angles = (camera.width / (2 * focal), camera.height / (2 * focal))
+        found.append(CameraIntrinsics(title, tuple(zip(names, *values)), half_angles))
+    return tuple(found)
 
 
 def in_natural_order(ids: Iterable[str]) -> list[str]:

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.report.content import Content, in_natural_order
-from rangesfm.report.plot import WIDE_SIZE, Figure, Panel, Series, figure_of, running_median
+from rangesfm.report.plot import WIDE_SIZE, Figure, Panel, Series, figure_of, running_median, time_axis
 from rangesfm.result.ranges_as_used import RangesAsUsed
 
 Array = npt.NDArray[np.float64]
@@ -71,7 +71,7 @@ def absolute_errors(content: Content) -> Figure | None:
         return None
     rows = np.flatnonzero(np.isfinite(true_m))
     stride = _stride(len(rows))
-    times, time_label = _times(content, ranges)
+    times, time_label = time_axis(content.range_times_s)
     errors = [("measured", "rejected", ranges.range_m)]
     errors += [(name, color, residuals + ranges.range_m) for name, color, residuals in _both(ranges)]
     x_range = (float(times[rows].min()), float(times[rows].max()))
@@ -97,7 +97,7 @@ def absolute_errors(content: Content) -> Figure | None:
 
 
 def _residual_panel(content: Content, ranges: RangesAsUsed, anchor_id: str) -> Panel:
-    times, time_label = _times(content, ranges)
+    times, time_label = time_axis(content.range_times_s)
     time_range = (float(np.nanmin(times)), float(np.nanmax(times)))
     limit = _residual_limit(ranges)
     is_mine = np.array(ranges.anchor_id, dtype=str) == anchor_id
@@ -139,12 +139,6 @@ def _both(ranges: RangesAsUsed) -> list[tuple[str, str, Array]]:
     """Name, color and residuals before and, where there are any, after the refinement."""
     both = [("scaled", "before", ranges.residual_scaled_m), ("refined", "after", ranges.residual_refined_m)]
     return both if np.isfinite(ranges.residual_refined_m).any() else both[:1]
-
-
-def _times(content: Content, ranges: RangesAsUsed) -> tuple[Array, str]:
-    if np.isfinite(content.range_times_s).any():
-        return content.range_times_s, "time s"
-    return np.arange(len(ranges.status), dtype=np.float64), "range number"
 
 
 def _has_residuals(ranges: RangesAsUsed) -> bool:

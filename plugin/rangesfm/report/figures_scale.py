@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from rangesfm.report.content import Content, in_natural_order
 from rangesfm.report.figures_ranges import histogram
-from rangesfm.report.plot import WIDE_SIZE, Figure, LegendEntry, Mark, Series, figure_of
+from rangesfm.report.plot import WIDE_SIZE, Figure, LegendEntry, Mark, Series, figure_of, time_axis
 from rangesfm.report.text import signed
 from rangesfm.result.tables import ScaleBootstrap, ScaleCandidates, ScaleConsensus, TimeOffsetCurve
 
@@ -58,11 +58,7 @@ def candidates(content: Content) -> Figure | None:
     if table is None or len(table.alpha0) == 0:
         return None
     stride = -(-len(table.alpha0) // MAX_NUM_CANDIDATES)
-    times, alpha0, alpha1 = (column[::stride] for column in (table.timestamp_s, table.alpha0, table.alpha1))
-    times = times - np.min(times, initial=np.inf, where=np.isfinite(times))
-    label = "time s"
-    if not np.isfinite(times).all():
-        times, label = np.arange(len(times), dtype=np.float64), "range number"
+    times, label = time_axis(table.timestamp_s[::stride])
     found = np.array([[times.min(), scale], [times.max(), scale]])
     caption = (
         "Each range has two possible scales. The true one is constant over time, the other is not; where the path "
@@ -76,8 +72,8 @@ def candidates(content: Content) -> Figure | None:
         "Both candidates of the scale over time",
         (label, "candidate m per unit"),
         (
-            Series("alpha0", "before", np.column_stack([times, alpha0])),
-            Series("alpha1", "after", np.column_stack([times, alpha1])),
+            Series("alpha0", "before", np.column_stack([times, table.alpha0[::stride]])),
+            Series("alpha1", "after", np.column_stack([times, table.alpha1[::stride]])),
             Series("scale found", "reference", found, "dashed", is_data=False),
         ),
         y_range=(CANDIDATE_AXIS[0] * scale, CANDIDATE_AXIS[1] * scale),

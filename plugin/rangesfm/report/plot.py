@@ -224,6 +224,13 @@ def running_median(points: Array, x_range: Range, num_bins: int) -> Array:
     return np.column_stack([(edges[:-1] + edges[1:]) / 2, medians])
 
 
+def time_axis(times_s: Array) -> tuple[Array, str]:
+    """(n,) seconds since the first and what the axis is called; numbers where no range has a time."""
+    if not np.isfinite(times_s).any():
+        return np.arange(len(times_s), dtype=np.float64), "range number"
+    return times_s - np.nanmin(times_s), "time s"
+
+
 def _limits(values: Array) -> Range:
     known = values[np.isfinite(values)]
     return (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)

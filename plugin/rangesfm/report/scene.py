@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -110,11 +110,6 @@ def scene_data(scene: Scene) -> dict[str, Any]:
     }
 
 
-def num_points_drawn(scene: Scene) -> int:
-    """How many of the map's points the view shows."""
-    return len(_chosen_points(scene))
-
-
 def range_stride(ranges: RangesAsUsed) -> int:
     """Every how many-th range the view shows."""
     return max(1, -(-len(ranges.status) // MAX_NUM_RANGES))
@@ -206,17 +201,15 @@ def _ranges(content: Content, path: Trajectory) -> dict[str, Any] | None:
     if ranges is None or len(ranges.status) == 0:
         return None
     rows = np.arange(0, len(ranges.status), range_stride(ranges))
-    index_of = {name: i for i, name in enumerate(path.image_names)}
-    before = _indices(ranges.keyframe_before, index_of, rows)
-    after = _indices(ranges.keyframe_after, index_of, rows)
-    weight = ranges.weight[rows]
-    has_place = (before >= 0) & (after >= 0) & np.isfinite(weight)
+    before, after, has_place = (of_all[rows] for of_all in ranges.places_on(path.image_names))
+    weight = np.where(has_place, ranges.weight[rows], 0.0)
     anchor_ids, anchor = np.unique(np.array(ranges.anchor_id, dtype=str), return_inverse=True)
-    statuses = _statuses_in_order(ranges)
+    present = set(ranges.status)
+    known = [status.label for status in RangeStatus if status.label in present]
+    statuses = [*known, *sorted(present.difference(known))]  # the used first
     status = np.array([statuses.index(label) for label in ranges.status])
     is_refined = bool(np.isfinite(ranges.residual_refined_m).any())
     final = ranges.residual_refined_m if is_refined else ranges.residual_scaled_m
-    weight = np.where(has_place, weight, 0.0)
     tags, tag = np.unique(content.tags_in_cam_m[rows], axis=0, return_inverse=True)
     return {
         "num": len(rows),
@@ -239,17 +232,6 @@ def _ranges(content: Content, path: Trajectory) -> dict[str, Any] | None:
         "weight": pack(np.round(255 * weight), "uint8"),
         "camera": pack(np.where(has_place, np.where(weight < 0.5, before, after), -1), "int32"),
     }
-
-
-def _statuses_in_order(ranges: RangesAsUsed) -> list[str]:
-    """Those that there are, the used first."""
-    present = set(ranges.status)
-    known = [status.label for status in RangeStatus if status.label in present]
-    return [*known, *sorted(present.difference(known))]
-
-
-def _indices(names: Sequence[str], index_of: dict[str, int], rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    return np.array([index_of.get(names[row], -1) for row in rows], dtype=np.int64)
 
 
 def _residual_limit(residuals: Array) -> float:

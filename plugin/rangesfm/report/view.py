@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rangesfm.ranging.observations import RangeStatus
-from rangesfm.report.scene import Scene, num_points_drawn, range_stride, scene_data
+from rangesfm.report.scene import Scene, range_stride, scene_data
 from rangesfm.report.text import count
 
 SHOWN_STATUSES = (RangeStatus.USED.label, RangeStatus.DOWN_WEIGHTED.label)
@@ -52,7 +52,7 @@ def _note(scene: Scene, data: dict[str, Any]) -> str:
     sentences = [
         "Drag to turn, wheel or pinch to zoom, right drag or two fingers to move; click a camera for its photo."
     ]
-    if num_left_out := len(scene.points_m) - num_points_drawn(scene):
+    if num_left_out := len(scene.points_m) - (data["points"] or {"num": 0})["num"]:
         sentences.append(f"{count(num_left_out)} points far away or beyond the view's limit are not drawn.")
     ranges = None if scene.content is None else scene.content.ranges
     if ranges is not None and (stride := range_stride(ranges)) > 1:
