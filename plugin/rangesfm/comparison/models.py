@@ -55,10 +55,10 @@ class ModelRow:
 
     Attributes:
         name: of the model.
-        num_photos, num_common: in it, and in the first as well.
+        num_photos: in it.
         base_from_model: the similarity that carries it onto the first; None with fewer than three common photos.
         common_names: the photos in both, in the first's order.
-        moved, moved_aligned: (num_common,) distance of each camera from where the first has it, as it is and after
+        moved, moved_aligned: (n,) distance of each of these cameras from where the first has it, as it is and after
             that similarity, in the first's unit; the latter None without one.
         reprojection_rms_px: None of a file of positions, NaN without points.
         range_rms_m: of the ranges given, else of those that the first result folder used: of the cameras as they are,
@@ -67,7 +67,6 @@ class ModelRow:
 
     name: str
     num_photos: int
-    num_common: int
     base_from_model: Similarity | None
     common_names: tuple[str, ...]
     moved: Array
@@ -209,7 +208,6 @@ def _row(base: NamedModel, other: NamedModel, ranges: ModelRanges | None) -> Mod
     return ModelRow(
         name=other.name,
         num_photos=len(other.path),
-        num_common=len(names),
         base_from_model=similarity,
         common_names=names,
         moved=np.linalg.norm(theirs - ours, axis=1),
@@ -338,7 +336,7 @@ def _cells(row: ModelRow) -> list[str]:
     similarity, aligned = row.base_from_model, row.moved_aligned
     return [
         row.name,
-        f"{row.num_common} of {row.num_photos}",
+        f"{len(row.common_names)} of {row.num_photos}",
         text_or_dash(None if similarity is None else similarity.scale, ".6g"),
         text_or_dash(row.rotation_deg, ".3f"),
         text_or_dash(rmse(row.moved[:, None]), ".4f"),
