@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from rangesfm.report.content import Content, in_natural_order
 from rangesfm.report.figures_ranges import histogram
-from rangesfm.report.plot import WIDE_SIZE, Figure, LegendEntry, Mark, Series, figure_of, time_axis
+from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Series, figure_of, time_axis
 from rangesfm.report.text import signed
 from rangesfm.result.tables import ScaleBootstrap, ScaleCandidates, ScaleConsensus, TimeOffsetCurve
 
@@ -41,13 +41,12 @@ def scale_per_anchor(content: Content) -> Figure | None:
         "Scale from each anchor alone against the joint scale",
         ("scale m per unit", ""),
         (),
-        legend=(_line("joint scale"), *((_band("± one standard deviation"),) if stddev is not None else ())),
+        line=("joint scale", joint),
+        band=None if stddev is None else ("± one standard deviation", joint - stddev, joint + stddev),
         marks=tuple(marks),
         x_range=(joint - half, joint + half),
         y_range=(len(alone) - 0.5, -0.5),
         size=(322.0, 24.0 * len(alone) + 10),
-        verticals=((joint, "ink"),),
-        bands=() if stddev is None else ((joint - stddev, joint + stddev, "interval"),),
         rows=tuple(rows),
     )
 
@@ -94,9 +93,8 @@ def consensus(content: Content) -> Figure | None:
         "Number of ranges that agree with each scale",
         ("scale m per unit", "ranges"),
         (curve,),
-        legend=(_line("scale found"),),
+        line=("scale found", content.summary.scale.value),
         y_range=(0.0, 1.08 * max(float(table.num_agreeing.max()), 1.0)),
-        verticals=_joint(content),
     )
 
 
@@ -117,11 +115,10 @@ def bootstrap(content: Content) -> Figure | None:
         "Histogram of resampled scales",
         ("scale m per unit", "resamples"),
         (resampled,),
-        legend=(_line("scale found"), *((_band("95 % interval"),) if interval is not None else ())),
+        line=("scale found", content.summary.scale.value),
+        band=None if interval is None else ("95 % interval", *interval),
         x_range=(float(edges[0]), float(edges[-1])),
         y_range=(0.0, 1.08 * max(float(resampled.points[:, 1].max()), 1.0)),
-        verticals=_joint(content),
-        bands=() if interval is None else ((*interval, "interval"),),
     )
 
 
@@ -138,18 +135,5 @@ def clock_curve(content: Content) -> Figure | None:
         "Misfit of the ranges for each clock offset",
         ("time offset s", "misfit"),
         (curve,),
-        legend=() if offset is None else (_line("offset used"),),
-        verticals=() if offset is None else ((offset, "ink"),),
+        line=None if offset is None else ("offset used", offset),
     )
-
-
-def _joint(content: Content) -> tuple[tuple[float, str], ...]:
-    return ((content.summary.scale.value, "ink"),)
-
-
-def _line(text: str) -> LegendEntry:
-    return LegendEntry(text, "ink", "upright")
-
-
-def _band(text: str) -> LegendEntry:
-    return LegendEntry(text, "interval", "strip")

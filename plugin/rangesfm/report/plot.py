@@ -159,13 +159,26 @@ def figure_of(
     labels: tuple[str, str],
     series: Iterable[Series],
     *,
-    legend: tuple[LegendEntry, ...] = (),
+    line: tuple[str, float] | None = None,
+    band: tuple[str, float, float] | None = None,
     table: str | None = None,
     **of_panel: Any,
 ) -> Figure:
-    """A figure of one panel without a title; ``of_panel``: what else a Panel has."""
+    """A figure of one panel without a title.
+
+    Args:
+        line, band: name in the legend, and the place of one or the ends of the other on the x axis.
+        of_panel: what else a Panel has.
+    """
+    legend = []
+    if line is not None:
+        legend.append(LegendEntry(line[0], "ink", "upright"))
+        of_panel["verticals"] = ((line[1], "ink"),)
+    if band is not None:
+        legend.append(LegendEntry(band[0], "interval", "strip"))
+        of_panel["bands"] = ((*band[1:], "interval"),)
     panel = Panel("", description, *labels, tuple(series), **of_panel)
-    return Figure(name, caption, (panel,), legend=legend, table=table)
+    return Figure(name, caption, (panel,), legend=tuple(legend), table=table)
 
 
 @dataclass(frozen=True)
