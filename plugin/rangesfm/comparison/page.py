@@ -14,8 +14,7 @@ from rangesfm.report.chart import page_charts
 from rangesfm.report.content import points_of
 from rangesfm.report.page import render
 from rangesfm.report.plot import WIDE_SIZE, Figure, Series, equal_view, figure_of, views_of
-from rangesfm.report.scene import Scene, ScenePath
-from rangesfm.report.view import view_of
+from rangesfm.report.scene import Scene, ScenePath, view_of
 
 COLORS = ("after", "before", "third", "fourth")
 PAGE_NAME = "comparison.html"

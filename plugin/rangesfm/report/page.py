@@ -17,8 +17,7 @@ from rangesfm.report.chart import ASSETS, page_charts
 from rangesfm.report.checks import quality_checks
 from rangesfm.report.content import Content
 from rangesfm.report.plot import Figure
-from rangesfm.report.scene import scene_of
-from rangesfm.report.view import view_of
+from rangesfm.report.scene import scene_of, view_of
 
 if TYPE_CHECKING:
     from jinja2 import Environment
