@@ -22,7 +22,7 @@ function unpackArray({ type, data }) {
   return new ARRAY_TYPES[type](bytes.buffer);
 }
 
-/** A place in the frame of a path's i-th camera, seen from the world's axes; where the camera stands there. */
+/** A place in the frame of a path's i-th camera, carried into the world; center: where the camera is then. */
 function fromCamera(path, i, place, center) {
   const rotation = path.rotations.subarray(9 * i, 9 * i + 9);
   return center.map((value, axis) => {
