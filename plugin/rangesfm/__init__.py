@@ -33,7 +33,7 @@ _HOME = {
     "Trajectory": "rangesfm.geometry.trajectory",
     "associate": "rangesfm.ranging.association",
     "compare": "rangesfm.comparison.with_reference",
-    "compare_models": "rangesfm.comparison.with_reference",
+    "compare_models": "rangesfm.comparison.before_after",
     "estimate_time_offset": "rangesfm.ranging.clock.estimate",
     "export_model": "rangesfm.export",
     "export_result": "rangesfm.workflows.export_result",

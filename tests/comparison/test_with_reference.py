@@ -12,15 +12,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tests.result_document import result_document
 
+from rangesfm.comparison.before_after import compare_folder, compare_models
+from rangesfm.comparison.models import reprojection_rms_px
 from rangesfm.comparison.with_reference import (
     compare,
-    compare_folder,
-    compare_models,
-    format_models,
     format_table,
     papers_table,
     reference_in_frame,
-    reprojection_rms_px,
     with_true_scale,
 )
 from rangesfm.errors import InputError
@@ -222,16 +220,16 @@ def test_two_models_differ_by_what_was_done_to_one_of_them(model: pycolmap.Recon
     residuals = np.array([0.3, -0.4]), np.array([0.1, -0.1])
     comparison = compare_models(model, after, range_residuals_m=residuals)
     moved = np.linalg.norm(trajectory_from_reconstruction(model).centers, axis=1)
-    assert comparison.num_keyframes == 8
+    assert len(comparison.displacements_m) == 8
     assert comparison.reprojection_rms_px == pytest.approx((0.0, 0.0), abs=1e-6)
-    assert comparison.mean_displacement_m == pytest.approx(moved.mean())
-    assert comparison.max_displacement_m == pytest.approx(moved.max())
+    assert comparison.displacements_m.mean() == pytest.approx(moved.mean())
+    assert comparison.displacements_m.max() == pytest.approx(moved.max())
     assert comparison.range_rms_m == pytest.approx((np.sqrt(0.125), 0.1))
     assert comparison.range_median_abs_m == pytest.approx((0.35, 0.1))
     assert len(comparison.distances) >= 3
-    for distance in comparison.distances:
-        assert distance.after == pytest.approx(2.0 * distance.before)
-    assert "8 keyframes moved" in format_models(comparison)
+    for _, _, (length_before, length_after) in comparison.distances:
+        assert length_after == pytest.approx(2.0 * length_before)
+    assert "8 keyframes moved" in str(comparison)
 
 
 def test_paths_are_compared_without_reprojection() -> None:
@@ -239,7 +237,7 @@ def test_paths_are_compared_without_reprojection() -> None:
     comparison = compare_models(before, after)
     assert comparison.reprojection_rms_px is None
     assert comparison.range_rms_m is None
-    assert comparison.mean_displacement_m == pytest.approx(0.2)
+    assert comparison.displacements_m.mean() == pytest.approx(0.2)
 
 
 def test_models_of_different_photos_are_not_compared() -> None:

@@ -7,7 +7,6 @@ import hashlib
 import json
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -17,9 +16,8 @@ import pytest
 
 from rangesfm.errors import InputError
 from rangesfm.report import write_report
-from rangesfm.report.content import gather
-from rangesfm.report.result_scene import scene_of
-from rangesfm.report.scene import scene_data
+from rangesfm.report.content import Content, true_ranges_m
+from rangesfm.report.scene import scene_data, scene_of
 from rangesfm.result.folder import read_result_folder
 
 MakeResult = Callable[..., Path]
@@ -296,18 +294,20 @@ def test_each_range_begins_at_its_own_tag(make_result: MakeResult) -> None:
     lines = (folder / "ranges.csv").read_text().splitlines()
     changed = [line.replace(",tag,", ",other,") if number % 2 else line for number, line in enumerate(lines)]
     (folder / "ranges.csv").write_text("\n".join(changed))
-    content = gather(read_result_folder(folder))
+    content = Content(read_result_folder(folder))
     assert content.ranges is not None
     expected = np.array([arms[tag_id] for tag_id in content.ranges.tag_id])
     assert set(content.ranges.tag_id) == {"tag", "other"}
     np.testing.assert_array_equal(content.tags_in_cam_m, expected)
     # A tag in another place of the camera is nearer to the anchor or farther by at most as much.
-    moved = replace(content, tags_in_cam_m=np.zeros((len(expected), 3)))
+    assert content.final is not None
     assert content.true_ranges_m is not None
-    assert moved.true_ranges_m is not None
+    anchors_m = content.result.anchor_positions_m
+    in_camera = np.zeros((len(expected), 3))
+    moved = true_ranges_m(content.ranges, content.final, content.reference_by_photo, anchors_m, in_camera)
     known = np.isfinite(content.true_ranges_m)
     assert known.any()
-    differences = np.abs(content.true_ranges_m - moved.true_ranges_m)[known]
+    differences = np.abs(content.true_ranges_m - moved)[known]
     assert np.all(differences <= np.linalg.norm(expected[known], axis=1) + 1e-9)
     assert differences.max() > 0.2
     scene = scene_of(content)

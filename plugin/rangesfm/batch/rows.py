@@ -8,8 +8,8 @@ from enum import Enum
 from typing import Any
 
 from rangesfm.failures import INTERNAL_ERROR
+from rangesfm.files.text_table import align_rows
 from rangesfm.result.summary import ResultSummary
-from rangesfm.text_table import align_rows
 
 _FAILED = 4
 

@@ -54,7 +54,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     reference = None if args.reference is None else Path(args.reference)
     if len(paths) == 1:
         _check_more_than_one_is_not_asked_for(args, paths[0])
-        from rangesfm.comparison.with_reference import compare_folder
+        from rangesfm.comparison.before_after import compare_folder
 
         return Outcome([str(compare_folder(paths[0], reference))])
     return _compare_many(args, paths, reference)

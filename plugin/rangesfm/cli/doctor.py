@@ -6,8 +6,8 @@ import argparse
 
 from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.errors import SolverError
+from rangesfm.files.text_table import align_rows
 from rangesfm.progress import Progress
-from rangesfm.text_table import align_rows
 
 
 def add_command(commands: Commands) -> None:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.cli.log_arguments import add_log_arguments, read_log
+from rangesfm.files.text_table import align_rows
 from rangesfm.progress import Progress
-from rangesfm.text_table import align_rows
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -13,18 +13,20 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array
 from rangesfm.colmap.model_files import read_model
 from rangesfm.comparison.ranges import ModelRanges, ranges_of_result
-from rangesfm.comparison.with_reference import MIN_NUM_ALIGNED, reprojection_rms_px
+from rangesfm.comparison.with_reference import MIN_NUM_ALIGNED, text_or_dash
 from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
+from rangesfm.files.text_table import align_rows
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.similarity import Similarity, rmse, similarity_between
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.report.tables import Table
 from rangesfm.result.folder import ResultFolder, read_result_folder
 from rangesfm.result.summary import ResultSummary
-from rangesfm.text_table import align_rows
 
-NUM_DISTANCES = 6
+Length = tuple[str, str, tuple[float, ...]]
+"""Between two photos: their names, and the length in each model's unit."""
 
 
 @dataclass(frozen=True)
@@ -52,19 +54,18 @@ class ModelRow:
 
     Attributes:
         name: of the model.
-        num_photos, num_common: in it, and in the first as well.
+        num_photos: in it.
         base_from_model: the similarity that carries it onto the first; None with fewer than three common photos.
         common_names: the photos in both, in the first's order.
-        moved, moved_aligned: (num_common,) distance of each camera from where the first has it, as it is and after
+        moved, moved_aligned: (n,) distance of each of these cameras from where the first has it, as it is and after
             that similarity, in the first's unit; the latter None without one.
-        reprojection_rms_px: None without points.
+        reprojection_rms_px: None of a file of positions, NaN without points.
         range_rms_m: of the ranges given, else of those that the first result folder used: of the cameras as they are,
             and carried by a similarity onto the path that the ranges themselves have placed; None without ranges.
     """
 
     name: str
     num_photos: int
-    num_common: int
     base_from_model: Similarity | None
     common_names: tuple[str, ...]
     moved: Array
@@ -104,20 +105,34 @@ class ModelsComparison:
     Attributes:
         models: as given; the first is what the others are compared with.
         rows: one for each.
-        distances: of a few pairs of photos that all models have: both names, and the length in each model's unit.
+        distances: of a few pairs of photos that all models have.
         taped: taped distances; empty without.
     """
 
     models: tuple[NamedModel, ...]
     rows: tuple[ModelRow, ...]
-    distances: tuple[tuple[str, str, tuple[float, ...]], ...]
+    distances: tuple[Length, ...]
     taped: tuple[TapedRow, ...] = ()
 
+    @property
+    def tables(self) -> tuple[Table, ...]:
+        """All that is to be read; of what there is none, without rows."""
+        names = [model.name for model in self.models]
+        of_row = [f"{name} after Sim(3)" for name in names] if self.taped and self.taped[0].lengths_m else []
+        distances = [[f"{a} to {b}", *(f"{length:.4f}" for length in lengths)] for a, b, lengths in self.distances]
+        return (
+            Table("Each model against the first", _HEADER, [_cells(row) for row in self.rows], _NOTE),
+            Table("Distances between photos, in each model's unit", ["distance", *names], distances),
+            Table(
+                "Taped distances",
+                ["taped distance", "tape m", *names, *of_row],
+                [_taped_cells(row) for row in self.taped],
+                _TAPED_NOTE,
+            ),
+        )
+
     def __str__(self) -> str:
-        tables = [_similarity_table(self), _distance_table(self)]
-        if self.taped:
-            tables.append(align_rows([taped_header(self), *(tuple(taped_cells(row)) for row in self.taped)]))
-        return "\n\n".join(tables)
+        return "\n\n".join(align_rows([table.header, *table.rows]) for table in self.tables if table.rows)
 
 
 def read_models(paths: Sequence[Path]) -> tuple[NamedModel, ...]:
@@ -149,7 +164,7 @@ def compare_many(
     ranges = ranges or _ranges_of_first_result(models)
     rows = tuple(_row(models[0], model, ranges) for model in models)
     taped = () if tape is None else _taped(models, ranges, tape)
-    return ModelsComparison(tuple(models), rows, _distances(models), taped)
+    return ModelsComparison(tuple(models), rows, lengths_along([model.path for model in models]), taped)
 
 
 def _ranges_of_first_result(models: Sequence[NamedModel]) -> ModelRanges | None:
@@ -185,29 +200,23 @@ def _read_positions(path: Path, base: Trajectory) -> NamedModel:
 
 
 def _row(base: NamedModel, other: NamedModel, ranges: ModelRanges | None) -> ModelRow:
-    names, ours, theirs = _common(base.path, other.path)
+    names, ours, theirs = common_photos(base.path, other.path)
     if not names:
         raise InputError(f"it has no photo in common with {base.name}", other.name)
     similarity = _similarity(theirs, ours)
     return ModelRow(
         name=other.name,
         num_photos=len(other.path),
-        num_common=len(names),
         base_from_model=similarity,
         common_names=names,
         moved=np.linalg.norm(theirs - ours, axis=1),
         moved_aligned=None if similarity is None else np.linalg.norm(similarity.apply(theirs) - ours, axis=1),
-        reprojection_rms_px=_reprojection(other.model),
+        reprojection_rms_px=None if other.model is None else reprojection_rms_px(other.model),
         range_rms_m=None if ranges is None else _range_rms(ranges, other),
     )
 
 
-def _reprojection(model: pycolmap.Reconstruction | None) -> float | None:
-    value = None if model is None else reprojection_rms_px(model)
-    return None if value is None or np.isnan(value) else value
-
-
-def _common(first: Trajectory, second: Trajectory) -> tuple[tuple[str, ...], Array, Array]:
+def common_photos(first: Trajectory, second: Trajectory) -> tuple[tuple[str, ...], Array, Array]:
     """Names of the photos in both, and their centres in each."""
     index = {name: i for i, name in enumerate(second.image_names)}
     rows = [(i, index[name]) for i, name in enumerate(first.image_names) if name in index]
@@ -221,7 +230,7 @@ def _similarity(source: Array, target: Array) -> Similarity | None:
 
 def _onto_ranges(ranges: ModelRanges, path: Trajectory) -> Similarity | None:
     """What carries a path onto the one that the ranges have placed."""
-    _, goal, source = _common(ranges.metric_path, path)
+    _, goal, source = common_photos(ranges.metric_path, path)
     return _similarity(source, goal)
 
 
@@ -272,46 +281,34 @@ def _taped_lengths(
     return [float(length) for length in located.lengths_m(scale, np.array(list(anchors_m.values())).reshape(-1, 3))]
 
 
-def _distances(models: Sequence[NamedModel]) -> tuple[tuple[str, str, tuple[float, ...]], ...]:
-    """Between photos spread over the path that all models have."""
-    places = [dict(zip(model.path.image_names, model.path.centers)) for model in models]
-    names = [name for name in models[0].path.image_names if all(name in place for place in places)]
-    last = len(names) - 1
-    quarters = [round(last * share / 4) for share in range(5)]
+def lengths_along(paths: Sequence[Trajectory]) -> tuple[Length, ...]:
+    """Between photos spread over the path that all have: all of it, its halves, its middle and its end quarters."""
+    places = [dict(zip(path.image_names, path.centers)) for path in paths]
+    names = [name for name in paths[0].image_names if all(name in place for place in places)]
+    quarters = [(len(names) - 1) * share // 4 for share in range(5)]
     pairs = [(quarters[i], quarters[j]) for i, j in ((0, 4), (0, 2), (2, 4), (1, 3), (0, 1), (3, 4))]
-    distinct = dict.fromkeys((names[a], names[b]) for a, b in pairs[:NUM_DISTANCES] if names and a != b)
+    distinct = dict.fromkeys((names[a], names[b]) for a, b in pairs if a != b)
     return tuple((a, b, tuple(float(np.linalg.norm(place[a] - place[b])) for place in places)) for a, b in distinct)
 
 
-def taped_header(comparison: ModelsComparison) -> tuple[str, ...]:
-    """Titles of the columns of ``taped_cells``."""
-    names = [model.name for model in comparison.models]
-    placed = [f"{name} after Sim(3)" for name in names] if comparison.taped[0].lengths_m is not None else []
-    return ("taped distance", "tape m", *names, *placed)
+def reprojection_rms_px(reconstruction: pycolmap.Reconstruction) -> float:
+    """Root of the mean squared distance between observed and projected points; NaN for none."""
+    squared: list[Array] = [np.zeros(0)]
+    for image in reconstruction.images.values():
+        if not image.has_pose:
+            continue
+        observed = list(image.get_observation_points2D())
+        if not observed:
+            continue
+        xyz = np.array([reconstruction.point3D(point.point3D_id).xyz for point in observed])
+        in_cam = image.cam_from_world() * xyz
+        projected = image.camera.img_from_cam(in_cam, check_cheirality=False)
+        squared.append(np.sum((projected - np.array([point.xy for point in observed])) ** 2, axis=1))
+    errors = np.concatenate(squared)
+    return float(np.sqrt(errors.mean())) if len(errors) else float("nan")
 
 
-def taped_cells(row: TapedRow) -> list[str]:
-    """The row as text."""
-    lengths = (*row.lengths, *(row.lengths_m or ()))
-    return ["{} to {}".format(*row.ends), *(_text(length, ".4f") for length in (row.measured_m, *lengths))]
-
-
-def similarity_cells(row: ModelRow) -> list[str]:
-    """The row as text, but for its name: what ``SIMILARITY_HEADER`` names."""
-    similarity, aligned = row.base_from_model, row.moved_aligned
-    return [
-        f"{row.num_common} of {row.num_photos}",
-        _text(None if similarity is None else similarity.scale, ".6g"),
-        _text(row.rotation_deg, ".3f"),
-        _text(rmse(row.moved[:, None]), ".4f"),
-        _text(None if aligned is None else rmse(aligned[:, None]), ".4f"),
-        _text(None if aligned is None else float(aligned.max()), ".4f"),
-        _text(row.reprojection_rms_px, ".4f"),
-        *(_text(None if row.range_rms_m is None else value, ".4f") for value in row.range_rms_m or (0.0, 0.0)),
-    ]
-
-
-SIMILARITY_HEADER = (
+_HEADER = (
     "model",
     "photos in common",
     "scale",
@@ -323,17 +320,32 @@ SIMILARITY_HEADER = (
     "range RMS m",
     "after Sim(3)",
 )
+_NOTE = (
+    "Scale and turn carry a model onto the first. Moved: RMS distance of the cameras from where the first has "
+    "them, as they are and after that similarity, in the first's unit. Range RMS: of the ranges used, with the "
+    "cameras as they are, and carried onto the path that the ranges themselves have placed."
+)
+_TAPED_NOTE = (
+    "Each model's length in its own unit; after Sim(3): with the scale that carries its cameras onto those of the "
+    "first model that the ranges have placed."
+)
 
 
-def _similarity_table(comparison: ModelsComparison) -> str:
-    return align_rows([SIMILARITY_HEADER, *((row.name, *similarity_cells(row)) for row in comparison.rows)])
+def _cells(row: ModelRow) -> list[str]:
+    similarity, aligned = row.base_from_model, row.moved_aligned
+    return [
+        row.name,
+        f"{len(row.common_names)} of {row.num_photos}",
+        text_or_dash(None if similarity is None else similarity.scale, ".6g"),
+        text_or_dash(row.rotation_deg, ".3f"),
+        text_or_dash(rmse(row.moved[:, None]), ".4f"),
+        text_or_dash(None if aligned is None else rmse(aligned[:, None]), ".4f"),
+        text_or_dash(None if aligned is None else float(aligned.max()), ".4f"),
+        text_or_dash(row.reprojection_rms_px, ".4f"),
+        *(text_or_dash(value, ".4f") for value in row.range_rms_m or (None, None)),
+    ]
 
 
-def _distance_table(comparison: ModelsComparison) -> str:
-    header = ("distance", *(model.name for model in comparison.models))
-    rows = [(f"{a} to {b}", *(f"{length:.4f}" for length in lengths)) for a, b, lengths in comparison.distances]
-    return align_rows([header, *rows])
-
-
-def _text(value: float | None, spec: str) -> str:
-    return "-" if value is None else f"{value:{spec}}"
+def _taped_cells(row: TapedRow) -> list[str]:
+    lengths = (row.measured_m, *row.lengths, *(row.lengths_m or ()))
+    return ["{} to {}".format(*row.ends), *(text_or_dash(length, ".4f") for length in lengths)]

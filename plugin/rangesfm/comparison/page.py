@@ -6,38 +6,18 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesfm.comparison.models import (
-    SIMILARITY_HEADER,
-    ModelRow,
-    ModelsComparison,
-    NamedModel,
-    similarity_cells,
-    taped_cells,
-    taped_header,
-)
+from rangesfm.comparison.models import ModelRow, ModelsComparison, NamedModel
 from rangesfm.files.atomic import new_file
 from rangesfm.files.sole_writer import sole_writer
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.report.chart import page_charts
 from rangesfm.report.content import points_of
 from rangesfm.report.page import render
-from rangesfm.report.plot import WIDE_SIZE, Figure, Panel, Series, equal_view
-from rangesfm.report.result_scene import anchors_in_scene
-from rangesfm.report.scene import Scene, ScenePath
-from rangesfm.report.tables import Table
-from rangesfm.report.view import view_of
+from rangesfm.report.plot import WIDE_SIZE, Figure, Series, equal_view, figure_of, views_of
+from rangesfm.report.scene import Scene, ScenePath, view_of
 
 COLORS = ("after", "before", "third", "fourth")
 PAGE_NAME = "comparison.html"
-_SIMILARITY_NOTE = (
-    "Scale and turn carry a model onto the first. Moved: RMS distance of the cameras from where the first has "
-    "them, as they are and after that similarity, in the first's unit. Range RMS: of the ranges used, with the "
-    "cameras as they are, and carried onto the path that the ranges themselves have placed."
-)
-_TAPED_NOTE = (
-    "Each model's length in its own unit; after Sim(3): with the scale that carries its cameras onto those of the "
-    "first model that the ranges have placed."
-)
 
 
 def write_comparison(comparison: ModelsComparison, folder: Path) -> Path:
@@ -57,33 +37,16 @@ def render_comparison(comparison: ModelsComparison) -> str:
     base = comparison.models[0]
     aligned = [_aligned(model, row) for model, row in zip(comparison.models, comparison.rows)]
     title = f"{len(comparison.models)} models of {len(base.path)} photos"
-    figures = [*_moved_figure(comparison), _path_figure(comparison, aligned)]
+    frame = "first_camera" if base.result is None else base.result.summary.frame
+    figures = [*_moved_figure(comparison), _path_figure(comparison, aligned, frame)]
     return render(
         "comparison.html",
         title=f"{title} – rangesfm comparison",
         heading=title,
-        view=view_of(_scene(comparison, aligned)),
+        view=view_of(_scene(comparison, aligned, frame)),
         figures=figures,
         charts=page_charts(figures),
-        tables={
-            "similarity": Table(
-                "Each model against the first",
-                SIMILARITY_HEADER,
-                [[row.name, *similarity_cells(row)] for row in comparison.rows],
-                _SIMILARITY_NOTE,
-            ),
-            "distances": Table(
-                "Distances between photos, in each model's unit",
-                ["from and to", *(model.name for model in comparison.models)],
-                [[f"{a} to {b}", *(f"{length:.4f}" for length in lengths)] for a, b, lengths in comparison.distances],
-            ),
-            "taped": Table(
-                "Taped distances",
-                taped_header(comparison) if comparison.taped else [],
-                [taped_cells(row) for row in comparison.taped],
-                _TAPED_NOTE,
-            ),
-        },
+        tables=comparison.tables,
     )
 
 
@@ -98,7 +61,7 @@ def _color(index: int) -> str:
     return COLORS[index % len(COLORS)]
 
 
-def _scene(comparison: ModelsComparison, aligned: list[Trajectory]) -> Scene:
+def _scene(comparison: ModelsComparison, aligned: list[Trajectory], frame: str) -> Scene:
     """The first model's map with all paths; the first path comes last, as what is clicked on."""
     base = comparison.models[0]
     assert base.model is not None
@@ -108,11 +71,11 @@ def _scene(comparison: ModelsComparison, aligned: list[Trajectory]) -> Scene:
         for i, (model, path) in enumerate(zip(comparison.models, aligned))
     ]
     return Scene(
-        frame="first_camera" if base.result is None else base.result.summary.frame,
+        frame=frame,
         paths=(*paths[1:], paths[0]),
         points_m=points_m,
         points_rgb=points_rgb,
-        anchors=() if base.result is None else anchors_in_scene(base.result.summary, base.result.anchor_positions_m),
+        anchors={} if base.result is None else base.result.summary.anchors,
     )
 
 
@@ -126,32 +89,26 @@ def _moved_figure(comparison: ModelsComparison) -> list[Figure]:
             series.append(Series(row.name, _color(i), points, "line"))
     if not series:
         return []
-    highest = max(float(one.points[:, 1].max()) for one in series)
-    panel = Panel(
-        "",
-        "Distance of each camera from where the first model has it",
-        "photo",
+    moved = figure_of(
         "moved",
-        tuple(series),
-        y_range=(0.0, 1.08 * highest),
+        "How far each camera is from where the first model has it, after the similarity, in the first's unit.",
+        "Distance of each camera from where the first model has it",
+        ("photo", "moved"),
+        series,
+        y_range=(0.0, 1.08 * max(float(one.points[:, 1].max()) for one in series)),
         size=WIDE_SIZE,
     )
-    caption = "How far each camera is from where the first model has it, after the similarity, in the first's unit."
-    return [Figure("moved", caption, (panel,))]
+    return [moved]
 
 
-def _path_figure(comparison: ModelsComparison, aligned: list[Trajectory]) -> Figure:
-    views = []
-    base = comparison.models[0]
-    is_site = base.result is not None and base.result.summary.frame == "site"
-    for name, axes in (("Plan", (0, 1) if is_site else (0, 2)), ("Elevation", (0, 2) if is_site else (0, 1))):
-        signs = np.array([1.0, 1.0 if is_site or name == "Plan" else -1.0])
+def _path_figure(comparison: ModelsComparison, aligned: list[Trajectory], frame: str) -> Figure:
+    panels = []
+    for view in views_of(comparison.models[0].path.centers, frame):
         lines = [
-            Series(model.name, _color(i), path.centers[:, axes] * signs, "line")
+            Series(model.name, _color(i), view.seen(path.centers), "line")
             for i, (model, path) in enumerate(zip(comparison.models, aligned))
         ]
-        labels = ("x", f"{'−' if signs[1] < 0 else ''}{'xyz'[axes[1]]}")
-        ranges = equal_view(np.concatenate([line.points for line in lines]))
-        views.append(Panel(name, f"{name} of all paths", *labels, tuple(lines), (), *ranges, keeps_shape=True))
+        limits = equal_view(np.concatenate([line.points for line in lines]))
+        panels.append(view.panel("all paths", "", lines, limits))
     caption = "All paths, carried onto the first, in its frame and unit."
-    return Figure("paths", caption, tuple(views), layout="views")
+    return Figure("paths", caption, tuple(panels), layout="views")

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
 from rangesfm.arrays import Array
@@ -17,7 +16,6 @@ from rangesfm.options import AssociationOptions
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock.estimate import estimate_time_offset
 from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.observations import RangeObservations
 from rangesfm.result.folder import ResultFolder
 from rangesfm.result.metric_result import USED
 from rangesfm.result.ranges_as_used import RangesAsUsed
@@ -71,14 +69,15 @@ def ranges_of_result(result: ResultFolder, metric_path: Trajectory) -> ModelRang
     ranges, anchors = result.read(RangesAsUsed), result.anchor_positions_m
     if ranges is None:
         return None
-    index = {name: i for i, name in enumerate(metric_path.image_names)}
-    ends = [
-        np.array([index.get(name, -1) for name in names], dtype=np.int64)
-        for names in (ranges.keyframe_before, ranges.keyframe_after)
-    ]
-    is_placed = (ends[0] >= 0) & (ends[1] >= 0) & np.isfinite(ranges.weight)
-    rows = np.flatnonzero(ranges.is_used & is_placed & np.isin(np.array(ranges.anchor_id, dtype=str), list(anchors)))
-    times, names = _times_of_places(metric_path, ends[0][rows], ends[1][rows], ranges.weight[rows])
+    before, after, has_place = ranges.places_on(metric_path.image_names)
+    rows = np.flatnonzero(ranges.is_used & has_place & np.isin(np.array(ranges.anchor_id, dtype=str), list(anchors)))
+    # When the camera was there by its own clock; the photos' names where they have no times.
+    times = names = None
+    if metric_path.timestamps_s is None:
+        names = [metric_path.image_names[row] for row in before[rows]]
+    else:
+        weight, known = ranges.weight[rows], metric_path.timestamps_s
+        times = (1 - weight) * known[before[rows]] + weight * known[after[rows]]
     tag_ids = [ranges.tag_id[row] for row in rows]
     log = RangeLog.from_arrays(
         [ranges.anchor_id[row] for row in rows],
@@ -97,15 +96,6 @@ def ranges_of_result(result: ResultFolder, metric_path: Trajectory) -> ModelRang
         metric_path=metric_path,
         association=result.summary.settings.ranges.association,
     )
-
-
-def _times_of_places(
-    path: Trajectory, before: npt.NDArray[np.int64], after: npt.NDArray[np.int64], weight: Array
-) -> tuple[Array | None, list[str] | None]:
-    """When the camera was there by its own clock; the photos' names where they have no times."""
-    if path.timestamps_s is None:
-        return None, [path.image_names[row] for row in before]
-    return (1 - weight) * path.timestamps_s[before] + weight * path.timestamps_s[after], None
 
 
 def ranges_of_survey(
@@ -144,7 +134,7 @@ def ranges_of_survey(
     to_site = inputs.site.offset_m if estimate.frame == "site" else np.zeros(3)
     anchors = {anchor.anchor_id: anchor for anchor in estimate.anchors if np.isfinite(anchor.position_m).all()}
     return ModelRanges(
-        log=_believed(estimate.observations),
+        log=estimate.observations.log.subset(np.isin(estimate.observations.status, USED)),
         tags_in_cam_m=dict(zip(log.tag_ids, inputs.tag_in_cam_m, strict=True)),
         anchors_m={id_: anchor.position_m + to_site for id_, anchor in anchors.items()},
         biases_m={id_: anchor.range_bias_m for id_, anchor in anchors.items()},
@@ -152,10 +142,6 @@ def ranges_of_survey(
         metric_path=path.transformed(metric.scale, metric.rotation, metric.translation + to_site),
         association=survey.ranges,
     )
-
-
-def _believed(observations: RangeObservations) -> RangeLog:
-    return observations.log.subset(np.isin(observations.status, USED))
 
 
 def _offsets_s(survey: Survey, inputs: RangingInputs, path: Trajectory) -> float | Array:

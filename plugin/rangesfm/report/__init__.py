@@ -6,9 +6,8 @@ from pathlib import Path
 
 from rangesfm.files.atomic import new_file
 from rangesfm.files.sole_writer import sole_writer
-from rangesfm.report.content import gather
-from rangesfm.report.figures import all_figures
-from rangesfm.report.page import render_report
+from rangesfm.report.content import Content
+from rangesfm.report.page import figures_of, render_report
 from rangesfm.report.pictures import write_pictures
 from rangesfm.result.folder import read_result_folder
 
@@ -35,7 +34,7 @@ def write_report(result_folder: Path, *, images_path: Path | None = None) -> Pat
     result = read_result_folder(result_folder)
     path = result_folder / "report.html"
     with sole_writer(result_folder), new_file(path) as temporary:
-        page = render_report(gather(result, images_path=images_path))
+        page = render_report(Content(result, images_path=images_path))
         temporary.write_text(page, encoding="utf-8", errors="xmlcharrefreplace")
     return path
 
@@ -48,4 +47,5 @@ def write_report_pictures(result_folder: Path) -> list[Path]:
     """
     result = read_result_folder(result_folder)
     with sole_writer(result_folder):
-        return write_pictures(all_figures(gather(result)), result_folder / PICTURES_FOLDER)
+        figures = figures_of(Content(result)).values()
+        return write_pictures([one for of_section in figures for one in of_section], result_folder / PICTURES_FOLDER)

@@ -7,6 +7,7 @@ import io
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, TypeAlias
 
 from PIL import Image
@@ -14,6 +15,7 @@ from PIL import Image
 from rangesfm.report.plot import Figure, Mark, Panel, Pixels, Range, Series
 from rangesfm.report.scene import pack
 
+ASSETS = Path(__file__).with_name("assets")
 Spec: TypeAlias = dict[str, Any]
 Color: TypeAlias = Callable[[str], str]
 

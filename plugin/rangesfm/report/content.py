@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,17 +14,17 @@ import numpy.typing as npt
 
 from rangesfm.arrays import Array
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.report.true_ranges import true_ranges_m
 from rangesfm.result.folder import ResultFolder
 from rangesfm.result.ranges_as_used import RangesAsUsed
 from rangesfm.result.summary import ResultSummary
-from rangesfm.result.tables import ScaleBootstrap, ScaleCandidates, ScaleConsensus, TimeOffsetCurve
 
 if TYPE_CHECKING:
     import pycolmap
 
 
 DEFAULT_FOLDER = "out"
+MAX_KEYFRAME_SHARE = 0.1
+"""A range counts as taken at a photo if it is no farther from it, in parts of the way to the next."""
 
 
 @dataclass(frozen=True)
@@ -32,111 +32,73 @@ class CameraIntrinsics:
     """One camera of the models.
 
     Attributes:
-        camera_id: COLMAP's.
-        model: COLMAP's name of the camera model.
-        size_px: width and height of its photos.
+        title: COLMAP's number and model of it, and the size of its photos.
         parameters: name, value before the refinement, value after it (NaN without).
         half_angles: half width and half height of its picture at unit distance.
     """
 
-    camera_id: int
-    model: str
-    size_px: tuple[int, int]
+    title: str
     parameters: tuple[tuple[str, float, float], ...]
     half_angles: tuple[float, float]
 
 
-@dataclass(frozen=True)
 class Content:
-    """All that a report shows.
+    """What a report shows of a result folder.
 
     Attributes:
         title: name of the result.
-        summary: ``result.json``.
-        ranges: ``ranges.csv``.
-        tags_in_cam_m: (n, 3) antenna of each range's tag in the camera's frame; None without ranges.
-        range_times_s: (n,) when each range was taken, seconds since the first; NaN where unknown.
-        scaled, refined: the path before and after the refinement.
-        reference_m: (k, 3) positions in the map's frame.
-        anchors_m: (3,) by id.
-        points_m, points_rgb: (m, 3) of the final map; None without a model.
-        cameras: intrinsics in the scaled and in the final model.
-        true_scale: the path before the refinement with the reference's scale; None if that is not known.
-        reference_by_photo: (3,) by name, in the map's frame.
+        summary: ``result.json``; ``result`` has the tables beside it.
         images_path: folder of the photos; None where it is not known.
-        candidates, consensus, bootstrap, clock_curve: how scale and clock offset came about, as far as it is there.
+        ranges: ``ranges.csv``.
+        tags_in_cam_m: (n, 3) antenna of each range's tag in the camera's frame; n is 0 without ranges.
+        range_times_s: (n,) when each range was taken, seconds since the first; NaN where unknown.
+        scaled, refined: the path before and after the refinement; ``final`` is the best there is.
+        true_scale: the path before the refinement with the reference's scale; None if that is not known.
+        reference_m: (k, 3) positions in the map's frame; ``reference_by_photo`` (3,) by name.
+        points_m, points_rgb: (m, 3) of the final map.
+        cameras: intrinsics in the scaled and in the final model.
     """
 
-    title: str
-    summary: ResultSummary
-    ranges: RangesAsUsed | None
-    tags_in_cam_m: Array | None
-    range_times_s: Array | None
-    scaled: Trajectory | None
-    refined: Trajectory | None
-    reference_m: Array | None
-    anchors_m: dict[str, Array]
-    points_m: Array | None
-    points_rgb: npt.NDArray[np.uint8] | None
-    cameras: tuple[CameraIntrinsics, ...]
-    true_scale: Trajectory | None
-    reference_by_photo: dict[str, Array]
-    images_path: Path | None
-    candidates: ScaleCandidates | None
-    consensus: ScaleConsensus | None
-    bootstrap: ScaleBootstrap | None
-    clock_curve: TimeOffsetCurve | None
+    def __init__(self, result: ResultFolder, *, images_path: Path | None = None):
+        """Read what the report needs.
+
+        Args:
+            images_path: folder of the photos, for thumbnails; None: where the run had them.
+
+        Raises:
+            InputError: a file of the result is there but cannot be read.
+        """
+        self.result = result
+        self.title = _title(result.path.resolve())
+        self.summary = result.summary
+        self.images_path = images_path or result.images_path
+        self.ranges = result.read(RangesAsUsed)
+        self.tags_in_cam_m = result.lever_arms_m(() if self.ranges is None else self.ranges.tag_id)
+        self.range_times_s = (
+            np.zeros(0) if self.ranges is None else _range_times(self.ranges, result.timestamps_s or {})
+        )
+        scaled, refined = result.read_model("sparse_scaled"), result.read_model("sparse_metric")
+        self.scaled, self.refined = (
+            None if model is None else trajectory_from_reconstruction(model, result.timestamps_s)
+            for model in (scaled, refined)
+        )
+        self.final = self.refined or self.scaled
+        self.true_scale = None if self.scaled is None else _with_true_scale(self.scaled, result.summary)
+        reference = result.read_reference()
+        self.reference_m = None if reference is None else reference.positions_m
+        names = () if reference is None else reference.image_names or ()
+        self.reference_by_photo = {} if reference is None else dict(zip(names, reference.positions_m))
+        self.points_m, self.points_rgb = points_of(refined or scaled)
+        self.cameras = _cameras(scaled, refined)
 
     @cached_property
     def true_ranges_m(self) -> Array | None:
         """(n,) by the reference, NaN where it says nothing; None where it says nothing at all."""
-        if self.ranges is None or self.tags_in_cam_m is None or self.final is None or not self.reference_by_photo:
+        if self.ranges is None or self.final is None or not self.reference_by_photo:
             return None
-        distances = true_ranges_m(self.ranges, self.final, self.reference_by_photo, self.anchors_m, self.tags_in_cam_m)
+        anchors_m = self.result.anchor_positions_m
+        distances = true_ranges_m(self.ranges, self.final, self.reference_by_photo, anchors_m, self.tags_in_cam_m)
         return distances if np.isfinite(distances).any() else None
-
-    @property
-    def final(self) -> Trajectory | None:
-        """The best path there is."""
-        return self.refined if self.refined is not None else self.scaled
-
-
-def gather(result: ResultFolder, *, images_path: Path | None = None) -> Content:
-    """Read what the report needs.
-
-    Args:
-        images_path: folder of the photos; None: where the run had them.
-
-    Raises:
-        InputError: a file of the result is there but cannot be read.
-    """
-    ranges = result.read(RangesAsUsed)
-    scaled, refined = result.read_model("sparse_scaled"), result.read_model("sparse_metric")
-    final = refined or scaled
-    path_scaled = None if scaled is None else trajectory_from_reconstruction(scaled, result.timestamps_s)
-    points_m, points_rgb = (None, None) if final is None else points_of(final)
-    reference = result.read_reference()
-    return Content(
-        title=_title(result.path.resolve()),
-        summary=result.summary,
-        ranges=ranges,
-        tags_in_cam_m=None if ranges is None else result.lever_arms_m(ranges.tag_id),
-        range_times_s=None if ranges is None else _range_times(ranges, result.timestamps_s or {}),
-        scaled=path_scaled,
-        refined=None if refined is None else trajectory_from_reconstruction(refined, result.timestamps_s),
-        reference_m=None if reference is None else reference.positions_m,
-        anchors_m=result.anchor_positions_m,
-        points_m=points_m,
-        points_rgb=points_rgb,
-        cameras=() if final is None else _cameras(scaled, refined, final),
-        true_scale=None if path_scaled is None else _with_true_scale(path_scaled, result.summary),
-        reference_by_photo={} if reference is None else dict(zip(reference.image_names or (), reference.positions_m)),
-        images_path=images_path or result.images_path,
-        candidates=result.read(ScaleCandidates),
-        consensus=result.read(ScaleConsensus),
-        bootstrap=result.read(ScaleBootstrap),
-        clock_curve=result.read(TimeOffsetCurve),
-    )
 
 
 def _title(folder: Path) -> str:
@@ -152,37 +114,26 @@ def _with_true_scale(path: Trajectory, summary: ResultSummary) -> Trajectory | N
     return None
 
 
-def points_of(model: pycolmap.Reconstruction) -> tuple[Array, npt.NDArray[np.uint8]]:
-    """(m, 3) positions and (m, 3) colours of a model's points."""
-    points = list(model.points3D.values())
+def points_of(model: pycolmap.Reconstruction | None) -> tuple[Array, npt.NDArray[np.uint8]]:
+    """(m, 3) positions and (m, 3) colours of a model's points; of none without a model."""
+    points = [] if model is None else list(model.points3D.values())
     positions = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
     return positions, np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
 
 
 def _cameras(
-    scaled: pycolmap.Reconstruction | None, refined: pycolmap.Reconstruction | None, final: pycolmap.Reconstruction
+    scaled: pycolmap.Reconstruction | None, refined: pycolmap.Reconstruction | None
 ) -> tuple[CameraIntrinsics, ...]:
-    before, after = ({} if model is None else dict(model.cameras.items()) for model in (scaled, refined))
-    return tuple(
-        _intrinsics(camera_id, camera, before.get(camera_id), after.get(camera_id))
-        for camera_id, camera in sorted(final.cameras.items())
-    )
-
-
-def _intrinsics(
-    camera_id: int, camera: pycolmap.Camera, before: pycolmap.Camera | None, after: pycolmap.Camera | None
-) -> CameraIntrinsics:
-    names = [name.strip() for name in camera.params_info.split(",")]
-    unknown = [math.nan] * len(names)
-    columns = [unknown if one is None else [float(value) for value in one.params] for one in (before, after)]
-    focal = camera.mean_focal_length()
-    return CameraIntrinsics(
-        camera_id=camera_id,
-        model=camera.model.name,
-        size_px=(camera.width, camera.height),
-        parameters=tuple(zip(names, *columns)),
-        half_angles=(camera.width / (2 * focal), camera.height / (2 * focal)),
-    )
+    both = [{} if model is None else dict(model.cameras.items()) for model in (scaled, refined)]
+    found = []
+    for camera_id, camera in sorted((both[1] or both[0]).items()):
+        names = [name.strip() for name in camera.params_info.split(",")]
+        values = [of_model[camera_id].params if camera_id in of_model else [math.nan] * len(names) for of_model in both]
+        title = f"{camera_id} {camera.model.name} {camera.width} × {camera.height}"
+        focal = camera.mean_focal_length()
+        half_angles = (camera.width / (2 * focal), camera.height / (2 * focal))
+        found.append(CameraIntrinsics(title, tuple(zip(names, *values)), half_angles))
+    return tuple(found)
 
 
 def in_natural_order(ids: Iterable[str]) -> list[str]:
@@ -196,3 +147,29 @@ def _range_times(ranges: RangesAsUsed, image_times_s: dict[str, float]) -> Array
     times = np.where(np.isfinite(ranges.timestamp_s), ranges.timestamp_s, of_image)
     since_first: Array = times - np.min(times, initial=np.inf, where=np.isfinite(times))
     return since_first
+
+
+def true_ranges_m(
+    ranges: RangesAsUsed,
+    path: Trajectory,
+    reference_by_photo: Mapping[str, Array],
+    anchors_m: Mapping[str, Array],
+    tags_in_cam_m: Array,
+) -> Array:
+    """(n,) distances from the tag at the reference's camera to the anchor, NaN where unknown.
+
+    Only of ranges used and taken at a photo: what the camera did in between the reference may
+    not say. The camera is turned as in ``path``, with each range's tag at ``tags_in_cam_m`` (n, 3) in its frame;
+    anchors stand where the map has them.
+    """
+    index_of = {name: i for i, name in enumerate(path.image_names)}
+    distances = np.full(len(ranges.status), np.nan)
+    for row in np.flatnonzero(np.isfinite(ranges.weight) & ranges.is_used):
+        weight = float(ranges.weight[row])
+        name = (ranges.keyframe_before if weight < 0.5 else ranges.keyframe_after)[row]
+        position, anchor = reference_by_photo.get(name), anchors_m.get(ranges.anchor_id[row])
+        is_at_photo = min(weight, 1 - weight) <= MAX_KEYFRAME_SHARE and name in index_of
+        if is_at_photo and position is not None and anchor is not None:
+            tag = position + path.world_from_cam[index_of[name]] @ tags_in_cam_m[row]
+            distances[row] = np.linalg.norm(tag - anchor)
+    return distances

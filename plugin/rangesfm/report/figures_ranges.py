@@ -7,7 +7,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.report.content import Content, in_natural_order
-from rangesfm.report.plot import WIDE_SIZE, Figure, Panel, Series, running_median
+from rangesfm.report.plot import WIDE_SIZE, Figure, Panel, Series, figure_of, running_median, time_axis
 from rangesfm.result.ranges_as_used import RangesAsUsed
 
 NUM_HISTOGRAM_BINS = 60
@@ -26,9 +26,8 @@ def residuals_over_time(content: Content) -> Figure | None:
     panels = tuple(_residual_panel(content, ranges, anchor_id) for anchor_id in in_natural_order(ranges.anchor_id))
     caption = (
         "Range residuals over time, predicted minus measured, with their running median. A steady offset is a bias; "
-        "a slow wave is drift or a clock. What lies beyond an axis is drawn at its edge."
+        "a slow wave is drift or a clock. What lies beyond an axis is drawn at its edge." + _thinned(len(ranges.status))
     )
-    caption += _thinned(len(ranges.status))
     return Figure("range_residuals", caption, panels, layout="panels", table="ranges")
 
 
@@ -42,26 +41,24 @@ def residual_histogram(content: Content) -> Figure | None:
     outlines = []
     for name, color, residuals in _both(ranges):
         known = residuals[ranges.is_used & np.isfinite(residuals)]
-        heights = np.histogram(np.clip(known, -limit, limit), edges)[0].astype(float)
-        if heights.any():
-            outlines.append(Series(name, color, outline(edges, heights), "filled"))
+        if len(known):
+            outlines.append(Series(name, color, histogram(known, edges), "filled"))
     highest = max(float(series.points[:, 1].max()) for series in outlines)
-    panel = Panel(
-        "",
+    return figure_of(
+        "range_residual_histogram",
+        "Residuals of the ranges used. Real radios lean to long measurements, which here are negative.",
         "Histogram of the range residuals before and after the refinement",
-        "predicted − measured m",
-        "ranges",
-        tuple(outlines),
+        ("predicted − measured m", "ranges"),
+        outlines,
         x_range=(-limit, limit),
         y_range=(0.0, 1.08 * highest),
         verticals=((0.0, "ink"),),
     )
-    caption = "Residuals of the ranges used. Real radios lean to long measurements, which here are negative."
-    return Figure("range_residual_histogram", caption, (panel,))
 
 
-def outline(edges: Array, heights: Array) -> Array:
-    """The line around the bars of a histogram."""
+def histogram(values: Array, edges: Array) -> Array:
+    """(n, 2): the line around the bars; what lies beyond the edges is in the outermost."""
+    heights = np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0].astype(float)
     return np.column_stack([np.repeat(edges, 2), np.concatenate([[0.0], np.repeat(heights, 2), [0.0]])])
 
 
@@ -71,10 +68,8 @@ def absolute_errors(content: Content) -> Figure | None:
     if ranges is None or true_m is None:
         return None
     rows = np.flatnonzero(np.isfinite(true_m))
-    if len(rows) == 0:
-        return None
     stride = _stride(len(rows))
-    times, time_label = _times(content, ranges)
+    times, time_label = time_axis(content.range_times_s)
     errors = [("measured", "rejected", ranges.range_m)]
     errors += [(name, color, residuals + ranges.range_m) for name, color, residuals in _both(ranges)]
     x_range = (float(times[rows].min()), float(times[rows].max()))
@@ -85,26 +80,22 @@ def absolute_errors(content: Content) -> Figure | None:
             dots.append(Series(name, color, points[::stride]))
             lines.append(Series(name, color, running_median(points, x_range, NUM_MEDIAN_BINS), "line", is_data=False))
     sizes = np.concatenate([series.points[:, 1] for series in dots])
-    panel = Panel(
-        "",
+    return figure_of(
+        "absolute_range_errors",
+        "How far ranges are from those of the reference: as measured, by the scaled map, and by the refined one, with "
+        "their running medians. Ranges taken at a photo, to anchors where this map has them." + _thinned(len(rows)),
         "Absolute range errors over time",
-        time_label,
-        "absolute error m",
+        (time_label, "absolute error m"),
         (*dots, *lines),
+        table="range_errors",
         x_range=x_range,
         y_range=(0.0, 1.1 * max(float(np.nanquantile(sizes, 0.98)), 1e-3)),
         size=WIDE_SIZE,
     )
-    caption = (
-        "How far ranges are from those of the reference: as measured, by the scaled map, and by the refined one, with "
-        "their running medians. Ranges taken at a photo, to anchors where this map has them."
-    )
-    caption += _thinned(len(rows))
-    return Figure("absolute_range_errors", caption, (panel,), table="range_errors")
 
 
 def _residual_panel(content: Content, ranges: RangesAsUsed, anchor_id: str) -> Panel:
-    times, time_label = _times(content, ranges)
+    times, time_label = time_axis(content.range_times_s)
     time_range = (float(np.nanmin(times)), float(np.nanmax(times)))
     limit = _residual_limit(ranges)
     is_mine = np.array(ranges.anchor_id, dtype=str) == anchor_id
@@ -146,13 +137,6 @@ def _both(ranges: RangesAsUsed) -> list[tuple[str, str, Array]]:
     """Name, color and residuals before and, where there are any, after the refinement."""
     both = [("scaled", "before", ranges.residual_scaled_m), ("refined", "after", ranges.residual_refined_m)]
     return both if np.isfinite(ranges.residual_refined_m).any() else both[:1]
-
-
-def _times(content: Content, ranges: RangesAsUsed) -> tuple[Array, str]:
-    times = content.range_times_s
-    if times is None or not np.isfinite(times).any():
-        return np.arange(len(ranges.status), dtype=np.float64), "range number"
-    return times, "time s"
 
 
 def _has_residuals(ranges: RangesAsUsed) -> bool:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from rangesfm.report.content import Content, in_natural_order
-from rangesfm.report.figures_ranges import outline
-from rangesfm.report.plot import WIDE_SIZE, Figure, LegendEntry, Mark, Panel, Series
+from rangesfm.report.figures_ranges import histogram
+from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Series, figure_of, time_axis
 from rangesfm.report.text import signed
+from rangesfm.result.tables import ScaleBootstrap, ScaleCandidates, ScaleConsensus, TimeOffsetCurve
 
 NUM_BOOTSTRAP_BINS = 40
 MAX_NUM_CANDIDATES = 3000
@@ -28,144 +29,108 @@ def scale_per_anchor(content: Content) -> Figure | None:
     for row, (anchor_id, value) in enumerate(alone.items()):
         percent = signed(100.0 * (value / joint - 1.0), 2, "%")
         rows.append((float(row), anchor_id, percent))
-        marks.append(
-            Mark(
-                "one anchor", "after", "disc", value, row, "", f"anchor {anchor_id}: {value:.6g} m per unit, {percent}"
-            )
-        )
-    panel = Panel(
-        "",
+        title = f"anchor {anchor_id}: {value:.6g} m per unit, {percent}"
+        marks.append(Mark("one anchor", "after", "disc", value, row, "", title))
+    return figure_of(
+        "scale_per_anchor",
+        "The scale from each anchor alone, and how far it is from the joint one. Line and band: the joint scale "
+        "and one standard deviation. The spread of the anchors is the most honest error bar there is.",
         "Scale from each anchor alone against the joint scale",
-        "scale m per unit",
-        "",
+        ("scale m per unit", ""),
         (),
-        tuple(marks),
+        line=("joint scale", joint),
+        band=None if stddev is None else ("± one standard deviation", joint - stddev, joint + stddev),
+        marks=tuple(marks),
         x_range=(joint - half, joint + half),
         y_range=(len(alone) - 0.5, -0.5),
         size=(322.0, 24.0 * len(alone) + 10),
-        verticals=((joint, "ink"),),
-        bands=() if stddev is None else ((joint - stddev, joint + stddev, "interval"),),
         rows=tuple(rows),
     )
-    caption = (
-        "The scale from each anchor alone, and how far it is from the joint one. Line and band: the joint scale "
-        "and one standard deviation. The spread of the anchors is the most honest error bar there is."
-    )
-    legend = (_line("joint scale"), *((_band("± one standard deviation"),) if stddev is not None else ()))
-    return Figure("scale_per_anchor", caption, (panel,), legend=legend)
 
 
 def candidates(content: Content) -> Figure | None:
     """The paper's figure: both candidates of each range over time."""
-    table, scale = content.candidates, content.summary.scale.value
+    table, scale = content.result.read(ScaleCandidates), content.summary.scale.value
     if table is None or len(table.alpha0) == 0:
         return None
     stride = -(-len(table.alpha0) // MAX_NUM_CANDIDATES)
-    times, alpha0, alpha1 = (column[::stride] for column in (table.timestamp_s, table.alpha0, table.alpha1))
-    times = times - np.min(times, initial=np.inf, where=np.isfinite(times))
-    label = "time s"
-    if not np.isfinite(times).all():
-        times, label = np.arange(len(times), dtype=np.float64), "range number"
-    both = [
-        Series("alpha0", "before", np.column_stack([times, alpha0])),
-        Series("alpha1", "after", np.column_stack([times, alpha1])),
-        Series(
-            "scale found", "reference", np.array([[times.min(), scale], [times.max(), scale]]), "dashed", is_data=False
-        ),
-    ]
-    panel = Panel(
-        "",
-        "Both candidates of the scale over time",
-        label,
-        "candidate m per unit",
-        tuple(both),
-        y_range=(CANDIDATE_AXIS[0] * scale, CANDIDATE_AXIS[1] * scale),
-        size=WIDE_SIZE,
-    )
+    times, label = time_axis(table.timestamp_s[::stride])
+    found = np.array([[times.min(), scale], [times.max(), scale]])
     caption = (
         "Each range has two possible scales. The true one is constant over time, the other is not; where the path "
         "turns towards or away from an anchor they change places. What lies beyond the axis is drawn at its edge."
     )
     if stride > 1:
         caption += f" One range in {stride}; scale_candidates.csv holds all."
-    return Figure("scale_candidates", caption, (panel,))
+    return figure_of(
+        "scale_candidates",
+        caption,
+        "Both candidates of the scale over time",
+        (label, "candidate m per unit"),
+        (
+            Series("alpha0", "before", np.column_stack([times, table.alpha0[::stride]])),
+            Series("alpha1", "after", np.column_stack([times, table.alpha1[::stride]])),
+            Series("scale found", "reference", found, "dashed", is_data=False),
+        ),
+        y_range=(CANDIDATE_AXIS[0] * scale, CANDIDATE_AXIS[1] * scale),
+        size=WIDE_SIZE,
+    )
 
 
 def consensus(content: Content) -> Figure | None:
     """How many ranges agree with each scale."""
-    table = content.consensus
+    table = content.result.read(ScaleConsensus)
     if table is None or len(table.scale) == 0:
         return None
     curve = Series("ranges that agree", "after", np.column_stack([table.scale, table.num_agreeing]), "filled")
-    panel = Panel(
-        "",
-        "Number of ranges that agree with each scale",
-        "scale m per unit",
-        "ranges",
-        (curve,),
-        y_range=(0.0, 1.08 * max(float(table.num_agreeing.max()), 1.0)),
-        verticals=_joint(content),
-    )
-    caption = (
+    return figure_of(
+        "scale_consensus",
         "How many ranges fit to each scale within their tolerance, anchors where the estimate has them. One high, "
-        "narrow peak at the scale found (the line) is what a sound survey looks like."
+        "narrow peak at the scale found (the line) is what a sound survey looks like.",
+        "Number of ranges that agree with each scale",
+        ("scale m per unit", "ranges"),
+        (curve,),
+        line=("scale found", content.summary.scale.value),
+        y_range=(0.0, 1.08 * max(float(table.num_agreeing.max()), 1.0)),
     )
-    return Figure("scale_consensus", caption, (panel,), legend=(_line("scale found"),))
 
 
 def bootstrap(content: Content) -> Figure | None:
     """The scale when blocks of time are drawn anew."""
-    table = content.bootstrap
+    table = content.result.read(ScaleBootstrap)
     if table is None or len(table.scale) < 2:
         return None
     values = table.scale
     low, high = np.quantile(values, [0.005, 0.995])
     margin = max(0.15 * (high - low), 1e-6 * abs(high))
     edges = np.linspace(low - margin, high + margin, NUM_BOOTSTRAP_BINS + 1)
-    heights = np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0].astype(float)
+    resampled = Series("resampled", "after", histogram(values, edges), "filled")
     interval = content.summary.scale.interval_95
-    panel = Panel(
-        "",
+    return figure_of(
+        "scale_bootstrap",
+        f"{len(values)} scales from blocks of time drawn anew. The band is the 95 % interval of the scale.",
         "Histogram of resampled scales",
-        "scale m per unit",
-        "resamples",
-        (Series("resampled", "after", outline(edges, heights), "filled"),),
+        ("scale m per unit", "resamples"),
+        (resampled,),
+        line=("scale found", content.summary.scale.value),
+        band=None if interval is None else ("95 % interval", *interval),
         x_range=(float(edges[0]), float(edges[-1])),
-        y_range=(0.0, 1.08 * max(float(heights.max()), 1.0)),
-        verticals=_joint(content),
-        bands=() if interval is None else ((*interval, "interval"),),
+        y_range=(0.0, 1.08 * max(float(resampled.points[:, 1].max()), 1.0)),
     )
-    caption = f"{len(values)} scales from blocks of time drawn anew. The band is the 95 % interval of the scale."
-    legend = (_line("scale found"), *((_band("95 % interval"),) if interval is not None else ()))
-    return Figure("scale_bootstrap", caption, (panel,), legend=legend)
 
 
 def clock_curve(content: Content) -> Figure | None:
     """How well each clock offset fits."""
-    table = content.clock_curve
+    table = content.result.read(TimeOffsetCurve)
     if table is None or len(table.cost) == 0:
         return None
     offset = content.summary.time_offset.value_s
     curve = Series("misfit", "after", np.column_stack([table.time_offset_s, table.cost]), "line")
-    panel = Panel(
-        "",
+    return figure_of(
+        "time_offset_curve",
+        "Misfit of the ranges for each offset between the clocks. One sharp valley at the line is what is wanted.",
         "Misfit of the ranges for each clock offset",
-        "time offset s",
-        "misfit",
+        ("time offset s", "misfit"),
         (curve,),
-        verticals=() if offset is None else ((offset, "ink"),),
+        line=None if offset is None else ("offset used", offset),
     )
-    caption = "Misfit of the ranges for each offset between the clocks. One sharp valley at the line is what is wanted."
-    return Figure("time_offset_curve", caption, (panel,), legend=() if offset is None else (_line("offset used"),))
-
-
-def _joint(content: Content) -> tuple[tuple[float, str], ...]:
-    return ((content.summary.scale.value, "ink"),)
-
-
-def _line(text: str) -> LegendEntry:
-    return LegendEntry(text, "ink", "upright")
-
-
-def _band(text: str) -> LegendEntry:
-    return LegendEntry(text, "interval", "strip")

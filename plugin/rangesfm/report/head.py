@@ -28,40 +28,25 @@ def tiles(content: Content) -> list[tuple[str, str, str]]:
     """Name, value and a note on it, of what one looks for first."""
     summary, path = content.summary, content.final
     length_m = None if path is None else float(np.linalg.norm(np.diff(path.centers, axis=0), axis=1).sum())
-    num_points = None if content.points_m is None else len(content.points_m)
-    offset_decimals = min(decimals_for(summary.time_offset.stddev_s, default=3), 6)
+    num_points = None if path is None else len(content.points_m)
 
-    def shown(key: str, write: Callable[..., str], *how: object) -> str:
+    def shown(key: str, write: Callable[..., str], *how: object, within: str = "{}") -> str:
         value: Any = reduce(lambda entry, name: entry and getattr(entry, name), key.split("."), summary)
-        return keyed(key, value, write(value, *how))
+        return Markup(within).format(keyed(key, value, write(value, *how)))
+
+    def offset(key: str, write: Callable[..., str], within: str = "{}") -> str:
+        return shown(key, write, min(decimals_for(summary.time_offset.stddev_s, default=3), 6), "s", within=within)
+
+    def metres(key: str, within: str = "{}") -> str:
+        return shown(key, fixed, 3, "m", within=within)
 
     return [
         ("Keyframes", count(None if path is None else len(path)), f"path of {fixed(length_m, 2, 'm')}"),
-        (
-            "Ranges used",
-            shown("ranges.num_used", count),
-            Markup("of {} in the log").format(shown("ranges.num", count)),
-        ),
-        (
-            "Range RMS",
-            shown("ranges.rms_m", fixed, 3, "m"),
-            Markup("median {}").format(shown("ranges.median_abs_m", fixed, 3, "m")),
-        ),
-        (
-            "Check range RMS",
-            shown("check_ranges.rms_m", fixed, 3, "m"),
-            Markup("{} held out").format(shown("check_ranges.num", count)),
-        ),
-        (
-            "Reprojection RMS",
-            shown("refine.reprojection_rms_px", fixed, 2, "px"),
-            f"{count(num_points)} map points",
-        ),
-        (
-            "Clock offset",
-            shown("time_offset.value_s", signed, offset_decimals, "s"),
-            Markup("± {}").format(shown("time_offset.stddev_s", fixed, offset_decimals, "s")),
-        ),
+        ("Ranges used", shown("ranges.num_used", count), shown("ranges.num", count, within="of {} in the log")),
+        ("Range RMS", metres("ranges.rms_m"), metres("ranges.median_abs_m", "median {}")),
+        ("Check range RMS", metres("check_ranges.rms_m"), shown("check_ranges.num", count, within="{} held out")),
+        ("Reprojection RMS", shown("refine.reprojection_rms_px", fixed, 2, "px"), f"{count(num_points)} map points"),
+        ("Clock offset", offset("time_offset.value_s", signed), offset("time_offset.stddev_s", fixed, "± {}")),
         ("Time taken", duration(_total_seconds(summary.seconds)), "all stages"),
     ]
 

@@ -8,9 +8,8 @@ from pathlib import Path
 
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import make_output_folder, new_file
-from rangesfm.report.chart import Color, Spec, config, panel_spec, rows_of
+from rangesfm.report.chart import ASSETS, Color, Spec, config, panel_spec, rows_of
 from rangesfm.report.plot import Figure, LegendEntry, Panel
-from rangesfm.report.script import ASSETS
 
 PNG_SCALE = 2.5
 MAX_WIDTH_PX = 660.0

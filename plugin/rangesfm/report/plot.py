@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +13,7 @@ from rangesfm.arrays import Array
 
 Pixels = npt.NDArray[np.uint8]
 Range = tuple[float, float]
+Limits = tuple[Range, Range, tuple[float, float]]
 
 VIEW_SIZE = (400.0, 350.0)
 """Of a plan or an elevation, at most."""
@@ -150,7 +153,72 @@ class Figure:
         return [*found.values(), *self.legend]
 
 
-def equal_view(points: Array) -> tuple[Range, Range, tuple[float, float]]:
+def figure_of(
+    name: str,
+    caption: str,
+    description: str,
+    labels: tuple[str, str],
+    series: Iterable[Series],
+    *,
+    line: tuple[str, float] | None = None,
+    band: tuple[str, float, float] | None = None,
+    table: str | None = None,
+    **of_panel: Any,
+) -> Figure:
+    """A figure of one panel without a title.
+
+    Args:
+        line, band: name in the legend, and the place of one or the ends of the other on the x axis.
+        of_panel: what else a Panel has.
+    """
+    legend = []
+    if line is not None:
+        legend.append(LegendEntry(line[0], "ink", "upright"))
+        of_panel["verticals"] = ((line[1], "ink"),)
+    if band is not None:
+        legend.append(LegendEntry(band[0], "interval", "strip"))
+        of_panel["bands"] = ((*band[1:], "interval"),)
+    panel = Panel("", description, *labels, tuple(series), **of_panel)
+    return Figure(name, caption, (panel,), legend=tuple(legend), table=table)
+
+
+@dataclass(frozen=True)
+class View:
+    """A look at the world along one of its axes.
+
+    Attributes:
+        name: "Plan" or "Elevation".
+        axes: the horizontal and the vertical one on the page.
+        sign: of the vertical one there.
+    """
+
+    name: str
+    axes: tuple[int, int]
+    sign: float = 1.0
+
+    def seen(self, points: Array) -> Array:
+        """(n, 2) places on the page of (n, 3) points."""
+        return np.asarray(points[:, self.axes] * np.array([1.0, self.sign]))
+
+    def panel(self, what: str, unit: str, series: Iterable[Series], limits: Limits, **others: Any) -> Panel:
+        """What ``equal_view`` says of the limits, and what else a Panel has."""
+        x, y = (f"{'xyz'[axis]}{unit}" for axis in self.axes)
+        labels, (x_range, y_range, size) = (x, f"−{y}" if self.sign < 0 else y), limits
+        lines, what = tuple(series), f"{self.name} of {what}"
+        others |= {"x_range": x_range, "y_range": y_range, "size": size, "keeps_shape": True}
+        return Panel(self.name, what, *labels, lines, **others)
+
+
+def views_of(centers: Array, frame: str) -> tuple[View, View]:
+    """Plan and elevation of a path; the latter with its longer horizontal direction."""
+    extents = np.ptp(centers, axis=0)
+    if frame == "site":
+        return View("Plan", (0, 1)), View("Elevation", (0 if extents[0] >= extents[1] else 1, 2))
+    # A camera looks along +z and its y axis points down.
+    return View("Plan", (0, 2)), View("Elevation", (0 if extents[0] >= extents[2] else 2, 1), -1.0)
+
+
+def equal_view(points: Array) -> Limits:
     """Ranges of both axes and a size that show all (n, 2) points, with a margin, at one scale in both directions."""
     width, height = VIEW_SIZE
     center, extents = (points.min(axis=0) + points.max(axis=0)) / 2, np.ptp(points, axis=0)
@@ -168,6 +236,13 @@ def running_median(points: Array, x_range: Range, num_bins: int) -> Array:
     index = np.clip(np.digitize(x, edges) - 1, 0, num_bins - 1)
     medians = [float(np.median(y[index == i])) if np.any(index == i) else np.nan for i in range(num_bins)]
     return np.column_stack([(edges[:-1] + edges[1:]) / 2, medians])
+
+
+def time_axis(times_s: Array) -> tuple[Array, str]:
+    """(n,) seconds since the first and what the axis is called; numbers where no range has a time."""
+    if not np.isfinite(times_s).any():
+        return np.arange(len(times_s), dtype=np.float64), "range number"
+    return times_s - np.nanmin(times_s), "time s"
 
 
 def _limits(values: Array) -> Range:

@@ -8,7 +8,7 @@ import numpy as np
 
 from rangesfm.ranging.errors.calibration import Calibration
 from rangesfm.ranging.log import RangeLog
-from rangesfm.report.plot import Figure, Panel, Series
+from rangesfm.report.plot import Figure, Series, figure_of
 
 SIZE = (660.0, 330.0)
 
@@ -23,8 +23,7 @@ def plot_ranges(log: RangeLog) -> Figure:
     ]
     label = "range" if times is None else f"s since {times.min():.3f}"
     y_range = (0.0, 1.05 * float(log.range_m.max()))
-    panel = Panel("", "Ranges over time", label, "m", tuple(series), y_range=y_range, size=SIZE)
-    return Figure("ranges", "", (panel,))
+    return figure_of("ranges", "", "Ranges over time", (label, "m"), series, y_range=y_range, size=SIZE)
 
 
 def plot_error_curve(calibration: Calibration) -> Figure:
@@ -36,11 +35,11 @@ def plot_error_curve(calibration: Calibration) -> Figure:
         error_m = curve.error_m + num_stddevs * curve.stddev_m
         return Series(name, "after", np.column_stack([curve.distance_m, error_m]), kind)
 
-    panel = Panel(
+    return figure_of(
+        "error_curve",
         "",
         "Errors of ranges over their distance",
-        "distance, m",
-        "measured minus true, m",
+        ("distance, m", "measured minus true, m"),
         (
             Series("errors", "rejected", np.column_stack([calibration.distance_m, calibration.error_m])),
             line("curve", "line", 0),
@@ -50,7 +49,6 @@ def plot_error_curve(calibration: Calibration) -> Figure:
         y_range=(float(curve.error_m.min()) - shown, float(curve.error_m.max()) + shown),
         size=SIZE,
     )
-    return Figure("error_curve", "", (panel,))
 
 
 def _color(index: int, num: int) -> str:

@@ -1,11 +1,10 @@
-"""The data of the 3-D view: what stands where, in metres."""
+"""The 3-D view: what stands where, in metres, and what the page says around it."""
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,11 @@ import numpy.typing as npt
 from rangesfm.arrays import Array
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.observations import RangeStatus
+from rangesfm.report.content import Content
+from rangesfm.report.text import count
 from rangesfm.report.thumbnails import thumbnails
+from rangesfm.result.entries import AnchorEntry, ScaleEntry
+from rangesfm.result.metric_result import USED
 from rangesfm.result.ranges_as_used import RangesAsUsed
 
 MAX_NUM_POINTS = 500_000
@@ -24,6 +27,7 @@ NUM_STEPS = 65535
 
 _FAR_QUANTILE = 0.005
 _SEEN_QUANTILE = 0.05
+_FRUSTUM_SHAPE = (0.6, 0.4)
 _RADIUS_OF_95_PERCENT = 2.80
 """Of a three-dimensional normal distribution, in stddevs."""
 
@@ -48,16 +52,6 @@ class ScenePath:
 
 
 @dataclass(frozen=True)
-class SceneAnchor:
-    """One anchor: (3,) position, stddev of each coordinate, and the mirror image if there is one; metres."""
-
-    anchor_id: str
-    position_m: Array
-    stddev_m: Array
-    mirror_position_m: Array | None
-
-
-@dataclass(frozen=True)
 class Scene:
     """What the view shows, in one metric frame.
 
@@ -65,53 +59,109 @@ class Scene:
         frame: "site" (z up) or any other (a camera's: y down).
         paths: the last is the result, on which cameras are chosen.
         points_m, points_rgb: (m, 3) of the map.
-        anchors: where the ranges end.
-        ranges: with times (n,) in seconds; or None.
-        tags_in_cam_m: (n, 3) where each begins, in the camera's frame; or None.
-        frustum_shape: half width and half height of a camera's picture at unit distance.
-        images_path: folder of the photos; None where it is not known.
-        true_ranges_m: (n,) by a reference, NaN where unknown; or None.
-        scale_interval: the scale's 95 % interval relative to the scale; None if not known.
+        anchors: by id; those with a position are where the ranges end.
+        content: whose ranges and photos are shown too; None: only the map.
     """
 
     frame: str
     paths: tuple[ScenePath, ...]
     points_m: Array
     points_rgb: npt.NDArray[np.uint8]
-    anchors: tuple[SceneAnchor, ...] = ()
-    ranges: RangesAsUsed | None = None
-    range_times_s: Array | None = None
-    true_ranges_m: Array | None = None
-    tags_in_cam_m: Array | None = None
-    frustum_shape: tuple[float, float] = (0.6, 0.4)
-    images_path: Path | None = None
-    scale_interval: tuple[float, float] | None = None
+    anchors: Mapping[str, AnchorEntry]
+    content: Content | None = None
 
     @property
     def result(self) -> Trajectory:
         return self.paths[-1].trajectory
 
 
+def scene_of(content: Content) -> Scene | None:
+    """What the view shows of a result; None without a model."""
+    if not content.final:
+        return None
+    paths = []
+    if content.reference_m is not None:
+        n = len(content.reference_m)
+        nowhere = np.tile(np.eye(3), (n, 1, 1))
+        reference = Trajectory(np.arange(n), tuple(map(str, range(n))), None, content.reference_m, nowhere)
+        paths.append(ScenePath("reference", "Reference", "reference", reference, False))
+    if content.scaled:
+        paths.append(ScenePath("scaled", "Cameras, scaled only", "before", content.scaled))
+    if content.refined:
+        paths.append(ScenePath("refined", "Cameras, refined", "after", content.refined))
+    summary = content.summary
+    return Scene(summary.frame, tuple(paths), content.points_m, content.points_rgb, summary.anchors, content)
+
+
+@dataclass(frozen=True)
+class View:
+    """The 3-D view on the page.
+
+    Attributes:
+        data: what its script reads.
+        layers: id, name, colour and shape of the swatch of what can be taken away.
+        statuses: of ranges, and whether those are drawn at first.
+        num_photos: to choose from; 0 where photos have no orientation.
+        note: what one can do, and what is not drawn.
+    """
+
+    data: dict[str, Any]
+    layers: list[tuple[str, str, str, str]]
+    statuses: list[tuple[str, bool]]
+    num_photos: int
+    note: str
+
+
+def view_of(scene: Scene) -> View:
+    """The view of a scene."""
+    data = scene_data(scene)
+    statuses = data["ranges"]["statuses"] if data["ranges"] else []
+    layers = [("points", "Map points", "map", "dots")] if len(scene.points_m) else []
+    layers += [(path.id, path.name, path.color, "line" if path.has_orientations else "dashed") for path in scene.paths]
+    layers += [("anchors", "Anchors", "anchor", "triangle")] if data["anchors"] else []
+    layers += [("grid", "Grid", "muted", "box")]
+    return View(
+        data=data,
+        layers=layers,
+        statuses=[(name, name in [status.label for status in USED]) for name in statuses],
+        num_photos=len(scene.result) if scene.paths[-1].has_orientations else 0,
+        note=_note(scene, data),
+    )
+
+
+def _note(scene: Scene, data: dict[str, Any]) -> str:
+    sentences = [
+        "Drag to turn, wheel or pinch to zoom, right drag or two fingers to move; click a camera for its photo."
+    ]
+    if num_left_out := len(scene.points_m) - (data["points"] or {"num": 0})["num"]:
+        sentences.append(f"{count(num_left_out)} points far away or beyond the view's limit are not drawn.")
+    ranges = None if scene.content is None else scene.content.ranges
+    if ranges is not None and (stride := range_stride(ranges)) > 1:
+        sentences.append(f"One in {stride} ranges is drawn and listed; ranges.csv holds all.")
+    num_thumbnails, num_photos = len(data["thumbnails"]), len(scene.result)
+    if 0 < num_thumbnails < num_photos:
+        sentences.append(f"{count(num_thumbnails)} of {count(num_photos)} photos have a picture: the page stays small.")
+    if data["anchors"]:
+        sentences.append("Ellipsoids around the anchors hold 95 %, at their true size.")
+    return " ".join(sentences)
+
+
 def scene_data(scene: Scene) -> dict[str, Any]:
     """What the page's script reads."""
-    box = _box(scene)
+    box, content = _box(scene), scene.content
+    cameras = () if content is None else content.cameras
     return {
         "up": [0, 0, 1] if scene.frame == "site" else [0, -1, 0],
         "box": box,
         "paths": [_path(path) for path in scene.paths],
         "points": _points(scene),
-        "anchors": [_anchor(anchor) for anchor in scene.anchors],
-        "ranges": _ranges(scene),
+        "anchors": [_anchor(id_, anchor) for id_, anchor in scene.anchors.items() if anchor.position_m is not None],
+        "ranges": None if content is None else _ranges(content, scene.result),
         "frustum_size": _frustum_size(scene.result, box["radius"]),
-        "frustum_shape": list(scene.frustum_shape),
-        "thumbnails": thumbnails(scene.images_path, scene.result.image_names),
-        "scale_interval": None if scene.scale_interval is None else list(scene.scale_interval),
+        "frustum_shape": cameras[0].half_angles if cameras else _FRUSTUM_SHAPE,
+        "thumbnails": {} if content is None else thumbnails(content.images_path, scene.result.image_names),
+        "scale_interval": None if content is None else _scale_interval(content.summary.scale),
     }
-
-
-def num_points_drawn(scene: Scene) -> int:
-    """How many of the map's points the view shows."""
-    return len(_chosen_points(scene))
 
 
 def range_stride(ranges: RangesAsUsed) -> int:
@@ -163,7 +213,7 @@ def _chosen_points(scene: Scene) -> npt.NDArray[np.int64]:
 
 def _around(scene: Scene) -> Array:
     """All positions beside the map's points."""
-    anchors = [anchor.position_m[None] for anchor in scene.anchors]
+    anchors = [[anchor.position_m] for anchor in scene.anchors.values() if anchor.position_m is not None]
     return np.concatenate([*(path.trajectory.centers for path in scene.paths), *anchors])
 
 
@@ -186,36 +236,35 @@ def _frustum_size(path: Trajectory, radius: float) -> float:
     return float(np.clip(0.7 * typical, 0.012 * radius, 0.05 * radius))
 
 
-def _anchor(anchor: SceneAnchor) -> dict[str, Any]:
-    known = np.isfinite(anchor.stddev_m).all() and np.any(anchor.stddev_m > 0)
-    mirror = anchor.mirror_position_m
+def _anchor(anchor_id: str, anchor: AnchorEntry) -> dict[str, Any]:
     return {
-        "id": anchor.anchor_id,
-        "position": anchor.position_m.tolist(),
-        "ellipsoid": (_RADIUS_OF_95_PERCENT * anchor.stddev_m).tolist() if known else None,
-        "mirror": None if mirror is None else mirror.tolist(),
+        "id": anchor_id,
+        "position": anchor.position_m,
+        "ellipsoid": [_RADIUS_OF_95_PERCENT * anchor.stddev_m] * 3 if anchor.stddev_m else None,
+        "mirror": anchor.mirror_position_m,
     }
 
 
-def _ranges(scene: Scene) -> dict[str, Any] | None:
-    ranges = scene.ranges
+def _scale_interval(scale: ScaleEntry) -> list[float] | None:
+    """Relative to the scale."""
+    return [end / scale.value for end in scale.interval_95] if scale.interval_95 and scale.value else None
+
+
+def _ranges(content: Content, path: Trajectory) -> dict[str, Any] | None:
+    ranges = content.ranges
     if ranges is None or len(ranges.status) == 0:
         return None
     rows = np.arange(0, len(ranges.status), range_stride(ranges))
-    index_of = {name: i for i, name in enumerate(scene.result.image_names)}
-    before = _indices(ranges.keyframe_before, index_of, rows)
-    after = _indices(ranges.keyframe_after, index_of, rows)
-    weight = ranges.weight[rows]
-    has_place = (before >= 0) & (after >= 0) & np.isfinite(weight)
+    before, after, has_place = (of_all[rows] for of_all in ranges.places_on(path.image_names))
+    weight = np.where(has_place, ranges.weight[rows], 0.0)
     anchor_ids, anchor = np.unique(np.array(ranges.anchor_id, dtype=str), return_inverse=True)
-    statuses = _statuses_in_order(ranges)
+    present = set(ranges.status)
+    known = [status.label for status in RangeStatus if status.label in present]
+    statuses = [*known, *sorted(present.difference(known))]  # the used first
     status = np.array([statuses.index(label) for label in ranges.status])
-    times = scene.range_times_s
     is_refined = bool(np.isfinite(ranges.residual_refined_m).any())
     final = ranges.residual_refined_m if is_refined else ranges.residual_scaled_m
-    weight = np.where(has_place, weight, 0.0)
-    of_ranges = np.zeros((len(ranges.status), 3)) if scene.tags_in_cam_m is None else scene.tags_in_cam_m
-    tags, tag = np.unique(of_ranges[rows], axis=0, return_inverse=True)
+    tags, tag = np.unique(content.tags_in_cam_m[rows], axis=0, return_inverse=True)
     return {
         "num": len(rows),
         "anchor_ids": anchor_ids.tolist(),
@@ -224,30 +273,19 @@ def _ranges(scene: Scene) -> dict[str, Any] | None:
         "tag": pack(tag.reshape(-1), "uint8"),
         "statuses": statuses,
         "status": pack(status[rows], "uint8"),
-        "time": pack(np.full(len(rows), np.nan) if times is None else times[rows], "float32"),
+        "time": pack(content.range_times_s[rows], "float32"),
         "measured": pack(ranges.range_m[rows], "float32"),
         "residual_scaled": pack(ranges.residual_scaled_m[rows], "float32"),
         "residual_refined": pack(ranges.residual_refined_m[rows], "float32"),
         "final": "residual_refined" if is_refined else "residual_scaled",
         "residual_limit_m": _residual_limit(final[ranges.is_used]),
-        "true": None if scene.true_ranges_m is None else pack(scene.true_ranges_m[rows], "float32"),
+        "true": None if content.true_ranges_m is None else pack(content.true_ranges_m[rows], "float32"),
         "has_place": pack(has_place, "uint8"),
         "before": pack(np.maximum(before, 0), "int32"),
         "after": pack(np.maximum(after, 0), "int32"),
         "weight": pack(np.round(255 * weight), "uint8"),
         "camera": pack(np.where(has_place, np.where(weight < 0.5, before, after), -1), "int32"),
     }
-
-
-def _statuses_in_order(ranges: RangesAsUsed) -> list[str]:
-    """Those that there are, the used first."""
-    present = set(ranges.status)
-    known = [status.label for status in RangeStatus if status.label in present]
-    return [*known, *sorted(present.difference(known))]
-
-
-def _indices(names: Sequence[str], index_of: dict[str, int], rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    return np.array([index_of.get(names[row], -1) for row in rows], dtype=np.int64)
 
 
 def _residual_limit(residuals: Array) -> float:

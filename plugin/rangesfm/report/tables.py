@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from rangesfm.arrays import Array
 from rangesfm.report.content import Content, in_natural_order
 from rangesfm.report.text import count, duration, fixed, keyed, plain, signed
 from rangesfm.result.entries import AnchorEntry
@@ -51,7 +50,8 @@ def ranges_per_anchor(content: Content) -> Table:
         row = [anchor_id, count(int(mine.sum())), count(int(used.sum()))]
         for residuals in (ranges.residual_scaled_m[used], ranges.residual_refined_m[used]):
             known = residuals[np.isfinite(residuals)]
-            row += [_fixed_or_nothing(known**2, np.mean, root=True), _fixed_or_nothing(known, np.median)]
+            rms, median = (np.sqrt(np.mean(known**2)), np.median(known)) if len(known) else (None, None)
+            row += [fixed(rms, 3), fixed(median, 3)]
         rows.append(row)
     header = ["anchor", "ranges", "used", "scaled: RMS m", "median m", "refined: RMS m", "median m"]
     return Table("Ranges of each anchor", header, rows)
@@ -59,22 +59,8 @@ def ranges_per_anchor(content: Content) -> Table:
 
 def comparison(content: Content) -> Table:
     """The paper's table."""
-    columns = (
-        ("rmse_m", fixed, 4),
-        ("rmse_se3_m", fixed, 4),
-        ("rmse_sim3_m", fixed, 4),
-        ("scale_error_percent", signed, 3),
-    )
-    rows = [
-        [
-            row.name,
-            *(
-                keyed(f"comparison.{i}.{key}", getattr(row, key), write(getattr(row, key), n))
-                for key, write, n in columns
-            ),
-        ]
-        for i, row in enumerate(content.summary.comparison)
-    ]
+    columns = dict.fromkeys(("rmse_m", "rmse_se3_m", "rmse_sim3_m"), (fixed, 4)) | {"scale_error_percent": (signed, 3)}
+    rows = [[row.name, *_cells(f"comparison.{i}", row, columns)] for i, row in enumerate(content.summary.comparison)]
     return Table(
         "Keyframe centres against the reference",
         ["trajectory", "RMSE m", "after SE(3) m", "after Sim(3) m", "scale error %"],
@@ -87,11 +73,11 @@ def two_candidates(content: Content) -> Table:
     """Mean and standard deviation of the paper's two branches."""
     given = content.summary.scale.two_candidate
     branches = [] if given is None else [("alpha0", given.alpha0), ("alpha1", given.alpha1)]
+    columns = {"mean": (plain,), "std": (plain,)}
     rows = [
         [
             name,
-            keyed(f"scale.two_candidate.{name}.mean", branch.mean, plain(branch.mean)),
-            keyed(f"scale.two_candidate.{name}.std", branch.std, plain(branch.std)),
+            *_cells(f"scale.two_candidate.{name}", branch, columns),
             "chosen" if given and given.chosen == name else "",
         ]
         for name, branch in branches
@@ -130,13 +116,9 @@ def _anchor(key: str, anchor_id: str, anchor: AnchorEntry) -> list[str]:
 
 def distances(content: Content) -> Table:
     """Taped distances, those that held the scale and those that check it."""
-    columns = (("measured_m", fixed), ("stddev_m", fixed), ("estimated_m", fixed), ("residual_m", signed))
+    columns = dict.fromkeys(("measured_m", "stddev_m", "estimated_m"), (fixed, 4)) | {"residual_m": (signed, 4)}
     rows = [
-        [
-            f"{row.from_} to {row.to}",
-            row.kind,
-            *(keyed(f"distances.{i}.{key}", getattr(row, key), write(getattr(row, key), 4)) for key, write in columns),
-        ]
+        [f"{row.from_} to {row.to}", row.kind, *_cells(f"distances.{i}", row, columns)]
         for i, row in enumerate(content.summary.distances)
     ]
     header = ["distance", "kind", "by tape m", "stddev m", "in the map m", "difference m"]
@@ -149,7 +131,7 @@ def intrinsics(content: Content) -> Table:
     num_columns = 3 if content.refined is None else 5
     rows = [
         [
-            f"{camera.camera_id} {camera.model} {camera.size_px[0]} × {camera.size_px[1]}",
+            camera.title,
             name,
             *(fixed(before, 6), fixed(after, 6), signed(after - before, 6))[: num_columns - 2],
         ]
@@ -159,16 +141,10 @@ def intrinsics(content: Content) -> Table:
     return Table("Cameras", header[:num_columns], rows)
 
 
-def sensitivity(content: Content) -> Table:
-    """How the scale answers to what was assumed, where the run tells."""
-    rows = _flattened(content.summary.scale.to_json()["sensitivity"])
-    return Table("How the scale answers to what was assumed", [], rows)
-
-
 def inputs(content: Content) -> Table:
     """The files that the result was made from."""
     rows = [
-        [entry.path, keyed(f"inputs.{i}.bytes", entry.bytes, count(entry.bytes)), entry.sha256, entry.hashed]
+        [entry.path, *_cells(f"inputs.{i}", entry, {"bytes": (count,)}), entry.sha256, entry.hashed]
         for i, entry in enumerate(content.summary.inputs)
     ]
     return Table("Inputs", ["file", "bytes", "SHA-256", "of"], rows, kind="settings")
@@ -192,28 +168,25 @@ def stages(content: Content) -> Table:
 
 def refinement(content: Content) -> Table:
     """What the solver did."""
+    refine = content.summary.refine
     rows = [
         [name.replace("_", " "), keyed(f"refine.{name}", value, plain(value))]
-        for name, value in ({} if content.summary.refine is None else content.summary.refine.to_json()).items()
+        for name, value in ({} if refine is None else refine.to_json()).items()
     ]
     return Table("Refinement", [], rows)
 
 
-def versions(content: Content) -> Table:
-    """What the result was made with."""
-    return Table("Versions", [], _flattened(content.summary.versions))
+def values(caption: str, given: Mapping[str, Any], kind: str | None = None) -> Table:
+    """Keys of a nested object, joined by dots, and what they are."""
+    return Table(caption, [], _flattened(given), kind=kind)
 
 
-def settings(content: Content) -> Table:
-    """What was asked for."""
-    return Table("Settings", [], _flattened(content.summary.settings.to_json()), kind="settings")
-
-
-def _fixed_or_nothing(values: Array, measure: Any, *, root: bool = False) -> str:
-    if len(values) == 0:
-        return fixed(None, 3)
-    value = float(measure(values))
-    return fixed(value**0.5 if root else value, 3)
+def _cells(key: str, entry: object, columns: Mapping[str, tuple[Any, ...]]) -> list[str]:
+    """Numbers of an entry of ``result.json``: by name, a function of text.py and what it takes beside the value."""
+    of_entry = {name: getattr(entry, name) for name in columns}
+    return [
+        keyed(f"{key}.{name}", of_entry[name], write(of_entry[name], *how)) for name, (write, *how) in columns.items()
+    ]
 
 
 def _flattened(values: Mapping[str, Any]) -> list[list[str]]:

@@ -31,35 +31,27 @@ def thumbnails(folder: Path | None, image_names: Sequence[str]) -> dict[str, str
     if folder is None or not folder.is_dir() or not image_names:
         return {}
     chosen = np.unique(np.linspace(0, len(image_names) - 1, MAX_NUM_THUMBNAILS).round().astype(int))
-    names = [image_names[i] for i in chosen]
-    width = _width_that_fits(folder, names)
+    photos = {image_names[i]: _small_copy(folder / image_names[i]) for i in chosen}
     made: dict[str, str] = {}
-    num_bytes = 0
-    for name in names:
-        uri = _thumbnail(folder / name, width)
-        if uri is not None and num_bytes + len(uri) <= MAX_BYTES:
-            made[name] = uri
-            num_bytes += len(uri)
-    return made
-
-
-def _width_that_fits(folder: Path, names: Sequence[str]) -> int:
-    """By a few photos; a quarter is kept in reserve for richer ones."""
-    few = names[:: max(1, len(names) // 4)]
     for width in _WIDTHS_PX:
-        sizes = [len(uri) for uri in (_thumbnail(folder / name, width) for name in few) if uri is not None]
-        if not sizes or 1.25 * len(names) * sum(sizes) / len(sizes) <= MAX_BYTES:
-            return width
-    return _WIDTHS_PX[-1]
+        made = {name: _data_uri(photo, width) for name, photo in photos.items() if photo is not None}
+        if sum(map(len, made.values())) <= MAX_BYTES:
+            return made
+    num_bytes = np.cumsum([len(uri) for uri in made.values()])
+    return {name: uri for (name, uri), up_to_it in zip(made.items(), num_bytes) if up_to_it <= MAX_BYTES}
 
 
-def _thumbnail(path: Path, width: int) -> str | None:
+def _small_copy(path: Path) -> Image.Image | None:
+    width = _WIDTHS_PX[0]
     try:
         with Image.open(path) as photo:
             photo.draft("RGB", (2 * width, 2 * width))  # a JPEG is decoded no larger than needed
-            small = ImageOps.contain(photo.convert("RGB"), (width, width))
+            return ImageOps.contain(photo.convert("RGB"), (width, width))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         return None
+
+
+def _data_uri(photo: Image.Image, width: int) -> str:
     file = io.BytesIO()
-    small.save(file, "JPEG", quality=_QUALITY, optimize=True)
+    ImageOps.contain(photo, (width, width)).save(file, "JPEG", quality=_QUALITY, optimize=True)
     return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode("ascii")

@@ -105,7 +105,7 @@ class MetricResult:
         """Metres per SfM unit after refinement, by the keyframe centres."""
         if self.refined is None:
             return None
-        return align_points(self.trajectory.centers, self.path_of(self.refined).centers).scale
+        return align_points(self.trajectory.centers, self.trajectory.as_in(self.refined).centers).scale
 
     def moved(self, offset_m: Array) -> MetricResult:
         """The same in a world whose coordinates are larger by ``offset_m`` (3,)."""
@@ -134,10 +134,6 @@ class MetricResult:
             return self
         kept = self.estimate.reasons if self.estimate.verdict == "doubtful" else ()
         return replace(self, estimate=replace(self.estimate, verdict="doubtful", reasons=(*reasons, *kept)))
-
-    def path_of(self, model: pycolmap.Reconstruction) -> Trajectory:
-        """The keyframes as another model has them."""
-        return self.trajectory.as_in(model)
 
 
 def _moved_anchor(anchor: AnchorEstimate, offset_m: Array) -> AnchorEstimate:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -12,6 +13,8 @@ from rangesfm.arrays import Array
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.result.metric_result import USED, MetricResult
 from rangesfm.result.table_file import Numbers, NumbersOrEmpty, RoundedOrEmpty, TableFile, Texts, TextsOrEmpty
+
+Rows = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,15 @@ class RangesAsUsed(TableFile):
             robust_weight=np.where(has_say, found.weights, np.nan),
             status=tuple(labels[status] for status in observations.status.tolist()),
         )
+
+    def places_on(self, image_names: Sequence[str]) -> tuple[Rows, Rows, npt.NDArray[np.bool_]]:
+        """(n,) which of a path's keyframes are before and after each range, -1 for none; and whether it has a place."""
+        index_of = {name: i for i, name in enumerate(image_names)}
+        before, after = (
+            np.array([index_of.get(name, -1) for name in names], dtype=np.int64)
+            for names in (self.keyframe_before, self.keyframe_after)
+        )
+        return before, after, (before >= 0) & (after >= 0) & np.isfinite(self.weight)
 
     @property
     def residual_scaled_m(self) -> Array:

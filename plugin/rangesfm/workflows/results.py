@@ -97,8 +97,8 @@ def _comparison(survey: Survey, inputs: RangingInputs, metric: MetricResult) -> 
     if inputs.reference is None:
         return ()
     frame = metric.estimate.frame
-    scaled = metric.path_of(metric.scaled)
-    refined = None if metric.refined is None else metric.path_of(metric.refined)
+    scaled = metric.trajectory.as_in(metric.scaled)
+    refined = None if metric.refined is None else metric.trajectory.as_in(metric.refined)
     rows = papers_table(scaled, refined, inputs.reference, frame=frame)
     in_frame = reference_in_frame(refined or scaled, inputs.reference, frame=frame)
     if in_frame is not None:

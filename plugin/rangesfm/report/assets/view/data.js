@@ -22,6 +22,15 @@ function unpackArray({ type, data }) {
   return new ARRAY_TYPES[type](bytes.buffer);
 }
 
+/** A place in the frame of a path's i-th camera, carried into the world; center: where the camera is then. */
+function fromCamera(path, i, place, center) {
+  const rotation = path.rotations.subarray(9 * i, 9 * i + 9);
+  return center.map((value, axis) => {
+    const [x, y, z] = row3(rotation, axis);
+    return value + x * place[0] + y * place[1] + z * place[2];
+  });
+}
+
 /** The i-th row of three of a flat array. */
 function row3(values, i) {
   return [values[3 * i], values[3 * i + 1], values[3 * i + 2]];

@@ -31,11 +31,7 @@ function makeGrid(box, up) {
       }
     }
   }
-  const material = new THREE.LineBasicMaterial();
-  onTheme(() => material.color.set(themeColor("stage-grid")));
-  const grid = new THREE.LineSegments(lineGeometry(lines), material);
-  grid.frustumCulled = false;
-  return { grid, cell };
+  return { grid: themed(THREE.LineSegments, lines, new THREE.LineBasicMaterial(), "stage-grid"), cell };
 }
 
 /** Keeps a bar of round length up to date. */

@@ -16,11 +16,10 @@ class View {
     this.#fillStage();
     this.#attachLayers();
     this.#attachViews();
-    this.#attachRanges();
     this.#attachPhoto();
     onClick(this.canvas, (pixel) => this.click(pixel));
     attachScaleBar(this.stage, root.querySelector(".scale-bar"));
-    attachPrinting(this.stage, root.querySelector(".printed"));
+    this.#attachPrinting();
     this.look("oblique");
   }
 
@@ -38,7 +37,7 @@ class View {
 
   click(pixel) {
     const isMeasuring = this.root.querySelector("[name=measure]").checked;
-    const camera = this.path === null ? null : nearestOfPath(this.stage, pixel, this.path);
+    const camera = this.path === null ? null : nearestTo(this.stage, pixel, this.path.centers);
     if (!isMeasuring) {
       if (camera !== null) this.choose(camera.index);
       return;
@@ -68,10 +67,11 @@ class View {
 
   #candidates(pixel, camera) {
     const { points, anchors } = this.scene;
-    const anchor = nearestTo(this.stage, pixel, anchors.length, (i, out) => {
-      for (let axis = 0; axis < 3; axis++) out[axis] = anchors[i].position[axis];
-    });
-    const point = points !== null && this.layers.points.visible ? nearestPoint(this.stage, pixel, points) : null;
+    const anchor = nearestTo(this.stage, pixel, anchors.flatMap(({ position }) => position));
+    const point =
+      points !== null && this.layers.points.visible
+        ? nearestTo(this.stage, pixel, points.steps, points.origin, stepOf(points))
+        : null;
     return [
       { at: anchor, name: anchor && `anchor ${anchors[anchor.index].id}` },
       { at: camera, name: camera && `camera ${this.path.names[camera.index]}` },
@@ -122,9 +122,6 @@ class View {
     for (const button of this.root.querySelectorAll("[data-look]")) {
       button.addEventListener("click", () => this.look(button.dataset.look));
     }
-  }
-
-  #attachRanges() {
     for (const box of this.root.querySelectorAll("[name=status], [name=all-photos]")) {
       box.addEventListener("change", () => this.#showRanges());
     }
@@ -137,6 +134,14 @@ class View {
     this.rangeLines.show(new Set(boxes.map((box) => Number(box.value))), isOfAll ? null : this.chosen);
     this.root.querySelector(".num-lines").textContent = `${this.rangeLines.numShown} ranges drawn`;
     this.stage.requestFrame();
+  }
+
+  /** On paper, a picture stands for the view. */
+  #attachPrinting() {
+    addEventListener("beforeprint", () => {
+      this.stage.draw(); // what is drawn can be read only at once
+      this.root.querySelector(".printed").src = this.canvas.toDataURL("image/png");
+    });
   }
 
   #attachPhoto() {

@@ -7,10 +7,8 @@ class Measuring {
     this.output = output;
     this.interval = interval;
     this.label = labels.add("", null, "distance");
-    this.line = new THREE.Line(new THREE.BufferGeometry(), new THREE.LineBasicMaterial({ depthTest: false }));
+    this.line = themed(THREE.Line, [], new THREE.LineBasicMaterial({ depthTest: false }), "chosen");
     this.line.renderOrder = 1;
-    this.line.frustumCulled = false;
-    onTheme(() => this.line.material.color.set(themeColor("chosen")));
     this.clear();
     stage.add(this.line);
   }

@@ -48,18 +48,14 @@ class PhotoPanel {
     this.body.replaceChildren(
       ...numbers.slice(0, MAX_NUM_ROWS).map((i) => {
         const row = document.createElement("tr");
+        const anchor = ranges.anchor_ids[ranges.anchor[i]];
+        row.append(Object.assign(document.createElement("th"), { scope: "row", textContent: anchor }));
         const cells = [
-          ranges.anchor_ids[ranges.anchor[i]],
           ranges.measured[i].toFixed(3),
           Number.isNaN(ranges.residual[i]) ? "–" : ranges.residual[i].toFixed(3).replace("-", "−"),
           ranges.statuses[ranges.status[i]],
         ];
-        for (const [column, text] of cells.entries()) {
-          const cell = document.createElement(column === 0 ? "th" : "td");
-          if (column === 0) cell.scope = "row";
-          cell.textContent = text;
-          row.append(cell);
-        }
+        for (const text of cells) row.insertCell().textContent = text;
         return row;
       }),
     );

@@ -19,15 +19,15 @@ function onClick(canvas, callback) {
 
 /**
  * The nearest of many positions to a pixel; of several on the same spot, the one in front.
- * positionAt(i, out) writes the i-th into out. Returns {index, position, pixels, depth} or null.
+ * values: their coordinates in turn, in steps from an origin. Returns {index, position, pixels, depth} or null.
  */
-function nearestTo(stage, pixel, num, positionAt) {
+function nearestTo(stage, pixel, values, origin = [0, 0, 0], step = 1) {
   const matrix = stage.camera.projectionMatrix.clone().multiply(stage.camera.matrixWorldInverse).elements;
   const [width, height] = [stage.canvas.clientWidth, stage.canvas.clientHeight];
   const p = [0, 0, 0];
   let best = null;
-  for (let i = 0; i < num; i++) {
-    positionAt(i, p);
+  for (let i = 0; 3 * i < values.length; i++) {
+    for (let axis = 0; axis < 3; axis++) p[axis] = origin[axis] + step * values[3 * i + axis];
     const w = matrix[3] * p[0] + matrix[7] * p[1] + matrix[11] * p[2] + matrix[15];
     if (w <= 0) continue;
     const x = ((matrix[0] * p[0] + matrix[4] * p[1] + matrix[8] * p[2] + matrix[12]) / w + 1) * 0.5 * width;
@@ -39,17 +39,4 @@ function nearestTo(stage, pixel, num, positionAt) {
     if (isCloser || isInFront) best = { index: i, position: [...p], pixels, depth: w };
   }
   return best;
-}
-
-function nearestOfPath(stage, pixel, path) {
-  return nearestTo(stage, pixel, path.names.length, (i, out) => {
-    for (let axis = 0; axis < 3; axis++) out[axis] = path.centers[3 * i + axis];
-  });
-}
-
-function nearestPoint(stage, pixel, data) {
-  const step = data.extent / 65535;
-  return nearestTo(stage, pixel, data.num, (i, out) => {
-    for (let axis = 0; axis < 3; axis++) out[axis] = data.origin[axis] + step * data.steps[3 * i + axis];
-  });
 }

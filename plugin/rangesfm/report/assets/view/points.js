@@ -42,8 +42,12 @@ function makePoints(stage, data) {
   return points;
 }
 
+/** Metres from one whole number that a coordinate may have to the next. */
+function stepOf(data) {
+  return data.extent / 65535;
+}
+
 /** Position of the i-th point, metres. */
 function pointPosition(data, i) {
-  const step = data.extent / 65535;
-  return row3(data.steps, i).map((value, axis) => data.origin[axis] + step * value);
+  return row3(data.steps, i).map((value, axis) => data.origin[axis] + stepOf(data) * value);
 }

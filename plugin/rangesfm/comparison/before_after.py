@@ -1,0 +1,137 @@
+"""What the refinement changed: a model before it against the same model after it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from rangesfm.comparison.models import Length, common_photos, lengths_along, reprojection_rms_px
+from rangesfm.comparison.with_reference import format_table, papers_table
+from rangesfm.errors import InputError
+from rangesfm.files.text_table import align_rows
+from rangesfm.geometry.reference import read_reference
+from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.result.entries import ComparisonRow
+from rangesfm.result.folder import ResultFolder, read_result_folder
+from rangesfm.result.ranges_as_used import RangesAsUsed
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ModelComparison:
+    """Two models of the same photos in the same world; pairs are (before, after).
+
+    Attributes:
+        reprojection_rms_px: None where one of the two is only a path.
+        range_rms_m, range_median_abs_m: of the given range residuals; None without.
+        displacements_m: (n,) of the camera centres of the keyframes in both.
+        distances: between a few keyframes spread over the path.
+    """
+
+    reprojection_rms_px: tuple[float, float] | None
+    range_rms_m: tuple[float, float] | None
+    range_median_abs_m: tuple[float, float] | None
+    displacements_m: Array
+    distances: tuple[Length, ...]
+
+    def __str__(self) -> str:
+        pairs = {
+            "reprojection RMS px": self.reprojection_rms_px,
+            "range residual RMS m": self.range_rms_m,
+            "range residual median abs m": self.range_median_abs_m,
+            **{f"{a} to {b} m": lengths for a, b, lengths in self.distances},
+        }
+        rows = [(label, *(f"{value:.4f}" for value in pair)) for label, pair in pairs.items() if pair is not None]
+        moved = self.displacements_m
+        return (
+            f"{align_rows([('', 'before', 'after'), *rows])}\n{len(moved)} keyframes moved by {moved.mean():.4f} m on "
+            f"average, at most {moved.max():.4f} m"
+        )
+
+
+def compare_models(
+    before: pycolmap.Reconstruction | Trajectory,
+    after: pycolmap.Reconstruction | Trajectory,
+    *,
+    range_residuals_m: tuple[Array, Array] | None = None,
+) -> ModelComparison:
+    """What changed from one model to another of the same photos, both metric and in one world.
+
+    Args:
+        range_residuals_m: predicted minus measured, of the ranges used, before and after.
+
+    Raises:
+        InputError: they have no photo in common.
+    """
+    paths = [one if isinstance(one, Trajectory) else trajectory_from_reconstruction(one) for one in (before, after)]
+    names, centers_before, centers_after = common_photos(*paths)
+    if not names:
+        raise InputError("the two models have no photo in common")
+    reprojection = rms = median = None
+    if not isinstance(before, Trajectory) and not isinstance(after, Trajectory):
+        reprojection = (reprojection_rms_px(before), reprojection_rms_px(after))
+    if range_residuals_m is not None:
+        first, second = range_residuals_m
+        rms = (float(np.sqrt(np.mean(first**2))), float(np.sqrt(np.mean(second**2))))
+        median = (float(np.median(np.abs(first))), float(np.median(np.abs(second))))
+    return ModelComparison(
+        reprojection_rms_px=reprojection,
+        range_rms_m=rms,
+        range_median_abs_m=median,
+        displacements_m=np.linalg.norm(centers_after - centers_before, axis=1),
+        distances=lengths_along(paths),
+    )
+
+
+@dataclass(frozen=True)
+class FolderComparison:
+    """What a finished run can be compared with.
+
+    Attributes:
+        rows: the paper's table; empty without a reference.
+        models: scaled against refined; None where the run did not refine.
+    """
+
+    rows: tuple[ComparisonRow, ...]
+    models: ModelComparison | None
+
+    def __str__(self) -> str:
+        parts = [format_table(self.rows)] if self.rows else []
+        return "\n\n".join([*parts, *([] if self.models is None else [str(self.models)])])
+
+
+def compare_folder(output_path: Path, reference_path: Path | None = None) -> FolderComparison:
+    """Compare the models in a run's output folder, with a reference file if there is one.
+
+    Raises:
+        InputError: the folder is not a result, it holds nothing to compare, or the
+            reference cannot be read or knows none of its photos.
+    """
+    result = read_result_folder(output_path)
+    scaled, refined = result.read_model("sparse_scaled"), result.read_model("sparse_metric")
+    if scaled is None:
+        raise InputError("there is no scaled model (sparse_scaled/0) to compare", output_path)
+    if refined is None and reference_path is None:
+        raise InputError("the run did not refine (no sparse_metric/0): a reference is needed to compare", output_path)
+    rows: tuple[ComparisonRow, ...] = ()
+    if reference_path is not None:
+        path = trajectory_from_reconstruction(scaled, result.timestamps_s)
+        path_of_refined = None if refined is None else path.as_in(refined)
+        rows = papers_table(path, path_of_refined, read_reference(reference_path), frame=result.summary.frame)
+    if refined is None:
+        return FolderComparison(rows, None)
+    return FolderComparison(rows, compare_models(scaled, refined, range_residuals_m=_used_residuals(result)))
+
+
+def _used_residuals(result: ResultFolder) -> tuple[Array, Array] | None:
+    ranges = result.read(RangesAsUsed)
+    if ranges is None:
+        return None
+    before, after = ranges.residual_scaled_m[ranges.is_used], ranges.residual_refined_m[ranges.is_used]
+    known = np.isfinite(before) & np.isfinite(after)
+    return (before[known], after[known]) if known.any() else None
