@@ -26,7 +26,7 @@ class Calls:
             options.pop("progress").message("working")
             self.made.append((name, survey, options))
             lines = [f"{name} is done", "scale 2.5"]
-            return lines if name == "reconstruct_survey" else SimpleNamespace(summary_lines=lambda: lines)
+            return lines if name == "reconstruct_survey" else SimpleNamespace(lines=lines)
 
         return run
 

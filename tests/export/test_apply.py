@@ -11,10 +11,10 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
 from rangesfm.export import MetricMap, apply_to, best_similarity, export_map
-from rangesfm.export.metric_map import Array
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.options import ExportOptions
 

@@ -179,7 +179,7 @@ class TestFastWay:
             lambda table: table.text("b", empty="none"),
             lambda table: (table.categories("b").names, table.categories("b").index.tolist()),
             lambda table: table.categories("a", empty="none").names,
-            lambda table: str(table.error(0, "a", "something else")),
+            lambda table: str(table.error(0, "a", "something else")) if len(table) else "no row to be wrong",
             lambda table: table.line.tolist(),
         ]
         answers: list[object] = []

@@ -199,7 +199,7 @@ def _summary(
             "value": 0.74213,
             "stddev_formal": 0.00031,
             "stddev_empirical": 0.00412,
-            "interval_95": [0.73405, 0.75021],
+            "interval_95": [0.73406, 0.75021],
             "method": "robust",
             "verdict": "good",
             "reasons": ["eight anchors agree within 1.5 %", "the path fills the room in all three directions"],

@@ -47,7 +47,7 @@ import subprocess
 import sys
 import tempfile
 from collections import defaultdict
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -132,7 +132,7 @@ def map_in_one_piece(folder: Path, output: Path) -> None:
 def plan(folder: Path, output: Path, size: int, overlap: int) -> None:
     """Write the submaps, ready to be mapped, to ``output``."""
     database = folder / "database.db"
-    mapper = replace(_mapper(), submap_size=size, submap_overlap=overlap)
+    mapper = _mapper().changed(submap_size=size, submap_overlap=overlap)
     submaps = plan_submaps(matched_photos(database), database, output, camera_options(database), mapper, seed=0)
     (output / "submaps.pickle").write_bytes(pickle.dumps(submaps))
 

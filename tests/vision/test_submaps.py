@@ -169,7 +169,7 @@ def test_only_submaps_with_the_same_photos_under_the_same_ids_are_taken_over(wal
     assert sorted(path.name for path in (walk.folder / "submaps").iterdir()) == ["000000", "000001", "000002"]
     later = replace(walk.matched, photos=replace(photos, names=photos.names[1:]))
     assert not any(submap.is_mapped for submap in walk.plan(later))
-    assert not any(submap.is_mapped for submap in walk.plan(mapper=replace(MAPPER, pipeline={"min_num_matches": 9})))
+    assert not any(submap.is_mapped for submap in walk.plan(mapper=MAPPER.changed(pipeline={"min_num_matches": 9})))
 
 
 def test_a_stretch_where_nothing_is_seen_has_no_model_and_is_done(walk: Walk, tmp_path: Path) -> None:
@@ -177,14 +177,14 @@ def test_a_stretch_where_nothing_is_seen_has_no_model_and_is_done(walk: Walk, tm
     submap.folder.mkdir()
     with pycolmap.Database.open(walk.database) as database:
         database.clear_two_view_geometries()
-    walk.plan(mapper=replace(MAPPER, pipeline={}))
+    walk.plan(mapper=MAPPER.changed(pipeline={}))
     shutil.copy(walk.folder / "submaps" / "000000" / "database.db", submap.database)
     submap.map(SilentProgress())
     assert (submap.is_mapped, submap.models()) == (True, ())
 
 
 def test_a_process_that_fails_is_named_with_what_it_said(walk: Walk) -> None:
-    submaps = walk.plan(mapper=replace(MAPPER, pipeline={"min_num_matches": 16}))
+    submaps = walk.plan(mapper=MAPPER.changed(pipeline={"min_num_matches": 16}))
     submaps[1].database.write_bytes(b"no database")
     with pytest.raises(ReconstructionError, match="submap 000001: COLMAP stopped: "):
         map_submaps(submaps[1:2], 1, SilentProgress())
@@ -199,7 +199,7 @@ def test_whoever_stops_listening_stops_the_processes(walk: Walk, monkeypatch: py
         def update(self, num_done: int, num_total: int | None = None) -> None:
             raise KeyboardInterrupt
 
-    submap = walk.plan(mapper=replace(MAPPER, pipeline={"min_num_matches": 17}))[0]
+    submap = walk.plan(mapper=MAPPER.changed(pipeline={"min_num_matches": 17}))[0]
     with pytest.raises(KeyboardInterrupt):
         map_submaps([submap], 1, Deaf())
     assert not submap.is_mapped
@@ -207,7 +207,8 @@ def test_whoever_stops_listening_stops_the_processes(walk: Walk, monkeypatch: py
 
 
 def test_photos_are_mapped_by_processes_joined_and_taken_over(room: Room, tmp_path: Path, listener: Listener) -> None:
-    mapper = replace(MAPPER, features={"sift": {"max_num_features": 250}}, submap_size=5, submap_overlap=4)
+    few = {"features": {"sift": {"max_num_features": 250}}, "submap_size": 5, "submap_overlap": 4}
+    mapper = MAPPER.model_copy(update=few)  # smaller than they may be, for few photos
     made = reconstruct(room.folder, room.names, tmp_path, camera=room.camera, mapper=mapper, progress=listener)
     assert (len(made.models), made.num_registered) == (1, 6)
     assert listener.messages == ["mapping: 2 submaps of 5 photos"]
@@ -233,13 +234,12 @@ def test_photos_are_mapped_by_processes_joined_and_taken_over(room: Room, tmp_pa
 @pytest.mark.parametrize(
     ("mapper", "said"),
     [
-        (replace(MAPPER, submap_overlap=10), "submap_overlap is 10, expected 3 to 9 of a submap_size of 10"),
-        (replace(MAPPER, submap_overlap=2), "submap_overlap is 2, expected 3 to 9"),
-        (replace(MAPPER, pipeline={"init_image_id1": 3}), "init_image_id1 is of one mapping, expected none beside"),
-        (replace(MAPPER, ranges_in_mapping=True), "ranges_in_mapping is of one mapping, expected none beside"),
+        (MAPPER.changed(submap_overlap=10), "submap_overlap is 10, expected 3 to 9 of a submap_size of 10"),
+        (MAPPER.changed(pipeline={"init_image_id1": 3}), "init_image_id1 is of one mapping, expected none beside"),
+        (MAPPER.changed(ranges_in_mapping=True), "ranges_in_mapping is of one mapping, expected none beside"),
     ],
 )
 def test_options_that_fit_no_submap_are_refused(mapper: MapperOptions, said: str) -> None:
     with pytest.raises(InputError, match=said):
         check_submap_options(mapper)
-    check_submap_options(replace(mapper, submap_size=None))
+    check_submap_options(mapper.changed(submap_size=None))

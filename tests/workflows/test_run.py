@@ -73,7 +73,7 @@ def test_result_and_summary_are_returned_as_written(survey: Survey) -> None:
     assert done.output_path == survey.output.path
     written = ResultSummary.read(survey.output.path / "result.json")
     assert written == done.summary
-    assert done.summary_lines()[0].startswith(f"scale: {done.summary.scale.value:.6g} m per SfM unit")
+    assert done.lines[0].startswith(f"scale: {done.summary.scale.value:.6g} m per SfM unit")
     assert "comparison" not in written.to_json()
 
 

@@ -122,8 +122,7 @@ def _ending(ended: Ended, memory_limit_bytes: int) -> dict[str, Any]:
         raise KilledError(
             f"its process was killed ({ended.signal.name}): by somebody, or by the system for want of memory"
         )
-    how = "its process ended too soon" if ended.signal is None else f"its process crashed ({ended.signal.name})"
-    return _failed(f"{how}: {ended.errors}" if ended.errors else how, _FAILED)
+    return _failed(ended.how, _FAILED)
 
 
 def _failed(message: str, exit_status: int) -> dict[str, Any]:

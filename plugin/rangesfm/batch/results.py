@@ -9,8 +9,8 @@ from rangesfm.batch.course import Course
 from rangesfm.batch.page import render
 from rangesfm.batch.rows import Status, SurveyRow
 from rangesfm.ceres.doctor import versions
-from rangesfm.files.atomic import new_file
-from rangesfm.files.records import write_json
+from rangesfm.files.atomic import write_text
+from rangesfm.files.json_files import write_json
 from rangesfm.files.tables import write_table
 
 TABLE_NAME, JSON_NAME, PAGE_NAME = "batch.csv", "batch.json", "batch.html"
@@ -28,8 +28,7 @@ def write_results(course: Course, folder: Path) -> None:
         "surveys": [row.cells() for row in rows],
     }
     write_json(summary, folder / JSON_NAME)
-    with new_file(folder / PAGE_NAME) as temporary:
-        temporary.write_text(render(course, folder), encoding="utf-8")
+    write_text(render(course, folder), folder / PAGE_NAME)
 
 
 @cache

@@ -14,13 +14,11 @@ from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix, diags
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
+from rangesfm.arrays import Array, Mask
 from rangesfm.ceres import num_columns, tangent_jacobian
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.trajectory import pose_of
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 # A motion of the whole world that changes the residuals by less than this part of what its parts would do alone
 # changes nothing: rounding leaves some 1e-15, a single weak range some 1e-5.

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-Indices = npt.NDArray[np.int64]
+from rangesfm.arrays import Indices
 
 # Of an entry of a sparse factor, in time, against one of a dense factor.
 _SPARSE_SLOWDOWN = 8

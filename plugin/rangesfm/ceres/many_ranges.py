@@ -8,17 +8,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array, Indices
 from rangesfm.ceres.compatibility import check_compatibility
 from rangesfm.ceres.problem import ResidualAdder
 
 if TYPE_CHECKING:
     import pyceres
     import pycolmap
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.ceres.compatibility import check_compatibility
 
 if TYPE_CHECKING:
     import pyceres
     import pycolmap
 
-Array = npt.NDArray[np.float64]
 
 _NUM_POSE_PARAMS = 7
 _NUM_POSE_COLUMNS = 6

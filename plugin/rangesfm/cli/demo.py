@@ -49,4 +49,4 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
         overrides["mapper.num_threads"] = args.num_threads
     survey = read_survey(made.survey_path, overrides)
     result = run_survey(survey, progress=progress, restart=args.restart)
-    return Outcome(result.summary_lines())
+    return Outcome(result.lines)

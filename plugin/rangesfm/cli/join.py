@@ -37,4 +37,4 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     from rangesfm.workflows.join_surveys import join_surveys
 
     folders = [Path(result) for result in args.results]
-    return Outcome(join_surveys(survey, folders, progress=progress).summary_lines())
+    return Outcome(join_surveys(survey, folders, progress=progress).lines)

@@ -38,4 +38,4 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     from rangesfm.workflows.run import refine_model
 
     result = refine_model(survey, progress=progress)
-    return Outcome(result.summary_lines())
+    return Outcome(result.lines)

@@ -44,7 +44,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
         require_model(survey)
     require_ranges(survey)
     if not args.live:
-        return Outcome(_run(survey, progress, args.restart).summary_lines())
+        return Outcome(_run(survey, progress, args.restart).lines)
     from rangesfm.files.sole_writer import sole_writer
     from rangesfm.report.live import live_page
 
@@ -52,7 +52,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
         page.message(f"this run can be watched in {page.path}")
         result = _run(survey, page, args.restart)
         page.finish(survey.output.path / "report.html" if survey.report.enabled else None)
-    return Outcome(result.summary_lines())
+    return Outcome(result.lines)
 
 
 def _run(survey: Survey, progress: Progress, restart: bool) -> RunResult:

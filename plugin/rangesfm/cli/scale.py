@@ -35,4 +35,4 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     from rangesfm.workflows.run import scale_model
 
     result = scale_model(survey, progress=progress)
-    return Outcome(result.summary_lines())
+    return Outcome(result.lines)

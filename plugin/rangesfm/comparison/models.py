@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 from scipy.spatial.transform import Rotation
 
+from rangesfm.arrays import Array
 from rangesfm.colmap.model_files import read_model
 from rangesfm.comparison.ranges import ModelRanges, ranges_of_result
 from rangesfm.comparison.with_reference import MIN_NUM_ALIGNED, reprojection_rms_px
@@ -23,8 +23,6 @@ from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruct
 from rangesfm.result.folder import ResultFolder, read_result_folder
 from rangesfm.result.summary import ResultSummary
 from rangesfm.text_table import align_rows
-
-Array = npt.NDArray[np.float64]
 
 NUM_DISTANCES = 6
 

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.options import AssociationOptions
@@ -23,8 +24,6 @@ from rangesfm.result.ranges_as_used import RangesAsUsed
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.survey.inputs import RangingInputs, times_of_model
 from rangesfm.survey.settings import Survey
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.geometry.reference import Reference, read_reference
 from rangesfm.geometry.similarity import align_points, rmse, similarity_between
@@ -18,8 +18,6 @@ from rangesfm.result.entries import ComparisonRow
 from rangesfm.result.folder import ResultFolder, read_result_folder
 from rangesfm.result.ranges_as_used import RangesAsUsed
 from rangesfm.text_table import align_rows
-
-Array = npt.NDArray[np.float64]
 
 MIN_NUM_ALIGNED = 3
 """Poses from which an alignment says something: two points always fit after Sim(3)."""

@@ -8,11 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-FloatArray = npt.NDArray[np.float64]
+from rangesfm.arrays import Array
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,7 @@ class CameraPath:
     rotation: RotationSpline
 
     @classmethod
-    def through(cls, times_s: FloatArray, centers_m: FloatArray, world_from_cam: FloatArray) -> CameraPath:
+    def through(cls, times_s: Array, centers_m: Array, world_from_cam: Array) -> CameraPath:
         """The smooth path through n poses.
 
         Args:
@@ -44,10 +43,10 @@ class CameraPath:
             float(times_s[0]), float(times_s[-1]), CubicSpline(times_s, centers_m), RotationSpline(times_s, rotations)
         )
 
-    def centers(self, times_s: FloatArray) -> FloatArray:
+    def centers(self, times_s: Array) -> Array:
         """(n, 3) projection centres in the world, metres."""
         return np.asarray(self.position(times_s))
 
-    def world_from_cam(self, times_s: FloatArray) -> FloatArray:
+    def world_from_cam(self, times_s: Array) -> Array:
         """(n, 3, 3) rotations."""
         return np.asarray(self.rotation(times_s).as_matrix())

@@ -8,10 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.demo.path import CameraPath
 from rangesfm.ranging.log import RangeLog
-
-FloatArray = npt.NDArray[np.float64]
 
 # A radio cannot measure less than this; the log's ranges are positive.
 _MIN_RANGE_M = 0.01
@@ -54,15 +53,15 @@ class SimulatedRanges:
     """
 
     log: RangeLog
-    image_time_s: FloatArray
-    distance_m: FloatArray
+    image_time_s: Array
+    distance_m: Array
     is_obstructed: npt.NDArray[np.bool_]
 
 
 def simulate_ranges(
     path: CameraPath,
-    anchors_m: Mapping[str, Sequence[float] | FloatArray],
-    tag_in_cam_m: Sequence[float] | FloatArray,
+    anchors_m: Mapping[str, Sequence[float] | Array],
+    tag_in_cam_m: Sequence[float] | Array,
     radio: Radio,
     seed: int = 0,
 ) -> SimulatedRanges:
@@ -83,10 +82,10 @@ def simulate_ranges(
 
 
 def measure_ranges(
-    times_s: FloatArray,
-    tags_m: FloatArray,
+    times_s: Array,
+    tags_m: Array,
     anchor_index: npt.NDArray[np.int64],
-    anchors_m: Mapping[str, Sequence[float] | FloatArray],
+    anchors_m: Mapping[str, Sequence[float] | Array],
     radio: Radio,
     seed: int,
 ) -> SimulatedRanges:

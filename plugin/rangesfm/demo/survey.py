@@ -15,18 +15,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from rangesfm.arrays import Array
 from rangesfm.demo.path import CameraPath
 from rangesfm.demo.ranges import Radio, SimulatedRanges, simulate_ranges
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import LEFTOVER, new_file, new_folder
+from rangesfm.files.atomic import LEFTOVER, new_folder, write_text
 from rangesfm.files.sole_writer import LOCK_NAME, sole_writer
 from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.ranging.readers.canonical import write_ranges_csv
-
-FloatArray = npt.NDArray[np.float64]
 
 PHOTOS = Path(__file__).with_name("photos")
 PATH_FILE = PHOTOS / "path.csv"
@@ -73,9 +71,9 @@ class DemoSurvey:
 
     folder: Path
     image_names: tuple[str, ...]
-    timestamps_s: FloatArray
-    centers_m: FloatArray
-    world_from_cam: FloatArray
+    timestamps_s: Array
+    centers_m: Array
+    world_from_cam: Array
     ranges: SimulatedRanges
 
     @property
@@ -107,10 +105,10 @@ def make_demo_survey(folder: Path, *, num_photos: int = 40, seed: int = 0) -> De
             for name in survey.image_names:
                 shutil.copyfile(PHOTOS / name, images / name)
         write_ranges_csv(survey.ranges.log, folder / "uwb.csv")
-        _write_text(folder / "anchors.csv", _anchor_file(seed))
+        write_text(_anchor_file(seed), folder / "anchors.csv")
         write_reference(Reference(survey.centers_m, image_names=survey.image_names), folder / "reference.csv")
         # Last: where it is, all is.
-        _write_text(survey.survey_path, text)
+        write_text(text, survey.survey_path)
     return survey
 
 
@@ -194,8 +192,3 @@ path = "out"
 
 def _listed(values: tuple[float, ...]) -> str:
     return ", ".join(f"{value:g}" for value in values)
-
-
-def _write_text(path: Path, text: str) -> None:
-    with new_file(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.ranging.errors.noise import shared_stddev
 from rangesfm.ranging.log import RangeLog
-
-Array = npt.NDArray[np.float64]
 
 # Stddev of a median over that of a mean.
 _MEDIAN_OVER_MEAN = 1.2533

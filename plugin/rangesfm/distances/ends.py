@@ -9,10 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from rangesfm.arrays import Array
 from rangesfm.distances.tape import CHECK, Marker, Tape, TapedDistance
 from rangesfm.errors import InputError
-
-Array = npt.NDArray[np.float64]
 
 # Marks of one point further from it than this share of the photo's size are of different points.
 _MAX_REPROJECTION = 0.02

@@ -8,20 +8,22 @@ from typing import TYPE_CHECKING
 
 from rangesfm.errors import InputError
 from rangesfm.export.apply import apply_to, best_similarity
-from rangesfm.export.colmap import write_model
+from rangesfm.export.colmap import write_model, write_positions, write_transform
 from rangesfm.export.features import write_features
 from rangesfm.export.frames import in_frame
-from rangesfm.export.kitti import write_kitti
 from rangesfm.export.las import write_laz
 from rangesfm.export.metric_map import MetricMap
-from rangesfm.export.model_aligner import write_positions
 from rangesfm.export.nerfstudio import write_nerfstudio
 from rangesfm.export.opensfm import write_opensfm
 from rangesfm.export.opf import write_opf
 from rangesfm.export.ply import write_anchors, write_cameras, write_points
-from rangesfm.export.pose_covariance import COVARIANCE_FORMATS, write_kitti_covariance, write_tum_covariance
-from rangesfm.export.transform import write_transform
-from rangesfm.export.tum import write_trajectory
+from rangesfm.export.trajectories import (
+    COVARIANCE_FORMATS,
+    write_kitti,
+    write_kitti_covariance,
+    write_trajectory,
+    write_tum_covariance,
+)
 from rangesfm.export.undistorted import write_undistorted
 from rangesfm.files.atomic import make_output_folder
 from rangesfm.options import ExportOptions
@@ -29,7 +31,7 @@ from rangesfm.options import ExportOptions
 if TYPE_CHECKING:
     import pycolmap
 
-    from rangesfm.export.metric_map import Array
+    from rangesfm.arrays import Array
     from rangesfm.geometry.similarity import Similarity
 
 __all__ = [

@@ -6,7 +6,6 @@ splatting) and COLMAP models.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,14 +13,14 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from rangesfm.arrays import Array
 from rangesfm.colmap.model_files import read_model
 from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
 from rangesfm.export.colmap import write_model
-from rangesfm.export.metric_map import Array
 from rangesfm.export.ply_transform import transform_ply
-from rangesfm.files.atomic import make_output_folder, new_file
-from rangesfm.files.json_files import read_json
+from rangesfm.files.atomic import make_output_folder, write_text
+from rangesfm.files.json_files import read_json, write_json
 from rangesfm.files.tables import read_text
 from rangesfm.geometry.similarity import Similarity, align_points, overflow_raised, rmse
 
@@ -96,8 +95,7 @@ def _transform_obj(path: Path, metric_from_sfm: Similarity, target: Path) -> Pat
                 raise InputError(f"'{line[:60]}' is no vertex, expected three numbers", path, number) from None
             line = " ".join([words[0], *(f"{value:.10g}" for value in moved), *words[4:]])
         lines.append(line)
-    with new_file(target) as temporary:
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text("\n".join(lines) + "\n", target)
     return target
 
 
@@ -108,10 +106,7 @@ def _transform_json(path: Path, metric_from_sfm: Similarity, target: Path) -> Pa
             _move_cameras(content, metric_from_sfm, path)
     except (ArithmeticError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"a camera is not as expected ({error!r})", path) from error
-    with new_file(target) as temporary:
-        temporary.write_text(
-            json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8", errors="backslashreplace"
-        )
+    write_json(content, target)
     return target
 
 

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.export.metric_map import Array, MetricMap
+from rangesfm.export.metric_map import MetricMap
 from rangesfm.files.atomic import new_file
 from rangesfm.geometry.georeference import GEOGRAPHIC
 

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
-from rangesfm.export.metric_map import Array, MetricMap
+from rangesfm.export.metric_map import MetricMap
 from rangesfm.geometry.georeference import check_crs, georeference_of_anchor
 from rangesfm.geometry.similarity import Similarity, path_shape
 from rangesfm.geometry.trajectory import Trajectory

@@ -1,4 +1,4 @@
-"""MetricMap: all that an exporter may need."""
+"""What exporters share: the map with all that they may need, and parts of a camera that programs name one by one."""
 
 from __future__ import annotations
 
@@ -7,15 +7,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
 import pycolmap
 
+from rangesfm.arrays import Array
 from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -47,3 +44,9 @@ class MetricMap:
     @cached_property
     def trajectory(self) -> Trajectory:
         return trajectory_from_reconstruction(self.reconstruction, self.timestamps_s)
+
+
+def distortion_params(camera: pycolmap.Camera) -> list[float]:
+    """The parameters that are neither focal lengths nor principal point, in COLMAP's order."""
+    others = {*camera.focal_length_idxs(), *camera.principal_point_idxs()}
+    return [float(value) for index, value in enumerate(camera.params) if index not in others]

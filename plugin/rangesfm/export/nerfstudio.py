@@ -6,18 +6,17 @@ what it reads unless it is told not to (``--auto-scale-poses False --center-meth
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.export.intrinsics import distortion_params
-from rangesfm.export.metric_map import Array, MetricMap
+from rangesfm.export.metric_map import MetricMap, distortion_params
 from rangesfm.export.ply import write_points
-from rangesfm.files.atomic import new_file
+from rangesfm.files.json_files import write_json
 
 _POINTS_NAME = "transforms_points.ply"
 # By COLMAP's camera model: nerfstudio's name, and what the parameters after focal lengths and principal point are.
@@ -49,8 +48,7 @@ def write_nerfstudio(map_: MetricMap, folder: Path) -> Path:
         "frames": [_frame(map_.reconstruction.cameras[image.camera_id], image) for image in images],
     }
     path = folder / "transforms.json"
-    with new_file(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    write_json(content, path)
     return path
 
 

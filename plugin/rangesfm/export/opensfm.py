@@ -5,7 +5,6 @@ OpenSfM measures in photos in units of their longer side, from the photo's middl
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,8 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
-from rangesfm.export.intrinsics import distortion_params
-from rangesfm.export.metric_map import MetricMap
-from rangesfm.files.atomic import new_file
+from rangesfm.export.metric_map import MetricMap, distortion_params
+from rangesfm.files.json_files import write_json
 
 # By COLMAP's camera model: OpenSfM's projection, and the names of the distortion parameters.
 _PROJECTIONS = {
@@ -49,8 +47,7 @@ def write_opensfm(map_: MetricMap, path: Path) -> Path:
             "longitude": origin.lon_deg,
             "altitude": origin.height_m,
         }
-    with new_file(path) as temporary:
-        temporary.write_text(json.dumps([reconstruction], indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    write_json([reconstruction], path)
     return path
 
 

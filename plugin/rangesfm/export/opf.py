@@ -7,7 +7,6 @@ constraint with the uncertainty of the scale: a program that maps the same photo
 from __future__ import annotations
 
 import hashlib
-import json
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ import pycolmap
 from rangesfm.errors import InputError
 from rangesfm.export.metric_map import MetricMap
 from rangesfm.files.atomic import new_folder
+from rangesfm.files.json_files import write_json
 
 _NUM_CONSTRAINTS = 10
 _MIN_TRACK_LENGTH = 3
@@ -48,7 +48,7 @@ def write_opf(map_: MetricMap, folder: Path) -> Path:
     }
     with new_folder(folder) as temporary:
         for name, content in files.items():
-            (temporary / name).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+            write_json(content, temporary / name)
     return folder
 
 

@@ -10,10 +10,9 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from rangesfm.arrays import Array
 from rangesfm.files.atomic import new_file
 from rangesfm.geometry.trajectory import Trajectory
-
-Array = npt.NDArray[np.float64]
 
 CAMERA_COLOR = (37, 99, 235)
 ANCHOR_COLOR = (162, 28, 175)

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import new_file
 from rangesfm.geometry.similarity import Similarity, overflow_raised
 
-Array = npt.NDArray[np.float64]
 Vertices = npt.NDArray[np.void]
 
 _CODES = {

@@ -1,4 +1,4 @@
-"""JSON read strictly."""
+"""JSON, read strictly and written so."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rangesfm.errors import InputError
+from rangesfm.files.atomic import write_text
 from rangesfm.files.tables import read_text
 
 
@@ -25,6 +26,14 @@ def read_json(path: Path) -> Any:
         raise InputError("not JSON that can be read: nested too deeply", path) from None
     except ValueError as error:  # numbers that Python refuses
         raise InputError(f"not JSON: {error}", path) from None
+
+
+def write_json(value: Any, path: Path) -> None:
+    """Write plain values.
+
+    Of paths that are no UTF-8, what is none becomes JSON's own escapes, by which they are read as they were.
+    """
+    write_text(json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n", path)
 
 
 def _whole(text: str) -> int:

@@ -10,8 +10,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, InstanceOf, Strict, ValidationError
 
 from rangesfm.errors import InputError, one_line
-from rangesfm.files.atomic import new_file
-from rangesfm.files.json_files import read_json
+from rangesfm.files.json_files import read_json, write_json
 
 _Kind = TypeVar("_Kind", bound="Record")
 _MAX_SHOWN = 60
@@ -99,13 +98,3 @@ def _what_is_wrong(error: ValidationError) -> str:
         expected = expected.removeprefix(prefix)
     found = one_line(json.dumps(first["input"]))
     return f"'{key}' is {found[:_MAX_SHOWN]}{'...' * (len(found) > _MAX_SHOWN)}, expected {expected}"
-
-
-def write_json(value: Any, path: Path) -> None:
-    """Write plain values.
-
-    Of paths that are no UTF-8, what is none becomes JSON's own escapes, by which they are read as they were.
-    """
-    with new_file(path) as temporary:
-        text = json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False)
-        temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")

@@ -12,15 +12,14 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 
 if TYPE_CHECKING:
     from pyproj import Transformer
 
-Array = npt.NDArray[np.float64]
 
 GEOGRAPHIC = "EPSG:4979"
 """WGS 84: longitude and latitude in degrees, ellipsoidal height in metres; always in this order here."""

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from rangesfm.arrays import Array
 from rangesfm.geometry.rotations import cross_matrices
-
-Array = npt.NDArray[np.float64]
 
 UP_IN_SITE = np.array([0.0, 0.0, 1.0])
 # A camera that somebody held level, or a phone's accelerometer.

@@ -10,11 +10,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation, Slerp
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
 from rangesfm.files.tables import Table, header_names, read_head, read_table, read_text, write_table
 from rangesfm.geometry.trajectory import ROUNDING_S, Trajectory
-
-Array = npt.NDArray[np.float64]
 
 POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")

@@ -42,6 +42,12 @@ class Ended:
     stopped: bool
     errors: str
 
+    @property
+    def how(self) -> str:
+        """In words, of one that did not say it itself."""
+        how = "its process ended too soon" if self.signal is None else f"its process was ended ({self.signal.name})"
+        return f"{how}: {self.errors}" if self.errors else how
+
 
 def child_command(module: str) -> list[str]:
     """Of a module that works for its parent (``child_process``)."""

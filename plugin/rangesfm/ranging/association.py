@@ -9,6 +9,7 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
+from rangesfm.arrays import Array, Mask
 from rangesfm.errors import InputError
 from rangesfm.geometry.trajectory import ROUNDING_S, Trajectory
 from rangesfm.options import AssociationOptions
@@ -16,9 +17,6 @@ from rangesfm.ranging.clock.time_resolution import time_resolution_s
 from rangesfm.ranging.errors.noise import robust_stddev
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 # A spline through every second keyframe misses the others by up to this many times what one
 # through all keyframes misses in between: 16 for a smooth path (the error grows with the

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Indices
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
-
-Indices = npt.NDArray[np.int64]
 
 
 def each_on_one_path(parts: Sequence[RangeObservations]) -> list[RangeObservations]:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from rangesfm.arrays import Array
 
 _TINY_DISTANCE_M = 1e-9
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
 from rangesfm.geometry.reference import Reference
 from rangesfm.ranging.log import RangeLog
-
-Array = npt.NDArray[np.float64]
 
 
 def tag_positions(

@@ -8,10 +8,10 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
 from rangesfm import ceres
+from rangesfm.arrays import Array
 from rangesfm.ceres.linear_solver import max_num_images_direct, overlaps_in
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import SolverError
@@ -19,8 +19,6 @@ from rangesfm.geometry.trajectory import pose_of
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.errors.noise import robust_stddev
 from rangesfm.refine.stillness import Stillness, farthest, keyframe_centers
-
-Array = npt.NDArray[np.float64]
 
 # Ceres' default of 1e4 damps the scale, which all poses share, so strongly that it creeps and is then taken for
 # converged; 1e8 does the same to the bends of a path of 2000 keyframes.

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 from scipy import sparse
 from scipy.spatial.transform import Rotation
 
+from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.refine.vision_information import (
     Observations,
@@ -16,9 +16,6 @@ from rangesfm.refine.vision_information import (
     ray_residuals,
     robust_root_weights,
 )
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 _NUM_ROUNDS = 5
 

@@ -6,18 +6,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
 from rangesfm import ceres
+from rangesfm.arrays import Array
 from rangesfm.distances.ends import LocatedDistances, images_by_name, triangulate_markers
 from rangesfm.distances.tape import Tape
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.refine.bundle_adjustment import BundleAdjustment
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

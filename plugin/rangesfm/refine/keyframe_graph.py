@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial.transform import Rotation
 
+from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import rounding_of
@@ -24,9 +24,6 @@ from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.refine.antennas import Antennas
 from rangesfm.refine.vision_information import Poses, VisionInformation
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 _MAX_NUM_STEPS = 60
 _INITIAL_DAMPING = 1e-8

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pycolmap
 
 from rangesfm import ceres
+from rangesfm.arrays import Array
 from rangesfm.ceres.covariance import ResidualErrors
 from rangesfm.geometry.gravity import UP_IN_SITE, Gravity
 from rangesfm.geometry.trajectory import pose_of
@@ -20,8 +21,6 @@ from rangesfm.refine.bundle_adjustment import BundleAdjustment, bundle_adjustmen
 from rangesfm.refine.distances import MeasuredDistances, add_distances
 from rangesfm.refine.radio import RadioBlocks, RadioEstimate, RadioRanges, add_radio_priors, add_ranges
 from rangesfm.refine.residual_errors import residual_errors
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import pycolmap
 
 from rangesfm import ceres
+from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory, pose_of
 from rangesfm.options import RefineOptions
@@ -20,9 +21,6 @@ from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.refine.antennas import Antennas, antennas
 from rangesfm.refine.bundle_adjustment import BundleAdjustment
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)

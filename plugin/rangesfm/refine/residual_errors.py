@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import csr_matrix, hstack
 
+from rangesfm.arrays import Array, Indices
 from rangesfm.ceres.covariance import ResidualErrors
 from rangesfm.ranging.errors.noise import inflation_before_fit
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.errors.robust_loss import RobustLoss
 from rangesfm.ranging.errors.shared_errors import antenna_modes, curve_modes
 from rangesfm.ranging.range_gradient import RangeGradient
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 # Of the loss, where most ranges are outliers and the mean says nothing.
 _MIN_CURVATURE = 0.3

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 from scipy.spatial.transform import Rotation
 
 from rangesfm import ceres
+from rangesfm.arrays import Array
 from rangesfm.geometry.trajectory import pose_of
-
-Array = npt.NDArray[np.float64]
 
 # Damping by a smaller one is felt.
 _FREE_TRUST_REGION_RADIUS = 1e8

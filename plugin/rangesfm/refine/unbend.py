@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pycolmap
 from scipy.spatial.transform import Rotation
 
+from rangesfm.arrays import Array
 from rangesfm.colmap.transform import transform
 from rangesfm.geometry.similarity import Similarity, align_points, are_apart, rmse
 from rangesfm.geometry.trajectory import pose_of
@@ -26,9 +27,6 @@ from rangesfm.refine.keyframe_graph import (
 )
 from rangesfm.refine.problem import RefinementProblem
 from rangesfm.refine.vision_information import Observations, Poses, model_poses, vision_information
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 _MAX_NUM_ROUNDS = 12
 # Relative; the noise itself is not known better from some hundred ranges.

@@ -16,12 +16,10 @@ import numpy.typing as npt
 import pycolmap
 from scipy import sparse
 
+from rangesfm.arrays import Array, Indices
 from rangesfm.errors import SolverError
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.trajectory import pose_of
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 # A long track is cut into overlapping pieces: what lies further apart hangs together through what is between.
 _MAX_PIECE = 8

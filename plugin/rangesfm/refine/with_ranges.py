@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from rangesfm.arrays import Array
 from rangesfm.ceres.covariance import JointCovariance, joint_covariance
 from rangesfm.ceres.linear_solver import inverse_is_affordable, overlaps_in
 from rangesfm.distances.by_radio import distances_by_radio
@@ -32,8 +33,6 @@ from rangesfm.refine.problem import AddedBlocks, RefinementProblem
 from rangesfm.refine.radio import RadioEstimate, RadioRanges
 from rangesfm.refine.unbend import SAME_ERRORS, Unbent, unbend
 from rangesfm.refine.vision_information import model_observations, model_poses, points_in_cameras
-
-Array = npt.NDArray[np.float64]
 
 # Solutions of the full problem, with the weights of ranges and pixels estimated anew in between.
 _MAX_NUM_ROUNDS = 3

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.report.true_ranges import true_ranges_m
 from rangesfm.result.folder import ResultFolder
@@ -22,7 +23,6 @@ from rangesfm.result.tables import ScaleBootstrap, ScaleCandidates, ScaleConsens
 if TYPE_CHECKING:
     import pycolmap
 
-Array = npt.NDArray[np.float64]
 
 DEFAULT_FOLDER = "out"
 

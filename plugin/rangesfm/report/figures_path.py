@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.geometry.similarity import align_points
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.report.content import Content
 from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Panel, Pixels, Range, Series, equal_view
 from rangesfm.report.text import count
-
-Array = npt.NDArray[np.float64]
 
 MAX_NUM_POINTS_DRAWN = 6000
 PICTURE_WIDTH_PX = 900

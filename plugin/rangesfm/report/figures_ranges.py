@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.report.content import Content, in_natural_order
 from rangesfm.report.plot import WIDE_SIZE, Figure, Panel, Series, running_median
 from rangesfm.result.ranges_as_used import RangesAsUsed
-
-Array = npt.NDArray[np.float64]
 
 NUM_HISTOGRAM_BINS = 60
 NUM_MEDIAN_BINS = 48

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from rangesfm.report.content import Content, in_natural_order
 from rangesfm.report.figures_ranges import outline
 from rangesfm.report.plot import WIDE_SIZE, Figure, LegendEntry, Mark, Panel, Series
 from rangesfm.report.text import signed
-
-Array = npt.NDArray[np.float64]
 
 NUM_BOOTSTRAP_BINS = 40
 MAX_NUM_CANDIDATES = 3000

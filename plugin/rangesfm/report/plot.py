@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from rangesfm.arrays import Array
+
 Pixels = npt.NDArray[np.uint8]
 Range = tuple[float, float]
 

@@ -6,14 +6,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.report.content import Content
 from rangesfm.report.scene import Scene, SceneAnchor, ScenePath
 from rangesfm.result.summary import ResultSummary
-
-Array = npt.NDArray[np.float64]
 
 
 def scene_of(content: Content) -> Scene | None:

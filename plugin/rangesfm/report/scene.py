@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.report.thumbnails import thumbnails
 from rangesfm.result.ranges_as_used import RangesAsUsed
-
-Array = npt.NDArray[np.float64]
 
 MAX_NUM_POINTS = 500_000
 MAX_NUM_RANGES = 20_000

@@ -8,14 +8,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from markupsafe import Markup
 
+from rangesfm.arrays import Array
 from rangesfm.report.content import Content, in_natural_order
 from rangesfm.report.text import count, duration, fixed, keyed, plain, signed
 from rangesfm.result.entries import AnchorEntry
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.result.ranges_as_used import RangesAsUsed
-
-Array = npt.NDArray[np.float64]
 
 MAX_KEYFRAME_SHARE = 0.1
 """A range counts as taken at a photo if it is no farther from it, in parts of the way to the next."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import AfterValidator, AliasChoices, AliasPath, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
+from rangesfm.arrays import Array, Mask
 from rangesfm.files.records import Count, Flag, IntervalOrNull, Number, NumberOrNull, Record, Text, Vector, VectorOrNull
 from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.similarity import Similarity
@@ -19,9 +19,6 @@ from rangesfm.ranging.observations import RangeStatus
 from rangesfm.result.metric_result import USED, MetricResult
 from rangesfm.scale.estimate import CutoffTest, ScaleSensitivity, ScaleUncertainty
 from rangesfm.scale.two_candidate import Branch
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 
 def _unit(quaternion: tuple[float, ...]) -> tuple[float, ...]:

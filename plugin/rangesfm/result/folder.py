@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import path_of
 from rangesfm.geometry.reference import Reference, read_reference
@@ -30,7 +30,6 @@ from rangesfm.result.tables import (
 if TYPE_CHECKING:
     import pycolmap
 
-Array = npt.NDArray[np.float64]
 _Table = TypeVar("_Table", bound=TableFile)
 
 TABLES: tuple[type[TableFile], ...] = (

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
+from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
 from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import Trajectory
@@ -19,8 +19,6 @@ from rangesfm.ranging.observations import RangeObservations, RangeStatus
 from rangesfm.refine.with_ranges import RefineSummary
 from rangesfm.scale.diagnostics import ScaleDiagnostics, scale_diagnostics
 from rangesfm.scale.estimate import ScaleEstimate
-
-Array = npt.NDArray[np.float64]
 
 USED = (RangeStatus.USED, RangeStatus.DOWN_WEIGHTED)
 """Of ranges with a say in the final model, however small."""

@@ -8,9 +8,10 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.result.metric_result import USED, MetricResult
-from rangesfm.result.table_file import Array, Numbers, NumbersOrEmpty, RoundedOrEmpty, TableFile, Texts, TextsOrEmpty
+from rangesfm.result.table_file import Numbers, NumbersOrEmpty, RoundedOrEmpty, TableFile, Texts, TextsOrEmpty
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar, get_type_hints
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.files.tables import Table, read_table, write_table
 from rangesfm.result.metric_result import MetricResult
 
-Array = npt.NDArray[np.float64]
 _Kind = TypeVar("_Kind", bound="TableFile")
 _TEXT = "s"
 
@@ -71,7 +70,8 @@ class TableFile:
         path, columns = folder / cls.NAME, cls.columns()
         if not path.is_file():
             return None
-        table = read_table(path, list(columns))
+        texts = [name for name, column in columns.items() if column.format_spec == _TEXT]
+        table = read_table(path, list(columns), text=texts)
         return cls(**{name: _values(table, name, column) for name, column in columns.items()})
 
 

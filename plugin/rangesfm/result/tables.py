@@ -8,8 +8,9 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
+from rangesfm.arrays import Array
 from rangesfm.result.metric_result import MetricResult
-from rangesfm.result.table_file import Array, Column, Numbers, NumbersOrEmpty, Rounded, RoundedOrEmpty, TableFile, Texts
+from rangesfm.result.table_file import Column, Numbers, NumbersOrEmpty, Rounded, RoundedOrEmpty, TableFile, Texts
 
 _Covariance = Annotated[Array, Column(".9g")]
 

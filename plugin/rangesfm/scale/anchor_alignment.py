@@ -7,16 +7,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import Similarity, align_points, path_shape, rmse
 from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.scale.anchor_plane import is_line
-
-Array = npt.NDArray[np.float64]
 
 # Anchors of which triples are tried, the best placed ones: more make it slow, and no better.
 _MAX_NUM_TRIED = 8

@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE
 from rangesfm.scale.range_equation import RangeProblem, RangeState, solve
 from rangesfm.scale.solution import MIN_COST_GAP, Solution
 from rangesfm.scale.starts import anchor_alone, choose_sides, mirrored, spread_subset
-
-Array = npt.NDArray[np.float64]
 
 _MIN_RANGES_ALONE = 8
 _MAX_RANGES_ALONE = 3000

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.gravity import UP_IN_SITE
 from rangesfm.geometry.similarity import PathShape, Similarity, path_shape
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, RangeState
-
-Array = npt.NDArray[np.float64]
 
 # Extent of the anchors across their plane, in widths, below which it is one.
 _COPLANAR = 0.1

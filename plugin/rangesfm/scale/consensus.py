@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import off_origin
 from rangesfm.scale.range_equation import RangeProblem
-
-Array = npt.NDArray[np.float64]
 
 # A range agrees with a scale if it fits to this many stddevs of noise and bias together.
 TOLERANCE_STDDEVS = 2.5

@@ -12,8 +12,6 @@ from rangesfm.scale.range_equation import RangeProblem, solve
 from rangesfm.scale.solution import Solution
 from rangesfm.scale.starts import spread_subset
 
-Array = npt.NDArray[np.float64]
-
 _CUTOFFS_M = (0.0, 1.0, 1.5, 2.0, 2.5, 3.0)
 _MAX_RANGES_PER_ANCHOR = 1000
 _MIN_RANGES_PER_ANCHOR = 20

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.scale.consensus import TOLERANCE_STDDEVS, agreeing_intervals
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.two_candidate import two_candidate
-
-Array = npt.NDArray[np.float64]
 
 NUM_CURVE_POINTS = 601
 CURVE_FACTOR = 3.0

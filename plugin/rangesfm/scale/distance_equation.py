@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.ranging.range_gradient import RangeGradient
-
-Array = npt.NDArray[np.float64]
 
 
 def distance_residuals(distances: LocatedDistances, scale: float, anchors_m: Array) -> Array:

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import Similarity, path_shape, rmse
@@ -19,8 +19,6 @@ from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, RangeState, solve
 from rangesfm.scale.solution import MIN_COST_GAP
 from rangesfm.scale.starts import spread_subset
-
-Array = npt.NDArray[np.float64]
 
 # No range tells better where an anchor is: antennas err by as much.
 _MIN_STDDEV_M = 0.02

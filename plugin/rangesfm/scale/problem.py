@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.distances.by_radio import distances_by_radio
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.distances.surveyed import surveyed_distances
@@ -22,8 +23,6 @@ from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.anchor_plane import is_line, is_steep
 from rangesfm.scale.range_equation import RangeProblem
-
-Array = npt.NDArray[np.float64]
 
 _MIN_RANGES = 8
 _MIN_KEYFRAMES = 4

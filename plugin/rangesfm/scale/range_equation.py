@@ -19,6 +19,7 @@ import numpy.typing as npt
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from rangesfm.arrays import Array
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.rotations import left_jacobian
@@ -27,8 +28,6 @@ from rangesfm.ranging.errors.noise import bias_whitening
 from rangesfm.ranging.errors.robust_loss import CAUCHY, RobustLoss
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.scale.distance_equation import distance_jacobian, distance_residuals
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.scale.estimate import ScaleSensitivity
 from rangesfm.scale.range_equation import predicted_ranges, range_gradient
 from rangesfm.scale.solution import Solution
 from rangesfm.scale.uncertainty import scale_influence
-
-Array = npt.NDArray[np.float64]
 
 _CM = 0.01
 # Of all ranges from one distance, which rounding spreads, none is shorter than the others.

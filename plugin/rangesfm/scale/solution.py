@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from rangesfm.distances.ends import LocatedDistances
@@ -31,8 +30,6 @@ from rangesfm.scale.starts import (
     spread_subset,
     unknown_anchor_starts,
 )
-
-Array = npt.NDArray[np.float64]
 
 _SUBSET_PER_ANCHOR = 300
 _NUM_NOISE_ROUNDS = 3

@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import IDENTITY, Similarity, path_shape, round_middle, rounding_of
 from rangesfm.ranging.anchors.multilateration import multilaterate
@@ -20,8 +20,6 @@ from rangesfm.ranging.errors.noise import robust_stddevs
 from rangesfm.ranging.errors.robust_loss import SAME_COST
 from rangesfm.scale.consensus import consensus_scales
 from rangesfm.scale.range_equation import RangeProblem, RangeState, solve, tag_positions
-
-Array = npt.NDArray[np.float64]
 
 _NUM_SCALES = 80
 _SCALE_SPAN = 200.0

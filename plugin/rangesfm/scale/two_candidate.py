@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.geometry.similarity import off_origin
-
-Array = npt.NDArray[np.float64]
 
 # Of what a discriminant is the difference of: less may be its rounding.
 _ONE_ROOT = 1e-12

@@ -9,13 +9,12 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.ranging.errors.noise import inflation_before_fit
 from rangesfm.ranging.errors.shared_errors import antenna_modes, curve_modes
 from rangesfm.scale.estimate import ScaleUncertainty
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, predicted_ranges, range_gradient
 from rangesfm.scale.solution import Solution
-
-Array = npt.NDArray[np.float64]
 
 # Where most ranges are outliers, so that the curvature says nothing.
 _MIN_CURVATURE = 0.3

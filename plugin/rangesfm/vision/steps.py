@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rangesfm.files.atomic import new_file
+from rangesfm.files.json_files import write_json
 from rangesfm.progress import Progress
 
 
@@ -87,22 +87,12 @@ class Steps:
         self._write()
 
     def _write(self) -> None:
-        with new_file(self._path) as temporary:
-            temporary.write_text(
-                json.dumps({"steps": self._record, "notes": self.notes}, indent=2) + "\n", encoding="utf-8"
-            )
+        write_json({"steps": self._record, "notes": self.notes}, self._path)
 
 
 def _read(path: Path, part: str) -> dict[str, dict[str, Any]]:
     try:
         entries = json.loads(path.read_text(encoding="utf-8"))[part]
         return {str(name): dict(entry) for name, entry in entries.items()}
-    except (
-        OSError,
-        ValueError,
-        AttributeError,
-        TypeError,
-        LookupError,
-        RecursionError,
-    ):  # none yet, or not ours: nothing is known
-        return {}
+    except (OSError, ValueError, AttributeError, TypeError, LookupError, RecursionError):
+        return {}  # none yet, or not ours: nothing is known

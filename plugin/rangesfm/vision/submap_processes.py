@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
 from rangesfm.errors import ReconstructionError
-from rangesfm.processes.supervision import Ended, child_command, supervise
+from rangesfm.processes.supervision import child_command, supervise
 from rangesfm.progress import Progress
 from rangesfm.vision.submaps import Submap
 
@@ -67,15 +67,9 @@ def _map_in_a_process(submap: Submap, tell: Callable[[int], None], stop: threadi
         is_stopped=stop.is_set,
     )
     if "done" not in (ended.last or {}) and not ended.stopped:
-        raise ReconstructionError(f"submap {submap.folder.name}: {_why(ended)}")
+        failed = (ended.last or {}).get("failed")
+        raise ReconstructionError(f"submap {submap.folder.name}: {failed['message'] if failed else ended.how}")
     tell(len(submap.photos.names))
-
-
-def _why(ended: Ended) -> str:
-    if ended.last is not None and "failed" in ended.last:
-        return str(ended.last["failed"]["message"])
-    how = "its process ended too soon" if ended.signal is None else f"its process was ended ({ended.signal.name})"
-    return f"{how}: {ended.errors}" if ended.errors else how
 
 
 def _sharing_threads(submap: Submap, num_at_once: int) -> Submap:

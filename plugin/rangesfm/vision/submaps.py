@@ -56,7 +56,7 @@ class Submap:
 
     def with_threads(self, num_threads: int) -> Submap:
         """The same, mapped with so many threads."""
-        return replace(self, mapper=self.mapper.changed(num_threads=num_threads))
+        return replace(self, mapper=self.mapper.model_copy(update={"num_threads": num_threads}))
 
     def models(self) -> tuple[pycolmap.Reconstruction, ...]:
         """Those that its photos gave, with the ids of the whole survey's database; there may be none."""
@@ -105,7 +105,7 @@ def check_submap_options(mapper: MapperOptions) -> None:
     """Raises InputError for sizes that do not fit together, and options of pycolmap that fit no submap."""
     if mapper.submap_size is None:
         return
-    if not 3 <= mapper.submap_overlap < mapper.submap_size:
+    if mapper.submap_overlap >= mapper.submap_size:
         found = f"[mapper] submap_overlap is {mapper.submap_overlap}"
         raise OptionError(
             f"{found}, expected 3 to {mapper.submap_size - 1} of a submap_size of {mapper.submap_size}",

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.join.models import PathOfModel
@@ -19,8 +20,6 @@ from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.result.folder import ResultFolder, read_result_folder
 from rangesfm.result.ranges_as_used import RangesAsUsed
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -40,9 +40,6 @@ class RunResult:
     summary: ResultSummary
     lines: tuple[str, ...]
 
-    def summary_lines(self) -> list[str]:
-        return list(self.lines)
-
 
 def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, journal: Journal) -> RunResult:
     """All files of the result, ``result.json`` after all others, and the report on them."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import new_file
-from rangesfm.files.tables import Table, read_table
+from rangesfm.files.tables import Table, read_table, write_table
 from rangesfm.ranging.anchors.anchor import Anchor
 
 _COORDINATES = ("x_m", "y_m", "z_m")
@@ -56,10 +54,7 @@ def write_anchors(anchors: Sequence[Anchor], path: str | Path) -> None:
         InputError: the file cannot be written.
     """
     try:
-        with new_file(Path(path)) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(["anchor_id", *_COORDINATES, *_OPTIONAL])
-            writer.writerows(map(_row, anchors))
+        write_table(Path(path), ["anchor_id", *_COORDINATES, *_OPTIONAL], map(_row, anchors))
     except OSError as error:
         raise InputError(f"cannot be written ({error.strerror})", path) from error
 

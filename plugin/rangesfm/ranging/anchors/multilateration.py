@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.geometry.similarity import path_shape
 from rangesfm.ranging.errors.noise import robust_stddev
-
-Array = npt.NDArray[np.float64]
 
 
 def multilaterate(positions: Array, ranges: Array) -> tuple[Array, Array]:

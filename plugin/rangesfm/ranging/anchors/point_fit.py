@@ -13,13 +13,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
 
+from rangesfm.arrays import Array
 from rangesfm.geometry.similarity import path_shape
 from rangesfm.ranging.anchors.multilateration import multilaterate
 from rangesfm.ranging.errors.inlier_noise import inlier_noise
 from rangesfm.ranging.errors.robust_loss import CAUCHY, RobustLoss
 from rangesfm.ranging.range_gradient import RangeGradient
-
-Array = npt.NDArray[np.float64]
 
 _CONVERGED = 1e-13
 # Of a search: as many ranges and directions of starts, widths of the loss in units, and how far apart places are two.

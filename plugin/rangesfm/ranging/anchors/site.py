@@ -6,13 +6,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.geometry.georeference import Georeference, georeference_at
 from rangesfm.ranging.anchors.anchor import Anchor
-
-Array = npt.NDArray[np.float64]
 
 # Anchors further from their origin are moved there: least squares lose digits to large coordinates.
 _FAR_M = 1000.0

@@ -10,14 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import PathShape, oriented, path_shape
 from rangesfm.ranging.anchors.point_fit import PointProblem, best_start, improve
 from rangesfm.ranging.errors.inlier_noise import inlier_noise
 from rangesfm.ranging.errors.noise import correlation_inflation, inflation_before_fit, short_range_stddev
 from rangesfm.ranging.errors.robust_loss import CAUCHY, GEMAN_MCCLURE, SAME_COST
-
-Array = npt.NDArray[np.float64]
 
 # Three numbers, and one range more to see that they fit.
 MIN_NUM_RANGES = 4

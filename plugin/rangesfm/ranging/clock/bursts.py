@@ -9,12 +9,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import f as f_distribution
 
+from rangesfm.arrays import Array
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.clock.curve import CostCurve
 from rangesfm.ranging.clock.search import TimedRanges
 from rangesfm.ranging.clock.squares import MIN_RESIDUAL_M, fit_squares
 
-Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64]
 
 # Shares of the usual time between photos: a pause this long ends a burst; a photo's burst is this near.

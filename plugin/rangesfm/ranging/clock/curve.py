@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.ranging.clock.fit import OffsetFit, fit_at_offset
 from rangesfm.ranging.clock.path import PathSamples
 from rangesfm.ranging.clock.search import OffsetCurve, TimedRanges, ranges_on_path
-
-Array = npt.NDArray[np.float64]
 
 _NUM_COARSE = 160
 _NUM_FINE = 81

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import AssociationOptions
@@ -20,8 +21,6 @@ from rangesfm.ranging.clock.path import PathSamples, moving_path
 from rangesfm.ranging.clock.search import TimedRanges, ranges_on_path, scan_offsets
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.observations import RangeStatus
-
-Array = npt.NDArray[np.float64]
 
 _REMEDY = "give the time offset (--ranges_time_offset)"
 _MIN_NUM_KEYFRAMES = 4

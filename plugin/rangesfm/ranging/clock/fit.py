@@ -10,11 +10,10 @@ import numpy.typing as npt
 from scipy.stats import norm
 from scipy.stats import t as student
 
+from rangesfm.arrays import Array
 from rangesfm.ranging.clock.path import PathSamples
 from rangesfm.ranging.clock.search import TimedRanges
 from rangesfm.ranging.clock.squares import MIN_RESIDUAL_M, SquaresFit, fit_squares, residual_stddev, rows_by_anchor
-
-Array = npt.NDArray[np.float64]
 
 _MAX_NUM_STEPS = 12
 _MAX_STEP_S = 1.0

@@ -16,11 +16,10 @@ import numpy.typing as npt
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.ndimage import maximum_filter1d
 
+from rangesfm.arrays import Array
 from rangesfm.geometry.similarity import rounding_of
 from rangesfm.ranging.clock.path import PathSamples
 from rangesfm.ranging.clock.squares import MIN_RANGE_M
-
-Array = npt.NDArray[np.float64]
 
 # An offset that puts fewer ranges on the path than this share of the most possible is not tried.
 _MIN_COVERAGE = 0.5

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.ranging.errors.noise import robust_stddev
 
-Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64]
 
 # Ranges shorter than this say as little of the squared distance as one of this length.

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.error_curve import ErrorCurve
@@ -15,8 +16,6 @@ from rangesfm.ranging.errors.noise import correlation_inflation, robust_stddev
 from rangesfm.ranging.errors.range_errors import fit_with_own_errors
 from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.ranging.log import RangeLog
-
-Array = npt.NDArray[np.float64]
 
 # Knots a sixth of an e-fold apart follow every curve that antennas and received power make.
 _LOG_SPACING = 1 / 6

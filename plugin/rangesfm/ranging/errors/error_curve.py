@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import new_file
-from rangesfm.files.tables import Table, read_table
+from rangesfm.files.tables import Table, read_table, write_table
 from rangesfm.ranging.log import RangeLog
-
-Array = npt.NDArray[np.float64]
 
 COLUMNS = ("distance_m", "error_m", "stddev_m", "noise_stddev_m")
 # How fast a curve may run away beyond where it was learnt, for each e-fold of distance. The DW1000's own
@@ -74,10 +71,7 @@ def correct_ranges(log: RangeLog, curve: ErrorCurve) -> tuple[RangeLog, list[str
 def write_error_curve(curve: ErrorCurve, path: str | Path) -> None:
     """Write ``distance_m,error_m,stddev_m,noise_stddev_m``."""
     rows = np.column_stack([curve.distance_m, curve.error_m, curve.stddev_m, curve.noise_stddev_m])
-    with new_file(Path(path)) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        writer.writerows([f"{value:.5f}" for value in row] for row in rows.tolist())
+    write_table(Path(path), COLUMNS, ([f"{value:.5f}" for value in row] for row in rows.tolist()))
 
 
 def read_error_curve(path: str | Path) -> ErrorCurve:

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.ranging.errors.noise import robust_stddev
-
-Array = npt.NDArray[np.float64]
 
 _MAX_NUM = 4000
 _NUM_ROUNDS = 60

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.errors.noise import robust_stddev
 from rangesfm.ranging.errors.range_errors import RangeErrors
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 # Median block residuals beyond this many stddevs are no noise.
 _MAX_BLOCK_STDDEVS = 3.0

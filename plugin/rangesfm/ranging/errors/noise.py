@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.ranging.log import RangeLog
-
-Array = npt.NDArray[np.float64]
 
 # Radios read up to 0.15 m short below about 2 m, every anchor alike, by an amount that depends
 # on the antennas (Decawave application note APS011). An error common to all short ranges does

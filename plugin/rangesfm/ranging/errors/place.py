@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.errors.noise import NO_ERROR
 from rangesfm.ranging.errors.robust_loss import RobustLoss
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 # Some wavelengths: the echoes that meet the direct path change at that scale. On real logs, anything from 0.1 to 0.5 m
 # gives scales within 0.7 % of each other.

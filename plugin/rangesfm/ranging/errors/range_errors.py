@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.errors.inlier_noise import InlierNoise, inlier_noise
 from rangesfm.ranging.errors.noise import (
@@ -22,9 +23,6 @@ from rangesfm.ranging.errors.place import place_labels, shares_by_residuals
 from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE, RobustLoss
 from rangesfm.ranging.observations import RangeObservations
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
-Mask = npt.NDArray[np.bool_]
 _Errors = TypeVar("_Errors")
 _Fit = TypeVar("_Fit")
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from rangesfm.arrays import Array
 
 # Costs that two fits have alike, but for rounding and a solver's last step, differ by less.
 SAME_COST = 1e-6

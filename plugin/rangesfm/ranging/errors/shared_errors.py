@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.ranging.log import RangeLog
-
-Array = npt.NDArray[np.float64]
 
 # How wrong a radio's range may be as a smooth function of distance, where no error curve was learnt: the DW1000's
 # own error changes by 0.05 to 0.1 m when the distance grows e-fold (Decawave application note APS011), in either

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import new_file
-from rangesfm.files.tables import header_names, read_head
+from rangesfm.files.tables import header_names, read_head, write_table
 from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.columns import Columns, read_columns
 from rangesfm.ranging.readers.reader import Reader, ReadOptions
@@ -48,10 +46,7 @@ def write_ranges_csv(log: RangeLog, path: str | Path) -> None:
     if np.any(log.los >= 0):
         columns["los"] = ("" if los < 0 else str(los) for los in log.los)
     try:
-        with new_file(Path(path)) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(columns)
-            writer.writerows(zip(*columns.values()))
+        write_table(Path(path), [*columns], zip(*columns.values()))
     except OSError as error:
         raise InputError(f"cannot be written ({error.strerror})", path) from error
 

@@ -3,38 +3,12 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
-from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.readers.host_time import HostClock
-from rangesfm.ranging.readers.printed import check_only_time_is_described, numbered_lines
-from rangesfm.ranging.readers.reader import Reader, ReadOptions
+from rangesfm.ranging.readers.printed import printed_reader
 from rangesfm.ranging.readers.records import Records
 from rangesfm.ranging.readers.roles import Sides
 
-_BEGIN = re.compile(r"AT\+RANGE=tid:")
-_RECORD = re.compile(
-    r"AT\+RANGE=tid:(?P<tag_id>\d{1,9}),mask:(?P<mask>[0-9A-Fa-f]{1,16}),seq:\d{1,9},"
-    r"range:\((?P<range>-?\d{1,9}(?:,-?\d{1,9}){0,63})\)(?:,rssi:\([^()]{0,999}\))?"
-    r"(?P<rest>,ancid:(?:\((?P<anchor_id>-?\d{1,9}(?:,-?\d{1,9}){0,63})\))?)?",
-    re.ASCII,
-)
-
-
-def _read(path: Path, options: ReadOptions) -> RangeLog:
-    check_only_time_is_described(path, options)
-    clock = HostClock(path, options)
-    records = Records()
-    for line, text in numbered_lines(path):
-        begin = _BEGIN.search(text)
-        if begin is None:
-            continue
-        timestamp_s = clock.seconds(text[: begin.start()], line)
-        whole = list(_RECORD.finditer(text))
-        for record in whole:
-            _add(records, record, timestamp_s, line)
-        records.num_no_measurement += len(_BEGIN.findall(text)) - len(whole)
-    return records.to_log(path, READER.name)
+_BEGIN = r"AT\+RANGE=tid:"
 
 
 def _add(records: Records, record: re.Match[str], timestamp_s: float, line: int) -> None:
@@ -53,10 +27,16 @@ def _add(records: Records, record: re.Match[str], timestamp_s: float, line: int)
             records.add(timestamp_s, str(anchor_id), range_cm / 100, line, tag_id=record["tag_id"])
 
 
-READER = Reader(
+READER = printed_reader(
     "mauwb",
     "MaUWB: AT+RANGE=tid:0,mask:03,seq:182,range:(232,401,..)..",
-    recognizes=lambda head: _BEGIN.search(head) is not None,
-    read=_read,
+    begin=_BEGIN,
+    each=_BEGIN,
+    whole=(
+        r"AT\+RANGE=tid:(?P<tag_id>\d{1,9}),mask:(?P<mask>[0-9A-Fa-f]{1,16}),seq:\d{1,9},"
+        r"range:\((?P<range>-?\d{1,9}(?:,-?\d{1,9}){0,63})\)(?:,rssi:\([^()]{0,999}\))?"
+        r"(?P<rest>,ancid:(?:\((?P<anchor_id>-?\d{1,9}(?:,-?\d{1,9}){0,63})\))?)?"
+    ),
+    add=_add,
     sides=Sides.APART,
 )

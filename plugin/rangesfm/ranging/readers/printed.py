@@ -7,8 +7,9 @@ is whole in a damaged line survives, and what was begun and is not whole counts 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,25 +21,46 @@ from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers.host_time import HostClock
 from rangesfm.ranging.readers.reader import Reader, ReadOptions
 from rangesfm.ranging.readers.records import Records
+from rangesfm.ranging.readers.roles import Sides
+
+AddPhrase = Callable[[Records, "re.Match[str]", float, int], None]
+
+
+def _add(records: Records, phrase: re.Match[str], timestamp_s: float, line: int) -> None:
+    """Take a range of metres, with the groups anchor_id and range."""
+    records.add(timestamp_s, phrase["anchor_id"], float(phrase["range"]), line)
 
 
 @dataclass(frozen=True)
-class Phrases:
+class _Phrases:
     """How a radio prints its ranges.
 
     Attributes:
         begin: begins a line's first range; the host's time stands before it.
         each: begins each range.
-        whole: a range in metres, with the groups anchor_id and range and possibly x, y and z in metres.
+        whole: all of it; groups x, y and z, if there are any, are where the anchor stands, in metres.
+        add: puts the ranges of such a phrase, the time in seconds and the line into the records.
     """
 
     begin: re.Pattern[str]
     each: re.Pattern[str]
     whole: re.Pattern[str]
+    add: AddPhrase
 
 
-def printed_reader(name: str, description: str, phrases: Phrases) -> Reader:
-    """The reader of lines with such phrases."""
+def printed_reader(
+    name: str,
+    description: str,
+    *,
+    begin: str,
+    each: str,
+    whole: str,
+    add: AddPhrase = _add,
+    sides: Sides = Sides.TOLD,
+) -> Reader:
+    """The reader of lines with such phrases, given as patterns of ASCII."""
+    compiled = partial(re.compile, flags=re.ASCII)
+    phrases = _Phrases(compiled(begin), compiled(each), compiled(whole), add)
 
     def read(path: Path, options: ReadOptions) -> RangeLog:
         check_only_time_is_described(path, options)
@@ -50,6 +72,7 @@ def printed_reader(name: str, description: str, phrases: Phrases) -> Reader:
         recognizes=lambda head: phrases.begin.search(head) is not None,
         read=read,
         read_anchors=lambda path: _read_anchors(path, phrases) if "x" in phrases.whole.groupindex else (),
+        sides=sides,
     )
 
 
@@ -59,7 +82,7 @@ def check_only_time_is_described(path: Path, options: ReadOptions) -> None:
         raise InputError("the log has a format of its own, without columns, range_unit or separator to be given", path)
 
 
-def numbered_lines(path: Path) -> Iterator[tuple[int, str]]:
+def _numbered_lines(path: Path) -> Iterator[tuple[int, str]]:
     """Every line with its 1-based number; bytes that are no text, as serial lines have them, are replaced."""
     return enumerate(read_text(path, errors="replace").split("\n"), 1)
 
@@ -74,10 +97,10 @@ def positions_to_anchors(positions: Mapping[str, list[tuple[float, float, float]
     )
 
 
-def _read(path: Path, options: ReadOptions, name: str, phrases: Phrases) -> RangeLog:
+def _read(path: Path, options: ReadOptions, name: str, phrases: _Phrases) -> RangeLog:
     clock = HostClock(path, options)
     records = Records()
-    for line, text in numbered_lines(path):
+    for line, text in _numbered_lines(path):
         num_begun = len(phrases.each.findall(text))
         begin = phrases.begin.search(text) if num_begun else None
         if begin is None:
@@ -85,14 +108,14 @@ def _read(path: Path, options: ReadOptions, name: str, phrases: Phrases) -> Rang
         timestamp_s = clock.seconds(text[: begin.start()], line)
         whole = list(phrases.whole.finditer(text))
         for phrase in whole:
-            records.add(timestamp_s, phrase["anchor_id"], float(phrase["range"]), line)
+            phrases.add(records, phrase, timestamp_s, line)
         records.num_no_measurement += max(0, num_begun - len(whole))
     return records.to_log(path, name)
 
 
-def _read_anchors(path: Path, phrases: Phrases) -> tuple[Anchor, ...]:
+def _read_anchors(path: Path, phrases: _Phrases) -> tuple[Anchor, ...]:
     positions: dict[str, list[tuple[float, float, float]]] = {}
-    for _, text in numbered_lines(path):
+    for _, text in _numbered_lines(path):
         for phrase in phrases.whole.finditer(text):
             position = (float(phrase["x"]), float(phrase["y"]), float(phrase["z"]))
             positions.setdefault(phrase["anchor_id"], []).append(position)

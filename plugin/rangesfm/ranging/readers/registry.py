@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rangesfm.ranging.readers import canonical, dwm1001, inrol, leaps, makerfabs, mapped, mauwb, qorvo, ros
+from rangesfm.ranging.readers import canonical, dwm1001, inrol, makerfabs, mapped, mauwb, qorvo, ros
 from rangesfm.ranging.readers.reader import Reader
 
 READERS: tuple[Reader, ...] = (
@@ -10,8 +10,8 @@ READERS: tuple[Reader, ...] = (
     canonical.READER,
     *mapped.READERS,
     inrol.READER,
-    leaps.MEAS,
-    leaps.LEA,
+    dwm1001.MEAS,
+    dwm1001.LEA,
     dwm1001.LEC,
     dwm1001.LES,
     qorvo.READER,
