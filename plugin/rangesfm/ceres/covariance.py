@@ -36,13 +36,13 @@ class ResidualErrors:
 
     Attributes:
         rows: (k,) which residuals, in the order of the problem; 3-D points have no part in them.
-        variance: of each, in squares of the residual stddev.
-        modes: (k, m) sparse: what they do together, in residual stddevs for each of m independent errors of stddev 1.
+        by_error: (k, m) sparse: how each of m errors changes them, in residual stddevs.
+        covariance: (m, m) of these errors: all that the residuals have.
     """
 
     rows: npt.NDArray[np.int64]
-    variance: float
-    modes: csr_matrix
+    by_error: csr_matrix
+    covariance: Array
 
 
 @dataclass(frozen=True)
@@ -195,21 +195,23 @@ class _Columns:
 class _Excess:
     """J^T (S - 1) J, in the columns that are kept."""
 
-    def __init__(self, weighted: csc_matrix, modes: Array) -> None:
-        self._weighted, self._modes = weighted, modes
+    def __init__(self, independent: csc_matrix, by_error: csc_matrix, covariance: Array) -> None:
+        self._independent, self._by_error, self._covariance = independent, by_error, covariance
 
     def between(self, left: Array, right: Array) -> Array:
         """(a, b) left^T (...) right, of (size, a) and (size, b)."""
-        shared: Array = (left.T @ self._modes) @ (self._modes.T @ right)
-        shared += left.T @ (self._weighted @ right)
+        of_left, of_right = self._by_error.T @ left, self._by_error.T @ right
+        shared: Array = of_left.T @ (self._covariance @ of_right)
+        shared -= left.T @ (self._independent @ right)
         return shared
 
 
 def _excess(kept: csc_matrix, errors: ResidualErrors | None) -> _Excess:
     if errors is None:
-        return _Excess(csc_matrix((kept.shape[1], kept.shape[1])), np.zeros((kept.shape[1], 0)))
+        size = kept.shape[1]
+        return _Excess(csc_matrix((size, size)), csc_matrix((size, 0)), np.zeros((0, 0)))
     rows = csr_matrix(kept)[errors.rows]
-    return _Excess(csc_matrix((errors.variance - 1) * (rows.T @ rows)), (rows.T @ errors.modes).toarray())
+    return _Excess(csc_matrix(rows.T @ rows), csc_matrix(rows.T @ errors.by_error), errors.covariance)
 
 
 def _address(block: Array) -> int:

@@ -8,7 +8,7 @@ from rangesfm.report.content import Content, in_natural_order
 from rangesfm.report.figures_ranges import histogram
 from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Series, figure_of, time_axis
 from rangesfm.report.text import signed
-from rangesfm.result.tables import ScaleBootstrap, ScaleCandidates, ScaleConsensus, TimeOffsetCurve
+from rangesfm.result.tables import ScaleCandidates, ScaleConsensus, TimeOffsetCurve
 
 NUM_BOOTSTRAP_BINS = 40
 MAX_NUM_CANDIDATES = 3000
@@ -92,30 +92,6 @@ def consensus(content: Content) -> Figure | None:
         (curve,),
         line=("scale found", content.summary.scale.value),
         y_range=(0.0, 1.08 * max(float(table.num_agreeing.max()), 1.0)),
-    )
-
-
-def bootstrap(content: Content) -> Figure | None:
-    """The scale when blocks of time are drawn anew."""
-    table = content.result.read(ScaleBootstrap)
-    if table is None or len(table.scale) < 2:
-        return None
-    values = table.scale
-    low, high = np.quantile(values, [0.005, 0.995])
-    margin = max(0.15 * (high - low), 1e-6 * abs(high))
-    edges = np.linspace(low - margin, high + margin, NUM_BOOTSTRAP_BINS + 1)
-    resampled = Series("resampled", "after", histogram(values, edges), "filled")
-    interval = content.summary.scale.interval_95
-    return figure_of(
-        "scale_bootstrap",
-        f"{len(values)} scales from blocks of time drawn anew. The band is the 95 % interval of the scale.",
-        "Histogram of resampled scales",
-        ("scale m per unit", "resamples"),
-        (resampled,),
-        line=("scale found", content.summary.scale.value),
-        band=None if interval is None else ("95 % interval", *interval),
-        x_range=(float(edges[0]), float(edges[-1])),
-        y_range=(0.0, 1.08 * max(float(resampled.points[:, 1].max()), 1.0)),
     )
 
 

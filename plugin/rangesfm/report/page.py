@@ -29,7 +29,6 @@ SECTIONS = {
     "path": (figures_path.trajectory_views, figures_path.map_views, figures_path.local_scale),
     "scale": (
         figures_scale.scale_per_anchor,
-        figures_scale.bootstrap,
         figures_scale.consensus,
         figures_scale.clock_curve,
         figures_scale.candidates,

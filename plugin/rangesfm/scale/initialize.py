@@ -15,17 +15,17 @@ from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.errors.shared_errors import curve_stddev
 from rangesfm.ranging.observations import RangeObservations, RangeStatus, status_by_weight
 from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
 from rangesfm.scale.cutoff import cutoff_test
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.levelled_places import levelled_places
+from rangesfm.scale.placing import place_in_site
 from rangesfm.scale.problem import ScaleProblem, scale_problem
 from rangesfm.scale.sensitivity import scale_sensitivity
 from rangesfm.scale.solution import Solution, solve_scale
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
-from rangesfm.scale.uncertainty import resampled_log_scales, scale_uncertainty
+from rangesfm.scale.uncertainty import learned_errors, scale_uncertainty
 from rangesfm.scale.verdict import judge
 
 
@@ -57,13 +57,15 @@ def initialize_scale(
     """
     options, range_model = options or ScaleOptions(), range_model or RangeModelOptions()
     gravity = gravity_of(options.up_in_first_camera)
-    block_s = options.bootstrap_block_s
-    problem = scale_problem(observations, trajectory, anchors, anchor_frame, range_model, block_s, distances, gravity)
+    problem = scale_problem(observations, trajectory, anchors, anchor_frame, range_model, distances, gravity)
     solution = solve_scale(problem, camera_side=options.camera_side, seed=seed)
     table = _paper_table(solution)
-    uncertainty = scale_uncertainty(
-        solution, curve_stddev(observations.log)[problem.rows], num_bootstrap=options.num_bootstrap, seed=seed
-    )
+    model_from_cam = _model_from_cam(observations, trajectory, problem)
+    learned = learned_errors(problem, solution, observations, model_from_cam)
+    uncertainty = scale_uncertainty(solution, learned)
+    if problem.ranges.frame_is_free:
+        placing = place_in_site(solution, learned, uncertainty.empirical)
+        solution = placing.solution
     per_anchor = scale_per_anchor(solution, observations.log.anchor_ids)
     found = anchor_estimates(solution, observations.log.anchor_ids)
     tests = cutoff_test(solution)
@@ -87,22 +89,14 @@ def initialize_scale(
         reasons=reasons,
         advice=judged.advice,
         cutoff_test=tests,
-        sensitivity=scale_sensitivity(
-            solution, _model_from_cam(observations, trajectory, problem), observations.log.anchor_ids
-        ),
+        sensitivity=scale_sensitivity(solution, model_from_cam, observations.log.anchor_ids),
         per_anchor=per_anchor,
         two_candidate=table,
         anchors=found,
         observations=replace(observations, status=status),
-        errors=solution.errors.spread(problem.rows, len(observations.log)),
+        errors=replace(solution.errors, learned=learned).spread(problem.rows, len(observations.log)),
         noise_stddev_m=solution.noise_stddev_m,
-        resampled_scales=_resampled_scales(solution, options.num_bootstrap, seed),
     )
-
-
-def _resampled_scales(solution: Solution, num: int, seed: int) -> Array:
-    steps = resampled_log_scales(solution.fit, solution.errors.block, num=num, seed=seed)
-    return np.asarray(solution.fit.state.metric_from_model.scale * np.exp(steps))
 
 
 def _model_from_cam(observations: RangeObservations, trajectory: Trajectory, problem: ScaleProblem) -> Array:

@@ -26,6 +26,13 @@ _FEW_RANGES = 50
 # Relative stddev of a scale that may as well be nothing.
 _NOTHING_KNOWN = 1.0
 _MAX_ANCHOR_SPREAD = 0.03
+# Components of the ranges' errors that the same measure helps against.
+_KINDS = (
+    ("curve", "rough_curve", "slope", "short", "common_bias", "learnt_curve"),
+    ("antenna", "tag_antenna"),
+    ("bias",),
+    ("white", "moment", "time", "long_time", "bending"),
+)
 _CALIBRATE = "calibrate the radio at the distances of this survey (rangesfm ranges calibrate)"
 
 
@@ -94,17 +101,21 @@ def judge(
 
 def _what_narrows_it(solution: Solution, uncertainty: ScaleUncertainty) -> str:
     """Advice by the largest part of the uncertainty."""
-    seen, by_anchor = max(uncertainty.bootstrap, uncertainty.correlated), uncertainty.jackknife or 0.0
     some_unknown = bool(np.isinf(solution.problem.anchor_stddev_m).any())
-    if uncertainty.range_model > max(seen, by_anchor, uncertainty.antennas):
+    parts = uncertainty.components
+    of_curve, of_antennas, of_biases, of_time = (
+        float(np.linalg.norm([parts.get(name, 0.0) for name in names])) for names in _KINDS
+    )
+    largest = max(of_curve, of_antennas, of_biases, of_time)
+    if largest == of_curve:
         return (
             f"{_CALIBRATE}, or tape a distance between two photos or points; failing both, keep the anchors farther "
             "from the path"
         )
-    if by_anchor > max(seen, uncertainty.antennas):
+    if largest == of_biases:
         survey = "survey the anchors" if some_unknown else "check the surveyed positions of the anchors"
         return f"{survey}, and place them where they see the whole path"
-    if uncertainty.antennas > seen:
+    if largest == of_antennas:
         return "range to more anchors, on all sides of the path: a single antenna errs with the direction"
     return "walk a wider or longer loop, or survey the anchors" if some_unknown else "walk a wider or longer loop"
 
