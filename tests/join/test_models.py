@@ -20,8 +20,7 @@ from rangesfm.cli import main
 from rangesfm.colmap.merge import without_photos
 from rangesfm.colmap.model_files import read_model
 from rangesfm.colmap.transform import rescale
-from rangesfm.demo.path import CameraPath
-from rangesfm.demo.ranges import Radio
+from rangesfm.demo.ranges import CameraPath, Radio
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import align_points
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction

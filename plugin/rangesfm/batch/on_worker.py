@@ -14,7 +14,7 @@ from dask.system import CPU_COUNT
 from distributed import get_worker
 from distributed.system import MEMORY_LIMIT
 
-from rangesfm.batch.shares import Share
+from rangesfm.batch.jobs import Share
 from rangesfm.processes.supervision import Ended, child_command, supervise
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.submaps import Submap

@@ -5,12 +5,11 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
-from rangesfm.batch.course import Course
+from rangesfm.batch.course import Course, Status, SurveyRow
 from rangesfm.batch.page import render
-from rangesfm.batch.rows import Status, SurveyRow
 from rangesfm.ceres.doctor import versions
 from rangesfm.files.atomic import write_text
-from rangesfm.files.json_files import write_json
+from rangesfm.files.records import write_json
 from rangesfm.files.tables import write_table
 
 TABLE_NAME, JSON_NAME, PAGE_NAME = "batch.csv", "batch.json", "batch.html"

@@ -14,12 +14,10 @@ from typing import Any
 from distributed import Client, Future, KilledWorker, wait
 
 from rangesfm.batch.cluster import local_workers, num_at_once, this_machine, workers_of
-from rangesfm.batch.course import BatchListener, Course
-from rangesfm.batch.jobs import Job
+from rangesfm.batch.course import BatchListener, Course, Figures
+from rangesfm.batch.jobs import BatchOptions, Job, Share, share_this_machine
 from rangesfm.batch.on_worker import KilledError, SurveyTask, run_on_worker, stop_batch
 from rangesfm.batch.results import write_results
-from rangesfm.batch.rows import Figures
-from rangesfm.batch.shares import BatchOptions, Share, share_this_machine
 from rangesfm.files.sole_writer import sole_writer
 from rangesfm.vision.submaps import Submap
 

@@ -20,7 +20,7 @@ from rangesfm.survey.settings import Survey
 def _run(given: tuple[Survey, bool, bool], worker: MessagesToParent) -> dict[str, Any]:
     survey, restart, only_prepare = given
     sys.argv = ["rangesfm", "batch", str(survey.source.path)]  # by which others know who writes to its folder
-    from rangesfm.batch.rows import figures_of
+    from rangesfm.batch.course import figures_of
     from rangesfm.workflows.run import prepare_survey, run_survey
 
     if only_prepare:

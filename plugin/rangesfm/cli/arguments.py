@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import itertools
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,22 +14,15 @@ from typing import Any, NoReturn
 from rangesfm.errors import InputError
 from rangesfm.progress import Progress
 
-COMMANDS = (
-    "run",
-    "batch",
-    "demo",
-    "reconstruct",
-    "scale",
-    "refine",
-    "join",
-    "export",
-    "compare",
-    "report",
-    "ranges",
-    "ranges calibrate",
-    "trilaterate",
-    "doctor",
-)
+_COMMANDS_OF = {
+    "stages": ("run", "reconstruct", "scale", "refine", "join"),
+    "batch": ("batch",),
+    "demo": ("demo",),
+    "results": ("export", "compare", "report"),
+    "ranges": ("ranges", "ranges calibrate", "trilaterate"),
+    "doctor": ("doctor",),
+}
+COMMANDS = tuple(itertools.chain.from_iterable(_COMMANDS_OF.values()))
 
 
 @dataclass(frozen=True)
@@ -124,8 +118,8 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     )
     parser.add_argument("--version", action=_PrintVersion)
     commands = Commands(parser)
-    for name in COMMANDS:
-        import_module(f"rangesfm.cli.{name.replace(' ', '_')}").add_command(commands)
+    for module in _COMMANDS_OF:
+        import_module(f"rangesfm.cli.{module}").add_commands(commands)
     args: argparse.Namespace
     args, unknown = parser.parse_known_args(_two_words_in_one(argv))
     if not hasattr(args, "command"):

@@ -23,7 +23,7 @@ _OF_A_SURVEY = ("images.path", "images.times", "mapper.num_threads", "output.pat
 _BYTES_PER_UNIT = {"mb": 10**6, "gb": 10**9, "mib": 1 << 20, "gib": 1 << 30}
 
 
-def add_command(commands: Commands) -> None:
+def add_commands(commands: Commands) -> None:
     parser = commands.add(
         "batch",
         execute,
@@ -67,11 +67,10 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     if args.scheduler is not None and args.num_workers is not None:
         raise InputError("--num_workers is of this machine: with --scheduler, those that run there count")
     _require_dask()
-    from rangesfm.batch.jobs import read_jobs
+    from rangesfm.batch.course import exit_status_of, format_rows
+    from rangesfm.batch.jobs import BatchOptions, read_jobs
     from rangesfm.batch.results import PAGE_NAME, TABLE_NAME
-    from rangesfm.batch.rows import exit_status_of, format_rows
     from rangesfm.batch.run import run_batch
-    from rangesfm.batch.shares import BatchOptions
 
     output_path = Path(args.output_path)
     jobs = read_jobs(args.surveys, overrides_from_arguments(args), output_path)

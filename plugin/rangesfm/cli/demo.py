@@ -14,7 +14,7 @@ _DEFAULT_FOLDER = "rangesfm_demo"
 _NUM_PHOTOS = range(10, 41)  # fewer do not make a map, more are not in the package
 
 
-def add_command(commands: Commands) -> None:
+def add_commands(commands: Commands) -> None:
     parser = commands.add(
         "demo",
         execute,

@@ -6,11 +6,10 @@ import argparse
 
 from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.errors import SolverError
-from rangesfm.files.text_table import align_rows
 from rangesfm.progress import Progress
 
 
-def add_command(commands: Commands) -> None:
+def add_commands(commands: Commands) -> None:
     commands.add(
         "doctor",
         execute,
@@ -22,6 +21,7 @@ def add_command(commands: Commands) -> None:
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     from rangesfm.ceres.doctor import diagnose
+    from rangesfm.files.tables import align_rows
 
     checks = diagnose()
     rows = []

@@ -1,12 +1,13 @@
-"""Tables in text files: the one place that reads CSV and its relatives, and writes it.
+"""Tables in text: the one place that reads CSV and its relatives, and writes it; and tables as commands print them.
 
-A table has a header row; ``#`` comments and blank lines may stand anywhere; a byte order mark, any
-line ending and quoted cells are understood. Whatever is wrong is an InputError with its line.
+A file's table has a header row; ``#`` comments and blank lines may stand anywhere; a byte order mark, any line ending
+and quoted cells are understood. Whatever is wrong is an InputError with its line.
 """
 
 from __future__ import annotations
 
 import csv
+import io
 import itertools
 import os
 import stat
@@ -346,3 +347,24 @@ def _listed(names: Iterable[str]) -> str:
 
 def _counted(num: int, noun: str) -> str:
     return f"{num} {noun}" if num == 1 else f"{num} {noun}s"
+
+
+def align_rows(rows: Iterable[Sequence[str]], *, num_left: int = 1) -> str:
+    """One line a row; columns as wide as their longest cell on a terminal, whatever alphabet it is written in.
+
+    Args:
+        rows: all of equal length; cells stand there as they are, whatever looks like markup.
+        num_left: so many columns begin at their left edge, the others end at their right.
+    """
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table.grid(padding=(0, 2, 0, 0))
+    for row in rows:
+        while len(table.columns) < len(row):
+            table.add_column(justify="left" if len(table.columns) < num_left else "right", no_wrap=True)
+        table.add_row(*map(Text, row))
+    lines = io.StringIO()
+    Console(file=lines, width=1 << 20).print(table)  # nothing is cut
+    return "\n".join(line.rstrip() for line in lines.getvalue()[:-1].split("\n"))

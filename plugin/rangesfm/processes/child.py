@@ -18,7 +18,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any, TextIO
 
-from rangesfm.failures import failure_of
+from rangesfm.errors import failure_of
 
 _PR_SET_PDEATHSIG = 1
 _UPDATE_INTERVAL_S = 0.5

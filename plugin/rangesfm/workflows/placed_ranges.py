@@ -20,7 +20,7 @@ from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes
 from rangesfm.workflows.journal import Journal
-from rangesfm.workflows.survey_stages import path_of_model
+from rangesfm.workflows.metric_map import path_of_model
 
 
 def path_with_times(

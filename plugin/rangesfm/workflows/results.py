@@ -10,7 +10,7 @@ import numpy as np
 from rangesfm.ceres.doctor import versions
 from rangesfm.comparison.with_reference import format_table, papers_table, reference_in_frame
 from rangesfm.distances.ends import locate_distances
-from rangesfm.distances.rows import DistanceRow, disagreements, distance_rows
+from rangesfm.distances.tape import DistanceRow, disagreements, distance_rows
 from rangesfm.export import COVARIANCE_FORMATS
 from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.reference import write_reference
@@ -20,8 +20,7 @@ from rangesfm.result.folder import REFERENCE_NAME, replacing_result
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.summary import ResultSummary
 from rangesfm.result.write import write_models_and_tables
-from rangesfm.survey.input_hashes import input_hashes
-from rangesfm.survey.inputs import RangingInputs
+from rangesfm.survey.inputs import RangingInputs, input_hashes
 from rangesfm.survey.settings import Survey
 from rangesfm.workflows.journal import Journal
 

@@ -21,10 +21,18 @@ from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes
 from rangesfm.vision.reconstruct import prepare_submaps
 from rangesfm.vision.submaps import Submap
-from rangesfm.workflows.checked_inputs import check_times, checked_inputs, read_inputs, read_registered
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.metric_map import join_by_survey, refine_map, scale_by_survey
-from rangesfm.workflows.photos import find_keyframes, map_keyframes, noted, with_photos
+from rangesfm.workflows.photos import (
+    check_times,
+    checked_inputs,
+    find_keyframes,
+    map_keyframes,
+    noted,
+    read_inputs,
+    read_registered,
+    with_photos,
+)
 from rangesfm.workflows.placed_ranges import find_time_offset, path_with_times, ranges_on_paths
 from rangesfm.workflows.ranges_in_mapping import AdjustmentWithRanges
 from rangesfm.workflows.results import RunResult, write_results
