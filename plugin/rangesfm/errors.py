@@ -88,11 +88,10 @@ class SolverError(RangesfmError):
     exit_status = 4
 
 
-INTERNAL_ERROR = 1
-"""Exit status of what nobody should ever see."""
-
-_BAD_INPUT, _FAILED = 2, 4
-_INTERRUPTED = 130  # as shells have it
+INTERNAL_ERROR, BAD_INPUT, FAILED = 1, 2, 4
+"""Exit statuses; the first is of what nobody should ever see."""
+INTERRUPTED = 130
+"""As shells have it."""
 _UNUSABLE_PATH = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG)
 
 
@@ -114,11 +113,11 @@ def _told(error: BaseException) -> tuple[str, int]:
     if isinstance(error, RangesfmError):
         return str(error), error.exit_status
     if isinstance(error, KeyboardInterrupt):
-        return "interrupted; stages that were done are kept", _INTERRUPTED
+        return "interrupted; stages that were done are kept", INTERRUPTED
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename is not None else ""
-        return f"{where}{error.strerror or error}", _BAD_INPUT if error.errno in _UNUSABLE_PATH else _FAILED
+        return f"{where}{error.strerror or error}", BAD_INPUT if error.errno in _UNUSABLE_PATH else FAILED
     if isinstance(error, MemoryError):
-        return "out of memory", _FAILED
+        return "out of memory", FAILED
     what = f"{type(error).__name__}: {error}"
     return f"internal error, please report it (RANGESFM_DEBUG=1 shows where): {what}", INTERNAL_ERROR

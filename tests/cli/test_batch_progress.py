@@ -9,7 +9,7 @@ from tests.cli.screen import Terminal
 
 from rangesfm.batch.course import Course, Figures
 from rangesfm.batch.jobs import Job
-from rangesfm.cli.batch_progress import BatchTerminal
+from rangesfm.cli.batch import BatchTerminal
 from rangesfm.survey.settings import Survey
 
 

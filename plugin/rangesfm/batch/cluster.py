@@ -51,7 +51,8 @@ def local_workers(num: int) -> Iterator[Client]:
             silence_logs=_SILENT,
             memory_limit=0,  # surveys are watched, and named
             local_directory=scratch,
-            preload=["rangesfm.batch.ignore_interrupts"],
+            # A Ctrl-C in the terminal is for the command, which stops them in order.
+            preload=["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
         ) as cluster,
         Client(cluster, set_as_default=False) as client,
     ):

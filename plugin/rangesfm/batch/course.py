@@ -9,11 +9,9 @@ from enum import Enum
 from typing import Any, Protocol
 
 from rangesfm.batch.jobs import Job
-from rangesfm.errors import INTERNAL_ERROR, one_line
+from rangesfm.errors import FAILED, INTERNAL_ERROR, one_line
 from rangesfm.files.tables import align_rows
 from rangesfm.result.summary import ResultSummary
-
-_FAILED = 4
 
 
 class Status(str, Enum):
@@ -104,7 +102,7 @@ def figures_of(summary: ResultSummary) -> Figures:
 
 def exit_status_of(rows: Iterable[SurveyRow]) -> int:
     """0 if all surveys are done, otherwise the largest of their statuses; what broke off has that of a failed run."""
-    return max((_FAILED if row.exit_status == INTERNAL_ERROR else row.exit_status or 0 for row in rows), default=0)
+    return max((FAILED if row.exit_status == INTERNAL_ERROR else row.exit_status or 0 for row in rows), default=0)
 
 
 def format_rows(rows: Sequence[SurveyRow]) -> str:
@@ -218,12 +216,8 @@ class Course:
         if state.row.status.is_final:
             return
         if "began_on" in message:
-            row = replace(
-                state.row,
-                status=Status.RUNNING,
-                host=message["began_on"],
-                num_attempts=state.row.num_attempts + 1,
-            )
+            num_attempts, host = state.row.num_attempts + 1, message["began_on"]
+            row = replace(state.row, status=Status.RUNNING, host=host, num_attempts=num_attempts)
             self._states[index] = SurveyState(row, began_s=self._clock())
         elif "stage" in message:
             self._states[index] = replace(state, stage=message["stage"], num_done=None, num_total=None)
@@ -236,33 +230,33 @@ class Course:
 
     def failed(self, index: int, reason: str, exit_status: int) -> None:
         """One line why, and the exit status that ``rangesfm run`` has then."""
-        self._end(index, Status.FAILED, reason, exit_status, Figures())
-
-    def all_failed(self, reason: str, exit_status: int) -> None:
-        """Whatever is not over has failed."""
-        for index, row in enumerate(self.rows):
-            if not row.status.is_final:
-                self.failed(index, reason, exit_status)
+        self._end(index, Status.FAILED, reason, exit_status)
 
     def interrupted(self) -> None:
         """Whatever is not over will not be."""
+        self._end_others(Status.INTERRUPTED, "interrupted", None)
+
+    def all_failed(self, reason: str) -> None:
+        """Whatever is not over has failed."""
+        self._end_others(Status.FAILED, reason, FAILED)
+
+    def _end_others(self, status: Status, reason: str, exit_status: int | None) -> None:
         for index, row in enumerate(self.rows):
             if not row.status.is_final:
-                self._end(index, Status.INTERRUPTED, "interrupted", None, Figures())
+                self._end(index, status, reason, exit_status)
 
-    def _end(self, index: int, status: Status, reason: str, exit_status: int | None, figures: Figures) -> None:
+    def _end(
+        self, index: int, status: Status, reason: str, exit_status: int | None, figures: Figures | None = None
+    ) -> None:
         state = self._states[index]
         seconds = None if state.began_s is None else self.seconds_running(state)
-        row = replace(
-            state.row, status=status, reason=reason, exit_status=exit_status, seconds=seconds, figures=figures
-        )
-        self._states[index] = SurveyState(row)
+        ended = replace(state.row, status=status, reason=reason, exit_status=exit_status, seconds=seconds)
+        self._states[index] = SurveyState(replace(ended, figures=figures or Figures()))
 
 
 def _first_row(job: Job) -> SurveyRow:
     output = "" if job.survey is None else one_line(str(job.survey.output.path))
+    row = SurveyRow(job.name, output_path=output)
     if job.failure is None:
-        return SurveyRow(job.name, output_path=output)
-    return SurveyRow(
-        job.name, Status.FAILED, reason=job.failure.message, exit_status=job.failure.exit_status, output_path=output
-    )
+        return row
+    return replace(row, status=Status.FAILED, reason=job.failure.message, exit_status=job.failure.exit_status)

@@ -15,14 +15,13 @@ from distributed import get_worker
 from distributed.system import MEMORY_LIMIT
 
 from rangesfm.batch.jobs import Share
+from rangesfm.errors import FAILED, INTERRUPTED, Failure
 from rangesfm.processes.supervision import Ended, child_command, supervise
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.submaps import Submap
 
 # By the system for want of memory, or by somebody from outside: then it is worth another try.
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
-
-_FAILED, _INTERRUPTED = 4, 130
 
 # Batches whose surveys this worker is to leave alone.
 _stopped: set[str] = set()
@@ -61,12 +60,12 @@ def stop_batch(batch: str) -> None:
     _stopped.add(batch)
 
 
-def run_on_worker(task: SurveyTask) -> dict[str, Any]:
+def run_on_worker(task: SurveyTask) -> Any:
     """Run a survey, or a part of one, in a process of its own.
 
     Returns:
-        ``{"done": {"figures": ..., "reason": ...}}`` or ``{"failed": {"message": ..., "exit_status": ...}}``; of one
-        only prepared ``{"done": {"submaps": (Submap, ...)}}``, of a submap ``{"done": None}``.
+        The Failure, or what the process ended with: ``{"figures": ..., "reason": ...}``; of a survey only prepared a
+        tuple of Submap; of a submap None.
 
     Raises:
         KilledError: the process was killed from outside, so that another attempt may well go through.
@@ -78,7 +77,7 @@ def run_on_worker(task: SurveyTask) -> dict[str, Any]:
             worker.log_event(task.batch, {"index": task.index, **message})
 
     if task.batch in _stopped:
-        return _failed("interrupted", _INTERRUPTED)
+        return Failure("interrupted", INTERRUPTED)
     if task.begins:
         tell({"began_on": host})
     # The limit of all of a worker's tasks, if it has one, as clusters' workers do.
@@ -93,10 +92,12 @@ def run_on_worker(task: SurveyTask) -> dict[str, Any]:
         memory_limit_bytes=memory_limit_bytes,
         is_stopped=lambda: task.batch in _stopped,
     )
-    ending = _ending(ended, memory_limit_bytes)
-    if task.only_prepare and "done" in ending:
-        return {"done": {"submaps": pickle.loads(base64.b64decode(ending["done"]["submaps"]))}}
-    return ending
+    if ended.last is None or not ended.last.keys() & {"done", "failed"}:
+        return _why_it_did_not_end(ended, memory_limit_bytes)
+    if "failed" in ended.last:
+        return Failure(**ended.last["failed"])
+    done = ended.last["done"]
+    return pickle.loads(base64.b64decode(done["submaps"])) if task.only_prepare else done
 
 
 def _work(task: SurveyTask, num_threads: int) -> tuple[str, bytes]:
@@ -109,21 +110,15 @@ def _work(task: SurveyTask, num_threads: int) -> tuple[str, bytes]:
     return "rangesfm.batch.survey_process", pickle.dumps((survey, task.restart, task.only_prepare))
 
 
-def _ending(ended: Ended, memory_limit_bytes: int) -> dict[str, Any]:
-    if ended.last is not None and ended.last.keys() & {"done", "failed"}:
-        return ended.last
+def _why_it_did_not_end(ended: Ended, memory_limit_bytes: int) -> Failure:
     if ended.needed_bytes is not None:
         needed, limit = (f"{num / 1e6:.0f} MB" for num in (ended.needed_bytes, memory_limit_bytes))
         why = f"needs more memory than its share: {needed}, and {limit} is what it may take"
-        return _failed(f"{why}; give it more by --memory_limit, or fewer --num_workers", _FAILED)
+        return Failure(f"{why}; give it more by --memory_limit, or fewer --num_workers", FAILED)
     if ended.stopped:
-        return _failed("interrupted", _INTERRUPTED)
+        return Failure("interrupted", INTERRUPTED)
     if ended.signal in _FROM_OUTSIDE:
         raise KilledError(
             f"its process was killed ({ended.signal.name}): by somebody, or by the system for want of memory"
         )
-    return _failed(ended.how, _FAILED)
-
-
-def _failed(message: str, exit_status: int) -> dict[str, Any]:
-    return {"failed": {"message": message, "exit_status": exit_status}}
+    return Failure(ended.how, FAILED)

@@ -172,48 +172,28 @@ def joined_log(
     for id_ in use_anchors:
         if id_ not in anchor_ids:
             raise InputError(f"anchor {id_!r} to be used is in none of the surveys ({', '.join(sorted(anchor_ids))})")
-    parts = [_rows(survey, use_anchors) for survey in surveys]
+    # Ranges between two tags have no say, and no anchor.
+    parts = [
+        (survey, [k for k, id_ in enumerate(survey.ranges.anchor_id) if not use_anchors or id_ in use_anchors])
+        for survey in surveys
+    ]
+    parts = [(one, [k for k in rows if one.ranges.status[k] != RangeStatus.TAG_TAG.label]) for one, rows in parts]
+    of_each = [(one, k) for one, rows in parts for k in rows]
     has_times = surveys[0].path.timestamps_s is not None
     log = RangeLog.from_arrays(
-        [id_ for part in parts for id_ in part.anchor_ids],
-        np.concatenate([part.range_m for part in parts]),
-        timestamp_s=np.concatenate([part.times_s for part in parts]) if has_times else None,
-        image_name=None if has_times else [name for part in parts for name in part.image_names],
-        tag_id=[id_ for part in parts for id_ in part.tag_ids],
+        [one.ranges.anchor_id[k] for one, k in of_each],
+        np.concatenate([one.ranges.range_m[rows] for one, rows in parts]),
+        timestamp_s=np.concatenate([_camera_times_s(one)[rows] for one, rows in parts]) if has_times else None,
+        image_name=None if has_times else [_own(one.own_name, one.ranges.image_name[k]) for one, k in of_each],
+        tag_id=[_own(one.tag_ids, one.ranges.tag_id[k]) for one, k in of_each],
     )
-    number = np.repeat(np.arange(len(parts)), [len(part.range_m) for part in parts])
-    is_check = np.concatenate([part.is_check for part in parts])
+    number = np.repeat(np.arange(len(parts)), [len(rows) for _, rows in parts])
+    is_check = np.array([one.ranges.status[k] == RangeStatus.CHECK.label for one, k in of_each], dtype=bool)
     return log.with_anchors(anchor_ids), number, is_check
 
 
-@dataclass(frozen=True)
-class _Rows:
-    """The ranges of one survey, by columns."""
-
-    anchor_ids: list[str]
-    tag_ids: list[str]
-    range_m: Array
-    times_s: Array
-    image_names: list[str]
-    is_check: npt.NDArray[np.bool_]
-
-
-def _rows(survey: FinishedRun, use_anchors: Sequence[str]) -> _Rows:
-    ranges = survey.ranges
-    # Ranges between two tags have no say, and no anchor.
-    wanted = [
-        k
-        for k, id_ in enumerate(ranges.anchor_id)
-        if (not use_anchors or id_ in use_anchors) and ranges.status[k] != RangeStatus.TAG_TAG.label
-    ]
-    return _Rows(
-        [ranges.anchor_id[k] for k in wanted],
-        [survey.tag_ids.get(ranges.tag_id[k], ranges.tag_id[k]) for k in wanted],
-        ranges.range_m[wanted],
-        _camera_times_s(survey)[wanted],
-        [survey.own_name.get(ranges.image_name[k], ranges.image_name[k]) for k in wanted],
-        np.array([ranges.status[k] == RangeStatus.CHECK.label for k in wanted], dtype=bool),
-    )
+def _own(names: dict[str, str], name: str) -> str:
+    return names.get(name, name)
 
 
 def _camera_times_s(survey: FinishedRun) -> Array:

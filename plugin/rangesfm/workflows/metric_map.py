@@ -13,7 +13,7 @@ from rangesfm.distances.surveyed import surveyed_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.gravity import gravity_of
-from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.join.models import ModelVerdict, PathOfModel, Ranging, join_models
 from rangesfm.ranging.clock.estimate import TimeOffset
 from rangesfm.ranging.observations import RangeObservations
@@ -24,15 +24,7 @@ from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
-from rangesfm.vision.image_times import ImageTimes
 from rangesfm.workflows.journal import Journal
-
-
-def path_of_model(model: pycolmap.Reconstruction, times: ImageTimes | None) -> Trajectory:
-    """The path of a model's photos; without their times where the log names photos."""
-    if times is None:
-        return trajectory_from_reconstruction(model)
-    return trajectory_from_reconstruction(model, times.by_name(), time_resolution_s=times.resolution_s)
 
 
 def estimate_scale(

@@ -10,7 +10,7 @@ import pycolmap
 
 from rangesfm.colmap.merge import without_photos
 from rangesfm.errors import InputError
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.join.models import PathOfModel
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock.estimate import TimeOffset, estimate_time_offset
@@ -20,7 +20,13 @@ from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes
 from rangesfm.workflows.journal import Journal
-from rangesfm.workflows.metric_map import path_of_model
+
+
+def path_of_model(model: pycolmap.Reconstruction, times: ImageTimes | None) -> Trajectory:
+    """The path of a model's photos; without their times where the log names photos."""
+    if times is None:
+        return trajectory_from_reconstruction(model)
+    return trajectory_from_reconstruction(model, times.by_name(), time_resolution_s=times.resolution_s)
 
 
 def path_with_times(

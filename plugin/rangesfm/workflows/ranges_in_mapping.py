@@ -16,8 +16,8 @@ from rangesfm.ranging.observations import RangeObservations
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes
-from rangesfm.workflows.metric_map import estimate_scale, path_of_model, refine_by_survey
-from rangesfm.workflows.placed_ranges import ranges_on_path
+from rangesfm.workflows.metric_map import estimate_scale, refine_by_survey
+from rangesfm.workflows.placed_ranges import path_of_model, ranges_on_path
 
 # Fewer have no shape by which ranges could tell a scale.
 _MIN_NUM_KEYFRAMES = 5

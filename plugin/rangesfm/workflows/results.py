@@ -12,7 +12,6 @@ from rangesfm.comparison.with_reference import format_table, papers_table, refer
 from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.tape import DistanceRow, disagreements, distance_rows
 from rangesfm.export import COVARIANCE_FORMATS
-from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.reference import write_reference
 from rangesfm.report import write_report
 from rangesfm.result.entries import ComparisonRow
@@ -55,7 +54,8 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
     with replacing_result(folder):
         with journal.stage("results"):
             comparison = _comparison(survey, inputs, metric)
-            georeference = _georeference(inputs, metric)
+            # Of the final map: that of the anchors, if the map could be carried to them.
+            georeference = inputs.site.georeference if metric.estimate.frame == "site" else None
             write_models_and_tables(
                 metric, survey.export, folder, images_path=survey.images.path, georeference=georeference
             )
@@ -75,11 +75,6 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
     if survey.report.enabled:
         lines.append(f"report: {write_report(folder)}")
     return RunResult(folder, summary, tuple(lines))
-
-
-def _georeference(inputs: RangingInputs, metric: MetricResult) -> Georeference | None:
-    """Of the final map: that of the anchors, if the map could be carried to them."""
-    return inputs.site.georeference if metric.estimate.frame == "site" else None
 
 
 def _distances(inputs: RangingInputs, metric: MetricResult) -> list[DistanceRow]:
