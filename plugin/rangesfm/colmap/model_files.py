@@ -132,33 +132,29 @@ class _Cursor:
         self.place += struct.calcsize(f"<{code}")
         return int(value)
 
-    def skip(self, num_bytes: int) -> None:
-        self.place += num_bytes
+    def skip(self, num_bytes: int) -> int:
+        """Skip so many bytes; where they begin."""
+        start, self.place = self.place, self.place + num_bytes
         if self.place > len(self.data):
             raise struct.error
+        return start
 
     def skip_text(self) -> None:
         """Up to and with the zero byte that ends it."""
         end = self.data.find(b"\0", self.place)
         self.skip(end + 1 - self.place if end >= 0 else len(self.data))
 
-    def skip_groups(self, num: int, num_bytes: int) -> int:
-        """Skip so many groups of one length; where they begin."""
-        start = self.place
-        self.skip(num * num_bytes)
-        return start
-
 
 def _walk_camera(cursor: _Cursor) -> int:
     cursor.skip(4)
     model = cursor.number("i")
-    return cursor.skip_groups(1, 16 + 8 * NUM_CAMERA_PARAMS.get(model, 0))
+    return cursor.skip(16 + 8 * NUM_CAMERA_PARAMS.get(model, 0))
 
 
 def _walk_rig(cursor: _Cursor) -> int:
     cursor.skip(4)
     num_sensors = cursor.number("I")
-    start = cursor.skip_groups(1, 8 if num_sensors else 0)
+    start = cursor.skip(8 if num_sensors else 0)
     for _ in range(num_sensors - 1):
         cursor.skip(8)
         cursor.skip(56 if cursor.number("B") else 0)
@@ -167,18 +163,18 @@ def _walk_rig(cursor: _Cursor) -> int:
 
 def _walk_frame(cursor: _Cursor) -> int:
     cursor.skip(64)
-    return cursor.skip_groups(cursor.number("I"), 16)
+    return cursor.skip(cursor.number("I") * 16)
 
 
 def _walk_image(cursor: _Cursor) -> int:
     cursor.skip(64)
     cursor.skip_text()
-    return cursor.skip_groups(cursor.number("Q"), _FEATURE.itemsize)
+    return cursor.skip(cursor.number("Q") * _FEATURE.itemsize)
 
 
 def _walk_point(cursor: _Cursor) -> int:
     cursor.skip(43)
-    return cursor.skip_groups(cursor.number("Q"), _ELEMENT.itemsize)
+    return cursor.skip(cursor.number("Q") * _ELEMENT.itemsize)
 
 
 # Each steps over a record and tells where the groups begin with which it ends.

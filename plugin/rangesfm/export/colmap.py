@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.colmap.log import colmap_log
 from rangesfm.colmap.model_files import write_binary_model
 from rangesfm.errors import InputError
-from rangesfm.export.metric_map import MetricMap
+from rangesfm.export.metric_map import MetricMap, registered_images
 from rangesfm.files.atomic import new_folder, stays_inside, write_text
 from rangesfm.geometry.similarity import Similarity
 
@@ -51,7 +51,7 @@ def write_positions(reconstruction: pycolmap.Reconstruction, path: Path) -> Path
         InputError: a photo's name holds white space, at which COLMAP would split it.
     """
     lines = []
-    for image in sorted((image for image in reconstruction.images.values() if image.has_pose), key=lambda i: i.name):
+    for image in registered_images(reconstruction):
         if len(image.name.split()) != 1:
             raise InputError(f"the format 'model_aligner' cannot hold white space in a photo's name: {image.name!r}")
         lines.append(" ".join([image.name, *(f"{value:.17g}" for value in image.projection_center())]))
@@ -69,7 +69,7 @@ def write_undistorted(map_: MetricMap, folder: Path) -> Path:
     images_path = map_.images_path
     if images_path is None:
         raise InputError("the format 'undistorted' needs the photos: give their folder (--images)")
-    names = [image.name for image in map_.reconstruction.images.values() if image.has_pose]
+    names = [image.name for image in registered_images(map_.reconstruction)]
     for name in names:
         if not stays_inside(name):
             raise InputError(f"the photo {name} would be written outside of it, expected names inside a folder", folder)

@@ -9,7 +9,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.export.metric_map import MetricMap
+from rangesfm.export.metric_map import MetricMap, points_of
 from rangesfm.files.atomic import new_file
 from rangesfm.geometry.georeference import GEOGRAPHIC, is_geographic
 
@@ -28,9 +28,8 @@ def write_laz(map_: MetricMap, path: Path) -> Path:
         import laspy
     except ImportError:
         raise InputError("the format 'laz' needs laspy: pip install 'rangesfm[geo]'") from None
-    model = map_.reconstruction
-    points = [model.point3D(point_id) for point_id in sorted(model.point3D_ids())]
-    xyz, steps = _coordinates(map_, np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3))
+    places, colors = points_of(map_.reconstruction)
+    xyz, steps = _coordinates(map_, places)
     header = laspy.LasHeader(version="1.4", point_format=_POINT_FORMAT_WITH_COLOR)
     header.scales = steps
     header.offsets = np.floor(xyz.min(axis=0)) if len(xyz) else np.zeros(3)
@@ -40,9 +39,7 @@ def write_laz(map_: MetricMap, path: Path) -> Path:
         header.add_crs(pyproj.CRS.from_user_input(map_.georeference.crs))
     las = laspy.LasData(header)
     las.x, las.y, las.z = xyz.T
-    # LAS counts colours to 65535.
-    colors = np.array([point.color for point in points], dtype=np.uint16).reshape(-1, 3) * np.uint16(257)
-    las.red, las.green, las.blue = colors.T
+    las.red, las.green, las.blue = colors.T * np.uint16(257)  # LAS counts colours to 65535
     with new_file(path) as temporary:
         las.write(str(temporary))
     return path

@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pycolmap
 
 from rangesfm.arrays import Array
@@ -50,10 +51,16 @@ class MetricMap:
         return trajectory_from_reconstruction(self.reconstruction, self.timestamps_s)
 
 
-def distortion_params(camera: pycolmap.Camera) -> list[float]:
-    """The parameters that are neither focal lengths nor principal point, in COLMAP's order."""
-    others = {*camera.focal_length_idxs(), *camera.principal_point_idxs()}
-    return [float(value) for index, value in enumerate(camera.params) if index not in others]
+def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    """Those that have a pose, by their names."""
+    return sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+
+
+def points_of(model: pycolmap.Reconstruction) -> tuple[Array, npt.NDArray[np.uint8]]:
+    """(n, 3) positions and (n, 3) colours of the 3-D points, in order of their ids."""
+    points = [model.point3D(point_id) for point_id in sorted(model.point3D_ids())]
+    xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
+    return xyz, np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
 
 
 # Extent of a path across its plane, in its second extent: above this there is no plane to speak of.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,68 +11,75 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.export.metric_map import MetricMap, distortion_params
+from rangesfm.export.metric_map import MetricMap, registered_images
 from rangesfm.export.ply import write_points
 from rangesfm.files.atomic import new_folder
 from rangesfm.files.records import write_json
 
 _POINTS_NAME = "transforms_points.ply"
-# By COLMAP's camera model: nerfstudio's name, and what the parameters after focal lengths and principal point are.
-_DISTORTION = {
-    "SIMPLE_PINHOLE": ("OPENCV", ()),
-    "PINHOLE": ("OPENCV", ()),
-    "SIMPLE_RADIAL": ("OPENCV", ("k1",)),
-    "RADIAL": ("OPENCV", ("k1", "k2")),
-    "OPENCV": ("OPENCV", ("k1", "k2", "p1", "p2")),
-    "FULL_OPENCV": ("OPENCV", ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
-    "SIMPLE_RADIAL_FISHEYE": ("OPENCV_FISHEYE", ("k1",)),
-    "RADIAL_FISHEYE": ("OPENCV_FISHEYE", ("k1", "k2")),
-    "OPENCV_FISHEYE": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
-}
 _FLIP_Y_AND_Z = np.diag([1.0, -1.0, -1.0, 1.0])
+# By COLMAP's camera model: what the parameters after focal lengths and principal point are.
+_DISTORTION: dict[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": (),
+    "PINHOLE": (),
+    "SIMPLE_RADIAL": ("k1",),
+    "RADIAL": ("k1", "k2"),
+    "OPENCV": ("k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "SIMPLE_RADIAL_FISHEYE": ("k1",),
+    "RADIAL_FISHEYE": ("k1", "k2"),
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+}
+# The programs' names of these models.
+_NERFSTUDIO = {name: "OPENCV_FISHEYE" if "FISHEYE" in name else "OPENCV" for name in _DISTORTION}
+_OPENSFM = {
+    **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), "brown"),
+    "OPENCV_FISHEYE": "fisheye_opencv",
+}
+_ALL_OF_OPENSFM = {"brown": ("k1", "k2", "k3", "p1", "p2"), "fisheye_opencv": ("k1", "k2", "k3", "k4")}
+
+
+def _distortion(camera: pycolmap.Camera, program: str, known: Mapping[str, str]) -> tuple[str, dict[str, float]]:
+    """What a program calls a camera's model, and the camera's distortion by the parameters' names."""
+    name = camera.model.name
+    if name not in known:
+        raise InputError(f"{program} does not know the camera model {name}, expected one of: {', '.join(known)}")
+    named = {*camera.focal_length_idxs(), *camera.principal_point_idxs()}
+    values = [float(value) for index, value in enumerate(camera.params) if index not in named]
+    return known[name], dict(zip(_DISTORTION[name], values, strict=True))
 
 
 def write_nerfstudio(map_: MetricMap, folder: Path) -> Path:
     """Write ``transforms.json`` and its points; photos are referred to as ``images/NAME``.
 
+    nerfstudio's cameras look along their -z with y up, and its worlds have z up. Its own loader centres and shrinks
+    what it reads unless it is told not to (``--auto-scale-poses False --center-method none
+    --orientation-method none``).
+
     Raises:
         InputError: a camera model that nerfstudio does not know.
     """
     points = write_points(map_.reconstruction, folder / _POINTS_NAME)
-    images = sorted((i for i in map_.reconstruction.images.values() if i.has_pose), key=lambda image: image.name)
     content = {
         "applied_transform": np.eye(4)[:3].tolist(),
         "ply_file_path": points.name,
-        "frames": [_frame(map_.reconstruction.cameras[image.camera_id], image) for image in images],
+        "frames": [
+            _frame(map_.reconstruction.cameras[image.camera_id], image)
+            for image in registered_images(map_.reconstruction)
+        ],
     }
-    path = folder / "transforms.json"
-    write_json(content, path)
-    return path
+    write_json(content, folder / "transforms.json")
+    return folder / "transforms.json"
 
 
 def _frame(camera: pycolmap.Camera, image: pycolmap.Image) -> dict[str, Any]:
-    return {
-        "file_path": f"images/{image.name}",
-        "transform_matrix": _world_from_opengl(image).tolist(),
-        **_intrinsics(camera),
-    }
-
-
-def _world_from_opengl(image: pycolmap.Image) -> Array:
+    kind, distortion = _distortion(camera, "nerfstudio", _NERFSTUDIO)
     world_from_cam = np.eye(4)
     world_from_cam[:3] = image.cam_from_world().inverse().matrix()
-    turned: Array = world_from_cam @ _FLIP_Y_AND_Z
-    return turned
-
-
-def _intrinsics(camera: pycolmap.Camera) -> dict[str, Any]:
-    name = camera.model.name
-    if name not in _DISTORTION:
-        raise InputError(f"nerfstudio does not know the camera model {name}, expected one of: {', '.join(_DISTORTION)}")
-    kind, names = _DISTORTION[name]
     return {
+        "file_path": f"images/{image.name}",
+        "transform_matrix": (world_from_cam @ _FLIP_Y_AND_Z).tolist(),
         "camera_model": kind,
         "w": camera.width,
         "h": camera.height,
@@ -79,51 +87,35 @@ def _intrinsics(camera: pycolmap.Camera) -> dict[str, Any]:
         "fl_y": camera.focal_length_y,
         "cx": camera.principal_point_x,
         "cy": camera.principal_point_y,
-        **dict(zip(names, distortion_params(camera), strict=True)),
+        **distortion,
     }
-
-
-# By COLMAP's camera model: OpenSfM's projection, and the names of the distortion parameters.
-_PROJECTIONS = {
-    "SIMPLE_PINHOLE": ("brown", ()),
-    "PINHOLE": ("brown", ()),
-    "SIMPLE_RADIAL": ("brown", ("k1",)),
-    "RADIAL": ("brown", ("k1", "k2")),
-    "OPENCV": ("brown", ("k1", "k2", "p1", "p2")),
-    "OPENCV_FISHEYE": ("fisheye_opencv", ("k1", "k2", "k3", "k4")),
-}
-_ALL_DISTORTION = {"brown": ("k1", "k2", "k3", "p1", "p2"), "fisheye_opencv": ("k1", "k2", "k3", "k4")}
 
 
 def write_opensfm(map_: MetricMap, path: Path) -> Path:
     """Write one reconstruction with its cameras, shots and points; ``reference_lla`` where the map is georeferenced.
 
+    OpenSfM (and so OpenDroneMap) measures in photos in units of their longer side, from the photo's middle, and turns
+    by rotation vectors.
+
     Raises:
         InputError: a camera model that OpenSfM does not know.
     """
-    model = map_.reconstruction
-    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    model, origin = map_.reconstruction, map_.georeference
+    images = registered_images(model)
     reconstruction: dict[str, Any] = {
         "cameras": {str(i): _camera(model.cameras[i]) for i in sorted({image.camera_id for image in images})},
         "shots": {image.name: _shot(image, map_) for image in images},
         "points": {str(i): _point(model.point3D(i)) for i in sorted(model.point3D_ids())},
     }
-    if map_.georeference is not None:
-        origin = map_.georeference
-        reconstruction["reference_lla"] = {
-            "latitude": origin.lat_deg,
-            "longitude": origin.lon_deg,
-            "altitude": origin.height_m,
-        }
+    if origin is not None:
+        place = {"latitude": origin.lat_deg, "longitude": origin.lon_deg, "altitude": origin.height_m}
+        reconstruction["reference_lla"] = place
     write_json([reconstruction], path)
     return path
 
 
 def _camera(camera: pycolmap.Camera) -> dict[str, Any]:
-    name = camera.model.name
-    if name not in _PROJECTIONS:
-        raise InputError(f"OpenSfM does not know the camera model {name}, expected one of: {', '.join(_PROJECTIONS)}")
-    projection, names = _PROJECTIONS[name]
+    projection, distortion = _distortion(camera, "OpenSfM", _OPENSFM)
     size = max(camera.width, camera.height)
     return {
         "projection_type": projection,
@@ -133,21 +125,21 @@ def _camera(camera: pycolmap.Camera) -> dict[str, Any]:
         "focal_y": camera.focal_length_y / size,
         "c_x": (camera.principal_point_x - camera.width / 2) / size,
         "c_y": (camera.principal_point_y - camera.height / 2) / size,
-        **dict.fromkeys(_ALL_DISTORTION[projection], 0.0),
-        **dict(zip(names, distortion_params(camera), strict=True)),
+        **dict.fromkeys(_ALL_OF_OPENSFM[projection], 0.0),
+        **distortion,
     }
 
 
 def _shot(image: pycolmap.Image, map_: MetricMap) -> dict[str, Any]:
     cam_from_world = image.cam_from_world()
-    shot = {
+    time = (map_.timestamps_s or {}).get(image.name)
+    return {
         "camera": str(image.camera_id),
         "rotation": Rotation.from_matrix(cam_from_world.rotation.matrix()).as_rotvec().tolist(),
         "translation": cam_from_world.translation.tolist(),
         "orientation": 1,
+        **({} if time is None else {"capture_time": time}),
     }
-    time = None if map_.timestamps_s is None else map_.timestamps_s.get(image.name)
-    return shot if time is None else {**shot, "capture_time": time}
 
 
 def _point(point: pycolmap.Point3D) -> dict[str, Any]:
@@ -162,6 +154,9 @@ _MARK_ACCURACY = 1.0
 
 def write_opf(map_: MetricMap, folder: Path) -> Path:
     """Write ``camera_list.json``, ``input_control_points.json`` and ``constraints.json`` into ``folder``.
+
+    Pairs of well-seen points are manual tie points with their marks, and each pair's distance is a scale constraint
+    with the uncertainty of the scale: a program that maps the same photos then gets our scale.
 
     Raises:
         InputError: the map has no two points that three photos see, or its scale's stddev is not known.

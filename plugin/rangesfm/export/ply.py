@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
+from rangesfm.export.metric_map import points_of
 from rangesfm.files.atomic import new_file
 from rangesfm.geometry.similarity import Similarity, overflow_raised
 from rangesfm.geometry.trajectory import Trajectory
@@ -24,10 +26,7 @@ PLY_TYPES = {"f8": "double", "f4": "float", "u1": "uchar"}
 
 def write_points(reconstruction: pycolmap.Reconstruction, path: Path) -> Path:
     """Write the 3-D points with their colours, in order of their ids."""
-    points = [reconstruction.point3D(point_id) for point_id in sorted(reconstruction.point3D_ids())]
-    xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
-    colors = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
-    return _write_vertices(path, xyz, colors)
+    return _write_vertices(path, *points_of(reconstruction))
 
 
 def write_cameras(trajectory: Trajectory, path: Path) -> Path:
@@ -66,16 +65,9 @@ def _write_vertices(
 
 Vertices = npt.NDArray[np.void]
 
-_CODES = {
-    **dict.fromkeys(("char", "int8"), "i1"),
-    **dict.fromkeys(("uchar", "uint8"), "u1"),
-    **dict.fromkeys(("short", "int16"), "i2"),
-    **dict.fromkeys(("ushort", "uint16"), "u2"),
-    **dict.fromkeys(("int", "int32"), "i4"),
-    **dict.fromkeys(("uint", "uint32"), "u4"),
-    **dict.fromkeys(("float", "float32"), "f4"),
-    **dict.fromkeys(("double", "float64"), "f8"),
-}
+_CODES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
+_CODES |= {"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4"}
+_CODES |= {"uint32": "u4", "float32": "f4", "float64": "f8"}
 _MAX_NUM_DIGITS = 18  # larger numbers are not for a machine's word
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _MAX_HEADER_BYTES = 1 << 16
@@ -128,11 +120,16 @@ def transform_ply(path: Path, new_from_old: Similarity, target: Path) -> Path:
 def _moved(vertices: Vertices, new_from_old: Similarity) -> Vertices:
     """Moved and turned; far from the origin in double precision."""
     moved = new_from_old.apply(_vectors(vertices, ("x", "y", "z")))
-    kinds = dict.fromkeys("xyz", np.float64) if np.abs(moved).max(initial=0.0) > _MAX_SINGLE else {}
-    written = _with_types(vertices, kinds)
-    _set(written, ("x", "y", "z"), moved)
-    if {"nx", "ny", "nz"} <= set(vertices.dtype.names or ()):
-        _set(written, ("nx", "ny", "nz"), _vectors(vertices, ("nx", "ny", "nz")) @ new_from_old.rotation.T)
+    is_far, order = np.abs(moved).max(initial=0.0) > _MAX_SINGLE, vertices.dtype[0].byteorder
+    names = vertices.dtype.names or ()
+    double = np.dtype(np.float64).newbyteorder(order)
+    written = vertices.astype([(name, double if is_far and name in "xyz" else vertices.dtype[name]) for name in names])
+    columns = dict(zip("xyz", moved.T, strict=True))
+    if {"nx", "ny", "nz"} <= set(names):
+        turned = _vectors(vertices, ("nx", "ny", "nz")) @ new_from_old.rotation.T
+        columns |= zip(("nx", "ny", "nz"), turned.T, strict=True)
+    for name, column in columns.items():
+        written[name] = column
     return written
 
 
@@ -193,29 +190,11 @@ def _vectors(vertices: Vertices, names: tuple[str, str, str]) -> Array:
     return values
 
 
-def _with_types(vertices: Vertices, kinds: dict[str, type[np.float64]]) -> Vertices:
-    """A copy to write to, some of its columns in another type."""
-    names = vertices.dtype.names or ()
-    order = vertices.dtype[0].byteorder
-    columns = [
-        (name, np.dtype(kinds[name]).newbyteorder(order) if name in kinds else vertices.dtype[name]) for name in names
-    ]
-    return vertices.astype(np.dtype(columns))
-
-
-def _set(vertices: Vertices, names: tuple[str, str, str], values: Array) -> None:
-    for name, column in zip(names, values.T, strict=True):
-        vertices[name] = column
-
-
 def _header_text(header: _Header, is_double: bool) -> bytes:
-    lines = []
-    for line in header.lines:
-        words = line.split()
-        if is_double and words[:1] == ["property"] and words[-1] in ("x", "y", "z"):
-            line = f"property double {words[-1]}"
-        lines.append(line)
-    return ("\n".join(lines) + "\n").encode("latin-1")
+    text = "\n".join(header.lines) + "\n"
+    if is_double:
+        text = re.sub(r"^[ \t]*property[ \t].*[ \t]([xyz])[ \t]*$", r"property double \1", text, flags=re.MULTILINE)
+    return text.encode("latin-1")
 
 
 def _body(vertices: Vertices, header: _Header) -> bytes:
