@@ -1,4 +1,4 @@
-#include "rangesfm/padded_manifold.h"
+#include "rangesfm/beside_points.h"
 
 #include <ceres/autodiff_cost_function.h>
 #include <ceres/problem.h>

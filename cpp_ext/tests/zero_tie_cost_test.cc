@@ -1,4 +1,4 @@
-#include "rangesfm/zero_tie_cost.h"
+#include "rangesfm/beside_points.h"
 
 #include <gtest/gtest.h>
 

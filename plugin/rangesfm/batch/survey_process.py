@@ -13,7 +13,7 @@ import sys
 from dataclasses import asdict
 from typing import Any
 
-from rangesfm.processes.child import MessagesToParent, work_for_parent
+from rangesfm.processes.supervision import MessagesToParent, work_for_parent
 from rangesfm.survey.settings import Survey
 
 

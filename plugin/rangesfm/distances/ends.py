@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -40,23 +41,14 @@ class LocatedDistances:
 
     def subset(self, rows: npt.NDArray[np.bool_]) -> LocatedDistances:
         """Some of them."""
-        return LocatedDistances(
-            self.model_length[rows],
-            self.anchor_pair[rows],
-            self.distance_m[rows],
-            self.stddev_m[rows],
-            self.is_check[rows],
-        )
+        return LocatedDistances(*(column[rows] for column in self._columns()))
 
     def joined(self, others: LocatedDistances) -> LocatedDistances:
         """These, then others."""
-        return LocatedDistances(
-            np.concatenate([self.model_length, others.model_length]),
-            np.concatenate([self.anchor_pair, others.anchor_pair]),
-            np.concatenate([self.distance_m, others.distance_m]),
-            np.concatenate([self.stddev_m, others.stddev_m]),
-            np.concatenate([self.is_check, others.is_check]),
-        )
+        return LocatedDistances(*map(np.concatenate, zip(self._columns(), others._columns(), strict=True)))
+
+    def _columns(self) -> tuple[npt.NDArray[Any], ...]:
+        return tuple(getattr(self, field.name) for field in fields(self))
 
     def lengths_m(self, scale: float, anchors_m: Array) -> Array:
         """(k,) as a map has them, with the model's scale and the anchors (m, 3); NaN where an anchor has no place."""

@@ -150,19 +150,18 @@ class DistanceRow(Record):
 
 def distance_rows(tape: Tape, lengths_m: npt.NDArray[np.float64]) -> list[DistanceRow]:
     """One entry for each distance of the tape, in its order, with (k,) lengths in the map."""
-    return [_row(taped, length) for taped, length in zip(tape.distances, lengths_m.tolist(), strict=True)]
-
-
-def _row(taped: TapedDistance, length_m: float) -> DistanceRow:
-    return DistanceRow(
-        from_=taped.ends[0],
-        to=taped.ends[1],
-        kind=taped.kind,
-        measured_m=taped.distance_m,
-        stddev_m=taped.stddev_m,
-        estimated_m=length_m,
-        residual_m=length_m - taped.distance_m,
-    )
+    return [
+        DistanceRow(
+            from_=taped.ends[0],
+            to=taped.ends[1],
+            kind=taped.kind,
+            measured_m=taped.distance_m,
+            stddev_m=taped.stddev_m,
+            estimated_m=length_m,
+            residual_m=length_m - taped.distance_m,
+        )
+        for taped, length_m in zip(tape.distances, lengths_m.tolist(), strict=True)
+    ]
 
 
 def disagreements(rows: Iterable[DistanceRow], relative_scale_stddev: float) -> Iterator[str]:

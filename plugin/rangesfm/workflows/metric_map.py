@@ -8,8 +8,8 @@ from dataclasses import replace
 import pycolmap
 
 from rangesfm.colmap.transform import rescale
+from rangesfm.distances.between_anchors import surveyed_distances
 from rangesfm.distances.ends import LocatedDistances, locate_distances
-from rangesfm.distances.surveyed import surveyed_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.gravity import gravity_of

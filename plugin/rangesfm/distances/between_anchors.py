@@ -1,11 +1,16 @@
-"""Distances between anchors, from the ranges that they took among themselves."""
+"""Distances between anchors: from the ranges that they took among themselves, and from their surveyed places."""
 
 from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
 
 import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.distances.ends import LocatedDistances
+from rangesfm.distances.tape import CONTROL, TapedDistance
+from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.noise import shared_stddev
 from rangesfm.ranging.log import RangeLog
 
@@ -43,4 +48,23 @@ def distances_by_radio(
         distance_m=medians - (bias_m[first] + bias_m[second]) / 2,
         stddev_m=np.sqrt(variance),
         is_check=np.zeros(len(pairs), dtype=bool),
+    )
+
+
+# So that it can be divided by.
+_MIN_STDDEV_M = 1e-3
+
+
+def surveyed_distances(anchors: Sequence[Anchor]) -> tuple[TapedDistance, ...]:
+    """One for each pair of anchors with given positions, as if it had been taped."""
+    return tuple(
+        TapedDistance(
+            (first.anchor_id, second.anchor_id),
+            float(np.linalg.norm(first.position_m - second.position_m)),
+            max(float(np.hypot(first.position_stddev_m, second.position_stddev_m)), _MIN_STDDEV_M),
+            CONTROL,
+            line=0,
+        )
+        for first, second in itertools.combinations(anchors, 2)
+        if first.position_m is not None and second.position_m is not None
     )
