@@ -13,16 +13,23 @@ from typing import Any
 
 from distributed import Client, Future, KilledWorker, wait
 
-from rangesfm.batch.cluster import local_workers, num_at_once, this_machine, workers_of
 from rangesfm.batch.course import BatchListener, Course, Figures, Status, SurveyRow
 from rangesfm.batch.jobs import BatchOptions, Job, Share, share_this_machine
-from rangesfm.batch.on_worker import KilledError, SurveyTask, run_on_worker, stop_batch
 from rangesfm.batch.page import render
+from rangesfm.batch.workers import (
+    KilledError,
+    SurveyTask,
+    local_workers,
+    num_at_once,
+    run_on_worker,
+    stop_batch,
+    this_machine,
+    workers_of,
+)
 from rangesfm.ceres.doctor import versions
 from rangesfm.errors import FAILED, Failure
-from rangesfm.files.atomic import write_text
+from rangesfm.files.atomic import sole_writer, write_text
 from rangesfm.files.records import write_json
-from rangesfm.files.sole_writer import sole_writer
 from rangesfm.files.tables import write_table
 from rangesfm.vision.submaps import Submap
 

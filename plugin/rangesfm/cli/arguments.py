@@ -15,9 +15,8 @@ from rangesfm.errors import InputError
 from rangesfm.progress import Progress
 
 _COMMANDS_OF = {
-    "stages": ("run", "reconstruct", "scale", "refine", "join"),
+    "stages": ("run", "demo", "reconstruct", "scale", "refine", "join"),
     "batch": ("batch",),
-    "demo": ("demo",),
     "results": ("export", "compare", "report"),
     "ranges": ("ranges", "ranges calibrate", "trilaterate"),
     "doctor": ("doctor",),

@@ -1,4 +1,4 @@
-"""The commands that make a map: ``run``, ``reconstruct``, ``scale``, ``refine`` and ``join``."""
+"""The commands that make a map: ``run``, ``demo``, ``reconstruct``, ``scale``, ``refine`` and ``join``."""
 
 from __future__ import annotations
 
@@ -16,10 +16,13 @@ if TYPE_CHECKING:
     from rangesfm.survey.settings import Survey
     from rangesfm.workflows.results import RunResult
 
+
 _SCALE_KEYS = (
     *("images.path", "images.times", "ranges", "anchors", "tag", "mapper.num_threads", "scale"),
     *("export", "report", "output"),
 )
+_DEMO_FOLDER = "rangesfm_demo"
+_NUM_PHOTOS = range(10, 41)  # fewer do not make a map, more are not in the package
 _JOIN_KEYS = (
     *("ranges.range_stddev_m", "ranges.range_bias_stddev_m", "ranges.common_bias_stddev_m", "anchors", "scale"),
     *("mapper.num_threads", "refine", "export", "report", "output"),
@@ -37,6 +40,22 @@ def add_commands(commands: Commands) -> None:
     add_survey_arguments(run, has_model=True)
     add_restart_argument(run)
     run.add_argument("--live", action="store_true", help="keep live.html, a page to watch, in the output folder")
+    demo = commands.add(
+        "demo",
+        _demo,
+        help="make a small survey and run the pipeline on it: no data needed",
+        description="Make a small survey (photos that come with rangesfm, simulated UWB log, truth) and run it.",
+        example="rangesfm demo my_demo",
+    )
+    demo.add_argument(
+        "folder", nargs="?", default=_DEMO_FOLDER, metavar="DIR", help=f"where to (default: {_DEMO_FOLDER})"
+    )
+    demo.add_argument(
+        "--num_photos", type=int, default=40, metavar="N", help="the first so many of 40 along the path (default: 40)"
+    )
+    demo.add_argument("--seed", type=int, default=0, metavar="N", help="of the radio and of the run (default: 0)")
+    demo.add_argument("--num_threads", type=int, metavar="N", help="-1 for all cores")
+    add_restart_argument(demo)
     reconstruct = commands.add(
         "reconstruct",
         _reconstruct,
@@ -89,7 +108,7 @@ def _run(args: argparse.Namespace, progress: Progress) -> Outcome:
         _require_model_and_ranges(survey)
     if not args.live:
         return Outcome(_run_or_refine(survey, progress, args.restart).lines)
-    from rangesfm.files.sole_writer import sole_writer
+    from rangesfm.files.atomic import sole_writer
     from rangesfm.report.live import live_page
 
     with sole_writer(survey.output.path), live_page(progress, survey.output.path) as page:
@@ -105,6 +124,24 @@ def _run_or_refine(survey: Survey, progress: Progress, restart: bool) -> RunResu
     if survey.model_path is None:
         return run_survey(survey, progress=progress, restart=restart)
     return refine_model(survey, progress=progress)
+
+
+def _demo(args: argparse.Namespace, progress: Progress) -> Outcome:
+    if args.num_photos not in _NUM_PHOTOS:
+        raise InputError(f"--num_photos is {args.num_photos}, expected {_NUM_PHOTOS[0]} to {_NUM_PHOTOS[-1]}")
+    if args.seed < 0:
+        raise InputError(f"--seed is {args.seed}, expected 0 or more")
+    from rangesfm.demo.survey import make_demo_survey
+    from rangesfm.survey.settings import read_survey
+    from rangesfm.workflows.run import run_survey
+
+    folder = Path(args.folder)
+    made = make_demo_survey(folder, num_photos=args.num_photos, seed=args.seed)
+    overrides: dict[str, object] = {"output.seed": args.seed, "report.reference": folder / "reference.csv"}
+    if args.num_threads is not None:
+        overrides["mapper.num_threads"] = args.num_threads
+    survey = read_survey(made.survey_path, overrides)
+    return Outcome(run_survey(survey, progress=progress, restart=args.restart).lines)
 
 
 def _reconstruct(args: argparse.Namespace, progress: Progress) -> Outcome:

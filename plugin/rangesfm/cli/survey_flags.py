@@ -154,7 +154,7 @@ def _columns(text: str) -> dict[str, str]:
 
 
 def _options(text: str) -> dict[str, Any]:
-    from rangesfm.survey.toml_source import parse_inline_table
+    from rangesfm.survey.settings import parse_inline_table
 
     try:
         return parse_inline_table(text)

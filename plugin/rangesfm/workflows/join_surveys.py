@@ -14,7 +14,7 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.export import check_formats
-from rangesfm.files.sole_writer import sole_writer
+from rangesfm.files.atomic import sole_writer
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.join.models import PathOfModel
