@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import inspect
 import itertools
 import re
 from collections.abc import Callable, Sequence
@@ -66,13 +67,14 @@ class Commands:
         self._subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=Parser)
         self.by_name: dict[str, Parser] = {}
 
-    def add(self, name: str, execute: Execute, *, help: str, description: str, example: str) -> Parser:
-        """A new command, with the options that all of them have."""
+    def add(self, name: str, execute: Execute, help: str) -> Parser:
+        """A new command, with the options that all of them have. What it does, and an example, says its docstring."""
+        description, _, example = inspect.cleandoc(execute.__doc__ or "").partition("\n\nexample:")
         parser: Parser = self._subparsers.add_parser(
             name,
             help=help,
             description=description,
-            epilog=f"example:\n  {example}",
+            epilog=f"example:{example}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )

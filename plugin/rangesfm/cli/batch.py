@@ -31,27 +31,7 @@ _BYTES_PER_UNIT = {"mb": 10**6, "gb": 10**9, "mib": 1 << 20, "gib": 1 << 30}
 
 
 def add_commands(commands: Commands) -> None:
-    parser = commands.add(
-        "batch",
-        execute,
-        help="many surveys at once, on this machine or on a cluster",
-        description=(
-            "Run many surveys, each as rangesfm run would. One that fails does not stop the others. What became of\n"
-            "each is in batch.csv, batch.json and batch.html. Needs pip install 'rangesfm[batch]'.\n\n"
-            "Without --scheduler the workers are processes of this machine, which share its cores and memory. With\n"
-            "it they are those of a Dask scheduler; they must have this version of rangesfm installed and see the\n"
-            "surveys' files under the same paths. Each should do one survey at a time:\n"
-            "  dask scheduler --host HEAD\n"
-            "  dask worker tcp://HEAD:8786 --nthreads 1 --no-dashboard       # on each machine\n"
-            "On Slurm, PBS and the like dask-jobqueue starts them, on Kubernetes dask-kubernetes: see the README.\n\n"
-            "Exit status: 0 all done; otherwise the largest of the statuses that rangesfm run would have had."
-        ),
-        example=(
-            "rangesfm batch surveys/*.toml --output_path batch\n"
-            "  rangesfm batch surveys/*.toml --num_workers 2 --num_threads 4 --memory_limit 8GB\n"
-            "  rangesfm batch surveys/*.toml --scheduler tcp://head:8786 --num_threads 8"
-        ),
-    )
+    parser = commands.add("batch", execute, "many surveys at once, on this machine or on a cluster")
     parser.add_argument(
         "surveys", nargs="+", metavar="SURVEY.toml", help="survey files, each with its own [output] path"
     )
@@ -71,6 +51,23 @@ def add_commands(commands: Commands) -> None:
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """Run many surveys, each as rangesfm run would. One that fails does not stop the others. What became of
+    each is in batch.csv, batch.json and batch.html. Needs pip install 'rangesfm[batch]'.
+
+    Without --scheduler the workers are processes of this machine, which share its cores and memory. With
+    it they are those of a Dask scheduler; they must have this version of rangesfm installed and see the
+    surveys' files under the same paths. Each should do one survey at a time:
+      dask scheduler --host HEAD
+      dask worker tcp://HEAD:8786 --nthreads 1 --no-dashboard       # on each machine
+    On Slurm, PBS and the like dask-jobqueue starts them, on Kubernetes dask-kubernetes: see the README.
+
+    Exit status: 0 all done; otherwise the largest of the statuses that rangesfm run would have had.
+
+    example:
+      rangesfm batch surveys/*.toml --output_path batch
+      rangesfm batch surveys/*.toml --num_workers 2 --num_threads 4 --memory_limit 8GB
+      rangesfm batch surveys/*.toml --scheduler tcp://head:8786 --num_threads 8
+    """
     if args.scheduler is not None and args.num_workers is not None:
         raise InputError("--num_workers is of this machine: with --scheduler, those that run there count")
     _require_dask()

@@ -39,55 +39,20 @@ _TOWARD = {
 
 
 def add_commands(commands: Commands) -> None:
-    ranges = commands.add(
-        "ranges",
-        _ranges,
-        help="what is in a radio log; writes it as canonical CSV",
-        description=(
-            "Print what is in a radio log, and write it as canonical CSV. The noise is how far ranges are off a "
-            "smooth curve through their neighbours."
-        ),
-        example=(
-            "rangesfm ranges log.csv --columns timestamp=t,anchor_id=node,range=d --timestamp_unit ms \\\n"
-            "    --output_path ranges.csv"
-        ),
-    )
+    ranges = commands.add("ranges", _ranges, "what is in a radio log; writes it as canonical CSV")
     _add_log_arguments(ranges)
     ranges.add_argument("--anchors", metavar="CSV", help="who is an anchor, to tell ranges between two of them")
     ranges.add_argument("--output_path", metavar="CSV", help="write the ranges there")
     ranges.add_argument("--plot", metavar="FILE", help="draw the ranges over time there (PNG or SVG)")
     calibrate = commands.add(
-        "ranges calibrate",
-        _calibrate,
-        help="the error curve of a radio, from a log with known tag positions",
-        description=(
-            "Learn by how much a radio reads long or short at each distance, from a log whose tag positions are "
-            "known (a total station, motion capture) and surveyed anchors. Every command takes the file that this "
-            "writes as --error_curve, or as error_curve in [ranges]."
-        ),
-        example=(
-            "rangesfm ranges calibrate log.csv --anchors anchors.csv --positions truth.csv \\\n"
-            "    --output_path curve.csv"
-        ),
+        "ranges calibrate", _calibrate, "the error curve of a radio, from a log with known tag positions"
     )
     _add_log_arguments(calibrate)
     calibrate.add_argument("--anchors", required=True, metavar="CSV", help="anchor_id,x_m,y_m,z_m: surveyed")
     _add_position_arguments(calibrate, max_interpolation_gap_s=0.2)
     calibrate.add_argument("--output_path", required=True, metavar="CSV", help="write the curve there")
     calibrate.add_argument("--plot", metavar="FILE", help="draw the curve and the ranges' errors there (PNG or SVG)")
-    trilaterate = commands.add(
-        "trilaterate",
-        _trilaterate,
-        help="anchor positions from ranges at known tag positions",
-        description=(
-            "Find where anchors stand from ranges that were taken at known positions of the tag, robustly. If these "
-            "lie in a plane, an anchor has two possible places, one on each side: --side says which."
-        ),
-        example=(
-            "rangesfm trilaterate uwb.csv --positions total_station.csv --side above --output_path anchors.csv\n"
-            "  rangesfm run survey.toml --anchors anchors.csv --anchor_frame site"
-        ),
-    )
+    trilaterate = commands.add("trilaterate", _trilaterate, "anchor positions from ranges at known tag positions")
     _add_log_arguments(trilaterate)
     _add_position_arguments(trilaterate, max_interpolation_gap_s=0.5)
     _add_estimate_arguments(trilaterate)
@@ -192,6 +157,13 @@ def _read_placed_log(args: argparse.Namespace) -> tuple[RangeLog, Array]:
 
 
 def _ranges(args: argparse.Namespace, progress: Progress) -> Outcome:
+    r"""Print what is in a radio log, and write it as canonical CSV. The noise is how far ranges are off a smooth curve
+    through their neighbours.
+
+    example:
+      rangesfm ranges log.csv --columns timestamp=t,anchor_id=node,range=d --timestamp_unit ms \
+        --output_path ranges.csv
+    """
     from rangesfm.ranging.anchors.anchor_file import read_anchors
     from rangesfm.ranging.readers import read_anchors_in_log, write_ranges_csv
     from rangesfm.ranging.summary import summarize_ranges
@@ -264,6 +236,14 @@ def _number(value: float | None) -> str:
 
 
 def _calibrate(args: argparse.Namespace, progress: Progress) -> Outcome:
+    r"""Learn by how much a radio reads long or short at each distance, from a log whose tag positions are known (a
+    total station, motion capture) and surveyed anchors. Every command takes the file that this writes as
+    --error_curve, or as error_curve in [ranges].
+
+    example:
+      rangesfm ranges calibrate log.csv --anchors anchors.csv --positions truth.csv \
+        --output_path curve.csv
+    """
     from rangesfm.ranging.anchors.anchor_file import read_anchors
     from rangesfm.ranging.errors.calibration import calibrate_ranges
     from rangesfm.ranging.errors.error_curve import write_error_curve
@@ -302,6 +282,13 @@ def _calibrated(calibration: Calibration, num_in_log: int) -> list[str]:
 
 
 def _trilaterate(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """Find where anchors stand from ranges that were taken at known positions of the tag, robustly. If these lie in a
+    plane, an anchor has two possible places, one on each side: --side says which.
+
+    example:
+      rangesfm trilaterate uwb.csv --positions total_station.csv --side above --output_path anchors.csv
+      rangesfm run survey.toml --anchors anchors.csv --anchor_frame site
+    """
     from rangesfm.ranging.anchors.anchor_file import write_anchors
     from rangesfm.ranging.anchors.anchor_survey import trilaterate_anchors
     from rangesfm.ranging.anchors.trilateration import TrilaterationOptions

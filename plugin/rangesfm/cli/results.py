@@ -24,13 +24,7 @@ _WITHOUT_LOG = ("--distances", "--markers")
 
 
 def add_commands(commands: Commands) -> None:
-    export = commands.add(
-        "export",
-        _export,
-        help="metric model to other formats",
-        description="Write the metric model of a result folder in other formats; an unknown one lists them all.",
-        example="rangesfm export out --formats tum,ply,nerfstudio --frame level --output_path exported",
-    )
+    export = commands.add("export", _export, "metric model to other formats")
     _add_result_argument(export)
     add_flags(export, "export", by_own_names=True)
     export.add_argument(
@@ -41,35 +35,13 @@ def add_commands(commands: Commands) -> None:
     )
     export.add_argument("--images", metavar="FOLDER", help="the photos (default: where the run found them)")
     export.add_argument("--output_path", metavar="FOLDER", help="where to (default: the result folder)")
-    compare = commands.add(
-        "compare",
-        _compare,
-        help="models with each other and with a reference",
-        description=(
-            "One result folder: its models with each other, and with a reference if there is one.\n"
-            "Two or more models, result folders or files of camera positions: each with the first.\n"
-            "--ranges holds them against a radio log, which the first of them places (default: the ranges that the\n"
-            "first result folder used), --distances against taped distances."
-        ),
-        example=(
-            "rangesfm compare out --reference reference.csv\n"
-            "  rangesfm compare out other_tool/sparse/0 --output_path comparison\n"
-            "  rangesfm compare one/sparse/0 other/sparse/0 --ranges uwb.csv --anchors anchors.csv \\\n"
-            "      --images images.csv --tag_in_cam -0.0012,-0.09,-0.0663 --distances taped.csv"
-        ),
-    )
+    compare = commands.add("compare", _compare, "models with each other and with a reference")
     compare.add_argument("models", nargs="*", metavar="MODEL", help="result folders, COLMAP models, CSV or TUM files")
     compare.add_argument("--input_path", metavar="RESULT", help="one result folder (default: out)")
     compare.add_argument("--reference", metavar="FILE", help="true positions: CSV or TUM")
     compare.add_argument("--output_path", metavar="FOLDER", help="of two or more: write comparison.html there as well")
     add_flags(compare, *_COMPARE_KEYS, without=_OF_A_RUN)
-    report = commands.add(
-        "report",
-        _report,
-        help="result folder to one self-contained HTML page",
-        description="Write report.html, one self-contained page, into a result folder.",
-        example="rangesfm report out",
-    )
+    report = commands.add("report", _report, "result folder to one self-contained HTML page")
     _add_result_argument(report)
     report.add_argument("--images", metavar="FOLDER", help="the photos, for thumbnails (default: as in the run)")
     report.add_argument("--png", action="store_true", help="write the figures for a paper too, as PNG and SVG")
@@ -92,6 +64,11 @@ def _path(given: str | None) -> Path | None:
 
 
 def _export(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """Write the metric model of a result folder in other formats; an unknown one lists them all.
+
+    example:
+      rangesfm export out --formats tum,ply,nerfstudio --frame level --output_path exported
+    """
     from rangesfm.workflows.export_result import apply_result, export_result
 
     source = _result_path(args)
@@ -125,6 +102,17 @@ def _frame_note(options: ExportOptions, result_folder: Path) -> list[str]:
 
 
 def _compare(args: argparse.Namespace, progress: Progress) -> Outcome:
+    r"""One result folder: its models with each other, and with a reference if there is one.
+    Two or more models, result folders or files of camera positions: each with the first.
+    --ranges holds them against a radio log, which the first of them places (default: the ranges that the
+    first result folder used), --distances against taped distances.
+
+    example:
+      rangesfm compare out --reference reference.csv
+      rangesfm compare out other_tool/sparse/0 --output_path comparison
+      rangesfm compare one/sparse/0 other/sparse/0 --ranges uwb.csv --anchors anchors.csv \
+          --images images.csv --tag_in_cam -0.0012,-0.09,-0.0663 --distances taped.csv
+    """
     given = [*([] if args.input_path is None else [args.input_path]), *args.models]
     paths = [Path(path) for path in given] or [Path("out")]
     if len(paths) > 1:
@@ -177,6 +165,11 @@ def _tape(survey: Survey) -> Tape | None:
 
 
 def _report(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """Write report.html, one self-contained page, into a result folder.
+
+    example:
+      rangesfm report out
+    """
     from rangesfm.report import write_report, write_report_pictures
 
     source, images = _result_path(args), _path(args.images)

@@ -30,23 +30,11 @@ _JOIN_KEYS = (
 
 
 def add_commands(commands: Commands) -> None:
-    run = commands.add(
-        "run",
-        _run,
-        help="photos and ranges to a metric model: the whole pipeline",
-        description="Photos and ranges to a metric model. Stages that an earlier run has done are used again.",
-        example="rangesfm run survey.toml --every_nth 3 --output_path out",
-    )
+    run = commands.add("run", _run, "photos and ranges to a metric model: the whole pipeline")
     add_survey_arguments(run, has_model=True)
     add_restart_argument(run)
     run.add_argument("--live", action="store_true", help="keep live.html, a page to watch, in the output folder")
-    demo = commands.add(
-        "demo",
-        _demo,
-        help="make a small survey and run the pipeline on it: no data needed",
-        description="Make a small survey (photos that come with rangesfm, simulated UWB log, truth) and run it.",
-        example="rangesfm demo my_demo",
-    )
+    demo = commands.add("demo", _demo, "make a small survey and run the pipeline on it: no data needed")
     demo.add_argument(
         "folder", nargs="?", default=_DEMO_FOLDER, metavar="DIR", help=f"where to (default: {_DEMO_FOLDER})"
     )
@@ -56,50 +44,26 @@ def add_commands(commands: Commands) -> None:
     demo.add_argument("--seed", type=int, default=0, metavar="N", help="of the radio and of the run (default: 0)")
     demo.add_argument("--num_threads", type=int, metavar="N", help="-1 for all cores")
     add_restart_argument(demo)
-    reconstruct = commands.add(
-        "reconstruct",
-        _reconstruct,
-        help="photos to an unscaled COLMAP model",
-        description="Photos to an unscaled COLMAP model: keyframes, features, matching, incremental mapping.",
-        example="rangesfm reconstruct --images photos --image_times images.csv --output_path out",
-    )
+    reconstruct = commands.add("reconstruct", _reconstruct, "photos to an unscaled COLMAP model")
     add_survey_arguments(reconstruct, "images", "camera", "mapper", "output")
     add_restart_argument(reconstruct)
-    scale = commands.add(
-        "scale",
-        _scale,
-        help="COLMAP model and ranges to the scale, with uncertainty and verdict",
-        description="The scale of a COLMAP model (points are not needed) from ranges, and the rescaled model.",
-        example="rangesfm scale --input_path sparse/0 --ranges uwb.csv --images images.csv --output_path out",
-    )
+    scale = commands.add("scale", _scale, "COLMAP model and ranges to the scale, with uncertainty and verdict")
     add_survey_arguments(scale, *_SCALE_KEYS, has_model=True)
-    refine = commands.add(
-        "refine",
-        _refine,
-        help="COLMAP model and ranges to a refined metric model",
-        description="Scale a COLMAP model by ranges, then adjust it with the ranges in its bundle adjustment.",
-        example=(
-            "rangesfm refine --input_path sparse/0 --ranges uwb.csv --anchors anchors.csv \\\n"
-            "    --images images.csv --tag_in_cam -0.0012,-0.09,-0.0663 --output_path out"
-        ),
-    )
+    refine = commands.add("refine", _refine, "COLMAP model and ranges to a refined metric model")
     add_survey_arguments(refine, *_SCALE_KEYS, "camera.refine_intrinsics", "refine", has_model=True)
     join = commands.add(
-        "join",
-        _join,
-        help="several surveys of one site to one metric map, through the anchors that they share",
-        description=(
-            "Result folders of surveys that share anchors (other days, other cameras with their own tags) to one map\n"
-            "with one set of anchors; no common photo is needed. To the first one the others are joined. Anchors that\n"
-            "nobody surveyed join them too, if each has three or more with the others that are not on a line."
-        ),
-        example="rangesfm join monday/out tuesday/out --output_path site",
+        "join", _join, "several surveys of one site to one metric map, through the anchors that they share"
     )
     join.add_argument("results", nargs="*", metavar="RESULT", help="output folders of runs, two or more")
     add_flags(join, *_JOIN_KEYS, without=("scale.up_in_first_camera", "scale.distances", "scale.markers"))
 
 
 def _run(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """Photos and ranges to a metric model. Stages that an earlier run has done are used again.
+
+    example:
+      rangesfm run survey.toml --every_nth 3 --output_path out
+    """
     survey = survey_from_arguments(args)
     if survey.model_path is None:
         _require_images(survey)
@@ -127,6 +91,11 @@ def _run_or_refine(survey: Survey, progress: Progress, restart: bool) -> RunResu
 
 
 def _demo(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """Make a small survey (photos that come with rangesfm, simulated UWB log, truth) and run it.
+
+    example:
+      rangesfm demo my_demo
+    """
     if args.num_photos not in _NUM_PHOTOS:
         raise InputError(f"--num_photos is {args.num_photos}, expected {_NUM_PHOTOS[0]} to {_NUM_PHOTOS[-1]}")
     if args.seed < 0:
@@ -145,6 +114,11 @@ def _demo(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _reconstruct(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """Photos to an unscaled COLMAP model: keyframes, features, matching, incremental mapping.
+
+    example:
+      rangesfm reconstruct --images photos --image_times images.csv --output_path out
+    """
     survey = survey_from_arguments(args)
     _require_images(survey)
     from rangesfm.workflows.run import reconstruct_survey
@@ -153,6 +127,11 @@ def _reconstruct(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _scale(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """The scale of a COLMAP model (points are not needed) from ranges, and the rescaled model.
+
+    example:
+      rangesfm scale --input_path sparse/0 --ranges uwb.csv --images images.csv --output_path out
+    """
     survey = survey_from_arguments(args)
     _require_model_and_ranges(survey)
     from rangesfm.workflows.run import scale_model
@@ -161,6 +140,12 @@ def _scale(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _refine(args: argparse.Namespace, progress: Progress) -> Outcome:
+    r"""Scale a COLMAP model by ranges, then adjust it with the ranges in its bundle adjustment.
+
+    example:
+      rangesfm refine --input_path sparse/0 --ranges uwb.csv --anchors anchors.csv \
+        --images images.csv --tag_in_cam -0.0012,-0.09,-0.0663 --output_path out
+    """
     survey = survey_from_arguments(args)
     _require_model_and_ranges(survey)
     from rangesfm.workflows.run import refine_model
@@ -169,6 +154,13 @@ def _refine(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _join(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """Result folders of surveys that share anchors (other days, other cameras with their own tags) to one map
+    with one set of anchors; no common photo is needed. To the first one the others are joined. Anchors that
+    nobody surveyed join them too, if each has three or more with the others that are not on a line.
+
+    example:
+      rangesfm join monday/out tuesday/out --output_path site
+    """
     survey = survey_from_arguments(args)
     from rangesfm.workflows.join_surveys import join_surveys
 
