@@ -10,15 +10,9 @@
 
 namespace rangesfm {
 
-// Two residuals that are always zero and depend on nothing: they say that two blocks belong together, no more.
-//
-// Ceres solves bundle adjustment by first eliminating a set of blocks no two of which share a residual, chosen greedily
-// from the blocks with the fewest neighbours: the 3-D points. A free anchor meets no point and so joins the set; so
-// does a free bias. Then the blocks to eliminate are no longer all of size 3 in rows of 2, Ceres falls back from its
-// specialised kernels (2,3,6 or 2,3,d) to the general one (d,d,d), and eliminating the anchor couples all the poses it
-// was ranged from. Tied to a 3-D point that is seen in fewer images than the block has neighbours, it stays out of the
-// set, and PaddedManifold makes it as wide as a pose. Every free anchor and every free bias needs a tie of its own.
-// Two rows, since a reprojection has two: the rows of the points must all be of that size.
+// Two residuals that are always zero and depend on nothing: they say that two blocks belong together, no more. Why an
+// anchor is tied to a point so: keep_from_elimination in plugin/rangesfm/ceres/problem.py. Two rows, since a
+// reprojection has two: for Ceres' specialised kernels the rows of the points must all be of that size.
 //
 // Blocks: any two, for example anchor_in_world (3) and a 3-D point (3).
 class ZeroTieCost final : public ceres::CostFunction {
@@ -47,10 +41,9 @@ class ZeroTieCost final : public ceres::CostFunction {
 // Numbers that add up as usual, in a tangent space with further directions that move nothing: a block of k numbers that
 // takes as many columns of the Jacobian as a pose, the last of them zero.
 //
-// Ceres' Schur eliminator has kernels for blocks of fixed size. All blocks that share a residual with an eliminated
-// point must be of one size for them; poses have 6 columns, and one anchor (3) or bias (1) that is tied to a point to
-// keep it from elimination (ZeroTieCost) would make them all be handled as of any size. Levenberg-Marquardt's
-// damping has a floor (Solver::Options::min_lm_diagonal), so that directions that move nothing get a step of zero.
+// Among the blocks that share a residual with an eliminated point it is then of the poses' size, for which there are
+// kernels. Levenberg-Marquardt's damping has a floor (Solver::Options::min_lm_diagonal), so that directions that move
+// nothing get a step of zero.
 class PaddedManifold final : public ceres::Manifold {
  public:
   PaddedManifold(int ambient_size, int tangent_size) : ambient_size_(ambient_size), tangent_size_(tangent_size) {}
