@@ -12,11 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
 from rangesfm.cli.arguments import Commands, Outcome
-from rangesfm.cli.survey_flags import (
-    add_flags,
-    add_restart_argument,
-    overrides_from_arguments,
-)
+from rangesfm.cli.survey_flags import add_flags, add_restart_argument, overrides_from_arguments
 from rangesfm.cli.terminal import Screen, counts, duration
 from rangesfm.errors import InputError
 from rangesfm.progress import Progress

@@ -12,11 +12,7 @@ from rangesfm.errors import InputError
 from rangesfm.progress import Progress
 
 if TYPE_CHECKING:
-    from rangesfm.comparison.models import NamedModel
-    from rangesfm.comparison.ranges import ModelRanges
-    from rangesfm.distances.tape import Tape
     from rangesfm.options import ExportOptions
-    from rangesfm.survey.settings import Survey
 
 _COMPARE_KEYS = ("images.path", "ranges", "anchors", "tag", "scale")
 _OF_A_RUN = ("ranges.check_share", "ranges.check_anchors", "ranges.check_times_s", "scale.method")
@@ -128,16 +124,23 @@ def _compare(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
     from rangesfm.comparison.models import compare_many, read_models
+    from rangesfm.comparison.ranges import ranges_of_survey
     from rangesfm.comparison.with_reference import compare, format_table
+    from rangesfm.distances.tape import read_tape
     from rangesfm.geometry.reference import read_reference
+    from rangesfm.survey.inputs import read_ranging_inputs
 
     given = flags_given(args, *_COMPARE_KEYS)
     of_log = [name for name in given if name not in _WITHOUT_LOG]
     if of_log and "--ranges" not in given:
         raise InputError(f"{', '.join(of_log)} given without a log to use it for, expected --ranges LOG as well")
     survey = survey_from_arguments(args)
-    models = read_models(paths)
-    comparison = compare_many(models, _ranges(survey, models[0], paths[0]), _tape(survey))
+    models, ranges, tape = read_models(paths), None, None
+    if survey.ranges.path is not None and models[0].model is not None:
+        ranges = ranges_of_survey(survey, read_ranging_inputs(survey), models[0].model, paths[0])
+    if survey.scale.distances is not None:
+        tape = read_tape(survey.scale.distances, survey.scale.markers)
+    comparison = compare_many(models, ranges, tape)
     lines = [str(comparison)]
     if args.reference is not None:
         trajectories = {model.name: model.path for model in comparison.models}
@@ -147,21 +150,6 @@ def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
 
         lines += ["", f"page: {write_comparison(comparison, Path(args.output_path))}"]
     return Outcome(lines)
-
-
-def _ranges(survey: Survey, first: NamedModel, path: Path) -> ModelRanges | None:
-    from rangesfm.comparison.ranges import ranges_of_survey
-    from rangesfm.survey.inputs import read_ranging_inputs
-
-    if survey.ranges.path is None or first.model is None:
-        return None
-    return ranges_of_survey(survey, read_ranging_inputs(survey), first.model, path)
-
-
-def _tape(survey: Survey) -> Tape | None:
-    from rangesfm.distances.tape import read_tape
-
-    return None if survey.scale.distances is None else read_tape(survey.scale.distances, survey.scale.markers)
 
 
 def _report(args: argparse.Namespace, progress: Progress) -> Outcome:

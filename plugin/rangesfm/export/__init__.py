@@ -35,22 +35,12 @@ __all__ = [
     "MetricMap",
     "apply_to",
     "best_similarity",
+    "check_formats",
     "export_map",
     "export_model",
-    "write_anchors",
-    "write_cameras",
-    "write_features",
-    "write_kitti",
-    "write_laz",
     "write_model",
-    "write_nerfstudio",
-    "write_opensfm",
-    "write_opf",
     "write_points",
     "write_positions",
-    "write_trajectory",
-    "write_transform",
-    "write_undistorted",
 ]
 
 Exporter = Callable[[MetricMap, Path], Path]

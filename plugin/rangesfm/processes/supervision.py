@@ -175,20 +175,15 @@ class _Watched:
 
     def look(self) -> None:
         if self._limit is not None and self.needed_bytes is None:
-            self._look_at_memory(self._limit)
+            with suppress(psutil.Error):  # it has ended
+                used = psutil.Process(self._process.pid).memory_info().rss
+                if used > self._limit:
+                    self.needed_bytes = used
+                    self._process.kill()
         if self.stopped_at is None and self._is_stopped():
             self.stopped_at = time.monotonic()
             self._process.send_signal(signal.SIGINT)
         if self.stopped_at is not None and time.monotonic() - self.stopped_at > _MAX_STOP_S:
-            self._process.kill()
-
-    def _look_at_memory(self, limit_bytes: int) -> None:
-        try:
-            used = psutil.Process(self._process.pid).memory_info().rss
-        except psutil.Error:  # it has ended
-            return
-        if used > limit_bytes:
-            self.needed_bytes = used
             self._process.kill()
 
 
@@ -200,32 +195,23 @@ def _talk(
     assert process.stdout is not None
     lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
     threading.Thread(target=_read_lines, args=(process.stdout, lines), daemon=True).start()
+    last = None
     try:
         with suppress(BrokenPipeError):  # it died; what it said before counts
             process.stdin.write(given)
             process.stdin.flush()
-        last = _hear(lines, listen, watched)
+        while True:
+            watched.look()
+            with suppress(queue.Empty):
+                if (line := lines.get(timeout=_POLL_INTERVAL_S)) is None:
+                    break
+                last = json.loads(line)
+                listen(last)
     finally:
         with suppress(BrokenPipeError):
             process.stdin.close()  # not sooner: that it is open says that we live
     process.wait()
     return last
-
-
-def _hear(
-    lines: queue.SimpleQueue[bytes | None], listen: Callable[[dict[str, Any]], None], watched: _Watched
-) -> dict[str, Any] | None:
-    last = None
-    while True:
-        watched.look()
-        try:
-            line = lines.get(timeout=_POLL_INTERVAL_S)
-        except queue.Empty:
-            continue
-        if line is None:
-            return last
-        last = json.loads(line)
-        listen(last)
 
 
 def _read_lines(stream: IO[bytes], lines: queue.SimpleQueue[bytes | None]) -> None:

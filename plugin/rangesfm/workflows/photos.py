@@ -219,17 +219,13 @@ class AdjustmentWithRanges:
 
     def _observations(self, path: Trajectory) -> RangeObservations:
         survey, inputs = self._survey, self._inputs
-        if self._is_to_look_for_offset(path):
+        is_open = inputs.log.timestamp_s is not None and survey.ranges.time_offset_s is None
+        if is_open and len(path) >= _GROWTH * self._num_with_offset:
             found = estimate_time_offset(
                 inputs.log, path, inputs.tag_in_cam_m, association=survey.ranges, seed=survey.output.seed
             )
             self._offset_s, self._num_with_offset = found.value_s, len(path)
         return ranges_on_path(survey, inputs, path, self._offset_s or 0.0)
-
-    def _is_to_look_for_offset(self, path: Trajectory) -> bool:
-        if self._inputs.log.timestamp_s is None or self._survey.ranges.time_offset_s is not None:
-            return False
-        return len(path) >= _GROWTH * self._num_with_offset
 
     def _anchor_frame(self, path: Trajectory) -> str:
         """Positions in the first camera's frame are of no use before that photo is part of the map."""
