@@ -9,6 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 _MAX_SHOWN = 100
+INTERNAL_ERROR, BAD_INPUT, FAILED = 1, 2, 4
+"""Exit statuses; the first is of what nobody should ever see."""
+INTERRUPTED = 130
+"""As shells have it."""
+_UNUSABLE_PATH = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG)
 
 
 def one_line(text: str) -> str:
@@ -86,13 +91,6 @@ class SolverError(RangesfmError):
     """A solver failed, or the compiled part does not fit the installed packages."""
 
     exit_status = 4
-
-
-INTERNAL_ERROR, BAD_INPUT, FAILED = 1, 2, 4
-"""Exit statuses; the first is of what nobody should ever see."""
-INTERRUPTED = 130
-"""As shells have it."""
-_UNUSABLE_PATH = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,8 @@ from pathlib import Path
 from rangesfm.errors import Failure, InputError, failure_of, one_line
 from rangesfm.survey.settings import Survey, read_survey
 
+_USUAL_BYTES = 2 * 10**9  # what a reconstruction of some hundred photos stays below
+
 
 @dataclass(frozen=True)
 class Job:
@@ -57,9 +59,6 @@ def _read_job(path: str | Path, overrides: Mapping[str, object]) -> Job:
         return Job(one_line(str(path)), read_survey(path, overrides))
     except (InputError, OSError) as error:
         return Job(one_line(str(path)), None, failure_of(error))
-
-
-_USUAL_BYTES = 2 * 10**9  # what a reconstruction of some hundred photos stays below
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,10 @@ _CONFIG = {
     "distributed.comm.timeouts.connect": f"{_CONNECT_S}s",
 }
 _SILENT = logging.CRITICAL + 1
+# By the system for want of memory, or by somebody from outside: then it is worth another try.
+_FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
+# Batches whose surveys this worker is to leave alone.
+_stopped: set[str] = set()
 
 
 def this_machine() -> tuple[int, int]:
@@ -116,13 +120,6 @@ def num_at_once(client: Client) -> Mapping[str, int]:
 
 def _slots(dask_worker: Any) -> tuple[str, int]:
     return socket.gethostname(), dask_worker.state.nthreads
-
-
-# By the system for want of memory, or by somebody from outside: then it is worth another try.
-_FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
-
-# Batches whose surveys this worker is to leave alone.
-_stopped: set[str] = set()
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 # Each survey has its own photos and output; threads are what the workers share.
 _OF_A_SURVEY = ("images.path", "images.times", "mapper.num_threads", "output.path")
 _BYTES_PER_UNIT = {"mb": 10**6, "gb": 10**9, "mib": 1 << 20, "gib": 1 << 30}
+_INTERVAL_S = 0.2
+_MAX_NUM_LINES = 20
 
 
 def add_commands(commands: Commands) -> None:
@@ -104,10 +106,6 @@ def _bytes(text: str) -> int:
     if found is None or float(found[1]) == 0:
         raise argparse.ArgumentTypeError(f"'{text}' is no size, expected one as 8GB or 500MB")
     return int(float(found[1]) * _BYTES_PER_UNIT[found[2].lower()])
-
-
-_INTERVAL_S = 0.2
-_MAX_NUM_LINES = 20
 
 
 class BatchTerminal:

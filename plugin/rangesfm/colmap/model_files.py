@@ -30,6 +30,11 @@ _NO_POINT = 2**64 - 1
 _FEATURE = np.dtype([("xy", "<f8", 2), ("point_id", "<u8")])
 _ELEMENT = np.dtype([("image_id", "<u4"), ("feature", "<u4")])
 _POINT = np.dtype([("point_id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")])
+_EXPECTED = "expected cameras, images and points3D files that COLMAP wrote"
+# Text files round quaternions, and some programs write a few digits only.
+_MAX_QUATERNION_ERROR = 1e-2
+_UNIT_LENGTH_ERROR = 1e-9
+_MAX_IMAGE_SIZE = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -187,13 +192,6 @@ _WALKS: dict[str, Callable[[_Cursor], int]] = {
 }
 MODEL_FILES = tuple(_WALKS)
 """COLMAP's binary files, each a count and so many records."""
-
-
-_EXPECTED = "expected cameras, images and points3D files that COLMAP wrote"
-# Text files round quaternions, and some programs write a few digits only.
-_MAX_QUATERNION_ERROR = 1e-2
-_UNIT_LENGTH_ERROR = 1e-9
-_MAX_IMAGE_SIZE = 1_000_000
 
 
 def read_model(path: Path) -> pycolmap.Reconstruction:

@@ -13,6 +13,9 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from rangesfm.arrays import Array
 from rangesfm.ranging.log import RangeLog
 
+# A radio cannot measure less than this; the log's ranges are positive.
+_MIN_RANGE_M = 0.01
+
 
 @dataclass(frozen=True)
 class CameraPath:
@@ -50,10 +53,6 @@ class CameraPath:
     def world_from_cam(self, times_s: Array) -> Array:
         """(n, 3, 3) rotations."""
         return np.asarray(self.rotation(times_s).as_matrix())
-
-
-# A radio cannot measure less than this; the log's ranges are positive.
-_MIN_RANGE_M = 0.01
 
 
 @dataclass(frozen=True)

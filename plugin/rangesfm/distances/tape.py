@@ -18,6 +18,9 @@ from rangesfm.files.tables import Table, read_table
 CONTROL, CHECK = "control", "check"
 # What a steel tape and a steady hand are good for.
 DEFAULT_STDDEV_M = 0.01
+_PIXELS = ("x_px", "y_px")
+# Of stddevs; one honest distance in three hundred is further off.
+_DISAGREES = 3.0
 
 
 @dataclass(frozen=True)
@@ -87,9 +90,6 @@ def read_tape(distances_path: str | Path, markers_path: str | Path | None = None
     return Tape(distances, markers, Path(distances_path), None if markers_path is None else Path(markers_path))
 
 
-_PIXELS = ("x_px", "y_px")
-
-
 def _distances(table: Table) -> tuple[TapedDistance, ...]:
     if not len(table):
         raise InputError("holds no distance, expected one a line", table.path)
@@ -130,10 +130,6 @@ def _marker(table: Table, image_names: Sequence[str], pixels: npt.NDArray[np.flo
         if seen_in[k] in seen_in[:k]:
             raise table.error(row, "image_name", "a photo in which this marker has no place yet")
     return Marker(tuple(seen_in), pixels[rows], tuple(table.line[rows].tolist()))
-
-
-# Of stddevs; one honest distance in three hundred is further off.
-_DISAGREES = 3.0
 
 
 class DistanceRow(Record):

@@ -16,6 +16,9 @@ from rangesfm.geometry.georeference import GEOGRAPHIC, is_geographic
 _STEP_M = 1e-4
 _STEP_DEG = 1e-9
 _POINT_FORMAT_WITH_COLOR = 7
+_WKB_POINT_Z = 1001
+# Nine decimals of a degree are a tenth of a millimetre.
+_OPTIONS = {"GeoJSON": {"COORDINATE_PRECISION": "9"}}
 
 
 def write_laz(map_: MetricMap, path: Path) -> Path:
@@ -51,9 +54,6 @@ def _coordinates(map_: MetricMap, xyz: Array) -> tuple[Array, Array]:
         return xyz, np.full(3, _STEP_M)
     step = _STEP_DEG if is_geographic(map_.georeference.crs) else _STEP_M
     return map_.georeference.projected(xyz), np.array([step, step, _STEP_M])
-
-
-_WKB_POINT_Z = 1001
 
 
 def write_features(map_: MetricMap, path: Path, driver: str) -> Path:
@@ -95,10 +95,6 @@ def write_features(map_: MetricMap, path: Path, driver: str) -> Path:
             **_OPTIONS.get(driver, {}),
         )
     return path
-
-
-# Nine decimals of a degree are a tenth of a millimetre.
-_OPTIONS = {"GeoJSON": {"COORDINATE_PRECISION": "9"}}
 
 
 def _wkb(coordinates: Array) -> np.ndarray[tuple[int], np.dtype[np.object_]]:

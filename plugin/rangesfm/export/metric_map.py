@@ -19,6 +19,14 @@ from rangesfm.geometry.similarity import Similarity, path_shape
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.options import ExportOptions
 
+# Extent of a path across its plane, in its second extent: above this there is no plane to speak of.
+_MAX_ROUGHNESS = 0.3
+# Mean of the photos' up directions: of photos that agree it has length 1.
+_MIN_AGREEMENT = 0.3
+_NEARLY_VERTICAL = 0.1
+# Of the same mean along the normal of the path's plane: photos straight down, or of a wall, have none.
+_MIN_LEAN = 0.01
+
 
 @dataclass(frozen=True)
 class MetricMap:
@@ -61,15 +69,6 @@ def points_of(model: pycolmap.Reconstruction) -> tuple[Array, npt.NDArray[np.uin
     points = [model.point3D(point_id) for point_id in sorted(model.point3D_ids())]
     xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
     return xyz, np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
-
-
-# Extent of a path across its plane, in its second extent: above this there is no plane to speak of.
-_MAX_ROUGHNESS = 0.3
-# Mean of the photos' up directions: of photos that agree it has length 1.
-_MIN_AGREEMENT = 0.3
-_NEARLY_VERTICAL = 0.1
-# Of the same mean along the normal of the path's plane: photos straight down, or of a wall, have none.
-_MIN_LEAN = 0.01
 
 
 def in_frame(map_: MetricMap, options: ExportOptions) -> MetricMap:

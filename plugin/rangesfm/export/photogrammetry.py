@@ -38,6 +38,10 @@ _OPENSFM = {
     "OPENCV_FISHEYE": "fisheye_opencv",
 }
 _ALL_OF_OPENSFM = {"brown": ("k1", "k2", "k3", "p1", "p2"), "fisheye_opencv": ("k1", "k2", "k3", "k4")}
+_NUM_CONSTRAINTS = 10
+_MIN_TRACK_LENGTH = 3
+# Of marks that a feature detector made; a person's click is of 1.
+_MARK_ACCURACY = 1.0
 
 
 def _distortion(camera: pycolmap.Camera, program: str, known: Mapping[str, str]) -> tuple[str, dict[str, float]]:
@@ -144,12 +148,6 @@ def _shot(image: pycolmap.Image, map_: MetricMap) -> dict[str, Any]:
 
 def _point(point: pycolmap.Point3D) -> dict[str, Any]:
     return {"color": [float(channel) for channel in point.color], "coordinates": point.xyz.tolist()}
-
-
-_NUM_CONSTRAINTS = 10
-_MIN_TRACK_LENGTH = 3
-# Of marks that a feature detector made; a person's click is of 1.
-_MARK_ACCURACY = 1.0
 
 
 def write_opf(map_: MetricMap, folder: Path) -> Path:

@@ -22,6 +22,13 @@ from rangesfm.geometry.trajectory import Trajectory
 CAMERA_COLOR = (37, 99, 235)
 ANCHOR_COLOR = (162, 28, 175)
 PLY_TYPES = {"f8": "double", "f4": "float", "u1": "uchar"}
+Vertices = npt.NDArray[np.void]
+_CODES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
+_MAX_NUM_DIGITS = 18  # larger numbers are not for a machine's word
+_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+_MAX_HEADER_BYTES = 1 << 16
+# Further from the origin, single precision is coarser than a millimetre.
+_MAX_SINGLE = 8192.0
 
 
 def write_points(reconstruction: pycolmap.Reconstruction, path: Path) -> Path:
@@ -63,16 +70,8 @@ def _write_vertices(
     return path
 
 
-Vertices = npt.NDArray[np.void]
-
-_CODES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 _CODES |= {"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4"}
 _CODES |= {"uint32": "u4", "float32": "f4", "float64": "f8"}
-_MAX_NUM_DIGITS = 18  # larger numbers are not for a machine's word
-_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
-_MAX_HEADER_BYTES = 1 << 16
-# Further from the origin, single precision is coarser than a millimetre.
-_MAX_SINGLE = 8192.0
 
 
 @dataclass(frozen=True)

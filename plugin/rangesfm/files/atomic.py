@@ -30,6 +30,11 @@ LEFTOVER = r"\..+\.(?P<pid>\d+)\.(part(\..+)?|old)"
 
 _CHUNK_BYTES = 1 << 20
 _NOT_IN_NAMES = ("Cc", "Cs", "Zl", "Zp")  # control characters, bytes that are no text, ends of lines and paragraphs
+LOCK_NAME = ".rangesfm.lock"
+# For a holder that ends, and removes the file, between two tries.
+_MAX_WAIT_S = 0.2
+# Folders that this thread holds: what it calls meanwhile may ask for them again.
+_held: ContextVar[frozenset[Path]] = ContextVar("held", default=frozenset())
 
 
 def sha256_of(path: Path) -> str:
@@ -121,15 +126,6 @@ def new_folder(path: Path) -> Iterator[Path]:
             if old.exists() and not path.exists():  # interrupted halfway
                 old.rename(path)
             shutil.rmtree(old, ignore_errors=True)
-
-
-LOCK_NAME = ".rangesfm.lock"
-
-# For a holder that ends, and removes the file, between two tries.
-_MAX_WAIT_S = 0.2
-
-# Folders that this thread holds: what it calls meanwhile may ask for them again.
-_held: ContextVar[frozenset[Path]] = ContextVar("held", default=frozenset())
 
 
 @contextmanager

@@ -13,6 +13,18 @@ from rangesfm.errors import InputError, one_line
 from rangesfm.files.atomic import write_text
 from rangesfm.files.tables import read_text
 
+_Kind = TypeVar("_Kind", bound="Record")
+_MAX_SHOWN = 60
+# Errors of pydantic whose own words are about Python.
+_EXPECTED = {
+    "dict_type": "a JSON object",
+    "model_type": "a JSON object",
+    "model_attributes_type": "a JSON object",
+    "tuple_type": "a JSON array",
+    "too_long": "{max_length} items",
+    "is_instance_of": "text",
+}
+
 
 def read_json(path: Path) -> Any:
     """The content of a JSON file; NaN and infinity, which some programs write and JSON does not know, become None.
@@ -50,19 +62,6 @@ def _finite(text: str) -> float:
     if math.isinf(value):
         raise ValueError(f"{text[:20]}{'...' * (len(text) > 20)} is too large a number")
     return value
-
-
-_Kind = TypeVar("_Kind", bound="Record")
-_MAX_SHOWN = 60
-# Errors of pydantic whose own words are about Python.
-_EXPECTED = {
-    "dict_type": "a JSON object",
-    "model_type": "a JSON object",
-    "model_attributes_type": "a JSON object",
-    "tuple_type": "a JSON array",
-    "too_long": "{max_length} items",
-    "is_instance_of": "text",
-}
 
 
 def _plain(value: Any) -> Any:

@@ -28,6 +28,10 @@ from rangesfm.errors import failure_of
 
 _PR_SET_PDEATHSIG = 1
 _UPDATE_INTERVAL_S = 0.5
+_POLL_INTERVAL_S = 0.2
+_MAX_STOP_S = 20.0  # until a process that was interrupted is killed
+_MAX_LINE = 200
+_STACK_TRACE = ("***", "@", "PC:")  # as glog begins its lines
 
 
 class MessagesToParent:
@@ -88,12 +92,6 @@ def _end_with(parent: int) -> None:
             os.kill(os.getpid(), signal.SIGKILL)
     else:  # the parent's end of stdin closes with it
         threading.Thread(target=lambda: (sys.stdin.buffer.read(), os._exit(1)), daemon=True).start()
-
-
-_POLL_INTERVAL_S = 0.2
-_MAX_STOP_S = 20.0  # until a process that was interrupted is killed
-_MAX_LINE = 200
-_STACK_TRACE = ("***", "@", "PC:")  # as glog begins its lines
 
 
 @dataclass(frozen=True)

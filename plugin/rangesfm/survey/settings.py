@@ -35,6 +35,9 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
+# An override of the first takes the place of the other in the file.
+_INSTEAD_OF = {"tag.tag_in_cam_m": "lever_arms_m", "tag.lever_arms_m": "tag_in_cam_m"}
+
 
 @dataclass(frozen=True)
 class Source:
@@ -102,10 +105,6 @@ def parse_inline_table(text: str) -> dict[str, Any]:
 
 def _dotted(text: str) -> str:
     return ".".join(part.strip().strip("\"'") for part in text.split(".")).strip(".")
-
-
-# An override of the first takes the place of the other in the file.
-_INSTEAD_OF = {"tag.tag_in_cam_m": "lever_arms_m", "tag.lever_arms_m": "tag_in_cam_m"}
 
 
 class Survey(BaseModel):

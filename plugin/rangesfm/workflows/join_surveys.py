@@ -33,6 +33,9 @@ from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.results import RunResult
 from rangesfm.workflows.run import map_in_metres
 
+# Two surveys' files may give a place with other digits.
+_SAME_PLACE_M = 1e-3
+
 
 @dataclass(frozen=True)
 class FinishedRun:
@@ -225,10 +228,6 @@ def paths_of_surveys(
         status[(status == RangeStatus.USED) & is_check] = RangeStatus.CHECK
         paths.append(PathOfModel(survey.name, survey.model, survey.path, replace(placed, status=status)))
     return paths
-
-
-# Two surveys' files may give a place with other digits.
-_SAME_PLACE_M = 1e-3
 
 
 def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress) -> RunResult:

@@ -10,8 +10,7 @@ import numpy.typing as npt
 import pycolmap
 
 from rangesfm.colmap.transform import rescale, without_photos
-from rangesfm.distances.between_anchors import surveyed_distances
-from rangesfm.distances.ends import LocatedDistances, locate_distances
+from rangesfm.distances.ends import LocatedDistances, locate_distances, surveyed_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.gravity import gravity_of

@@ -31,6 +31,12 @@ from rangesfm.vision.reconstruct import reconstruct
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.metric_map import estimate_scale, path_of_model, ranges_on_path, refine_by_survey
 
+_Done = TypeVar("_Done")
+# Fewer have no shape by which ranges could tell a scale.
+_MIN_NUM_KEYFRAMES = 5
+# By which factor the path must have grown for the clocks' offset to be looked for again.
+_GROWTH = 1.5
+
 
 def read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
     """Everything that can be wrong is found before the long work begins."""
@@ -72,9 +78,6 @@ def read_registered(path: Path) -> pycolmap.Reconstruction:
     if not model.num_reg_images():
         raise InputError("the model has no registered images", path)
     return model
-
-
-_Done = TypeVar("_Done")
 
 
 def find_keyframes(
@@ -141,12 +144,6 @@ def noted(image_times: ImageTimes, journal: Journal) -> ImageTimes:
     for note in image_times.notes:
         journal.warn(note)
     return image_times
-
-
-# Fewer have no shape by which ranges could tell a scale.
-_MIN_NUM_KEYFRAMES = 5
-# By which factor the path must have grown for the clocks' offset to be looked for again.
-_GROWTH = 1.5
 
 
 class AdjustmentWithRanges:
