@@ -18,10 +18,10 @@
 #include <utility>
 
 #include "gate.h"
+#include "rangesfm/beside_points.h"
 #include "rangesfm/direction_cost.h"
 #include "rangesfm/distance_cost.h"
 #include "rangesfm/joint_prior_cost.h"
-#include "rangesfm/beside_points.h"
 #include "rangesfm/range_cost.h"
 #include "rangesfm/robust_loss.h"
 #include "rangesfm/tag_place.h"

@@ -1,8 +1,7 @@
-#include "rangesfm/beside_points.h"
-
 #include <gtest/gtest.h>
 
 #include "cost_testing.h"
+#include "rangesfm/beside_points.h"
 
 namespace rangesfm {
 namespace {

@@ -1,4 +1,4 @@
-// What keeps anchors and biases out of the elimination of the 3-D points, and leaves that as fast as it is without them.
+// What keeps anchors and biases out of the elimination of the 3-D points, which stays as fast as it is without them.
 
 #pragma once
 
