@@ -12,7 +12,7 @@ import pycolmap
 from rangesfm.comparison.models import Length, common_photos, lengths_along, reprojection_rms_px
 from rangesfm.comparison.with_reference import format_table, papers_table
 from rangesfm.errors import InputError
-from rangesfm.files.text_table import align_rows
+from rangesfm.files.tables import align_rows
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.result.entries import ComparisonRow

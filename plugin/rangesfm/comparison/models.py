@@ -17,7 +17,7 @@ from rangesfm.comparison.with_reference import MIN_NUM_ALIGNED, text_or_dash
 from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
-from rangesfm.files.text_table import align_rows
+from rangesfm.files.tables import align_rows
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.similarity import Similarity, rmse, similarity_between
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction

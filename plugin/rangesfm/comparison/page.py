@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.comparison.models import ModelRow, ModelsComparison, NamedModel
-from rangesfm.files.atomic import new_file
-from rangesfm.files.sole_writer import sole_writer
+from rangesfm.files.atomic import new_file, sole_writer
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.report.chart import page_charts
 from rangesfm.report.content import points_of

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rangesfm.files.atomic import new_file
-from rangesfm.files.sole_writer import sole_writer
+from rangesfm.files.atomic import new_file, sole_writer
 from rangesfm.report.content import Content
 from rangesfm.report.page import figures_of, render_report
 from rangesfm.report.pictures import write_pictures
