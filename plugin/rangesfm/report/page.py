@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
-from rangesfm.report import figures_path, figures_ranges, figures_scale, head, tables, text
+from rangesfm.report import figures_path, figures_ranges, figures_scale, head, text
 from rangesfm.report.chart import ASSETS, page_charts
 from rangesfm.report.checks import quality_checks
 from rangesfm.report.content import Content
 from rangesfm.report.plot import Figure
 from rangesfm.report.scene import scene_of, view_of
+from rangesfm.report.tables import tables_of
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -25,7 +26,10 @@ if TYPE_CHECKING:
 # Nothing may be fetched, not even by mistake: the page holds all it shows. One script may run, this package's.
 CONTENT_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; script-src {script}"
 
-SECTIONS = {
+TITLES = {"path": "Path", "scale": "Scale", "ranges": "Ranges", "anchors": "Anchors"}
+"""Of the sections that show figures (FIGURES) and tables (``tables_of``), in their order."""
+
+FIGURES: dict[str, tuple[Callable[[Content], Figure | None], ...]] = {
     "path": (figures_path.trajectory_views, figures_path.map_views, figures_path.local_scale),
     "scale": (
         figures_scale.scale_per_anchor,
@@ -39,19 +43,20 @@ SECTIONS = {
         figures_ranges.residual_histogram,
         figures_ranges.absolute_errors,
     ),
+    "anchors": (),
 }
 
 STYLES = ("page.css", "view.css")
 _SCRIPTS = (
-    *("data", "theme", "stage", "points", "cameras", "anchors", "ranges", "grid", "labels", "picking", "measuring"),
-    *("photo_panel", "charts", "csv", "main"),
+    *("data", "stage", "points", "cameras", "anchors", "ranges", "grid", "picking", "measuring", "photo_panel"),
+    *("charts", "csv", "main"),
 )
 _FILTERS = (text.count, text.duration, text.fixed, text.plain, text.sentence, text.signed)
 
 
 def figures_of(content: Content) -> dict[str, list[Figure]]:
     """All that there are of this result, by the section that shows them."""
-    made = {section: [make(content) for make in all_of_it] for section, all_of_it in SECTIONS.items()}
+    made = {section: [make(content) for make in all_of_it] for section, all_of_it in FIGURES.items()}
     return {section: [figure for figure in figures if figure is not None] for section, figures in made.items()}
 
 
@@ -71,7 +76,8 @@ def render_report(content: Content) -> str:
         view=None if scene is None else view_of(scene),
         figures=figures,
         charts=page_charts([figure for of_section in figures.values() for figure in of_section]),
-        tables=tables,
+        sections=TITLES,
+        tables=tables_of(content),
     )
 
 

@@ -72,7 +72,7 @@ def test_points_cameras_and_anchors_are_drawn_and_layers_take_them_away(opened: 
     assert num_pixels(opened.picture(".stage canvas"), SCALED) < 5
     toggle(opened, "layer", "anchors")
     opened.picture(".stage canvas")
-    assert opened.run("return [...document.querySelectorAll('.label.anchor')].every(label => label.hidden)")
+    assert opened.run("return [...document.querySelectorAll('.label.anchor')].every(label => !label.checkVisibility())")
     assert opened.console() == []
 
 
