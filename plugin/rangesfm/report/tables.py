@@ -26,6 +26,7 @@ class Table:
         header: of the columns; empty for none.
         rows: cells, the first of each the row's name; whatever is not Markup is escaped.
         kind: name of a style of its own.
+        is_narrow: whether it stands beside others that are.
     """
 
     caption: str
@@ -33,36 +34,18 @@ class Table:
     rows: Sequence[Sequence[str]]
     note: str | None = None
     kind: str | None = None
+    is_narrow: bool = False
 
 
-def tables_of(content: Content) -> dict[str, list[Table]]:
-    """All of a result, by the section of the page that shows them."""
-    summary = content.summary
-    return {
-        "path": [_comparison(content)],
-        "scale": [
-            _two_candidates(content),
-            _values("How the scale answers to what was assumed", summary.scale.to_json()["sensitivity"]),
-        ],
-        "ranges": [_range_statuses(content), _ranges_per_anchor(content)],
-        "anchors": [_anchors(content), _distances(content)],
-        "run": [_stages(content), _refinement(content), _values("Versions", summary.versions)],
-        "inputs": [
-            _intrinsics(content),
-            _inputs(content),
-            _values("Settings", summary.settings.to_json(), "settings"),
-        ],
-    }
-
-
-def _range_statuses(content: Content) -> Table:
+def range_statuses(content: Content) -> Table:
+    """What became of the log's ranges."""
     statuses = Counter([] if content.ranges is None else content.ranges.status)
     rows = [[name, count(num), fixed(100.0 * num / statuses.total(), 1, "%")] for name, num in statuses.most_common()]
     return Table("What became of the ranges", ["status", "ranges", "share"], rows)
 
 
-def _ranges_per_anchor(content: Content) -> Table:
-    """Before and after the refinement."""
+def ranges_per_anchor(content: Content) -> Table:
+    """Numbers and residuals of each anchor's ranges, before and after the refinement."""
     ranges, rows = content.ranges, []
     for anchor_id in [] if ranges is None else in_natural_order(ranges.anchor_id):
         assert ranges is not None
@@ -78,7 +61,7 @@ def _ranges_per_anchor(content: Content) -> Table:
     return Table("Ranges of each anchor", header, rows)
 
 
-def _comparison(content: Content) -> Table:
+def comparison(content: Content) -> Table:
     """The paper's table."""
     columns = dict.fromkeys(("rmse_m", "rmse_se3_m", "rmse_sim3_m"), partial(fixed, decimals=4))
     columns["scale_error_percent"] = partial(signed, decimals=3)
@@ -91,7 +74,7 @@ def _comparison(content: Content) -> Table:
     )
 
 
-def _two_candidates(content: Content) -> Table:
+def two_candidates(content: Content) -> Table:
     """Mean and standard deviation of the paper's two branches."""
     given, rows = content.summary.scale.two_candidate, []
     for name in () if given is None else ("alpha0", "alpha1"):
@@ -106,7 +89,7 @@ def _two_candidates(content: Content) -> Table:
     )
 
 
-def _anchors(content: Content) -> Table:
+def anchors(content: Content) -> Table:
     """Where the anchors are, with what is not certain about it."""
     given = content.summary.anchors
     rows = [_anchor(anchor_id, given[anchor_id]) for anchor_id in in_natural_order(given)]
@@ -129,7 +112,7 @@ def _anchor(anchor_id: str, anchor: AnchorEntry) -> list[str]:
     ]
 
 
-def _distances(content: Content) -> Table:
+def distances(content: Content) -> Table:
     """Taped distances, those that held the scale and those that check it."""
     columns = dict.fromkeys(("measured_m", "stddev_m", "estimated_m"), partial(fixed, decimals=4))
     columns["residual_m"] = partial(signed, decimals=4)
@@ -141,7 +124,7 @@ def _distances(content: Content) -> Table:
     return Table("Control and check distances", header, rows)
 
 
-def _intrinsics(content: Content) -> Table:
+def intrinsics(content: Content) -> Table:
     """The cameras before and, if there was one, after the refinement."""
     header = ["camera", "parameter", "scaled", "refined", "change"]
     num_columns = 3 if content.refined is None else 5
@@ -153,7 +136,7 @@ def _intrinsics(content: Content) -> Table:
     return Table("Cameras", header[:num_columns], rows)
 
 
-def _inputs(content: Content) -> Table:
+def inputs(content: Content) -> Table:
     """The files that the result was made from."""
     rows = [
         [entry.path, *_cells(f"inputs.{i}", entry, {"bytes": count}), entry.sha256, entry.hashed]
@@ -162,34 +145,45 @@ def _inputs(content: Content) -> Table:
     return Table("Inputs", ["file", "bytes", "SHA-256", "of"], rows, kind="settings")
 
 
-def _stages(content: Content) -> Table:
+def stages(content: Content) -> Table:
     """Where the time went."""
     known = {name: s for name, s in content.summary.seconds.items() if s is not None and name != "total"}
     longest = max(known.values(), default=0.0) or 1.0
     bar = Markup('<i class="bar" style="width:{:.1f}%"></i>')
     rows = [[name.replace("_", " "), duration(s), bar.format(100.0 * s / longest)] for name, s in known.items()]
-    return Table("Time", ["stage", "time", ""], rows, kind="stages")
+    return Table("Time", ["stage", "time", ""], rows, kind="stages", is_narrow=True)
 
 
-def _refinement(content: Content) -> Table:
+def refinement(content: Content) -> Table:
     """What the solver did."""
     refine = content.summary.refine
     values = {} if refine is None else refine.to_json()
     rows = [[name.replace("_", " "), keyed(f"refine.{name}", value, plain(value))] for name, value in values.items()]
-    return Table("Refinement", [], rows)
+    return Table("Refinement", [], rows, is_narrow=True)
 
 
-def _values(caption: str, given: Mapping[str, Any], kind: str | None = None) -> Table:
-    """Keys of a nested object, joined by dots, and what they are."""
+def sensitivity(content: Content) -> Table:
+    """By how much the scale would change."""
+    return Table("How the scale answers to what was assumed", [], _flat(content.summary.scale.to_json()["sensitivity"]))
 
-    def flattened(values: Mapping[str, Any], within: str = "") -> list[list[str]]:
-        rows = []
-        for key, value in values.items():
-            is_object = value and isinstance(value, dict)
-            rows += flattened(value, f"{within}{key}.") if is_object else [[f"{within}{key}", plain(value)]]
-        return rows
 
-    return Table(caption, [], flattened(given), kind=kind)
+def versions(content: Content) -> Table:
+    """Of the software."""
+    return Table("Versions", [], _flat(content.summary.versions), is_narrow=True)
+
+
+def settings(content: Content) -> Table:
+    """The survey as the run had it."""
+    return Table("Settings", [], _flat(content.summary.settings.to_json()), kind="settings")
+
+
+def _flat(values: Mapping[str, Any], within: str = "") -> list[list[str]]:
+    """Rows of key and value of a nested object, keys joined by dots."""
+    rows = []
+    for key, value in values.items():
+        is_object = value and isinstance(value, dict)
+        rows += _flat(value, f"{within}{key}.") if is_object else [[f"{within}{key}", plain(value)]]
+    return rows
 
 
 def _cells(key: str, entry: object, columns: _Columns) -> list[str]:

@@ -116,6 +116,5 @@ class TimeOffsetCurve(TableFile):
 
     @classmethod
     def of(cls, found: MetricResult) -> TimeOffsetCurve | None:
-        if found.time_offset is None:
-            return None
-        return cls(found.time_offset.curve.offsets_s, found.time_offset.curve.costs_m)
+        curve = found.time_offset and found.time_offset.curve
+        return curve and cls(curve.offsets_s, curve.costs_m)
