@@ -116,5 +116,5 @@ class TimeOffsetCurve(TableFile):
 
     @classmethod
     def of(cls, found: MetricResult) -> TimeOffsetCurve | None:
-        curve = found.time_offset and found.time_offset.curve
-        return curve and cls(curve.offsets_s, curve.costs_m)
+        curve = None if found.time_offset is None else found.time_offset.curve
+        return None if curve is None else cls(curve.offsets_s, curve.costs_m)
