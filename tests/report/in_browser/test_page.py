@@ -132,6 +132,7 @@ def test_names_from_files_cannot_break_out(browser: Browser, make_result: MakeRe
     browser.draw_figures()
     assert browser.console() == []
     assert "broken out" not in browser.run("return document.title")
+    browser.wait_for("document.querySelector('.label.anchor')")  # with the first frame
     assert browser.run("return [...document.querySelectorAll('.label.anchor')].map(x => x.textContent)")[0] == EVIL
 
 
