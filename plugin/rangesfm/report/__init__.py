@@ -46,5 +46,4 @@ def write_report_pictures(result_folder: Path) -> list[Path]:
     """
     result = read_result_folder(result_folder)
     with sole_writer(result_folder):
-        figures = figures_of(Content(result)).values()
-        return write_pictures([one for of_section in figures for one in of_section], result_folder / PICTURES_FOLDER)
+        return write_pictures(figures_of(Content(result)), result_folder / PICTURES_FOLDER)
