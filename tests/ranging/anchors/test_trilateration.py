@@ -279,8 +279,7 @@ class TestRounding:
         found = trilaterate(flat(), distances(flat()) + noise(100, 0.02), toward=toward)
         assert found.mirror_position_m is not None
 
-    @pytest.mark.parametrize("away_m", [20.0, 60.0, 200.0])
-    @pytest.mark.parametrize("seed", range(3))
+    @pytest.mark.parametrize(("away_m", "seed"), [(20.0, 0), (60.0, 1), (200.0, 2)])
     def test_a_bias_that_is_known_does_not_make_a_place_about_a_line_certain(self, away_m: float, seed: int) -> None:
         """In metres its information is 1e12, and what is left of a direction beside it is rounding."""
         line = np.outer(np.linspace(-4.0, 4.0, 100), [1.0, 0.0, 0.0])
