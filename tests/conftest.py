@@ -58,9 +58,17 @@ def blas_kernels() -> list[str]:
     return [str(library.get("architecture")) for library in threadpool_info() if library["user_api"] == "blas"]
 
 
+# Of a minute and more each.
+LONG_FILES = (
+    *("test_style.py", "test_kernels.py", "test_commands.py", "test_batch.py", "test_initialize.py"),
+    *("test_trilateration.py", "test_run.py", "test_ranges_in_mapping.py", "test_kills.py", "test_bad_input.py"),
+)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest file first: of two processes, one would work on it alone at the end."""
-    items.sort(key=lambda item: item.path.name != "test_style.py")
+    """The longest files first: of two processes, one would work on the last of them alone at the end."""
+    place = {name: number for number, name in enumerate(LONG_FILES)}
+    items.sort(key=lambda item: place.get(item.path.name, len(place)))
 
 
 @dataclass(frozen=True)

@@ -88,6 +88,22 @@ COMPARISON = {
     "rmse_sim3_m": NUMBER,
     "scale_error_percent": NUMBER,
 }
+# All that a refined model leaves with a reference, each model as one entry.
+REFINED_FILES = {
+    "sparse_scaled/0",
+    "sparse_metric/0",
+    "pose_covariance.csv",
+    "result.json",
+    "ranges.csv",
+    "images.csv",
+    "reference.csv",
+    "report.html",
+    "scale_bootstrap.csv",
+    "scale_candidates.csv",
+    "scale_consensus.csv",
+    "trajectory.tum",
+    "points.ply",
+}
 MODEL_FILES = {"cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin"}
 
 
@@ -187,21 +203,7 @@ def refined(walked_survey: WalkedSurvey, rangesfm_process: Command, tmp_path_fac
 
 class TestRefineInASiteFrame:
     def test_leaves_every_file_and_nothing_half_written(self, refined: Left) -> None:
-        assert refined.files == {
-            "sparse_scaled/0",
-            "sparse_metric/0",
-            "pose_covariance.csv",
-            "result.json",
-            "ranges.csv",
-            "images.csv",
-            "reference.csv",
-            "report.html",
-            "scale_bootstrap.csv",
-            "scale_candidates.csv",
-            "scale_consensus.csv",
-            "trajectory.tum",
-            "points.ply",
-        }
+        assert refined.files == REFINED_FILES
 
     def test_result_has_every_key(self, refined: Left) -> None:
         assert_has(refined.result, {**RESULT, "refine": REFINE})
@@ -562,25 +564,7 @@ def first_run(photo_run: PhotoRun) -> Left:
 
 class TestRunOnPhotos:
     def test_leaves_every_file(self, first_run: Left) -> None:
-        assert first_run.files == {
-            "database.db",
-            "reconstruct.json",
-            "mapper.log",
-            "sparse/0",
-            "sparse_scaled/0",
-            "sparse_metric/0",
-            "pose_covariance.csv",
-            "result.json",
-            "ranges.csv",
-            "images.csv",
-            "reference.csv",
-            "report.html",
-            "scale_bootstrap.csv",
-            "scale_candidates.csv",
-            "scale_consensus.csv",
-            "trajectory.tum",
-            "points.ply",
-        }
+        assert first_run.files == REFINED_FILES | {"database.db", "reconstruct.json", "mapper.log", "sparse/0"}
 
     def test_tells_of_each_stage(self, first_run: Left) -> None:
         lines = first_run.stderr.splitlines()

@@ -53,6 +53,7 @@ SLOW = (
     "tests/scale/test_initialize.py::TestRefused::test_a_camera_that_moves_less_than_the_noise",
     "tests/scale/test_initialize.py::TestRefused::test_a_flat_path_among_anchors_in_a_plane",
     "tests/scale/test_initialize.py::TestRefused::test_a_straight_path_in_the_site_frame",
+    "tests/scale/test_initialize.py::TestWithoutNoise::test_so_it_is_from_millimetres_with_the_tag_in_the_camera",
     "tests/scale/test_initialize.py::TestWithoutNoise::test_the_similarity_is_recovered[five",
     "tests/scale/test_initialize.py::TestWithoutNoise::test_the_similarity_is_recovered[site",
     "tests/scale/test_range_equation.py::test_formal_stddev_is_the_scatter_of_estimates",

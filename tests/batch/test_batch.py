@@ -147,7 +147,7 @@ def test_interrupted_it_stops_its_workers_and_says_how_far_it_came(surveys: Path
         out, errors = process.communicate()
     assert (process.returncode, out) == (130, "")
     assert errors.splitlines()[-1] == "rangesfm: error: interrupted; stages that were done are kept"
-    assert psutil.wait_procs(processes, timeout=60)[1] == []
+    assert psutil.wait_procs(processes, timeout=600)[1] == []
     assert [row["status"] for row in rows_of(surveys).values()] == ["interrupted", "interrupted"]
     assert left_over(surveys) == []
 

@@ -169,12 +169,10 @@ class TestCovariance:
             if draw == "bias":
                 ranges += rng.normal(0.0, 0.2)
                 options = TrilaterationOptions(range_bias_stddev_m=0.2)
-            if draw == "outliers":
-                ranges[:20] += rng.choice([-1.0, 1.0], 20) * rng.uniform(1.0, 5.0, 20)
             squares.append(squared_error(trilaterate(positions, ranges, range_stddev_m=given, options=options)))
         return np.array(squares)
 
-    @pytest.mark.parametrize("draw", ["noise", "heteroscedastic", "bias", "outliers"])
+    @pytest.mark.parametrize("draw", ["noise", "heteroscedastic", "bias"])
     def test_is_that_of_the_errors(self, draw: str) -> None:
         low, high = chi2.ppf([5e-4, 1 - 5e-4], 3 * self.NUM) / self.NUM
         # Given stddevs are a lower limit, and the rest has 96 degrees of freedom: some per cent either way.
