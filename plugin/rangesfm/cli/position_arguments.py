@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from typing import TYPE_CHECKING
 
 from rangesfm.cli.survey_flags import position
@@ -12,6 +13,9 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from rangesfm.ranging.log import RangeLog
+
+# As of the times in a survey file.
+_MAX_TIME_S = 1e10
 
 
 def add_position_arguments(parser: argparse.ArgumentParser, *, max_interpolation_gap_s: float) -> None:
@@ -32,11 +36,11 @@ def add_position_arguments(parser: argparse.ArgumentParser, *, max_interpolation
     )
     parser.add_argument("--tag_id", metavar="ID", help="the tag whose positions these are, if the log has several")
     parser.add_argument(
-        "--time_offset", type=float, default=0.0, metavar="SECONDS", help="time of positions minus time of ranges"
+        "--time_offset", type=_seconds, default=0.0, metavar="SECONDS", help="time of positions minus time of ranges"
     )
     parser.add_argument(
         "--max_interpolation_gap_s",
-        type=float,
+        type=_seconds,
         default=max_interpolation_gap_s,
         metavar="S",
         help=f"between known positions further apart none is interpolated (default: {max_interpolation_gap_s:g})",
@@ -55,3 +59,13 @@ def read_tag_positions(args: argparse.Namespace, log: RangeLog) -> npt.NDArray[n
         time_offset_s=args.time_offset,
         max_gap_s=args.max_interpolation_gap_s,
     )
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= _MAX_TIME_S:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a time in seconds, expected at most {_MAX_TIME_S:g} of them")
+    return value

@@ -17,6 +17,7 @@ from rangesfm.result.metric_result import MetricResult
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.workflows.journal import Journal
+from rangesfm.workflows.rival_offsets import doubts_by_rivals
 from rangesfm.workflows.survey_stages import estimate_scale, refine_by_survey
 
 
@@ -48,7 +49,10 @@ def scale_by_survey(
     if inputs.tape is not None:
         distances = locate_distances(inputs.tape, sfm, observations.log.anchor_ids)
     estimate = estimate_scale(survey, inputs, observations, trajectory, inputs.anchor_frame, distances)
-    for doubt in estimate.reasons if estimate.verdict != "good" else ():
+    by_rivals = (
+        () if offset is None else doubts_by_rivals(survey, inputs, trajectory, distances, offset, estimate.value)
+    )
+    for doubt in (*by_rivals, *(estimate.reasons if estimate.verdict != "good" else ())):
         journal.warn(doubt)
     scaled = rescale(sfm, estimate.metric_from_sfm)
     predicted = predicted_ranges(
@@ -61,7 +65,7 @@ def scale_by_survey(
     )
     weights = estimate.errors.robust_weights(predicted - inputs.log.range_m)
     offset_s = offset.value_s if offset is not None else survey.ranges.time_offset_s
-    return MetricResult(trajectory, offset, offset_s, estimate, scaled, predicted, weights)
+    return MetricResult(trajectory, offset, offset_s, estimate, scaled, predicted, weights).doubted(by_rivals)
 
 
 def refine_map(survey: Survey, inputs: RangingInputs, metric: MetricResult, journal: Journal) -> MetricResult:
