@@ -17,16 +17,18 @@ _UNUSABLE_PATH = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.EN
 
 @dataclass(frozen=True)
 class Failure:
-    """One line for the user, and the exit status."""
+    """One line for the user, the exit status, and lines of advice."""
 
     message: str
     exit_status: int
+    advice: tuple[str, ...] = ()
 
 
 def failure_of(error: BaseException) -> Failure:
     """What to tell about any error at all; one that is not of our own classes may be a bug, and is called so."""
     message, status = _told(error)
-    return Failure(" ".join(one_line(message).split()), status)
+    advice = error.advice if isinstance(error, RangesfmError) else ()
+    return Failure(" ".join(one_line(message).split()), status, advice)
 
 
 def _told(error: BaseException) -> tuple[str, int]:

@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 
 def add_log_arguments(parser: Parser) -> None:
     """The log and how it is written."""
-    parser.add_argument("log", metavar="LOG", help="the radio's log")
+    parser.add_argument(
+        "log", nargs="+", metavar="LOG", help="the radio's log; a folder or several files: one an anchor"
+    )
     add_flags(parser, *LOG_KEYS, by_own_names=True)
 
 
@@ -27,4 +29,4 @@ def read_log(args: argparse.Namespace, anchor_ids: Sequence[str] = ()) -> RangeL
     from rangesfm.survey.settings import survey_from_tables
 
     options = survey_from_tables({}, Path.cwd(), overrides_from_arguments(args)).ranges
-    return inputs.read_log(options.changed(path=Path(args.log)), anchor_ids)
+    return inputs.read_log(options.changed(path=Path(args.log[0])), anchor_ids, files=args.log)

@@ -47,7 +47,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
 
     anchors = read_anchors(args.anchors) if args.anchors is not None else ()
     log = read_log(args, [anchor.anchor_id for anchor in anchors])
-    lines = [*_lines(summarize_ranges(log)), *_anchors(read_anchors_in_log(args.log, format=log.format))]
+    lines = [*_lines(summarize_ranges(log), log.notes), *_anchors(read_anchors_in_log(args.log, format=log.format))]
     if args.output_path is not None:
         write_ranges_csv(log, args.output_path)
         lines += ["", f"written to {args.output_path}"]
@@ -60,13 +60,13 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     return Outcome(lines)
 
 
-def _lines(summary: RangeSummary) -> list[str]:
+def _lines(summary: RangeSummary, notes_of_log: Sequence[str]) -> list[str]:
     return [
         f"format  {summary.format}",
         f"ranges  {summary.num}, and {summary.num_no_measurement} records without a measurement",
         f"tags    {', '.join(summary.tag_ids)}",
         f"time    {_time(summary)}",
-        *(f"note    {note}" for note in _notes(summary)),
+        *(f"note    {note}" for note in (*notes_of_log, *_notes(summary))),
         "",
         _table(summary),
         *_pairs(summary),

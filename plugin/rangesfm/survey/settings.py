@@ -26,6 +26,7 @@ from rangesfm.options import (
     ScaleAndTapeOptions,
     TagOptions,
 )
+from rangesfm.ranging.readers.several import files_of_log
 from rangesfm.survey.toml_source import Source, parse_toml
 
 # An override of the first takes the place of the other in the file.
@@ -73,7 +74,11 @@ class Survey(BaseModel):
         for dotted_key, role in _ROLE_OF_PATH.items():
             table, _, name = dotted_key.partition(".")
             path = getattr(getattr(self, table), name)
-            if path is not None and role != "output":
+            if path is not None and role == "log":
+                yield from (
+                    InputPath(dotted_key, "log" if file.is_dir() else "file", file) for file in files_of_log(path)
+                )
+            elif path is not None and role != "output":
                 yield InputPath(dotted_key, role, path)
         if self.model_path is not None:
             yield InputPath("model_path", "model", self.model_path)
