@@ -23,6 +23,11 @@ def add_log_arguments(parser: Parser) -> None:
     add_flags(parser, *LOG_KEYS, by_own_names=True)
 
 
+def notes_of_log(log: RangeLog) -> list[str]:
+    """What was assumed of it, as lines for people."""
+    return [f"note    {note}" for note in log.notes]
+
+
 def read_log(args: argparse.Namespace, anchor_ids: Sequence[str] = ()) -> RangeLog:
     """The log that the arguments name; ``anchor_ids`` as for ``read_ranges``."""
     from rangesfm.survey import inputs

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rangesfm.cli.arguments import Commands, Outcome
-from rangesfm.cli.log_arguments import add_log_arguments, read_log
+from rangesfm.cli.log_arguments import add_log_arguments, notes_of_log, read_log
 from rangesfm.files.text_table import align_rows
 from rangesfm.progress import Progress
 
@@ -47,7 +47,10 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
 
     anchors = read_anchors(args.anchors) if args.anchors is not None else ()
     log = read_log(args, [anchor.anchor_id for anchor in anchors])
-    lines = [*_lines(summarize_ranges(log), log.notes), *_anchors(read_anchors_in_log(args.log, format=log.format))]
+    lines = [
+        *_lines(summarize_ranges(log), notes_of_log(log)),
+        *_anchors(read_anchors_in_log(args.log, format=log.format)),
+    ]
     if args.output_path is not None:
         write_ranges_csv(log, args.output_path)
         lines += ["", f"written to {args.output_path}"]
@@ -60,13 +63,14 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     return Outcome(lines)
 
 
-def _lines(summary: RangeSummary, notes_of_log: Sequence[str]) -> list[str]:
+def _lines(summary: RangeSummary, of_reading: Sequence[str]) -> list[str]:
     return [
         f"format  {summary.format}",
         f"ranges  {summary.num}, and {summary.num_no_measurement} records without a measurement",
         f"tags    {', '.join(summary.tag_ids)}",
         f"time    {_time(summary)}",
-        *(f"note    {note}" for note in (*notes_of_log, *_notes(summary))),
+        *of_reading,
+        *(f"note    {note}" for note in _notes(summary)),
         "",
         _table(summary),
         *_pairs(summary),

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rangesfm.cli.arguments import Commands, Outcome
-from rangesfm.cli.log_arguments import add_log_arguments, read_log
+from rangesfm.cli.log_arguments import add_log_arguments, notes_of_log, read_log
 from rangesfm.cli.position_arguments import add_position_arguments, read_tag_positions
 from rangesfm.files.text_table import align_rows
 from rangesfm.progress import Progress
@@ -50,7 +50,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     log = of_one_tag(read_log(args), args.tag_id)
     tags = read_tag_positions(args, log)
     calibration = calibrate_ranges(log, tags, anchors)
-    lines = [*_lines(calibration, len(log)), "", f"written to {args.output_path}"]
+    lines = [*notes_of_log(log), *_lines(calibration, len(log)), "", f"written to {args.output_path}"]
     if args.plot is not None:
         from rangesfm.report.pictures import write_picture
         from rangesfm.report.range_plots import plot_error_curve

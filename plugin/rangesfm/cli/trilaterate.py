@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from rangesfm.cli.arguments import Commands, Outcome
-from rangesfm.cli.log_arguments import add_log_arguments, read_log
+from rangesfm.cli.log_arguments import add_log_arguments, notes_of_log, read_log
 from rangesfm.cli.position_arguments import add_position_arguments, read_tag_positions
 from rangesfm.files.text_table import align_rows
 from rangesfm.progress import Progress
@@ -97,7 +97,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     placements = trilaterate_anchors(log, positions, toward=_toward(args.side, log), options=options)
     if all(placement.found is None for placement in placements):
         raise GeometryError(f"anchor {placements[0].anchor_id}: {placements[0].why_not}")
-    lines = _lines(log, placements)
+    lines = [*notes_of_log(log), *_lines(log, placements)]
     if args.output_path is not None:
         write_anchors([placement.anchor for placement in placements], args.output_path)
         lines += ["", f"written to {args.output_path}"]

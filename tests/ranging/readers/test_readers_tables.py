@@ -284,7 +284,7 @@ def test_column_that_is_missing_is_asked_for(tmp_path: Path) -> None:
     path = write(tmp_path, lines("range,anchor", lambda t, a, r: f"{r:.3f},{a}"))
     with pytest.raises(InputError) as caught:
         read_ranges(path)
-    assert "not sure: there is not a column of times" in caught.value.advice
+    assert "not sure: no column seems to be the timestamp" in caught.value.advice
     assert "timestamp=NAME" in caught.value.advice[-1]
 
 

@@ -26,6 +26,7 @@ QUANTITIES = (
     *("los", "nlos", *STAMPS),
 )
 
+_NOTHING = 1e-12  # in any unit
 _TEXTS = ("image_name", "date", "anchor_id", "tag_id", "antenna")
 
 
@@ -97,7 +98,7 @@ def read_columns(path: Path, columns: Columns, options: ReadOptions, format: str
     row = np.repeat(np.arange(len(table)), num_ends)
     anchor, tag = _anchors(table, name, columns), _tags(table, name, columns)
     ranges = _ranges(table, name, columns)
-    measured = ranges > 0
+    measured = ranges > _NOTHING
     if not np.any(measured):
         said = f"all {len(ranges)} records say that there was no measurement" if len(ranges) else "no records"
         raise InputError(f"no usable range: {said}", path)
@@ -179,7 +180,7 @@ def _repeated(ids: list[str], num_rows: int) -> Categories:
 
 def _ids(table: Table, column: str, columns: Columns, empty: str | None) -> Categories:
     ids = table.categories(column, empty=empty)
-    if columns.is_strict or not all(re.fullmatch(r"\d+(?:\.\d*(?:[eE][+-]?\d+)?)?", name) for name in ids.names):
+    if columns.is_strict or not all(re.fullmatch(r"\d{1,18}(?:\.\d*(?:[eE][+-]?\d{1,2})?)?", name) for name in ids.names):
         return ids
     whole = [str(int(float(name))) if float(name) == int(float(name)) else name for name in ids.names]
     merged = Categories.of(whole)

@@ -67,7 +67,7 @@ class Guess:
         sides: what the columns of ids mean.
         notes: what was taken as what.
         doubts: why it is no more than a guess; none: it is sure.
-        missing: what could not be found at all.
+        missing: quantities that could not be found at all.
         span: ``wide`` in a few words, where its columns have no names: quantity and columns.
     """
 
@@ -291,7 +291,7 @@ def _find_by_values(free: list[Column], guess: Guess, has_names: bool) -> None:
             guess.columns["timestamp"] = rising[0].name
             guess.doubts += [f"{rising[0].name} may be the time"] * has_names
         else:
-            guess.missing.append("a column of times")
+            guess.missing.append("timestamp")
     if guess.wide or {"range", "tx1"} & {*guess.columns}:
         return
     ids = [column for column in free if _is_id(column)]
@@ -309,7 +309,7 @@ def _find_by_values(free: list[Column], guess: Guess, has_names: bool) -> None:
     elif reals:
         _wide_by_values(reals, guess)
     else:
-        guess.missing.append("a column of ranges")
+        guess.missing.append("range")
 
 
 def _ids_by_values(ids: list[Column], guess: Guess) -> None:

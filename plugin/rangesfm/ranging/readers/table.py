@@ -75,10 +75,10 @@ def _question(path: Path, options: ReadOptions, layout: Layout | None, guess: Gu
         first_line = printable(head.strip().split("\n")[0])
         return InputError(f"not a known log format, and no table; it begins with '{first_line}'", path)
     found = f"found: {len(layout.columns)} columns: {', '.join(described(layout.columns))}"
-    told = {**guess.told, **dict.fromkeys(_asked_for(guess), "NAME")}
+    told = {**guess.told, **dict.fromkeys(guess.missing, "NAME")}
     command = replace(options, columns=told).command(path)
     closest = ", ".join(f"{quantity} = {name}" for quantity, name in guess.told.items()) or "none"
-    why = "; ".join([*(f"there is not {missing}" for missing in guess.missing), *guess.doubts])
+    why = "; ".join([*(f"no column seems to be the {missing}" for missing in guess.missing), *guess.doubts])
     return InputError(
         "a table whose columns are not known for sure",
         path,
@@ -89,14 +89,6 @@ def _question(path: Path, options: ReadOptions, layout: Layout | None, guess: Gu
             f"{'name the column' if guess.missing else 'if that is right'}: {command}",
         ],
     )
-
-
-def _asked_for(guess: Guess) -> list[str]:
-    """Quantities that the user must name."""
-    return [quantity for quantity in ("timestamp", "range") if f"a column of {_CALLED[quantity]}" in guess.missing]
-
-
-_CALLED = {"timestamp": "times", "range": "ranges"}
 
 
 def _laid_out(layout: Layout, options: ReadOptions) -> Columns:
