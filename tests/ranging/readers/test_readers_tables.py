@@ -97,7 +97,9 @@ LONG = {
     + lines("Time\tAddress\tRange\tRxPower", lambda t, a, r: f"{t:.3f}\t{a}\t{r:.3f}\t-70.1"),
     "date and time": lines("Date,Time,AnchorID,Dist", lambda t, a, r: f"2026-01-31,{clock(t + 36000)},{a},{r:.3f}"),
     "names in a comment": lines("# time anchor range", lambda t, a, r: f"{t:.3f} {a} {r:.3f}"),
-    "no names": lines(None, lambda t, a, r: f"  {t:.16e}\t  {2:.16e}\t  {int(NUM[a]):.16e}\t  {r:.16e}\t"),
+    "no names": lines(None, lambda t, a, r: f"  {t:.16e}\t  {2:.16e}\t  {int(NUM[a]):.16e}\t  {r:.16e}\t").replace(
+        "e+0", "e+00"
+    ),
     "quoted": lines('"time","anchor","range"', lambda t, a, r: f'"{t:.3f}","{a}","{r:.3f}"'),
     "PlotJuggler": lines("__time,/uwb/to_id,/uwb/range", lambda t, a, r: f"{t + 1.7e9:.3f},{NUM[a]},{r:.3f}"),
 }

@@ -180,7 +180,9 @@ def _repeated(ids: list[str], num_rows: int) -> Categories:
 
 def _ids(table: Table, column: str, columns: Columns, empty: str | None) -> Categories:
     ids = table.categories(column, empty=empty)
-    if columns.is_strict or not all(re.fullmatch(r"\d{1,18}(?:\.\d*(?:[eE][+-]?\d{1,2})?)?", name) for name in ids.names):
+    if columns.is_strict or not all(
+        re.fullmatch(r"\d{1,18}(?:\.\d*(?:[eE][+-]?0{0,3}\d{1,2})?)?", name) for name in ids.names
+    ):
         return ids
     whole = [str(int(float(name))) if float(name) == int(float(name)) else name for name in ids.names]
     merged = Categories.of(whole)
