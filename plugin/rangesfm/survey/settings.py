@@ -10,7 +10,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from rangesfm.errors import OptionError, nearest_known, printable, shown
+from rangesfm.errors import InputError, OptionError, nearest_known, printable, shown
 from rangesfm.files.atomic import path_of
 from rangesfm.option_model import Key, Options, PathRole
 from rangesfm.options import (
@@ -173,7 +173,11 @@ def _absolute(value: object, folder: Path) -> object:
 
 
 def _require_files(survey: Survey) -> None:
-    for item in survey.input_paths():
+    try:
+        paths = [*survey.input_paths()]
+    except InputError as error:
+        raise OptionError(f"[ranges] path: {error}", "ranges", "path") from None
+    for item in paths:
         if item.role == "file" and not os.path.isfile(item.path):
             is_folder = os.path.isdir(item.path)
             found = f"{item.path} is a folder, expected a file" if is_folder else f"there is no file {item.path}"
