@@ -183,8 +183,8 @@ def read_table(
         raise InputError(f"separator is {separator!r}, expected one character", path)
     known, aliases = (*required, *optional), aliases or {}
     if header is None:
-        cells = [cell.strip() for cell in _split_row(header_row, separator, path, header_line)]
-        names = [name if name in known else aliases.get(name, name) for name in cells]
+        found = [cell.strip() for cell in _split_row(header_row, separator, path, header_line)]
+        names = [name if name in known else aliases.get(name, name) for name in found]
         _check_has_header(names, required, optional, path, header_line)
     else:
         names, header_line, body = list(header), num_skipped, "".join(content.split("\n", num_skipped)[num_skipped:])
