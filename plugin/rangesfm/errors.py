@@ -1,16 +1,19 @@
-"""The errors a user can meet; everything else that escapes is a bug.
-
-Each class carries the exit status of the command line, so that a caller
-never has to look at the text of a message.
-"""
+"""The errors a user can meet, and how a run that failed ends; everything else that escapes is a bug."""
 
 from __future__ import annotations
 
 import difflib
+import errno
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 _MAX_SHOWN = 100
+INTERNAL_ERROR, BAD_INPUT, FAILED = 1, 2, 4
+"""Exit statuses; the first is of what nobody should ever see."""
+INTERRUPTED = 130
+"""As shells have it."""
+_UNUSABLE_PATH = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG)
 
 
 def one_line(text: str) -> str:
@@ -43,9 +46,13 @@ def nearest_known(name: str, known: Iterable[str]) -> str:
 
 
 class RangesfmError(Exception):
-    """Root of all errors raised on purpose. Its text is one line for the user, whatever names the files hold."""
+    """Root of all errors raised on purpose. Its text is one line for the user, whatever names the files hold.
+
+    ``advice`` are further lines, for who sits at the terminal.
+    """
 
     exit_status = 4
+    advice: tuple[str, ...] = ()
 
     def __init__(self, message: str):
         super().__init__(one_line(message))
@@ -56,8 +63,16 @@ class InputError(RangesfmError):
 
     exit_status = 2
 
-    def __init__(self, message: str, path: str | Path | None = None, line: int | None = None):
+    def __init__(
+        self,
+        message: str,
+        path: str | Path | None = None,
+        line: int | None = None,
+        *,
+        advice: Iterable[str] = (),
+    ):
         self.path = None if path is None else Path(path)
+        self.advice = tuple(map(one_line, advice))
         self.line = line
         where = "" if path is None else f"{path}: " if line is None else f"{path}:{line}: "
         super().__init__(where + message)
@@ -88,3 +103,33 @@ class SolverError(RangesfmError):
     """A solver failed, or the compiled part does not fit the installed packages."""
 
     exit_status = 4
+
+
+@dataclass(frozen=True)
+class Failure:
+    """One line for the user, the exit status, and lines of advice."""
+
+    message: str
+    exit_status: int
+    advice: tuple[str, ...] = ()
+
+
+def failure_of(error: BaseException) -> Failure:
+    """What to tell about any error at all; one that is not of our own classes may be a bug, and is called so."""
+    message, status = _told(error)
+    advice = error.advice if isinstance(error, RangesfmError) else ()
+    return Failure(" ".join(one_line(message).split()), status, advice)
+
+
+def _told(error: BaseException) -> tuple[str, int]:
+    if isinstance(error, RangesfmError):
+        return str(error), error.exit_status
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted; stages that were done are kept", INTERRUPTED
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename is not None else ""
+        return f"{where}{error.strerror or error}", BAD_INPUT if error.errno in _UNUSABLE_PATH else FAILED
+    if isinstance(error, MemoryError):
+        return "out of memory", FAILED
+    what = f"{type(error).__name__}: {error}"
+    return f"internal error, please report it (RANGESFM_DEBUG=1 shows where): {what}", INTERNAL_ERROR

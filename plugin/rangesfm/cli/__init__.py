@@ -10,8 +10,7 @@ from collections.abc import Sequence
 
 from rangesfm.cli.arguments import Outcome, normalize, parse
 from rangesfm.cli.terminal import terminal_progress
-from rangesfm.errors import one_line
-from rangesfm.failures import INTERNAL_ERROR, failure_of
+from rangesfm.errors import INTERNAL_ERROR, failure_of, one_line
 
 _BROKEN_PIPE = 141  # as shells have it
 
@@ -47,5 +46,5 @@ def main(argv: Sequence[str] | None = None) -> int:
         failure = failure_of(error)
         if failure.exit_status == INTERNAL_ERROR and os.environ.get("RANGESFM_DEBUG"):
             traceback.print_exc()
-        print("rangesfm: error:", failure.message, file=sys.stderr)
+        print("rangesfm: error:", "\n  ".join([failure.message, *failure.advice]), file=sys.stderr)
         return failure.exit_status

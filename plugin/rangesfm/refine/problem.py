@@ -102,9 +102,7 @@ class RefinementProblem:
         if errors.learned is None:
             return None
         radio = added.blocks.estimate(RadioEstimate(self.anchors, self.tags_in_cam_m))
-        return residual_errors(
-            errors, errors.learned, added.residual_rows, self.residuals_m(radio)[self.ranges.rows]
-        )
+        return residual_errors(errors, errors.learned, added.residual_rows, self.residuals_m(radio)[self.ranges.rows])
 
     def residuals_m(self, radio: RadioEstimate) -> Array:
         """(n,) predicted minus measured; NaN without a place."""

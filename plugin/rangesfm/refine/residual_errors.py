@@ -11,9 +11,7 @@ from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.range_errors import RangeErrors
 
 
-def residual_errors(
-    errors: RangeErrors, learned: LearnedErrors, rows: Indices, residuals_m: Array
-) -> ResidualErrors:
+def residual_errors(errors: RangeErrors, learned: LearnedErrors, rows: Indices, residuals_m: Array) -> ResidualErrors:
     """Of k ranges that took part; the scale's uncertainty counts the same errors.
 
     Args:

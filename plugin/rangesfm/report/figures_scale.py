@@ -5,12 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from rangesfm.report.content import Content, in_natural_order
-from rangesfm.report.figures_ranges import histogram
-from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Series, figure_of, time_axis
+from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Series, figure_of, from_zero, time_axis
 from rangesfm.report.text import signed
 from rangesfm.result.tables import ScaleCandidates, ScaleConsensus, TimeOffsetCurve
 
-NUM_BOOTSTRAP_BINS = 40
 MAX_NUM_CANDIDATES = 3000
 CANDIDATE_AXIS = (-1.0, 4.0)
 """Ends of the axis of candidates, in units of the scale: they have no bounds of their own."""
@@ -91,7 +89,7 @@ def consensus(content: Content) -> Figure | None:
         ("scale m per unit", "ranges"),
         (curve,),
         line=("scale found", content.summary.scale.value),
-        y_range=(0.0, 1.08 * max(float(table.num_agreeing.max()), 1.0)),
+        y_range=from_zero([curve]),
     )
 
 
@@ -101,12 +99,11 @@ def clock_curve(content: Content) -> Figure | None:
     if table is None or len(table.cost) == 0:
         return None
     offset = content.summary.time_offset.value_s
-    curve = Series("misfit", "after", np.column_stack([table.time_offset_s, table.cost]), "line")
     return figure_of(
         "time_offset_curve",
         "Misfit of the ranges for each offset between the clocks. One sharp valley at the line is what is wanted.",
         "Misfit of the ranges for each clock offset",
         ("time offset s", "misfit"),
-        (curve,),
+        [Series("misfit", "after", np.column_stack([table.time_offset_s, table.cost]), "line")],
         line=None if offset is None else ("offset used", offset),
     )

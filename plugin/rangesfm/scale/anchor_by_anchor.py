@@ -70,8 +70,7 @@ def anchor_estimates(solution: Solution, anchor_ids: tuple[str, ...]) -> tuple[A
                 prior_position_m=problem.anchor_mean_m[k] if known else None,
                 prior_position_stddev_m=float(problem.anchor_stddev_m[k]),
                 range_bias_m=float(state.bias_m[k] if heard else problem.bias_mean_m[k] + common_bias_m),
-                # What the scale stage has found; a refinement that weighs the ranges as independent finds it no better.
-                prior_bias_m=float(state.bias_m[k] if problem.frame_is_free else problem.bias_mean_m[k]),
+                prior_bias_m=float(problem.bias_mean_m[k]),
                 prior_bias_stddev_m=float(problem.bias_stddev_m[k] * solution.errors.inflation),
                 mirror_position_m=mirrors.get(k),
                 position_covariance_m2=covariance[k],

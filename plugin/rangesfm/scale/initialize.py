@@ -20,7 +20,6 @@ from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
 from rangesfm.scale.cutoff import cutoff_test
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.levelled_places import levelled_places
-from rangesfm.scale.placing import place_in_site
 from rangesfm.scale.problem import ScaleProblem, scale_problem
 from rangesfm.scale.sensitivity import scale_sensitivity
 from rangesfm.scale.solution import Solution, solve_scale
@@ -63,9 +62,6 @@ def initialize_scale(
     model_from_cam = _model_from_cam(observations, trajectory, problem)
     learned = learned_errors(problem, solution, observations, model_from_cam)
     uncertainty = scale_uncertainty(solution, learned)
-    if problem.ranges.frame_is_free:
-        placing = place_in_site(solution, learned, uncertainty.empirical)
-        solution = placing.solution
     per_anchor = scale_per_anchor(solution, observations.log.anchor_ids)
     found = anchor_estimates(solution, observations.log.anchor_ids)
     tests = cutoff_test(solution)

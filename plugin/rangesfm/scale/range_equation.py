@@ -263,11 +263,6 @@ def solve(
     return system.fit(system.state_after(x), float(result.cost))
 
 
-def fit_at(problem: RangeProblem, state: RangeState, loss: RobustLoss) -> RangeFit:
-    """What the ranges say at a state that stands, its cost left open."""
-    return _System((problem,), columns_of([problem]), state, loss).fit(state, np.nan)
-
-
 def _settled(system: _System, x: Array) -> Array:
     """The bottom itself, by reweighted steps, which go by the gradient alone.
 

@@ -12,13 +12,13 @@ from rangesfm.ranging.errors.learned import LearnedErrors, learn_errors
 from rangesfm.ranging.errors.noise import robust_stddev
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.estimate import ScaleUncertainty
-from rangesfm.scale.placing import without_biases
 from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import (
     RangeFit,
     RangeProblem,
     RangeState,
     columns_of,
+    invert_information,
     predicted_ranges,
     prior_jacobian,
     range_gradient,
@@ -43,7 +43,9 @@ def learned_errors(
     """
     problem, state, log = solution.problem, solution.fit.state, observations.log
     unbiased = replace(state, bias_m=problem.bias_mean_m)
-    only_map = without_biases(problem)
+    ones = np.ones(len(problem.range_m))
+    # Biases are among the errors here.
+    only_map = replace(problem, bias_stddev_m=np.zeros(problem.num_anchors), stddev_m=ones, share=None)
     columns = columns_of([only_map])[0]
     taken_off = log.shared_stddev_m
     return learn_errors(
@@ -63,9 +65,7 @@ def _ruled_out(problem: RangeProblem) -> list[str]:
     return [name for name, stddev in stddevs.items() if stddev == 0]
 
 
-def _cells(
-    posed: ScaleProblem, solution: Solution, observations: RangeObservations, model_from_cam: Array
-) -> Cells:
+def _cells(posed: ScaleProblem, solution: Solution, observations: RangeObservations, model_from_cam: Array) -> Cells:
     problem, state, log = solution.problem, solution.fit.state, observations.log
     by = range_gradient(problem, state)
     world_from_cam = state.metric_from_model.rotation @ model_from_cam
@@ -84,7 +84,7 @@ def _times(posed: ScaleProblem, problem: RangeProblem, state: RangeState, observ
     """(n,) seconds; where the log names photos, by the way from photo to photo."""
     if observations.log.timestamp_s is not None:
         return observations.log.timestamp_s[posed.rows]
-    photos, first, of_range = np.unique(observations.before[posed.rows], return_index=True, return_inverse=True)
+    _, first, of_range = np.unique(observations.before[posed.rows], return_index=True, return_inverse=True)
     steps_m = np.linalg.norm(np.diff(state.metric_from_model.scale * problem.centers[first], axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps_m)])[of_range] / _WALKING_M_PER_S
 
@@ -99,13 +99,23 @@ def _noisiness(anchor_index: Indices, residuals_m: Array, num_anchors: int) -> A
     if np.isnan(scatter).all():
         return np.ones(num_anchors)
     relative = scatter / np.sqrt(np.nanmedian(scatter**2))
-    return np.clip(np.nan_to_num(relative, nan=1.0), _MIN_NOISINESS, _MAX_NOISINESS)
+    noisiness: Array = np.clip(np.nan_to_num(relative, nan=1.0), _MIN_NOISINESS, _MAX_NOISINESS)
+    return noisiness
 
 
 def scale_uncertainty(solution: Solution, learned: LearnedErrors) -> ScaleUncertainty:
     """Relative stddevs of the scale."""
     influence = scale_influence(solution.fit, solution.problem)
     return ScaleUncertainty(formal=solution.fit.log_scale_stddev, components=learned.stddev_of(influence))
+
+
+def parameter_covariance(fit: RangeFit, problem: RangeProblem, learned: LearnedErrors) -> Array:
+    """(p, p) of all that a fit estimates, in the parameters of its columns: what the ranges' errors do to it."""
+    influence = np.linalg.lstsq(fit.information, fit.gradients.T, rcond=1e-12)[0] / problem.stddev_m
+    of_cells = np.stack([learned.cells.total(row) for row in influence])
+    of_priors = invert_information(fit.information) @ fit.prior_information @ invert_information(fit.information)
+    covariance: Array = of_cells @ learned.covariance_m2 @ of_cells.T + of_priors
+    return covariance
 
 
 def scale_influence(fit: RangeFit, problem: RangeProblem) -> Array:

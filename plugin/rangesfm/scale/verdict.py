@@ -78,10 +78,10 @@ def judge(
         *weak,
         *(_Doubt(note, "survey three anchors or more that are not on one line") for note in problem.notes),
         *_left_out_doubts(problem.left_out),
-        *_path_doubts(solution, anchors),
+        *_path_doubts(solution),
         *_range_doubts(solution.fit),
-        *_anchor_doubts(per_anchor),
-        *_drift_doubts(cutoff_tests),
+        *_anchor_doubts(per_anchor, uncertainty),
+        *_drift_doubts(cutoff_tests, half_width),
     ]
     if half_width > NORMAL_95 * options.max_relative_stddev:
         why = f"{doubts[0].reason}; " if doubts else ""
@@ -93,10 +93,14 @@ def judge(
     summary = f"the scale is known to {100 * half_width:.1f} % (95 % interval)"
     if half_width > DOUBTFUL_ABOVE:
         doubts.insert(0, _Doubt(f"{summary}, worse than {100 * DOUBTFUL_ABOVE:g} %", narrower))
+    said = [*doubts, *_remarks(solution, anchors)]
+    advice: dict[str, str] = {}
+    for each in said:  # calibration is advised once, whatever else goes with it
+        advice.setdefault(_CALIBRATE if each.advice.startswith(_CALIBRATE) else each.advice, each.advice)
+    reasons = tuple(each.reason for each in said)
     if not doubts:
-        return Verdict("good", (summary,), ())
-    advice = dict.fromkeys(doubt.advice for doubt in doubts)
-    return Verdict("doubtful", tuple(doubt.reason for doubt in doubts), tuple(advice))
+        return Verdict("good", (summary, *reasons), tuple(advice.values()))
+    return Verdict("doubtful", reasons, tuple(advice.values()))
 
 
 def _what_narrows_it(solution: Solution, uncertainty: ScaleUncertainty) -> str:
@@ -142,7 +146,7 @@ def _weakness_doubts(solution: Solution, half_width: float) -> list[_Doubt]:
     return []
 
 
-def _path_doubts(solution: Solution, anchors: Sequence[AnchorEstimate]) -> list[_Doubt]:
+def _path_doubts(solution: Solution) -> list[_Doubt]:
     stddevs = path_shape(solution.problem.centers).stddevs
     if stddevs[1] < NEARLY_STRAIGHT * stddevs[0]:
         bend = "walk a bend or a loop instead of a straight line"
@@ -151,13 +155,18 @@ def _path_doubts(solution: Solution, anchors: Sequence[AnchorEstimate]) -> list[
             return [_Doubt(reason, f"{bend}, or survey the anchors")]
         if solution.problem.frame_is_free:
             return [_Doubt("the path is nearly straight: how far the map is rolled about it is uncertain", bend)]
-    elif stddevs[2] < NEARLY_FLAT * stddevs[0] and any(a.mirror_position_m is not None for a in anchors):
-        reason = (
-            "the path is nearly flat: on which side of it the unknown anchors stand is open; the scale does not "
-            "depend on it"
-        )
-        return [_Doubt(reason, "raise and lower the camera on the way, or survey the anchors")]
     return []
+
+
+def _remarks(solution: Solution, anchors: Sequence[AnchorEstimate]) -> list[_Doubt]:
+    """What is open and does not touch the scale."""
+    stddevs = path_shape(solution.problem.centers).stddevs
+    if stddevs[2] >= NEARLY_FLAT * stddevs[0] or all(a.mirror_position_m is None for a in anchors):
+        return []
+    reason = (
+        "the path is nearly flat: on which side of it the unknown anchors stand is open; the scale does not hang on it"
+    )
+    return [_Doubt(reason, "raise and lower the camera on the way, or survey the anchors")]
 
 
 def _range_doubts(fit: RangeFit) -> list[_Doubt]:
@@ -172,21 +181,22 @@ def _range_doubts(fit: RangeFit) -> list[_Doubt]:
     return doubts
 
 
-def _anchor_doubts(per_anchor: dict[str, float]) -> list[_Doubt]:
-    """Anchors that disagree on the scale."""
+def _anchor_doubts(per_anchor: dict[str, float], uncertainty: ScaleUncertainty) -> list[_Doubt]:
+    """Anchors that disagree on the scale, by more than m of them that err for themselves would."""
     if len(per_anchor) < 2:
         return []
     spread = float(np.std(np.log(np.array(list(per_anchor.values()))), ddof=1))
-    if spread <= _MAX_ANCHOR_SPREAD:
+    if spread <= max(_MAX_ANCHOR_SPREAD, NORMAL_95 * np.sqrt(len(per_anchor)) * uncertainty.empirical):
         return []
     reason = f"the anchors disagree: the scales found with each of them alone scatter by {100 * spread:.1f} %"
     return [_Doubt(reason, "check the anchors' positions and antenna delays, and place them in the open")]
 
 
-def _drift_doubts(tests: tuple[CutoffTest, ...]) -> list[_Doubt]:
-    """A scale that moves as short ranges are left out."""
+def _drift_doubts(tests: tuple[CutoffTest, ...], half_width: float) -> list[_Doubt]:
+    """A scale that moves out of its interval as short ranges are left out."""
     drift = scale_drift(tests)
-    if drift is None or abs(percent := 100 * (drift.scale / tests[0].scale - 1)) < _MIN_DRIFT_PERCENT:
+    expected = max(_MIN_DRIFT_PERCENT, 100 * half_width)
+    if drift is None or abs(percent := 100 * (drift.scale / tests[0].scale - 1)) < expected:
         return []
     reason = (
         f"short ranges disagree with long ones: without those under {drift.min_range_m:g} m the scale would change by "

@@ -1,17 +1,19 @@
-"""What a run reads before it works: the log, the anchors, the reference; checked against each other."""
+"""What a run reads before it works: the log, the anchors, the reference; checked against each other, and hashed."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from rangesfm.distances.tape import Tape, read_tape
 from rangesfm.errors import InputError
+from rangesfm.files.atomic import sha256_of
 from rangesfm.geometry.reference import Reference, read_reference
 from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
@@ -28,6 +30,7 @@ from rangesfm.vision.image_times import ImageTimes, find_image_times, read_image
 
 if TYPE_CHECKING:
     import pycolmap
+
 
 # Beyond it a unit is wrong, or the file: no such radio reaches so far.
 _MAX_RANGE_M = 1e6
@@ -107,12 +110,18 @@ def _without_known_errors(log: RangeLog, survey: Survey) -> tuple[RangeLog, list
     return (log, []) if curve_path is None else correct_ranges(log, read_error_curve(curve_path))
 
 
-def read_log(options: LogOptions, anchor_ids: Collection[str] = (), tag_ids: Collection[str] = ()) -> RangeLog:
-    """The radio's log as a survey describes it; see ``read_ranges``."""
+def read_log(
+    options: LogOptions,
+    anchor_ids: Collection[str] = (),
+    tag_ids: Collection[str] = (),
+    *,
+    files: Sequence[str] | None = None,
+) -> RangeLog:
+    """The radio's log as a survey describes it, or other files than it names; see ``read_ranges``."""
     if options.path is None:
         raise InputError("no ranges: give [ranges] path in a survey file, or --ranges LOG")
     return read_ranges(
-        options.path,
+        files or options.path,
         format=options.format,
         columns=options.columns or None,
         timestamp_unit=options.timestamp_unit,
@@ -242,7 +251,7 @@ def _check_anchors_known(log: RangeLog, anchors: Sequence[Anchor], survey: Surve
 
 def _notes(log: RangeLog, anchors: Sequence[Anchor], survey: Survey, *, anchors_are_of_log: bool) -> list[str]:
     silent = [anchor.anchor_id for anchor in anchors if anchor.anchor_id not in log.anchor_ids]
-    notes = [f"no ranges to anchor {', '.join(silent)}"] if silent else []
+    notes = [*log.notes, *([f"no ranges to anchor {', '.join(silent)}"] if silent else [])]
     silent = [tag_id for tag_id in survey.tag.lever_arms_m if tag_id not in log.tag_ids and survey.tag.tag_id is None]
     notes += [f"no ranges of tag {', '.join(silent)}"] if silent else []
     for kind, what in (
@@ -258,3 +267,34 @@ def _notes(log: RangeLog, anchors: Sequence[Anchor], survey: Survey, *, anchors_
     if (step_s := time_resolution_s(log)) >= _COARSE_STEP_S:
         notes.append(f"the log's times come in steps of {step_s:.2g} s: at walking pace that is as much in metres")
     return notes
+
+
+def input_hashes(survey: Survey) -> list[dict[str, Any]]:
+    """Path, SHA-256, bytes and what was hashed, for each input that is there.
+
+    Of a folder of photos only the names and sizes are hashed: reading gigabytes again would take
+    longer than what is gained.
+    """
+    entries: list[dict[str, Any]] = []
+    for item in survey.input_paths():
+        if item.role == "photos":
+            entries += [_folder(item.path)] if item.path.is_dir() else []
+        else:
+            files = sorted(item.path.glob("*.bin")) if item.role == "model" else [item.path]
+            entries += [_file(path) for path in files if path.is_file()]
+    return entries
+
+
+def _file(path: Path) -> dict[str, Any]:
+    return {"path": str(path), "sha256": sha256_of(path), "bytes": path.stat().st_size, "hashed": "content"}
+
+
+def _folder(path: Path) -> dict[str, Any]:
+    sizes = {file.relative_to(path).as_posix(): file.stat().st_size for file in path.rglob("*") if file.is_file()}
+    listing = "".join(f"{name}\t{size}\n" for name, size in sorted(sizes.items()))
+    return {
+        "path": str(path),
+        "sha256": hashlib.sha256(listing.encode("utf-8", "surrogateescape")).hexdigest(),
+        "bytes": sum(sizes.values()),
+        "hashed": f"names and sizes of {len(sizes)} files",
+    }

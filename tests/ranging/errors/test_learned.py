@@ -30,7 +30,13 @@ def walked() -> Cells:
     turns = np.linalg.qr(rng.standard_normal((len(time_s), 3, 3)))[0]
     num = len(time_s)
     return cells(
-        anchor_index, np.zeros(num, int), time_s, tag_m - anchors_m[anchor_index], turns, np.ones(num), np.ones(NUM_ANCHORS)
+        anchor_index,
+        np.zeros(num, int),
+        time_s,
+        tag_m - anchors_m[anchor_index],
+        turns,
+        np.ones(num),
+        np.ones(NUM_ANCHORS),
     )
 
 

@@ -79,7 +79,7 @@ def cells(
     begun = Cells(
         of_range=of_range,
         weight=weight,
-        worth=np.bincount(of_range, weight),
+        worth=np.bincount(of_range, weight).astype(np.float64),
         anchor_index=anchor_index[first],
         tag_index=tag_index[first],
         time_s=since[first],

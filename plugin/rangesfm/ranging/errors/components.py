@@ -7,12 +7,12 @@ survey learns its own stddevs on top of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.errors.cells import Cells
 
 _SHORT_M = 1.0
@@ -48,13 +48,14 @@ class Component:
     words: str
 
 
-def _same(labels: Array) -> Array:
+def _same(labels: Indices) -> Array:
     alike: Array = (labels[:, None] == labels).astype(np.float64)
     return alike
 
 
 def _same_link(cells: Cells) -> Array:
-    return _same(cells.anchor_index) * _same(cells.tag_index)
+    alike: Array = _same(cells.anchor_index) * _same(cells.tag_index)
+    return alike
 
 
 def _apart(values: Array) -> Array:
@@ -92,6 +93,22 @@ def _by_direction(directions: Array) -> Array:
     return alike
 
 
+def _white(cells: Cells) -> Array:
+    return np.diag(1 / np.maximum(cells.worth, 1e-6))
+
+
+def _proportional(cells: Cells) -> Array:
+    return np.outer(cells.distance_m, cells.distance_m)
+
+
+def _antenna(cells: Cells) -> Array:
+    return _same(cells.anchor_index) * _by_direction(cells.from_anchor)
+
+
+def _tag_antenna(cells: Cells) -> Array:
+    return _same(cells.tag_index) * _by_direction(cells.in_cam)
+
+
 def _bending(cells: Cells) -> Array:
     length_s = max(_BEND * float(np.ptp(cells.time_s)), 1e-9)
     alike: Array = (cells.from_anchor @ cells.from_anchor.T) * np.exp(-_apart(cells.time_s) / length_s)
@@ -99,7 +116,7 @@ def _bending(cells: Cells) -> Array:
 
 
 COMPONENTS = (
-    Component("white", 0.05, 1.0, None, True, lambda c: np.diag(1 / np.maximum(c.worth, 1e-6)), "noise of single ranges"),
+    Component("white", 0.05, 1.0, None, True, _white, "noise of single ranges"),
     Component("moment", 0.03, 1.0, None, True, lambda c: np.eye(len(c)), "errors of moments"),
     Component("time", 0.04, 0.7, None, True, lambda c: _in_time(c, _TIME_S), "errors that last for seconds"),
     Component("long_time", 0.03, 0.7, None, True, lambda c: _in_time(c, _LONG_TIME_S), "errors that last longer"),
@@ -108,8 +125,33 @@ COMPONENTS = (
     Component("short", 0.25, 0.5, 0.08, False, _short, "short ranges"),
     Component("curve", 0.04, 0.5, 0.02, False, _smooth, "the radio's error curve"),
     Component("rough_curve", 0.02, 0.3, 0.01, False, _rough, "unevenness of the error curve"),
-    Component("slope", 0.006, 0.7, 0.003, False, lambda c: np.outer(c.distance_m, c.distance_m), "ranges long by a share"),
-    Component("antenna", 0.05, 0.7, None, True, lambda c: _same(c.anchor_index) * _by_direction(c.from_anchor), "anchors' antennas by direction"),
-    Component("tag_antenna", 0.05, 0.7, None, False, lambda c: _same(c.tag_index) * _by_direction(c.in_cam), "the tag's antenna by direction"),
+    Component("slope", 0.006, 0.7, 0.003, False, _proportional, "ranges long by a share"),
+    Component(
+        "antenna",
+        0.05,
+        0.7,
+        None,
+        True,
+        _antenna,
+        "anchors' antennas by direction",
+    ),
+    Component(
+        "tag_antenna",
+        0.05,
+        0.7,
+        None,
+        False,
+        _tag_antenna,
+        "the tag's antenna by direction",
+    ),
     Component("bending", 0.01, 0.8, None, False, _bending, "the map's own bending"),
 )
+
+LEARNT_CURVE = "learnt_curve"
+"""What is left of an error curve that has been taken off, as it was learnt with it."""
+
+
+def component_words(names: Iterable[str]) -> dict[str, str]:
+    """What each component is, for people."""
+    words = {component.name: component.words for component in COMPONENTS} | {LEARNT_CURVE: "the learnt error curve"}
+    return {name: words[name] for name in names}

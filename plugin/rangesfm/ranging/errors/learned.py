@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.errors.cells import Cells
-from rangesfm.ranging.errors.components import COMPONENTS, Component
+from rangesfm.ranging.errors.components import COMPONENTS, LEARNT_CURVE, Component
 
 # Noise of single ranges up to which a radio is one of the population; of one with more, all else may be off by as much
 # more too.
@@ -63,20 +63,6 @@ class LearnedErrors:
         return dict(zip(self.names, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True))
 
 
-    def biases_m(self, pulls: Array, num_anchors: int) -> Array:
-        """(m,) the likeliest bias of each anchor, its own and that of all.
-
-        Args:
-            pulls: (c,) inverse of the covariance times what the cells are off.
-        """
-        of_biases = np.isin(self.names, ("bias", "common_bias"))
-        together = self.covariances_m2[of_biases].sum(axis=0)
-        index = self.cells.anchor_index
-        counts = np.bincount(index, minlength=num_anchors)
-        biases: Array = np.bincount(index, together @ pulls, num_anchors) / np.maximum(counts, 1)
-        return biases
-
-
 def learn_errors(
     cells: Cells,
     off_m: Array,
@@ -113,7 +99,7 @@ def learn_errors(
     covariances = stddevs[:, None, None] ** 2 * likelihood.of_components
     names = [component.name for component in components]
     if curve_stddev_m is not None:
-        names.append("learnt_curve")
+        names.append(LEARNT_CURVE)
         stddevs = np.append(stddevs, 1.0)
         covariances = np.concatenate([covariances, likelihood.known[None]])
     return LearnedErrors(cells, cells.of_range, tuple(names), stddevs, covariances)
@@ -192,9 +178,3 @@ class _Likelihood:
         traces = np.einsum("ij,kij->k", projector, self.of_components)
         squares = np.einsum("i,kij,j->k", pulls, self.of_components, pulls)
         return negative, variances * (traces - squares) + off_median / self.spreads
-
-
-def component_words(names: Sequence[str]) -> dict[str, str]:
-    """What each component is, for people."""
-    words = {component.name: component.words for component in COMPONENTS}
-    return {name: words.get(name, "the learnt error curve") for name in names}

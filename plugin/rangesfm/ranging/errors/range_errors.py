@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.options import RangeModelOptions
-from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.inlier_noise import InlierNoise, inlier_noise
+from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.noise import (
     START_STDDEV_M,
     correlation_inflation,
@@ -77,9 +77,7 @@ class RangeErrors:
     learned: LearnedErrors | None = None
 
     @classmethod
-    def begin(
-        cls, observations: RangeObservations, rows: Indices, range_model: RangeModelOptions
-    ) -> RangeErrors:
+    def begin(cls, observations: RangeObservations, rows: Indices, range_model: RangeModelOptions) -> RangeErrors:
         """Of some of the ranges, before any map is looked at.
 
         Args:

@@ -1,0 +1,103 @@
+"""What GIS programs read: points as LAZ; cameras and anchors as GeoPackage, GeoJSON and KML, through GDAL."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.errors import InputError
+from rangesfm.export.metric_map import MetricMap, points_of
+from rangesfm.files.atomic import new_file
+from rangesfm.geometry.georeference import GEOGRAPHIC, is_geographic
+
+_STEP_M = 1e-4
+_STEP_DEG = 1e-9
+_POINT_FORMAT_WITH_COLOR = 7
+_WKB_POINT_Z = 1001
+# Nine decimals of a degree are a tenth of a millimetre.
+_OPTIONS = {"GeoJSON": {"COORDINATE_PRECISION": "9"}}
+
+
+def write_laz(map_: MetricMap, path: Path) -> Path:
+    """Write the 3-D points with their colours, in tenths of a millimetre.
+
+    Raises:
+        InputError: laspy is not installed.
+    """
+    try:
+        import laspy
+    except ImportError:
+        raise InputError("the format 'laz' needs laspy: pip install 'rangesfm[geo]'") from None
+    places, colors = points_of(map_.reconstruction)
+    xyz, steps = _coordinates(map_, places)
+    header = laspy.LasHeader(version="1.4", point_format=_POINT_FORMAT_WITH_COLOR)
+    header.scales = steps
+    header.offsets = np.floor(xyz.min(axis=0)) if len(xyz) else np.zeros(3)
+    if map_.georeference is not None:
+        import pyproj
+
+        header.add_crs(pyproj.CRS.from_user_input(map_.georeference.crs))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = xyz.T
+    las.red, las.green, las.blue = colors.T * np.uint16(257)  # LAS counts colours to 65535
+    with new_file(path) as temporary:
+        las.write(str(temporary))
+    return path
+
+
+def _coordinates(map_: MetricMap, xyz: Array) -> tuple[Array, Array]:
+    """Coordinates to write and the step in which they are counted."""
+    if map_.georeference is None:
+        return xyz, np.full(3, _STEP_M)
+    step = _STEP_DEG if is_geographic(map_.georeference.crs) else _STEP_M
+    return map_.georeference.projected(xyz), np.array([step, step, _STEP_M])
+
+
+def write_features(map_: MetricMap, path: Path, driver: str) -> Path:
+    """Write one point for each photo and each anchor, with ``kind``, ``name`` and the photo's ``timestamp_s``.
+
+    A GeoPackage is in the map's coordinate system, the other two have longitude and latitude by their definition.
+
+    Raises:
+        InputError: the map is not georeferenced, or pyogrio is not installed.
+    """
+    if map_.georeference is None:
+        raise InputError(
+            f"the format {path.suffix[1:]!r} needs a georeferenced map: anchors with [anchors] crs, or origin_anchor, "
+            "origin_lat_lon_height and heading_deg"
+        )
+    try:
+        import pyogrio.raw
+    except ImportError:
+        raise InputError(f"the format {path.suffix[1:]!r} needs pyogrio: pip install 'rangesfm[geo]'") from None
+    anchors = map_.anchors_m or {}
+    trajectory = map_.trajectory
+    places = np.concatenate([trajectory.centers, np.array(list(anchors.values())).reshape(-1, 3)])
+    is_projected = driver == "GPKG"
+    georeference = map_.georeference
+    coordinates = georeference.projected(places) if is_projected else georeference.geographic(places)
+    times = np.full(len(trajectory), np.nan) if trajectory.timestamps_s is None else trajectory.timestamps_s
+    names = np.array([*trajectory.image_names, *anchors], dtype=object)
+    kinds = np.array(["camera"] * len(trajectory) + ["anchor"] * len(anchors), dtype=object)
+    with new_file(path) as temporary:
+        pyogrio.raw.write(
+            temporary,
+            geometry=_wkb(coordinates),
+            field_data=[kinds, names, np.concatenate([times, np.full(len(anchors), np.nan)])],
+            fields=np.array(["kind", "name", "timestamp_s"]),
+            layer="survey",
+            driver=driver,
+            geometry_type="Point Z",
+            crs=georeference.crs if is_projected else GEOGRAPHIC,
+            **_OPTIONS.get(driver, {}),
+        )
+    return path
+
+
+def _wkb(coordinates: Array) -> np.ndarray[tuple[int], np.dtype[np.object_]]:
+    """(n,) well-known binary of points."""
+    points = [struct.pack("<BI3d", 1, _WKB_POINT_Z, *row) for row in coordinates.tolist()]
+    return np.array(points, dtype=object)
