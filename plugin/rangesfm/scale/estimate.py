@@ -123,6 +123,8 @@ class ScaleEstimate:
         observations: all ranges, with status by their final weight.
         errors: of all n ranges of the log, as weighted; their inflation widens the formal stddev.
         noise_stddev_m: stddev of a range away from all special cases.
+        placement: (7, 7) covariance of the logarithm of the scale, of a turn (rad) and of a shift (m) of the map about
+            where the first camera is, widened as the scale's interval; None where the frame is the first camera's.
         resampled_scales: (k,) the robust scale from blocks of time drawn anew, metres per SfM unit.
     """
 
@@ -142,6 +144,7 @@ class ScaleEstimate:
     errors: RangeErrors
     noise_stddev_m: float
     resampled_scales: Array
+    placement: Array | None = None
 
     @property
     def value(self) -> float:

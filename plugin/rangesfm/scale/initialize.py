@@ -19,7 +19,7 @@ from rangesfm.ranging.errors.shared_errors import curve_stddev
 from rangesfm.ranging.observations import RangeObservations, RangeStatus, status_by_weight
 from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
 from rangesfm.scale.cutoff import cutoff_test
-from rangesfm.scale.estimate import ScaleEstimate
+from rangesfm.scale.estimate import NORMAL_95, ScaleEstimate, ScaleUncertainty
 from rangesfm.scale.levelled_places import levelled_places
 from rangesfm.scale.problem import ScaleProblem, scale_problem
 from rangesfm.scale.sensitivity import scale_sensitivity
@@ -97,7 +97,18 @@ def initialize_scale(
         errors=solution.errors.spread(problem.rows, len(observations.log)),
         noise_stddev_m=solution.noise_stddev_m,
         resampled_scales=_resampled_scales(solution, options.num_bootstrap, seed),
+        placement=_placement(solution, uncertainty),
     )
+
+
+def _placement(solution: Solution, uncertainty: ScaleUncertainty) -> Array | None:
+    """As ``ScaleEstimate.placement``: what makes the scale worse than its formal stddev does so to the place."""
+    columns, covariance = solution.fit.columns[0], solution.fit.covariance
+    if columns.frame < 0:
+        return None
+    of_map = [columns.scale, *range(columns.frame, columns.frame + 6)]
+    widening = uncertainty.half_width_95 / (NORMAL_95 * uncertainty.formal)
+    return np.asarray(widening**2 * covariance[np.ix_(of_map, of_map)])
 
 
 def _resampled_scales(solution: Solution, num: int, seed: int) -> Array:

@@ -23,6 +23,7 @@ from rangesfm.result.write import write_models_and_tables
 from rangesfm.survey.input_hashes import input_hashes
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
+from rangesfm.trust.finished_map import Doubt
 from rangesfm.workflows.journal import Journal
 
 
@@ -51,7 +52,7 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
     disagreeing = tuple(disagreements(distances, metric.estimate.uncertainty.empirical))
     for note in disagreeing:
         journal.warn(note)
-    metric = metric.doubted(disagreeing)
+    metric = metric.doubted([Doubt(note, "") for note in disagreeing])
     folder = survey.output.path
     with replacing_result(folder):
         with journal.stage("results"):
@@ -98,7 +99,7 @@ def _comparison(survey: Survey, inputs: RangingInputs, metric: MetricResult) -> 
         return ()
     frame = metric.estimate.frame
     scaled = metric.trajectory.as_in(metric.scaled)
-    refined = None if metric.refined is None else metric.trajectory.as_in(metric.refined)
+    refined = None if metric.kept_refinement is None else metric.trajectory.as_in(metric.final)
     rows = papers_table(scaled, refined, inputs.reference, frame=frame)
     in_frame = reference_in_frame(refined or scaled, inputs.reference, frame=frame)
     if in_frame is not None:

@@ -21,9 +21,15 @@ from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes
 from rangesfm.vision.reconstruct import prepare_submaps
 from rangesfm.vision.submaps import Submap
-from rangesfm.workflows.checked_inputs import check_times, checked_inputs, read_inputs, read_registered
+from rangesfm.workflows.checked_inputs import (
+    check_times,
+    checked_inputs,
+    read_inputs,
+    read_registered,
+    tell_of_times,
+)
 from rangesfm.workflows.journal import Journal
-from rangesfm.workflows.metric_map import join_by_survey, refine_map, scale_by_survey
+from rangesfm.workflows.metric_map import join_by_survey, judge_map, refine_map, scale_by_survey
 from rangesfm.workflows.photos import find_keyframes, map_keyframes, noted, with_photos
 from rangesfm.workflows.placed_ranges import find_time_offset, path_with_times, ranges_on_paths
 from rangesfm.workflows.ranges_in_mapping import AdjustmentWithRanges
@@ -84,12 +90,13 @@ def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResul
     inputs = read_inputs(survey, journal)
     if survey.model_path is None:
         raise InputError("no model: give --input_path MODEL, a COLMAP model as sparse/0")
-    sfm = read_registered(survey.model_path)
+    sfm = read_registered(survey.model_path, journal)
     if refine and not sfm.num_points3D():
         raise InputError("the model has no 3-D points to refine: a trajectory can only be scaled", survey.model_path)
     times = None
     if inputs.log.image_name is None:
         times = noted(times_of_model(survey, sfm, survey.model_path), journal)
+        tell_of_times(survey, inputs, times, journal)
     with sole_writer(survey.output.path):
         return to_metric(survey, inputs, [sfm], times, journal, refine=refine)
 
@@ -138,4 +145,4 @@ def map_in_metres(
         with journal.stage("refinement"):
             metric = refine_map(survey, inputs, metric, journal)
     # Comparison and results.
-    return write_results(survey, inputs, metric, journal)
+    return write_results(survey, inputs, judge_map(survey, metric, journal), journal)
