@@ -11,7 +11,7 @@ from rangesfm.ranging.log import RangeLog
 from rangesfm.trust.anchor_distances import notes_on_distances
 
 Array = npt.NDArray[np.float64]
-SITE_M = {
+SITE_M: dict[str, tuple[float, ...]] = {
     "A": (0.0, 0.0, 0.5),
     "B": (9.0, 1.0, 2.0),
     "C": (8.0, 14.0, 0.8),

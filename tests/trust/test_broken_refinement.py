@@ -18,7 +18,8 @@ from rangesfm.progress import SilentProgress
 from rangesfm.result.folder import read_result_folder
 from rangesfm.result.ranges_as_used import RangesAsUsed
 from rangesfm.survey.settings import Survey
-from rangesfm.workflows.run import RunResult, refine_model, scale_model
+from rangesfm.workflows.results import RunResult
+from rangesfm.workflows.run import refine_model, scale_model
 
 if TYPE_CHECKING:
     from tests.conftest import WalkedSurvey
@@ -47,7 +48,7 @@ def shorten_focal_length(model: pycolmap.Reconstruction) -> None:
 
 def throw_camera(model: pycolmap.Reconstruction, by: Array) -> None:
     frame = model.frame(sorted(model.reg_frame_ids())[20])
-    pose = frame.rig_from_world
+    pose = known(frame.rig_from_world)
     frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, pose.translation + by)
 
 

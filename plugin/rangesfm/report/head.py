@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import reduce
 from typing import Any
@@ -40,7 +41,20 @@ def tiles(content: Content) -> list[tuple[str, str, str]]:
     def metres(key: str, within: str = "{}") -> str:
         return shown(key, fixed, 3, "m", within=within)
 
+    place = summary.place
+    of_place = f"its middle ± {fixed(math.hypot(*place.stddev_m), 2, 'm')}, the worst keyframe" if place else ""
     return [
+        *(
+            [
+                (
+                    "Place in the site",
+                    place.verdict,
+                    shown("place.worst_keyframe_stddev_m", fixed, 2, "m", within=f"{of_place} ± {{}}"),
+                )
+            ]
+            if place
+            else []
+        ),
         ("Keyframes", count(None if path is None else len(path)), f"path of {fixed(length_m, 2, 'm')}"),
         ("Ranges used", shown("ranges.num_used", count), shown("ranges.num", count, within="of {} in the log")),
         ("Range RMS", metres("ranges.rms_m"), metres("ranges.median_abs_m", "median {}")),

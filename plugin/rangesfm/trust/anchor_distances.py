@@ -79,7 +79,7 @@ def notes_on_distances(log: RangeLog, anchors: Sequence[Anchor]) -> Iterator[str
     num = len(ids) * (len(ids) - 1) // 2
     found = f"the ranges do not allow the distances between anchors in {bad.sum()} of {num} pairs"
     causes = list(_causes(triangles, ids, positions_m, bad))
-    named = " and ".join(f"{ids[i]} and {ids[k]}" for i, k in np.argwhere(bad)[:_MAX_NUM_NAMED])
+    named = " and ".join(f"{ids[i]} and {ids[k]}" for i, k in np.argwhere(bad)[:_MAX_NUM_NAMED].tolist())
     likeliest = f"probably {' or '.join(causes)}" if causes else f"look at {named} first"
     yield f"{found}: {likeliest}; check labels, coordinates and units, or the map takes on what is wrong"
 
@@ -88,7 +88,7 @@ def _causes(triangles: _Triangles, ids: Sequence[str], positions_m: Array, bad: 
     """What alone would explain all that is wrong."""
     in_pairs = bad.sum(axis=0) + bad.sum(axis=1)
     if in_pairs.max() == bad.sum():
-        ends = [ids[k] for k in np.flatnonzero(in_pairs == bad.sum())]
+        ends = [ids[k] for k in np.flatnonzero(in_pairs == bad.sum()).tolist()]
         yield f"anchor {' or '.join(ends)} stands elsewhere"
     yield from (name for name, factor in _UNITS.items() if not triangles.bad_pairs(factor * positions_m).any())
     swaps = []

@@ -51,7 +51,9 @@ def _on_positions(anchors: Sequence[Anchor], *, is_site: bool) -> Iterator[str]:
             "height and tilt rest on a guess, and the ranges cannot show it; measure the heights of the antennas"
         )
     for one, other in combinations(anchors, 2):
-        if float(np.linalg.norm(np.subtract(one.position_m, other.position_m))) < _SAME_PLACE_M:
+        if one.position_m is None or other.position_m is None:
+            continue
+        if float(np.linalg.norm(one.position_m - other.position_m)) < _SAME_PLACE_M:
             yield (
                 f"anchors {one.anchor_id} and {other.anchor_id} have the same position: one of them stands elsewhere; "
                 "correct it, or leave its coordinates empty"
