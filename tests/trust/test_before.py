@@ -7,11 +7,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pycolmap
 import pytest
+from tests.known import known
 from tests.simulated.model import synthetic_model
 from tests.simulated.path import loop_path
 
-from rangesfm.colmap.reprojection import point_errors
 from rangesfm.survey.inputs import RangingInputs, read_ranging_inputs
 from rangesfm.survey.settings import Survey
 from rangesfm.trust.before import notes_before_work, notes_on_model, notes_on_times
@@ -115,17 +116,32 @@ def test_ranges_that_last_a_fraction_of_the_walk_are_told() -> None:
     assert note.startswith("the ranges last 0.12 s, the photos 120 s")
 
 
-def test_a_model_whose_points_are_not_of_its_photos_is_told() -> None:
+@pytest.fixture
+def model() -> pycolmap.Reconstruction:
     path, times = loop_path(30.0, seed=3), np.arange(1.0, 29.0)
-    model = synthetic_model(
+    made = synthetic_model(
         times, path.centers(times), path.world_from_cam(times), num_observations=40, pixel_stddev=1.0
     )
-    reconstruction = model.reconstruction
-    assert not list(notes_on_model(point_errors(reconstruction)))
-    for point in reconstruction.points3D.values():
+    return made.reconstruction
+
+
+def test_of_a_model_as_colmap_leaves_it_or_without_points_nothing_is_said(model: pycolmap.Reconstruction) -> None:
+    assert not list(notes_on_model(model))
+    for point_id in list(model.points3D):
+        model.delete_point3D(point_id)
+    assert not list(notes_on_model(model))
+
+
+def test_a_model_whose_points_are_not_of_its_photos_is_told(model: pycolmap.Reconstruction) -> None:
+    for point in model.points3D.values():
         point.xyz = point.xyz * [1.0, 1.0, -1.0]
-    (note,) = notes_on_model(point_errors(reconstruction))
+    (note,) = notes_on_model(model)
     assert note.startswith("the model's points lie")
-    for point_id in list(reconstruction.points3D):
-        reconstruction.delete_point3D(point_id)
-    assert not list(notes_on_model(point_errors(reconstruction)))
+
+
+def test_a_photo_whose_pose_is_wrong_is_named(model: pycolmap.Reconstruction) -> None:
+    frame = model.frame(7)
+    pose = known(frame.rig_from_world)
+    frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, pose.translation + np.array([5.0, 3.0, 0.0]))
+    (note,) = notes_on_model(model)
+    assert note.startswith(f"photo {model.image(7).name}: in the model most of its points are farther than 4.8 px")

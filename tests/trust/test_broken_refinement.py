@@ -98,7 +98,8 @@ def centers(path_of_model: str, survey: Survey) -> Array:
 def test_a_refinement_that_did_its_work_stays_good(survey: Survey, spoil: Spoil, own_survey: WalkedSurvey) -> None:
     summary = refined(spoilt(survey, spoil)).summary
     refine, place = known(summary.refine), known(summary.place)
-    assert (summary.scale.verdict, place.verdict, summary.warnings) == ("good", "good", ())
+    assert (summary.scale.verdict, place.verdict) == ("good", "good")
+    assert len(summary.warnings) == (spoil is throw_camera_a_little)
     assert refine.kept
     assert refine.converged
     assert refine.why_not_kept == ()

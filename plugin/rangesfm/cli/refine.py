@@ -21,8 +21,8 @@ def add_command(commands: Commands) -> None:
         "refine",
         execute,
         help="COLMAP model and ranges to a refined metric model",
-        description="Scale a COLMAP model by ranges, then adjust it with the ranges in its bundle adjustment. If that breaks "
-        "the map, the scaled one is the result, and the reason is said.",
+        description="Scale a COLMAP model by ranges, then adjust it with the ranges in its bundle adjustment. "
+        "If that breaks the map, the scaled one is the result, and the reason is said.",
         example=(
             "rangesfm refine --input_path sparse/0 --ranges uwb.csv --anchors anchors.csv \\\n"
             "    --images images.csv --tag_in_cam -0.0012,-0.09,-0.0663 --output_path out"

@@ -51,3 +51,18 @@ def point_errors(model: pycolmap.Reconstruction) -> PointErrors:
         np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
         max(_MAX_ERROR_PX, _MAX_ERROR_SHARE * longest_px),
     )
+
+
+def photo_errors_px(model: pycolmap.Reconstruction) -> dict[str, float]:
+    """Median reprojection error of each registered photo that sees points, by name; infinite where most lie behind."""
+    medians = {}
+    for image_id in sorted(model.reg_image_ids()):
+        image = model.image(image_id)
+        seen = [point for point in image.points2D if point.has_point3D()]
+        if not seen:
+            continue
+        in_cam = image.cam_from_world() * np.array([model.point3D(point.point3D_id).xyz for point in seen])
+        pixels = np.asarray(model.camera(image.camera_id).img_from_cam(in_cam), dtype=np.float64)
+        off_px = np.linalg.norm(pixels - np.array([point.xy for point in seen]), axis=1)
+        medians[image.name] = float(np.median(np.where((in_cam[:, 2] > 0) & np.isfinite(off_px), off_px, np.inf)))
+    return medians

@@ -6,9 +6,10 @@ from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
+import pycolmap
 
 from rangesfm.arrays import Array
-from rangesfm.colmap.reprojection import PointErrors
+from rangesfm.colmap.reprojection import photo_errors_px, point_errors
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.survey.inputs import RangingInputs
@@ -109,10 +110,20 @@ def notes_on_times(radio_s: Array, photos_s: Array) -> Iterator[str]:
         )
 
 
-def notes_on_model(errors: PointErrors) -> Iterator[str]:
+def notes_on_model(model: pycolmap.Reconstruction) -> Iterator[str]:
     """Of a model that was brought along."""
+    errors = point_errors(model)
     if not errors.fit:
         yield (
             f"the model's points lie {errors.median_px:.3g} px (median) from where its photos show them, expected "
             f"below {errors.max_median_px:.3g} px: check that model, photos and the camera's parameters belong together"
+        )
+        return
+    off_px = {name: off for name, off in photo_errors_px(model).items() if off > errors.max_median_px}
+    if off_px:
+        worst = max(off_px, key=lambda name: off_px[name])
+        others = f" and {len(off_px) - 1} more" if len(off_px) > 1 else ""
+        yield (
+            f"photo {worst}{others}: in the model most of its points are farther than {errors.max_median_px:.3g} px "
+            "from where it shows them: its pose is wrong; take it out of the model, or map anew"
         )

@@ -9,7 +9,6 @@ import pycolmap
 
 from rangesfm.colmap.model_files import read_model
 from rangesfm.colmap.passthrough import apply_options
-from rangesfm.colmap.reprojection import point_errors
 from rangesfm.errors import InputError
 from rangesfm.export import check_formats
 from rangesfm.geometry.trajectory import Trajectory
@@ -71,6 +70,6 @@ def read_registered(path: Path, journal: Journal) -> pycolmap.Reconstruction:
     model = read_model(path)
     if not model.num_reg_images():
         raise InputError("the model has no registered images", path)
-    for note in notes_on_model(point_errors(model)):
+    for note in notes_on_model(model):
         journal.warn(note)
     return model
