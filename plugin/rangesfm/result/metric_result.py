@@ -20,7 +20,7 @@ from rangesfm.ranging.observations import RangeObservations, RangeStatus
 from rangesfm.refine.with_ranges import RefineSummary
 from rangesfm.scale.diagnostics import ScaleDiagnostics, scale_diagnostics
 from rangesfm.scale.estimate import ScaleEstimate
-from rangesfm.trust.finished_map import Doubt, Place
+from rangesfm.trust.finished_map import Place
 
 USED = (RangeStatus.USED, RangeStatus.DOWN_WEIGHTED)
 """Of ranges with a say in the final model, however small."""
@@ -147,14 +147,14 @@ class MetricResult:
             refinement=refinement,
         )
 
-    def doubted(self, doubts: Sequence[Doubt]) -> MetricResult:
-        """The same with further reasons to doubt it, if there are any."""
-        if not doubts:
+    def doubted(self, reasons: Sequence[str], advice: Sequence[str] = ()) -> MetricResult:
+        """The same with further reasons to doubt it, if there are any, and what to do about them."""
+        if not reasons:
             return self
-        estimate, reasons = self.estimate, [doubt.reason for doubt in doubts]
+        estimate = self.estimate
         kept = estimate.reasons if estimate.verdict == "doubtful" else ()
-        advice = dict.fromkeys((*(doubt.advice for doubt in doubts if doubt.advice), *estimate.advice))
-        doubted = replace(estimate, verdict="doubtful", reasons=(*reasons, *kept), advice=tuple(advice))
+        all_advice = tuple(dict.fromkeys((*advice, *estimate.advice)))
+        doubted = replace(estimate, verdict="doubtful", reasons=(*reasons, *kept), advice=all_advice)
         return replace(self, estimate=doubted)
 
 

@@ -111,7 +111,8 @@ def judge_map(survey: Survey, metric: MetricResult, journal: Journal) -> MetricR
         journal.warn(doubt.reason)
     centers_m = metric.trajectory.as_in(metric.final).centers
     place = place_of_map(metric.estimate, metric.kept_refinement, centers_m, doubts)
-    return replace(metric, place=place).doubted(doubts)
+    judged = replace(metric, place=place)
+    return judged.doubted([doubt.reason for doubt in doubts], [doubt.advice for doubt in doubts])
 
 
 def _control(inputs: RangingInputs, metric: MetricResult) -> Tape:

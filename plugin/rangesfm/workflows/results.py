@@ -23,7 +23,6 @@ from rangesfm.result.write import write_models_and_tables
 from rangesfm.survey.input_hashes import input_hashes
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
-from rangesfm.trust.finished_map import Doubt
 from rangesfm.workflows.journal import Journal
 
 
@@ -52,7 +51,7 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
     disagreeing = tuple(disagreements(distances, metric.estimate.uncertainty.empirical))
     for note in disagreeing:
         journal.warn(note)
-    metric = metric.doubted([Doubt(note, "") for note in disagreeing])
+    metric = metric.doubted(disagreeing)
     folder = survey.output.path
     with replacing_result(folder):
         with journal.stage("results"):
