@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from rangesfm.ranging.errors.calibration import Calibration
     from rangesfm.ranging.log import RangeLog
     from rangesfm.ranging.summary import AnchorSummary, PairSummary, RangeSummary
+
+# As of the times in a survey file.
+_MAX_TIME_S = 1e10
 
 _LOG_KEYS = (
     *("ranges.format", "ranges.columns", "ranges.timestamp_unit", "ranges.range_unit", "ranges.separator"),
@@ -85,11 +89,11 @@ def _add_position_arguments(parser: Parser, *, max_interpolation_gap_s: float) -
     )
     parser.add_argument("--tag_id", metavar="ID", help="the tag whose positions these are, if the log has several")
     parser.add_argument(
-        "--time_offset", type=float, default=0.0, metavar="SECONDS", help="time of positions minus time of ranges"
+        "--time_offset", type=_seconds, default=0.0, metavar="SECONDS", help="time of positions minus time of ranges"
     )
     parser.add_argument(
         "--max_interpolation_gap_s",
-        type=float,
+        type=_seconds,
         default=max_interpolation_gap_s,
         metavar="S",
         help=f"between known positions further apart none is interpolated (default: {max_interpolation_gap_s:g})",
@@ -342,3 +346,13 @@ def _placed(log: RangeLog, placements: Sequence[AnchorPlacement]) -> list[str]:
         "",
         *(line + note for line, note in zip(align_rows(rows).split("\n"), notes, strict=True)),
     ]
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= _MAX_TIME_S:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a time in seconds, expected at most {_MAX_TIME_S:g} of them")
+    return value
