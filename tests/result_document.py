@@ -34,6 +34,7 @@ _SCALE = {
 }
 _RESULT: dict[str, Any] = {
     "scale": _SCALE,
+    "place": None,
     "metric_from_sfm": {"scale": 1.5, "rotation_xyzw": [0.0, 0.0, 0.0, 1.0], "translation_m": [1.0, 2.0, 3.0]},
     "frame": "site",
     "map": {"num_photos": 40, "num_points3D": 900},
@@ -57,6 +58,8 @@ _RESULT: dict[str, Any] = {
     "warnings": [],
 }
 REFINE = {
+    "kept": True,
+    "why_not_kept": [],
     "iterations": 23,
     "keyframe_graph_steps": 4,
     "bend_m": 0.01,

@@ -28,7 +28,7 @@ from rangesfm.ceres import (
 )
 from rangesfm.ceres.covariance import ResidualErrors, joint_covariance
 from rangesfm.errors import GeometryError
-from rangesfm.geometry.similarity import IDENTITY
+from rangesfm.geometry.similarity import IDENTITY, similarity_motions
 from rangesfm.geometry.trajectory import pose_of
 
 Array = npt.NDArray[np.float64]
@@ -296,7 +296,8 @@ def test_surveys_err_as_the_covariance_says() -> None:
     rng = np.random.default_rng(7)
     times = np.arange(NUM_FRAMES, dtype=np.float64)
     truth = orbit_path(1.4 * NUM_FRAMES).centers(times)
-    centers, anchors, scales = [], [], []
+    motions = similarity_motions(truth - truth.mean(axis=0)).reshape(-1, 7)
+    centers, anchors, scales, maps = [], [], [], []
     for seed in range(60):
         noise = RANGE_STDDEV_M * rng.standard_normal((len(ANCHORS_M), NUM_FRAMES))
         biases = BIAS_STDDEV_M * rng.standard_normal((len(ANCHORS_M), 1))
@@ -310,10 +311,13 @@ def test_surveys_err_as_the_covariance_says() -> None:
         anchors.append([e @ np.linalg.solve(c, e) / 3 for e, c in zip(anchor_errors, found.anchors, strict=True)])
         middle = truth - truth.mean(axis=0)
         scales.append((np.sum(errors * middle) / np.sum(middle**2) / found.relative_scale_stddev) ** 2)
-    # 60 runs: about 180 degrees of freedom of each center and anchor, 60 of the scale.
+        similarity = np.linalg.lstsq(motions, errors.ravel(), rcond=None)[0]
+        maps.append(similarity @ np.linalg.solve(found.similarity, similarity) / 7)
+    # 60 runs: about 180 degrees of freedom of each center and anchor, 60 of the scale, 420 of scale, turn and shift.
     assert np.mean(centers) == pytest.approx(1.0, abs=0.2)
     assert np.mean(anchors) == pytest.approx(1.0, abs=0.2)
     assert np.mean(scales) == pytest.approx(1.0, abs=0.4)
+    assert np.mean(maps) == pytest.approx(1.0, abs=0.2)
 
 
 def test_a_motion_that_only_rounding_keeps_from_moving_nothing_is_none() -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rangesfm.arrays import Array
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors
@@ -92,6 +93,8 @@ class ScaleEstimate:
         observations: all ranges, with status by their final weight.
         errors: of all n ranges of the log, as weighted; their inflation widens the formal stddev.
         noise_stddev_m: stddev of a range away from all special cases.
+        placement: (7, 7) covariance of the logarithm of the scale, of a turn (rad) and of a shift (m) of the map about
+            where the first camera is, by what the ranges get wrong; None where the frame is the first camera's.
     """
 
     metric_from_sfm: Similarity
@@ -109,6 +112,7 @@ class ScaleEstimate:
     observations: RangeObservations
     errors: RangeErrors
     noise_stddev_m: float
+    placement: Array | None = None
 
     @property
     def value(self) -> float:

@@ -24,7 +24,7 @@ from rangesfm.scale.problem import ScaleProblem, scale_problem
 from rangesfm.scale.sensitivity import scale_sensitivity
 from rangesfm.scale.solution import Solution, solve_scale
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
-from rangesfm.scale.uncertainty import learned_errors, scale_uncertainty
+from rangesfm.scale.uncertainty import learned_errors, parameter_covariance, scale_uncertainty
 from rangesfm.scale.verdict import judge
 
 
@@ -63,7 +63,8 @@ def initialize_scale(
     learned = learned_errors(problem, solution, observations, model_from_cam)
     uncertainty = scale_uncertainty(solution, learned)
     per_anchor = scale_per_anchor(solution, observations.log.anchor_ids)
-    found = anchor_estimates(solution, observations.log.anchor_ids)
+    covariance = parameter_covariance(solution.fit, solution.problem, learned)
+    found = anchor_estimates(solution, observations.log.anchor_ids, covariance)
     tests = cutoff_test(solution)
     judged = judge(problem, solution, uncertainty, per_anchor, found, tests, options)
     verdict, reasons = judged.verdict, judged.reasons
@@ -92,7 +93,17 @@ def initialize_scale(
         observations=replace(observations, status=status),
         errors=replace(solution.errors, learned=learned).spread(problem.rows, len(observations.log)),
         noise_stddev_m=solution.noise_stddev_m,
+        placement=_placement(solution, covariance),
     )
+
+
+def _placement(solution: Solution, covariance: Array) -> Array | None:
+    """As ``ScaleEstimate.placement``."""
+    columns = solution.fit.columns[0]
+    if columns.frame < 0:
+        return None
+    of_map = [columns.scale, *range(columns.frame, columns.frame + 6)]
+    return np.asarray(covariance[np.ix_(of_map, of_map)])
 
 
 def _model_from_cam(observations: RangeObservations, trajectory: Trajectory, problem: ScaleProblem) -> Array:
