@@ -20,12 +20,14 @@ from rangesfm.scale.solution import WHY_SCALE_IS_OPEN, Solution
 # Half of the 95 % interval of the scale, relative, from which it is called doubtful.
 DOUBTFUL_ABOVE = 0.04
 # Smaller changes with the least range are no news to a surveyor.
-_MIN_DRIFT_PERCENT = 1.0
+_MIN_DRIFT = 0.01
 _MANY_OUTLIERS = 0.3
 _FEW_RANGES = 50
 # Relative stddev of a scale that may as well be nothing.
 _NOTHING_KNOWN = 1.0
-_MAX_ANCHOR_SPREAD = 0.03
+# Scatter of the scales from one anchor each: more than antennas and short stretches of a path make of it, and in
+# stddevs of the joint scale.
+_MAX_ANCHOR_SPREAD, _MAX_SPREAD_STDDEVS = 0.05, 0.75
 # Components of the ranges' errors that the same measure helps against.
 _KINDS = (
     ("curve", "rough_curve", "slope", "short", "common_bias", "learnt_curve"),
@@ -81,8 +83,11 @@ def judge(
         *_path_doubts(solution),
         *_range_doubts(solution.fit),
         *_anchor_doubts(per_anchor, uncertainty),
-        *_drift_doubts(cutoff_tests, half_width),
     ]
+    remarks = _remarks(solution, anchors)
+    if drift := _drift(cutoff_tests):
+        is_out = abs(drift.scale / cutoff_tests[0].scale - 1) > half_width
+        (doubts if is_out else remarks).append(_drift_in_words(drift, cutoff_tests[0]))
     if half_width > NORMAL_95 * options.max_relative_stddev:
         why = f"{doubts[0].reason}; " if doubts else ""
         raise GeometryError(
@@ -93,7 +98,7 @@ def judge(
     summary = f"the scale is known to {100 * half_width:.1f} % (95 % interval)"
     if half_width > DOUBTFUL_ABOVE:
         doubts.insert(0, _Doubt(f"{summary}, worse than {100 * DOUBTFUL_ABOVE:g} %", narrower))
-    said = [*doubts, *_remarks(solution, anchors)]
+    said = [*doubts, *remarks]
     advice: dict[str, str] = {}
     for each in said:  # calibration is advised once, whatever else goes with it
         advice.setdefault(_CALIBRATE if each.advice.startswith(_CALIBRATE) else each.advice, each.advice)
@@ -182,24 +187,25 @@ def _range_doubts(fit: RangeFit) -> list[_Doubt]:
 
 
 def _anchor_doubts(per_anchor: dict[str, float], uncertainty: ScaleUncertainty) -> list[_Doubt]:
-    """Anchors that disagree on the scale, by more than m of them that err for themselves would."""
+    """Anchors that disagree on the scale, by more than its uncertainty lets expect."""
     if len(per_anchor) < 2:
         return []
     spread = float(np.std(np.log(np.array(list(per_anchor.values()))), ddof=1))
-    if spread <= max(_MAX_ANCHOR_SPREAD, NORMAL_95 * np.sqrt(len(per_anchor)) * uncertainty.empirical):
+    if spread <= max(_MAX_ANCHOR_SPREAD, _MAX_SPREAD_STDDEVS * uncertainty.empirical):
         return []
     reason = f"the anchors disagree: the scales found with each of them alone scatter by {100 * spread:.1f} %"
     return [_Doubt(reason, "check the anchors' positions and antenna delays, and place them in the open")]
 
 
-def _drift_doubts(tests: tuple[CutoffTest, ...], half_width: float) -> list[_Doubt]:
-    """A scale that moves out of its interval as short ranges are left out."""
+def _drift(tests: tuple[CutoffTest, ...]) -> CutoffTest | None:
+    """A scale that moves as short ranges are left out, by more than is news to a surveyor."""
     drift = scale_drift(tests)
-    expected = max(_MIN_DRIFT_PERCENT, 100 * half_width)
-    if drift is None or abs(percent := 100 * (drift.scale / tests[0].scale - 1)) < expected:
-        return []
+    return None if drift is None or abs(drift.scale / tests[0].scale - 1) < _MIN_DRIFT else drift
+
+
+def _drift_in_words(drift: CutoffTest, with_all: CutoffTest) -> _Doubt:
     reason = (
         f"short ranges disagree with long ones: without those under {drift.min_range_m:g} m the scale would change by "
-        f"{percent:+.1f} %"
+        f"{100 * (drift.scale / with_all.scale - 1):+.1f} %"
     )
-    return [_Doubt(reason, f"{_CALIBRATE}, and keep the anchors farther from the path")]
+    return _Doubt(reason, f"{_CALIBRATE}, and keep the anchors farther from the path")

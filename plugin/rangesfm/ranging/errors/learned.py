@@ -20,7 +20,8 @@ _MAX_NUM_ITERATIONS = 25
 _TOLERANCE = 1e-6
 # Logarithms of stddevs, beside the median: farther away the likelihood is flat.
 _FARTHEST_BELOW, _FARTHEST_ABOVE = 5.0, 4.0
-_ROUNDING_M2 = 1e-10
+# Of the trace of a covariance, which rounding may leave singular.
+_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -154,7 +155,7 @@ class _Likelihood:
     def _negative_with_gradient(self, logs: Array) -> tuple[float, Array]:
         variances = np.exp(2 * logs)
         covariance = np.tensordot(variances, self.of_components, axes=1) + self.known
-        covariance[np.diag_indices_from(covariance)] += _ROUNDING_M2
+        covariance[np.diag_indices_from(covariance)] += _ROUNDING * np.trace(covariance)
         lower = np.linalg.cholesky(covariance)
         inverse = cho_solve((lower, True), np.eye(len(covariance)))
         whitened = inverse @ self.design
