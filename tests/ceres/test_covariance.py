@@ -181,13 +181,17 @@ def test_residuals_that_err_together_count_as_their_covariance_says() -> None:
     num_ranges = NUM_FRAMES * len(ANCHORS_M)
     num = survey.problem.num_residuals()
     rows = np.arange(num - len(survey.biases) - num_ranges, num - len(survey.biases))
-    errors = ResidualErrors(rows, 1.7, csr_matrix(np.random.default_rng(0).standard_normal((num_ranges, 3))))
+    rng = np.random.default_rng(0)
+    # Each on its own with a variance of 1.7, and three errors that they share.
+    by_error = np.hstack([np.eye(num_ranges), rng.standard_normal((num_ranges, 3))])
+    of_errors = np.diag(np.concatenate([np.full(num_ranges, 1.7), np.ones(3)]))
+    errors = ResidualErrors(rows, csr_matrix(by_error), of_errors)
     found = joint_covariance(
         survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases, errors=errors
     )
     jacobian = tangent_jacobian(survey.problem, variable(survey)).toarray()
     of_residuals = np.eye(num)
-    of_residuals[np.ix_(rows, rows)] = 1.7 * np.eye(num_ranges) + (errors.modes @ errors.modes.T).toarray()
+    of_residuals[np.ix_(rows, rows)] = by_error @ of_errors @ by_error.T
     gain = covariance_of_all(survey.problem, variable(survey)) @ jacobian.T
     expected = gain @ of_residuals @ gain.T
     first = 6 * (NUM_FRAMES - 1)

@@ -70,7 +70,6 @@ def survey(own_survey: WalkedSurvey) -> Survey:
             "ranges.time_offset": 2.0,
             "anchors.path": folder / "anchors.csv",
             "tag.tag_in_cam_m": (0.03, -0.12, -0.05),
-            "scale.num_bootstrap": 20,
             "refine.max_num_iterations": 40,
             "report.enabled": False,
             "output.path": folder / "out",

@@ -27,7 +27,7 @@ GOOD_POINTS = PointErrors(np.full(100, 0.6), np.zeros((100, 3)), 4.0)
 COMMON_BIAS_STDDEV_M = 0.1
 
 
-OPTIONS = ScaleOptions(num_bootstrap=20)
+OPTIONS = ScaleOptions()
 RADIO = Radio(range_stddev_m=0.06)
 
 
