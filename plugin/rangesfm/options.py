@@ -6,6 +6,7 @@ commands' flags, their help, the reference of all keys and the settings in ``res
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -229,10 +230,12 @@ class TagOptions(Options):
 
 
 class MapperOptions(Options):
-    """Photos to unscaled model. Keys that are not here are pycolmap's IncrementalPipelineOptions', as in pipeline."""
+    """Photos to unscaled model. Keys that are not here are of pycolmap's options of the mapper, as in pipeline."""
 
     table: ClassVar[str] = "mapper"
 
+    method: Annotated[Literal["incremental", "global", "hierarchical"], Told(flag="mapper_method")] = "incremental"
+    """COLMAP's mapper: photo by photo; all at once; photo by photo in clusters, which are merged."""
     matching: Literal["sequential", "exhaustive", "auto"] = "auto"
     """Which photos are matched; auto: exhaustive up to 60 keyframes."""
     features: dict[str, Any] = Field(default_factory=dict)
@@ -242,22 +245,21 @@ class MapperOptions(Options):
     matcher: dict[str, Any] = Field(default_factory=dict)
     """Passed through to pycolmap's FeatureMatchingOptions."""
     pipeline: dict[str, Any] = Field(default_factory=dict)
-    """Passed through to pycolmap's IncrementalPipelineOptions."""
+    """Passed through to pycolmap's IncrementalPipelineOptions; of the other mappers GlobalPipelineOptions and
+    HierarchicalPipelineOptions."""
     ranges_in_mapping: bool = False
     """Each global bundle adjustment of the mapping carries the ranges, as soon as they determine the scale; takes much
     longer, and the refinement at the end mostly comes to the same map."""
     num_threads: Annotated[
         Literal[-1] | Annotated[int, Field(ge=1, le=4096)], Told(expected="1 or more up to 4096, or -1 for all cores")
     ] = -1
-    """-1 for all cores. Matching on the processor takes one thread all the same, as pycolmap 4.2 loses matches with
-    more; matcher.num_threads overrides that."""
-    submap_size: Annotated[int, Field(ge=10, le=1_000_000)] | None = None
-    """More photos than that are mapped in stretches of so many in their order, each on its own, which are joined by the
-    photos that they share (default: all in one piece)."""
-    submap_overlap: Annotated[int, Field(ge=3, le=1_000_000)] = 20
-    """Photos that a submap shares with the one before."""
-    num_submaps_at_once: Annotated[int, Field(ge=1, le=4096)] = 1
-    """Each is mapped by a process of its own; they share the threads."""
+    """-1 for all cores. Matching on the processor takes so many processes with one thread each, as pycolmap 4.2 loses
+    matches with more threads; matcher.num_threads overrides that one."""
+
+    @property
+    def num_cores(self) -> int:
+        """What ``num_threads`` comes to here."""
+        return self.num_threads if self.num_threads > 0 else os.cpu_count() or 1
 
     @model_validator(mode="before")
     @classmethod

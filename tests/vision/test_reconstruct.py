@@ -13,6 +13,7 @@ import numpy.typing as npt
 import pycolmap
 import pytest
 from PIL import Image
+from tests.vision.matches import content_of
 
 from rangesfm.errors import InputError, ReconstructionError
 from rangesfm.options import CameraOptions, MapperOptions
@@ -265,7 +266,7 @@ class TestEarlierRun:
         summary = reconstruct(room.folder, room.names, output, camera=room.camera, mapper=MAPPER)
         assert summary.seconds == {}
 
-    def test_killed_while_it_matched_in_time_order_can_be_matched_otherwise(
+    def test_killed_while_it_paired_photos_in_time_order_can_be_matched_otherwise(
         self, room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         def die(*_: Any, **__: Any) -> None:
@@ -273,7 +274,7 @@ class TestEarlierRun:
             raise KeyboardInterrupt
 
         with monkeypatch.context() as patched:
-            patched.setattr(pycolmap, "match_sequential", die)
+            patched.setattr(pycolmap, "SequentialPairGenerator", die)
             mapper = MapperOptions(features=FEATURES, matching="sequential")
             with pytest.raises(KeyboardInterrupt):
                 reconstruct(room.folder, room.names, tmp_path / "out", camera=room.camera, mapper=mapper)
@@ -288,26 +289,6 @@ class TestEarlierRun:
         with pytest.raises(ReconstructionError, match="no model from 2 photos"):
             reconstruct(room.folder, [room.names[0], room.names[-1]], output, camera=room.camera, mapper=MAPPER)
         assert not (output / "sparse").exists()
-
-
-def content_of(database_path: Path) -> dict[Any, list[bytes]]:
-    """All that is found in photos and pairs of photos, by their ids."""
-    with pycolmap.Database.open(database_path) as database:
-        found: dict[Any, list[bytes]] = {}
-        for image in database.read_all_images():
-            descriptors = database.read_descriptors(image.image_id)
-            found[image.name, image.image_id] = [
-                database.read_keypoints(image.image_id).tobytes(),
-                descriptors.data.tobytes(),
-            ]
-        for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True):
-            pair = pycolmap.pair_id_to_image_pair(pair_id)
-            found[pair] = [
-                database.read_matches(*pair).tobytes(),
-                geometry.inlier_matches.tobytes(),
-                str((geometry.config, geometry.E, geometry.F, geometry.H, geometry.cam2_from_cam1)).encode(),
-            ]
-    return found
 
 
 class TestOtherPhotos:

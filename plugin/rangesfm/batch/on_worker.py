@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import os
 import pickle
 import signal
@@ -17,7 +16,6 @@ from distributed.system import MEMORY_LIMIT
 from rangesfm.batch.shares import Share
 from rangesfm.processes.supervision import Ended, child_command, supervise
 from rangesfm.survey.settings import Survey
-from rangesfm.vision.submaps import Submap
 
 # By the system for want of memory, or by somebody from outside: then it is worth another try.
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
@@ -30,16 +28,13 @@ _stopped: set[str] = set()
 
 @dataclass(frozen=True)
 class SurveyTask:
-    """What a worker is given: a survey, or a part of one that is mapped in submaps.
+    """What a worker is given.
 
     Attributes:
         batch: the batch's own name, under which the worker tells how far it is.
         index: of the survey in the batch.
         share: what it may use.
         restart: do anew what earlier runs have done.
-        only_prepare: find the submaps that are to be mapped, and no more.
-        submap: only map this one.
-        begins: whether the survey begins with it.
     """
 
     batch: str
@@ -47,9 +42,6 @@ class SurveyTask:
     survey: Survey
     share: Share
     restart: bool
-    only_prepare: bool = False
-    submap: Submap | None = None
-    begins: bool = True
 
 
 class KilledError(Exception):
@@ -62,11 +54,10 @@ def stop_batch(batch: str) -> None:
 
 
 def run_on_worker(task: SurveyTask) -> dict[str, Any]:
-    """Run a survey, or a part of one, in a process of its own.
+    """Run a survey in a process of its own.
 
     Returns:
-        ``{"done": {"figures": ..., "reason": ...}}`` or ``{"failed": {"message": ..., "exit_status": ...}}``; of one
-        only prepared ``{"done": {"submaps": (Submap, ...)}}``, of a submap ``{"done": None}``.
+        ``{"done": {"figures": ..., "reason": ...}}`` or ``{"failed": {"message": ..., "exit_status": ...}}``.
 
     Raises:
         KilledError: the process was killed from outside, so that another attempt may well go through.
@@ -74,39 +65,25 @@ def run_on_worker(task: SurveyTask) -> dict[str, Any]:
     worker, host = get_worker(), socket.gethostname()
 
     def tell(message: dict[str, Any]) -> None:
-        if task.submap is None:  # of many at once the batch itself counts those that are done
-            worker.log_event(task.batch, {"index": task.index, **message})
+        worker.log_event(task.batch, {"index": task.index, **message})
 
     if task.batch in _stopped:
         return _failed("interrupted", _INTERRUPTED)
-    if task.begins:
-        tell({"began_on": host})
+    tell({"began_on": host})
     # The limit of all of a worker's tasks, if it has one, as clusters' workers do.
     memory_bytes = getattr(worker.memory_manager, "memory_limit", None) or MEMORY_LIMIT
     num_threads, memory_limit_bytes = task.share.on(host, worker.state.nthreads, CPU_COUNT, memory_bytes)
-    module, given = _work(task, num_threads)
+    own = task.survey.mapper.num_threads  # no more, though the file may ask for fewer
+    survey = task.survey.changed({"mapper.num_threads": num_threads if own < 1 else min(own, num_threads)})
     ended = supervise(
-        child_command(module),
-        given,
+        child_command("rangesfm.batch.survey_process"),
+        pickle.dumps((survey, task.restart)),
         tell,
         environment={**os.environ, "OMP_NUM_THREADS": str(num_threads), "OPENBLAS_NUM_THREADS": "1"},
         memory_limit_bytes=memory_limit_bytes,
         is_stopped=lambda: task.batch in _stopped,
     )
-    ending = _ending(ended, memory_limit_bytes)
-    if task.only_prepare and "done" in ending:
-        return {"done": {"submaps": pickle.loads(base64.b64decode(ending["done"]["submaps"]))}}
-    return ending
-
-
-def _work(task: SurveyTask, num_threads: int) -> tuple[str, bytes]:
-    """The module that does it, and what that is given; with no more threads, though the file may ask for fewer."""
-    own = task.survey.mapper.num_threads
-    num = num_threads if own < 1 else min(own, num_threads)
-    if task.submap is not None:
-        return "rangesfm.vision.submap_process", pickle.dumps(task.submap.with_threads(num))
-    survey = task.survey.changed({"mapper.num_threads": num})
-    return "rangesfm.batch.survey_process", pickle.dumps((survey, task.restart, task.only_prepare))
+    return _ending(ended, memory_limit_bytes)
 
 
 def _ending(ended: Ended, memory_limit_bytes: int) -> dict[str, Any]:

@@ -7,9 +7,8 @@ process holds on it. The database is broken within seconds.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import combinations
 from pathlib import Path
 
 import pycolmap
@@ -42,12 +41,8 @@ def remove_database(path: Path) -> None:
         path.with_name(path.name + suffix).unlink(missing_ok=True)
 
 
-def copy_stretch(source_path: Path, path: Path, image_ids: Sequence[int]) -> None:
-    """A new database for mapping some of another one's photos, which keep their ids.
-
-    It has their features, without descriptors, and those of their matches that fit one geometry of two views.
-    """
-    remove_database(path)
+def copy_features(source_path: Path, path: Path, image_ids: Sequence[int]) -> None:
+    """A new database for matching some of another one's photos, which keep their ids and are called by them."""
     with (
         pycolmap.Database.open(source_path) as source,
         pycolmap.Database.open(path) as target,
@@ -59,12 +54,28 @@ def copy_stretch(source_path: Path, path: Path, image_ids: Sequence[int]) -> Non
             target.write_rig(rig, use_rig_id=True)
         for image_id in image_ids:
             image = source.read_image(image_id)
+            image.name = str(image_id)
             target.write_frame(source.read_frame(image.frame_id), use_frame_id=True)
             target.write_image(image, use_image_id=True)
             target.write_keypoints(image_id, source.read_keypoints(image_id))
-        for first, second in combinations(sorted(image_ids), 2):
-            if source.exists_two_view_geometry(first, second):
-                target.write_two_view_geometry(first, second, source.read_two_view_geometry(first, second))
+            target.write_descriptors(image_id, source.read_descriptors(image_id))
+
+
+def copy_matches(source_path: Path, path: Path, pairs: Iterable[tuple[tuple[int, int], tuple[int, int]]]) -> None:
+    """Matches of pairs of photos into another database, as far as there are any.
+
+    Args:
+        pairs: ids in the source, smaller first, and those of the same photos in the target, likewise.
+    """
+    with (
+        pycolmap.Database.open(source_path) as source,
+        pycolmap.Database.open(path) as target,
+        pycolmap.DatabaseTransaction(target),
+    ):
+        for old, new in pairs:
+            if is_compared(source, *old):
+                target.write_matches(*new, source.read_matches(*old))
+                target.write_two_view_geometry(*new, source.read_two_view_geometry(*old))
 
 
 def restore_names(path: Path, image_names: Sequence[str]) -> None:
@@ -101,6 +112,11 @@ def _rename(path: Path, image_names: Sequence[str]) -> None:
 def num_photos_with_features(database: pycolmap.Database) -> int:
     """How many photos COLMAP has been through, whether or not it found anything in them."""
     return sum(database.exists_keypoints(image_id) for image_id in range(1, database.num_images() + 1))
+
+
+def is_compared(database: pycolmap.Database, first: int, second: int) -> bool:
+    """Whether COLMAP has been through a pair of photos, whether or not they match."""
+    return bool(database.exists_two_view_geometry(first, second))
 
 
 def num_compared_pairs(database: pycolmap.Database) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -31,7 +30,7 @@ class Workspace:
 
     Attributes:
         output: the folder, which ``begin`` makes.
-        database, models, snapshots, submaps, log: in it.
+        database, models, snapshots, log: in it.
         steps: the record of what is done.
         progress: who listens.
     """
@@ -42,7 +41,6 @@ class Workspace:
         self.database = output / "database.db"
         self.models = output / "sparse"
         self.snapshots = output / "mapping_snapshot"
-        self.submaps = output / "submaps"
         self.log = output / "mapper.log"
         self.steps = Steps(output / "reconstruct.json", progress)
         self._before_change = before_change
@@ -53,7 +51,6 @@ class Workspace:
         if restart:
             self.steps.forget("features")
             forget_database(self.steps)
-            shutil.rmtree(self.submaps, ignore_errors=True)
 
     def remove_old_models(self) -> None:
         self._before_change()
@@ -76,17 +73,11 @@ class MatchedPhotos:
 
     Attributes:
         photos: in the order of their ids 1, 2, ...
-        contents: SHA-256 of each, by name.
         inputs: fingerprint of the matches.
-        match_inputs: of what they depend on beside the photos.
-        only_by_place: whether a pair is matched for the places of its photos in the order, not for their looks.
     """
 
     photos: Photos
-    contents: dict[str, str]
     inputs: str
-    match_inputs: str
-    only_by_place: bool
 
 
 def match_photos(
@@ -140,9 +131,9 @@ def match_photos(
             inputs,
             database,
             prepare_matching,
-            lambda: match_features(database, photos, for_matching, progress),
+            lambda: match_features(database, photos, for_matching, space.log, progress),
         )
-    return MatchedPhotos(photos, contents, inputs, of_matches, for_matching.is_by_place)
+    return MatchedPhotos(photos, inputs)
 
 
 def _plain(camera: pycolmap.Camera) -> list[Any]:

@@ -11,7 +11,7 @@ import pycolmap
 
 from rangesfm.files.atomic import new_file
 from rangesfm.progress import Progress
-from rangesfm.vision.database import clear_matches, create_database, remove_database, restore_names
+from rangesfm.vision.database import clear_matches, copy_matches, create_database, remove_database, restore_names
 from rangesfm.vision.matching import MatchingOptions, pairs_to_match
 from rangesfm.vision.photos import Photos
 from rangesfm.vision.steps import Steps
@@ -72,7 +72,7 @@ class RenewedDatabase:
         ids = self._earlier_ids(earlier)
         if not ids or not self.path.exists():
             return 0
-        same_matches = earlier.get("matches") == self.match_inputs
+        same_matches = self.matching.is_by_place and earlier.get("matches") == self.match_inputs
         pairs = pairs_to_match(fresh, self.photos, self.matching) if same_matches else []
         return _copy(self.path, fresh, ids, pairs)
 
@@ -112,11 +112,8 @@ def _copy(earlier: Path, new: Path, earlier_ids: Mapping[int, int], pairs: Itera
             target.write_keypoints(new_id, source.read_keypoints(old_id))
             target.write_descriptors(new_id, source.read_descriptors(old_id))
         _copy_pose_priors(source, target, taken)
-        for first, second in pairs:
-            old_first, old_second = taken.get(first, 0), taken.get(second, 0)
-            if 0 < old_first < old_second and source.exists_two_view_geometry(old_first, old_second):
-                target.write_matches(first, second, source.read_matches(old_first, old_second))
-                target.write_two_view_geometry(first, second, source.read_two_view_geometry(old_first, old_second))
+    of_pairs = (((taken.get(first, 0), taken.get(second, 0)), (first, second)) for first, second in pairs)
+    copy_matches(earlier, new, ((old, pair) for old, pair in of_pairs if 0 < old[0] < old[1]))
     return len(taken)
 
 

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import nullcontext, suppress
-from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 import pycolmap
 
@@ -18,8 +15,6 @@ from rangesfm.vision.keyframes import select_keyframes
 from rangesfm.vision.mapping_loop import GlobalAdjustment
 from rangesfm.vision.reconstruct import reconstruct
 from rangesfm.workflows.journal import Journal
-
-_Done = TypeVar("_Done")
 
 
 def find_keyframes(
@@ -50,20 +45,8 @@ def map_keyframes(
     adjustment: GlobalAdjustment | None = None,
 ) -> tuple[pycolmap.Reconstruction, ...]:
     """Map the keyframes into ``sparse``; returns ``sparse/0``, ``sparse/1``, ..."""
-    summary = with_photos(partial(reconstruct, adjustment=adjustment), survey, keyframes, journal, restart)
-    journal.seconds.update(summary.seconds)
-    if summary.num_registered < summary.num_keyframes:
-        which = "the model" if len(summary.models) == 1 else f"the largest of {len(summary.models)} models"
-        journal.warn(f"{summary.num_registered} of {summary.num_keyframes} keyframes are in {which}")
-    return summary.models
-
-
-def with_photos(
-    do: Callable[..., _Done], survey: Survey, keyframes: tuple[str, ...], journal: Journal, restart: bool
-) -> _Done:
-    """Call ``reconstruct``, or a part of it, for the keyframes of a survey."""
     with survey.source.naming_lines():
-        return do(
+        summary = reconstruct(
             _images_path(survey),
             keyframes,
             survey.output.path,
@@ -73,7 +56,13 @@ def with_photos(
             progress=journal.progress,
             restart=restart,
             before_change=lambda: forget_result(survey.output.path),
+            adjustment=adjustment,
         )
+    journal.seconds.update(summary.seconds)
+    if summary.num_registered < summary.num_keyframes:
+        which = "the model" if len(summary.models) == 1 else f"the largest of {len(summary.models)} models"
+        journal.warn(f"{summary.num_registered} of {summary.num_keyframes} keyframes are in {which}")
+    return summary.models
 
 
 def _images_path(survey: Survey) -> Path:

@@ -19,12 +19,10 @@ from rangesfm.ranging.clock.estimate import TimeOffset
 from rangesfm.survey.inputs import RangingInputs, times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes
-from rangesfm.vision.reconstruct import prepare_submaps
-from rangesfm.vision.submaps import Submap
 from rangesfm.workflows.checked_inputs import check_times, checked_inputs, read_inputs, read_registered
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.metric_map import join_by_survey, refine_map, scale_by_survey
-from rangesfm.workflows.photos import find_keyframes, map_keyframes, noted, with_photos
+from rangesfm.workflows.photos import find_keyframes, map_keyframes, noted
 from rangesfm.workflows.placed_ranges import find_time_offset, path_with_times, ranges_on_paths
 from rangesfm.workflows.ranges_in_mapping import AdjustmentWithRanges
 from rangesfm.workflows.results import RunResult, write_results
@@ -42,19 +40,6 @@ def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> 
         if note := adjustment.note():
             journal.warn(note)
         return to_metric(survey, inputs, models, times, journal, refine=survey.refine.enabled)
-
-
-def prepare_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> tuple[Submap, ...]:
-    """What ``run_survey`` does before it maps the photos.
-
-    Returns:
-        The submaps that are to be mapped yet; whoever has them mapped (``Submap.map``), wherever, in any order and at
-        once, saves ``run_survey`` doing it. None where the photos are mapped in one piece.
-    """
-    journal = Journal(progress)
-    _, keyframes, _ = checked_inputs(survey, journal)
-    with sole_writer(survey.output.path):
-        return with_photos(prepare_submaps, survey, keyframes, journal, restart)
 
 
 def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> list[str]:
