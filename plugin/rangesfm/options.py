@@ -16,6 +16,7 @@ from rangesfm.errors import OptionError
 from rangesfm.option_model import Options, Told, looks_like
 
 DEFAULT_FORMATS = ("tum", "ply")
+_CALIBRATION_STDDEV = 0.005  # of a focal length, relative: what focus, warmth and another board make of it
 _LIKE_OURS = 0.85  # a [mapper] key this similar to one of ours is a slip; others are pycolmap's
 
 # Bounds keep out what only a slip can mean, and what would be infinite once it is squared or divided by.
@@ -86,13 +87,26 @@ class CameraOptions(Options):
     """COLMAP camera model, as OPENCV (default: COLMAP guesses)."""
     params: Annotated[_Numbers | None, Told(flag="camera_params")] = None
     """Its parameters in COLMAP's order."""
+    focal_length_stddev_px: _Uncertainty | None = None
+    """Of the focal lengths in params, a calibration, which mapping and refinement refine where the photos know better;
+    the other parameters' follow from it (default: 0.5 % of the focal length). 0 keeps them all to the digit."""
     refine_intrinsics: bool | None = None
-    """Whether mapping and refinement adjust them (default: mapping does if they are not given; the refinement keeps
-    what it finds, so that it does the same to a model just mapped and to one brought along)."""
+    """Whether mapping and refinement adjust them at all (default: mapping does; the refinement does to given ones, by
+    their stddev, and else keeps what it finds, so that it does the same to a model just mapped and one brought)."""
 
     @property
     def mapping_refines_intrinsics(self) -> bool:
-        return self.params is None if self.refine_intrinsics is None else self.refine_intrinsics
+        return self.focal_length_stddev_px != 0 if self.refine_intrinsics is None else self.refine_intrinsics
+
+    @property
+    def refinement_refines_intrinsics(self) -> bool:
+        if self.refine_intrinsics is None:
+            return self.params is not None and self.focal_length_stddev_px != 0
+        return self.refine_intrinsics
+
+    def calibration_stddev_px(self, focal_length_px: float) -> float:
+        """Of a given focal length."""
+        return self.focal_length_stddev_px or _CALIBRATION_STDDEV * focal_length_px
 
 
 class LogOptions(Options):

@@ -63,8 +63,15 @@ class TestOneModel:
         assert "Registering image" in log
         assert set(done.seconds) == {"features", "matching", "mapping"}
 
-    def test_keeps_known_intrinsics_to_the_last_digit(self, room: Room, done: ReconstructionSummary) -> None:
-        assert [tuple(camera.params) for camera in done.models[0].cameras.values()] == [room.camera.params]
+    @pytest.mark.parametrize("stddev_px", [0.0, None])
+    def test_keeps_known_intrinsics_to_the_last_digit_only_on_demand(
+        self, room: Room, output: Path, stddev_px: float | None
+    ) -> None:
+        camera = room.camera.changed(focal_length_stddev_px=stddev_px)
+        (model,) = reconstruct(room.folder, room.names, output, camera=camera, mapper=MAPPER).models
+        found = [tuple(camera.params) for camera in model.cameras.values()]
+        assert (found == [room.camera.params]) == (stddev_px == 0)
+        assert found[0] == pytest.approx(room.camera.params, rel=0.02)
 
     def test_has_a_database_with_options_as_given(self, output: Path) -> None:
         with pycolmap.Database.open(output / "database.db") as database:

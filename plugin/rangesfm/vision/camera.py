@@ -19,6 +19,8 @@ def check_camera(options: CameraOptions) -> None:
     Raises:
         InputError: an unknown model, parameters without a model, too few or too many or impossible ones.
     """
+    if options.params is None and options.focal_length_stddev_px is not None:
+        raise InputError("[camera] has focal_length_stddev_px but no params, expected those that it is of")
     if options.model is None:
         if options.params is not None:
             raise InputError("[camera] has params but no model, expected COLMAP's camera model that they belong to")
