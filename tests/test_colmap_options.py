@@ -22,11 +22,12 @@ from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.options import CameraOptions, MapperOptions, RefineOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.refine.bundle_adjustment import bundle_adjustment
-from rangesfm.vision.camera import camera_of_photos
+from rangesfm.vision.camera import cameras_of_photos
 from rangesfm.vision.features import feature_options
 from rangesfm.vision.mapping import pipeline_options
 from rangesfm.vision.matching import matching_options
 from rangesfm.vision.matching_share import MatchingShare
+from rangesfm.vision.photos import Photos
 
 SEED = 3
 KNOWN_CAMERA = CameraOptions(model="SIMPLE_PINHOLE", params=(240.0, 128.0, 96.0))
@@ -95,7 +96,8 @@ def test_models_are_mapped_as_colmap_maps_them(
 def test_a_camera_is_guessed_as_colmap_guesses_it(monkeypatch: pytest.MonkeyPatch) -> None:
     handed: list[Any] = []
     monkeypatch.setattr(pycolmap, "infer_camera_from_image", lambda _, reader: handed.append(reader))
-    camera_of_photos(CameraOptions(model="OPENCV"), Path("photo.jpg"), 640, 480)
+    photos = Photos(Path(), ("photo.jpg",), ((640, 480),), {})
+    cameras_of_photos(CameraOptions(model="OPENCV"), photos)
     assert changes(handed[0]) == {"camera_model": "OPENCV"}
 
 

@@ -79,14 +79,17 @@ class ImageOptions(KeyframeOptions):
 
 
 class CameraOptions(Options):
-    """One camera for all photos."""
+    """The cameras of the photos."""
 
     table: ClassVar[str] = "camera"
 
+    mode: Annotated[Literal["auto", "single", "per_folder", "per_image"], Told(flag="camera_mode")] = "auto"
+    """Which photos of one size share a camera: those of the same make, model, serial number and focal length by EXIF
+    (auto; without EXIF all), all of them, those of one folder, or none."""
     model: Annotated[str | None, Told(flag="camera_model")] = None
     """COLMAP camera model, as OPENCV (default: COLMAP guesses)."""
     params: Annotated[_Numbers | None, Told(flag="camera_params")] = None
-    """Its parameters in COLMAP's order."""
+    """Its parameters in COLMAP's order, for photos of the most common size; rescaled for others of the same shape."""
     focal_length_stddev_px: _Uncertainty | None = None
     """Of the focal lengths in params, a calibration, which mapping and refinement refine where the photos know better;
     the other parameters' follow from it (default: 0.5 % of the focal length). 0 keeps them all to the digit."""

@@ -107,7 +107,7 @@ def map_database(folder: Path, method: str, leaf_size: int) -> None:
     }
     mapper = MapperOptions(pipeline=pipelines[method], num_threads=1).changed(method=method)
     options = pipeline_options(camera, mapper, seed=0)
-    photos = Photos(folder, names, known.width, known.height, {})
+    photos = Photos(folder, names, ((known.width, known.height),) * len(names), {})
     map_photos(
         database, photos, folder / method, folder / "snapshots", options, folder / "mapper.log", SilentProgress()
     )

@@ -16,7 +16,7 @@ from rangesfm.errors import ReconstructionError
 from rangesfm.options import MapperOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.vision import matching
-from rangesfm.vision.camera import camera_of_photos
+from rangesfm.vision.camera import cameras_of_photos
 from rangesfm.vision.database import create_database
 from rangesfm.vision.features import extract_features, feature_options
 from rangesfm.vision.matching import match_features, matching_options
@@ -34,8 +34,8 @@ def photos(render_room: Callable[..., Room], tmp_path_factory: pytest.TempPathFa
     """Photos, and beside them a database with their features."""
     room = render_room(tmp_path_factory.mktemp("walk"), NUM_PHOTOS)
     photos = usable_photos(room.folder, room.names)
-    camera = camera_of_photos(room.camera, room.folder / room.names[0], photos.width, photos.height)
-    create_database(room.folder / "database.db", room.names, camera)
+    cameras = cameras_of_photos(room.camera, photos)
+    create_database(room.folder / "database.db", room.names, cameras.cameras, cameras.of_photo)
     options = feature_options(MapperOptions(features={"sift": {"max_num_features": 250}}))
     extract_features(room.folder / "database.db", photos, options, SilentProgress())
     return photos

@@ -7,6 +7,7 @@ import pycolmap
 
 from rangesfm import ceres
 from rangesfm.arrays import Array
+from rangesfm.colmap.calibration import calibrated_cameras
 from rangesfm.options import CameraOptions
 from rangesfm.refine.bundle_adjustment import BundleAdjustment
 
@@ -15,15 +16,16 @@ _STEP = 1e-6
 
 def add_calibration(bundle: BundleAdjustment, options: CameraOptions) -> None:
     """Draw each camera of the given model to the given parameters, where the adjustment refines it at all."""
-    if options.params is None:
+    if options.model is None or options.params is None:
         return
-    for camera in bundle.metric.cameras.values():
-        problem = bundle.adjuster.problem
-        if camera.model_name != options.model or not problem.has_parameter_block(camera.params):
+    metric, problem = bundle.metric, bundle.adjuster.problem
+    by_photo = [metric.camera(metric.image(image_id).camera_id) for image_id in metric.reg_image_ids()]
+    known = calibrated_cameras(options.model, options.params, [(camera.width, camera.height) for camera in by_photo])
+    for camera in metric.cameras.values():
+        given = known.get((camera.width, camera.height))
+        if given is None or camera.model != given.model or not problem.has_parameter_block(camera.params):
             continue
         if not problem.is_parameter_block_constant(camera.params):
-            given = pycolmap.Camera(camera.todict())
-            given.params = list(options.params)
             stddev = parameter_stddevs(given, options.calibration_stddev_px(given.mean_focal_length()))
             ceres.add_normal_prior(bundle.adjuster, camera.params, given.params, stddev / bundle.pixel_stddev)
 

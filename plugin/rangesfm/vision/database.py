@@ -14,23 +14,30 @@ from pathlib import Path
 import pycolmap
 
 
-def create_database(path: Path, image_names: Sequence[str], camera: pycolmap.Camera) -> None:
-    """A new database with these photos of one camera, in the place of an old one.
+def create_database(
+    path: Path, image_names: Sequence[str], cameras: Sequence[pycolmap.Camera], of_photo: Sequence[int]
+) -> None:
+    """A new database with these photos, in the place of an old one; each camera is a rig of its own.
 
     COLMAP would enter photos as its threads come to them; entered here they have the same ids
     1, 2, ... in every run, and the same seed gives the same model.
+
+    Args:
+        of_photo: place of each photo's camera in ``cameras``.
     """
     remove_database(path)
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
-        camera.camera_id = database.write_camera(camera)
-        rig = pycolmap.Rig()
-        rig.add_ref_sensor(camera.sensor_id)
-        rig.rig_id = database.write_rig(rig)
-        for name in image_names:
-            image = pycolmap.Image(name=name, camera_id=camera.camera_id)
+        rigs = []
+        for camera in cameras:
+            camera.camera_id = database.write_camera(camera)
+            rigs.append(pycolmap.Rig())
+            rigs[-1].add_ref_sensor(camera.sensor_id)
+            rigs[-1].rig_id = database.write_rig(rigs[-1])
+        for name, place in zip(image_names, of_photo, strict=True):
+            image = pycolmap.Image(name=name, camera_id=cameras[place].camera_id)
             image.image_id = database.write_image(image)
             frame = pycolmap.Frame()
-            frame.rig_id = rig.rig_id
+            frame.rig_id = rigs[place].rig_id
             frame.add_data_id(image.data_id)
             database.write_frame(frame)
 

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pycolmap
 
@@ -15,7 +14,7 @@ from rangesfm.errors import ReconstructionError
 from rangesfm.files.atomic import make_output_folder
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import Progress
-from rangesfm.vision.camera import camera_of_photos, check_camera
+from rangesfm.vision.camera import PhotoCameras, cameras_of_photos, check_camera
 from rangesfm.vision.features import extract_features, feature_options
 from rangesfm.vision.mapping import remove_models
 from rangesfm.vision.matching import match_features, matching_options
@@ -90,15 +89,16 @@ def match_photos(
     *,
     restart: bool,
 ) -> MatchedPhotos:
-    """Features and matches of photos of one camera; arguments and errors as of ``reconstruct``."""
+    """Features and matches of photos; arguments and errors as of ``reconstruct``."""
     check_camera(camera)
     for_features = feature_options(mapper)
     for_matching = matching_options(mapper, len(image_names), seed)
     photos = usable_photos(image_path, image_names)
-    its_camera = camera_of_photos(camera, photos.folder / photos.names[0], photos.width, photos.height)
+    cameras = cameras_of_photos(camera, photos)
     space.begin(restart=restart)
     steps, progress, database = space.steps, space.progress, space.database
     _say_left_out(photos, progress)
+    _say_guessed(cameras, progress)
 
     def prepare_features() -> None:
         space.remove_old_models()
@@ -114,10 +114,10 @@ def match_photos(
         contents = {name: sha256 for name, (_, sha256) in steps.notes["photos"].items()}
         of_features = fingerprint(pycolmap.__version__, mapper.features)
         of_matches = fingerprint(
-            of_features, _plain(its_camera), for_matching.is_sequential, mapper.pairing, mapper.matcher, seed
+            of_features, cameras.inputs, for_matching.is_sequential, mapper.pairing, mapper.matcher, seed
         )
-        renewed = RenewedDatabase(database, photos, contents, its_camera, for_matching, of_features, of_matches, steps)
-        inputs = fingerprint(of_features, _plain(its_camera), list(contents.items()))
+        renewed = RenewedDatabase(database, photos, contents, cameras, for_matching, of_features, of_matches, steps)
+        inputs = fingerprint(of_features, cameras.inputs, list(contents.items()))
         steps.run(
             "features",
             inputs,
@@ -136,12 +136,16 @@ def match_photos(
     return MatchedPhotos(photos, inputs)
 
 
-def _plain(camera: pycolmap.Camera) -> list[Any]:
-    return [camera.model_name, camera.params.tolist(), camera.width, camera.height, camera.has_prior_focal_length]
-
-
 def _say_left_out(photos: Photos, progress: Progress) -> None:
     if photos.left_out:
         name, reason = next(iter(photos.left_out.items()))
         num = len(photos.left_out)
         progress.message(f"{num} of {num + len(photos.names)} photos are left out; the first, {name}, {reason}")
+
+
+def _say_guessed(cameras: PhotoCameras, progress: Progress) -> None:
+    if cameras.guessed:
+        progress.message(
+            f"the camera's parameters are of photos of another shape than {cameras.guessed[0]}: COLMAP guesses its"
+            f" camera ({len(cameras.guessed)} of {len(cameras.cameras)} cameras)"
+        )

@@ -48,7 +48,7 @@ def reconstruct(
     before_change: Callable[[], None] = lambda: None,
     adjustment: GlobalAdjustment | None = None,
 ) -> ReconstructionSummary:
-    """Reconstruct photos of one camera.
+    """Reconstruct photos.
 
     Writes ``database.db``, the models ``sparse/0`` (the largest), ``sparse/1``, ..., ``mapper.log``
     and ``reconstruct.json`` to ``output_path``. Steps that an earlier run into the same folder did
@@ -60,7 +60,7 @@ def reconstruct(
         image_path: folder of the photos.
         image_names: the keyframes, relative to it, in time order.
         output_path: made if it does not exist.
-        camera: of all photos; photos of another size are left out.
+        camera: which photos share one, and what is known of it.
         seed: the same one gives the same models.
         restart: take nothing over.
         before_change: called before models of an earlier run are removed or replaced.

@@ -11,6 +11,7 @@ import pycolmap
 
 from rangesfm.files.atomic import new_file
 from rangesfm.progress import Progress
+from rangesfm.vision.camera import PhotoCameras
 from rangesfm.vision.database import clear_matches, copy_matches, create_database, remove_database, restore_names
 from rangesfm.vision.matching import MatchingOptions, pairs_to_match
 from rangesfm.vision.photos import Photos
@@ -29,7 +30,7 @@ class RenewedDatabase:
         path: of the database.
         photos: in the order of their ids.
         contents: SHA-256 of each photo, by name.
-        camera: that took them.
+        cameras: that took them.
         matching: how they will be matched.
         feature_inputs: fingerprint of what features depend on beside the photo itself.
         match_inputs: likewise, of matches beside the two photos.
@@ -39,7 +40,7 @@ class RenewedDatabase:
     path: Path
     photos: Photos
     contents: Mapping[str, str]
-    camera: pycolmap.Camera
+    cameras: PhotoCameras
     matching: MatchingOptions
     feature_inputs: str
     match_inputs: str
@@ -50,11 +51,11 @@ class RenewedDatabase:
         earlier = self.steps.notes.get(_NOTE, {})
         forget_database(self.steps)
         with new_file(self.path) as fresh:
-            create_database(fresh, self.photos.names, self.camera)
+            self._create(fresh)
             try:
                 num_taken = self._take_over(earlier, fresh)
             except RuntimeError:  # somebody has damaged the earlier one
-                create_database(fresh, self.photos.names, self.camera)
+                self._create(fresh)
                 num_taken = 0
             if num_taken:
                 progress.message(f"features: those of {num_taken} photos are taken over from an earlier run")
@@ -67,6 +68,9 @@ class RenewedDatabase:
         if self.steps.notes.get(_NOTE, {}).get("matches") != self.match_inputs:
             clear_matches(self.path)
         self._write_note()
+
+    def _create(self, path: Path) -> None:
+        create_database(path, self.photos.names, self.cameras.cameras, self.cameras.of_photo)
 
     def _take_over(self, earlier: Mapping[str, Any], fresh: Path) -> int:
         ids = self._earlier_ids(earlier)
