@@ -51,9 +51,18 @@ def test_features_are_found_as_colmap_finds_them() -> None:
     assert changes(feature_options(MapperOptions())) == {}
 
 
-@pytest.mark.parametrize("num_photos", [60, 61], ids=["all", "neighbours"])
-def test_photos_are_matched_as_colmap_matches_them(num_photos: int) -> None:
-    options = matching_options(MapperOptions(), num_photos, SEED)
+@pytest.mark.parametrize(
+    ("mapper", "num_photos", "pairing"),
+    [
+        (MapperOptions(), 60, pycolmap.ExhaustivePairingOptions),
+        (MapperOptions(), 61, pycolmap.SequentialPairingOptions),
+        (MapperOptions(matching="spatial"), 9, pycolmap.SpatialPairingOptions),
+    ],
+    ids=["all", "neighbours", "near ones"],
+)
+def test_photos_are_matched_as_colmap_matches_them(mapper: MapperOptions, num_photos: int, pairing: type) -> None:
+    options = matching_options(mapper, num_photos, SEED)
+    assert isinstance(options.pairing, pairing)
     assert changes(options.pairing) == {}
     assert changes(options.matcher) == ({} if pycolmap.has_cuda else {"num_threads": 1})
     assert changes(options.verification) == {"ransac.random_seed": SEED}
@@ -149,6 +158,7 @@ def test_no_other_options_of_colmaps_are_made_and_none_inside_of_others() -> Non
         "ImportedPairingOptions",
         "IncrementalPipelineOptions",
         "SequentialPairingOptions",
+        "SpatialPairingOptions",
         "TwoViewGeometryOptions",
     }, "one that this file does not look at"
 

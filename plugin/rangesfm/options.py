@@ -253,8 +253,11 @@ class MapperOptions(Options):
 
     method: Annotated[Literal["incremental", "global", "hierarchical"], Told(flag="mapper_method")] = "incremental"
     """COLMAP's mapper: photo by photo; all at once; photo by photo in clusters, which are merged."""
-    matching: Literal["sequential", "exhaustive", "auto"] = "auto"
-    """Which photos are matched; auto: exhaustive up to 60 keyframes."""
+    matching: Literal["sequential", "exhaustive", "spatial", "auto"] = "auto"
+    """Which photos are matched: neighbours in time, all, neighbours by EXIF position; auto: all up to 60 keyframes,
+    else neighbours in time."""
+    pairs: Annotated[Path | None, Told(role="file")] = None
+    """Text file with the names of two photos a line, a tab between them: these pairs are matched, and no others."""
     features: dict[str, Any] = Field(default_factory=dict)
     """Passed through to pycolmap's FeatureExtractionOptions."""
     pairing: dict[str, Any] = Field(default_factory=dict)

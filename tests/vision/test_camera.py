@@ -80,11 +80,9 @@ def test_photos_of_other_sizes_and_turned_ones_take_their_place_on_the_path(
 ) -> None:
     for index, name in enumerate(room.names):
         with Image.open(room.folder / name) as photo:
-            if index == 2:
-                photo = photo.resize((200, 150), Image.Resampling.LANCZOS)
-            elif index == 4:
-                photo = photo.transpose(Image.Transpose.ROTATE_90)
-            photo.save(tmp_path / name)
+            size = (200, 150) if index == 2 else photo.size
+            resized = photo.resize(size, Image.Resampling.LANCZOS)
+            (resized.transpose(Image.Transpose.ROTATE_90) if index == 4 else resized).save(tmp_path / name)
     mapper = MapperOptions(features={"sift": {"max_num_features": 400}})
     summary = reconstruct(tmp_path, room.names, tmp_path / "out", camera=room.camera, mapper=mapper, progress=listener)
     assert summary.num_registered == len(room.names)

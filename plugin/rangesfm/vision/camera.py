@@ -8,14 +8,13 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import pycolmap
-from PIL import Image
 
 from rangesfm.colmap.calibration import calibrated_cameras
 from rangesfm.errors import InputError, nearest_known
 from rangesfm.options import CameraOptions
+from rangesfm.vision.exif import exif_tags
 from rangesfm.vision.photos import Photos
 
-_EXIF_IFD = 0x8769
 _TELLING_TAGS = (0x010F, 0x0110, 0xA431, 0x920A)  # make, model, serial number, focal length
 _MODELS = {name: model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
 
@@ -112,12 +111,7 @@ def _keys(mode: str, photos: Photos) -> list[Any]:
 
 def _maker(path: Path) -> tuple[str, ...]:
     """What EXIF tells one camera from another by, and one focal length from another; empty without EXIF."""
-    try:
-        with Image.open(path) as image:
-            exif = image.getexif()
-            tags = {**exif, **exif.get_ifd(_EXIF_IFD)}
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # what Pillow's readers raise
-        return ()
+    tags = exif_tags(path)
     return tuple(str(tags[tag]).strip("\0 ") for tag in _TELLING_TAGS if tag in tags)
 
 

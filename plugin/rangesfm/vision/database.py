@@ -42,6 +42,21 @@ def create_database(
             database.write_frame(frame)
 
 
+def write_positions(path: Path, positions: Iterable[tuple[float, float, float] | None]) -> None:
+    """Where each photo was taken, by the order of their ids: latitude, longitude (degrees, WGS 84) and altitude (m).
+
+    COLMAP would write down those of photos that it enters itself.
+    """
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        for image_id, position in enumerate(positions, 1):
+            if position is not None:
+                prior = pycolmap.PosePrior(
+                    position=position, coordinate_system=pycolmap.PosePriorCoordinateSystem.WGS84
+                )
+                prior.corr_data_id = database.read_image(image_id).data_id
+                database.write_pose_prior(prior)
+
+
 def remove_database(path: Path) -> None:
     """Remove the file and those that SQLite keeps beside it."""
     for suffix in ("", "-wal", "-shm"):

@@ -113,9 +113,7 @@ def match_photos(
         steps.note("photos", photos.contents(steps.notes.get("photos", {})))
         contents = {name: sha256 for name, (_, sha256) in steps.notes["photos"].items()}
         of_features = fingerprint(pycolmap.__version__, mapper.features)
-        of_matches = fingerprint(
-            of_features, cameras.inputs, for_matching.is_sequential, mapper.pairing, mapper.matcher, seed
-        )
+        of_matches = fingerprint(of_features, cameras.inputs, for_matching.pairing_inputs, mapper.matcher, seed)
         renewed = RenewedDatabase(database, photos, contents, cameras, for_matching, of_features, of_matches, steps)
         inputs = fingerprint(of_features, cameras.inputs, list(contents.items()))
         steps.run(

@@ -5,9 +5,10 @@ from __future__ import annotations
 import shutil
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, nullcontext
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pycolmap
 
@@ -18,11 +19,11 @@ from rangesfm.files.atomic import scratch_folder
 from rangesfm.options import MapperOptions
 from rangesfm.processes.children import run_children
 from rangesfm.progress import Progress
-from rangesfm.vision.database import is_compared, named_by_place, num_matching_pairs
+from rangesfm.vision.database import is_compared, num_matching_pairs
 from rangesfm.vision.matching_share import MatchingShare
+from rangesfm.vision.pairs import NamedPairs, Pairing, pairing_options, pairs_to_match
 from rangesfm.vision.photos import Photos
 
-_MAX_NUM_EXHAUSTIVE = 60  # 1770 pairs; beyond, the pairs outgrow the photos
 _PROCESS = "rangesfm.vision.matching_share"
 _MIN_NUM_PAIRS = 100  # for less, a second process does not pay
 _MAX_NUM_PAIRS = 2000  # of one share, whose database is one of at most some hundred photos
@@ -35,53 +36,46 @@ _NUM_CPU_THREADS = 1
 
 @dataclass(frozen=True)
 class MatchingOptions:
-    """COLMAP's options for the chosen way of matching; its type of pairing says which.
+    """COLMAP's options for the chosen way of matching.
 
     Attributes:
+        pairing: says which pairs.
         num_processes: that match at once.
     """
 
-    pairing: pycolmap.ExhaustivePairingOptions | pycolmap.SequentialPairingOptions
+    pairing: Pairing | NamedPairs
     matcher: pycolmap.FeatureMatchingOptions
     verification: pycolmap.TwoViewGeometryOptions
     num_processes: int
 
     @property
-    def is_sequential(self) -> bool:
-        return isinstance(self.pairing, pycolmap.SequentialPairingOptions)
+    def is_by_place(self) -> bool:
+        """Whether a pair is one before anything is known of the photos but their order and their names."""
+        if isinstance(self.pairing, pycolmap.SpatialPairingOptions):
+            return False
+        return not (isinstance(self.pairing, pycolmap.SequentialPairingOptions) and self.pairing.loop_detection)
 
     @property
-    def is_by_place(self) -> bool:
-        """Whether it is the places of photos in the order that make a pair, and not what they look like."""
-        return not (isinstance(self.pairing, pycolmap.SequentialPairingOptions) and self.pairing.loop_detection)
+    def pairing_inputs(self) -> list[Any]:
+        """Plain values that tell these pairs from others of the same photos."""
+        if isinstance(self.pairing, tuple):
+            return list(self.pairing)
+        return [type(self.pairing).__name__, str(self.pairing.todict())]
 
 
 def matching_options(mapper: MapperOptions, num_photos: int, seed: int) -> MatchingOptions:
     """Raises InputError for keys or values that are not COLMAP's."""
-    is_sequential = mapper.matching == "sequential" or (mapper.matching == "auto" and num_photos > _MAX_NUM_EXHAUSTIVE)
     num_threads = mapper.num_threads if pycolmap.has_cuda else _NUM_CPU_THREADS
     options = MatchingOptions(
-        pairing=pycolmap.SequentialPairingOptions() if is_sequential else pycolmap.ExhaustivePairingOptions(),
+        pairing=pairing_options(mapper, num_photos),
         matcher=pycolmap.FeatureMatchingOptions(num_threads=num_threads),
         verification=pycolmap.TwoViewGeometryOptions(),
         num_processes=1 if pycolmap.has_cuda else mapper.num_cores,
     )
     # Within COLMAP's own: what it asks of two views is not what its RANSAC asks by itself.
     options.verification.ransac.random_seed = seed
-    apply_options(options.pairing, mapper.pairing, "mapper.pairing")
     apply_options(options.matcher, mapper.matcher, "mapper.matcher")
     return options
-
-
-def pairs_to_match(database_path: Path, photos: Photos, options: MatchingOptions) -> list[tuple[int, int]]:
-    """Ids of all pairs to be compared, smaller first; where the photos' looks decide, their features are needed."""
-    naming = named_by_place(database_path, photos.names) if options.is_sequential else nullcontext()
-    with naming, pycolmap.Database.open(database_path) as database:
-        if isinstance(options.pairing, pycolmap.SequentialPairingOptions):
-            pairs = pycolmap.SequentialPairGenerator(options.pairing, database).all_pairs()
-        else:
-            pairs = pycolmap.ExhaustivePairGenerator(options.pairing, database).all_pairs()
-    return sorted({(min(pair), max(pair)) for pair in pairs})
 
 
 def match_features(
@@ -95,7 +89,7 @@ def match_features(
     Raises:
         ReconstructionError: no two photos match.
     """
-    pairs = pairs_to_match(database_path, photos, options)
+    pairs = pairs_to_match(database_path, photos, options.pairing)
     with pycolmap.Database.open(database_path) as database:
         missing = [pair for pair in pairs if not is_compared(database, *pair)]
     num_there, num_all = len(pairs) - len(missing), len(pairs)
