@@ -116,7 +116,7 @@ def test_shares_of_pairs_are_matched_as_colmap_matches_pairs(monkeypatch: pytest
     share = MatchingShare(tmp_path, [(1, 2)], "matcher", "verification")  # type: ignore[arg-type]
     share.match(SilentProgress())
     assert (handed[0], handed[2]) == ("matcher", "verification")
-    assert changes(handed[1]) == {"match_list_path": tmp_path / "pairs.txt", "block_size": 36}
+    assert changes(handed[1]) == {"match_list_path": tmp_path / "pairs.txt", "block_size": 64}
 
 
 def test_a_model_is_adjusted_as_colmap_adjusts_it() -> None:

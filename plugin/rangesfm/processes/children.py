@@ -24,7 +24,7 @@ def run_children(
     Leaving the iteration (``contextlib.closing``) interrupts the processes, and waits for their end.
 
     Args:
-        module: what they run, by ``processes.child``; it ends with the number of items that it has done.
+        module: what they run, by ``work_for_parent``; it ends with the number of items that it has done.
         given: what each process is given. Not taken from before there is need of it: no more than one waits.
         update: called several times a second with the number of items that all of them have done.
 

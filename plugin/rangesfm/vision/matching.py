@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,8 @@ from rangesfm.vision.photos import Photos
 _PROCESS = "rangesfm.vision.matching_share"
 _MIN_NUM_PAIRS = 100  # for less, a second process does not pay
 _MAX_NUM_PAIRS = 2000  # of one share, whose database is one of at most some hundred photos
-_TILE_SIZE = 64
+# A tile's pairs are of few photos for one share, a small one's for COLMAP's memory.
+_TILE_SIZE, _SMALL_TILE_SIZE = 64, 8
 # pycolmap's wheels carry an OpenBLAS without locks. Of two threads that match at once, one now and then
 # computes in the other's memory: some pair keeps 50 of its 1100 matches, in every run another one.
 # Processes have memories of their own. [mapper.matcher] num_threads overrides this. On a GPU no BLAS is used.
@@ -125,8 +126,8 @@ def _match_shares(
 
     def take_first() -> None:
         share = begun.popleft()
-        share.hand_over(database_path)
         append_log(share.log, log)
+        share.hand_over(database_path)
         shutil.rmtree(share.folder)
 
     try:
@@ -135,12 +136,13 @@ def _match_shares(
                 take_first()
     finally:  # interrupted: what there is saves the next run doing it
         while begun:
-            take_first()
+            with suppress(RuntimeError):  # a database that was only being made
+                take_first()
 
 
 def _shared_out(pairs: Sequence[tuple[int, int]], num_processes: int) -> Iterator[list[tuple[int, int]]]:
     """Shares for processes that work at the same time: of the same size, and of few photos."""
-    tiles = sorted(pairs, key=lambda pair: (pair[0] // _TILE_SIZE, pair[1] // _TILE_SIZE, pair))
+    tiles = sorted(pairs, key=lambda pair: [id_ // size for size in (_TILE_SIZE, _SMALL_TILE_SIZE, 1) for id_ in pair])
     num_at_once = max(1, min(num_processes, len(pairs) // _MIN_NUM_PAIRS))
     for start in range(0, len(tiles), num_at_once * _MAX_NUM_PAIRS):
         together = tiles[start : start + num_at_once * _MAX_NUM_PAIRS]

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,13 +13,13 @@ from pathlib import Path
 import pycolmap
 
 from rangesfm.colmap.log import colmap_log
-from rangesfm.processes.child import MessagesToParent, work_for_parent
+from rangesfm.processes.supervision import MessagesToParent, work_for_parent
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import copy_features, copy_matches, num_compared_pairs
 
-# COLMAP hears of a Ctrl-C between two blocks of so many pairs.
-_BLOCK_SIZE = 36
+# Pairs after which COLMAP writes down what it has found; it keeps as many photos in memory.
+BLOCK_SIZE = 64
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class MatchingShare:
     def match(self, progress: Progress) -> int:
         """Returns how many pairs have been compared."""
         pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path, pairing.block_size = self.folder / "pairs.txt", _BLOCK_SIZE
+        pairing.match_list_path, pairing.block_size = self.folder / "pairs.txt", BLOCK_SIZE
         with colmap_log(self.log), pycolmap.Database.open(self.database) as database:
             run_in_background(
                 lambda token: pycolmap.match_image_pairs(
@@ -71,6 +72,7 @@ class MatchingShare:
 
 
 def _run(share: MatchingShare, parent: MessagesToParent) -> int:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # at once: what is written down is whole
     return share.match(parent)
 
 
