@@ -19,7 +19,7 @@ _POLL_INTERVAL_S = 0.2
 def run_children(
     module: str, given: Iterable[object], num_at_once: int, update: Callable[[int], None]
 ) -> Generator[None, None, None]:
-    """Have pieces of work done, each by a process with one thread; yields once for each that is done, in their order.
+    """Have pieces of work done, each by a process; yields once for each that is done, in their order.
 
     Leaving the iteration (``contextlib.closing``) interrupts the processes, and waits for their end.
 
