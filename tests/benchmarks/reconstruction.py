@@ -86,7 +86,8 @@ def match_anew(photos: Path, names: Sequence[str], database: Path, num_processes
     clear_matches(database)
     options = matching_options(MapperOptions(matching="sequential", num_threads=num_processes), len(names), seed)
     usable, log = usable_photos(photos, names), database.with_name("mapper.log")
-    return seconds_of(lambda: match_features(database, usable, options, log, SilentProgress()))
+    with colmap_log(log):
+        return seconds_of(lambda: match_features(database, usable, options, log, SilentProgress()))
 
 
 def row(what: str, ours: Sequence[float], theirs: Sequence[float]) -> str:
