@@ -17,6 +17,7 @@ from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.refine.bundle_adjustment import BundleAdjustment, bundle_adjustment
+from rangesfm.refine.calibration import add_calibration
 from rangesfm.refine.distances import MeasuredDistances, add_distances
 from rangesfm.refine.radio import RadioBlocks, RadioEstimate, RadioRanges, add_radio_priors, add_ranges
 from rangesfm.refine.residual_errors import residual_errors
@@ -83,6 +84,7 @@ class RefinementProblem:
         residual_rows = add_ranges(bundle, self.ranges, errors, blocks, self.options)
         blocks.others.extend(add_distances(bundle, self.distances, radio.anchors, blocks.positions, errors))
         add_radio_priors(bundle, radio, self.tags_in_cam_m, errors.common_bias_stddev_m, blocks, self.options)
+        add_calibration(bundle, self.camera)
         if self.gravity is not None:
             self._add_gravity(bundle, self.gravity)
         return AddedBlocks(blocks, residual_rows)

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from contextlib import nullcontext, suppress
-from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -32,7 +30,6 @@ from rangesfm.vision.reconstruct import reconstruct
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.metric_map import estimate_scale, path_of_model, ranges_on_path, refine_by_survey
 
-_Done = TypeVar("_Done")
 # Fewer have no shape by which ranges could tell a scale.
 _MIN_NUM_KEYFRAMES = 5
 # By which factor the path must have grown for the clocks' offset to be looked for again.
@@ -120,20 +117,8 @@ def map_keyframes(
     adjustment: GlobalAdjustment | None = None,
 ) -> tuple[pycolmap.Reconstruction, ...]:
     """Map the keyframes into ``sparse``; returns ``sparse/0``, ``sparse/1``, ..."""
-    summary = with_photos(partial(reconstruct, adjustment=adjustment), survey, keyframes, journal, restart)
-    journal.seconds.update(summary.seconds)
-    if summary.num_registered < summary.num_keyframes:
-        which = "the model" if len(summary.models) == 1 else f"the largest of {len(summary.models)} models"
-        journal.warn(f"{summary.num_registered} of {summary.num_keyframes} keyframes are in {which}")
-    return summary.models
-
-
-def with_photos(
-    do: Callable[..., _Done], survey: Survey, keyframes: tuple[str, ...], journal: Journal, restart: bool
-) -> _Done:
-    """Call ``reconstruct``, or a part of it, for the keyframes of a survey."""
     with survey.source.naming_lines():
-        return do(
+        summary = reconstruct(
             _images_path(survey),
             keyframes,
             survey.output.path,
@@ -143,7 +128,13 @@ def with_photos(
             progress=journal.progress,
             restart=restart,
             before_change=lambda: forget_result(survey.output.path),
+            adjustment=adjustment,
         )
+    journal.seconds.update(summary.seconds)
+    if summary.num_registered < summary.num_keyframes:
+        which = "the model" if len(summary.models) == 1 else f"the largest of {len(summary.models)} models"
+        journal.warn(f"{summary.num_registered} of {summary.num_keyframes} keyframes are in {which}")
+    return summary.models
 
 
 def _images_path(survey: Survey) -> Path:

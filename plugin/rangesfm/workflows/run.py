@@ -19,8 +19,6 @@ from rangesfm.ranging.clock.estimate import TimeOffset
 from rangesfm.survey.inputs import RangingInputs, times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes
-from rangesfm.vision.reconstruct import prepare_submaps
-from rangesfm.vision.submaps import Submap
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.metric_map import (
     find_time_offset,
@@ -41,7 +39,6 @@ from rangesfm.workflows.photos import (
     read_inputs,
     read_registered,
     tell_of_times,
-    with_photos,
 )
 from rangesfm.workflows.results import RunResult, write_results
 
@@ -58,19 +55,6 @@ def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> 
         if note := adjustment.note():
             journal.warn(note)
         return to_metric(survey, inputs, models, times, journal, refine=survey.refine.enabled)
-
-
-def prepare_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> tuple[Submap, ...]:
-    """What ``run_survey`` does before it maps the photos.
-
-    Returns:
-        The submaps that are to be mapped yet; whoever has them mapped (``Submap.map``), wherever, in any order and at
-        once, saves ``run_survey`` doing it. None where the photos are mapped in one piece.
-    """
-    journal = Journal(progress)
-    _, keyframes, _ = checked_inputs(survey, journal)
-    with sole_writer(survey.output.path):
-        return with_photos(prepare_submaps, survey, keyframes, journal, restart)
 
 
 def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> list[str]:
