@@ -4,8 +4,9 @@ Run: python -m tests.studies.real_logs --data FOLDER [--sets NAME ...] [--no_sin
      [--turned SEED]
 
 The sets are described in real_logs.json: public logs below the folder, of each tag its place in the tracked body, the
-offset of the clocks (time of the truth minus time of the ranges) and the truth's longest gap. The path is the true one, at most ten poses a
-second, divided by a factor that is to be found again. A survey has all anchors surveyed (site frame), known in the
+offset of the clocks (time of the truth minus time of the ranges) and the truth's longest gap. The path is the true
+one, at most ten poses a second, divided by a factor that is to be found again. A survey has all anchors surveyed
+(site frame), known in the
 first pose's frame, all unknown, or each alone unknown. With --by_photo ranges name the pose next to them instead of a
 time; with --turned the unscaled path lies in another frame, which should change nothing.
 """
@@ -80,7 +81,7 @@ def main() -> None:
 def read_set(data: Path, described: dict[str, Any]) -> tuple[RangeLog, list[Anchor], Reference]:
     ranges = data / described["ranges"]
     if "truth" in described:
-        anchors = read_anchors(data / described["anchors"])
+        anchors = list(read_anchors(data / described["anchors"]))
         reference = read_reference(data / described["truth"])
     else:  # STAR-loc: the tag's place stands beside each range, the anchors' ids in a column without a name
         anchors = [
