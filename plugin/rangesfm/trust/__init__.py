@@ -1,0 +1,1 @@
+"""Trust: every plausible mistake of a survey as a hypothesis that is tested."""

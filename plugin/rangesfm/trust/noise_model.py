@@ -1,0 +1,64 @@
+"""Which errors of ranges on a map are random: white, lasting, of antennas, of the map's bending, of the radio's curve."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.ranging.errors.shared_errors import ANTENNA_STDDEV_M, CURVE_STDDEV_M, antenna_modes, curve_modes
+from rangesfm.trust.hypothesis import Hypothesis
+from rangesfm.trust.linearized import Linearized
+from rangesfm.trust.random_errors import Component, RandomErrors, learn
+
+# Errors of radios stay alike for seconds (by 0.4 to 0.6 after one second on real logs).
+_MEMORY_S = 3.0
+_LASTING_STDDEV_M, _BEND_STDDEV_M = 0.04, 0.02
+# Of a path's duration: a map bends over no shorter part.
+_BEND_SHARE = 1 / 8
+
+
+def learnt_noise(problem: Linearized, explaining: Sequence[Hypothesis]) -> RandomErrors:
+    """What is left random when some mistakes explain what they can."""
+    design = np.hstack([problem.design, *(h.columns for h in explaining)])
+    prior = np.hstack([problem.prior_design, *(h.priors for h in explaining)])
+    return learn(
+        _components(problem),
+        _curve(problem),
+        problem.residual_m,
+        design,
+        problem.prior_residual,
+        prior,
+        problem.noise,
+    )
+
+
+def usual_noise(problem: Linearized) -> RandomErrors:
+    """As radios and maps usually have it."""
+    components = _components(problem)
+    covariance = _curve(problem) + sum(c.stddev_m**2 * c.unit_covariance for c in components)
+    return RandomErrors(covariance, {c.name: c.stddev_m for c in components}, np.inf)
+
+
+def _components(problem: Linearized) -> list[Component]:
+    apart = np.abs(problem.time_s[:, None] - problem.time_s)
+    same_anchor = problem.anchor_index[:, None] == problem.anchor_index
+    directions = problem.gradient.by_tag
+    antennas = antenna_modes(directions) / ANTENNA_STDDEV_M
+    duration = max(float(np.ptp(problem.time_s)), 1e-6)
+    bend = np.exp(-0.5 * (apart / (_BEND_SHARE * duration)) ** 2)
+    return [
+        Component("white", np.diag(1 / problem.cells.num_ranges), problem.cells.scatter_m, 0.3),
+        Component("lasting", same_anchor * np.exp(-apart / _MEMORY_S), _LASTING_STDDEV_M, 0.7),
+        Component("antennas", same_anchor * (antennas @ antennas.T), ANTENNA_STDDEV_M, 0.5),
+        Component("bend", (directions @ directions.T) * bend, _BEND_STDDEV_M, 1.0),
+    ]
+
+
+def _curve(problem: Linearized) -> Array:
+    """(c, c) of an error curve that nobody learnt."""
+    distance = problem.gradient.distance_m
+    modes = curve_modes(distance, np.full(len(distance), CURVE_STDDEV_M))
+    covariance: Array = modes @ modes.T
+    return covariance
