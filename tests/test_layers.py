@@ -23,6 +23,7 @@ LAYERS = (
     "survey",
     "refine",
     "join",
+    "trust",
     "result",
     "report",
     "comparison",

@@ -19,6 +19,7 @@ from rangesfm.ranging.observations import RangeObservations, RangeStatus
 from rangesfm.refine.with_ranges import RefineSummary
 from rangesfm.scale.diagnostics import ScaleDiagnostics, scale_diagnostics
 from rangesfm.scale.estimate import ScaleEstimate
+from rangesfm.trust.verdict import TrustVerdict
 
 USED = (RangeStatus.USED, RangeStatus.DOWN_WEIGHTED)
 """Of ranges with a say in the final model, however small."""
@@ -39,6 +40,7 @@ class MetricResult:
         refined: the model after refinement; None without.
         refinement: its summary; None without.
         models: that were to be joined to what is one model here; empty where there was only one.
+        trust: what the tests of mistakes say of the scaled map.
     """
 
     trajectory: Trajectory
@@ -51,6 +53,7 @@ class MetricResult:
     refined: pycolmap.Reconstruction | None = None
     refinement: RefineSummary | None = None
     models: tuple[ModelVerdict, ...] = ()
+    trust: TrustVerdict | None = None
 
     @property
     def final(self) -> pycolmap.Reconstruction:

@@ -28,6 +28,7 @@ from rangesfm.result.entries import (
     ScaleEntry,
     Settings,
     SimilarityEntry,
+    TestEntry,
     TimeOffsetEntry,
 )
 from rangesfm.result.metric_result import MetricResult
@@ -46,6 +47,7 @@ class ResultSummary(Record):
         anchors: by id.
         refine: null without a refinement.
         models: that were to be joined to what is one model here; empty where there was only one.
+        tests: of mistakes that may have been made, those that were found first.
         distances: that were taped.
         comparison: only there where a reference was given.
         georeference: null if the anchors did not say.
@@ -65,6 +67,7 @@ class ResultSummary(Record):
     check_ranges: CheckRangesEntry
     refine: RefineEntry | None
     models: tuple[ModelEntry, ...]
+    tests: tuple[TestEntry, ...] = ()
     distances: tuple[DistanceRow, ...]
     comparison: tuple[ComparisonRow, ...] = ()
     georeference: GeoreferenceEntry | None
@@ -88,6 +91,7 @@ class ResultSummary(Record):
             ranges=RangesEntry.of(found),
             check_ranges=CheckRangesEntry.of(found),
             refine=RefineEntry.of(found),
+            tests=tuple(TestEntry.model_validate(test) for test in (found.trust.tests if found.trust else ())),
             models=tuple(ModelEntry.of(model, estimate.metric_from_sfm) for model in found.models),
             **others,
         )

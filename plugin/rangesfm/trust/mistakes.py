@@ -112,7 +112,8 @@ def _causes(problem: Linearized, nominated: Sequence[Test], is_sure: bool) -> li
         again, noise = _settled_test(problem, test.hypothesis)
         gain = before - noise.deviance
         if _is_possible(again) and (is_sure or gain > test.threshold):
-            causes.append(_cause(_narrowed(problem, again, noise), gain, _penalty(again, num)))
+            named = replace(_narrowed(problem, again, noise), threshold=test.threshold)
+            causes.append(_cause(named, gain, _penalty(again, num)))
     causes += _alternatives(problem, before)
     causes.sort(key=lambda cause: -cause.score)
     return [cause for k, cause in enumerate(causes) if not k or _is_rival(causes[0], cause)][: 1 + _MAX_NUM_RIVALS]

@@ -18,6 +18,7 @@ from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.survey_stages import estimate_scale, refine_by_survey
+from rangesfm.workflows.trust_in_map import tested
 
 
 def join_by_survey(
@@ -61,7 +62,8 @@ def scale_by_survey(
     )
     weights = estimate.errors.robust_weights(predicted - inputs.log.range_m)
     offset_s = offset.value_s if offset is not None else survey.ranges.time_offset_s
-    return MetricResult(trajectory, offset, offset_s, estimate, scaled, predicted, weights)
+    metric = MetricResult(trajectory, offset, offset_s, estimate, scaled, predicted, weights)
+    return tested(survey, metric, journal)
 
 
 def refine_map(survey: Survey, inputs: RangingInputs, metric: MetricResult, journal: Journal) -> MetricResult:
