@@ -42,6 +42,8 @@ METRES_PER_UNIT = 2.3
 LASTING_STDDEV_M, DIRECTION_STDDEV_M, CURVE_STDDEV_M, BIAS_STDDEV_M, COMMON_BIAS_STDDEV_M = 0.03, 0.03, 0.03, 0.01, 0.05
 OBSTRUCTED_SHARE, OBSTRUCTED_MEAN_M = 0.04, 0.7
 BEND_SHARE = 0.002
+# A camera's x right, y down, z forward by a robot's x forward, y left, z up.
+X_FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,8 @@ def surveyed(site: Site, seed: int) -> Given:
 
 
 def distances(given: Given) -> Array:
-    return np.linalg.norm(given.tags_m - np.array(list(given.true_anchors_m.values()))[given.anchor], axis=1)
+    anchors_m = np.array(list(given.true_anchors_m.values()))
+    return np.asarray(np.linalg.norm(given.tags_m - anchors_m[given.anchor], axis=1))
 
 
 def mapped(path: CameraPath, rng: np.random.Generator) -> Trajectory:
@@ -154,7 +157,9 @@ def mapped(path: CameraPath, rng: np.random.Generator) -> Trajectory:
     extent = float(np.linalg.norm(np.std(centers, axis=0)))
     bend = BEND_SHARE * extent * rng.standard_normal((len(knots), 3))
     bent = centers + np.column_stack([np.interp(times, knots, bend[:, k]) for k in range(3)])
-    true = Trajectory(np.arange(1, len(times) + 1), tuple(f"{k:04d}.jpg" for k in range(len(times))), times, bent, rotations)
+    true = Trajectory(
+        np.arange(1, len(times) + 1), tuple(f"{k:04d}.jpg" for k in range(len(times))), times, bent, rotations
+    )
     turn = Rotation.from_quat(rng.normal(size=4)).as_matrix()
     return true.transformed(1 / METRES_PER_UNIT, turn, rng.normal(size=3))
 
@@ -188,6 +193,7 @@ class Run:
             return False
         low, high = self.estimate.interval_95
         return not low <= METRES_PER_UNIT <= high
+
 
 def run(given: Given, seed: int) -> Run:
     """The scale stage and the tests after it."""
@@ -242,7 +248,7 @@ def kinds(site: Site) -> list[Kind]:
     ids = list(site.anchors_m) if site.frame != "unknown" else []
     for k, name in enumerate(ids[:3]):
         for axis, letter in enumerate("xyz"):
-            right = (f"anchor place {name}", f"anchor coordinate {name} {letter}")
+            right: tuple[str, ...] = (f"anchor place {name}", f"anchor coordinate {name} {letter}")
             made.append(Kind(f"{name} {letter} typed wrong", _place(name, axis), right, ("anchor place", name)))
         right = (f"anchor bias {name}",)
         made.append(Kind(f"{name} reads long", _bias(name), right, ("anchor bias", name)))
@@ -256,7 +262,12 @@ def kinds(site: Site) -> list[Kind]:
     for name in ids[:2]:
         right = (f"anchor share {name}", f"anchor hardly used {name}", f"anchor place {name}")
         made.append(Kind(f"{name} reads a constant", _stuck(name), right))
-        right = (f"anchor's outliers {name}", f"anchor hardly used {name}", f"anchor bias {name}", f"anchor place {name}")
+        right = (
+            f"anchor's outliers {name}",
+            f"anchor hardly used {name}",
+            f"anchor bias {name}",
+            f"anchor place {name}",
+        )
         made.append(Kind(f"{name} mostly blocked", _blocked(name), right))
     for axis, letter in enumerate("xyz"):
         right = ("lever arm", "lever arm's axes")
@@ -264,7 +275,7 @@ def kinds(site: Site) -> list[Kind]:
     made += [
         Kind("lever arm forgotten", _lever_forgotten, ("lever arm", "lever arm's axes")),
         Kind("lever arm's sign", _lever_turned(-np.eye(3)), ("lever arm's axes", "lever arm")),
-        Kind("lever arm as x forward", _lever_turned(np.eye(3)[[1, 2, 0]] * [[-1], [-1], [1]]), ("lever arm's axes", "lever arm")),
+        Kind("lever arm as x forward", _lever_turned(X_FORWARD), ("lever arm's axes", "lever arm")),
         Kind("lever arm as y up", _lever_turned(np.diag([1.0, -1, -1])), ("lever arm's axes", "lever arm")),
         Kind("clock off", _clock(1), ("clock offset",), ("clock offset", "")),
         Kind("clock off, early", _clock(-1), ("clock offset",), ("clock offset", "")),
@@ -521,9 +532,7 @@ def runs_of(site: Site, kind: Kind, smallest: dict[tuple[str, str], float], args
         if args.verbose and not is_named:
             print(f"   {tally.name} {seed}: {'; '.join(done.trust.reasons) or 'nothing found'}")
         found = bool(done.trust.reasons)
-        tally = tally.plus(
-            Tally("", 1, 0, int(found), int(is_named), int(is_good), int(is_good and done.is_wrong))
-        )
+        tally = tally.plus(Tally("", 1, 0, int(found), int(is_named), int(is_good), int(is_good and done.is_wrong)))
     print(tally, flush=True)
     return tally
 

@@ -14,8 +14,8 @@ from rangesfm.ranging.anchors.multilateration import multilaterate
 from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.scale.range_equation import RangeProblem, RangeState, predicted_ranges, solve
 from rangesfm.scale.starts import spread_subset
-from rangesfm.trust.hypothesis import Correction
 from rangesfm.trust.corrected import corrected
+from rangesfm.trust.hypothesis import Correction
 from rangesfm.trust.ranges_on_map import RangesOnMap
 
 _NUM_PER_ANCHOR, _NUM_EVALUATIONS = 25, 12
@@ -139,7 +139,7 @@ class Refits:
         return fit.cost, replace(right, state=fit.state)
 
     def _starts(self, problem: RangeProblem) -> Iterator[RangeState]:
-        known = np.isfinite(problem.anchor_mean_m).all(axis=1)
+        known = np.asarray(np.isfinite(problem.anchor_mean_m).all(axis=1))
         anchors_m = np.where(known[:, None], problem.anchor_mean_m, self._on_map.state.anchors_m)
         yield replace(self._on_map.state, anchors_m=anchors_m)
         if not problem.frame_is_free:
@@ -192,6 +192,4 @@ def _given_m(on_map: RangesOnMap) -> Mapping[str, Array]:
 def _lever_arms_m(on_map: RangesOnMap) -> Mapping[str, Array]:
     """As given, by the first range of each tag."""
     arms = np.einsum("nji,nj->ni", on_map.world_from_cam, on_map.problem.tag_from_center)
-    return {
-        on_map.tag_ids[k]: np.median(arms[on_map.tag_index == k], axis=0) for k in np.unique(on_map.tag_index)
-    }
+    return {on_map.tag_ids[k]: np.median(arms[on_map.tag_index == k], axis=0) for k in np.unique(on_map.tag_index)}

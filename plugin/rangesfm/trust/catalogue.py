@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from rangesfm.arrays import Array
-from rangesfm.trust.hypothesis import Correction, Hypothesis, of_anchor_place, of_bias, of_cells
+from rangesfm.arrays import Array, Mask
+from rangesfm.trust.hypothesis import Correction, Effect, Hypothesis, of_anchor_place, of_bias, of_cells
 from rangesfm.trust.linearized import Linearized
 
 _AXES = "xyz"
@@ -54,7 +54,7 @@ def anchor_places(problem: Linearized) -> Iterator[Hypothesis]:
                         remedy=f"check its {of_axis}, or {_MEASURE_AGAIN}",
                         correction=along,
                         adoption=unknown,
-                        **columns,
+                        effect=columns,
                     )
                 )
 
@@ -73,7 +73,7 @@ def anchor_places(problem: Linearized) -> Iterator[Hypothesis]:
             correction=moved,
             adoption=unknown,
             narrower=tuple(coordinates),
-            **found,
+            effect=found,
         )
 
 
@@ -103,7 +103,7 @@ def _bias(problem: Linearized, anchors: list[int], subject: str, whose: str) -> 
         remedy="calibrate the radio's delay (range_bias_m in the anchors' file), or look for what stands in the way",
         correction=correction,
         is_linear=True,
-        **of_bias(problem, anchors),
+        effect=of_bias(problem, anchors),
     )
 
 
@@ -123,7 +123,7 @@ def range_shares(problem: Linearized) -> Iterator[Hypothesis]:
         correction=lambda size: Correction(longer_m=distance_m * size[0] / (1 + size[0])),
         most=0.5,
         is_linear=True,
-        **of_cells(problem, by_distance),
+        effect=of_cells(problem, by_distance),
     )
     heard = np.unique(problem.anchor_index)
     for k in heard if len(heard) > 1 else []:
@@ -135,7 +135,7 @@ def range_shares(problem: Linearized) -> Iterator[Hypothesis]:
                 return f"the ranges to anchor {name} hardly change with the distance: it reads nearly the same always"
             return f"the ranges to anchor {name} grow by {1 + size[0]:.2f} m for each metre of distance"
 
-        def left_out(_: Array, of_ranges: Array = of_ranges) -> Correction:
+        def left_out(_: Array, of_ranges: Mask = of_ranges) -> Correction:
             return Correction(left_out=of_ranges)
 
         yield Hypothesis(
@@ -146,7 +146,7 @@ def range_shares(problem: Linearized) -> Iterator[Hypothesis]:
             remedy="look at its ranges in the log, and leave it out (use_anchors)",
             correction=left_out,
             is_linear=True,
-            **of_cells(problem, np.where(is_of, by_distance + mean, 0.0)),
+            effect=of_cells(problem, np.where(is_of, by_distance + mean, 0.0)),
         )
 
 
@@ -163,7 +163,9 @@ def anchors_in_another_scale(problem: Linearized) -> Iterator[Hypothesis]:
         return
 
     def words(size: Array) -> str:
-        return f"the anchors' coordinates are about {100 * abs(size[0]):.1f} % too {'small' if size[0] > 0 else 'large'}"
+        return (
+            f"the anchors' coordinates are about {100 * abs(size[0]):.1f} % too {'small' if size[0] > 0 else 'large'}"
+        )
 
     def correction(size: Array) -> Correction:
         ids = problem.on_map.anchor_ids
@@ -176,8 +178,7 @@ def anchors_in_another_scale(problem: Linearized) -> Iterator[Hypothesis]:
         words=words,
         remedy="check the unit of the anchors' coordinates against a taped distance between two of them",
         correction=correction,
-        columns=np.sum([part["columns"] for part in found], axis=0),
-        priors=np.sum([part["priors"] for part in found], axis=0),
+        effect=Effect.of_sum(found),
     )
 
 
@@ -206,12 +207,9 @@ def heights_never_measured(problem: Linearized) -> Iterator[Hypothesis]:
         words=words,
         remedy="measure the heights of the antennas",
         correction=lambda size: Correction(
-            anchors_m={
-                ids[k]: given_m[k] + np.array([0.0, 0.0, h]) for k, h in zip(known.tolist(), size, strict=True)
-            }
+            anchors_m={ids[k]: given_m[k] + np.array([0.0, 0.0, h]) for k, h in zip(known.tolist(), size, strict=True)}
         ),
-        columns=np.hstack([part["columns"] for part in found]),
-        priors=np.hstack([part["priors"] for part in found]),
+        effect=Effect.of_all(found),
     )
 
 
@@ -238,7 +236,7 @@ def lever_arms(problem: Linearized) -> Iterator[Hypothesis]:
             words=words,
             remedy="measure where the tag's antenna sits, x to the right, y down, z forward (--tag_in_cam)",
             correction=correction,
-            **of_cells(problem, columns),
+            effect=of_cells(problem, columns),
         )
 
 
@@ -262,7 +260,7 @@ def clocks(problem: Linearized) -> Iterator[Hypothesis]:
         words=offset,
         remedy=remedy,
         correction=lambda size: Correction(time_shift_s=float(size[0])),
-        **of_cells(problem, -problem.by_time),
+        effect=of_cells(problem, -problem.by_time),
     )
     of_ranges = problem.on_map.time_s - problem.time_s.mean()
     yield Hypothesis(
@@ -272,7 +270,7 @@ def clocks(problem: Linearized) -> Iterator[Hypothesis]:
         words=drift,
         remedy=remedy,
         correction=lambda size: Correction(time_shift_s=size[0] * of_ranges),
-        **of_cells(problem, -problem.by_time * since),
+        effect=of_cells(problem, -problem.by_time * since),
     )
 
 

@@ -125,7 +125,7 @@ def _num_prior_rows(on_map: RangesOnMap, columns: Columns) -> tuple[int, int]:
     problem = on_map.problem
     anchors = np.count_nonzero((columns.anchor >= 0) & np.isfinite(problem.anchor_stddev_m))
     biases = np.count_nonzero((columns.bias >= 0) & np.isfinite(problem.bias_stddev_m))
-    return 3 * anchors, biases
+    return 3 * int(anchors), int(biases)
 
 
 def _place(centers_m: Array, arms_m: Array, columns: Columns) -> Array:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rangesfm.arrays import Array
+from rangesfm.scale.range_equation import state_after
 from rangesfm.trust.alternatives import ALTERNATIVES, Alternative, Refits
 from rangesfm.trust.catalogue import STANDING
 from rangesfm.trust.corrected import corrected
@@ -18,7 +18,6 @@ from rangesfm.trust.random_errors import RandomErrors
 from rangesfm.trust.ranges_on_map import RangesOnMap
 from rangesfm.trust.scanning import SCANNING
 from rangesfm.trust.testing import Test, Tester, overlap
-from rangesfm.scale.range_equation import state_after
 
 # Explanations that are tried with the noise that each of them leaves.
 _NUM_TRIED, _NUM_OF_KIND = 6, 2
@@ -132,20 +131,18 @@ def _is_rival(best: Cause, other: Cause) -> bool:
 
 
 def _settled_test(problem: Linearized, hypothesis: Hypothesis) -> tuple[Test, RandomErrors]:
-    """The test of one hypothesis with the noise that it leaves; of one that is not linear at the state that it leaves."""
-    original, sizes, at = hypothesis, np.zeros(hypothesis.columns.shape[1]), problem
+    """The test of a hypothesis with the noise that it leaves; of one that is not linear at the state that it leaves."""
+    original, sizes, at = hypothesis, np.zeros(hypothesis.num), problem
     for _ in range(0 if hypothesis.is_linear else _NUM_SETTLING):
         tester = Tester(at)
         [test] = tester.test([hypothesis], 0)
         sizes = sizes + test.sizes
         if np.linalg.norm(test.sizes) < _SETTLED * np.linalg.norm(sizes):
             break
-        state = state_after((at.columns,), at.on_map.state, tester.step(hypothesis, test.sizes))
+        state = state_after((at.columns,), at.on_map.state, tester.step((hypothesis.effect, test.sizes)))
         at = at_state(at, corrected(replace(problem.on_map, state=state), original.correction(sizes)))
         standing = _standing(at)
-        hypothesis = next(
-            h for h in [*standing, *(n for h in standing for n in h.narrower)] if h.key == hypothesis.key
-        )
+        hypothesis = next(h for h in [*standing, *(n for h in standing for n in h.narrower)] if h.key == hypothesis.key)
     noise = learnt_noise(at, [hypothesis])
     [test] = Tester(at.with_noise(noise)).test([hypothesis], 0)
     return replace(test, hypothesis=original, sizes=sizes + test.sizes), noise

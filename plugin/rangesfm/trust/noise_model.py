@@ -1,4 +1,4 @@
-"""Which errors of ranges on a map are random: white, lasting, of antennas, of the map's bending, of the radio's curve."""
+"""Which errors of ranges on a map are random: white and lasting, of antennas, a bent map, the radio's curve."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.ranging.errors.shared_errors import ANTENNA_STDDEV_M, CURVE_STDDEV_M, antenna_modes, curve_modes
-from rangesfm.trust.hypothesis import Hypothesis
+from rangesfm.trust.hypothesis import Effect, Hypothesis
 from rangesfm.trust.linearized import Linearized
 from rangesfm.trust.random_errors import Component, RandomErrors, learn
 
@@ -21,15 +21,14 @@ _BEND_SHARE = 1 / 8
 
 def learnt_noise(problem: Linearized, explaining: Sequence[Hypothesis]) -> RandomErrors:
     """What is left random when some mistakes explain what they can."""
-    design = np.hstack([problem.design, *(h.columns for h in explaining)])
-    prior = np.hstack([problem.prior_design, *(h.priors for h in explaining)])
+    all_of_it = Effect.of_all([Effect(problem.design, problem.prior_design), *(h.effect for h in explaining)])
     return learn(
         _components(problem),
         _curve(problem),
         problem.residual_m,
-        design,
+        all_of_it.columns,
         problem.prior_residual,
-        prior,
+        all_of_it.priors,
         problem.noise,
     )
 

@@ -99,7 +99,7 @@ def learn(
 
 
 def _deviance(covariance_m2: Array, residual: Array, design: Array, prior_residual: Array, prior: Array) -> float:
-    factor = np.linalg.cholesky(covariance_m2)
+    factor = np.asarray(np.linalg.cholesky(covariance_m2), dtype=np.float64)
     inverse = _inverse(factor)
     weighed = inverse @ design
     right = weighed.T @ residual + prior.T @ prior_residual
@@ -117,7 +117,10 @@ def _inverse(factor: Array) -> Array:
 def _normal(design: Array, weighed: Array, prior: Array) -> tuple[Array, bool]:
     """Of columns of length 1, a little more than it is, for those that say the same."""
     normal = design.T @ weighed + prior.T @ prior
-    return cho_factor(normal + _RIDGE * np.max(np.diag(normal), initial=1.0) * np.eye(len(normal)))
+    factor: tuple[Array, bool] = cho_factor(
+        normal + _RIDGE * np.max(np.diag(normal), initial=1.0) * np.eye(len(normal))
+    )
+    return factor
 
 
 def _scaled(design: Array, prior: Array) -> tuple[Array, Array]:

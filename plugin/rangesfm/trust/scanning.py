@@ -41,7 +41,7 @@ def anchors_moved(problem: Linearized) -> Iterator[Hypothesis]:
                 words=words,
                 remedy="fix anchors so that nobody bumps into them, and use its ranges from before only",
                 correction=_left_out(_of_ranges(problem, k) & (problem.on_map.time_s > time)),
-                **of_cells(problem, np.where(is_after[:, None], problem.gradient.by_tag, 0.0)),
+                effect=of_cells(problem, np.where(is_after[:, None], problem.gradient.by_tag, 0.0)),
             )
 
 
@@ -57,8 +57,8 @@ def steps(problem: Linearized) -> Iterator[Hypothesis]:
             of_ranges = _of_ranges(problem, k) & (problem.on_map.time_s > time)
 
             def words(size: Array, name: str = name, when: str = _when(problem, time)) -> str:
-                to = f" to anchor {name}" if name else ""
-                return f"{when} on the ranges{to} read about {abs(size[0]):.2f} m {'longer' if size[0] > 0 else 'shorter'}"
+                to, how = f" to anchor {name}" if name else "", "longer" if size[0] > 0 else "shorter"
+                return f"{when} on the ranges{to} read about {abs(size[0]):.2f} m {how}"
 
             def correction(size: Array, of_ranges: Mask = of_ranges) -> Correction:
                 return Correction(longer_m=np.where(of_ranges, size[0], 0.0))
@@ -71,7 +71,7 @@ def steps(problem: Linearized) -> Iterator[Hypothesis]:
                 words=words,
                 remedy="see what changed then: a tag that slipped, a restarted radio, a door or a vehicle in between",
                 correction=correction,
-                **of_cells(problem, -is_after.astype(np.float64)),
+                effect=of_cells(problem, -is_after.astype(np.float64)),
             )
 
 
@@ -98,7 +98,7 @@ def stretches(problem: Linearized) -> Iterator[Hypothesis]:
                 words=words,
                 remedy="look for what stood in the line of sight, and leave that stretch out",
                 correction=_left_out(_of_ranges(problem, k) & (times >= start) & (times < end)),
-                **of_cells(problem, -inside.astype(np.float64)),
+                effect=of_cells(problem, -inside.astype(np.float64)),
             )
 
 
@@ -126,7 +126,7 @@ def clock_jumps(problem: Linearized) -> Iterator[Hypothesis]:
             words=words,
             remedy="see whether a logger was restarted then, and run the two parts as surveys of their own",
             correction=correction,
-            **of_cells(problem, np.where(after, -problem.by_time, 0.0)),
+            effect=of_cells(problem, np.where(after, -problem.by_time, 0.0)),
         )
 
 

@@ -15,7 +15,7 @@ from scipy import stats
 from scipy.linalg import solve_triangular
 
 from rangesfm.arrays import Array
-from rangesfm.trust.hypothesis import Hypothesis
+from rangesfm.trust.hypothesis import Effect, Hypothesis
 from rangesfm.trust.linearized import Linearized
 
 FALSE_ALARMS = 0.02
@@ -83,11 +83,12 @@ class Tester:
         """Sum of squares of the residuals, whitened."""
         return float(self.residual @ self.residual)
 
-    def step(self, hypothesis: Hypothesis | None = None, sizes: Array | None = None) -> Array:
-        """(p,) from the state to the likeliest one, if a mistake of this size was made."""
+    def step(self, made: tuple[Effect, Array] | None = None) -> Array:
+        """(p,) from the state to the likeliest one, if a mistake of some size (k,) was made."""
         cells, priors = self.problem.residual_m, self.problem.prior_residual
-        if hypothesis is not None:
-            cells, priors = cells - hypothesis.columns @ sizes, priors - hypothesis.priors @ sizes
+        if made is not None:
+            effect, sizes = made
+            cells, priors = cells - effect.columns @ sizes, priors - effect.priors @ sizes
         return -self._solved(self._whitened(cells[:, None], priors[:, None]))[:, 0]
 
     def _solved(self, whitened: Array) -> Array:
@@ -95,12 +96,11 @@ class Tester:
 
     def test(self, hypotheses: Sequence[Hypothesis], seed: int) -> list[Test]:
         """All of them, with thresholds that hold for all together."""
-        whitened = self._whitened(
-            np.hstack([h.columns for h in hypotheses]), np.hstack([h.priors for h in hypotheses])
-        )
+        effects = Effect.of_all([h.effect for h in hypotheses])
+        whitened = self._whitened(effects.columns, effects.priors)
         left = self._off(whitened)
-        ends = np.cumsum([h.columns.shape[1] for h in hypotheses])
-        parts = [slice(end - h.columns.shape[1], end) for end, h in zip(ends, hypotheses, strict=True)]
+        ends = np.cumsum([h.num for h in hypotheses])
+        parts = [slice(end - h.num, end) for end, h in zip(ends, hypotheses, strict=True)]
         bases = [_basis_of(left[:, part], whitened[:, part]) for part in parts]
         nums = np.array([basis.shape[1] for basis in bases])
         thresholds = _thresholds(bases, nums, seed)
@@ -111,7 +111,7 @@ class Tester:
         ]
 
     def _test(self, hypothesis: Hypothesis, left: Array, basis: Array, by_unknowns: Array, threshold: float) -> Test:
-        inverse = np.linalg.pinv(left.T @ left, rcond=_NOTHING_LEFT, hermitian=True)
+        inverse = np.asarray(np.linalg.pinv(left.T @ left, rcond=_NOTHING_LEFT, hermitian=True), dtype=np.float64)
         is_whole = basis.shape[1] == left.shape[1]
         worst, on_scale, on_place = np.inf, np.inf, np.inf
         if is_whole:
