@@ -33,5 +33,24 @@ rangesfm_version_of_script(three.min.js "three\\.js" THREE_VERSION)
 rangesfm_version_of_script(vega.min.js "Vega" VEGA_VERSION)
 rangesfm_version_of_script(vega.min.js "Vega-Lite" VEGA_LITE_VERSION)
 
+# Appends to COMPONENTS and COMPONENT_NAMES; `purl` is the kind of its package URL.
+function(rangesfm_component name version license purl description)
+  string(APPEND COMPONENTS "\n    { \"type\": \"library\", \"bom-ref\": \"${name}\", \"name\": \"${name}\", "
+    "\"version\": \"${version}\", \"description\": \"${description}\", "
+    "\"licenses\": [{ \"license\": { \"id\": \"${license}\" } }], \"purl\": \"pkg:${purl}/${name}@${version}\" },")
+  set(COMPONENTS "${COMPONENTS}" PARENT_SCOPE)
+  set(COMPONENT_NAMES "${COMPONENT_NAMES}\"${name}\", " PARENT_SCOPE)
+endfunction()
+
+rangesfm_component(eigen "${EIGEN_HEADERS_VERSION}" MPL-2.0 generic "headers, compiled into the extension")
+rangesfm_component(ceres-solver "${CERES_HEADERS_VERSION}" BSD-3-Clause generic
+  "headers of its cost functions and manifolds, compiled into the extension")
+rangesfm_component(pybind11 "${pybind11_VERSION}" BSD-3-Clause pypi "headers, compiled into the extension")
+rangesfm_component(three "${THREE_VERSION}" MIT npm "part of the report's page")
+rangesfm_component(vega "${VEGA_VERSION}" BSD-3-Clause npm "part of the report's page, with parts of d3 (ISC)")
+rangesfm_component(vega-lite "${VEGA_LITE_VERSION}" BSD-3-Clause npm "part of the report's page")
+string(REGEX REPLACE ",$" "\n  " COMPONENTS "${COMPONENTS}")
+string(REGEX REPLACE ", $" "" COMPONENT_NAMES "${COMPONENT_NAMES}")
+
 configure_file(bundled.cdx.json.in bundled.cdx.json @ONLY)
 install(FILES ${CMAKE_CURRENT_BINARY_DIR}/bundled.cdx.json DESTINATION ${SKBUILD_METADATA_DIR}/sboms)

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 
 from rangesfm.export import MetricMap
-from rangesfm.export.frames import in_frame
+from rangesfm.export.metric_map import in_frame
 from rangesfm.options import ExportOptions
 from rangesfm.result.folder import read_result_folder
 

@@ -13,8 +13,7 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from rangesfm.survey.settings import read_survey
-from rangesfm.survey.toml_source import parse_toml
+from rangesfm.survey.settings import parse_toml, read_survey
 
 if TYPE_CHECKING:
     from tests.conftest import PhotoRun, WalkedSurvey

@@ -18,14 +18,13 @@
 #include <utility>
 
 #include "gate.h"
+#include "rangesfm/beside_points.h"
 #include "rangesfm/direction_cost.h"
 #include "rangesfm/distance_cost.h"
 #include "rangesfm/joint_prior_cost.h"
-#include "rangesfm/padded_manifold.h"
 #include "rangesfm/range_cost.h"
 #include "rangesfm/robust_loss.h"
 #include "rangesfm/tag_place.h"
-#include "rangesfm/zero_tie_cost.h"
 
 namespace py = pybind11;
 
@@ -204,10 +203,8 @@ ceres::CostFunction* MakeZeroTieCost(int size_a, int size_b) {
 }
 
 ceres::Manifold* MakePaddedManifold(int size, int tangent_size) {
-  if (BlockSize("size", size) > BlockSize("tangent_size", tangent_size)) {
-    throw py::value_error("tangent_size is " + std::to_string(tangent_size) + ", expected at least the block's size, " +
-                          std::to_string(size));
-  }
+  const std::string expected = "at least the block's size, " + std::to_string(BlockSize("size", size));
+  Checked("tangent_size", BlockSize("tangent_size", tangent_size), tangent_size >= size, expected);
   return new PaddedManifold(size, tangent_size);
 }
 
@@ -237,8 +234,8 @@ PYBIND11_MODULE(_cpp, m) {
         arg("direction_in_world"), arg("direction_in_cam"), arg("stddev_rad"));
   m.def("joint_prior_cost", &rangesfm::MakeJointPriorCost, kOwn, rangesfm::kJointPriorCostDoc, py::kw_only(),
         arg("mean"), arg("whitening"));
-  m.def("zero_tie_cost", &rangesfm::MakeZeroTieCost, kOwn, "See zero_tie_cost.h.", py::kw_only(), arg("size_a"),
+  m.def("zero_tie_cost", &rangesfm::MakeZeroTieCost, kOwn, "See beside_points.h.", py::kw_only(), arg("size_a"),
         arg("size_b"));
-  m.def("padded_manifold", &rangesfm::MakePaddedManifold, kOwn, "See padded_manifold.h.", py::kw_only(), arg("size"),
+  m.def("padded_manifold", &rangesfm::MakePaddedManifold, kOwn, "See beside_points.h.", py::kw_only(), arg("size"),
         arg("tangent_size"));
 }

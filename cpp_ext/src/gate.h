@@ -1,7 +1,6 @@
 // What Python hands over, checked and turned into Eigen's types. What passes here never fails in the solver.
 
-#ifndef RANGESFM_SRC_GATE_H_
-#define RANGESFM_SRC_GATE_H_
+#pragma once
 
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
@@ -14,18 +13,21 @@ namespace rangesfm {
 
 using Array = pybind11::array_t<double, pybind11::array::c_style | pybind11::array::forcecast>;
 
-inline double Finite(const std::string& name, double value) {
-  if (!std::isfinite(value)) {
-    throw pybind11::value_error(name + " is " + std::to_string(value) + ", expected a finite number");
+// The value, if it is as expected.
+template <typename Value>
+Value Checked(const std::string& name, Value value, bool is_as_expected, const std::string& expected) {
+  if (!is_as_expected) {
+    throw pybind11::value_error(name + " is " + std::to_string(value) + ", expected " + expected);
   }
   return value;
 }
 
+inline double Finite(const std::string& name, double value) {
+  return Checked(name, value, std::isfinite(value), "a finite number");
+}
+
 inline double Positive(const std::string& name, double value) {
-  if (Finite(name, value) <= 0.0) {
-    throw pybind11::value_error(name + " is " + std::to_string(value) + ", expected more than 0");
-  }
-  return value;
+  return Checked(name, Finite(name, value), value > 0.0, "more than 0");
 }
 
 // A loss scale: infinity stands for least squares.
@@ -34,18 +36,10 @@ inline double PositiveOrInfinite(const std::string& name, double value) {
 }
 
 inline double Weight(const std::string& name, double value) {
-  if (Finite(name, value) < 0.0 || value > 1.0) {
-    throw pybind11::value_error(name + " is " + std::to_string(value) + ", expected a number from 0 to 1");
-  }
-  return value;
+  return Checked(name, Finite(name, value), value >= 0.0 && value <= 1.0, "a number from 0 to 1");
 }
 
-inline int BlockSize(const std::string& name, int value) {
-  if (value <= 0) {
-    throw pybind11::value_error(name + " is " + std::to_string(value) + ", expected 1 or more");
-  }
-  return value;
-}
+inline int BlockSize(const std::string& name, int value) { return Checked(name, value, value > 0, "1 or more"); }
 
 [[noreturn]] inline void FailOnShape(const std::string& name, const Array& array, const std::string& expected) {
   throw pybind11::value_error(name + " has " + std::to_string(array.ndim()) + " dimensions and " +
@@ -115,5 +109,3 @@ inline Eigen::Matrix3Xd Vector3ForEachRange(const std::string& name, const Array
 }
 
 }  // namespace rangesfm
-
-#endif  // RANGESFM_SRC_GATE_H_

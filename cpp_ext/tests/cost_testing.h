@@ -1,7 +1,6 @@
 // What the tests of the costs share: random poses, evaluation, and the gradient check on COLMAP's manifolds.
 
-#ifndef RANGESFM_TESTS_COST_TESTING_H_
-#define RANGESFM_TESTS_COST_TESTING_H_
+#pragma once
 
 #include <ceres/cost_function.h>
 #include <ceres/gradient_checker.h>
@@ -130,5 +129,3 @@ inline void ExpectAllFinite(const Evaluation& evaluation) {
 }
 
 }  // namespace rangesfm
-
-#endif  // RANGESFM_TESTS_COST_TESTING_H_

@@ -1,5 +1,3 @@
-#include "rangesfm/padded_manifold.h"
-
 #include <ceres/autodiff_cost_function.h>
 #include <ceres/problem.h>
 #include <ceres/solver.h>
@@ -8,6 +6,8 @@
 #include <array>
 #include <cmath>
 #include <vector>
+
+#include "rangesfm/beside_points.h"
 
 namespace rangesfm {
 namespace {

@@ -1,7 +1,6 @@
 // Range costs of one range and of many, made as the tests want them.
 
-#ifndef RANGESFM_TESTS_RANGE_COSTS_H_
-#define RANGESFM_TESTS_RANGE_COSTS_H_
+#pragma once
 
 #include <Eigen/Core>
 #include <utility>
@@ -34,5 +33,3 @@ inline RangeCost<InterpolatedPlace> BetweenKeyframes(double range, const Eigen::
 }
 
 }  // namespace rangesfm
-
-#endif  // RANGESFM_TESTS_RANGE_COSTS_H_

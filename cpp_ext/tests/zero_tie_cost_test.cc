@@ -1,8 +1,7 @@
-#include "rangesfm/zero_tie_cost.h"
-
 #include <gtest/gtest.h>
 
 #include "cost_testing.h"
+#include "rangesfm/beside_points.h"
 
 namespace rangesfm {
 namespace {

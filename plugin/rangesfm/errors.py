@@ -1,16 +1,19 @@
-"""The errors a user can meet; everything else that escapes is a bug.
-
-Each class carries the exit status of the command line, so that a caller
-never has to look at the text of a message.
-"""
+"""The errors a user can meet, and how a run that failed ends; everything else that escapes is a bug."""
 
 from __future__ import annotations
 
 import difflib
+import errno
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 _MAX_SHOWN = 100
+INTERNAL_ERROR, BAD_INPUT, FAILED = 1, 2, 4
+"""Exit statuses; the first is of what nobody should ever see."""
+INTERRUPTED = 130
+"""As shells have it."""
+_UNUSABLE_PATH = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG)
 
 
 def one_line(text: str) -> str:
@@ -88,3 +91,31 @@ class SolverError(RangesfmError):
     """A solver failed, or the compiled part does not fit the installed packages."""
 
     exit_status = 4
+
+
+@dataclass(frozen=True)
+class Failure:
+    """One line for the user, and the exit status."""
+
+    message: str
+    exit_status: int
+
+
+def failure_of(error: BaseException) -> Failure:
+    """What to tell about any error at all; one that is not of our own classes may be a bug, and is called so."""
+    message, status = _told(error)
+    return Failure(" ".join(one_line(message).split()), status)
+
+
+def _told(error: BaseException) -> tuple[str, int]:
+    if isinstance(error, RangesfmError):
+        return str(error), error.exit_status
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted; stages that were done are kept", INTERRUPTED
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename is not None else ""
+        return f"{where}{error.strerror or error}", BAD_INPUT if error.errno in _UNUSABLE_PATH else FAILED
+    if isinstance(error, MemoryError):
+        return "out of memory", FAILED
+    what = f"{type(error).__name__}: {error}"
+    return f"internal error, please report it (RANGESFM_DEBUG=1 shows where): {what}", INTERNAL_ERROR

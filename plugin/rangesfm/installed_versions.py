@@ -1,12 +1,14 @@
-"""The packages that rangesfm exchanges C++ objects with: which versions it needs, and which are installed."""
+"""The packages that rangesfm needs: in which versions, and which are installed."""
 
 from __future__ import annotations
 
 import functools
 import importlib.metadata
+import re
 
 from rangesfm.errors import SolverError
 
+# Those that it exchanges C++ objects with.
 NEEDED_VERSIONS = {"pycolmap": "4.2", "pyceres": "2.6"}
 INSTALL_COMMAND = "python -m pip install 'pycolmap>=4.2,<4.3' 'pyceres>=2.6,<2.7'"
 
@@ -17,6 +19,16 @@ def installed_version(package: str) -> str | None:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return None
+
+
+def needed_packages() -> list[str]:
+    """All that rangesfm does not work without, by its own metadata; those of NEEDED_VERSIONS if it is not installed."""
+    try:
+        requirements = importlib.metadata.requires("rangesfm") or []
+    except importlib.metadata.PackageNotFoundError:
+        requirements = list(NEEDED_VERSIONS)
+    # After a semicolon stands when alone it is needed: by an extra, or by an older Python.
+    return [re.split(r"[^\w.-]", requirement)[0] for requirement in requirements if ";" not in requirement]
 
 
 @functools.cache

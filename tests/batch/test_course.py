@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 from tests.result_document import result_document
 
-from rangesfm.batch.course import Course
+from rangesfm.batch.course import Course, Figures, Status, SurveyRow, exit_status_of, figures_of, format_rows
 from rangesfm.batch.jobs import Job
-from rangesfm.batch.rows import Figures, Status, SurveyRow, exit_status_of, figures_of, format_rows
-from rangesfm.failures import Failure
+from rangesfm.errors import Failure
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import Survey
 

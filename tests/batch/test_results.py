@@ -9,11 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from rangesfm.batch.course import Course
+from rangesfm.batch.course import Course, Figures
 from rangesfm.batch.jobs import Job
-from rangesfm.batch.results import write_results
-from rangesfm.batch.rows import Figures
-from rangesfm.failures import Failure
+from rangesfm.batch.run import write_results
+from rangesfm.errors import Failure
 from rangesfm.options import OutputOptions
 from rangesfm.survey.settings import Survey
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rangesfm.batch.shares import BatchOptions, Share, share_this_machine
+from rangesfm.batch.jobs import BatchOptions, Share, share_this_machine
 from rangesfm.errors import InputError
 
 GB = 10**9

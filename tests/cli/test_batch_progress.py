@@ -7,10 +7,9 @@ import io
 import pytest
 from tests.cli.screen import Terminal
 
-from rangesfm.batch.course import Course
+from rangesfm.batch.course import Course, Figures
 from rangesfm.batch.jobs import Job
-from rangesfm.batch.rows import Figures
-from rangesfm.cli.batch_progress import BatchTerminal
+from rangesfm.cli.batch import BatchTerminal
 from rangesfm.survey.settings import Survey
 
 

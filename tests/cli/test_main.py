@@ -51,7 +51,7 @@ def raise_in_ranges(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> No
     def fail(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr("rangesfm.cli.ranges.execute", fail)
+    monkeypatch.setattr("rangesfm.cli.ranges._ranges", fail)
 
 
 @pytest.mark.parametrize("command", COMMANDS)

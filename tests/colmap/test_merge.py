@@ -9,8 +9,7 @@ import numpy.typing as npt
 import pycolmap
 import pytest
 
-from rangesfm.colmap.merge import joined_model, without_photos
-from rangesfm.colmap.transform import rescale
+from rangesfm.colmap.transform import joined_model, rescale, without_photos
 from rangesfm.geometry.similarity import Similarity
 
 TWICE_AS_LARGE = Similarity(2.0, np.eye(3), np.array([1.0, 2.0, 3.0]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from tests.simulated.path import loop_path
 
-from rangesfm.demo.path import CameraPath
+from rangesfm.demo.ranges import CameraPath
 
 
 def test_path_goes_through_the_given_poses() -> None:

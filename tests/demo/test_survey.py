@@ -22,7 +22,7 @@ from rangesfm.demo.survey import (
     make_demo_survey,
 )
 from rangesfm.errors import InputError
-from rangesfm.files.sole_writer import sole_writer
+from rangesfm.files.atomic import sole_writer
 from rangesfm.geometry.reference import read_reference
 from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.readers import read_ranges

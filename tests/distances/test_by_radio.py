@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rangesfm.distances.by_radio import distances_by_radio
+from rangesfm.distances.ends import distances_by_radio
 from rangesfm.ranging.log import RangeLog
 
 

@@ -11,8 +11,7 @@ from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import loop_path
 
 from rangesfm.distances.ends import locate_distances
-from rangesfm.distances.rows import disagreements, distance_rows
-from rangesfm.distances.tape import Marker, Tape, TapedDistance
+from rangesfm.distances.tape import Marker, Tape, TapedDistance, disagreements, distance_rows
 from rangesfm.errors import InputError
 
 

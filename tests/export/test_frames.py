@@ -22,7 +22,7 @@ from tests.simulated.path import loop_path
 from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
 from rangesfm.export import MetricMap, export_map
-from rangesfm.export.frames import in_frame, up_in_world
+from rangesfm.export.metric_map import in_frame, up_in_world
 from rangesfm.geometry.georeference import Georeference, georeference_at
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.options import ExportOptions

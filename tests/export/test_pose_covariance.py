@@ -15,7 +15,7 @@ from tests.simulated.path import loop_path
 from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
 from rangesfm.export import COVARIANCE_FORMATS, MetricMap, export_map
-from rangesfm.export.frames import moved
+from rangesfm.export.metric_map import moved
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.options import ExportOptions
 

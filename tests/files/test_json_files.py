@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from rangesfm.errors import InputError
-from rangesfm.files.json_files import read_json
+from rangesfm.files.records import read_json
 
 
 @pytest.mark.parametrize(

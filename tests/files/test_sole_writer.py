@@ -18,8 +18,7 @@ from tests.result_document import result_document
 
 from rangesfm.cli import main
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import new_file, new_folder
-from rangesfm.files.sole_writer import LOCK_NAME, sole_writer
+from rangesfm.files.atomic import LOCK_NAME, new_file, new_folder, sole_writer
 
 if TYPE_CHECKING:
     from tests.conftest import Command, WalkedSurvey
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
 HOLD = """
 import sys
 from pathlib import Path
-from rangesfm.files.sole_writer import sole_writer
+from rangesfm.files.atomic import sole_writer
 with sole_writer(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.readline()

@@ -8,7 +8,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from rangesfm.colmap.model_records import NUM_CAMERA_PARAMS
+from rangesfm.colmap.model_files import NUM_CAMERA_PARAMS
 
 TEXT = "text"
 _EXTREMES: dict[str, tuple[float | bytes, ...]] = {

@@ -17,11 +17,9 @@ from tests.simulated.path import loop_path
 from tests.simulated.ranges import simulate_ranges_at
 
 from rangesfm.cli import main
-from rangesfm.colmap.merge import without_photos
 from rangesfm.colmap.model_files import read_model
-from rangesfm.colmap.transform import rescale
-from rangesfm.demo.path import CameraPath
-from rangesfm.demo.ranges import Radio
+from rangesfm.colmap.transform import rescale, without_photos
+from rangesfm.demo.ranges import CameraPath, Radio
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import align_points
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction

@@ -21,8 +21,7 @@ from tests.studies.scale_breakdown import spoilt
 
 from rangesfm import ceres
 from rangesfm.colmap.transform import rescale
-from rangesfm.demo.path import CameraPath
-from rangesfm.demo.ranges import Radio, simulate_ranges
+from rangesfm.demo.ranges import CameraPath, Radio, simulate_ranges
 from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.tape import Marker, Tape, TapedDistance
 from rangesfm.errors import InputError, SolverError

@@ -7,35 +7,32 @@ import math
 import numpy as np
 import pytest
 
-from rangesfm.report.chart import joined_labels, panel_spec, rows_of
+from rangesfm.report.chart import joined_labels, panel_spec, points_of
 from rangesfm.report.plot import VIEW_SIZE, Figure, Mark, Panel, Series, equal_view, running_median
 
 
 def panel_of(*series: Series) -> Panel:
-    return Panel("", "", "x", "y", series, x_range=(0.0, 10.0), y_range=(0.0, 1.0))
+    return Panel("", "", ("x", "y"), series, x_range=(0.0, 10.0), y_range=(0.0, 1.0))
 
 
-def test_dots_beyond_an_axis_are_drawn_at_its_edge_and_lines_are_cut_there() -> None:
+def test_dots_beyond_an_axis_are_drawn_at_its_edge_and_each_for_itself_and_lines_are_cut_there() -> None:
     points = np.array([[5.0, 99.0]])
     panel = panel_of(Series("dots", "after", points), Series("line", "after", points, "line"))
-    dots, line = panel_spec(panel, str, lambda i: {"name": str(i)})["layer"][-2:]
-    assert [step["calculate"] for step in dots["transform"]] == [
-        "isValid(datum.x) ? clamp(datum.x, 0.0, 10.0) : null",
-        "isValid(datum.y) ? clamp(datum.y, 0.0, 1.0) : null",
-    ]
-    assert line["transform"] == []
+    dots, line = panel_spec(panel, lambda i: {"name": str(i)})["layer"][-2:]
+    assert dots["transform"] == [{"calculate": "[clamp(datum.y, 0.0, 1.0), null]", "as": "y"}, {"flatten": ["y"]}]
+    assert "transform" not in line
     assert line["mark"]["clip"]
 
 
-def test_a_line_is_broken_where_a_point_is_missing_and_dots_after_each() -> None:
+def test_a_missing_point_breaks_a_line_and_is_no_dot() -> None:
     points = np.array([[0.0, 0.0], [2.0, np.nan], [3.0, 0.0]])
-    assert rows_of(Series("a", "after", points, "line")) == [{"x": 0.0, "y": 0.0}, {}, {"x": 3.0, "y": 0.0}]
-    assert rows_of(Series("a", "after", points[:1])) == [{"x": 0.0, "y": 0.0}, {}]
+    np.testing.assert_array_equal(points_of(Series("a", "after", points, "line")), points)
+    np.testing.assert_array_equal(points_of(Series("a", "after", points)), points[[0, 2]])
 
 
 @pytest.mark.parametrize("points", [np.array([[5.0, -3.0]]), np.zeros((0, 2)), np.full((3, 2), np.nan)])
 def test_a_chart_of_one_value_or_none_still_has_axes(points: np.ndarray) -> None:
-    panel = Panel("", "", "x", "y", (Series("a", "after", points),))
+    panel = Panel("", "", ("x", "y"), (Series("a", "after", points),))
     for low, high in panel.limits:
         assert math.isfinite(low)
         assert low < high
@@ -53,7 +50,7 @@ def test_equal_views_have_one_scale_and_hold_all_points(width: float, height: fl
 def test_marks_that_fall_on_one_another_share_a_label() -> None:
     places = {"A": (1.0, 0.5), "B": (1.01, 0.5), "C": (9.0, 0.5)}
     marks = tuple(Mark("anchor", "anchor", "triangle", x, y, id_, id_) for id_, (x, y) in places.items())
-    panel = Panel("", "", "x", "y", (), marks, x_range=(0.0, 10.0), y_range=(0.0, 1.0))
+    panel = Panel("", "", ("x", "y"), (), marks, x_range=(0.0, 10.0), y_range=(0.0, 1.0))
     assert [mark.label for mark in joined_labels(panel)] == ["A, B", "C"]
 
 

@@ -17,7 +17,7 @@ import pytest
 from rangesfm.errors import InputError
 from rangesfm.report import write_report
 from rangesfm.report.content import Content, true_ranges_m
-from rangesfm.report.scene import scene_data, scene_of
+from rangesfm.report.scene import scene_of, view_of
 from rangesfm.result.folder import read_result_folder
 
 MakeResult = Callable[..., Path]
@@ -202,7 +202,7 @@ def test_names_cannot_inject_markup(make_result: MakeResult) -> None:
     assert not any(name.startswith("on") for name, _ in page.attributes)
     assert page.texts.count(evil) >= 5
     (panel,) = figures_in(folder)["scale_per_anchor"]
-    assert sum(mark["title"].startswith(f"anchor {evil}") for mark in panel["marks"]) == 1
+    assert sum(mark["name"].startswith(f"anchor {evil}") for mark in panel["marks"]) == 1
     assert f"Anchor {evil}" in page.texts
 
 
@@ -312,4 +312,4 @@ def test_each_range_begins_at_its_own_tag(make_result: MakeResult) -> None:
     assert differences.max() > 0.2
     scene = scene_of(content)
     assert scene is not None
-    assert sorted(scene_data(scene)["ranges"]["tags_in_cam_m"]) == sorted(arms.values())
+    assert sorted(view_of(scene)["ranges"]["tags_in_cam_m"]) == sorted(arms.values())

@@ -129,8 +129,8 @@ def test_times_and_ranges_are_read_as_they_stand(tmp_path: Path) -> None:
     assert ranges is not None
     assert ranges.keyframe_after == ("b.jpg", "")
     assert ranges.is_used.tolist() == [True, False]
-    np.testing.assert_array_equal(ranges.residual_scaled_m, [0.25, np.nan])
-    np.testing.assert_array_equal(ranges.residual_refined_m, [0.125, np.nan])
+    np.testing.assert_array_equal(ranges.residuals_by_model_m["scaled"], [0.25, np.nan])
+    np.testing.assert_array_equal(ranges.residuals_by_model_m["refined"], [0.125, np.nan])
 
 
 @pytest.mark.parametrize(

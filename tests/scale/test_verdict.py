@@ -118,6 +118,13 @@ class TestAdvice:
         assert "calibrate the radio" in advice
         assert "tape a distance" in advice
 
+    def test_calibration_is_named_once(self, make_survey: MakeSurvey, monkeypatch: pytest.MonkeyPatch) -> None:
+        drifted = lambda tests: CutoffTest(2.0, 1.1 * tests[0].scale, 0.01)  # noqa: E731
+        monkeypatch.setattr("rangesfm.scale.verdict.scale_drift", drifted)
+        (advice,) = self.advice(make_survey, "first_camera", monkeypatch, range_model=0.04)
+        assert advice.count("calibrate the radio") == 1
+        assert "tape a distance" in advice
+
     def test_anchors_that_were_surveyed(self, make_survey: MakeSurvey, monkeypatch: pytest.MonkeyPatch) -> None:
         (advice,) = self.advice(make_survey, "first_camera", monkeypatch, jackknife=0.04)
         assert advice.startswith("check the surveyed positions of the anchors")

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from rangesfm.demo.path import CameraPath
+from rangesfm.demo.ranges import CameraPath
 
 FloatArray = npt.NDArray[np.float64]
 

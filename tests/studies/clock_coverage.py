@@ -20,8 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from rangesfm.demo.path import CameraPath
-from rangesfm.demo.ranges import Radio, simulate_ranges
+from rangesfm.demo.ranges import CameraPath, Radio, simulate_ranges
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.clock.estimate import estimate_time_offset

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from tests.simulated.path import loop_path
 from tests.studies.scale_coverage import drifting, error_curve
 
-from rangesfm.demo.path import CameraPath
+from rangesfm.demo.ranges import CameraPath
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import ScaleOptions

@@ -19,8 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from tests.simulated.path import loop_path
 
-from rangesfm.demo.path import CameraPath
-from rangesfm.demo.ranges import Radio, SimulatedRanges, simulate_ranges
+from rangesfm.demo.ranges import CameraPath, Radio, SimulatedRanges, simulate_ranges
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory

@@ -16,7 +16,7 @@ from tests.simulated.path import loop_path
 from tests.simulated_database import camera_options, matched_photos, write_database
 
 from rangesfm.errors import InputError, ReconstructionError
-from rangesfm.files.sole_writer import LOCK_NAME
+from rangesfm.files.atomic import LOCK_NAME
 from rangesfm.geometry.similarity import align_points, rmse
 from rangesfm.options import MapperOptions
 from rangesfm.progress import SilentProgress

@@ -1,5 +1,4 @@
-#ifndef RANGESFM_DIRECTION_COST_H_
-#define RANGESFM_DIRECTION_COST_H_
+#pragma once
 
 #include <ceres/cost_function.h>
 
@@ -8,12 +7,9 @@
 
 namespace rangesfm {
 
-// Error of a direction of the world that was seen from a camera, such as the vertical, in stddevs:
-//
-//   (R direction_in_world - direction_in_cam) / stddev,
-//
-// three numbers for two degrees of freedom: along the direction only the square of the angle counts. Both directions
-// are unit vectors, the stddev is an angle in radians. Block: rig_from_world (7: qx qy qz qw tx ty tz).
+// Error of a direction of the world that was seen from a camera, in stddevs (formula and block: direction_cost in
+// src/bindings.cc): three numbers for two degrees of freedom, as along the direction only the square of the angle
+// counts. Both directions are unit vectors.
 class DirectionCost final : public ceres::CostFunction {
  public:
   DirectionCost(const Eigen::Vector3d& direction_in_world, const Eigen::Vector3d& direction_in_cam, double stddev)
@@ -51,5 +47,3 @@ class DirectionCost final : public ceres::CostFunction {
 };
 
 }  // namespace rangesfm
-
-#endif  // RANGESFM_DIRECTION_COST_H_

@@ -1,5 +1,4 @@
-#ifndef RANGESFM_DISTANCE_COST_H_
-#define RANGESFM_DISTANCE_COST_H_
+#pragma once
 
 #include <ceres/cost_function.h>
 
@@ -49,12 +48,8 @@ class CamEnd {
   Eigen::Vector3d end_in_cam_;
 };
 
-// 1-DoF error of a distance that was measured, by tape or by radio, in stddevs:
-//
-//   (|| a - b || + bias - distance) / stddev,
-//
-// made robust. Blocks: those of the two ends (rig_from_world, 7: qx qy qz qw tx ty tz; or a point in the world, 3), and
-// the bias (1: what is read too long) if it has one. Metres throughout.
+// 1-DoF error of a distance that was measured, by tape or by radio, in stddevs, made robust: formula and blocks are in
+// the docstring of distance_cost (src/bindings.cc). Metres throughout.
 template <typename EndA, typename EndB>
 class DistanceCost final : public ceres::CostFunction {
  public:
@@ -103,5 +98,3 @@ class DistanceCost final : public ceres::CostFunction {
 };
 
 }  // namespace rangesfm
-
-#endif  // RANGESFM_DISTANCE_COST_H_

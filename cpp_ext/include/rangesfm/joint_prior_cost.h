@@ -1,5 +1,4 @@
-#ifndef RANGESFM_JOINT_PRIOR_COST_H_
-#define RANGESFM_JOINT_PRIOR_COST_H_
+#pragma once
 
 #include <ceres/cost_function.h>
 
@@ -8,9 +7,7 @@
 
 namespace rangesfm {
 
-// n-DoF error of what was known beforehand of n numbers that are not independent, whitening (x - mean), with
-// whitening^T whitening the inverse of their covariance.
-// Blocks: each number for itself (the range biases of anchors, which share the tag's).
+// n-DoF error of what was known beforehand of n numbers that are not independent: joint_prior_cost in src/bindings.cc.
 class JointPriorCost final : public ceres::CostFunction {
  public:
   JointPriorCost(Eigen::VectorXd mean, Eigen::MatrixXd whitening)
@@ -40,5 +37,3 @@ class JointPriorCost final : public ceres::CostFunction {
 };
 
 }  // namespace rangesfm
-
-#endif  // RANGESFM_JOINT_PRIOR_COST_H_

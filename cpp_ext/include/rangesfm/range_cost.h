@@ -1,5 +1,4 @@
-#ifndef RANGESFM_RANGE_COST_H_
-#define RANGESFM_RANGE_COST_H_
+#pragma once
 
 #include <ceres/cost_function.h>
 
@@ -29,15 +28,9 @@ struct RangeModel {
   RobustLoss loss;
 };
 
-// n-DoF error of the ranges between the tag at one place and one anchor, in stddevs; for each of them
-//
-//   (d + bias + amplitude exp(-d / short_range_length) - range) / stddev,  d = || tag_in_world - anchor_in_world ||,
-//
-// made robust one by one, times the root of its share. Metres and seconds throughout. Needs the model to be metric
-// already, or close to it.
-//
-// Blocks: those of the place's poses (7 each: qx qy qz qw tx ty tz), anchor_in_world (3), range bias (1: what the radio
-// reads too long), and, as far as the model has them, in this order: tag_in_cam (3), time shift (1), amplitude (1).
+// n-DoF error of the ranges between the tag at one place and one anchor, in stddevs, made robust one by one, times the
+// root of its share. The formula, its blocks and their order are in the docstring of range_cost (src/bindings.cc).
+// Metres and seconds throughout. Needs the model to be metric already, or close to it.
 template <typename Place>
 class RangeCost final : public ceres::CostFunction {
  public:
@@ -146,5 +139,3 @@ class RangeCost final : public ceres::CostFunction {
 };
 
 }  // namespace rangesfm
-
-#endif  // RANGESFM_RANGE_COST_H_

@@ -1,8 +1,7 @@
 // What ranges and distances share: where a point of a camera is, how far from another, and how both move with the
 // parameters.
 
-#ifndef RANGESFM_RANGE_GEOMETRY_H_
-#define RANGESFM_RANGE_GEOMETRY_H_
+#pragma once
 
 #include <Eigen/Core>
 #include <Eigen/Geometry>
@@ -81,5 +80,3 @@ class AnchorToTag {
 };
 
 }  // namespace rangesfm
-
-#endif  // RANGESFM_RANGE_GEOMETRY_H_

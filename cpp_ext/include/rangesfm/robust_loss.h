@@ -1,5 +1,4 @@
-#ifndef RANGESFM_ROBUST_LOSS_H_
-#define RANGESFM_ROBUST_LOSS_H_
+#pragma once
 
 #include <cmath>
 
@@ -47,5 +46,3 @@ class RobustLoss {
 };
 
 }  // namespace rangesfm
-
-#endif  // RANGESFM_ROBUST_LOSS_H_

@@ -4,8 +4,7 @@
 // where the tag is for each of them at the present parameters and how that moves with them. Each gradient is the
 // derivative of direction . tag_in_world.
 
-#ifndef RANGESFM_TAG_PLACE_H_
-#define RANGESFM_TAG_PLACE_H_
+#pragma once
 
 #include <Eigen/Core>
 #include <utility>
@@ -99,5 +98,3 @@ class InterpolatedPlace {
 };
 
 }  // namespace rangesfm
-
-#endif  // RANGESFM_TAG_PLACE_H_

@@ -8,8 +8,7 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
-from rangesfm.batch.course import Course, SurveyState
-from rangesfm.batch.rows import Status
+from rangesfm.batch.course import Course, Status, SurveyState
 from rangesfm.report import page
 from rangesfm.report.tables import Table
 from rangesfm.report.text import count, decimals_for, duration, fixed, plain

@@ -13,20 +13,45 @@ from typing import Any
 
 from distributed import Client, Future, KilledWorker, wait
 
-from rangesfm.batch.cluster import local_workers, num_at_once, this_machine, workers_of
-from rangesfm.batch.course import BatchListener, Course
-from rangesfm.batch.jobs import Job
-from rangesfm.batch.on_worker import KilledError, SurveyTask, run_on_worker, stop_batch
-from rangesfm.batch.results import write_results
-from rangesfm.batch.rows import Figures
-from rangesfm.batch.shares import BatchOptions, Share, share_this_machine
-from rangesfm.files.sole_writer import sole_writer
+from rangesfm.batch.course import BatchListener, Course, Figures, Status, SurveyRow
+from rangesfm.batch.jobs import BatchOptions, Job, Share, share_this_machine
+from rangesfm.batch.page import render
+from rangesfm.batch.workers import (
+    KilledError,
+    SurveyTask,
+    local_workers,
+    num_at_once,
+    run_on_worker,
+    stop_batch,
+    this_machine,
+    workers_of,
+)
+from rangesfm.ceres.doctor import versions
+from rangesfm.errors import FAILED, Failure
+from rangesfm.files.atomic import sole_writer, write_text
+from rangesfm.files.records import write_json
+from rangesfm.files.tables import write_table
 from rangesfm.vision.submaps import Submap
 
 _POLL_INTERVAL_S = 0.2
 _NUM_RETRIES = 2  # of a survey whose process was killed; Dask itself counts the workers that were
 _MAX_STOP_S = 30.0  # more than a worker gives a survey
-_FAILED = 4
+TABLE_NAME, JSON_NAME, PAGE_NAME = "batch.csv", "batch.json", "batch.html"
+
+
+def write_results(course: Course, folder: Path) -> None:
+    """Write ``batch.csv``, ``batch.json`` and ``batch.html``; while the batch runs the page loads itself anew."""
+    rows = course.rows
+    cells = [["" if value is None else str(value) for value in row.cells().values()] for row in rows]
+    write_table(folder / TABLE_NAME, list(SurveyRow("").cells()), cells)
+    summary = {
+        **{f"num_{status.value}": course.num(status) for status in Status},
+        "seconds": course.seconds,
+        "versions": versions(),
+        "surveys": [row.cells() for row in rows],
+    }
+    write_json(summary, folder / JSON_NAME)
+    write_text(render(course, folder), folder / PAGE_NAME)
 
 
 def run_batch(jobs: Sequence[Job], options: BatchOptions, output_path: Path, listener: BatchListener) -> Course:
@@ -130,7 +155,7 @@ class _Crew:
         """Take in what has come, or wait a moment for it, and pass it on."""
         items = _all_of(self._inbox)
         if self._client.status != "running":
-            self._course.all_failed("the connection to the scheduler was lost", _FAILED)
+            self._course.all_failed("the connection to the scheduler was lost")
             return
         if items:
             self._course.num_at_once = max(1, sum(self._client.nthreads().values()))
@@ -148,22 +173,15 @@ class _Crew:
         task = self._task_of[future]
         if self._course.rows[task.index].status.is_final:  # another of its submaps has failed
             return
-        if future.cancelled():  # as it is where the scheduler has ended
-            self._fail(task, "the scheduler gave it up", _FAILED)
-            return
-        error = future.exception(timeout=_MAX_STOP_S)
-        if error is not None:
-            self._fail(task, _reason(error), _FAILED)
-            return
-        ending = future.result(timeout=_MAX_STOP_S)
-        if "failed" in ending:
-            self._fail(task, ending["failed"]["message"], ending["failed"]["exit_status"])
+        ending = _ending(future)
+        if isinstance(ending, Failure):
+            self._fail(task, ending)
         elif task.only_prepare:
-            self._begin_submaps(task, ending["done"]["submaps"])
+            self._begin_submaps(task, ending)
         elif task.submap is not None:
             self._end_submap(task)
         else:
-            self._course.done(task.index, Figures(**ending["done"]["figures"]), ending["done"]["reason"])
+            self._course.done(task.index, Figures(**ending["figures"]), ending["reason"])
 
     def _begin_submaps(self, task: SurveyTask, submaps: Sequence[Submap]) -> None:
         self._num_submaps[task.index] = self._num_left[task.index] = len(submaps)
@@ -184,10 +202,9 @@ class _Crew:
         self._course.tell(index, {"stage": "submaps"})
         self._course.tell(index, {"num_done": num_total - self._num_left[index], "num_total": num_total})
 
-    def _fail(self, task: SurveyTask, reason: str, exit_status: int) -> None:
-        if task.submap is not None:
-            reason = f"submap {task.submap.folder.name}: {reason}"
-        self._course.failed(task.index, reason, exit_status)
+    def _fail(self, task: SurveyTask, failure: Failure) -> None:
+        where = "" if task.submap is None else f"submap {task.submap.folder.name}: "
+        self._course.failed(task.index, where + failure.message, failure.exit_status)
         others = [future for future, other in self._task_of.items() if other.index == task.index and not future.done()]
         self._client.cancel(others)
 
@@ -220,9 +237,15 @@ def _all_of(inbox: queue.SimpleQueue[Any]) -> list[Any]:
         wait_s = 0.0
 
 
-def _reason(error: BaseException) -> str:
+def _ending(future: Future) -> Any:
+    """What ``run_on_worker`` returned, or why it did not."""
+    if future.cancelled():  # as it is where the scheduler has ended
+        return Failure("the scheduler gave it up", FAILED)
+    error = future.exception(timeout=_MAX_STOP_S)
+    if error is None:
+        return future.result(timeout=_MAX_STOP_S)
     if isinstance(error, KilledWorker):
-        return "the worker that had it was lost, and so were those that tried it again"
+        return Failure("the worker that had it was lost, and so were those that tried it again", FAILED)
     if isinstance(error, KilledError):
-        return f"{error}; so it was each time it was tried"
-    return " ".join(f"its worker failed: {type(error).__name__}: {error}".split())
+        return Failure(f"{error}; so it was each time it was tried", FAILED)
+    return Failure(" ".join(f"its worker failed: {type(error).__name__}: {error}".split()), FAILED)

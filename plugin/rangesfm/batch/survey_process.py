@@ -13,14 +13,14 @@ import sys
 from dataclasses import asdict
 from typing import Any
 
-from rangesfm.processes.child import MessagesToParent, work_for_parent
+from rangesfm.processes.supervision import MessagesToParent, work_for_parent
 from rangesfm.survey.settings import Survey
 
 
 def _run(given: tuple[Survey, bool, bool], worker: MessagesToParent) -> dict[str, Any]:
     survey, restart, only_prepare = given
     sys.argv = ["rangesfm", "batch", str(survey.source.path)]  # by which others know who writes to its folder
-    from rangesfm.batch.rows import figures_of
+    from rangesfm.batch.course import figures_of
     from rangesfm.workflows.run import prepare_survey, run_survey
 
     if only_prepare:

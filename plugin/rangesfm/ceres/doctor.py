@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from rangesfm.ceres import check_compatibility, compiled_part_version, pyceres_ceres_version
 from rangesfm.errors import SolverError
-from rangesfm.installed_versions import INSTALL_COMMAND, NEEDED_VERSIONS, installed_version
+from rangesfm.installed_versions import INSTALL_COMMAND, NEEDED_VERSIONS, installed_version, needed_packages
 
 MIN_PYTHON = (3, 10)
 MAX_PYTHON = (3, 13)
@@ -37,10 +37,9 @@ class Check:
 def diagnose() -> list[Check]:
     """Look at everything a run depends on. Nothing is raised or printed: what fails is in the list."""
     checks = [_check_python(), _check_package("rangesfm", "", "python -m pip install rangesfm")]
-    checks += [_check_package(package, needed, INSTALL_COMMAND) for package, needed in NEEDED_VERSIONS.items()]
-    checks += [
-        _check_package(package, "", f"python -m pip install {package}") for package in ("numpy", "scipy", "Pillow")
-    ]
+    for package in needed_packages():
+        command = INSTALL_COMMAND if package in NEEDED_VERSIONS else f"python -m pip install {package}"
+        checks.append(_check_package(package, NEEDED_VERSIONS.get(package, ""), command))
     checks.append(_check_compiled_part())
     # The rest asks pycolmap and pyceres themselves.
     if all(check.ok for check in checks):
@@ -50,10 +49,9 @@ def diagnose() -> list[Check]:
 
 def versions() -> dict[str, str]:
     """Versions that a result depends on, for the record; "not installed" where one is missing."""
-    packages = ("rangesfm", *NEEDED_VERSIONS, "numpy", "scipy", "Pillow")
     return {
         "python": platform.python_version(),
-        **{package: installed_version(package) or "not installed" for package in packages},
+        **{package: installed_version(package) or "not installed" for package in ("rangesfm", *needed_packages())},
         "compiled_part": compiled_part_version(),
         "platform": platform.platform(),
     }

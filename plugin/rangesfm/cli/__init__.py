@@ -10,8 +10,7 @@ from collections.abc import Sequence
 
 from rangesfm.cli.arguments import Outcome, normalize, parse
 from rangesfm.cli.terminal import terminal_progress
-from rangesfm.errors import one_line
-from rangesfm.failures import INTERNAL_ERROR, failure_of
+from rangesfm.errors import INTERNAL_ERROR, failure_of, one_line
 
 _BROKEN_PIPE = 141  # as shells have it
 

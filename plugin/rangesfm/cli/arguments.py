@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import inspect
+import itertools
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,22 +15,14 @@ from typing import Any, NoReturn
 from rangesfm.errors import InputError
 from rangesfm.progress import Progress
 
-COMMANDS = (
-    "run",
-    "batch",
-    "demo",
-    "reconstruct",
-    "scale",
-    "refine",
-    "join",
-    "export",
-    "compare",
-    "report",
-    "ranges",
-    "ranges calibrate",
-    "trilaterate",
-    "doctor",
-)
+_COMMANDS_OF = {
+    "stages": ("run", "demo", "reconstruct", "scale", "refine", "join"),
+    "batch": ("batch",),
+    "results": ("export", "compare", "report"),
+    "ranges": ("ranges", "ranges calibrate", "trilaterate"),
+    "doctor": ("doctor",),
+}
+COMMANDS = tuple(itertools.chain.from_iterable(_COMMANDS_OF.values()))
 
 
 @dataclass(frozen=True)
@@ -73,13 +67,14 @@ class Commands:
         self._subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=Parser)
         self.by_name: dict[str, Parser] = {}
 
-    def add(self, name: str, execute: Execute, *, help: str, description: str, example: str) -> Parser:
-        """A new command, with the options that all of them have."""
+    def add(self, name: str, execute: Execute, help: str) -> Parser:
+        """A new command, with the options that all of them have. What it does, and an example, says its docstring."""
+        description, _, example = inspect.cleandoc(execute.__doc__ or "").partition("\n\nexample:")
         parser: Parser = self._subparsers.add_parser(
             name,
             help=help,
             description=description,
-            epilog=f"example:\n  {example}",
+            epilog=f"example:{example}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
@@ -124,8 +119,8 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     )
     parser.add_argument("--version", action=_PrintVersion)
     commands = Commands(parser)
-    for name in COMMANDS:
-        import_module(f"rangesfm.cli.{name.replace(' ', '_')}").add_command(commands)
+    for module in _COMMANDS_OF:
+        import_module(f"rangesfm.cli.{module}").add_commands(commands)
     args: argparse.Namespace
     args, unknown = parser.parse_known_args(_two_words_in_one(argv))
     if not hasattr(args, "command"):

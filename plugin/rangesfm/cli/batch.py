@@ -1,4 +1,4 @@
-"""``rangesfm batch``: many surveys, on the cores of this machine or on a cluster."""
+"""``rangesfm batch``: many surveys, on the cores of this machine or on a cluster, and what is seen of them."""
 
 from __future__ import annotations
 
@@ -6,45 +6,30 @@ import argparse
 import io
 import re
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, TextIO
 
 from rangesfm.cli.arguments import Commands, Outcome
-from rangesfm.cli.batch_progress import BatchTerminal
-from rangesfm.cli.survey_flags import (
-    add_flags,
-    add_restart_argument,
-    overrides_from_arguments,
-)
+from rangesfm.cli.survey_flags import add_flags, add_restart_argument, overrides_from_arguments
+from rangesfm.cli.terminal import Screen, counts, duration
 from rangesfm.errors import InputError
 from rangesfm.progress import Progress
+
+if TYPE_CHECKING:
+    from rangesfm.batch.course import Course, SurveyState
+
 
 # Each survey has its own photos and output; threads are what the workers share.
 _OF_A_SURVEY = ("images.path", "images.times", "mapper.num_threads", "output.path")
 _BYTES_PER_UNIT = {"mb": 10**6, "gb": 10**9, "mib": 1 << 20, "gib": 1 << 30}
+_INTERVAL_S = 0.2
+_MAX_NUM_LINES = 20
 
 
-def add_command(commands: Commands) -> None:
-    parser = commands.add(
-        "batch",
-        execute,
-        help="many surveys at once, on this machine or on a cluster",
-        description=(
-            "Run many surveys, each as rangesfm run would. One that fails does not stop the others. What became of\n"
-            "each is in batch.csv, batch.json and batch.html. Needs pip install 'rangesfm[batch]'.\n\n"
-            "Without --scheduler the workers are processes of this machine, which share its cores and memory. With\n"
-            "it they are those of a Dask scheduler; they must have this version of rangesfm installed and see the\n"
-            "surveys' files under the same paths. Each should do one survey at a time:\n"
-            "  dask scheduler --host HEAD\n"
-            "  dask worker tcp://HEAD:8786 --nthreads 1 --no-dashboard       # on each machine\n"
-            "On Slurm, PBS and the like dask-jobqueue starts them, on Kubernetes dask-kubernetes: see the README.\n\n"
-            "Exit status: 0 all done; otherwise the largest of the statuses that rangesfm run would have had."
-        ),
-        example=(
-            "rangesfm batch surveys/*.toml --output_path batch\n"
-            "  rangesfm batch surveys/*.toml --num_workers 2 --num_threads 4 --memory_limit 8GB\n"
-            "  rangesfm batch surveys/*.toml --scheduler tcp://head:8786 --num_threads 8"
-        ),
-    )
+def add_commands(commands: Commands) -> None:
+    parser = commands.add("batch", execute, "many surveys at once, on this machine or on a cluster")
     parser.add_argument(
         "surveys", nargs="+", metavar="SURVEY.toml", help="survey files, each with its own [output] path"
     )
@@ -64,14 +49,29 @@ def add_command(commands: Commands) -> None:
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """Run many surveys, each as rangesfm run would. One that fails does not stop the others. What became of
+    each is in batch.csv, batch.json and batch.html. Needs pip install 'rangesfm[batch]'.
+
+    Without --scheduler the workers are processes of this machine, which share its cores and memory. With
+    it they are those of a Dask scheduler; they must have this version of rangesfm installed and see the
+    surveys' files under the same paths. Each should do one survey at a time:
+      dask scheduler --host HEAD
+      dask worker tcp://HEAD:8786 --nthreads 1 --no-dashboard       # on each machine
+    On Slurm, PBS and the like dask-jobqueue starts them, on Kubernetes dask-kubernetes: see the README.
+
+    Exit status: 0 all done; otherwise the largest of the statuses that rangesfm run would have had.
+
+    example:
+      rangesfm batch surveys/*.toml --output_path batch
+      rangesfm batch surveys/*.toml --num_workers 2 --num_threads 4 --memory_limit 8GB
+      rangesfm batch surveys/*.toml --scheduler tcp://head:8786 --num_threads 8
+    """
     if args.scheduler is not None and args.num_workers is not None:
         raise InputError("--num_workers is of this machine: with --scheduler, those that run there count")
     _require_dask()
-    from rangesfm.batch.jobs import read_jobs
-    from rangesfm.batch.results import PAGE_NAME, TABLE_NAME
-    from rangesfm.batch.rows import exit_status_of, format_rows
-    from rangesfm.batch.run import run_batch
-    from rangesfm.batch.shares import BatchOptions
+    from rangesfm.batch.course import exit_status_of, format_rows
+    from rangesfm.batch.jobs import BatchOptions, read_jobs
+    from rangesfm.batch.run import PAGE_NAME, TABLE_NAME, run_batch
 
     output_path = Path(args.output_path)
     jobs = read_jobs(args.surveys, overrides_from_arguments(args), output_path)
@@ -106,3 +106,75 @@ def _bytes(text: str) -> int:
     if found is None or float(found[1]) == 0:
         raise argparse.ArgumentTypeError(f"'{text}' is no size, expected one as 8GB or 500MB")
     return int(float(found[1]) * _BYTES_PER_UNIT[found[2].lower()])
+
+
+class BatchTerminal:
+    """Writes the course of a batch to ``stream``."""
+
+    def __init__(self, stream: TextIO, *, quiet: bool = False, clock: Callable[[], float] = time.monotonic):
+        self._screen = Screen(stream, quiet=quiet)
+        self._clock = clock
+        self._last_drawn: float | None = None
+        self._told: dict[int, str] = {}
+        self._num_over = 0
+
+    def show(self, course: Course) -> None:
+        """Say what is new, and on a terminal draw again what is going on."""
+        new = self._news(course)
+        now = self._clock()
+        if new or course.is_over:
+            self._screen.say(new)
+        if not course.is_over and (new or self._last_drawn is None or now - self._last_drawn >= _INTERVAL_S):
+            self._last_drawn = now
+            self._screen.draw(_going_on(course))
+
+    def message(self, text: str) -> None:
+        self._screen.say([text])
+
+    def _news(self, course: Course) -> list[str]:
+        """Lines on the surveys of which there is something to say that has not been said."""
+        lines = []
+        for index, state in enumerate(course.states):
+            line = _ended(state) if state.row.status.is_final else "" if self._screen.is_terminal else _stage(state)
+            if line and self._told.get(index) != line:
+                self._told[index] = line
+                lines.append(line)
+        num_over = sum(row.status.is_final for row in course.rows)
+        if num_over > self._num_over and not self._screen.is_terminal:
+            lines.append(_summary(course))
+        self._num_over = num_over
+        return lines
+
+
+def _going_on(course: Course) -> list[str]:
+    running = [state for state in course.states if state.began_s is not None]
+    lines = [f"  {_stage(state)}{_counted(state)}, {duration(course.seconds_running(state))}" for state in running]
+    return [*lines[:_MAX_NUM_LINES], _summary(course)]
+
+
+def _stage(state: SurveyState) -> str:
+    if state.began_s is None:
+        return ""
+    again = f" again, attempt {state.row.num_attempts}" if state.row.num_attempts > 1 else ""
+    return f"{state.row.survey}: {state.stage or 'begins' + again}"
+
+
+def _counted(state: SurveyState) -> str:
+    return "" if state.num_done is None else f" {counts(state.num_done, state.num_total)}"
+
+
+def _ended(state: SurveyState) -> str:
+    row = state.row
+    seconds = "" if row.seconds is None else f" after {duration(row.seconds)}"
+    what = f"{row.figures.verdict or row.status.value}" if row.exit_status == 0 else row.status.value
+    reason = f": {row.reason}" if row.reason and row.reason != what else ""
+    return f"{row.survey}: {what}{seconds}{reason}"
+
+
+def _summary(course: Course) -> str:
+    num_over = sum(row.status.is_final for row in course.rows)
+    num_failed = sum(bool(row.exit_status) for row in course.rows)
+    failed = f", {num_failed} of them failed" if num_failed else ""
+    left = course.seconds_left()
+    time_left = "" if left is None or course.is_over else f", {duration(left)} left"
+    return f"{num_over} of {len(course.rows)} surveys over{failed}, {duration(course.seconds)}{time_left}"

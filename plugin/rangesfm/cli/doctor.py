@@ -6,22 +6,21 @@ import argparse
 
 from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.errors import SolverError
-from rangesfm.files.text_table import align_rows
 from rangesfm.progress import Progress
 
 
-def add_command(commands: Commands) -> None:
-    commands.add(
-        "doctor",
-        execute,
-        help="versions, and whether the compiled part fits them",
-        description="Check versions, threads, and that the compiled part shares its types with pycolmap and pyceres.",
-        example="rangesfm doctor",
-    )
+def add_commands(commands: Commands) -> None:
+    commands.add("doctor", execute, "versions, and whether the compiled part fits them")
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """Check versions, threads, and that the compiled part shares its types with pycolmap and pyceres.
+
+    example:
+      rangesfm doctor
+    """
     from rangesfm.ceres.doctor import diagnose
+    from rangesfm.files.tables import align_rows
 
     checks = diagnose()
     rows = []

@@ -1,53 +1,176 @@
-"""``rangesfm ranges``: what is in a radio log, and the log as canonical CSV."""
+"""The commands about a radio's log alone: ``ranges``, ``ranges calibrate`` and ``trilaterate``."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rangesfm.cli.arguments import Commands, Outcome
-from rangesfm.cli.log_arguments import add_log_arguments, read_log
-from rangesfm.files.text_table import align_rows
+from rangesfm.cli.arguments import Commands, Outcome, Parser
+from rangesfm.cli.survey_flags import add_flags, position, survey_from_arguments
+from rangesfm.errors import GeometryError, InputError
 from rangesfm.progress import Progress
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
+    from rangesfm.arrays import Array
     from rangesfm.ranging.anchors.anchor import Anchor
+    from rangesfm.ranging.anchors.anchor_survey import AnchorPlacement
+    from rangesfm.ranging.errors.calibration import Calibration
+    from rangesfm.ranging.log import RangeLog
     from rangesfm.ranging.summary import AnchorSummary, PairSummary, RangeSummary
 
+_LOG_KEYS = (
+    *("ranges.format", "ranges.columns", "ranges.timestamp_unit", "ranges.range_unit", "ranges.separator"),
+    *("ranges.ranging_interval_s", "ranges.stamp_unit", "ranges.stamp_bits", "ranges.propagation_speed"),
+    "ranges.t_off_s",
+)
 _LENGTHS = ("number", "min m", "median m", "max m")
+_TOWARD = {
+    "above": (0.0, 0.0, 1.0),
+    "below": (0.0, 0.0, -1.0),
+    "x+": (1.0, 0.0, 0.0),
+    "x-": (-1.0, 0.0, 0.0),
+    "y+": (0.0, 1.0, 0.0),
+    "y-": (0.0, -1.0, 0.0),
+    "z+": (0.0, 0.0, 1.0),
+    "z-": (0.0, 0.0, -1.0),
+}
 
 
-def add_command(commands: Commands) -> None:
-    parser = commands.add(
-        "ranges",
-        execute,
-        help="what is in a radio log; writes it as canonical CSV",
-        description=(
-            "Print what is in a radio log, and write it as canonical CSV. The noise is how far ranges are off a "
-            "smooth curve through their neighbours."
-        ),
-        example=(
-            "rangesfm ranges log.csv --columns timestamp=t,anchor_id=node,range=d --timestamp_unit ms \\\n"
-            "    --output_path ranges.csv"
-        ),
+def add_commands(commands: Commands) -> None:
+    ranges = commands.add("ranges", _ranges, "what is in a radio log; writes it as canonical CSV")
+    _add_log_arguments(ranges)
+    ranges.add_argument("--anchors", metavar="CSV", help="who is an anchor, to tell ranges between two of them")
+    ranges.add_argument("--output_path", metavar="CSV", help="write the ranges there")
+    ranges.add_argument("--plot", metavar="FILE", help="draw the ranges over time there (PNG or SVG)")
+    calibrate = commands.add(
+        "ranges calibrate", _calibrate, "the error curve of a radio, from a log with known tag positions"
     )
-    add_log_arguments(parser)
-    parser.add_argument("--anchors", metavar="CSV", help="who is an anchor, to tell ranges between two of them")
-    parser.add_argument("--output_path", metavar="CSV", help="write the ranges there")
-    parser.add_argument("--plot", metavar="FILE", help="draw the ranges over time there (PNG or SVG)")
+    _add_log_arguments(calibrate)
+    calibrate.add_argument("--anchors", required=True, metavar="CSV", help="anchor_id,x_m,y_m,z_m: surveyed")
+    _add_position_arguments(calibrate, max_interpolation_gap_s=0.2)
+    calibrate.add_argument("--output_path", required=True, metavar="CSV", help="write the curve there")
+    calibrate.add_argument("--plot", metavar="FILE", help="draw the curve and the ranges' errors there (PNG or SVG)")
+    trilaterate = commands.add("trilaterate", _trilaterate, "anchor positions from ranges at known tag positions")
+    _add_log_arguments(trilaterate)
+    _add_position_arguments(trilaterate, max_interpolation_gap_s=0.5)
+    _add_estimate_arguments(trilaterate)
+    trilaterate.add_argument(
+        "--output_path", metavar="CSV", help="write the anchors there, for --anchors of other commands"
+    )
 
 
-def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
+def _add_log_arguments(parser: Parser) -> None:
+    """The log and how it is written."""
+    parser.add_argument("log", metavar="LOG", help="the radio's log")
+    add_flags(parser, *_LOG_KEYS, by_own_names=True)
+
+
+def _add_position_arguments(parser: Parser, *, max_interpolation_gap_s: float) -> None:
+    """The file of known positions of the tag and how it belongs to the log."""
+    parser.add_argument(
+        "--positions",
+        required=True,
+        metavar="FILE",
+        help="where the tag was, in the anchors' frame: CSV timestamp_s (or image_name, with ranges by name),"
+        "x_m,y_m,z_m[,qx,qy,qz,qw], or a TUM trajectory",
+    )
+    parser.add_argument(
+        "--tag_in_cam",
+        type=position,
+        default=(0.0, 0.0, 0.0),
+        metavar="X,Y,Z",
+        help="the antenna in the frame whose poses are given, metres (default: they are the antenna's)",
+    )
+    parser.add_argument("--tag_id", metavar="ID", help="the tag whose positions these are, if the log has several")
+    parser.add_argument(
+        "--time_offset", type=float, default=0.0, metavar="SECONDS", help="time of positions minus time of ranges"
+    )
+    parser.add_argument(
+        "--max_interpolation_gap_s",
+        type=float,
+        default=max_interpolation_gap_s,
+        metavar="S",
+        help=f"between known positions further apart none is interpolated (default: {max_interpolation_gap_s:g})",
+    )
+
+
+def _add_estimate_arguments(parser: Parser) -> None:
+    parser.add_argument(
+        "--side",
+        type=_side,
+        default={},
+        metavar="WORD|ID=WORD,..",
+        help=f"of two possible places the one that lies {', '.join(_TOWARD)}; for all anchors or for each",
+    )
+    add = parser.add_argument_group("estimate").add_argument
+    add("--range_stddev_m", type=_positive, metavar="M", help="noise of a range (default: estimated)")
+    add("--range_bias_m", type=float, default=0.0, metavar="M", help="what ranges read too long")
+    uncertain = "how uncertain that is; 0 fixes it (default: 0.1)"
+    add("--range_bias_stddev_m", type=_not_negative, default=0.1, metavar="M", help=uncertain)
+    refused = "an anchor less certain than this in any direction is refused (default: 1)"
+    add("--max_position_stddev_m", type=_positive, default=1.0, metavar="M", help=refused)
+
+
+def _side(text: str) -> dict[str, str]:
+    """Words by anchor; by the empty id the word for all others."""
+    pairs = [part.strip().rpartition("=") for part in text.split(",")]
+    for _, _, word in pairs:
+        if word not in _TOWARD:
+            raise argparse.ArgumentTypeError(f"'{word}' is no side, expected one of {', '.join(_TOWARD)}")
+    return {anchor_id: word for anchor_id, _, word in pairs}
+
+
+def _positive(text: str) -> float:
+    if not (value := _not_negative(text)) > 0:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a length in metres, expected more than 0")
+    return value
+
+
+def _not_negative(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a length in metres, expected 0 or more")
+    return value
+
+
+def _read_log(args: argparse.Namespace, anchor_ids: Sequence[str] = ()) -> RangeLog:
+    """The log that the arguments name; ``anchor_ids`` as for ``read_ranges``."""
+    from rangesfm.survey.inputs import read_log
+
+    return read_log(survey_from_arguments(args).ranges.changed(path=Path(args.log)), anchor_ids)
+
+
+def _read_placed_log(args: argparse.Namespace) -> tuple[RangeLog, Array]:
+    """The log, of one tag, and (n, 3) where that was at each of the ranges; NaN: not known."""
+    from rangesfm.geometry.reference import read_reference
+    from rangesfm.ranging.tag_positions import tag_positions
+    from rangesfm.survey.inputs import of_one_tag
+
+    log, known = of_one_tag(_read_log(args), args.tag_id), read_reference(args.positions)
+    offset_s, max_gap_s = args.time_offset, args.max_interpolation_gap_s
+    return log, tag_positions(log, known, args.tag_in_cam, time_offset_s=offset_s, max_gap_s=max_gap_s)
+
+
+def _ranges(args: argparse.Namespace, progress: Progress) -> Outcome:
+    r"""Print what is in a radio log, and write it as canonical CSV. The noise is how far ranges are off a smooth curve
+    through their neighbours.
+
+    example:
+      rangesfm ranges log.csv --columns timestamp=t,anchor_id=node,range=d --timestamp_unit ms \
+        --output_path ranges.csv
+    """
     from rangesfm.ranging.anchors.anchor_file import read_anchors
     from rangesfm.ranging.readers import read_anchors_in_log, write_ranges_csv
     from rangesfm.ranging.summary import summarize_ranges
 
     anchors = read_anchors(args.anchors) if args.anchors is not None else ()
-    log = read_log(args, [anchor.anchor_id for anchor in anchors])
-    lines = [*_lines(summarize_ranges(log)), *_anchors(read_anchors_in_log(args.log, format=log.format))]
+    log = _read_log(args, [anchor.anchor_id for anchor in anchors])
+    lines = [*_summary(summarize_ranges(log)), *_places(read_anchors_in_log(args.log, format=log.format))]
     if args.output_path is not None:
         write_ranges_csv(log, args.output_path)
         lines += ["", f"written to {args.output_path}"]
@@ -60,20 +183,9 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     return Outcome(lines)
 
 
-def _lines(summary: RangeSummary) -> list[str]:
-    return [
-        f"format  {summary.format}",
-        f"ranges  {summary.num}, and {summary.num_no_measurement} records without a measurement",
-        f"tags    {', '.join(summary.tag_ids)}",
-        f"time    {_time(summary)}",
-        *(f"note    {note}" for note in _notes(summary)),
-        "",
-        _table(summary),
-        *_pairs(summary),
-    ]
+def _summary(summary: RangeSummary) -> list[str]:
+    from rangesfm.files.tables import align_rows
 
-
-def _notes(summary: RangeSummary) -> list[str]:
     step_m = summary.quantization_m
     notes = {
         f"{summary.num_duplicates} ranges stand in the log twice": summary.num_duplicates,
@@ -82,18 +194,29 @@ def _notes(summary: RangeSummary) -> list[str]:
         f"{summary.num_between_tags} ranges are between two tags": summary.num_between_tags,
         f"all ranges are multiples of {step_m} m: rounded": step_m,
     }
-    return [note for note, applies in notes.items() if applies]
-
-
-def _anchors(anchors: Sequence[Anchor]) -> list[str]:
-    known = [(anchor.anchor_id, anchor.position_m) for anchor in anchors if anchor.position_m is not None]
-    if not known:
-        return []
+    # The noise only where there are enough ranges to tell it.
+    has_noise = any(anchor.noise_stddev_m is not None for anchor in summary.anchors)
+    rows = [["anchor", *_LENGTHS, *(["noise m"] if has_noise else []), "largest gap s"]]
+    for anchor in summary.anchors:
+        noise = [_number(anchor.noise_stddev_m)] if has_noise else []
+        rows.append([anchor.anchor_id, *_lengths(anchor), *noise, _number(anchor.largest_gap_s)])
+    pairs = [[pair.kind, " - ".join(pair.ids), *_lengths(pair)] for pair in summary.pairs]
     return [
+        f"format  {summary.format}",
+        f"ranges  {summary.num}, and {summary.num_no_measurement} records without a measurement",
+        f"tags    {', '.join(summary.tag_ids)}",
+        f"time    {_time(summary)}",
+        *(f"note    {note}" for note, applies in notes.items() if applies),
         "",
-        "the log tells where anchors stand (x, y, z in metres):",
-        *(f"  {anchor_id}  " + "  ".join(f"{value:.3f}" for value in position) for anchor_id, position in known),
+        align_rows(rows),
+        *(["", align_rows([["between", "", *_LENGTHS], *pairs], num_left=2)] if pairs else []),
     ]
+
+
+def _places(anchors: Sequence[Anchor]) -> list[str]:
+    known = [(anchor.anchor_id, anchor.position_m) for anchor in anchors if anchor.position_m is not None]
+    rows = (f"  {anchor_id}  " + "  ".join(f"{value:.3f}" for value in place) for anchor_id, place in known)
+    return ["", "the log tells where anchors stand (x, y, z in metres):", *rows] if known else []
 
 
 def _time(summary: RangeSummary) -> str:
@@ -104,33 +227,118 @@ def _time(summary: RangeSummary) -> str:
     return span + rate + f", largest gap {_number(summary.largest_gap_s)} s"
 
 
-def _table(summary: RangeSummary) -> str:
-    """One row an anchor; the noise only where there are enough ranges to tell it."""
-    has_noise = any(anchor.noise_stddev_m is not None for anchor in summary.anchors)
-    header = ["anchor", *_LENGTHS, *(["noise m"] if has_noise else []), "largest gap s"]
-    rows = [
-        [
-            anchor.anchor_id,
-            *_lengths(anchor),
-            *([_number(anchor.noise_stddev_m)] if has_noise else []),
-            _number(anchor.largest_gap_s),
-        ]
-        for anchor in summary.anchors
-    ]
-    return align_rows([header, *rows])
-
-
-def _pairs(summary: RangeSummary) -> list[str]:
-    """One row for each two of a kind that ranged with each other."""
-    if not summary.pairs:
-        return []
-    rows = [[pair.kind, " - ".join(pair.ids), *_lengths(pair)] for pair in summary.pairs]
-    return ["", align_rows([["between", "", *_LENGTHS], *rows], num_left=2)]
-
-
 def _lengths(ranges: AnchorSummary | PairSummary) -> list[str]:
     return [str(ranges.num), *map(_number, (ranges.min_m, ranges.median_m, ranges.max_m))]
 
 
 def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
+
+
+def _calibrate(args: argparse.Namespace, progress: Progress) -> Outcome:
+    r"""Learn by how much a radio reads long or short at each distance, from a log whose tag positions are known (a
+    total station, motion capture) and surveyed anchors. Every command takes the file that this writes as
+    --error_curve, or as error_curve in [ranges].
+
+    example:
+      rangesfm ranges calibrate log.csv --anchors anchors.csv --positions truth.csv \
+        --output_path curve.csv
+    """
+    from rangesfm.ranging.anchors.anchor_file import read_anchors
+    from rangesfm.ranging.errors.calibration import calibrate_ranges
+    from rangesfm.ranging.errors.error_curve import write_error_curve
+
+    anchors = read_anchors(args.anchors)
+    log, tags_m = _read_placed_log(args)
+    calibration = calibrate_ranges(log, tags_m, anchors)
+    lines = [*_calibrated(calibration, len(log)), "", f"written to {args.output_path}"]
+    if args.plot is not None:
+        from rangesfm.report.pictures import write_picture
+        from rangesfm.report.range_plots import plot_error_curve
+
+        write_picture(plot_error_curve(calibration), Path(args.plot))
+        lines.append(f"drawn in {args.plot}")
+    write_error_curve(calibration.curve, Path(args.output_path))
+    return Outcome(lines)
+
+
+def _calibrated(calibration: Calibration, num_in_log: int) -> list[str]:
+    from rangesfm.files.tables import align_rows
+
+    curve, share = calibration.curve, f"{100 * calibration.outlier_share:.1f} % do not fit"
+    columns = (curve.distance_m, curve.error_m, curve.stddev_m, curve.noise_stddev_m)
+    rows = [
+        (f"{at:.2f}", f"{error:+.3f}", f"{stddev:.3f}", f"{noise:.3f}") for at, error, stddev, noise in zip(*columns)
+    ]
+    biases = ", ".join(f"{anchor_id} {bias:+.3f} m" for anchor_id, bias in calibration.anchor_bias_m.items())
+    return [
+        f"ranges  {calibration.num_ranges} of {num_in_log} have a known length, {share}",
+        f"noise   {calibration.noise_stddev_m:.3f} m about the curve",
+        "",
+        align_rows([("distance m", "error m", "stddev m", "noise m"), *rows], num_left=0),
+        "",
+        f"anchors beyond the curve: {biases}",
+    ]
+
+
+def _trilaterate(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """Find where anchors stand from ranges that were taken at known positions of the tag, robustly. If these lie in a
+    plane, an anchor has two possible places, one on each side: --side says which.
+
+    example:
+      rangesfm trilaterate uwb.csv --positions total_station.csv --side above --output_path anchors.csv
+      rangesfm run survey.toml --anchors anchors.csv --anchor_frame site
+    """
+    from rangesfm.ranging.anchors.anchor_file import write_anchors
+    from rangesfm.ranging.anchors.anchor_survey import trilaterate_anchors
+    from rangesfm.ranging.anchors.trilateration import TrilaterationOptions
+
+    log, tags_m = _read_placed_log(args)
+    options = TrilaterationOptions(
+        range_stddev_m=args.range_stddev_m,
+        range_bias_m=args.range_bias_m,
+        range_bias_stddev_m=args.range_bias_stddev_m,
+        max_position_stddev_m=args.max_position_stddev_m,
+    )
+    placements = trilaterate_anchors(log, tags_m, toward=_toward(args.side, log), options=options)
+    if all(placement.found is None for placement in placements):
+        raise GeometryError(f"anchor {placements[0].anchor_id}: {placements[0].why_not}")
+    lines = _placed(log, placements)
+    if args.output_path is not None:
+        write_anchors([placement.anchor for placement in placements], args.output_path)
+        lines += ["", f"written to {args.output_path}"]
+    return Outcome(lines)
+
+
+def _toward(side: dict[str, str], log: RangeLog) -> dict[str, Sequence[float]]:
+    for anchor_id in side:
+        if anchor_id and anchor_id not in log.anchor_ids:
+            raise InputError(f"--side: anchor '{anchor_id}' is not in the log ({', '.join(log.anchor_ids)})")
+    words = {anchor_id: side.get(anchor_id, side.get("")) for anchor_id in log.anchor_ids}
+    return {anchor_id: _TOWARD[word] for anchor_id, word in words.items() if word is not None}
+
+
+def _placed(log: RangeLog, placements: Sequence[AnchorPlacement]) -> list[str]:
+    from rangesfm.files.tables import align_rows
+
+    rows: list[Sequence[str]] = [("anchor", "ranges", "fit", "x m", "y m", "z m", "stddev m", "bias m", "noise m")]
+    notes = [""]
+    for placement in placements:
+        found, name = placement.found, (placement.anchor_id, str(placement.num_ranges))
+        if found is None:
+            rows.append((*name, *("",) * 7))
+            notes.append(f"  {placement.why_not}")
+            continue
+        share = f"{100 * (found.weights > 0.5).mean():.0f} %"
+        stddevs = (found.position_stddev_m, found.range_bias_m, found.noise_stddev_m)
+        rows.append((*name, share, *map(_number, (*found.position_m, *stddevs))))
+        notes.append("")
+        if found.mirror_position_m is not None:
+            rows.append(("", "", "or", *map(_number, found.mirror_position_m), "", "", ""))
+            notes.append("  (the tag's positions lie in a plane: say which by --side)")
+    num_known = sum(placement.num_ranges for placement in placements)
+    return [
+        f"{num_known} of {len(log)} ranges are at known positions of the tag",
+        "",
+        *(line + note for line, note in zip(align_rows(rows).split("\n"), notes, strict=True)),
+    ]

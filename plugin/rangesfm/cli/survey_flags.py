@@ -17,25 +17,22 @@ if TYPE_CHECKING:
     from rangesfm.option_model import Key
     from rangesfm.survey.settings import Survey
 
-LOG_KEYS = (
-    *("ranges.format", "ranges.columns", "ranges.timestamp_unit", "ranges.range_unit", "ranges.separator"),
-    *("ranges.ranging_interval_s", "ranges.stamp_unit", "ranges.stamp_bits", "ranges.propagation_speed"),
-    "ranges.t_off_s",
-)
-SCALE_KEYS = (
-    *("images.path", "images.times", "ranges", "anchors", "tag", "mapper.num_threads", "scale"),
-    *("export", "report", "output"),
-)
 _WORDS = {"m": "METRES", "s": "SECONDS"}
 
 
-def add_survey_arguments(parser: Parser, *keys: str) -> None:
-    """The survey file, and flags for its keys, as ``add_flags`` has them."""
+def add_survey_arguments(parser: Parser, *keys: str, has_model: bool = False) -> None:
+    """The survey file, perhaps an existing model, and flags for the file's keys, as ``add_flags`` has them."""
     parser.add_argument("survey", nargs="?", metavar="SURVEY.toml", help="survey file; flags override its keys")
     parser.add_argument(
         "--base_path", metavar="FOLDER", help="what the file's paths are relative to (default: its folder)"
     )
+    if has_model:
+        parser.add_argument("--input_path", metavar="MODEL", help="existing COLMAP model, as sparse/0")
     add_flags(parser, *keys)
+
+
+def add_restart_argument(parser: Parser) -> None:
+    parser.add_argument("--restart", action="store_true", help="do anew what an earlier run has done")
 
 
 def add_flags(parser: Parser, *keys: str, without: tuple[str, ...] = (), by_own_names: bool = False) -> None:
@@ -157,7 +154,7 @@ def _columns(text: str) -> dict[str, str]:
 
 
 def _options(text: str) -> dict[str, Any]:
-    from rangesfm.survey.toml_source import parse_inline_table
+    from rangesfm.survey.settings import parse_inline_table
 
     try:
         return parse_inline_table(text)
@@ -188,14 +185,6 @@ def flags_given(args: argparse.Namespace, *keys: str) -> list[str]:
     return [f"--{item.flag}" for item in chosen_keys(keys) if getattr(args, item.dotted, None) is not None]
 
 
-def add_model_argument(parser: Parser) -> None:
-    parser.add_argument("--input_path", metavar="MODEL", help="existing COLMAP model, as sparse/0")
-
-
-def add_restart_argument(parser: Parser) -> None:
-    parser.add_argument("--restart", action="store_true", help="do anew what an earlier run has done")
-
-
 def survey_from_arguments(args: argparse.Namespace) -> Survey:
     """The survey file, if any, with the flags in place of its keys."""
     from rangesfm.survey.settings import read_survey, survey_from_tables
@@ -207,28 +196,6 @@ def survey_from_arguments(args: argparse.Namespace) -> Survey:
         survey = read_survey(args.survey, overrides, args.base_path)
     model = getattr(args, "input_path", None)
     return survey if model is None else survey.model_copy(update={"model_path": Path.cwd() / model})
-
-
-def require_images(survey: Survey) -> None:
-    """Raise InputError unless there is a folder of photos."""
-    if survey.images.path is None:
-        raise InputError("no photos: give [images] path in a survey file, or --images FOLDER")
-    if not os.path.isdir(survey.images.path):
-        raise InputError("no such folder of photos", survey.images.path)
-
-
-def require_model(survey: Survey) -> None:
-    """Raise InputError unless there is a folder of a COLMAP model."""
-    if survey.model_path is None:
-        raise InputError("no model: give --input_path MODEL, the folder of a COLMAP model such as sparse/0")
-    if not os.path.isdir(survey.model_path):
-        raise InputError("no such folder of a COLMAP model", survey.model_path)
-
-
-def require_ranges(survey: Survey) -> None:
-    """Raise InputError unless there is a radio log."""
-    if survey.ranges.path is None:
-        raise InputError("no ranges: give [ranges] path in a survey file, or --ranges LOG")
 
 
 def _is_table(path: str) -> bool:

@@ -1,7 +1,12 @@
-"""Carries a model into another world, or to what became of a copy of it."""
+"""Models carried into another world, put together there, or given what became of a copy."""
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 import pycolmap
 
 from rangesfm.geometry.similarity import Similarity
@@ -32,3 +37,131 @@ def take_over(reconstruction: pycolmap.Reconstruction, adjusted: pycolmap.Recons
         point.xyz[:] = adjusted.point3D(point_id).xyz
     for camera_id, camera in reconstruction.cameras.items():
         camera.params[:] = adjusted.camera(camera_id).params
+
+
+def joined_model(models: Sequence[pycolmap.Reconstruction]) -> pycolmap.Reconstruction:
+    """One model of the registered photos and the points of all.
+
+    Ids of photos, frames, rigs and cameras are kept where they are free, so that those of models from one database stay
+    the database's. A rig that is the same in two models, with all its cameras, is one. Points are numbered anew.
+
+    Args:
+        models: in one world and unit. A photo is in one of them only.
+    """
+    joined = pycolmap.Reconstruction()
+    for model in models:
+        _Addition(joined, model).make()
+    joined.update_point_3d_errors()
+    return joined
+
+
+def without_photos(model: pycolmap.Reconstruction, image_names: Collection[str]) -> pycolmap.Reconstruction:
+    """A copy of a model without the frames of some photos; the model itself if it has none of them."""
+    unwanted = {image.frame_id for image in model.images.values() if image.has_pose and image.name in image_names}
+    if not unwanted:
+        return model
+    rest = pycolmap.Reconstruction(model)
+    for frame_id in sorted(unwanted):
+        rest.deregister_frame(frame_id)
+    return rest
+
+
+@dataclass(frozen=True)
+class _Addition:
+    """A model on its way into the joined one."""
+
+    joined: pycolmap.Reconstruction
+    model: pycolmap.Reconstruction
+
+    def make(self) -> None:
+        rig_ids, camera_ids = self._add_rigs()
+        image_ids = _free_ids(self.model.reg_image_ids(), self.joined.images)
+        frame_ids = _free_ids(self.model.reg_frame_ids(), self.joined.frames)
+        for old_id, new_id in frame_ids.items():
+            frame = self.model.frame(old_id)
+            self._add_frame(frame, new_id, rig_ids[frame.rig_id], camera_ids, image_ids)
+        for _, point in sorted(self.model.points3D.items()):
+            seen = point.track.elements
+            track = [pycolmap.TrackElement(image_ids[element.image_id], element.point2D_idx) for element in seen]
+            self.joined.add_point3D(point.xyz, pycolmap.Track(track), point.color)
+
+    def _add_rigs(self) -> tuple[dict[int, int], dict[int, int]]:
+        """New ids of rigs and of cameras, by those in the model."""
+        same = {rig_id for rig_id in self.model.rigs if self._is_there(rig_id)}
+        cameras_of = {rig_id: _camera_ids(rig) for rig_id, rig in self.model.rigs.items()}
+        shared = {camera_id for rig_id in same for camera_id in cameras_of[rig_id]}
+        camera_ids = _free_ids(set(self.model.cameras) - shared, self.joined.cameras) | {id_: id_ for id_ in shared}
+        rig_ids = _free_ids(set(self.model.rigs) - same, self.joined.rigs) | {id_: id_ for id_ in same}
+        for old_id in sorted(set(self.model.rigs) - same):
+            for camera_id in cameras_of[old_id]:
+                camera = pycolmap.Camera(self.model.camera(camera_id).todict())
+                camera.camera_id = camera_ids[camera_id]
+                self.joined.add_camera(camera)
+            self.joined.add_rig(_renumbered(self.model.rig(old_id), rig_ids[old_id], camera_ids))
+        return rig_ids, camera_ids
+
+    def _is_there(self, rig_id: int) -> bool:
+        """Whether the joined model has this very rig."""
+        if not self.joined.exists_rig(rig_id):
+            return False
+        rigs = [_description(model, rig_id) for model in (self.joined, self.model)]
+        return bool(rigs[0] == rigs[1])
+
+    def _add_frame(
+        self, frame: pycolmap.Frame, frame_id: int, rig_id: int, camera_ids: dict[int, int], image_ids: dict[int, int]
+    ) -> None:
+        copy, images = pycolmap.Frame(), []
+        copy.frame_id, copy.rig_id = frame_id, rig_id
+        for image in sorted((self.model.image(data_id.id) for data_id in frame.image_ids), key=lambda i: i.image_id):
+            pixels = np.array([point.xy for point in image.points2D], dtype=np.float64).reshape(-1, 2)
+            images.append(pycolmap.Image(image.name, pixels, camera_ids[image.camera_id], image_ids[image.image_id]))
+            images[-1].frame_id = frame_id
+            copy.add_data_id(images[-1].data_id)
+        copy.rig_from_world = pose_of(frame)
+        self.joined.add_frame(copy)
+        for image in images:
+            self.joined.add_image(image)
+        self.joined.register_frame(frame_id)
+
+
+def _free_ids(wanted: Iterable[int], taken: Iterable[int]) -> dict[int, int]:
+    """The ids themselves where no other has them, new ones beyond all else."""
+    wanted, taken = sorted(wanted), set(taken)
+    next_id = max([*wanted, *taken], default=0) + 1
+    ids: dict[int, int] = {}
+    for id_ in wanted:
+        ids[id_] = id_
+        if id_ in taken:
+            ids[id_], next_id = next_id, next_id + 1
+    return ids
+
+
+def _camera_ids(rig: pycolmap.Rig) -> list[int]:
+    return sorted(sensor.id for sensor in rig.sensor_ids())
+
+
+def _description(model: pycolmap.Reconstruction, rig_id: int) -> Any:
+    """Plain values that are the same for the same rig."""
+    rig = model.rig(rig_id)
+    others = {
+        sensor.id: None if pose is None else pose.matrix().tolist() for sensor, pose in rig.non_ref_sensors.items()
+    }
+    cameras = [
+        (id_, camera.model, camera.width, camera.height, camera.params.tolist())
+        for id_ in _camera_ids(rig)
+        for camera in [model.camera(id_)]
+    ]
+    return rig.ref_sensor_id.id, others, cameras
+
+
+def _renumbered(rig: pycolmap.Rig, rig_id: int, camera_ids: Mapping[int, int]) -> pycolmap.Rig:
+    copy = pycolmap.Rig()
+    copy.rig_id = rig_id
+    copy.add_ref_sensor(_camera_sensor(camera_ids[rig.ref_sensor_id.id]))
+    for sensor, pose in rig.non_ref_sensors.items():
+        copy.add_sensor(_camera_sensor(camera_ids[sensor.id]), pose)
+    return copy
+
+
+def _camera_sensor(camera_id: int) -> pycolmap.sensor_t:
+    return pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id)

@@ -6,20 +6,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
+from rangesfm.arrays import Array
 from rangesfm.comparison.models import Length, common_photos, lengths_along, reprojection_rms_px
 from rangesfm.comparison.with_reference import format_table, papers_table
 from rangesfm.errors import InputError
-from rangesfm.files.text_table import align_rows
+from rangesfm.files.tables import align_rows
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.result.entries import ComparisonRow
+from rangesfm.result.entries import ComparisonRow, median, rms
 from rangesfm.result.folder import ResultFolder, read_result_folder
 from rangesfm.result.ranges_as_used import RangesAsUsed
 
-Array = npt.NDArray[np.float64]
+_Pair = tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class ModelComparison:
         distances: between a few keyframes spread over the path.
     """
 
-    reprojection_rms_px: tuple[float, float] | None
-    range_rms_m: tuple[float, float] | None
-    range_median_abs_m: tuple[float, float] | None
+    reprojection_rms_px: _Pair | None
+    range_rms_m: _Pair | None
+    range_median_abs_m: _Pair | None
     displacements_m: Array
     distances: tuple[Length, ...]
 
@@ -46,7 +46,7 @@ class ModelComparison:
             "range residual median abs m": self.range_median_abs_m,
             **{f"{a} to {b} m": lengths for a, b, lengths in self.distances},
         }
-        rows = [(label, *(f"{value:.4f}" for value in pair)) for label, pair in pairs.items() if pair is not None]
+        rows = [(label, *(f"{value:.4f}" for value in pair)) for label, pair in pairs.items() if pair]
         moved = self.displacements_m
         return (
             f"{align_rows([('', 'before', 'after'), *rows])}\n{len(moved)} keyframes moved by {moved.mean():.4f} m on "
@@ -68,21 +68,16 @@ def compare_models(
     Raises:
         InputError: they have no photo in common.
     """
+    models = [one for one in (before, after) if not isinstance(one, Trajectory)]
     paths = [one if isinstance(one, Trajectory) else trajectory_from_reconstruction(one) for one in (before, after)]
     names, centers_before, centers_after = common_photos(*paths)
     if not names:
         raise InputError("the two models have no photo in common")
-    reprojection = rms = median = None
-    if not isinstance(before, Trajectory) and not isinstance(after, Trajectory):
-        reprojection = (reprojection_rms_px(before), reprojection_rms_px(after))
-    if range_residuals_m is not None:
-        first, second = range_residuals_m
-        rms = (float(np.sqrt(np.mean(first**2))), float(np.sqrt(np.mean(second**2))))
-        median = (float(np.median(np.abs(first))), float(np.median(np.abs(second))))
+    residuals = range_residuals_m or ()
     return ModelComparison(
-        reprojection_rms_px=reprojection,
-        range_rms_m=rms,
-        range_median_abs_m=median,
+        reprojection_rms_px=tuple(map(reprojection_rms_px, models)) if len(models) == 2 else None,
+        range_rms_m=tuple(map(rms, residuals)) or None,
+        range_median_abs_m=tuple(median(np.abs(one)) for one in residuals) or None,
         displacements_m=np.linalg.norm(centers_after - centers_before, axis=1),
         distances=lengths_along(paths),
     )
@@ -101,8 +96,7 @@ class FolderComparison:
     models: ModelComparison | None
 
     def __str__(self) -> str:
-        parts = [format_table(self.rows)] if self.rows else []
-        return "\n\n".join([*parts, *([] if self.models is None else [str(self.models)])])
+        return "\n\n".join(filter(None, (format_table(self.rows) if self.rows else "", str(self.models or ""))))
 
 
 def compare_folder(output_path: Path, reference_path: Path | None = None) -> FolderComparison:
@@ -123,15 +117,12 @@ def compare_folder(output_path: Path, reference_path: Path | None = None) -> Fol
         path = trajectory_from_reconstruction(scaled, result.timestamps_s)
         path_of_refined = None if refined is None else path.as_in(refined)
         rows = papers_table(path, path_of_refined, read_reference(reference_path), frame=result.summary.frame)
-    if refined is None:
-        return FolderComparison(rows, None)
-    return FolderComparison(rows, compare_models(scaled, refined, range_residuals_m=_used_residuals(result)))
+    changed = None if refined is None else compare_models(scaled, refined, range_residuals_m=_used_residuals(result))
+    return FolderComparison(rows, changed)
 
 
 def _used_residuals(result: ResultFolder) -> tuple[Array, Array] | None:
     ranges = result.read(RangesAsUsed)
-    if ranges is None:
-        return None
-    before, after = ranges.residual_scaled_m[ranges.is_used], ranges.residual_refined_m[ranges.is_used]
-    known = np.isfinite(before) & np.isfinite(after)
-    return (before[known], after[known]) if known.any() else None
+    both = [] if ranges is None else [of_all[ranges.is_used] for of_all in ranges.residuals_by_model_m.values()]
+    known = np.isfinite(both).all(axis=0)
+    return (both[0][known], both[1][known]) if len(both) == 2 and known.any() else None

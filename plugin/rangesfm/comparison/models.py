@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,11 +17,12 @@ from rangesfm.comparison.with_reference import MIN_NUM_ALIGNED, text_or_dash
 from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
-from rangesfm.files.text_table import align_rows
+from rangesfm.files.tables import align_rows
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.similarity import Similarity, rmse, similarity_between
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.report.tables import Table
+from rangesfm.result.entries import rms
 from rangesfm.result.folder import ResultFolder, read_result_folder
 from rangesfm.result.summary import ResultSummary
 
@@ -161,15 +162,13 @@ def compare_many(
     Raises:
         InputError: one has no photo in common with the first, or lacks the end of a taped distance.
     """
-    ranges = ranges or _ranges_of_first_result(models)
-    rows = tuple(_row(models[0], model, ranges) for model in models)
-    taped = () if tape is None else _taped(models, ranges, tape)
+    if ranges is None:
+        of_results = (ranges_of_result(one.result, one.path) for one in models if one.result is not None)
+        ranges = next(filter(None, of_results), None)
+    onto_ranges = [None if ranges is None else _onto(ranges.metric_path, model.path) for model in models]
+    rows = tuple(_row(models[0], model, ranges, onto) for model, onto in zip(models, onto_ranges))
+    taped = () if tape is None else tuple(_taped(models, ranges, onto_ranges, tape))
     return ModelsComparison(tuple(models), rows, lengths_along([model.path for model in models]), taped)
-
-
-def _ranges_of_first_result(models: Sequence[NamedModel]) -> ModelRanges | None:
-    found = (None if model.result is None else ranges_of_result(model.result, model.path) for model in models)
-    return next((ranges for ranges in found if ranges is not None), None)
 
 
 def _read_model(path: Path) -> NamedModel:
@@ -199,7 +198,7 @@ def _read_positions(path: Path, base: Trajectory) -> NamedModel:
     return NamedModel(str(path), trajectory, None, None, has_orientations=rotations is not None)
 
 
-def _row(base: NamedModel, other: NamedModel, ranges: ModelRanges | None) -> ModelRow:
+def _row(base: NamedModel, other: NamedModel, ranges: ModelRanges | None, onto_ranges: Similarity | None) -> ModelRow:
     names, ours, theirs = common_photos(base.path, other.path)
     if not names:
         raise InputError(f"it has no photo in common with {base.name}", other.name)
@@ -212,7 +211,7 @@ def _row(base: NamedModel, other: NamedModel, ranges: ModelRanges | None) -> Mod
         moved=np.linalg.norm(theirs - ours, axis=1),
         moved_aligned=None if similarity is None else np.linalg.norm(similarity.apply(theirs) - ours, axis=1),
         reprojection_rms_px=None if other.model is None else reprojection_rms_px(other.model),
-        range_rms_m=None if ranges is None else _range_rms(ranges, other),
+        range_rms_m=_range_rms(ranges, other, onto_ranges) if ranges and onto_ranges else None,
     )
 
 
@@ -228,45 +227,42 @@ def _similarity(source: Array, target: Array) -> Similarity | None:
     return similarity_between(source, target) if len(source) >= MIN_NUM_ALIGNED else None
 
 
-def _onto_ranges(ranges: ModelRanges, path: Trajectory) -> Similarity | None:
-    """What carries a path onto the one that the ranges have placed."""
-    _, goal, source = common_photos(ranges.metric_path, path)
-    return _similarity(source, goal)
+def _onto(goal: Trajectory, path: Trajectory) -> Similarity | None:
+    """What carries a path onto another of the same photos."""
+    _, target, source = common_photos(goal, path)
+    return _similarity(source, target)
 
 
-def _scale_onto(ranges: ModelRanges, path: Trajectory) -> float | None:
-    similarity = _onto_ranges(ranges, path)
-    return None if similarity is None else similarity.scale
-
-
-def _range_rms(ranges: ModelRanges, model: NamedModel) -> tuple[float, float] | None:
+def _range_rms(ranges: ModelRanges, model: NamedModel, onto_ranges: Similarity) -> tuple[float, float] | None:
     """RMS of the residuals with a model's cameras, as they are and carried."""
-    similarity = _onto_ranges(ranges, model.path)
-    if similarity is None or not model.has_orientations:
+    if not model.has_orientations:
         return None
-    carried = model.path.transformed(similarity.scale, similarity.rotation, similarity.translation)
-    both = [ranges.residuals_m(path) for path in (model.path, carried)]
-    if not len(both[0]):
-        return None
-    return float(np.sqrt(np.mean(both[0] ** 2))), float(np.sqrt(np.mean(both[1] ** 2)))
+    own, carried = (rms(ranges.residuals_m(path)) for path in (model.path, carried_by(onto_ranges, model.path)))
+    return None if np.isnan(own) else (own, carried)
 
 
-def _taped(models: Sequence[NamedModel], ranges: ModelRanges | None, tape: Tape) -> tuple[TapedRow, ...]:
+def carried_by(similarity: Similarity | None, path: Trajectory) -> Trajectory:
+    """The path in another world; as it is without a similarity."""
+    if similarity is None:
+        return path
+    return path.transformed(similarity.scale, similarity.rotation, similarity.translation)
+
+
+def _taped(
+    models: Sequence[NamedModel],
+    ranges: ModelRanges | None,
+    onto_ranges: Sequence[Similarity | None],
+    tape: Tape,
+) -> Iterator[TapedRow]:
     anchors = {} if ranges is None else ranges.anchors_m
     own = [_taped_lengths(model, tape, 1.0, anchors) for model in models]
-    placed = None
-    if ranges is not None:
-        scales = [_scale_onto(ranges, model.path) for model in models]
-        placed = [_taped_lengths(model, tape, scale, anchors) for model, scale in zip(models, scales)]
-    return tuple(
-        TapedRow(
-            taped.ends,
-            taped.distance_m,
-            tuple(lengths[row] for lengths in own),
-            None if placed is None else tuple(lengths[row] for lengths in placed),
-        )
-        for row, taped in enumerate(tape.distances)
-    )
+    placed = [
+        _taped_lengths(model, tape, None if onto is None else onto.scale, anchors)
+        for model, onto in zip(models, onto_ranges)
+    ]
+    for row, taped in enumerate(tape.distances):
+        lengths, lengths_m = (tuple(of_model[row] for of_model in all_of_it) for all_of_it in (own, placed))
+        yield TapedRow(taped.ends, taped.distance_m, lengths, None if ranges is None else lengths_m)
 
 
 def _taped_lengths(
@@ -293,19 +289,14 @@ def lengths_along(paths: Sequence[Trajectory]) -> tuple[Length, ...]:
 
 def reprojection_rms_px(reconstruction: pycolmap.Reconstruction) -> float:
     """Root of the mean squared distance between observed and projected points; NaN for none."""
-    squared: list[Array] = [np.zeros(0)]
+    errors = [np.zeros((0, 2))]
     for image in reconstruction.images.values():
-        if not image.has_pose:
-            continue
-        observed = list(image.get_observation_points2D())
-        if not observed:
-            continue
-        xyz = np.array([reconstruction.point3D(point.point3D_id).xyz for point in observed])
-        in_cam = image.cam_from_world() * xyz
-        projected = image.camera.img_from_cam(in_cam, check_cheirality=False)
-        squared.append(np.sum((projected - np.array([point.xy for point in observed])) ** 2, axis=1))
-    errors = np.concatenate(squared)
-    return float(np.sqrt(errors.mean())) if len(errors) else float("nan")
+        observed = list(image.get_observation_points2D()) if image.has_pose else []
+        if observed:
+            in_world = np.array([reconstruction.point3D(point.point3D_id).xyz for point in observed])
+            projected = image.camera.img_from_cam(image.cam_from_world() * in_world, check_cheirality=False)
+            errors.append(projected - np.array([point.xy for point in observed]))
+    return rmse(np.concatenate(errors))
 
 
 _HEADER = (

@@ -6,14 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesfm.comparison.models import ModelRow, ModelsComparison, NamedModel
-from rangesfm.files.atomic import new_file
-from rangesfm.files.sole_writer import sole_writer
+from rangesfm.comparison.models import ModelsComparison, carried_by
+from rangesfm.files.atomic import new_file, sole_writer
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.report.chart import page_charts
 from rangesfm.report.content import points_of
 from rangesfm.report.page import render
-from rangesfm.report.plot import WIDE_SIZE, Figure, Series, equal_view, figure_of, views_of
+from rangesfm.report.plot import WIDE_SIZE, Figure, Series, equal_view, figure_of, from_zero, views_of
 from rangesfm.report.scene import Scene, ScenePath, view_of
 
 COLORS = ("after", "before", "third", "fourth")
@@ -35,7 +34,7 @@ def write_comparison(comparison: ModelsComparison, folder: Path) -> Path:
 def render_comparison(comparison: ModelsComparison) -> str:
     """The page; everything drawn is carried onto the first model, in its unit."""
     base = comparison.models[0]
-    aligned = [_aligned(model, row) for model, row in zip(comparison.models, comparison.rows)]
+    aligned = [carried_by(row.base_from_model, model.path) for model, row in zip(comparison.models, comparison.rows)]
     title = f"{len(comparison.models)} models of {len(base.path)} photos"
     frame = "first_camera" if base.result is None else base.result.summary.frame
     figures = [*_moved_figure(comparison), _path_figure(comparison, aligned, frame)]
@@ -48,13 +47,6 @@ def render_comparison(comparison: ModelsComparison) -> str:
         charts=page_charts(figures),
         tables=comparison.tables,
     )
-
-
-def _aligned(model: NamedModel, row: ModelRow) -> Trajectory:
-    similarity = row.base_from_model
-    if similarity is None:
-        return model.path
-    return model.path.transformed(similarity.scale, similarity.rotation, similarity.translation)
 
 
 def _color(index: int) -> str:
@@ -95,7 +87,7 @@ def _moved_figure(comparison: ModelsComparison) -> list[Figure]:
         "Distance of each camera from where the first model has it",
         ("photo", "moved"),
         series,
-        y_range=(0.0, 1.08 * max(float(one.points[:, 1].max()) for one in series)),
+        y_range=from_zero(series),
         size=WIDE_SIZE,
     )
     return [moved]

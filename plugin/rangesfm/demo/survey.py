@@ -18,11 +18,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
-from rangesfm.demo.path import CameraPath
-from rangesfm.demo.ranges import Radio, SimulatedRanges, simulate_ranges
+from rangesfm.demo.ranges import CameraPath, Radio, SimulatedRanges, simulate_ranges
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import LEFTOVER, new_folder, write_text
-from rangesfm.files.sole_writer import LOCK_NAME, sole_writer
+from rangesfm.files.atomic import LEFTOVER, LOCK_NAME, new_folder, sole_writer, write_text
 from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.ranging.readers.canonical import write_ranges_csv
 

@@ -1,20 +1,26 @@
-"""The files of taped distances and of the marks in photos between which they were taken."""
+"""Taped distances: their files, the marks in photos between which they were taken, and their table against the map."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import AliasChoices, Field
 
 from rangesfm.errors import InputError
+from rangesfm.files.records import Number, NumberOrNull, Record, Text
 from rangesfm.files.tables import Table, read_table
 
 CONTROL, CHECK = "control", "check"
 # What a steel tape and a steady hand are good for.
 DEFAULT_STDDEV_M = 0.01
+_PIXELS = ("x_px", "y_px")
+# Of stddevs; one honest distance in three hundred is further off.
+_DISAGREES = 3.0
 
 
 @dataclass(frozen=True)
@@ -84,9 +90,6 @@ def read_tape(distances_path: str | Path, markers_path: str | Path | None = None
     return Tape(distances, markers, Path(distances_path), None if markers_path is None else Path(markers_path))
 
 
-_PIXELS = ("x_px", "y_px")
-
-
 def _distances(table: Table) -> tuple[TapedDistance, ...]:
     if not len(table):
         raise InputError("holds no distance, expected one a line", table.path)
@@ -127,3 +130,47 @@ def _marker(table: Table, image_names: Sequence[str], pixels: npt.NDArray[np.flo
         if seen_in[k] in seen_in[:k]:
             raise table.error(row, "image_name", "a photo in which this marker has no place yet")
     return Marker(tuple(seen_in), pixels[rows], tuple(table.line[rows].tolist()))
+
+
+class DistanceRow(Record):
+    """One taped distance, metres: by tape, in the map, and what the map has too much."""
+
+    from_: Text = Field(validation_alias=AliasChoices("from", "from_"), serialization_alias="from")
+    to: Text
+    kind: Text
+    measured_m: Number
+    stddev_m: Number
+    estimated_m: NumberOrNull
+    residual_m: NumberOrNull
+
+
+def distance_rows(tape: Tape, lengths_m: npt.NDArray[np.float64]) -> list[DistanceRow]:
+    """One entry for each distance of the tape, in its order, with (k,) lengths in the map."""
+    return [
+        DistanceRow(
+            from_=taped.ends[0],
+            to=taped.ends[1],
+            kind=taped.kind,
+            measured_m=taped.distance_m,
+            stddev_m=taped.stddev_m,
+            estimated_m=length_m,
+            residual_m=length_m - taped.distance_m,
+        )
+        for taped, length_m in zip(tape.distances, lengths_m.tolist(), strict=True)
+    ]
+
+
+def disagreements(rows: Iterable[DistanceRow], relative_scale_stddev: float) -> Iterator[str]:
+    """What to tell of distances that the map misses by more than tape and scale explain.
+
+    A control distance has held the scale already, so that only the tape's own error excuses it.
+    """
+    for row in rows:
+        scale_stddev_m = relative_scale_stddev * row.measured_m if row.kind == CHECK else 0.0
+        stddev_m = math.hypot(row.stddev_m, scale_stddev_m)
+        if row.residual_m is not None and abs(row.residual_m) > _DISAGREES * stddev_m:
+            yield (
+                f"{row.kind} distance from {row.from_} to {row.to}: {row.estimated_m:.3f} m in the map, "
+                f"{row.measured_m:.3f} m by tape ({row.residual_m:+.3f} m, expected within "
+                f"{_DISAGREES * stddev_m:.3f} m)"
+            )

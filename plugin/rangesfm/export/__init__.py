@@ -8,14 +8,10 @@ from typing import TYPE_CHECKING
 
 from rangesfm.errors import InputError
 from rangesfm.export.apply import apply_to, best_similarity
-from rangesfm.export.colmap import write_model, write_positions, write_transform
-from rangesfm.export.features import write_features
-from rangesfm.export.frames import in_frame
-from rangesfm.export.las import write_laz
-from rangesfm.export.metric_map import MetricMap
-from rangesfm.export.nerfstudio import write_nerfstudio
-from rangesfm.export.opensfm import write_opensfm
-from rangesfm.export.opf import write_opf
+from rangesfm.export.colmap import write_model, write_positions, write_transform, write_undistorted
+from rangesfm.export.gis import write_features, write_laz
+from rangesfm.export.metric_map import MetricMap, in_frame
+from rangesfm.export.photogrammetry import write_nerfstudio, write_opensfm, write_opf
 from rangesfm.export.ply import write_anchors, write_cameras, write_points
 from rangesfm.export.trajectories import (
     COVARIANCE_FORMATS,
@@ -24,7 +20,6 @@ from rangesfm.export.trajectories import (
     write_trajectory,
     write_tum_covariance,
 )
-from rangesfm.export.undistorted import write_undistorted
 from rangesfm.files.atomic import make_output_folder
 from rangesfm.options import ExportOptions
 
@@ -40,22 +35,12 @@ __all__ = [
     "MetricMap",
     "apply_to",
     "best_similarity",
+    "check_formats",
     "export_map",
     "export_model",
-    "write_anchors",
-    "write_cameras",
-    "write_features",
-    "write_kitti",
-    "write_laz",
     "write_model",
-    "write_nerfstudio",
-    "write_opensfm",
-    "write_opf",
     "write_points",
     "write_positions",
-    "write_trajectory",
-    "write_transform",
-    "write_undistorted",
 ]
 
 Exporter = Callable[[MetricMap, Path], Path]

@@ -18,9 +18,9 @@ from rangesfm.colmap.model_files import read_model
 from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
 from rangesfm.export.colmap import write_model
-from rangesfm.export.ply_transform import transform_ply
+from rangesfm.export.ply import transform_ply
 from rangesfm.files.atomic import make_output_folder, write_text
-from rangesfm.files.json_files import read_json, write_json
+from rangesfm.files.records import read_json, write_json
 from rangesfm.files.tables import read_text
 from rangesfm.geometry.similarity import Similarity, align_points, overflow_raised, rmse
 

@@ -1,16 +1,22 @@
-"""What COLMAP itself reads: models, similarities for ``model_transformer`` and positions for ``model_aligner``."""
+"""What COLMAP itself reads, and what reads its models: with undistorted photos, dense reconstruction and splatting."""
 
 from __future__ import annotations
 
+import errno
+import os
+import shutil
+import tempfile
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
+from rangesfm.colmap.log import colmap_log
 from rangesfm.colmap.model_files import write_binary_model
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import new_folder, write_text
+from rangesfm.export.metric_map import MetricMap, registered_images
+from rangesfm.files.atomic import new_folder, stays_inside, write_text
 from rangesfm.geometry.similarity import Similarity
 
 
@@ -45,9 +51,51 @@ def write_positions(reconstruction: pycolmap.Reconstruction, path: Path) -> Path
         InputError: a photo's name holds white space, at which COLMAP would split it.
     """
     lines = []
-    for image in sorted((image for image in reconstruction.images.values() if image.has_pose), key=lambda i: i.name):
+    for image in registered_images(reconstruction):
         if len(image.name.split()) != 1:
             raise InputError(f"the format 'model_aligner' cannot hold white space in a photo's name: {image.name!r}")
         lines.append(" ".join([image.name, *(f"{value:.17g}" for value in image.projection_center())]))
     write_text("\n".join(lines) + "\n", path)
     return path
+
+
+def write_undistorted(map_: MetricMap, folder: Path) -> Path:
+    """Write ``images/`` (pinhole) and ``sparse/0`` into ``folder``.
+
+    Raises:
+        InputError: the photos are not where the map says, or nobody said where they are.
+        OSError: the disk has no room for them.
+    """
+    images_path = map_.images_path
+    if images_path is None:
+        raise InputError("the format 'undistorted' needs the photos: give their folder (--images)")
+    names = [image.name for image in registered_images(map_.reconstruction)]
+    for name in names:
+        if not stays_inside(name):
+            raise InputError(f"the photo {name} would be written outside of it, expected names inside a folder", folder)
+        if not os.path.isfile(images_path / name):
+            raise InputError(f"there is no photo {name}, which the map needs, in this folder", images_path)
+    with new_folder(folder) as temporary, tempfile.TemporaryDirectory() as model_path:
+        write_binary_model(map_.reconstruction, Path(model_path))
+        _require_room(temporary, sum(os.path.getsize(images_path / name) for name in names))
+        with colmap_log(temporary / "undistortion.log"):
+            pycolmap.undistort_images(temporary, model_path, images_path)
+        _into_sparse_0(temporary)
+    return folder
+
+
+def _require_room(folder: Path, num_bytes: int) -> None:
+    """On a full disk the library that writes the photos ends the whole process, without a word of ours."""
+    if shutil.disk_usage(folder).free < num_bytes:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
+
+
+def _into_sparse_0(folder: Path) -> None:
+    """The model to where everybody looks for it; COLMAP's scripts for MVS and its log stay out."""
+    files = list((folder / "sparse").iterdir())
+    (folder / "sparse" / "0").mkdir()
+    for path in files:
+        path.rename(folder / "sparse" / "0" / path.name)
+    for path in folder.iterdir():
+        if path.name not in ("images", "sparse"):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()

@@ -1,8 +1,10 @@
-"""Points, cameras and anchors as binary little-endian PLY vertices."""
+"""PLY: points, cameras and anchors written; whatever else is in such a file carried into another world."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +13,27 @@ import numpy.typing as npt
 import pycolmap
 
 from rangesfm.arrays import Array
+from rangesfm.errors import InputError
+from rangesfm.export.metric_map import points_of
 from rangesfm.files.atomic import new_file
+from rangesfm.geometry.similarity import Similarity, overflow_raised
 from rangesfm.geometry.trajectory import Trajectory
 
 CAMERA_COLOR = (37, 99, 235)
 ANCHOR_COLOR = (162, 28, 175)
 PLY_TYPES = {"f8": "double", "f4": "float", "u1": "uchar"}
+Vertices = npt.NDArray[np.void]
+_CODES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
+_MAX_NUM_DIGITS = 18  # larger numbers are not for a machine's word
+_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+_MAX_HEADER_BYTES = 1 << 16
+# Further from the origin, single precision is coarser than a millimetre.
+_MAX_SINGLE = 8192.0
 
 
 def write_points(reconstruction: pycolmap.Reconstruction, path: Path) -> Path:
     """Write the 3-D points with their colours, in order of their ids."""
-    points = [reconstruction.point3D(point_id) for point_id in sorted(reconstruction.point3D_ids())]
-    xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
-    colors = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
-    return _write_vertices(path, xyz, colors)
+    return _write_vertices(path, *points_of(reconstruction))
 
 
 def write_cameras(trajectory: Trajectory, path: Path) -> Path:
@@ -59,3 +68,140 @@ def _write_vertices(
     with new_file(path) as temporary:
         temporary.write_bytes("\n".join([*header, "end_header\n"]).encode("ascii") + vertices.tobytes())
     return path
+
+
+_CODES |= {"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4"}
+_CODES |= {"uint32": "u4", "float32": "f4", "float64": "f8"}
+
+
+@dataclass(frozen=True)
+class _Header:
+    """What a PLY file says of itself.
+
+    Attributes:
+        lines: all of them, with end_header.
+        num_bytes: of the header.
+        encoding: a key of _ORDERS.
+        num_vertices: of the first element.
+        columns: names of the vertex properties and their types.
+    """
+
+    lines: list[str]
+    num_bytes: int
+    encoding: str
+    num_vertices: int
+    columns: dict[str, str]
+
+
+def transform_ply(path: Path, new_from_old: Similarity, target: Path) -> Path:
+    """Write the file with its vertices (x, y, z) moved and its normals (nx, ny, nz) turned; the rest stays.
+
+    Raises:
+        InputError: not a PLY file that begins with vertices, or one of Gaussian splats, whose colours would have to
+            turn as well.
+    """
+    content = path.read_bytes()
+    header = _read_header(path, content)
+    if "rot_0" in header.columns:
+        raise InputError("Gaussian splats cannot be carried over: train them anew on the metric model", path)
+    vertices, rest = _split(path, content, header)
+    try:
+        with overflow_raised():
+            written = _moved(vertices, new_from_old)
+    except FloatingPointError:
+        raise InputError("the vertices hold infinite numbers, or too large ones", path) from None
+    is_double = written.dtype != vertices.dtype
+    with new_file(target) as temporary:
+        temporary.write_bytes(_header_text(header, is_double) + _body(written, header) + rest)
+    return target
+
+
+def _moved(vertices: Vertices, new_from_old: Similarity) -> Vertices:
+    """Moved and turned; far from the origin in double precision."""
+    moved = new_from_old.apply(_vectors(vertices, ("x", "y", "z")))
+    is_far, order = np.abs(moved).max(initial=0.0) > _MAX_SINGLE, vertices.dtype[0].byteorder
+    names = vertices.dtype.names or ()
+    double = np.dtype(np.float64).newbyteorder(order)
+    written = vertices.astype([(name, double if is_far and name in "xyz" else vertices.dtype[name]) for name in names])
+    columns = dict(zip("xyz", moved.T, strict=True))
+    if {"nx", "ny", "nz"} <= set(names):
+        turned = _vectors(vertices, ("nx", "ny", "nz")) @ new_from_old.rotation.T
+        columns |= zip(("nx", "ny", "nz"), turned.T, strict=True)
+    for name, column in columns.items():
+        written[name] = column
+    return written
+
+
+def _read_header(path: Path, content: bytes) -> _Header:
+    end = content.find(b"end_header", 0, _MAX_HEADER_BYTES)
+    newline = content.find(b"\n", end)
+    if not content.startswith(b"ply") or end < 0 or newline < 0:
+        raise InputError("not a PLY file, expected 'ply' and a header", path)
+    lines = content[: newline + 1].decode("latin-1").splitlines()
+    words = [line.split() for line in lines]
+    encoding = next((w[1] for w in words if w[:1] == ["format"] and len(w) == 3), "")
+    elements = [(number, w) for number, w in enumerate(words) if w[:1] == ["element"]]
+    if encoding not in _ORDERS or not elements or elements[0][1][1:2] != ["vertex"] or len(elements[0][1]) != 3:
+        raise InputError("expected a PLY file whose first element is vertex", path)
+    first, stop = elements[0][0], elements[1][0] if len(elements) > 1 else len(words)
+    columns = {}
+    for number in range(first + 1, stop):
+        if words[number][:1] == ["property"]:
+            if len(words[number]) != 3 or words[number][1] not in _CODES:
+                raise InputError(f"'{lines[number]}', expected a number for each vertex", path, number + 1)
+            columns[words[number][2]] = _CODES[words[number][1]]
+    if not {"x", "y", "z"} <= columns.keys():
+        raise InputError("the vertices have no x, y and z", path)
+    count = elements[0][1][2]
+    if not (count.isascii() and count.isdigit() and len(count) <= _MAX_NUM_DIGITS):
+        raise InputError(f"'{lines[first]}', expected a number of vertices", path, first + 1)
+    return _Header(lines, newline + 1, encoding, int(count), columns)
+
+
+def _split(path: Path, content: bytes, header: _Header) -> tuple[Vertices, bytes]:
+    """The vertices, and the bytes of all other elements."""
+    kind = np.dtype([(name, _ORDERS[header.encoding] + code) for name, code in header.columns.items()])
+    body = content[header.num_bytes :]
+    if header.encoding != "ascii":
+        size = kind.itemsize * header.num_vertices
+        if len(body) < size:
+            raise InputError(f"ends within its {header.num_vertices} vertices", path)
+        return np.frombuffer(body[:size], dtype=kind), body[size:]
+    lines = body.split(b"\n", header.num_vertices)
+    if len(lines) < header.num_vertices:
+        raise InputError(f"ends within its {header.num_vertices} vertices", path)
+    vertices = np.empty(header.num_vertices, dtype=kind)
+    with overflow_raised():
+        for row, line in enumerate(lines[: header.num_vertices]):
+            try:
+                vertices[row] = tuple(float(word) for word in line.split())
+            except (ValueError, ArithmeticError):
+                message = f"not a vertex of {len(header.columns)} numbers"
+                raise InputError(message, path, len(header.lines) + row + 1) from None
+    return vertices, lines[header.num_vertices] if len(lines) > header.num_vertices else b""
+
+
+def _vectors(vertices: Vertices, names: tuple[str, str, str]) -> Array:
+    """(n, 3); NaN stands for no point, infinity for nothing."""
+    values: Array = np.column_stack([vertices[name] for name in names]).astype(np.float64).reshape(-1, 3)
+    if np.isinf(values).any():
+        raise FloatingPointError("infinite")
+    return values
+
+
+def _header_text(header: _Header, is_double: bool) -> bytes:
+    text = "\n".join(header.lines) + "\n"
+    if is_double:
+        text = re.sub(r"^[ \t]*property[ \t].*[ \t]([xyz])[ \t]*$", r"property double \1", text, flags=re.MULTILINE)
+    return text.encode("latin-1")
+
+
+def _body(vertices: Vertices, header: _Header) -> bytes:
+    if header.encoding != "ascii":
+        return vertices.tobytes()
+    is_whole = [code[0] in "iu" for code in header.columns.values()]
+    lines = [
+        " ".join(str(int(v)) if whole else f"{v:.10g}" for v, whole in zip(row, is_whole, strict=True))
+        for row in vertices.tolist()
+    ]
+    return ("\n".join(lines) + "\n").encode("ascii") if lines else b""

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.export.metric_map import MetricMap
-from rangesfm.files.atomic import new_file, write_text
+from rangesfm.files.atomic import new_file
 from rangesfm.geometry.trajectory import Trajectory
 
 # Formats that cannot do without covariances.
@@ -28,7 +28,7 @@ def write_trajectory(trajectory: Trajectory, path: Path) -> Path:
 
     Without times the first column counts the keyframes from 0, and a comment says so.
     """
-    return _write_tum(trajectory, path, _TUM_HEADER, [""] * len(trajectory))
+    return _write_tum(trajectory, path, _TUM_HEADER, np.empty((len(trajectory), 0)))
 
 
 def write_tum_covariance(map_: MetricMap, path: Path) -> Path:
@@ -38,8 +38,7 @@ def write_tum_covariance(map_: MetricMap, path: Path) -> Path:
         InputError: the map comes without covariances.
     """
     header = f"{_TUM_HEADER} and xx xy xz yy yz zz of the centre (square metres)"
-    endings = ["".join(f" {number:.9g}" for number in numbers) for numbers in _upper_triangles(map_)]
-    return _write_tum(map_.trajectory, path, header, endings)
+    return _write_tum(map_.trajectory, path, header, _upper_triangles(map_))
 
 
 def write_kitti(trajectory: Trajectory, path: Path) -> Path:
@@ -56,19 +55,15 @@ def write_kitti_covariance(map_: MetricMap, path: Path) -> Path:
     return _write_numbers(np.hstack([_kitti_poses(map_.trajectory), _upper_triangles(map_)]), path)
 
 
-def _write_tum(trajectory: Trajectory, path: Path, header: str, endings: list[str]) -> Path:
-    lines = [header]
+def _write_tum(trajectory: Trajectory, path: Path, header: str, further: Array) -> Path:
+    """``further``: (n, k) numbers that stand behind the poses."""
     timestamps_s = trajectory.timestamps_s
     if timestamps_s is None:
-        lines.append("# the photos have no times: the first column is the keyframe's index, in order of its name")
+        header += "\n# the photos have no times: the first column is the keyframe's index, in order of its name"
         timestamps_s = np.arange(len(trajectory), dtype=np.float64)
-    if len(trajectory):
-        quaternions = Rotation.from_matrix(trajectory.world_from_cam).as_quat()
-        for time, center, quaternion, ending in zip(timestamps_s, trajectory.centers, quaternions, endings):
-            numbers = [f"{value:.9f}" for value in center] + [f"{value:.12f}" for value in quaternion]
-            lines.append(f"{time:.9f} {' '.join(numbers)}{ending}")
-    write_text("\n".join(lines) + "\n", path)
-    return path
+    quaternions = Rotation.from_matrix(trajectory.world_from_cam).as_quat() if len(trajectory) else np.empty((0, 4))
+    rows = np.hstack([timestamps_s[:, None], trajectory.centers, quaternions, further])
+    return _write_numbers(rows, path, ["%.9f"] * 4 + ["%.12f"] * 4 + ["%.9g"] * further.shape[1], header)
 
 
 def _kitti_poses(trajectory: Trajectory) -> Array:
@@ -76,9 +71,9 @@ def _kitti_poses(trajectory: Trajectory) -> Array:
     return np.concatenate([trajectory.world_from_cam, trajectory.centers[:, :, None]], axis=2).reshape(-1, 12)
 
 
-def _write_numbers(rows: Array, path: Path) -> Path:
+def _write_numbers(rows: Array, path: Path, formats: str | list[str] = "%.17g", header: str = "") -> Path:
     with new_file(path) as temporary:
-        np.savetxt(temporary, rows, fmt="%.17g")
+        np.savetxt(temporary, rows, formats, header=header, comments="")
     return path
 
 

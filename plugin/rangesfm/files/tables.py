@@ -1,16 +1,16 @@
-"""Tables in text files: the one place that reads CSV and its relatives, and writes it.
+"""Tables in text: the one place that reads CSV and its relatives, and writes it; and tables as commands print them.
 
-A table has a header row; ``#`` comments and blank lines may stand anywhere; a byte order mark, any
-line ending and quoted cells are understood. Whatever is wrong is an InputError with its line.
+A file's table has a header row; ``#`` comments and blank lines may stand anywhere; a byte order mark, any line ending
+and quoted cells are understood. Whatever is wrong is an InputError with its line.
 """
 
 from __future__ import annotations
 
 import csv
-import itertools
+import io
 import os
 import stat
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,7 +22,6 @@ from rangesfm.errors import InputError, printable
 from rangesfm.files.atomic import new_file
 
 _HEAD_BYTES = 1 << 16
-_CHUNK_ROWS = 20_000  # split at once: wide tables would otherwise hold every cell in memory
 _UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 _UNPACKED = (".gz", ".bz2", ".xz")  # by numpy, whatever such a file holds
 
@@ -164,10 +163,11 @@ def read_table(
         separator = guess_separator(header_row)
     if len(separator) != 1 or separator in '"\r\n\0#':
         raise InputError(f"separator is {separator!r}, expected one character", path)
-    header = _split_row(header_row, separator, path, header_line)
-    names = _canonical_names(header, [*required, *optional], aliases or {})
+    header = [cell.strip() for cell in _split_row(header_row, separator, path, header_line)]
+    known, aliases = (*required, *optional), aliases or {}
+    names = [name if name in known else aliases.get(name, name) for name in header]
     _check_header(names, required, optional, path, header_line)
-    wanted = {name: names.index(name) for name in (*required, *optional) if name in names}
+    wanted = {name: names.index(name) for name in known if name in names}
     reread = partial(_table_of_texts, path, names, wanted, header_line, body, separator)
     rows = None
     if body and not body.isspace() and separator != " " and not any(character in body for character in '"#'):
@@ -195,15 +195,19 @@ def _table_of_texts(
     path: Path, names: list[str], wanted: Mapping[str, int], header_line: int, body: str, separator: str
 ) -> Table:
     """Whatever the rows hold: quoted cells, comments, blank lines."""
-    lines = body.split("\n")
-    keep = list(map(_has_content, lines))
-    rows = list(itertools.compress(lines, keep))
-    line = header_line + 1 + np.flatnonzero(keep)
+    lines: list[int] = []
     cells: dict[str, list[str]] = {name: [] for name in wanted}
-    for chunk in _chunks_of_cells(rows, line, len(names), separator, path):
+    for line, row in enumerate(body.split("\n"), header_line + 1):
+        if not _has_content(row):
+            continue
+        found = _split_row(row, separator, path, line)
+        if len(found) != len(names):
+            num = f"{len(found)} cell{'s' * (len(found) != 1)}"
+            raise InputError(f"has {num}, the header row has {len(names)}", path, line)
+        lines.append(line)
         for name, index in wanted.items():
-            cells[name] += chunk[index :: len(names)]
-    return Table(path, tuple(names), line, cells)
+            cells[name].append(found[index])
+    return Table(path, tuple(names), np.array(lines, dtype=np.int64), cells)
 
 
 def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
@@ -239,7 +243,7 @@ def header_names(text: str, separator: str | None = None) -> list[str]:
     """The cells of the first line that is neither blank nor a comment, as far as it is a row of cells at all."""
     row = next(filter(_has_content, text.split("\n")), "")
     try:
-        return _split_row(row, separator or guess_separator(row))
+        return [cell.strip() for cell in _split_row(row, separator or guess_separator(row))]
     except InputError:
         return []
 
@@ -286,38 +290,13 @@ def _split_header(text: str) -> tuple[str, int, str]:
 
 
 def _split_row(row: str, separator: str, path: Path | None = None, line: int | None = None) -> list[str]:
-    if separator == " " and '"' not in row:
-        return row.split()
+    if '"' not in row:
+        return row.split(None if separator == " " else separator)
     try:
         cells = next(csv.reader([row], delimiter=separator, skipinitialspace=True, strict=True))
     except csv.Error as error:
         raise InputError(f"not a row of cells ({error})", path, line) from None
-    return [cell.strip() for cell in cells]
-
-
-def _chunks_of_cells(
-    rows: list[str], line: npt.NDArray[np.int64], num_columns: int, separator: str, path: Path
-) -> Iterator[list[str]]:
-    """The cells of some thousand rows after the other, each row's ``num_columns`` in turn."""
-    for start in range(0, len(rows), _CHUNK_ROWS):
-        chunk = rows[start : start + _CHUNK_ROWS]
-        joined = "\n".join(chunk)
-        if separator == " " or '"' in joined:
-            split = [_split_row(row, separator, path, int(line[start + i])) for i, row in enumerate(chunk)]
-            num_cells = list(map(len, split))
-            cells = list(itertools.chain.from_iterable(split))
-        else:
-            num_cells = [row.count(separator) + 1 for row in chunk]
-            cells = joined.replace("\n", separator).split(separator)
-        if num_cells.count(num_columns) != len(chunk):
-            row = next(row for row, num in enumerate(num_cells) if num != num_columns)
-            message = f"has {_counted(num_cells[row], 'cell')}, the header row has {num_columns}"
-            raise InputError(message, path, int(line[start + row]))
-        yield cells
-
-
-def _canonical_names(header: list[str], known: Sequence[str], aliases: Mapping[str, str]) -> list[str]:
-    return [name if name in known else aliases.get(name, name) for name in header]
+    return cells
 
 
 def _check_header(names: list[str], required: Sequence[str], optional: Sequence[str], path: Path, line: int) -> None:
@@ -344,5 +323,22 @@ def _listed(names: Iterable[str]) -> str:
     return printable(", ".join(names))
 
 
-def _counted(num: int, noun: str) -> str:
-    return f"{num} {noun}" if num == 1 else f"{num} {noun}s"
+def align_rows(rows: Iterable[Sequence[str]], *, num_left: int = 1) -> str:
+    """One line a row; columns as wide as their longest cell on a terminal, whatever alphabet it is written in.
+
+    Args:
+        rows: all of equal length; cells stand there as they are, whatever looks like markup.
+        num_left: so many columns begin at their left edge, the others end at their right.
+    """
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table.grid(padding=(0, 2, 0, 0))
+    for row in rows:
+        while len(table.columns) < len(row):
+            table.add_column(justify="left" if len(table.columns) < num_left else "right", no_wrap=True)
+        table.add_row(*map(Text, row))
+    lines = io.StringIO()
+    Console(file=lines, width=1 << 20).print(table)  # nothing is cut
+    return "\n".join(line.rstrip() for line in lines.getvalue()[:-1].split("\n"))

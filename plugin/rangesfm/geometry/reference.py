@@ -86,9 +86,8 @@ class Reference:
         gap = known[after] - known[before]
         between = (gap > 0) & (gap <= max_gap_s + ROUNDING_S) & (times >= known[before]) & (times <= known[after])
         weight = ((times - known[before])[between] / gap[between])[:, None]
-        positions[between] = (1 - weight) * self.positions_m[before[between]] + weight * self.positions_m[
-            after[between]
-        ]
+        start_m, end_m = self.positions_m[before[between]], self.positions_m[after[between]]
+        positions[between] = (1 - weight) * start_m + weight * end_m
         if rotations is not None and between.any():
             assert self.world_from_cam is not None
             rotations[between] = Slerp(known, Rotation.from_matrix(self.world_from_cam))(times[between]).as_matrix()
@@ -187,11 +186,8 @@ def _from_table(table: Table, key: str) -> Reference:
     times = table.numbers(key)
     _refuse_repeated(table, key, times.tolist())
     order = np.argsort(times)
-    return Reference(
-        positions[order],
-        timestamps_s=times[order],
-        world_from_cam=None if rotations is None else rotations[order],
-    )
+    turns = None if rotations is None else rotations[order]
+    return Reference(positions[order], timestamps_s=times[order], world_from_cam=turns)
 
 
 def _rotations(table: Table) -> Array | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -45,14 +45,8 @@ class Trajectory:
         self, scale: float, rotation: npt.NDArray[np.float64], translation: npt.NDArray[np.float64]
     ) -> Trajectory:
         """The same path in the world ``x_new = scale * rotation @ x + translation``."""
-        return Trajectory(
-            self.frame_ids,
-            self.image_names,
-            self.timestamps_s,
-            scale * self.centers @ rotation.T + translation,
-            rotation @ self.world_from_cam,
-            self.time_resolution_s,
-        )
+        centers = scale * self.centers @ rotation.T + translation
+        return replace(self, centers=centers, world_from_cam=rotation @ self.world_from_cam)
 
     def as_in(self, model: pycolmap.Reconstruction) -> Trajectory:
         """The same keyframes as another model has them."""
@@ -109,13 +103,14 @@ def trajectory_from_reconstruction(
             center = -world_from_cam @ rig_from_world.translation
             rows.append((time, name, frame_id, center, world_from_cam))
     rows.sort(key=lambda row: row[:2])
+    times, names, frame_ids, centers, turns = zip(*rows) if rows else ((),) * 5
     return Trajectory(
-        frame_ids=np.array([row[2] for row in rows], dtype=np.int64),
-        image_names=tuple(row[1] for row in rows),
-        timestamps_s=None if timestamps_s is None else np.array([row[0] for row in rows], dtype=np.float64),
-        centers=np.array([row[3] for row in rows], dtype=np.float64).reshape(-1, 3),
-        world_from_cam=np.array([row[4] for row in rows], dtype=np.float64).reshape(-1, 3, 3),
-        time_resolution_s=time_resolution_s,
+        np.array(frame_ids, dtype=np.int64),
+        tuple(names),
+        None if timestamps_s is None else np.array(times, dtype=np.float64),
+        np.array(centers, dtype=np.float64).reshape(-1, 3),
+        np.array(turns, dtype=np.float64).reshape(-1, 3, 3),
+        time_resolution_s,
     )
 
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pycolmap
 
-from rangesfm.colmap.merge import joined_model
-from rangesfm.colmap.transform import rescale
+from rangesfm.colmap.transform import joined_model, rescale
 from rangesfm.distances.ends import distances_within, locate_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError

@@ -1,9 +1,15 @@
-"""A process that is watched from its start to its end: what it says, what memory it takes, and why it ended."""
+"""A process of our own, watched from its start to its end: what it says, what memory it takes, and why it ended.
+
+It is started as ``python -m MODULE PARENT``, reads one pickled object and writes one JSON object a line:
+``{"stage": name}``, ``{"num_done": n, "num_total": m}``, and last either ``{"done": ...}`` or ``{"failed": ...}``.
+"""
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
+import pickle
 import queue
 import signal
 import subprocess
@@ -13,15 +19,79 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import IO, Any
+from dataclasses import asdict, dataclass
+from typing import IO, Any, TextIO
 
 import psutil
 
+from rangesfm.errors import failure_of
+
+_PR_SET_PDEATHSIG = 1
+_UPDATE_INTERVAL_S = 0.5
 _POLL_INTERVAL_S = 0.2
 _MAX_STOP_S = 20.0  # until a process that was interrupted is killed
 _MAX_LINE = 200
 _STACK_TRACE = ("***", "@", "PC:")  # as glog begins its lines
+
+
+class MessagesToParent:
+    """The progress of the work, one message a line; not every one of the many updates."""
+
+    def __init__(self, stream: TextIO):
+        self._stream = stream
+        self._last_update = 0.0
+
+    def stage(self, name: str) -> None:
+        self._last_update = time.monotonic()
+        self.send({"stage": name})
+
+    def update(self, num_done: int, num_total: int | None = None) -> None:
+        now = time.monotonic()
+        if now - self._last_update >= _UPDATE_INTERVAL_S:
+            self._last_update = now
+            self.send({"num_done": num_done, "num_total": num_total})
+
+    def message(self, text: str) -> None:
+        """Warnings are in what the work leaves."""
+
+    def send(self, message: dict[str, Any]) -> None:
+        self._stream.write(json.dumps(message) + "\n")
+        self._stream.flush()
+
+
+def work_for_parent(work: Callable[[Any, MessagesToParent], Any]) -> None:
+    """Do what a process is there for.
+
+    Args:
+        work: called with what the process is given; what it returns (plain values), or the error that it raises, is
+            the process's last message.
+    """
+    # It may have been started where Ctrl-C is ignored.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    parent = MessagesToParent(_own_stdout())
+    try:
+        given = pickle.load(sys.stdin.buffer)
+        _end_with(int(sys.argv[1]))
+        parent.send({"done": work(given, parent)})
+    except (Exception, KeyboardInterrupt) as error:
+        parent.send({"failed": asdict(failure_of(error))})
+
+
+def _own_stdout() -> TextIO:
+    """The parent's end of stdout; whatever else is printed goes to stderr."""
+    stream = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    return stream
+
+
+def _end_with(parent: int) -> None:
+    """Be killed as soon as the parent is, however it ends: the folder written to must be free for the next one."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:
+            os.kill(os.getpid(), signal.SIGKILL)
+    else:  # the parent's end of stdin closes with it
+        threading.Thread(target=lambda: (sys.stdin.buffer.read(), os._exit(1)), daemon=True).start()
 
 
 @dataclass(frozen=True)
@@ -50,7 +120,7 @@ class Ended:
 
 
 def child_command(module: str) -> list[str]:
-    """Of a module that works for its parent (``child_process``)."""
+    """Of a module that works for its parent (``work_for_parent``)."""
     return [sys.executable, "-m", module, str(os.getpid())]
 
 
@@ -103,20 +173,15 @@ class _Watched:
 
     def look(self) -> None:
         if self._limit is not None and self.needed_bytes is None:
-            self._look_at_memory(self._limit)
+            with suppress(psutil.Error):  # it has ended
+                used = psutil.Process(self._process.pid).memory_info().rss
+                if used > self._limit:
+                    self.needed_bytes = used
+                    self._process.kill()
         if self.stopped_at is None and self._is_stopped():
             self.stopped_at = time.monotonic()
             self._process.send_signal(signal.SIGINT)
         if self.stopped_at is not None and time.monotonic() - self.stopped_at > _MAX_STOP_S:
-            self._process.kill()
-
-    def _look_at_memory(self, limit_bytes: int) -> None:
-        try:
-            used = psutil.Process(self._process.pid).memory_info().rss
-        except psutil.Error:  # it has ended
-            return
-        if used > limit_bytes:
-            self.needed_bytes = used
             self._process.kill()
 
 
@@ -128,32 +193,23 @@ def _talk(
     assert process.stdout is not None
     lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
     threading.Thread(target=_read_lines, args=(process.stdout, lines), daemon=True).start()
+    last = None
     try:
         with suppress(BrokenPipeError):  # it died; what it said before counts
             process.stdin.write(given)
             process.stdin.flush()
-        last = _hear(lines, listen, watched)
+        while True:
+            watched.look()
+            with suppress(queue.Empty):
+                if (line := lines.get(timeout=_POLL_INTERVAL_S)) is None:
+                    break
+                last = json.loads(line)
+                listen(last)
     finally:
         with suppress(BrokenPipeError):
             process.stdin.close()  # not sooner: that it is open says that we live
     process.wait()
     return last
-
-
-def _hear(
-    lines: queue.SimpleQueue[bytes | None], listen: Callable[[dict[str, Any]], None], watched: _Watched
-) -> dict[str, Any] | None:
-    last = None
-    while True:
-        watched.look()
-        try:
-            line = lines.get(timeout=_POLL_INTERVAL_S)
-        except queue.Empty:
-            continue
-        if line is None:
-            return last
-        last = json.loads(line)
-        listen(last)
 
 
 def _read_lines(stream: IO[bytes], lines: queue.SimpleQueue[bytes | None]) -> None:

@@ -13,8 +13,7 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.ceres.covariance import JointCovariance, joint_covariance
 from rangesfm.ceres.linear_solver import inverse_is_affordable, overlaps_in
-from rangesfm.distances.by_radio import distances_by_radio
-from rangesfm.distances.ends import LocatedDistances
+from rangesfm.distances.ends import LocatedDistances, distances_by_radio
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.gravity import Gravity

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rangesfm.files.atomic import new_file
-from rangesfm.files.sole_writer import sole_writer
+from rangesfm.files.atomic import new_file, sole_writer
 from rangesfm.report.content import Content
 from rangesfm.report.page import figures_of, render_report
 from rangesfm.report.pictures import write_pictures
@@ -47,5 +46,4 @@ def write_report_pictures(result_folder: Path) -> list[Path]:
     """
     result = read_result_folder(result_folder)
     with sole_writer(result_folder):
-        figures = figures_of(Content(result)).values()
-        return write_pictures([one for of_section in figures for one in of_section], result_folder / PICTURES_FOLDER)
+        return write_pictures(figures_of(Content(result)), result_folder / PICTURES_FOLDER)

@@ -77,64 +77,25 @@ class Check:
 
 def quality_checks(summary: ResultSummary) -> tuple[Check, ...]:
     """The checks of a result, in the order in which they matter."""
+    scale, ranges, offset = summary.scale, summary.ranges, summary.time_offset
+    uncertainty = _relative_percent(scale.larger_stddev, scale.value)
+    share_used = _relative_percent(ranges.num_used, ranges.num)
+    reprojection_px = None if summary.refine is None else summary.refine.reprojection_rms_px
+    of_scale = "The larger of the formal and the empirical standard deviation."
+    of_anchors = "Farthest that the scale from one anchor alone is from the joint one."
+    of_check_ranges = "RMS of ranges that no estimate has seen."
+    of_share = "Share of all ranges in the log that had a say."
+    of_clocks = "Standard deviation of the offset between the camera's and the radio's clock."
+    of_points = "RMS distance of the map's points from where the photos show them."
+    no_matter = _why_no_offset_matters(offset)
     return (
-        Check(
-            "Scale uncertainty",
-            "The larger of the formal and the empirical standard deviation.",
-            _relative_percent(summary.scale.larger_stddev, summary.scale.value),
-            "%",
-            1.0,
-            5.0,
-            2,
-        ),
-        Check(
-            "Anchor agreement",
-            "Farthest that the scale from one anchor alone is from the joint one.",
-            _anchor_spread_percent(summary.scale),
-            "%",
-            2.0,
-            5.0,
-            2,
-        ),
-        Check(
-            "Check ranges",
-            "RMS of ranges that no estimate has seen.",
-            summary.check_ranges.rms_m,
-            "m",
-            0.20,
-            0.40,
-            3,
-        ),
-        Check("Range residuals", "RMS of the ranges used.", summary.ranges.rms_m, "m", 0.15, 0.30, 3),
-        Check(
-            "Ranges used",
-            "Share of all ranges in the log that had a say.",
-            _relative_percent(summary.ranges.num_used, summary.ranges.num),
-            "%",
-            70.0,
-            40.0,
-            1,
-            larger_is_better=True,
-        ),
-        Check(
-            "Clock offset",
-            "Standard deviation of the offset between the camera's and the radio's clock.",
-            summary.time_offset.stddev_s,
-            "s",
-            0.02,
-            0.10,
-            4,
-            no_matter=_why_no_offset_matters(summary.time_offset),
-        ),
-        Check(
-            "Reprojection",
-            "RMS distance of the map's points from where the photos show them.",
-            None if summary.refine is None else summary.refine.reprojection_rms_px,
-            "px",
-            1.0,
-            2.0,
-            2,
-        ),
+        Check("Scale uncertainty", of_scale, uncertainty, "%", 1.0, 5.0, 2),
+        Check("Anchor agreement", of_anchors, _anchor_spread_percent(scale), "%", 2.0, 5.0, 2),
+        Check("Check ranges", of_check_ranges, summary.check_ranges.rms_m, "m", 0.20, 0.40, 3),
+        Check("Range residuals", "RMS of the ranges used.", ranges.rms_m, "m", 0.15, 0.30, 3),
+        Check("Ranges used", of_share, share_used, "%", 70.0, 40.0, 1, larger_is_better=True),
+        Check("Clock offset", of_clocks, offset.stddev_s, "s", 0.02, 0.10, 4, no_matter=no_matter),
+        Check("Reprojection", of_points, reprojection_px, "px", 1.0, 2.0, 2),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +16,6 @@ from rangesfm.arrays import Array
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.result.folder import ResultFolder
 from rangesfm.result.ranges_as_used import RangesAsUsed
-from rangesfm.result.summary import ResultSummary
 
 if TYPE_CHECKING:
     import pycolmap
@@ -53,7 +52,6 @@ class Content:
         tags_in_cam_m: (n, 3) antenna of each range's tag in the camera's frame; n is 0 without ranges.
         range_times_s: (n,) when each range was taken, seconds since the first; NaN where unknown.
         scaled, refined: the path before and after the refinement; ``final`` is the best there is.
-        true_scale: the path before the refinement with the reference's scale; None if that is not known.
         reference_m: (k, 3) positions in the map's frame; ``reference_by_photo`` (3,) by name.
         points_m, points_rgb: (m, 3) of the final map.
         cameras: intrinsics in the scaled and in the final model.
@@ -68,28 +66,34 @@ class Content:
         Raises:
             InputError: a file of the result is there but cannot be read.
         """
-        self.result = result
+        self.result, self.summary = result, result.summary
         self.title = _title(result.path.resolve())
-        self.summary = result.summary
         self.images_path = images_path or result.images_path
         self.ranges = result.read(RangesAsUsed)
         self.tags_in_cam_m = result.lever_arms_m(() if self.ranges is None else self.ranges.tag_id)
-        self.range_times_s = (
-            np.zeros(0) if self.ranges is None else _range_times(self.ranges, result.timestamps_s or {})
-        )
-        scaled, refined = result.read_model("sparse_scaled"), result.read_model("sparse_metric")
+        self.range_times_s = _range_times(self.ranges, result.timestamps_s or {}) if self.ranges else np.zeros(0)
+        scaled, refined = models = [result.read_model(stage) for stage in ("sparse_scaled", "sparse_metric")]
         self.scaled, self.refined = (
-            None if model is None else trajectory_from_reconstruction(model, result.timestamps_s)
-            for model in (scaled, refined)
+            None if model is None else trajectory_from_reconstruction(model, result.timestamps_s) for model in models
         )
         self.final = self.refined or self.scaled
-        self.true_scale = None if self.scaled is None else _with_true_scale(self.scaled, result.summary)
+        self.points_m, self.points_rgb = points_of(refined or scaled)
+        self.cameras = tuple(_cameras(scaled, refined))
         reference = result.read_reference()
         self.reference_m = None if reference is None else reference.positions_m
         names = () if reference is None else reference.image_names or ()
         self.reference_by_photo = {} if reference is None else dict(zip(names, reference.positions_m))
-        self.points_m, self.points_rgb = points_of(refined or scaled)
-        self.cameras = _cameras(scaled, refined)
+
+    @cached_property
+    def true_scale(self) -> Trajectory | None:
+        """The path before the refinement with the reference's scale; None if that is not known.
+
+        By the error that the comparison found: the reference itself may know no more than a few photos.
+        """
+        errors = [row.scale_error_percent for row in self.summary.comparison if row.name == "estimated scale"]
+        if self.scaled is None or not errors or errors[0] is None:
+            return None
+        return self.scaled.resized(1.0 / (1.0 + errors[0] / 100.0), self.summary.frame)
 
     @cached_property
     def true_ranges_m(self) -> Array | None:
@@ -106,14 +110,6 @@ def _title(folder: Path) -> str:
     return folder.parent.name if folder.name == DEFAULT_FOLDER and folder.parent.name else folder.name
 
 
-def _with_true_scale(path: Trajectory, summary: ResultSummary) -> Trajectory | None:
-    """By the error that the comparison found: the reference itself may know no more than a few photos."""
-    for row in summary.comparison:
-        if row.name == "estimated scale" and row.scale_error_percent is not None:
-            return path.resized(1.0 / (1.0 + row.scale_error_percent / 100.0), summary.frame)
-    return None
-
-
 def points_of(model: pycolmap.Reconstruction | None) -> tuple[Array, npt.NDArray[np.uint8]]:
     """(m, 3) positions and (m, 3) colours of a model's points; of none without a model."""
     points = [] if model is None else list(model.points3D.values())
@@ -123,17 +119,16 @@ def points_of(model: pycolmap.Reconstruction | None) -> tuple[Array, npt.NDArray
 
 def _cameras(
     scaled: pycolmap.Reconstruction | None, refined: pycolmap.Reconstruction | None
-) -> tuple[CameraIntrinsics, ...]:
-    both = [{} if model is None else dict(model.cameras.items()) for model in (scaled, refined)]
-    found = []
-    for camera_id, camera in sorted((both[1] or both[0]).items()):
+) -> Iterator[CameraIntrinsics]:
+    before, after = ({} if model is None else dict(model.cameras) for model in (scaled, refined))
+    for camera_id, camera in sorted((after or before).items()):
         names = [name.strip() for name in camera.params_info.split(",")]
-        values = [of_model[camera_id].params if camera_id in of_model else [math.nan] * len(names) for of_model in both]
+        unknown = [math.nan] * len(names)
+        values = [of_model[camera_id].params if camera_id in of_model else unknown for of_model in (before, after)]
         title = f"{camera_id} {camera.model.name} {camera.width} × {camera.height}"
         focal = camera.mean_focal_length()
         half_angles = (camera.width / (2 * focal), camera.height / (2 * focal))
-        found.append(CameraIntrinsics(title, tuple(zip(names, *values)), half_angles))
-    return tuple(found)
+        yield CameraIntrinsics(title, tuple(zip(names, *values)), half_angles)
 
 
 def in_natural_order(ids: Iterable[str]) -> list[str]:

@@ -60,10 +60,9 @@ def local_scale(content: Content) -> Figure | None:
     if path is None or content.refined is None:
         return None
     known = [content.reference_by_photo.get(name, [np.nan] * 3) for name in path.image_names]
-    truth = np.array(known, dtype=np.float64).reshape(-1, 3)
     series = [
         Series("refined over scaled", "after", _local_scales(path, content.refined.centers), "line"),
-        Series("reference over scaled", "reference", _local_scales(path, truth), "dashed"),
+        Series("reference over scaled", "reference", _local_scales(path, np.array(known, dtype=np.float64)), "dashed"),
     ]
     series = [one for one in series if len(one.points)]
     if not series:
@@ -89,25 +88,16 @@ def _trajectory_view(content: Content, view: View) -> Panel:
     anchors = content.result.anchor_positions_m
     places = view.seen(np.array(list(anchors.values())).reshape(-1, 3))
     limits = equal_view(np.concatenate([*(line.points for line in lines), places]))
-    if len(content.points_m):
-        lines.insert(0, Series("map", "map", _inside(view.seen(_thinned(content.points_m)), limits), is_data=False))
+    if (num := len(content.points_m)) > 0:
+        even = np.random.default_rng(0).choice(num, min(num, MAX_NUM_POINTS_DRAWN), replace=False)
+        points, (low, high) = view.seen(content.points_m[even]), np.transpose(limits[:2])
+        inside = np.all((points > low) & (points < high), axis=1)
+        lines.insert(0, Series("map", "map", points[inside], is_data=False))
     marks = tuple(
         Mark("anchor", "anchor", "triangle", x, y, anchor_id, f"anchor {anchor_id}")
         for anchor_id, (x, y) in zip(anchors, places.tolist())
     )
     return view.panel("the camera's path with the anchors", " m", lines, limits, marks=marks)
-
-
-def _inside(points: Array, limits: Limits) -> Array:
-    low, high = np.transpose(limits[:2])
-    return np.asarray(points[np.all((points > low) & (points < high), axis=1)])
-
-
-def _thinned(points: Array) -> Array:
-    """An even sample of what may be very many."""
-    if len(points) <= MAX_NUM_POINTS_DRAWN:
-        return points
-    return points[np.random.default_rng(0).choice(len(points), MAX_NUM_POINTS_DRAWN, replace=False)]
 
 
 def _map_view(content: Content, path: Array, view: View) -> Panel:
@@ -124,17 +114,16 @@ def _map_view(content: Content, path: Array, view: View) -> Panel:
 
 def _raster(points: Array, colors: Pixels, limits: Limits) -> Pixels:
     """(h, w, 4) pixels with each point two pixels wide."""
-    x_range, y_range, size = limits
+    (x_low, x_high), (y_low, y_high), size = limits
     width, height = PICTURE_WIDTH_PX, max(round(PICTURE_WIDTH_PX * size[1] / size[0]), 1)
     pixels = np.zeros((height, width, 4), dtype=np.uint8)
-    column = (points[:, 0] - x_range[0]) / (x_range[1] - x_range[0]) * (width - 1)
-    row = (y_range[1] - points[:, 1]) / (y_range[1] - y_range[0]) * (height - 1)
-    inside = (column >= 0) & (row >= 0) & (column < width - 1) & (row < height - 1)
-    i, j = row[inside].astype(np.int64), column[inside].astype(np.int64)
-    rgba = np.column_stack([colors[inside], np.full(len(i), 255, dtype=np.uint8)])
-    for down in (0, 1):
-        for right in (0, 1):
-            pixels[i + down, j + right] = rgba
+    last = np.array([width - 1, height - 1])
+    places = (points - (x_low, y_high)) / (x_high - x_low, y_low - y_high) * last
+    inside = np.all((places >= 0) & (places < last), axis=1)
+    column, row = places[inside].astype(np.int64).T
+    rgba = np.insert(colors[inside], 3, 255, axis=1)
+    for down, right in np.ndindex(2, 2):
+        pixels[row + down, column + right] = rgba
     return pixels
 
 

@@ -7,7 +7,18 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.report.content import Content, in_natural_order
-from rangesfm.report.plot import WIDE_SIZE, Figure, Panel, Series, figure_of, running_median, time_axis
+from rangesfm.report.plot import (
+    WIDE_SIZE,
+    Figure,
+    Panel,
+    Range,
+    Series,
+    figure_of,
+    from_zero,
+    histogram,
+    running_median,
+    time_axis,
+)
 from rangesfm.result.ranges_as_used import RangesAsUsed
 
 NUM_HISTOGRAM_BINS = 60
@@ -16,6 +27,7 @@ MAX_NUM_DRAWN = 6_000
 """Ranges that a figure has a dot for; medians and histograms are of all."""
 
 PANEL_SIZE = (270.0, 125.0)
+_COLORS = {"measured": "rejected", "scaled": "before", "refined": "after"}
 
 
 def residuals_over_time(content: Content) -> Figure | None:
@@ -38,12 +50,9 @@ def residual_histogram(content: Content) -> Figure | None:
         return None
     limit = _residual_limit(ranges)
     edges = np.linspace(-limit, limit, NUM_HISTOGRAM_BINS + 1)
-    outlines = []
-    for name, color, residuals in _both(ranges):
-        known = residuals[ranges.is_used & np.isfinite(residuals)]
-        if len(known):
-            outlines.append(Series(name, color, histogram(known, edges), "filled"))
-    highest = max(float(series.points[:, 1].max()) for series in outlines)
+    outlines = [
+        Series(name, _COLORS[name], histogram(known, edges), "filled") for name, known in _of_used(ranges).items()
+    ]
     return figure_of(
         "range_residual_histogram",
         "Residuals of the ranges used. Real radios lean to long measurements, which here are negative.",
@@ -51,15 +60,9 @@ def residual_histogram(content: Content) -> Figure | None:
         ("predicted − measured m", "ranges"),
         outlines,
         x_range=(-limit, limit),
-        y_range=(0.0, 1.08 * highest),
-        verticals=((0.0, "ink"),),
+        y_range=from_zero(outlines),
+        line=("", 0.0),
     )
-
-
-def histogram(values: Array, edges: Array) -> Array:
-    """(n, 2): the line around the bars; what lies beyond the edges is in the outermost."""
-    heights = np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0].astype(float)
-    return np.column_stack([np.repeat(edges, 2), np.concatenate([[0.0], np.repeat(heights, 2), [0.0]])])
 
 
 def absolute_errors(content: Content) -> Figure | None:
@@ -68,17 +71,13 @@ def absolute_errors(content: Content) -> Figure | None:
     if ranges is None or true_m is None:
         return None
     rows = np.flatnonzero(np.isfinite(true_m))
-    stride = _stride(len(rows))
     times, time_label = time_axis(content.range_times_s)
-    errors = [("measured", "rejected", ranges.range_m)]
-    errors += [(name, color, residuals + ranges.range_m) for name, color, residuals in _both(ranges)]
+    lengths = {"measured": ranges.range_m}
+    lengths |= {name: residuals + ranges.range_m for name, residuals in ranges.residuals_by_model_m.items()}
+    points = {name: np.column_stack([times, np.abs(m - true_m)])[rows] for name, m in lengths.items()}
+    points = {name: errors for name, errors in points.items() if np.isfinite(errors[:, 1]).any()}
     x_range = (float(times[rows].min()), float(times[rows].max()))
-    dots, lines = [], []
-    for name, color, values in errors:
-        points = np.column_stack([times[rows], np.abs(values - true_m)[rows]])
-        if np.isfinite(points[:, 1]).any():
-            dots.append(Series(name, color, points[::stride]))
-            lines.append(Series(name, color, running_median(points, x_range, NUM_MEDIAN_BINS), "line", is_data=False))
+    dots = [Series(name, _COLORS[name], errors[:: _stride(len(rows))]) for name, errors in points.items()]
     sizes = np.concatenate([series.points[:, 1] for series in dots])
     return figure_of(
         "absolute_range_errors",
@@ -86,7 +85,7 @@ def absolute_errors(content: Content) -> Figure | None:
         "their running medians. Ranges taken at a photo, to anchors where this map has them." + _thinned(len(rows)),
         "Absolute range errors over time",
         (time_label, "absolute error m"),
-        (*dots, *lines),
+        [*dots, *(_median(name, errors, x_range) for name, errors in points.items())],
         table="range_errors",
         x_range=x_range,
         y_range=(0.0, 1.1 * max(float(np.nanquantile(sizes, 0.98)), 1e-3)),
@@ -101,26 +100,27 @@ def _residual_panel(content: Content, ranges: RangesAsUsed, anchor_id: str) -> P
     is_mine = np.array(ranges.anchor_id, dtype=str) == anchor_id
     is_used = is_mine & ranges.is_used
     is_rejected = is_mine & (np.array(ranges.status, dtype=str) == RangeStatus.OUTLIER.label)
-    final = _both(ranges)[-1][2]
     is_drawn = np.arange(len(times)) % _stride(len(times)) == 0
-    series = [Series("rejected", "rejected", np.column_stack([times, final])[is_rejected & is_drawn])]
-    medians = []
-    for name, color, residuals in _both(ranges):
-        points = np.column_stack([times, residuals])
-        series.append(Series(name, color, points[is_used & is_drawn]))
-        line = running_median(points[is_used], time_range, NUM_MEDIAN_BINS)
-        medians.append(Series(name, color, line, "line", is_data=False))
+    points = {name: np.column_stack([times, m]) for name, m in ranges.residuals_by_model_m.items()}
+    *_, final = points.values()
     return Panel(
         f"Anchor {anchor_id}",
         f"Range residuals of anchor {anchor_id} over time",
-        time_label,
-        "residual m",
-        (*series, *medians),
+        (time_label, "residual m"),
+        (
+            Series("rejected", "rejected", final[is_rejected & is_drawn]),
+            *(Series(name, _COLORS[name], of_model[is_used & is_drawn]) for name, of_model in points.items()),
+            *(_median(name, of_model[is_used], time_range) for name, of_model in points.items()),
+        ),
         x_range=time_range,
         y_range=(-limit, limit),
         zero_line=True,
         size=PANEL_SIZE,
     )
+
+
+def _median(name: str, points: Array, x_range: Range) -> Series:
+    return Series(name, _COLORS[name], running_median(points, x_range, NUM_MEDIAN_BINS), "line", is_data=False)
 
 
 def _stride(num: int) -> int:
@@ -133,17 +133,16 @@ def _thinned(num: int) -> str:
     return "" if _stride(num) == 1 else f" One range in {_stride(num)} is drawn; the medians are of all."
 
 
-def _both(ranges: RangesAsUsed) -> list[tuple[str, str, Array]]:
-    """Name, color and residuals before and, where there are any, after the refinement."""
-    both = [("scaled", "before", ranges.residual_scaled_m), ("refined", "after", ranges.residual_refined_m)]
-    return both if np.isfinite(ranges.residual_refined_m).any() else both[:1]
+def _of_used(ranges: RangesAsUsed) -> dict[str, Array]:
+    """Residuals that are known, of the ranges used, by model."""
+    used = {name: residuals[ranges.is_used] for name, residuals in ranges.residuals_by_model_m.items()}
+    return {name: residuals[np.isfinite(residuals)] for name, residuals in used.items() if np.isfinite(residuals).any()}
 
 
 def _has_residuals(ranges: RangesAsUsed) -> bool:
-    return bool(np.isfinite(ranges.residual_scaled_m[ranges.is_used]).any())
+    return "scaled" in _of_used(ranges)
 
 
 def _residual_limit(ranges: RangesAsUsed) -> float:
     """Half the height of the residual axes: room for nearly all ranges used, before and after."""
-    sizes = [np.abs(residuals[ranges.is_used & np.isfinite(residuals)]) for _, _, residuals in _both(ranges)]
-    return max(1.15 * max(float(np.quantile(size, 0.995)) for size in sizes if len(size)), 1e-3)
+    return max(1.15 * max(float(np.quantile(np.abs(known), 0.995)) for known in _of_used(ranges).values()), 1e-3)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rangesfm.report.content import Content, in_natural_order
-from rangesfm.report.figures_ranges import histogram
-from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Series, figure_of, time_axis
+from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Series, figure_of, from_zero, histogram, time_axis
 from rangesfm.report.text import signed
 from rangesfm.result.tables import ScaleBootstrap, ScaleCandidates, ScaleConsensus, TimeOffsetCurve
 
@@ -91,7 +90,7 @@ def consensus(content: Content) -> Figure | None:
         ("scale m per unit", "ranges"),
         (curve,),
         line=("scale found", content.summary.scale.value),
-        y_range=(0.0, 1.08 * max(float(table.num_agreeing.max()), 1.0)),
+        y_range=from_zero([curve]),
     )
 
 
@@ -100,22 +99,21 @@ def bootstrap(content: Content) -> Figure | None:
     table = content.result.read(ScaleBootstrap)
     if table is None or len(table.scale) < 2:
         return None
-    values = table.scale
-    low, high = np.quantile(values, [0.005, 0.995])
+    low, high = np.quantile(table.scale, [0.005, 0.995])
     margin = max(0.15 * (high - low), 1e-6 * abs(high))
     edges = np.linspace(low - margin, high + margin, NUM_BOOTSTRAP_BINS + 1)
-    resampled = Series("resampled", "after", histogram(values, edges), "filled")
-    interval = content.summary.scale.interval_95
+    resampled = Series("resampled", "after", histogram(table.scale, edges), "filled")
+    scale = content.summary.scale
     return figure_of(
         "scale_bootstrap",
-        f"{len(values)} scales from blocks of time drawn anew. The band is the 95 % interval of the scale.",
+        f"{len(table.scale)} scales from blocks of time drawn anew. The band is the 95 % interval of the scale.",
         "Histogram of resampled scales",
         ("scale m per unit", "resamples"),
         (resampled,),
-        line=("scale found", content.summary.scale.value),
-        band=None if interval is None else ("95 % interval", *interval),
+        line=("scale found", scale.value),
+        band=None if scale.interval_95 is None else ("95 % interval", *scale.interval_95),
         x_range=(float(edges[0]), float(edges[-1])),
-        y_range=(0.0, 1.08 * max(float(resampled.points[:, 1].max()), 1.0)),
+        y_range=from_zero([resampled]),
     )
 
 
@@ -125,12 +123,11 @@ def clock_curve(content: Content) -> Figure | None:
     if table is None or len(table.cost) == 0:
         return None
     offset = content.summary.time_offset.value_s
-    curve = Series("misfit", "after", np.column_stack([table.time_offset_s, table.cost]), "line")
     return figure_of(
         "time_offset_curve",
         "Misfit of the ranges for each offset between the clocks. One sharp valley at the line is what is wanted.",
         "Misfit of the ranges for each clock offset",
         ("time offset s", "misfit"),
-        (curve,),
+        [Series("misfit", "after", np.column_stack([table.time_offset_s, table.cost]), "line")],
         line=None if offset is None else ("offset used", offset),
     )

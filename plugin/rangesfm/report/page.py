@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from markupsafe import Markup
 
@@ -25,53 +25,81 @@ if TYPE_CHECKING:
 # Nothing may be fetched, not even by mistake: the page holds all it shows. One script may run, this package's.
 CONTENT_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; script-src {script}"
 
-SECTIONS = {
-    "path": (figures_path.trajectory_views, figures_path.map_views, figures_path.local_scale),
-    "scale": (
-        figures_scale.scale_per_anchor,
-        figures_scale.bootstrap,
-        figures_scale.consensus,
-        figures_scale.clock_curve,
-        figures_scale.candidates,
-    ),
-    "ranges": (
-        figures_ranges.residuals_over_time,
-        figures_ranges.residual_histogram,
-        figures_ranges.absolute_errors,
-    ),
-}
 
+class Section(NamedTuple):
+    """A card of the report, which leaves it out if it has neither a figure nor a table."""
+
+    id: str
+    title: str
+    figures: tuple[Callable[[Content], Figure | None], ...]
+    tables: tuple[Callable[[Content], tables.Table], ...]
+
+
+SECTIONS = (
+    Section(
+        "path",
+        "Path",
+        (figures_path.trajectory_views, figures_path.map_views, figures_path.local_scale),
+        (tables.comparison,),
+    ),
+    Section(
+        "scale",
+        "Scale",
+        (
+            figures_scale.scale_per_anchor,
+            figures_scale.bootstrap,
+            figures_scale.consensus,
+            figures_scale.clock_curve,
+            figures_scale.candidates,
+        ),
+        (tables.two_candidates, tables.sensitivity),
+    ),
+    Section(
+        "ranges",
+        "Ranges",
+        (figures_ranges.residuals_over_time, figures_ranges.residual_histogram, figures_ranges.absolute_errors),
+        (tables.range_statuses, tables.ranges_per_anchor),
+    ),
+    Section("anchors", "Anchors", (), (tables.anchors, tables.distances)),
+    Section(
+        "run",
+        "Run",
+        (),
+        (tables.stages, tables.refinement, tables.versions, tables.intrinsics, tables.inputs, tables.settings),
+    ),
+)
 STYLES = ("page.css", "view.css")
 _SCRIPTS = (
-    *("data", "theme", "stage", "points", "cameras", "anchors", "ranges", "grid", "labels", "picking", "measuring"),
-    *("photo_panel", "charts", "csv", "main"),
+    *("data", "stage", "points", "cameras", "anchors", "ranges", "grid", "picking", "measuring", "photo_panel"),
+    *("charts", "csv", "main"),
 )
 _FILTERS = (text.count, text.duration, text.fixed, text.plain, text.sentence, text.signed)
 
 
-def figures_of(content: Content) -> dict[str, list[Figure]]:
-    """All that there are of this result, by the section that shows them."""
-    made = {section: [make(content) for make in all_of_it] for section, all_of_it in SECTIONS.items()}
-    return {section: [figure for figure in figures if figure is not None] for section, figures in made.items()}
+def figures_of(content: Content, sections: Iterable[Section] = SECTIONS) -> list[Figure]:
+    """All that there are of this result."""
+    made = (make(content) for section in sections for make in section.figures)
+    return [figure for figure in made if figure is not None]
 
 
 def render_report(content: Content) -> str:
     """The report of a result."""
-    figures = figures_of(content)
     scene = scene_of(content)
+    sections = [
+        (section.id, section.title, figures_of(content, [section]), [make(content) for make in section.tables])
+        for section in SECTIONS
+    ]
     return render(
         "report.html",
         title=f"{content.title} – rangesfm report",
         heading=content.title,
-        content=content,
         summary=content.summary,
         checks=quality_checks(content.summary),
         stddevs=head.stddevs(content.summary.scale),
         tiles=head.tiles(content),
         view=None if scene is None else view_of(scene),
-        figures=figures,
-        charts=page_charts([figure for of_section in figures.values() for figure in of_section]),
-        tables=tables,
+        sections=sections,
+        charts=page_charts([figure for _, _, figures, _ in sections for figure in figures]),
     )
 
 

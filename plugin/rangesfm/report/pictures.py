@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
 
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import make_output_folder, new_file
-from rangesfm.report.chart import ASSETS, Color, Spec, config, panel_spec, rows_of
-from rangesfm.report.plot import Figure, LegendEntry, Panel
+from rangesfm.report.chart import ASSETS, CONFIG, Spec, css, panel_spec, points_of
+from rangesfm.report.plot import Figure, LegendEntry, Panel, Series
 
 PNG_SCALE = 2.5
 MAX_WIDTH_PX = 660.0
@@ -60,20 +62,18 @@ def write_picture(figure: Figure, path: Path) -> None:
 
 def figure_spec(figure: Figure) -> Spec:
     """All panels of a figure with its legend, in the page's light colours."""
-    colors = light_colors()
-
-    def color(name: str) -> str:
-        return colors.get(name, name)
 
     def sheet(panel: Panel) -> Spec:
         panel = replace(panel, size=(min(panel.size[0], MAX_WIDTH_PX), panel.size[1]))
-        return panel_spec(panel, color, lambda i: {"values": rows_of(panel.series[i])}) | {"title": panel.title}
+        return panel_spec(panel, lambda i: {"values": _rows(panel.series[i])}) | {"title": panel.title}
 
     panels = [sheet(panel) for panel in figure.panels]
     if len(figure.entries) > 1:
-        panels[0]["layer"].append(_legend(figure.entries, color))
+        panels[0]["layer"].append(_legend(figure.entries))
     columns = min(_NUM_COLUMNS[figure.layout], len(panels))
-    return {"background": "white", "padding": 8, "config": config(color), "concat": panels, "columns": columns}
+    spec = {"background": "white", "padding": 8, "config": CONFIG, "concat": panels, "columns": columns}
+    colors = light_colors()
+    return dict(json.loads(re.sub(r"var\(--([\w-]+)\)", lambda found: colors[found[1]], json.dumps(spec))))
 
 
 def light_colors() -> dict[str, str]:
@@ -82,17 +82,22 @@ def light_colors() -> dict[str, str]:
     return dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", light))
 
 
-def _legend(entries: list[LegendEntry], color: Color) -> Spec:
+def _rows(series: Series) -> list[dict[str, float | None]]:
+    return [{"x": x, "y": y if math.isfinite(y) else None} for x, y in points_of(series).tolist()]
+
+
+def _legend(entries: list[LegendEntry]) -> Spec:
     """A layer of which nothing is seen but its legend."""
     texts = [entry.text for entry in entries]
     legend = {"title": None, "orient": "top", "columns": 6, "symbolOpacity": 1}
     ranges = {
-        "color": [color(entry.color) for entry in entries],
+        "color": [css(entry.color) for entry in entries],
         "shape": [_SYMBOLS.get(entry.shape, "square") for entry in entries],
     }
-    encoding = {
+    encoding: Spec = {
         channel: {"field": "text", "scale": {"domain": texts, "range": values}, "legend": legend}
         for channel, values in ranges.items()
     }
     data = {"values": [{"text": text} for text in texts]}
-    return {"data": data, "mark": {"type": "point", "filled": True, "opacity": 0}, "encoding": encoding}
+    nowhere = {"x": None, "y": None}
+    return {"data": data, "mark": {"type": "point", "filled": True, "opacity": 0}, "encoding": encoding | nowhere}

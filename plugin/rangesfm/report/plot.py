@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -24,13 +24,12 @@ WIDE_SIZE = (990.0, 250.0)
 _ROOM_AROUND = 0.06
 
 
-@dataclass(frozen=True)
-class Series:
+class Series(NamedTuple):
     """Points that belong together.
 
     Attributes:
         name: as the legend and the CSV file have it.
-        color: name of a colour of the page's style.
+        color: name of a colour of the page's style, or "#rrggbb".
         points: (n, 2); NaN breaks a line.
         kind: "dots", "line", "dashed", or "filled" (a line with the area from there to zero).
         is_data: whether the CSV file and the pointer know it; not a mere summary of another series.
@@ -43,8 +42,7 @@ class Series:
     is_data: bool = True
 
 
-@dataclass(frozen=True)
-class Mark:
+class Mark(NamedTuple):
     """One labelled place: a "triangle" or a "disc".
 
     Attributes:
@@ -70,20 +68,20 @@ class Panel:
     Attributes:
         title: above it; "" for none.
         description: for those who cannot see it.
+        labels: of the x and the y axis.
         x_range, y_range: of the axes; None takes that of the data.
         size: width and height between the axes, in pixels.
         keeps_shape: whether its height goes with its width, so that both axes keep one scale.
         zero_line: whether zero is marked on the y axis.
-        verticals: (x, color) lines over the whole height.
-        bands: (low, high, color) strips over the whole height.
-        rows: labels left and right of heights, instead of numbers on the y axis.
+        line: name and x of a line over the whole height.
+        band: name and ends on the x axis of a strip over the whole height.
+        rows: height, left and right label of each row, instead of numbers on the y axis.
         picture: (h, w, 4) red, green, blue, opacity, behind the series and all over the panel; top row first.
     """
 
     title: str
     description: str
-    x_label: str
-    y_label: str
+    labels: tuple[str, str]
     series: tuple[Series, ...]
     marks: tuple[Mark, ...] = ()
     x_range: Range | None = None
@@ -91,8 +89,8 @@ class Panel:
     size: tuple[float, float] = (400.0, 200.0)
     keeps_shape: bool = False
     zero_line: bool = False
-    verticals: tuple[tuple[float, str], ...] = ()
-    bands: tuple[tuple[float, float, str], ...] = ()
+    line: tuple[str, float] | None = None
+    band: tuple[str, float, float] | None = None
     rows: tuple[tuple[float, str, str], ...] = ()
     picture: Pixels | None = None
 
@@ -102,12 +100,11 @@ class Panel:
         marks = np.array([[mark.x, mark.y] for mark in self.marks], dtype=np.float64).reshape(-1, 2)
         points = np.concatenate([marks, *(series.points for series in self.series)])
         x_range = self.x_range or _limits(points[:, 0])
-        y_range = self.y_range or _with_room(_limits(points[:, 1]))
+        y_range = self.y_range or _limits(points[:, 1], _ROOM_AROUND)
         return _widened(x_range), _widened(y_range)
 
 
-@dataclass(frozen=True)
-class LegendEntry:
+class LegendEntry(NamedTuple):
     """Name, colour and shape ("dots", "line", "dashed", "filled", "triangle", "disc", "upright" or "strip")."""
 
     text: str
@@ -123,7 +120,6 @@ class Figure:
         name: of its files.
         caption: what there is to see.
         layout: "single", "views" (two side by side) or "panels" (many).
-        legend: entries beyond those of the series and marks.
         table: which of the page's own tables is its data, where that is too much to hold twice;
             None: the series themselves.
     """
@@ -132,7 +128,6 @@ class Figure:
     caption: str
     panels: tuple[Panel, ...]
     layout: str = "single"
-    legend: tuple[LegendEntry, ...] = ()
     table: str | None = None
 
     @property
@@ -142,15 +137,15 @@ class Figure:
 
     @property
     def entries(self) -> list[LegendEntry]:
-        """The whole legend; what goes by one name is in it once."""
-        found: dict[str, LegendEntry] = {}
+        """The legend; what goes by one name is in it once."""
+        given: list[LegendEntry] = []
         for panel in self.panels:
-            for series in panel.series:
-                if len(series.points):
-                    found[series.name] = LegendEntry(series.name, series.color, series.kind)
-        for mark in (mark for panel in self.panels for mark in panel.marks):
-            found[mark.name] = LegendEntry(mark.name, mark.color, mark.shape)
-        return [*found.values(), *self.legend]
+            given += [LegendEntry(one.name, one.color, one.kind) for one in panel.series if len(one.points)]
+        for panel in self.panels:
+            given += [LegendEntry(mark.name, mark.color, mark.shape) for mark in panel.marks]
+            given += [LegendEntry(panel.line[0], "ink", "upright")] if panel.line else []
+            given += [LegendEntry(panel.band[0], "interval", "strip")] if panel.band else []
+        return list({entry.text: entry for entry in given if entry.text}.values())
 
 
 def figure_of(
@@ -160,26 +155,11 @@ def figure_of(
     labels: tuple[str, str],
     series: Iterable[Series],
     *,
-    line: tuple[str, float] | None = None,
-    band: tuple[str, float, float] | None = None,
     table: str | None = None,
     **of_panel: Any,
 ) -> Figure:
-    """A figure of one panel without a title.
-
-    Args:
-        line, band: name in the legend, and the place of one or the ends of the other on the x axis.
-        of_panel: what else a Panel has.
-    """
-    legend = []
-    if line is not None:
-        legend.append(LegendEntry(line[0], "ink", "upright"))
-        of_panel["verticals"] = ((line[1], "ink"),)
-    if band is not None:
-        legend.append(LegendEntry(band[0], "interval", "strip"))
-        of_panel["bands"] = ((*band[1:], "interval"),)
-    panel = Panel("", description, *labels, tuple(series), **of_panel)
-    return Figure(name, caption, (panel,), legend=tuple(legend), table=table)
+    """A figure of one panel without a title; ``of_panel`` is what else a Panel has."""
+    return Figure(name, caption, (Panel("", description, labels, tuple(series), **of_panel),), table=table)
 
 
 @dataclass(frozen=True)
@@ -203,10 +183,9 @@ class View:
     def panel(self, what: str, unit: str, series: Iterable[Series], limits: Limits, **others: Any) -> Panel:
         """What ``equal_view`` says of the limits, and what else a Panel has."""
         x, y = (f"{'xyz'[axis]}{unit}" for axis in self.axes)
-        labels, (x_range, y_range, size) = (x, f"−{y}" if self.sign < 0 else y), limits
-        lines, what = tuple(series), f"{self.name} of {what}"
-        others |= {"x_range": x_range, "y_range": y_range, "size": size, "keeps_shape": True}
-        return Panel(self.name, what, *labels, lines, **others)
+        others |= dict(zip(("x_range", "y_range", "size"), limits)) | {"keeps_shape": True}
+        labels = (x, f"−{y}" if self.sign < 0 else y)
+        return Panel(self.name, f"{self.name} of {what}", labels, tuple(series), **others)
 
 
 def views_of(centers: Array, frame: str) -> tuple[View, View]:
@@ -238,6 +217,12 @@ def running_median(points: Array, x_range: Range, num_bins: int) -> Array:
     return np.column_stack([(edges[:-1] + edges[1:]) / 2, medians])
 
 
+def histogram(values: Array, edges: Array) -> Array:
+    """(n, 2): the line around the bars; what lies beyond the edges is in the outermost."""
+    heights = np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0].astype(float)
+    return np.column_stack([np.repeat(edges, 2), np.concatenate([[0.0], np.repeat(heights, 2), [0.0]])])
+
+
 def time_axis(times_s: Array) -> tuple[Array, str]:
     """(n,) seconds since the first and what the axis is called; numbers where no range has a time."""
     if not np.isfinite(times_s).any():
@@ -245,14 +230,15 @@ def time_axis(times_s: Array) -> tuple[Array, str]:
     return times_s - np.nanmin(times_s), "time s"
 
 
-def _limits(values: Array) -> Range:
+def from_zero(series: Iterable[Series]) -> Range:
+    """A y axis from zero to a little above the highest point."""
+    return 0.0, 1.08 * max(float(one.points[:, 1].max()) for one in series)
+
+
+def _limits(values: Array, share_around: float = 0.0) -> Range:
     known = values[np.isfinite(values)]
-    return (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
-
-
-def _with_room(limits: Range) -> Range:
-    margin = _ROOM_AROUND * (limits[1] - limits[0])
-    return limits[0] - margin, limits[1] + margin
+    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
+    return low - share_around * (high - low), high + share_around * (high - low)
 
 
 def _widened(limits: Range) -> Range:

@@ -16,7 +16,7 @@ from rangesfm.ranging.observations import RangeStatus
 from rangesfm.report.content import Content
 from rangesfm.report.text import count
 from rangesfm.report.thumbnails import thumbnails
-from rangesfm.result.entries import AnchorEntry, ScaleEntry
+from rangesfm.result.entries import AnchorEntry
 from rangesfm.result.metric_result import USED
 from rangesfm.result.ranges_as_used import RangesAsUsed
 
@@ -30,6 +30,7 @@ _SEEN_QUANTILE = 0.05
 _FRUSTUM_SHAPE = (0.6, 0.4)
 _RADIUS_OF_95_PERCENT = 2.80
 """Of a three-dimensional normal distribution, in stddevs."""
+_USED = [status.label for status in USED]
 
 
 @dataclass(frozen=True)
@@ -93,74 +94,41 @@ def scene_of(content: Content) -> Scene | None:
     return Scene(summary.frame, tuple(paths), content.points_m, content.points_rgb, summary.anchors, content)
 
 
-@dataclass(frozen=True)
-class View:
-    """The 3-D view on the page.
-
-    Attributes:
-        data: what its script reads.
-        layers: id, name, colour and shape of the swatch of what can be taken away.
-        statuses: of ranges, and whether those are drawn at first.
-        num_photos: to choose from; 0 where photos have no orientation.
-        note: what one can do, and what is not drawn.
-    """
-
-    data: dict[str, Any]
-    layers: list[tuple[str, str, str, str]]
-    statuses: list[tuple[str, bool]]
-    num_photos: int
-    note: str
-
-
-def view_of(scene: Scene) -> View:
-    """The view of a scene."""
-    data = scene_data(scene)
-    statuses = data["ranges"]["statuses"] if data["ranges"] else []
-    layers = [("points", "Map points", "map", "dots")] if len(scene.points_m) else []
+def view_of(scene: Scene) -> dict[str, Any]:
+    """The view on the page: what its script draws, its layers (id, name, colour and shape of the swatch) and a note."""
+    box, content, photos = _box(scene), scene.content, scene.result.image_names
+    cameras, scale = (None, None) if content is None else (content.cameras, content.summary.scale)
+    pictures = {} if content is None else thumbnails(content.images_path, photos)
+    points, ranges = _points(scene), None if content is None else _ranges(content, scene.result)
+    anchors = [_anchor(id_, anchor) for id_, anchor in scene.anchors.items() if anchor.position_m is not None]
+    layers = [("points", "Map points", "map", "dots")] if points else []
     layers += [(path.id, path.name, path.color, "line" if path.has_orientations else "dashed") for path in scene.paths]
-    layers += [("anchors", "Anchors", "anchor", "triangle")] if data["anchors"] else []
-    layers += [("grid", "Grid", "muted", "box")]
-    return View(
-        data=data,
-        layers=layers,
-        statuses=[(name, name in [status.label for status in USED]) for name in statuses],
-        num_photos=len(scene.result) if scene.paths[-1].has_orientations else 0,
-        note=_note(scene, data),
+    layers += [("anchors", "Anchors", "anchor", "triangle")] if anchors else []
+    num_left_out = len(scene.points_m) - (points["num"] if points else 0)
+    stride = 1 if content is None or content.ranges is None else range_stride(content.ranges)
+    note = (
+        "Drag to turn, wheel or pinch to zoom, right drag or two fingers to move; click a camera for its photo.",
+        f"{count(num_left_out)} points far away or beyond the view's limit are not drawn." if num_left_out else "",
+        f"One in {stride} ranges is drawn and listed; ranges.csv holds all." if stride > 1 else "",
+        f"{count(len(pictures))} of {count(len(photos))} photos have a picture: the page stays small."
+        if 0 < len(pictures) < len(photos)
+        else "",
+        "Ellipsoids around the anchors hold 95 %, at their true size." if anchors else "",
     )
-
-
-def _note(scene: Scene, data: dict[str, Any]) -> str:
-    sentences = [
-        "Drag to turn, wheel or pinch to zoom, right drag or two fingers to move; click a camera for its photo."
-    ]
-    if num_left_out := len(scene.points_m) - (data["points"] or {"num": 0})["num"]:
-        sentences.append(f"{count(num_left_out)} points far away or beyond the view's limit are not drawn.")
-    ranges = None if scene.content is None else scene.content.ranges
-    if ranges is not None and (stride := range_stride(ranges)) > 1:
-        sentences.append(f"One in {stride} ranges is drawn and listed; ranges.csv holds all.")
-    num_thumbnails, num_photos = len(data["thumbnails"]), len(scene.result)
-    if 0 < num_thumbnails < num_photos:
-        sentences.append(f"{count(num_thumbnails)} of {count(num_photos)} photos have a picture: the page stays small.")
-    if data["anchors"]:
-        sentences.append("Ellipsoids around the anchors hold 95 %, at their true size.")
-    return " ".join(sentences)
-
-
-def scene_data(scene: Scene) -> dict[str, Any]:
-    """What the page's script reads."""
-    box, content = _box(scene), scene.content
-    cameras = () if content is None else content.cameras
     return {
         "up": [0, 0, 1] if scene.frame == "site" else [0, -1, 0],
         "box": box,
         "paths": [_path(path) for path in scene.paths],
-        "points": _points(scene),
-        "anchors": [_anchor(id_, anchor) for id_, anchor in scene.anchors.items() if anchor.position_m is not None],
-        "ranges": None if content is None else _ranges(content, scene.result),
+        "points": points,
+        "anchors": anchors,
+        "ranges": ranges,
         "frustum_size": _frustum_size(scene.result, box["radius"]),
         "frustum_shape": cameras[0].half_angles if cameras else _FRUSTUM_SHAPE,
-        "thumbnails": {} if content is None else thumbnails(content.images_path, scene.result.image_names),
-        "scale_interval": None if content is None else _scale_interval(content.summary.scale),
+        "thumbnails": pictures,
+        "scale_interval": [end / scale.value for end in scale.interval_95] if scale and scale.interval_95 else None,
+        "layers": [*layers, ("grid", "Grid", "muted", "box")],
+        "num_photos": len(photos) if scene.paths[-1].has_orientations else 0,
+        "note": " ".join(filter(None, note)),
     }
 
 
@@ -245,11 +213,6 @@ def _anchor(anchor_id: str, anchor: AnchorEntry) -> dict[str, Any]:
     }
 
 
-def _scale_interval(scale: ScaleEntry) -> list[float] | None:
-    """Relative to the scale."""
-    return [end / scale.value for end in scale.interval_95] if scale.interval_95 and scale.value else None
-
-
 def _ranges(content: Content, path: Trajectory) -> dict[str, Any] | None:
     ranges = content.ranges
     if ranges is None or len(ranges.status) == 0:
@@ -262,8 +225,9 @@ def _ranges(content: Content, path: Trajectory) -> dict[str, Any] | None:
     known = [status.label for status in RangeStatus if status.label in present]
     statuses = [*known, *sorted(present.difference(known))]  # the used first
     status = np.array([statuses.index(label) for label in ranges.status])
-    is_refined = bool(np.isfinite(ranges.residual_refined_m).any())
-    final = ranges.residual_refined_m if is_refined else ranges.residual_scaled_m
+    residuals_m = ranges.residuals_by_model_m
+    final = next(reversed(residuals_m))
+    unknown = np.full(len(ranges.status), np.nan)
     tags, tag = np.unique(content.tags_in_cam_m[rows], axis=0, return_inverse=True)
     return {
         "num": len(rows),
@@ -272,13 +236,14 @@ def _ranges(content: Content, path: Trajectory) -> dict[str, Any] | None:
         "tags_in_cam_m": tags.tolist(),
         "tag": pack(tag.reshape(-1), "uint8"),
         "statuses": statuses,
+        "shown_at_first": [name in _USED for name in statuses],
         "status": pack(status[rows], "uint8"),
         "time": pack(content.range_times_s[rows], "float32"),
         "measured": pack(ranges.range_m[rows], "float32"),
-        "residual_scaled": pack(ranges.residual_scaled_m[rows], "float32"),
-        "residual_refined": pack(ranges.residual_refined_m[rows], "float32"),
-        "final": "residual_refined" if is_refined else "residual_scaled",
-        "residual_limit_m": _residual_limit(final[ranges.is_used]),
+        "residual_scaled": pack(residuals_m["scaled"][rows], "float32"),
+        "residual_refined": pack(residuals_m.get("refined", unknown)[rows], "float32"),
+        "final": f"residual_{final}",
+        "residual_limit_m": _residual_limit(residuals_m[final][ranges.is_used]),
         "true": None if content.true_ranges_m is None else pack(content.true_ranges_m[rows], "float32"),
         "has_place": pack(has_place, "uint8"),
         "before": pack(np.maximum(before, 0), "int32"),

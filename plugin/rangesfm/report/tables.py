@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,9 @@ from markupsafe import Markup
 
 from rangesfm.report.content import Content, in_natural_order
 from rangesfm.report.text import count, duration, fixed, keyed, plain, signed
-from rangesfm.result.entries import AnchorEntry
+from rangesfm.result.entries import AnchorEntry, median, rms
+
+_Columns = Mapping[str, Callable[[Any], str]]
 
 
 @dataclass(frozen=True)
@@ -23,6 +26,7 @@ class Table:
         header: of the columns; empty for none.
         rows: cells, the first of each the row's name; whatever is not Markup is escaped.
         kind: name of a style of its own.
+        is_narrow: whether it stands beside others that are.
     """
 
     caption: str
@@ -30,6 +34,7 @@ class Table:
     rows: Sequence[Sequence[str]]
     note: str | None = None
     kind: str | None = None
+    is_narrow: bool = False
 
 
 def range_statuses(content: Content) -> Table:
@@ -41,17 +46,16 @@ def range_statuses(content: Content) -> Table:
 
 def ranges_per_anchor(content: Content) -> Table:
     """Numbers and residuals of each anchor's ranges, before and after the refinement."""
-    ranges = content.ranges
-    rows = []
+    ranges, rows = content.ranges, []
     for anchor_id in [] if ranges is None else in_natural_order(ranges.anchor_id):
         assert ranges is not None
         mine = np.array(ranges.anchor_id, dtype=str) == anchor_id
         used = mine & ranges.is_used
         row = [anchor_id, count(int(mine.sum())), count(int(used.sum()))]
-        for residuals in (ranges.residual_scaled_m[used], ranges.residual_refined_m[used]):
+        for predicted in (ranges.predicted_scaled_m, ranges.predicted_refined_m):
+            residuals = (predicted - ranges.range_m)[used]
             known = residuals[np.isfinite(residuals)]
-            rms, median = (np.sqrt(np.mean(known**2)), np.median(known)) if len(known) else (None, None)
-            row += [fixed(rms, 3), fixed(median, 3)]
+            row += [fixed(rms(known), 3), fixed(median(known), 3)]
         rows.append(row)
     header = ["anchor", "ranges", "used", "scaled: RMS m", "median m", "refined: RMS m", "median m"]
     return Table("Ranges of each anchor", header, rows)
@@ -59,7 +63,8 @@ def ranges_per_anchor(content: Content) -> Table:
 
 def comparison(content: Content) -> Table:
     """The paper's table."""
-    columns = dict.fromkeys(("rmse_m", "rmse_se3_m", "rmse_sim3_m"), (fixed, 4)) | {"scale_error_percent": (signed, 3)}
+    columns = dict.fromkeys(("rmse_m", "rmse_se3_m", "rmse_sim3_m"), partial(fixed, decimals=4))
+    columns["scale_error_percent"] = partial(signed, decimals=3)
     rows = [[row.name, *_cells(f"comparison.{i}", row, columns)] for i, row in enumerate(content.summary.comparison)]
     return Table(
         "Keyframe centres against the reference",
@@ -71,17 +76,10 @@ def comparison(content: Content) -> Table:
 
 def two_candidates(content: Content) -> Table:
     """Mean and standard deviation of the paper's two branches."""
-    given = content.summary.scale.two_candidate
-    branches = [] if given is None else [("alpha0", given.alpha0), ("alpha1", given.alpha1)]
-    columns = {"mean": (plain,), "std": (plain,)}
-    rows = [
-        [
-            name,
-            *_cells(f"scale.two_candidate.{name}", branch, columns),
-            "chosen" if given and given.chosen == name else "",
-        ]
-        for name, branch in branches
-    ]
+    given, rows = content.summary.scale.two_candidate, []
+    for name in () if given is None else ("alpha0", "alpha1"):
+        cells = _cells(f"scale.two_candidate.{name}", getattr(given, name), {"mean": plain, "std": plain})
+        rows.append([name, *cells, "chosen" if given and given.chosen == name else ""])
     return Table(
         "The paper's two candidates",
         ["branch", "mean", "stddev", ""],
@@ -94,29 +92,30 @@ def two_candidates(content: Content) -> Table:
 def anchors(content: Content) -> Table:
     """Where the anchors are, with what is not certain about it."""
     given = content.summary.anchors
-    rows = [_anchor(f"anchors.{anchor_id}", anchor_id, given[anchor_id]) for anchor_id in in_natural_order(given)]
+    rows = [_anchor(anchor_id, given[anchor_id]) for anchor_id in in_natural_order(given)]
     header = ["anchor", "x m", "y m", "z m", "stddev m", "Δx m", "Δy m", "Δz m", "range bias m", "mirror image at m"]
     note = "Δ: estimated minus surveyed position, where it was surveyed. A stddev of 0: held there."
     return Table("Anchors in the map's frame", header, rows, note)
 
 
-def _anchor(key: str, anchor_id: str, anchor: AnchorEntry) -> list[str]:
-    position, surveyed, mirror = anchor.position_m, anchor.surveyed_position_m, anchor.mirror_position_m
-    nowhere = (None, None, None)
-    moved = zip(position, surveyed) if position and surveyed else ()
+def _anchor(anchor_id: str, anchor: AnchorEntry) -> list[str]:
+    key, nowhere = f"anchors.{anchor_id}", (None, None, None)
+    position, surveyed = anchor.position_m or nowhere, anchor.surveyed_position_m or nowhere
+    moved = [None if a is None or b is None else a - b for a, b in zip(position, surveyed)]
     return [
         anchor_id,
-        *(keyed(f"{key}.position_m.{axis}", x, fixed(x, 3)) for axis, x in enumerate(position or nowhere)),
-        keyed(f"{key}.stddev_m", anchor.stddev_m, fixed(anchor.stddev_m, 3)),
-        *([signed(a - b, 3) for a, b in moved] or [signed(None, 3)] * 3),
-        keyed(f"{key}.range_bias_m", anchor.range_bias_m, signed(anchor.range_bias_m, 3)),
-        " ".join(fixed(x, 3) for x in mirror) if mirror else "none",
+        *(keyed(f"{key}.position_m.{axis}", x, fixed(x, 3)) for axis, x in enumerate(position)),
+        *_cells(key, anchor, {"stddev_m": partial(fixed, decimals=3)}),
+        *(signed(by, 3) for by in moved),
+        *_cells(key, anchor, {"range_bias_m": partial(signed, decimals=3)}),
+        " ".join(fixed(x, 3) for x in anchor.mirror_position_m or ()) or "none",
     ]
 
 
 def distances(content: Content) -> Table:
     """Taped distances, those that held the scale and those that check it."""
-    columns = dict.fromkeys(("measured_m", "stddev_m", "estimated_m"), (fixed, 4)) | {"residual_m": (signed, 4)}
+    columns = dict.fromkeys(("measured_m", "stddev_m", "estimated_m"), partial(fixed, decimals=4))
+    columns["residual_m"] = partial(signed, decimals=4)
     rows = [
         [f"{row.from_} to {row.to}", row.kind, *_cells(f"distances.{i}", row, columns)]
         for i, row in enumerate(content.summary.distances)
@@ -130,11 +129,7 @@ def intrinsics(content: Content) -> Table:
     header = ["camera", "parameter", "scaled", "refined", "change"]
     num_columns = 3 if content.refined is None else 5
     rows = [
-        [
-            camera.title,
-            name,
-            *(fixed(before, 6), fixed(after, 6), signed(after - before, 6))[: num_columns - 2],
-        ]
+        [camera.title, name, fixed(before, 6), fixed(after, 6), signed(after - before, 6)][:num_columns]
         for camera in content.cameras
         for name, before, after in camera.parameters
     ]
@@ -144,7 +139,7 @@ def intrinsics(content: Content) -> Table:
 def inputs(content: Content) -> Table:
     """The files that the result was made from."""
     rows = [
-        [entry.path, *_cells(f"inputs.{i}", entry, {"bytes": (count,)}), entry.sha256, entry.hashed]
+        [entry.path, *_cells(f"inputs.{i}", entry, {"bytes": count}), entry.sha256, entry.hashed]
         for i, entry in enumerate(content.summary.inputs)
     ]
     return Table("Inputs", ["file", "bytes", "SHA-256", "of"], rows, kind="settings")
@@ -152,49 +147,46 @@ def inputs(content: Content) -> Table:
 
 def stages(content: Content) -> Table:
     """Where the time went."""
-    seconds = content.summary.seconds
-    known = {name: value for name, value in seconds.items() if value is not None and name != "total"}
+    known = {name: s for name, s in content.summary.seconds.items() if s is not None and name != "total"}
     longest = max(known.values(), default=0.0) or 1.0
-    rows = [
-        [
-            name.replace("_", " "),
-            duration(value),
-            Markup('<i class="bar" style="width:{:.1f}%"></i>').format(100.0 * value / longest),
-        ]
-        for name, value in known.items()
-    ]
-    return Table("Time", ["stage", "time", ""], rows, kind="stages")
+    bar = Markup('<i class="bar" style="width:{:.1f}%"></i>')
+    rows = [[name.replace("_", " "), duration(s), bar.format(100.0 * s / longest)] for name, s in known.items()]
+    return Table("Time", ["stage", "time", ""], rows, kind="stages", is_narrow=True)
 
 
 def refinement(content: Content) -> Table:
     """What the solver did."""
     refine = content.summary.refine
-    rows = [
-        [name.replace("_", " "), keyed(f"refine.{name}", value, plain(value))]
-        for name, value in ({} if refine is None else refine.to_json()).items()
-    ]
-    return Table("Refinement", [], rows)
+    values = {} if refine is None else refine.to_json()
+    rows = [[name.replace("_", " "), keyed(f"refine.{name}", value, plain(value))] for name, value in values.items()]
+    return Table("Refinement", [], rows, is_narrow=True)
 
 
-def values(caption: str, given: Mapping[str, Any], kind: str | None = None) -> Table:
-    """Keys of a nested object, joined by dots, and what they are."""
-    return Table(caption, [], _flattened(given), kind=kind)
+def sensitivity(content: Content) -> Table:
+    """By how much the scale would change."""
+    return Table("How the scale answers to what was assumed", [], _flat(content.summary.scale.to_json()["sensitivity"]))
 
 
-def _cells(key: str, entry: object, columns: Mapping[str, tuple[Any, ...]]) -> list[str]:
-    """Numbers of an entry of ``result.json``: by name, a function of text.py and what it takes beside the value."""
-    of_entry = {name: getattr(entry, name) for name in columns}
-    return [
-        keyed(f"{key}.{name}", of_entry[name], write(of_entry[name], *how)) for name, (write, *how) in columns.items()
-    ]
+def versions(content: Content) -> Table:
+    """Of the software."""
+    return Table("Versions", [], _flat(content.summary.versions), is_narrow=True)
 
 
-def _flattened(values: Mapping[str, Any]) -> list[list[str]]:
+def settings(content: Content) -> Table:
+    """The survey as the run had it."""
+    return Table("Settings", [], _flat(content.summary.settings.to_json()), kind="settings")
+
+
+def _flat(values: Mapping[str, Any], within: str = "") -> list[list[str]]:
     """Rows of key and value of a nested object, keys joined by dots."""
     rows = []
     for key, value in values.items():
-        if value and isinstance(value, dict):
-            rows += [[f"{key}.{inner}", text] for inner, text in _flattened(value)]
-        else:
-            rows.append([key, plain(value)])
+        is_object = value and isinstance(value, dict)
+        rows += _flat(value, f"{within}{key}.") if is_object else [[f"{within}{key}", plain(value)]]
     return rows
+
+
+def _cells(key: str, entry: object, columns: _Columns) -> list[str]:
+    """Numbers of an entry of ``result.json``, by their names in it."""
+    given = {name: getattr(entry, name) for name in columns}
+    return [keyed(f"{key}.{name}", value, columns[name](value)) for name, value in given.items()]

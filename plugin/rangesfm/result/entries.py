@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -185,21 +186,19 @@ class RangesEntry(ResidualEntry):
 
     @classmethod
     def of(cls, found: MetricResult) -> RangesEntry:
-        log, used = found.observations.log, np.isin(found.observations.status, USED)
+        kind, used = found.observations.log.kind, np.isin(found.observations.status, USED)
 
         def residuals(of: Mask) -> dict[str, Any]:
             chosen = found.residuals_m[used & of]
             nums = {"num": of.sum(), "num_used": (used & of).sum(), "num_rejected": (~used & of).sum()}
-            return {**nums, "rms_m": _rms(chosen), "median_abs_m": _median(np.abs(chosen))}
+            return {**nums, "rms_m": rms(chosen), "median_abs_m": median(np.abs(chosen))}
 
-        is_of_camera = log.kind == RangeKind.TAG_ANCHOR
-        by_anchor = {id_: is_of_camera & (log.anchor_index == k) for k, id_ in enumerate(log.anchor_ids)}
+        others = {RangeKind.ANCHOR_ANCHOR: "num_anchor_anchor", RangeKind.TAG_TAG: "num_tag_tag"}
         return cls.model_validate(
             {
-                **residuals(is_of_camera),
-                "num_anchor_anchor": np.count_nonzero(log.kind == RangeKind.ANCHOR_ANCHOR),
-                "num_tag_tag": np.count_nonzero(log.kind == RangeKind.TAG_TAG),
-                "per_anchor": {id_: residuals(of) for id_, of in by_anchor.items()},
+                **residuals(kind == RangeKind.TAG_ANCHOR),
+                **{name: np.count_nonzero(kind == other) for other, name in others.items()},
+                "per_anchor": {id_: residuals(of) for id_, of in _by_anchor(found, kind == RangeKind.TAG_ANCHOR)},
             }
         )
 
@@ -219,23 +218,30 @@ class CheckRangesEntry(CheckEntry):
 
     @classmethod
     def of(cls, found: MetricResult) -> CheckRangesEntry:
-        log, held_out = found.observations.log, found.observations.status == RangeStatus.CHECK
+        held_out = found.observations.status == RangeStatus.CHECK
 
         def residuals(of: Mask) -> dict[str, Any]:
             chosen = found.residuals_m[of & np.isfinite(found.residuals_m)]
-            return {"num": len(chosen), "rms_m": _rms(chosen), "median_m": _median(chosen)}
+            return {"num": len(chosen), "rms_m": rms(chosen), "median_m": median(chosen)}
 
-        by_anchor = {id_: held_out & (log.anchor_index == k) for k, id_ in enumerate(log.anchor_ids)}
-        per_anchor = {id_: residuals(of) for id_, of in by_anchor.items() if of.any()}
+        per_anchor = {id_: residuals(of) for id_, of in _by_anchor(found, held_out) if of.any()}
         return cls.model_validate({**residuals(held_out), "per_anchor": per_anchor})
 
 
-def _rms(residuals_m: Array) -> float | None:
-    return float(np.sqrt(np.mean(residuals_m**2))) if len(residuals_m) else None
+def _by_anchor(found: MetricResult, chosen: Mask) -> Iterator[tuple[str, Mask]]:
+    """Which of the chosen ranges are to each anchor."""
+    log = found.observations.log
+    for k, anchor_id in enumerate(log.anchor_ids):
+        yield anchor_id, chosen & (log.anchor_index == k)
 
 
-def _median(residuals_m: Array) -> float | None:
-    return float(np.median(residuals_m)) if len(residuals_m) else None
+def rms(values: Array) -> float:
+    """Root of the mean square; NaN of none, as ``median``."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else np.nan
+
+
+def median(values: Array) -> float:
+    return float(np.median(values)) if len(values) else np.nan
 
 
 class RefineEntry(Record):

@@ -87,14 +87,11 @@ class RangesAsUsed(TableFile):
         return before, after, (before >= 0) & (after >= 0) & np.isfinite(self.weight)
 
     @property
-    def residual_scaled_m(self) -> Array:
-        """(n,) predicted with the scaled model minus measured."""
-        return self.predicted_scaled_m - self.range_m
-
-    @property
-    def residual_refined_m(self) -> Array:
-        """(n,) predicted with the refined model minus measured."""
-        return self.predicted_refined_m - self.range_m
+    def residuals_by_model_m(self) -> dict[str, Array]:
+        """(n,) predicted minus measured, with the "scaled" model and, if there is one, with the "refined"."""
+        refined = self.predicted_refined_m - self.range_m
+        both = {"scaled": self.predicted_scaled_m - self.range_m, "refined": refined}
+        return both if np.isfinite(refined).any() else {"scaled": both["scaled"]}
 
     @property
     def is_used(self) -> npt.NDArray[np.bool_]:

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from rangesfm.distances.rows import DistanceRow
+from rangesfm.distances.tape import DistanceRow
 from rangesfm.files.records import NumberOrNull, Record, Text
 from rangesfm.result.entries import (
     AnchorEntry,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -38,15 +39,15 @@ RoundedOrEmpty = Annotated[Array, Column(".6g", may_be_empty=True)]
 
 
 @dataclass(frozen=True)
-class TableFile:
+class TableFile(ABC):
     """n rows; each field is a column (``Texts``, ``Numbers``, ...), in the order and by the names of the file."""
 
     NAME: ClassVar[str]
 
     @classmethod
+    @abstractmethod
     def of(cls: type[_Kind], found: MetricResult) -> _Kind | None:
         """What a run found, for this file; None: the run does not leave it."""
-        raise NotImplementedError
 
     @classmethod
     def columns(cls) -> dict[str, Column]:

@@ -116,6 +116,5 @@ class TimeOffsetCurve(TableFile):
 
     @classmethod
     def of(cls, found: MetricResult) -> TimeOffsetCurve | None:
-        if found.time_offset is None:
-            return None
-        return cls(found.time_offset.curve.offsets_s, found.time_offset.curve.costs_m)
+        curve = None if found.time_offset is None else found.time_offset.curve
+        return None if curve is None else cls(curve.offsets_s, curve.costs_m)

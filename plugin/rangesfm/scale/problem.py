@@ -9,9 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.arrays import Array
-from rangesfm.distances.by_radio import distances_by_radio
-from rangesfm.distances.ends import LocatedDistances
-from rangesfm.distances.surveyed import surveyed_distances
+from rangesfm.distances.ends import LocatedDistances, distances_by_radio, surveyed_distances
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.similarity import Similarity, path_shape, rounding_of

@@ -88,8 +88,10 @@ def judge(
         doubts.insert(0, _Doubt(f"{summary}, worse than {100 * DOUBTFUL_ABOVE:g} %", narrower))
     if not doubts:
         return Verdict("good", (summary,), ())
-    advice = dict.fromkeys(doubt.advice for doubt in doubts)
-    return Verdict("doubtful", tuple(doubt.reason for doubt in doubts), tuple(advice))
+    advice: dict[str, str] = {}
+    for doubt in doubts:  # calibration is advised once, whatever else goes with it
+        advice.setdefault(_CALIBRATE if doubt.advice.startswith(_CALIBRATE) else doubt.advice, doubt.advice)
+    return Verdict("doubtful", tuple(doubt.reason for doubt in doubts), tuple(advice.values()))
 
 
 def _what_narrows_it(solution: Solution, uncertainty: ScaleUncertainty) -> str:

@@ -1,17 +1,19 @@
-"""What a run reads before it works: the log, the anchors, the reference; checked against each other."""
+"""What a run reads before it works: the log, the anchors, the reference; checked against each other, and hashed."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from rangesfm.distances.tape import Tape, read_tape
 from rangesfm.errors import InputError
+from rangesfm.files.atomic import sha256_of
 from rangesfm.geometry.reference import Reference, read_reference
 from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
@@ -28,6 +30,7 @@ from rangesfm.vision.image_times import ImageTimes, find_image_times, read_image
 
 if TYPE_CHECKING:
     import pycolmap
+
 
 # Beyond it a unit is wrong, or the file: no such radio reaches so far.
 _MAX_RANGE_M = 1e6
@@ -258,3 +261,34 @@ def _notes(log: RangeLog, anchors: Sequence[Anchor], survey: Survey, *, anchors_
     if (step_s := time_resolution_s(log)) >= _COARSE_STEP_S:
         notes.append(f"the log's times come in steps of {step_s:.2g} s: at walking pace that is as much in metres")
     return notes
+
+
+def input_hashes(survey: Survey) -> list[dict[str, Any]]:
+    """Path, SHA-256, bytes and what was hashed, for each input that is there.
+
+    Of a folder of photos only the names and sizes are hashed: reading gigabytes again would take
+    longer than what is gained.
+    """
+    entries: list[dict[str, Any]] = []
+    for item in survey.input_paths():
+        if item.role == "photos":
+            entries += [_folder(item.path)] if item.path.is_dir() else []
+        else:
+            files = sorted(item.path.glob("*.bin")) if item.role == "model" else [item.path]
+            entries += [_file(path) for path in files if path.is_file()]
+    return entries
+
+
+def _file(path: Path) -> dict[str, Any]:
+    return {"path": str(path), "sha256": sha256_of(path), "bytes": path.stat().st_size, "hashed": "content"}
+
+
+def _folder(path: Path) -> dict[str, Any]:
+    sizes = {file.relative_to(path).as_posix(): file.stat().st_size for file in path.rglob("*") if file.is_file()}
+    listing = "".join(f"{name}\t{size}\n" for name, size in sorted(sizes.items()))
+    return {
+        "path": str(path),
+        "sha256": hashlib.sha256(listing.encode("utf-8", "surrogateescape")).hexdigest(),
+        "bytes": sum(sizes.values()),
+        "hashed": f"names and sizes of {len(sizes)} files",
+    }

@@ -13,9 +13,10 @@ from rangesfm.ranging.errors.noise import MIN_STDDEV_M, robust_stddev
 
 _MAX_NUM = 240
 _MIN_NUM_RANGES = 5
-# In stddevs from the median of its cell: what is further off is an outlier among its neighbours.
+# In stddevs from the median of its cell, of which the noise is at least this: what is further off is an outlier among
+# its neighbours. A radio may repeat itself to a centimetre and err by ten from one place to the next.
 _OUTLYING = 3.0
-_NO_SCATTER_M = 1e-3
+_LEAST_SCATTER_M = 0.08
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class Cells:
         steps = np.diff(residuals_m[order])[np.diff(anchor_index[order]) == 0]
         scatter_m = max(robust_stddev(steps) / np.sqrt(2), MIN_STDDEV_M)
         off = np.abs(residuals_m - _medians(residuals_m, labels, num)[labels])
-        return cls(labels, (off <= _OUTLYING * max(scatter_m, _NO_SCATTER_M)).astype(np.float64), num, scatter_m)
+        return cls(labels, (off <= _OUTLYING * max(scatter_m, _LEAST_SCATTER_M)).astype(np.float64), num, scatter_m)
 
     @cached_property
     def num_ranges(self) -> Array:

@@ -21,7 +21,7 @@ def evidence(problem: Linearized) -> Iterator[MistakeTest]:
     """Of the noise as learnt beside the likeliest mistake, and of each anchor's ranges."""
     if problem.noise is not None:
         far = _NOISE_BY_DISTANCE * float(problem.gradient.distance_m.mean())
-        yield _noise("range noise", problem.noise.stddev_m["white"], _MOST_NOISE_M + far, "scatter")
+        yield _noise("range noise", problem.cells.scatter_m, _MOST_NOISE_M + far, "scatter")
         yield _noise("lasting errors", problem.noise.stddev_m["lasting"], _MOST_LASTING_M + far, "err for seconds")
     index, cells = problem.on_map.problem.anchor_index, problem.cells
     for k in np.unique(index):

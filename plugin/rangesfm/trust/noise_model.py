@@ -17,6 +17,8 @@ _MEMORY_S = 3.0
 _LASTING_STDDEV_M, _BEND_STDDEV_M = 0.04, 0.02
 # Of a path's duration: a map bends over no shorter part.
 _BEND_SHARE = 1 / 8
+# What ranges drift by in a minute, each anchor's and all alike, as hands and bodies move and radios warm up.
+_WANDERING_STDDEV_M, _WANDERING_MEMORY_S = 0.025, 60.0
 
 
 def learnt_noise(problem: Linearized, explaining: Sequence[Hypothesis]) -> RandomErrors:
@@ -24,7 +26,7 @@ def learnt_noise(problem: Linearized, explaining: Sequence[Hypothesis]) -> Rando
     all_of_it = Effect.of_all([Effect(problem.design, problem.prior_design), *(h.effect for h in explaining)])
     return learn(
         _components(problem),
-        _curve(problem),
+        _known(problem),
         problem.residual_m,
         all_of_it.columns,
         problem.prior_residual,
@@ -36,7 +38,7 @@ def learnt_noise(problem: Linearized, explaining: Sequence[Hypothesis]) -> Rando
 def usual_noise(problem: Linearized) -> RandomErrors:
     """As radios and maps usually have it."""
     components = _components(problem)
-    covariance = _curve(problem) + sum(c.stddev_m**2 * c.unit_covariance for c in components)
+    covariance = _known(problem) + sum(c.stddev_m**2 * c.unit_covariance for c in components)
     return RandomErrors(covariance, {c.name: c.stddev_m for c in components}, np.inf)
 
 
@@ -55,9 +57,11 @@ def _components(problem: Linearized) -> list[Component]:
     ]
 
 
-def _curve(problem: Linearized) -> Array:
-    """(c, c) of an error curve that nobody learnt."""
+def _known(problem: Linearized) -> Array:
+    """(c, c) of an error curve that nobody learnt, and of what wanders too slowly to be learnt."""
     distance = problem.gradient.distance_m
     modes = curve_modes(distance, np.full(len(distance), CURVE_STDDEV_M))
-    covariance: Array = modes @ modes.T
-    return covariance
+    apart = np.abs(problem.time_s[:, None] - problem.time_s)
+    same_anchor = problem.anchor_index[:, None] == problem.anchor_index
+    wandering = _WANDERING_STDDEV_M**2 * (1.0 + same_anchor) * np.exp(-apart / _WANDERING_MEMORY_S)
+    return np.asarray(modes @ modes.T + wandering)

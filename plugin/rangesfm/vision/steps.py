@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rangesfm.files.json_files import write_json
+from rangesfm.files.records import write_json
 from rangesfm.progress import Progress
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from rangesfm.processes.child import MessagesToParent, work_for_parent
+from rangesfm.processes.supervision import MessagesToParent, work_for_parent
 from rangesfm.vision.submaps import Submap
 
 

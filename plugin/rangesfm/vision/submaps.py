@@ -13,8 +13,7 @@ import pycolmap
 
 from rangesfm.colmap.log import colmap_log
 from rangesfm.errors import OptionError
-from rangesfm.files.atomic import new_file
-from rangesfm.files.sole_writer import sole_writer
+from rangesfm.files.atomic import new_file, sole_writer
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import Progress, SilentProgress
 from rangesfm.vision.database import copy_stretch, remove_database

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from rangesfm.errors import InputError
 from rangesfm.export import MetricMap, apply_to, best_similarity, check_formats, export_map
-from rangesfm.export.frames import in_frame
-from rangesfm.files.sole_writer import sole_writer
+from rangesfm.export.metric_map import in_frame
+from rangesfm.files.atomic import sole_writer
 from rangesfm.options import ExportOptions
 from rangesfm.result.folder import ResultFolder, read_result_folder
 from rangesfm.result.tables import CenterCovariances

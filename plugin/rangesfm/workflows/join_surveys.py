@@ -2,29 +2,232 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
+import pycolmap
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.export import check_formats
-from rangesfm.files.sole_writer import sole_writer
+from rangesfm.files.atomic import sole_writer
 from rangesfm.geometry.reference import read_reference
+from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.join.models import PathOfModel
 from rangesfm.progress import Progress
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.anchor_file import default_anchor_frame, read_anchors
 from rangesfm.ranging.anchors.site import local_site
+from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.observations import RangeStatus
+from rangesfm.result.folder import ResultFolder, read_result_folder
+from rangesfm.result.ranges_as_used import RangesAsUsed
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
-from rangesfm.workflows.finished_runs import FinishedRun, joined_log, paths_of_surveys, read_finished_runs
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.results import RunResult
 from rangesfm.workflows.run import map_in_metres
 
 # Two surveys' files may give a place with other digits.
 _SAME_PLACE_M = 1e-3
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """What one run left.
+
+    Attributes:
+        name: unlike that of any other survey here.
+        result: its folder.
+        model: unscaled; its photos have names of their own among all surveys.
+        path: of the model.
+        ranges: as it used them.
+        own_name: of each photo, as its survey calls it, the name that it has here.
+        tag_ids: of each tag, as its survey calls it, the id that it has here.
+    """
+
+    name: str
+    result: ResultFolder
+    model: pycolmap.Reconstruction
+    path: Trajectory
+    ranges: RangesAsUsed
+    own_name: dict[str, str]
+    tag_ids: dict[str, str]
+
+    @property
+    def tags_in_cam_m(self) -> dict[str, Array]:
+        """(3,) lever arm by the id that a tag has here."""
+        arms = self.result.lever_arms_m(list(self.tag_ids))
+        return dict(zip(self.tag_ids.values(), arms, strict=True))
+
+
+def read_finished_runs(folders: Sequence[Path]) -> list[FinishedRun]:
+    """Read result folders. Photos and tags that bear the same name in two of them are called after their survey too.
+
+    Raises:
+        InputError: fewer than two folders, one of them twice, one without ranges, models or times as the others have.
+    """
+    if len(folders) < 2:
+        raise InputError(f"{len(folders)} result folder is given, expected two or more to join")
+    results = [read_result_folder(folder) for folder in folders]
+    surveys = [_read(name, result) for name, result in zip(_names(folders), results, strict=True)]
+    timed = [survey for survey in surveys if survey.path.timestamps_s is not None]
+    if timed and len(timed) < len(surveys):
+        bare = next(survey for survey in surveys if survey.path.timestamps_s is None)
+        raise InputError(f"its photos have no times, those of {timed[0].name} have", bare.result.path)
+    return _with_names_of_their_own(_with_tags_of_their_own(surveys))
+
+
+def _names(folders: Sequence[Path]) -> list[str]:
+    """The part of each path that tells them apart: the last one, if that will do."""
+    paths = [folder.resolve() for folder in folders]
+    if len(set(paths)) < len(paths):
+        twice = next(path for path in paths if paths.count(path) > 1)
+        raise InputError("the same result folder is given twice", twice)
+    depth = min(len(path.parts) for path in paths)
+    for back in range(1, depth + 1):
+        names = [path.parts[-back] for path in paths]
+        if len(set(names)) == len(names):
+            return names
+    return [path.as_posix().strip("/") for path in paths]
+
+
+def _read(name: str, result: ResultFolder) -> FinishedRun:
+    model, ranges = _unscaled_model(result), result.read(RangesAsUsed)
+    if ranges is None:
+        raise InputError("there is no ranges.csv, expected the output_path of a run", result.path)
+    path = trajectory_from_reconstruction(model, result.timestamps_s)
+    if not len(path):
+        raise InputError("none of the model's photos has a time in images.csv", result.path)
+    own_name = {image.name: image.name for image in model.images.values()}
+    of_two_anchors = RangeStatus.ANCHOR_ANCHOR.label
+    tags = (id_ for id_, status in zip(ranges.tag_id, ranges.status, strict=True) if status != of_two_anchors)
+    return FinishedRun(name, result, model, path, ranges, own_name, {id_: id_ for id_ in tags})
+
+
+def _unscaled_model(result: ResultFolder) -> pycolmap.Reconstruction:
+    """``sparse/0``; where that is not all of what was scaled, the scaled model, which is as good."""
+    scaled = result.read_model("sparse_scaled")
+    if scaled is None:
+        raise InputError("there is no sparse_scaled/0, expected the output_path of a run", result.path)
+    sfm = result.read_model("sparse")
+    return sfm if sfm is not None and _registered(sfm) == _registered(scaled) else scaled
+
+
+def _registered(model: pycolmap.Reconstruction) -> set[str]:
+    return {image.name for image in model.images.values() if image.has_pose}
+
+
+def _with_names_of_their_own(surveys: Sequence[FinishedRun]) -> list[FinishedRun]:
+    counts = Counter(name for survey in surveys for name in survey.own_name)
+    if not counts or max(counts.values()) == 1:
+        return list(surveys)
+    renamed = []
+    for survey in surveys:
+        own_name = {name: f"{survey.name}/{name}" for name in survey.own_name}
+        model = pycolmap.Reconstruction(survey.model)
+        for image in model.images.values():
+            image.name = own_name[image.name]
+        times = survey.result.timestamps_s
+        path = trajectory_from_reconstruction(
+            model, times and {own_name[name]: time for name, time in times.items() if name in own_name}
+        )
+        renamed.append(replace(survey, model=model, path=path, own_name=own_name))
+    return renamed
+
+
+def _with_tags_of_their_own(surveys: Sequence[FinishedRun]) -> list[FinishedRun]:
+    """A tag that has the same id and the same lever arm in two surveys is the same one."""
+    arms: dict[str, list[Array]] = {}
+    for survey in surveys:
+        for tag_id, arm in survey.tags_in_cam_m.items():
+            arms.setdefault(tag_id, []).append(arm)
+    differ = {tag_id for tag_id, places in arms.items() if np.ptp(places, axis=0).max() > 0}
+    return [
+        replace(
+            survey,
+            tag_ids={tag_id: f"{survey.name}/{tag_id}" if tag_id in differ else tag_id for tag_id in survey.tag_ids},
+        )
+        for survey in surveys
+    ]
+
+
+def joined_log(
+    surveys: Sequence[FinishedRun], use_anchors: Sequence[str]
+) -> tuple[RangeLog, npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+    """All their ranges: on the cameras' clocks, or by photo.
+
+    Args:
+        use_anchors: ids; empty: all.
+
+    Returns:
+        the log; (n,) the survey of each range; (n,) whether it was held out as a check.
+
+    Raises:
+        InputError: an anchor to be used is in none of the logs.
+    """
+    anchor_ids = {id_ for survey in surveys for id_ in survey.result.summary.anchors}
+    for id_ in use_anchors:
+        if id_ not in anchor_ids:
+            raise InputError(f"anchor {id_!r} to be used is in none of the surveys ({', '.join(sorted(anchor_ids))})")
+    # Ranges between two tags have no say, and no anchor.
+    parts = [
+        (survey, [k for k, id_ in enumerate(survey.ranges.anchor_id) if not use_anchors or id_ in use_anchors])
+        for survey in surveys
+    ]
+    parts = [(one, [k for k in rows if one.ranges.status[k] != RangeStatus.TAG_TAG.label]) for one, rows in parts]
+    of_each = [(one, k) for one, rows in parts for k in rows]
+    has_times = surveys[0].path.timestamps_s is not None
+    log = RangeLog.from_arrays(
+        [one.ranges.anchor_id[k] for one, k in of_each],
+        np.concatenate([one.ranges.range_m[rows] for one, rows in parts]),
+        timestamp_s=np.concatenate([_camera_times_s(one)[rows] for one, rows in parts]) if has_times else None,
+        image_name=None if has_times else [_own(one.own_name, one.ranges.image_name[k]) for one, k in of_each],
+        tag_id=[_own(one.tag_ids, one.ranges.tag_id[k]) for one, k in of_each],
+    )
+    number = np.repeat(np.arange(len(parts)), [len(rows) for _, rows in parts])
+    is_check = np.array([one.ranges.status[k] == RangeStatus.CHECK.label for one, k in of_each], dtype=bool)
+    return log.with_anchors(anchor_ids), number, is_check
+
+
+def _own(names: dict[str, str], name: str) -> str:
+    return names.get(name, name)
+
+
+def _camera_times_s(survey: FinishedRun) -> Array:
+    """(n,) when each range was taken, by the photos around it; of those without a place, by the clocks' offset."""
+    ranges, times = survey.ranges, survey.result.timestamps_s
+    if times is None:
+        return np.full(len(ranges.range_m), np.nan)
+    offset = survey.result.summary.time_offset.value_s or 0.0
+    before, after = (
+        np.array([times.get(name, np.nan) for name in names], dtype=np.float64)
+        for names in (ranges.keyframe_before, ranges.keyframe_after)
+    )
+    at_place = (1 - ranges.weight) * before + ranges.weight * after
+    return np.where(np.isfinite(at_place), at_place, ranges.timestamp_s + offset)
+
+
+def paths_of_surveys(
+    surveys: Sequence[FinishedRun],
+    log: RangeLog,
+    number: npt.NDArray[np.int64],
+    is_check: npt.NDArray[np.bool_],
+    tags_in_cam_m: Array,
+) -> list[PathOfModel]:
+    """Each survey's model with its own ranges on its path, as the survey put them there; checks stay checks."""
+    paths = []
+    for k, survey in enumerate(surveys):
+        placed = associate(log, survey.path, tags_in_cam_m, options=survey.result.summary.settings.ranges.association)
+        status = np.where(placed.has_place & (number != k), RangeStatus.OUTSIDE_PATH, placed.status).astype(np.int8)
+        status[(status == RangeStatus.USED) & is_check] = RangeStatus.CHECK
+        paths.append(PathOfModel(survey.name, survey.model, survey.path, replace(placed, status=status)))
+    return paths
 
 
 def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress) -> RunResult:

@@ -1,25 +1,83 @@
-"""Photos by a survey: which become keyframes, when they were taken, and the unscaled models of them."""
+"""Photos to unscaled models by a survey: all checked before the long work begins, and ranges in the mapping."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import numpy as np
 import pycolmap
 
-from rangesfm.errors import InputError
-from rangesfm.result.folder import forget_result
+from rangesfm.colmap.model_files import read_model
+from rangesfm.colmap.passthrough import apply_options
+from rangesfm.colmap.transform import rescale, take_over
+from rangesfm.errors import GeometryError, InputError, SolverError
+from rangesfm.export import check_formats
+from rangesfm.files.atomic import sha256_of
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.ranging.clock.estimate import estimate_time_offset
+from rangesfm.ranging.observations import RangeObservations
+from rangesfm.result.folder import forget_result, refuse_to_overwrite
+from rangesfm.survey.inputs import RangingInputs, read_ranging_inputs
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images
 from rangesfm.vision.keyframes import select_keyframes
 from rangesfm.vision.mapping_loop import GlobalAdjustment
 from rangesfm.vision.reconstruct import reconstruct
 from rangesfm.workflows.journal import Journal
+from rangesfm.workflows.metric_map import estimate_scale, path_of_model, ranges_on_path, refine_by_survey
 
 _Done = TypeVar("_Done")
+# Fewer have no shape by which ranges could tell a scale.
+_MIN_NUM_KEYFRAMES = 5
+# By which factor the path must have grown for the clocks' offset to be looked for again.
+_GROWTH = 1.5
+
+
+def read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
+    """Everything that can be wrong is found before the long work begins."""
+    check_formats(survey.export.formats)
+    with survey.source.naming_lines():
+        apply_options(pycolmap.BundleAdjustmentOptions(), survey.refine.bundle_adjustment, "refine.bundle_adjustment")
+    refuse_to_overwrite((item.path for item in survey.input_paths()), survey.output.path)
+    inputs = read_ranging_inputs(survey)
+    for note in inputs.notes:
+        journal.warn(note)
+    return inputs
+
+
+def checked_inputs(survey: Survey, journal: Journal) -> tuple[RangingInputs, tuple[str, ...], ImageTimes | None]:
+    """Ranges and photos that have to do with each other; the photos' times, where any are needed."""
+    inputs = read_inputs(survey, journal)
+    keyframes, times = find_keyframes(survey, journal, log_names_photos=inputs.log.image_name is not None)
+    check_times(survey, inputs, _path_without_places(keyframes, times))
+    return inputs, keyframes, times
+
+
+def check_times(survey: Survey, inputs: RangingInputs, path: Trajectory) -> None:
+    """Refuse a reference and ranges that have nothing to do with these photos; where they were does not matter."""
+    reference, offset_s = inputs.reference, survey.ranges.time_offset_s
+    if reference is not None and not np.isfinite(reference.positions_at(path)[0]).any():
+        raise InputError(reference.why_nothing_is_known(path), survey.report.reference)
+    if inputs.log.image_name is not None or offset_s is not None:
+        ranges_on_path(survey, inputs, path, offset_s or 0.0)
+
+
+def _path_without_places(keyframes: tuple[str, ...], times: ImageTimes | None) -> Trajectory:
+    n = len(keyframes)
+    timestamps_s = None if times is None else times.timestamps_s
+    return Trajectory(np.arange(n), keyframes, timestamps_s, np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))
+
+
+def read_registered(path: Path) -> pycolmap.Reconstruction:
+    model = read_model(path)
+    if not model.num_reg_images():
+        raise InputError("the model has no registered images", path)
+    return model
 
 
 def find_keyframes(
@@ -86,3 +144,88 @@ def noted(image_times: ImageTimes, journal: Journal) -> ImageTimes:
     for note in image_times.notes:
         journal.warn(note)
     return image_times
+
+
+class AdjustmentWithRanges:
+    """Scale, clocks and refinement of whatever there is of a map, by the options of a survey.
+
+    Each time all is estimated anew but the clocks' offset: a map in the making has no anchors, scale or weights that
+    are worth keeping. Taped distances wait for the whole map, where their ends are.
+
+    Attributes:
+        num_with_ranges, num_without: adjustments so far, and those left to COLMAP.
+    """
+
+    def __init__(self, survey: Survey, inputs: RangingInputs, first_keyframe: str, times: ImageTimes | None):
+        """
+        Args:
+            first_keyframe: the photo to whose frame anchors of the frame "first_camera" refer.
+            times: of the photos; None: the log names them.
+        """
+        self._survey = survey
+        self._inputs = inputs
+        self._first_keyframe = first_keyframe
+        self._times = times
+        self._offset_s = 0.0 if inputs.log.timestamp_s is None else survey.ranges.time_offset_s
+        self._num_with_offset = 0
+        self.num_with_ranges = self.num_without = 0
+
+    @property
+    def inputs(self) -> list[Any]:
+        """All settings that it may look at, and its files by their content."""
+        survey = self._survey
+        settings = survey.model_dump(
+            mode="json",
+            include={"camera", "ranges", "anchors", "tag", "scale", "refine"},
+            exclude={"ranges": {"path", "error_curve"}, "anchors": {"path"}, "scale": {"distances", "markers"}},
+        )
+        files = (survey.ranges.path, survey.ranges.error_curve, survey.anchors.path, survey.images.times)
+        contents = [None if path is None else sha256_of(path) for path in files]
+        return [settings, self._inputs.anchor_frame, self._first_keyframe, contents]
+
+    def adjust(self, model: pycolmap.Reconstruction) -> bool:
+        """Adjust a model in place; False, and it is as it was, while the ranges do not determine its scale."""
+        path = path_of_model(model, self._times)
+        try:
+            if len(path) < _MIN_NUM_KEYFRAMES:
+                raise GeometryError(f"{_MIN_NUM_KEYFRAMES} or more are needed")
+            take_over(model, self._adjusted(model, path))
+        except (GeometryError, InputError, SolverError) as error:
+            logging.getLogger(__name__).info("%d keyframes are adjusted without ranges: %s", len(path), error)
+            self.num_without += 1
+            return False
+        self.num_with_ranges += 1
+        return True
+
+    def note(self) -> str | None:
+        """What became of the ranges, for the user; None where there was nothing to adjust."""
+        num = self.num_with_ranges + self.num_without
+        if not num:
+            return None
+        return f"ranges took part in {self.num_with_ranges} of {num} global adjustments of the map while it grew"
+
+    def _adjusted(self, model: pycolmap.Reconstruction, path: Trajectory) -> pycolmap.Reconstruction:
+        survey, inputs = self._survey, self._inputs
+        observations = self._observations(path)
+        estimate = estimate_scale(survey, inputs, observations, path, self._anchor_frame(path), distances=None)
+        refine_intrinsics = survey.camera.mapping_refines_intrinsics
+        asked = survey.changed({"camera.refine_intrinsics": refine_intrinsics, "refine.covariance": False})
+        scaled = rescale(model, estimate.metric_from_sfm)
+        refined, _ = refine_by_survey(asked, inputs, scaled, path, estimate, tape=None)
+        return refined
+
+    def _observations(self, path: Trajectory) -> RangeObservations:
+        survey, inputs = self._survey, self._inputs
+        is_open = inputs.log.timestamp_s is not None and survey.ranges.time_offset_s is None
+        if is_open and len(path) >= _GROWTH * self._num_with_offset:
+            found = estimate_time_offset(
+                inputs.log, path, inputs.tag_in_cam_m, association=survey.ranges, seed=survey.output.seed
+            )
+            self._offset_s, self._num_with_offset = found.value_s, len(path)
+        return ranges_on_path(survey, inputs, path, self._offset_s or 0.0)
+
+    def _anchor_frame(self, path: Trajectory) -> str:
+        """Positions in the first camera's frame are of no use before that photo is part of the map."""
+        is_there = path.image_names[0] == self._first_keyframe
+        frame = self._inputs.anchor_frame
+        return "unknown" if frame == "first_camera" and not is_there else frame

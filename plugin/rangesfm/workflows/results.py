@@ -10,9 +10,8 @@ import numpy as np
 from rangesfm.ceres.doctor import versions
 from rangesfm.comparison.with_reference import format_table, papers_table, reference_in_frame
 from rangesfm.distances.ends import locate_distances
-from rangesfm.distances.rows import DistanceRow, disagreements, distance_rows
+from rangesfm.distances.tape import DistanceRow, disagreements, distance_rows
 from rangesfm.export import COVARIANCE_FORMATS
-from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.reference import write_reference
 from rangesfm.report import write_report
 from rangesfm.result.entries import ComparisonRow
@@ -20,8 +19,7 @@ from rangesfm.result.folder import REFERENCE_NAME, replacing_result
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.summary import ResultSummary
 from rangesfm.result.write import write_models_and_tables
-from rangesfm.survey.input_hashes import input_hashes
-from rangesfm.survey.inputs import RangingInputs
+from rangesfm.survey.inputs import RangingInputs, input_hashes
 from rangesfm.survey.settings import Survey
 from rangesfm.workflows.journal import Journal
 
@@ -56,7 +54,8 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
     with replacing_result(folder):
         with journal.stage("results"):
             comparison = _comparison(survey, inputs, metric)
-            georeference = _georeference(inputs, metric)
+            # Of the final map: that of the anchors, if the map could be carried to them.
+            georeference = inputs.site.georeference if metric.estimate.frame == "site" else None
             write_models_and_tables(
                 metric, survey.export, folder, images_path=survey.images.path, georeference=georeference
             )
@@ -76,11 +75,6 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
     if survey.report.enabled:
         lines.append(f"report: {write_report(folder)}")
     return RunResult(folder, summary, tuple(lines))
-
-
-def _georeference(inputs: RangingInputs, metric: MetricResult) -> Georeference | None:
-    """Of the final map: that of the anchors, if the map could be carried to them."""
-    return inputs.site.georeference if metric.estimate.frame == "site" else None
 
 
 def _distances(inputs: RangingInputs, metric: MetricResult) -> list[DistanceRow]:

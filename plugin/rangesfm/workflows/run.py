@@ -12,7 +12,7 @@ from dataclasses import replace
 import pycolmap
 
 from rangesfm.errors import InputError
-from rangesfm.files.sole_writer import sole_writer
+from rangesfm.files.atomic import sole_writer
 from rangesfm.join.models import PathOfModel
 from rangesfm.progress import Progress
 from rangesfm.ranging.clock.estimate import TimeOffset
@@ -21,12 +21,26 @@ from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes
 from rangesfm.vision.reconstruct import prepare_submaps
 from rangesfm.vision.submaps import Submap
-from rangesfm.workflows.checked_inputs import check_times, checked_inputs, read_inputs, read_registered
 from rangesfm.workflows.journal import Journal
-from rangesfm.workflows.metric_map import join_by_survey, refine_map, scale_by_survey
-from rangesfm.workflows.photos import find_keyframes, map_keyframes, noted, with_photos
-from rangesfm.workflows.placed_ranges import find_time_offset, path_with_times, ranges_on_paths
-from rangesfm.workflows.ranges_in_mapping import AdjustmentWithRanges
+from rangesfm.workflows.metric_map import (
+    find_time_offset,
+    join_by_survey,
+    path_with_times,
+    ranges_on_paths,
+    refine_map,
+    scale_by_survey,
+)
+from rangesfm.workflows.photos import (
+    AdjustmentWithRanges,
+    check_times,
+    checked_inputs,
+    find_keyframes,
+    map_keyframes,
+    noted,
+    read_inputs,
+    read_registered,
+    with_photos,
+)
 from rangesfm.workflows.results import RunResult, write_results
 
 

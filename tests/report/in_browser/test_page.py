@@ -132,6 +132,7 @@ def test_names_from_files_cannot_break_out(browser: Browser, make_result: MakeRe
     browser.draw_figures()
     assert browser.console() == []
     assert "broken out" not in browser.run("return document.title")
+    browser.wait_for("document.querySelector('.label.anchor')")  # with the first frame
     assert browser.run("return [...document.querySelectorAll('.label.anchor')].map(x => x.textContent)")[0] == EVIL
 
 
@@ -166,7 +167,7 @@ def test_the_data_of_figures_are_downloads(
 
 def test_a_figures_data_are_those_of_the_result(browser: Browser, page: Path) -> None:
     browser.open(page)
-    rows = browser.run("return [...rangesfmFigures.scale_consensus[0].rows()]")
+    rows = browser.run("return [...rangesfmFigures.scale_consensus[0].rows()].map(Object.values)")
     lines = (page.parent / "scale_consensus.csv").read_text().splitlines()[1:]
     expected = [[float(cell) for cell in line.split(",")] for line in lines]
     np.testing.assert_allclose([row[1:] for row in rows], expected, rtol=1e-6)
@@ -188,7 +189,7 @@ def place_in(browser: Browser, chart: str, x: float, y: float) -> tuple[float, f
 def test_the_pointer_tells_the_values_of_what_is_nearest(browser: Browser, page: Path) -> None:
     browser.open(page)
     chart = "rangesfmFigures.scale_consensus[0]"
-    _, scale, num_agreeing = browser.run(f"return [...{chart}.rows()][50]")
+    _, scale, num_agreeing = browser.run(f"return Object.values([...{chart}.rows()][50])")
     x, y = place_in(browser, chart, scale, num_agreeing)
     browser.command("Input.dispatchMouseEvent", type="mouseMoved", x=x + 2, y=y - 2)
     said = browser.run(f"return {chart}.tip.checkVisibility() && {chart}.tip.textContent")

@@ -72,7 +72,7 @@ def test_points_cameras_and_anchors_are_drawn_and_layers_take_them_away(opened: 
     assert num_pixels(opened.picture(".stage canvas"), SCALED) < 5
     toggle(opened, "layer", "anchors")
     opened.picture(".stage canvas")
-    assert opened.run("return [...document.querySelectorAll('.label.anchor')].every(label => label.hidden)")
+    assert opened.run("return [...document.querySelectorAll('.label.anchor')].every(label => !label.checkVisibility())")
     assert opened.console() == []
 
 
@@ -149,6 +149,7 @@ def test_two_clicks_measure_a_distance_with_its_interval(opened: Browser) -> Non
     half = 1.96 * 0.00412 / 0.74213
     expected = [distance, distance * (1 - half), distance * (1 + half)]
     assert [float(value) for value in said.groups()] == pytest.approx(expected, abs=6e-4)
+    opened.wait_for("document.querySelector('.label.distance')")  # with the next frame
     assert text_of(opened, ".label.distance") == f"{distance:.3f} m"
 
 

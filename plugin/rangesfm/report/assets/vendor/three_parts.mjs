@@ -4,6 +4,8 @@ export {
   BufferGeometry,
   Color,
   ColorManagement,
+  Float32BufferAttribute,
+  GridHelper,
   Group,
   Line,
   LineBasicMaterial,
@@ -15,10 +17,12 @@ export {
   OctahedronGeometry,
   PerspectiveCamera,
   Points,
+  PointsMaterial,
   Scene,
-  ShaderMaterial,
   SphereGeometry,
+  Vector2,
   Vector3,
   WebGLRenderer,
 } from "three";
 export { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
+export { CSS2DObject, CSS2DRenderer } from "three/examples/jsm/renderers/CSS2DRenderer.js";

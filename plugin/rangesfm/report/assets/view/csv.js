@@ -1,64 +1,63 @@
 // Data of the page as CSV files, made when asked for.
 
-function csvCell(value) {
-  const text = typeof value === "number" ? (Number.isFinite(value) ? String(value) : "") : String(value);
-  return /[",\n\r]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
-}
-
-function csvText(header, num, rowAt) {
-  const lines = [header.join(",")];
-  for (let i = 0; i < num; i++) lines.push(rowAt(i).map(csvCell).join(","));
-  return `${lines.join("\n")}\n`;
+function csvText(rows) {
+  const cell = (value) => (/[",\n\r]/.test(value) ? `"${value.replaceAll('"', '""')}"` : Number.isNaN(value) ? "" : value);
+  return `${[Object.keys(rows[0]), ...rows.map(Object.values)].map((row) => row.map(cell).join(",")).join("\n")}\n`;
 }
 
 function rounded(value, decimals) {
-  return Number.isFinite(value) ? Number(value.toFixed(decimals)) : NaN;
+  return Number(value.toFixed(decimals));
 }
 
-const CSV_TABLES = {
+function rangeRows(ranges, others) {
+  return Array.from({ length: ranges.num }, (_, i) => ({
+    time_s: rounded(ranges.time[i], 3),
+    anchor_id: ranges.anchor_ids[ranges.anchor[i]],
+    range_m: rounded(ranges.measured[i], 4),
+    ...others(i),
+  }));
+}
+
+/** Rows of the tables that figures name. */
+const TABLES = {
   ranges: ({ ranges }) =>
-    csvText(
-      ["time_s", "anchor_id", "range_m", "residual_scaled_m", "residual_refined_m", "status"],
-      ranges.num,
-      (i) => [
-        rounded(ranges.time[i], 3),
-        ranges.anchor_ids[ranges.anchor[i]],
-        rounded(ranges.measured[i], 4),
-        rounded(ranges.residual_scaled[i], 4),
-        rounded(ranges.residual_refined[i], 4),
-        ranges.statuses[ranges.status[i]],
-      ],
-    ),
+    rangeRows(ranges, (i) => ({
+      residual_scaled_m: rounded(ranges.residual_scaled[i], 4),
+      residual_refined_m: rounded(ranges.residual_refined[i], 4),
+      status: ranges.statuses[ranges.status[i]],
+    })),
   range_errors: ({ ranges }) =>
-    csvText(["time_s", "anchor_id", "range_m", "range_by_reference_m", "error_scaled_m", "error_refined_m"], ranges.num, (i) => {
-      const fromReference = ranges.measured[i] - ranges.true[i];
-      return [
-        rounded(ranges.time[i], 3),
-        ranges.anchor_ids[ranges.anchor[i]],
-        rounded(ranges.measured[i], 4),
-        rounded(ranges.true[i], 4),
-        rounded(ranges.residual_scaled[i] + fromReference, 4),
-        rounded(ranges.residual_refined[i] + fromReference, 4),
-      ];
-    }),
+    rangeRows(ranges, (i) => ({
+      range_by_reference_m: rounded(ranges.true[i], 4),
+      error_scaled_m: rounded(ranges.residual_scaled[i] + ranges.measured[i] - ranges.true[i], 4),
+      error_refined_m: rounded(ranges.residual_refined[i] + ranges.measured[i] - ranges.true[i], 4),
+    })),
   points: ({ points }) =>
-    csvText(["x_m", "y_m", "z_m", "red", "green", "blue"], points.num, (i) => [
-      ...pointPosition(points, i).map((value) => rounded(value, 4)),
-      ...row3(points.colors, i),
-    ]),
+    Array.from({ length: points.num }, (_, i) => {
+      const [x_m, y_m, z_m] = pointPosition(points, i).map((value) => rounded(value, 4));
+      const [red, green, blue] = row3(points.colors, i);
+      return { x_m, y_m, z_m, red, green, blue };
+    }),
 };
+
+/** Rows of what a figure's charts draw. */
+function rowsOfCharts(charts) {
+  const [x, y] = charts[0].labels.map((label) => (label || "row").replace("−", "minus ").split(/\s+/).join("_"));
+  const number = (value) => Number(value.toPrecision(7));
+  return charts.flatMap((chart) =>
+    [...chart.rows()].map((row) => ({ panel: chart.title, series: row.name, [x]: number(row.x), [y]: number(row.y) })),
+  );
+}
 
 /** A figure's button gives the table it names, or else what its charts draw. */
 function attachDownloads(scene, figures) {
   for (const button of document.querySelectorAll("button[data-figure]")) {
     button.addEventListener("click", () => {
       const { csv, figure } = button.dataset;
-      const text = csv ? CSV_TABLES[csv](scene) : csvOfFigure(figures[figure]);
-      const link = document.createElement("a");
-      link.href = URL.createObjectURL(new Blob([text], { type: "text/csv" }));
-      link.download = `${figure}.csv`;
-      link.click();
-      setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+      const text = csvText(csv ? TABLES[csv](scene) : rowsOfCharts(figures[figure]));
+      const href = URL.createObjectURL(new Blob([text], { type: "text/csv" }));
+      Object.assign(document.createElement("a"), { href, download: `${figure}.csv` }).click();
+      setTimeout(() => URL.revokeObjectURL(href), 10000);
     });
   }
 }

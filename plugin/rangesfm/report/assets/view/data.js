@@ -1,37 +1,29 @@
-// The page's data blocks: JSON, and typed arrays in it as base64.
+// The page's data blocks: JSON, and typed arrays in it as base64; the page's colours.
 
 const ARRAY_TYPES = { uint8: Uint8Array, uint16: Uint16Array, int32: Int32Array, float32: Float32Array };
 
+/** A block by its id, with every {type, data} in it as a typed array; null where there is none. */
 function readBlock(id) {
   const block = document.getElementById(id);
-  return block === null ? null : unpackAll(JSON.parse(block.textContent));
+  return block && JSON.parse(block.textContent, (_, value) => (ARRAY_TYPES[value?.type] ? unpacked(value) : value));
 }
 
-/** Every {type, data} in a JSON value becomes a typed array. */
-function unpackAll(value) {
-  if (value === null || typeof value !== "object") return value;
-  if (typeof value.data === "string" && value.type in ARRAY_TYPES) return unpackArray(value);
-  for (const key of Object.keys(value)) value[key] = unpackAll(value[key]);
-  return value;
-}
-
-function unpackArray({ type, data }) {
-  const text = atob(data);
-  const bytes = new Uint8Array(text.length);
-  for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
-  return new ARRAY_TYPES[type](bytes.buffer);
-}
-
-/** A place in the frame of a path's i-th camera, carried into the world; center: where the camera is then. */
-function fromCamera(path, i, place, center) {
-  const rotation = path.rotations.subarray(9 * i, 9 * i + 9);
-  return center.map((value, axis) => {
-    const [x, y, z] = row3(rotation, axis);
-    return value + x * place[0] + y * place[1] + z * place[2];
-  });
+function unpacked({ type, data }) {
+  return new ARRAY_TYPES[type](Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0)).buffer);
 }
 
 /** The i-th row of three of a flat array. */
 function row3(values, i) {
   return [values[3 * i], values[3 * i + 1], values[3 * i + 2]];
+}
+
+/** A colour of the page's style, so that view and page change together. */
+function themeColor(name) {
+  return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+}
+
+/** Calls back now and whenever the reader's theme changes. */
+function onTheme(callback) {
+  callback();
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", callback);
 }

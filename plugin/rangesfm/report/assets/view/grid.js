@@ -15,23 +15,15 @@ function lengthText(length) {
 /** Returns the grid and the width of its cells. */
 function makeGrid(box, up) {
   const cell = roundLength((2.4 * box.radius) / NUM_GRID_CELLS);
+  const numCells = 2 * Math.ceil((1.2 * box.radius) / cell);
+  const grid = new THREE.GridHelper(cell * numCells, numCells);
+  grid.material.vertexColors = false;
+  onTheme(() => grid.material.color.set(themeColor("stage-grid")));
   const vertical = up.findIndex((value) => value !== 0);
-  const [first, second] = [0, 1, 2].filter((axis) => axis !== vertical);
-  const half = cell * Math.ceil((1.2 * box.radius) / cell);
   const middle = box.low.map((value, axis) => cell * Math.round((value + box.high[axis]) / 2 / cell));
-  const lines = [];
-  for (let offset = -half; offset <= half + cell / 2; offset += cell) {
-    for (const [along, across] of [[first, second], [second, first]]) {
-      for (const end of [-half, half]) {
-        const corner = [0, 0, 0];
-        corner[vertical] = box.ground;
-        corner[along] = middle[along] + end;
-        corner[across] = middle[across] + offset;
-        lines.push(corner);
-      }
-    }
-  }
-  return { grid: themed(THREE.LineSegments, lines, new THREE.LineBasicMaterial(), "stage-grid"), cell };
+  grid.position.set(...middle.with(vertical, box.ground));
+  if (vertical === 2) grid.rotateX(Math.PI / 2); // it is made with y up
+  return { grid, cell };
 }
 
 /** Keeps a bar of round length up to date. */

@@ -2,22 +2,20 @@
 
 class Measuring {
   /** interval: the scale's interval relative to its value, [low, high], or null. */
-  constructor(stage, labels, output, interval) {
-    this.stage = stage;
-    this.output = output;
-    this.interval = interval;
-    this.label = labels.add("", null, "distance");
+  constructor(stage, output, interval) {
+    Object.assign(this, { stage, output, interval });
     this.line = themed(THREE.Line, [], new THREE.LineBasicMaterial({ depthTest: false }), "chosen");
     this.line.renderOrder = 1;
+    this.label = makeLabel("distance", "");
+    this.line.add(this.label);
     this.clear();
     stage.add(this.line);
   }
 
-  clear() {
+  clear(text = "") {
     this.ends = [];
     this.line.visible = false;
-    this.label.position = null;
-    this.output.textContent = "";
+    this.output.textContent = text;
     this.stage.requestFrame();
   }
 
@@ -26,24 +24,18 @@ class Measuring {
     if (this.ends.length === 2) this.clear();
     this.ends.push({ name, position });
     if (this.ends.length === 1) this.output.textContent = `From ${name}: now click the other end.`;
-    else this.#show();
+    else this.#show(...this.ends);
   }
 
-  #show() {
-    const [a, b] = this.ends;
+  #show(a, b) {
     const distance = Math.hypot(...a.position.map((value, axis) => value - b.position[axis]));
-    this.line.geometry.dispose();
-    this.line.geometry = lineGeometry([a.position, b.position]);
+    moveTo(this.line, [a.position, b.position]);
     this.line.visible = true;
-    this.label.position = a.position.map((value, axis) => (value + b.position[axis]) / 2);
-    this.label.node.textContent = `${distance.toFixed(3)} m`;
-    this.output.textContent = `${a.name} to ${b.name}: ${distance.toFixed(3)} m${this.#interval(distance)}`;
+    this.label.position.set(...a.position.map((value, axis) => (value + b.position[axis]) / 2));
+    this.label.element.textContent = `${distance.toFixed(3)} m`;
+    const [low, high] = (this.interval ?? []).map((share) => (share * distance).toFixed(3));
+    const interval = low && ` (95 % by the scale alone: ${low} to ${high} m)`;
+    this.output.textContent = `${a.name} to ${b.name}: ${distance.toFixed(3)} m${interval ?? ""}`;
     this.stage.requestFrame();
-  }
-
-  #interval(distance) {
-    if (this.interval === null) return "";
-    const [low, high] = this.interval.map((share) => (share * distance).toFixed(3));
-    return ` (95 % by the scale alone: ${low} to ${high} m)`;
   }
 }

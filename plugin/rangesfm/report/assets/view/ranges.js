@@ -1,19 +1,6 @@
 // Ranges as lines from the radio at the camera to its anchor, coloured by residual.
 
-const RESIDUAL_STOPS = ["residual-negative", "residual-zero", "residual-positive"];
-
-/** Colour of a residual in the scale from -limit to +limit, as three bytes. */
-function residualColor(residual, limit, stops) {
-  const place = Math.max(-1, Math.min(1, residual / limit));
-  const end = place < 0 ? stops[0] : stops[2];
-  const share = Math.sqrt(Math.abs(place));
-  return stops[1].map((value, channel) => Math.round(value + share * (end[channel] - value)));
-}
-
-/** "#rrggbb" as three bytes. */
-function bytesOf(color) {
-  return [1, 3, 5].map((at) => parseInt(color.slice(at, at + 2), 16));
-}
+const RESIDUAL_COLORS = ["residual-negative", "residual-zero", "residual-positive"];
 
 /** The radio's antenna when a range was taken: on the line between the two keyframes. */
 function tagPosition(path, ranges, i) {
@@ -25,17 +12,14 @@ function tagPosition(path, ranges, i) {
 
 class RangeLines {
   constructor(ranges, path, anchors) {
-    this.ranges = ranges;
-    this.numShown = 0;
+    Object.assign(this, { ranges, numShown: 0 });
     const positionOf = new Map(anchors.map((anchor) => [anchor.id, anchor.position]));
-    this.hasLine = Array.from(ranges.anchor, (id, i) => ranges.has_place[i] === 1 && positionOf.has(ranges.anchor_ids[id]));
-    const ends = this.hasLine.map((known, i) =>
-      known
-        ? [...tagPosition(path, ranges, i), ...positionOf.get(ranges.anchor_ids[ranges.anchor[i]])]
-        : [0, 0, 0, 0, 0, 0],
-    );
+    const anchorAt = Array.from(ranges.anchor, (number) => positionOf.get(ranges.anchor_ids[number]));
+    this.hasLine = anchorAt.map((anchor, i) => anchor !== undefined && ranges.has_place[i] === 1);
+    const nowhere = [[0, 0, 0], [0, 0, 0]];
+    const ends = anchorAt.flatMap((anchor, i) => (this.hasLine[i] ? [tagPosition(path, ranges, i), anchor] : nowhere));
     this.geometry = lineGeometry(ends);
-    this.geometry.setAttribute("color", new THREE.BufferAttribute(new Uint8Array(6 * ranges.num), 3, true));
+    this.geometry.setAttribute("color", new THREE.BufferAttribute(new Float32Array(6 * ranges.num), 3));
     const material = new THREE.LineBasicMaterial({ vertexColors: true, transparent: true, opacity: 0.9 });
     this.lines = new THREE.LineSegments(this.geometry, material);
     this.lines.frustumCulled = false;
@@ -55,13 +39,16 @@ class RangeLines {
     return [...this.ranges.camera.keys()].filter((i) => this.ranges.camera[i] === camera);
   }
 
+  /** From the middle colour to an end's as the residual grows to the limit, fast at first. */
   #paint() {
-    const stops = RESIDUAL_STOPS.map((name) => bytesOf(themeColor(name)));
+    const [negative, zero, positive] = RESIDUAL_COLORS.map((name) => new THREE.Color(themeColor(name)));
     const colors = this.geometry.getAttribute("color");
-    for (let i = 0; i < this.ranges.num; i++) {
-      const color = residualColor(this.ranges.residual[i] || 0, this.ranges.residual_limit_m, stops);
-      colors.array.set([...color, ...color], 6 * i);
-    }
+    const color = new THREE.Color();
+    this.ranges.residual.forEach((residual, i) => {
+      const share = Math.sqrt(Math.min(1, Math.abs(residual || 0) / this.ranges.residual_limit_m));
+      color.lerpColors(zero, residual < 0 ? negative : positive, share);
+      for (const end of [2 * i, 2 * i + 1]) colors.setXYZ(end, color.r, color.g, color.b);
+    });
     colors.needsUpdate = true;
   }
 }

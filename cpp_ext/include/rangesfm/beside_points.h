@@ -1,19 +1,49 @@
-#ifndef RANGESFM_PADDED_MANIFOLD_H_
-#define RANGESFM_PADDED_MANIFOLD_H_
+// What keeps anchors and biases out of the elimination of the 3-D points, which stays as fast as it is without them.
 
+#pragma once
+
+#include <ceres/cost_function.h>
 #include <ceres/manifold.h>
 
 #include <Eigen/Core>
+#include <algorithm>
 
 namespace rangesfm {
+
+// Two residuals that are always zero and depend on nothing: they say that two blocks belong together, no more. Why an
+// anchor is tied to a point so: keep_from_elimination in plugin/rangesfm/ceres/problem.py. Two rows, since a
+// reprojection has two: for Ceres' specialised kernels the rows of the points must all be of that size.
+//
+// Blocks: any two, for example anchor_in_world (3) and a 3-D point (3).
+class ZeroTieCost final : public ceres::CostFunction {
+ public:
+  ZeroTieCost(int size_a, int size_b) {
+    set_num_residuals(kNumResiduals);
+    *mutable_parameter_block_sizes() = {size_a, size_b};
+  }
+
+  bool Evaluate(double const* const* /*parameters*/, double* residuals, double** jacobians) const override {
+    std::fill_n(residuals, kNumResiduals, 0.0);
+    if (jacobians != nullptr) {
+      for (int i = 0; i < 2; ++i) {
+        if (jacobians[i] != nullptr) {
+          std::fill_n(jacobians[i], kNumResiduals * parameter_block_sizes()[i], 0.0);
+        }
+      }
+    }
+    return true;
+  }
+
+ private:
+  static constexpr int kNumResiduals = 2;
+};
 
 // Numbers that add up as usual, in a tangent space with further directions that move nothing: a block of k numbers that
 // takes as many columns of the Jacobian as a pose, the last of them zero.
 //
-// Ceres' Schur eliminator has kernels for blocks of fixed size. All blocks that share a residual with an eliminated
-// point must be of one size for them; poses have 6 columns, and one anchor (3) or bias (1) that is tied to a point to
-// keep it from elimination (zero_tie_cost.h) would make them all be handled as of any size. Levenberg-Marquardt's
-// damping has a floor (Solver::Options::min_lm_diagonal), so that directions that move nothing get a step of zero.
+// Among the blocks that share a residual with an eliminated point it is then of the poses' size, for which there are
+// kernels. Levenberg-Marquardt's damping has a floor (Solver::Options::min_lm_diagonal), so that directions that move
+// nothing get a step of zero.
 class PaddedManifold final : public ceres::Manifold {
  public:
   PaddedManifold(int ambient_size, int tangent_size) : ambient_size_(ambient_size), tangent_size_(tangent_size) {}
@@ -64,5 +94,3 @@ class PaddedManifold final : public ceres::Manifold {
 };
 
 }  // namespace rangesfm
-
-#endif  // RANGESFM_PADDED_MANIFOLD_H_

@@ -1,4 +1,4 @@
-"""Cameras and anchors as points on the map, for GIS programs: GeoPackage, GeoJSON and KML, through GDAL."""
+"""What GIS programs read: points as LAZ; cameras and anchors as GeoPackage, GeoJSON and KML, through GDAL."""
 
 from __future__ import annotations
 
@@ -9,11 +9,51 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.export.metric_map import MetricMap
+from rangesfm.export.metric_map import MetricMap, points_of
 from rangesfm.files.atomic import new_file
-from rangesfm.geometry.georeference import GEOGRAPHIC
+from rangesfm.geometry.georeference import GEOGRAPHIC, is_geographic
 
+_STEP_M = 1e-4
+_STEP_DEG = 1e-9
+_POINT_FORMAT_WITH_COLOR = 7
 _WKB_POINT_Z = 1001
+# Nine decimals of a degree are a tenth of a millimetre.
+_OPTIONS = {"GeoJSON": {"COORDINATE_PRECISION": "9"}}
+
+
+def write_laz(map_: MetricMap, path: Path) -> Path:
+    """Write the 3-D points with their colours, in tenths of a millimetre.
+
+    Raises:
+        InputError: laspy is not installed.
+    """
+    try:
+        import laspy
+    except ImportError:
+        raise InputError("the format 'laz' needs laspy: pip install 'rangesfm[geo]'") from None
+    places, colors = points_of(map_.reconstruction)
+    xyz, steps = _coordinates(map_, places)
+    header = laspy.LasHeader(version="1.4", point_format=_POINT_FORMAT_WITH_COLOR)
+    header.scales = steps
+    header.offsets = np.floor(xyz.min(axis=0)) if len(xyz) else np.zeros(3)
+    if map_.georeference is not None:
+        import pyproj
+
+        header.add_crs(pyproj.CRS.from_user_input(map_.georeference.crs))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = xyz.T
+    las.red, las.green, las.blue = colors.T * np.uint16(257)  # LAS counts colours to 65535
+    with new_file(path) as temporary:
+        las.write(str(temporary))
+    return path
+
+
+def _coordinates(map_: MetricMap, xyz: Array) -> tuple[Array, Array]:
+    """Coordinates to write and the step in which they are counted."""
+    if map_.georeference is None:
+        return xyz, np.full(3, _STEP_M)
+    step = _STEP_DEG if is_geographic(map_.georeference.crs) else _STEP_M
+    return map_.georeference.projected(xyz), np.array([step, step, _STEP_M])
 
 
 def write_features(map_: MetricMap, path: Path, driver: str) -> Path:
@@ -55,10 +95,6 @@ def write_features(map_: MetricMap, path: Path, driver: str) -> Path:
             **_OPTIONS.get(driver, {}),
         )
     return path
-
-
-# Nine decimals of a degree are a tenth of a millimetre.
-_OPTIONS = {"GeoJSON": {"COORDINATE_PRECISION": "9"}}
 
 
 def _wkb(coordinates: Array) -> np.ndarray[tuple[int], np.dtype[np.object_]]:

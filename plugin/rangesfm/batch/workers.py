@@ -1,0 +1,219 @@
+"""Dask: its workers, of this machine or of a scheduler that is there, and what one of them does for a survey."""
+
+from __future__ import annotations
+
+import base64
+import logging
+import os
+import pickle
+import signal
+import socket
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import dask
+from dask.system import CPU_COUNT
+from distributed import Client, LocalCluster, get_worker
+from distributed.comm import get_address_host_port
+from distributed.system import MEMORY_LIMIT
+
+from rangesfm.batch.jobs import Share
+from rangesfm.errors import FAILED, INTERRUPTED, Failure, InputError
+from rangesfm.processes.supervision import Ended, child_command, supervise
+from rangesfm.survey.settings import Survey
+from rangesfm.vision.submaps import Submap
+
+_CONNECT_S = 10
+# Nothing is served beside the work itself.
+_CONFIG = {
+    "distributed.scheduler.http.routes": [],
+    "distributed.worker.http.routes": [],
+    "distributed.admin.system-monitor.interval": "5s",
+    "distributed.worker.profile.enabled": False,
+    "distributed.comm.timeouts.connect": f"{_CONNECT_S}s",
+}
+_SILENT = logging.CRITICAL + 1
+# By the system for want of memory, or by somebody from outside: then it is worth another try.
+_FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
+# Batches whose surveys this worker is to leave alone.
+_stopped: set[str] = set()
+
+
+def this_machine() -> tuple[int, int]:
+    """Its cores and the bytes of its memory, as far as this process may use them."""
+    return CPU_COUNT, MEMORY_LIMIT
+
+
+@contextmanager
+def local_workers(num: int) -> Iterator[Client]:
+    """Processes of this machine, each for one survey at a time, which only this machine can speak to."""
+    with (
+        dask.config.set(_CONFIG),
+        _silence(),
+        tempfile.TemporaryDirectory(prefix="rangesfm_batch_", ignore_cleanup_errors=True) as scratch,
+        LocalCluster(
+            n_workers=num,
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            dashboard_address=None,
+            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
+            silence_logs=_SILENT,
+            memory_limit=0,  # surveys are watched, and named
+            local_directory=scratch,
+            # A Ctrl-C in the terminal is for the command, which stops them in order.
+            preload=["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
+        ) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        yield client
+
+
+@contextmanager
+def workers_of(scheduler: str) -> Iterator[Client]:
+    """The workers of a scheduler, by its address.
+
+    Raises:
+        InputError: it does not answer.
+    """
+    with dask.config.set(_CONFIG), _silence():
+        try:
+            get_address_host_port(scheduler)
+            client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
+        except (OSError, ValueError, ImportError, RuntimeError) as error:
+            reason = " ".join(str(error).split())
+            raise InputError(f"no Dask scheduler answers at '{scheduler}', as tcp://head:8786: {reason}") from None
+        with client:
+            yield client
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Nobody but the batch itself speaks to the user: Dask logs each worker that is lost, with a traceback."""
+    before = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logging.disable(before)
+
+
+def num_at_once(client: Client) -> Mapping[str, int]:
+    """How many tasks each host does at once, by the workers that are there now.
+
+    Raises:
+        InputError: they do not know this package.
+    """
+    try:
+        slots = client.run(_slots).values()
+    except Exception as error:  # whatever went wrong there, it is raised here
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise InputError(f"the workers of the scheduler cannot run surveys ({reason})") from None
+    num: dict[str, int] = {}
+    for host, num_threads in slots:
+        num[host] = num.get(host, 0) + num_threads
+    return num
+
+
+def _slots(dask_worker: Any) -> tuple[str, int]:
+    return socket.gethostname(), dask_worker.state.nthreads
+
+
+@dataclass(frozen=True)
+class SurveyTask:
+    """What a worker is given: a survey, or a part of one that is mapped in submaps.
+
+    Attributes:
+        batch: the batch's own name, under which the worker tells how far it is.
+        index: of the survey in the batch.
+        share: what it may use.
+        restart: do anew what earlier runs have done.
+        only_prepare: find the submaps that are to be mapped, and no more.
+        submap: only map this one.
+        begins: whether the survey begins with it.
+    """
+
+    batch: str
+    index: int
+    survey: Survey
+    share: Share
+    restart: bool
+    only_prepare: bool = False
+    submap: Submap | None = None
+    begins: bool = True
+
+
+class KilledError(Exception):
+    """The survey's process was killed from outside; its text is one line for the user."""
+
+
+def stop_batch(batch: str) -> None:
+    """Interrupt the surveys of a batch, and begin no more of them on this worker."""
+    _stopped.add(batch)
+
+
+def run_on_worker(task: SurveyTask) -> Any:
+    """Run a survey, or a part of one, in a process of its own.
+
+    Returns:
+        The Failure, or what the process ended with: ``{"figures": ..., "reason": ...}``; of a survey only prepared a
+        tuple of Submap; of a submap None.
+
+    Raises:
+        KilledError: the process was killed from outside, so that another attempt may well go through.
+    """
+    worker, host = get_worker(), socket.gethostname()
+
+    def tell(message: dict[str, Any]) -> None:
+        if task.submap is None:  # of many at once the batch itself counts those that are done
+            worker.log_event(task.batch, {"index": task.index, **message})
+
+    if task.batch in _stopped:
+        return Failure("interrupted", INTERRUPTED)
+    if task.begins:
+        tell({"began_on": host})
+    # The limit of all of a worker's tasks, if it has one, as clusters' workers do.
+    memory_bytes = getattr(worker.memory_manager, "memory_limit", None) or MEMORY_LIMIT
+    num_threads, memory_limit_bytes = task.share.on(host, worker.state.nthreads, CPU_COUNT, memory_bytes)
+    module, given = _work(task, num_threads)
+    ended = supervise(
+        child_command(module),
+        given,
+        tell,
+        environment={**os.environ, "OMP_NUM_THREADS": str(num_threads), "OPENBLAS_NUM_THREADS": "1"},
+        memory_limit_bytes=memory_limit_bytes,
+        is_stopped=lambda: task.batch in _stopped,
+    )
+    if ended.last is None or not ended.last.keys() & {"done", "failed"}:
+        return _why_it_did_not_end(ended, memory_limit_bytes)
+    if "failed" in ended.last:
+        return Failure(**ended.last["failed"])
+    done = ended.last["done"]
+    return pickle.loads(base64.b64decode(done["submaps"])) if task.only_prepare else done
+
+
+def _work(task: SurveyTask, num_threads: int) -> tuple[str, bytes]:
+    """The module that does it, and what that is given; with no more threads, though the file may ask for fewer."""
+    own = task.survey.mapper.num_threads
+    num = num_threads if own < 1 else min(own, num_threads)
+    if task.submap is not None:
+        return "rangesfm.vision.submap_process", pickle.dumps(task.submap.with_threads(num))
+    survey = task.survey.changed({"mapper.num_threads": num})
+    return "rangesfm.batch.survey_process", pickle.dumps((survey, task.restart, task.only_prepare))
+
+
+def _why_it_did_not_end(ended: Ended, memory_limit_bytes: int) -> Failure:
+    if ended.needed_bytes is not None:
+        needed, limit = (f"{num / 1e6:.0f} MB" for num in (ended.needed_bytes, memory_limit_bytes))
+        why = f"needs more memory than its share: {needed}, and {limit} is what it may take"
+        return Failure(f"{why}; give it more by --memory_limit, or fewer --num_workers", FAILED)
+    if ended.stopped:
+        return Failure("interrupted", INTERRUPTED)
+    if ended.signal in _FROM_OUTSIDE:
+        raise KilledError(
+            f"its process was killed ({ended.signal.name}): by somebody, or by the system for want of memory"
+        )
+    return Failure(ended.how, FAILED)

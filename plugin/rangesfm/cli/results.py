@@ -1,0 +1,167 @@
+"""The commands that take what runs left: ``export``, ``compare`` and ``report``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rangesfm.cli.arguments import Commands, Outcome, Parser
+from rangesfm.cli.survey_flags import add_flags, flags_given, overrides_from_arguments, survey_from_arguments
+from rangesfm.errors import InputError
+from rangesfm.progress import Progress
+
+if TYPE_CHECKING:
+    from rangesfm.options import ExportOptions
+
+_COMPARE_KEYS = ("images.path", "ranges", "anchors", "tag", "scale")
+_OF_A_RUN = ("ranges.check_share", "ranges.check_anchors", "ranges.check_times_s", "scale.method")
+_WITHOUT_LOG = ("--distances", "--markers")
+
+
+def add_commands(commands: Commands) -> None:
+    export = commands.add("export", _export, "metric model to other formats")
+    _add_result_argument(export)
+    add_flags(export, "export", by_own_names=True)
+    export.add_argument(
+        "--apply_to",
+        nargs="+",
+        metavar="FILE",
+        help="carry these, made from the unscaled model, over instead: PLY, OBJ, camera JSON, COLMAP folders",
+    )
+    export.add_argument("--images", metavar="FOLDER", help="the photos (default: where the run found them)")
+    export.add_argument("--output_path", metavar="FOLDER", help="where to (default: the result folder)")
+    compare = commands.add("compare", _compare, "models with each other and with a reference")
+    compare.add_argument("models", nargs="*", metavar="MODEL", help="result folders, COLMAP models, CSV or TUM files")
+    compare.add_argument("--input_path", metavar="RESULT", help="one result folder (default: out)")
+    compare.add_argument("--reference", metavar="FILE", help="true positions: CSV or TUM")
+    compare.add_argument("--output_path", metavar="FOLDER", help="of two or more: write comparison.html there as well")
+    add_flags(compare, *_COMPARE_KEYS, without=_OF_A_RUN)
+    report = commands.add("report", _report, "result folder to one self-contained HTML page")
+    _add_result_argument(report)
+    report.add_argument("--images", metavar="FOLDER", help="the photos, for thumbnails (default: as in the run)")
+    report.add_argument("--png", action="store_true", help="write the figures for a paper too, as PNG and SVG")
+
+
+def _add_result_argument(parser: Parser) -> None:
+    """The result folder, by place or as ``--input_path``."""
+    parser.add_argument("result", nargs="?", metavar="RESULT", help="output folder of a run (default: out)")
+    parser.add_argument("--input_path", metavar="RESULT", help="the same")
+
+
+def _result_path(args: argparse.Namespace) -> Path:
+    if args.result is not None and args.input_path is not None:
+        raise InputError(f"two result folders are given, {args.result} and {args.input_path}; expected one")
+    return Path(args.result or args.input_path or "out")
+
+
+def _path(given: str | None) -> Path | None:
+    return None if given is None else Path(given)
+
+
+def _export(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """Write the metric model of a result folder in other formats; an unknown one lists them all.
+
+    example:
+      rangesfm export out --formats tum,ply,nerfstudio --frame level --output_path exported
+    """
+    from rangesfm.workflows.export_result import apply_result, export_result
+
+    source = _result_path(args)
+    options = survey_from_arguments(args).export
+    if args.apply_to is None:
+        destination, notes = Path(args.output_path or source), []
+        written = export_result(source, options.formats, destination, options=options, images_path=_path(args.images))
+    else:
+        if "formats" in options.model_fields_set:
+            raise InputError("--apply_to writes files in their own formats: leave out --formats")
+        destination = Path(args.output_path or source / "applied")
+        written, residual_m = apply_result(source, list(map(Path, args.apply_to)), destination, options=options)
+        note = f"cameras of the refined map are {residual_m:.3f} m (rms) from where the similarity puts them"
+        notes = [note] if residual_m else []
+    return Outcome([*map(str, written), *_frame_note(options, source), *notes])
+
+
+def _frame_note(options: ExportOptions, result_folder: Path) -> list[str]:
+    """Where up came from, if it was asked for: nobody can see it in the files."""
+    if options.frame == "result" and options.origin_anchor is None:
+        return []
+    if options.frame == "enu" and options.origin_anchor is None:
+        return ["up is away from the ellipsoid, by the anchors' coordinates"]
+    from rangesfm.result.folder import read_result_folder
+
+    if options.up == "auto" and read_result_folder(result_folder).summary.frame == "site":
+        return ["up is z of the site"]
+    photos = "the mean of what is up in the photos"
+    source = {"cameras": photos, "auto": photos, "path": "across the plane of the path"}
+    return [f"up is {source.get(options.up, f'{options.up} in the frame of the result')}"]
+
+
+def _compare(args: argparse.Namespace, progress: Progress) -> Outcome:
+    r"""One result folder: its models with each other, and with a reference if there is one.
+    Two or more models, result folders or files of camera positions: each with the first.
+    --ranges holds them against a radio log, which the first of them places (default: the ranges that the
+    first result folder used), --distances against taped distances.
+
+    example:
+      rangesfm compare out --reference reference.csv
+      rangesfm compare out other_tool/sparse/0 --output_path comparison
+      rangesfm compare one/sparse/0 other/sparse/0 --ranges uwb.csv --anchors anchors.csv \
+          --images images.csv --tag_in_cam -0.0012,-0.09,-0.0663 --distances taped.csv
+    """
+    given = [*([] if args.input_path is None else [args.input_path]), *args.models]
+    paths = [Path(path) for path in given] or [Path("out")]
+    if len(paths) > 1:
+        return _compare_many(args, paths)
+    if args.output_path is not None:
+        raise InputError(f"one model is given, {paths[0]}; a page of comparison needs two (see rangesfm report)")
+    if overrides_from_arguments(args):
+        raise InputError(f"one model is given, {paths[0]}; ranges and distances to hold models against need two")
+    from rangesfm.comparison.before_after import compare_folder
+
+    return Outcome([str(compare_folder(paths[0], _path(args.reference)))])
+
+
+def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
+    from rangesfm.comparison.models import compare_many, read_models
+    from rangesfm.comparison.ranges import ranges_of_survey
+    from rangesfm.comparison.with_reference import compare, format_table
+    from rangesfm.distances.tape import read_tape
+    from rangesfm.geometry.reference import read_reference
+    from rangesfm.survey.inputs import read_ranging_inputs
+
+    given = flags_given(args, *_COMPARE_KEYS)
+    of_log = [name for name in given if name not in _WITHOUT_LOG]
+    if of_log and "--ranges" not in given:
+        raise InputError(f"{', '.join(of_log)} given without a log to use it for, expected --ranges LOG as well")
+    survey = survey_from_arguments(args)
+    models, ranges, tape = read_models(paths), None, None
+    if survey.ranges.path is not None and models[0].model is not None:
+        ranges = ranges_of_survey(survey, read_ranging_inputs(survey), models[0].model, paths[0])
+    if survey.scale.distances is not None:
+        tape = read_tape(survey.scale.distances, survey.scale.markers)
+    comparison = compare_many(models, ranges, tape)
+    lines = [str(comparison)]
+    if args.reference is not None:
+        trajectories = {model.name: model.path for model in comparison.models}
+        lines += ["", format_table(compare(trajectories, read_reference(args.reference), frame=None))]
+    if args.output_path is not None:
+        from rangesfm.comparison.page import write_comparison
+
+        lines += ["", f"page: {write_comparison(comparison, Path(args.output_path))}"]
+    return Outcome(lines)
+
+
+def _report(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """Write report.html, one self-contained page, into a result folder.
+
+    example:
+      rangesfm report out
+    """
+    from rangesfm.report import write_report, write_report_pictures
+
+    source, images = _result_path(args), _path(args.images)
+    if images is not None and not images.is_dir():
+        raise InputError("no such folder of photos", images)
+    pictures = write_report_pictures if args.png else lambda _: ()
+    return Outcome([str(write_report(source, images_path=images)), *map(str, pictures(source))])

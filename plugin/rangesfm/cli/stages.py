@@ -1,0 +1,187 @@
+"""The commands that make a map: ``run``, ``demo``, ``reconstruct``, ``scale``, ``refine`` and ``join``."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rangesfm.cli.arguments import Commands, Outcome
+from rangesfm.cli.survey_flags import add_flags, add_restart_argument, add_survey_arguments, survey_from_arguments
+from rangesfm.errors import InputError
+from rangesfm.progress import Progress
+
+if TYPE_CHECKING:
+    from rangesfm.survey.settings import Survey
+    from rangesfm.workflows.results import RunResult
+
+
+_SCALE_KEYS = (
+    *("images.path", "images.times", "ranges", "anchors", "tag", "mapper.num_threads", "scale"),
+    *("export", "report", "output"),
+)
+_DEMO_FOLDER = "rangesfm_demo"
+_NUM_PHOTOS = range(10, 41)  # fewer do not make a map, more are not in the package
+_JOIN_KEYS = (
+    *("ranges.range_stddev_m", "ranges.range_bias_stddev_m", "ranges.common_bias_stddev_m", "anchors", "scale"),
+    *("mapper.num_threads", "refine", "export", "report", "output"),
+)
+
+
+def add_commands(commands: Commands) -> None:
+    run = commands.add("run", _run, "photos and ranges to a metric model: the whole pipeline")
+    add_survey_arguments(run, has_model=True)
+    add_restart_argument(run)
+    run.add_argument("--live", action="store_true", help="keep live.html, a page to watch, in the output folder")
+    demo = commands.add("demo", _demo, "make a small survey and run the pipeline on it: no data needed")
+    demo.add_argument(
+        "folder", nargs="?", default=_DEMO_FOLDER, metavar="DIR", help=f"where to (default: {_DEMO_FOLDER})"
+    )
+    demo.add_argument(
+        "--num_photos", type=int, default=40, metavar="N", help="the first so many of 40 along the path (default: 40)"
+    )
+    demo.add_argument("--seed", type=int, default=0, metavar="N", help="of the radio and of the run (default: 0)")
+    demo.add_argument("--num_threads", type=int, metavar="N", help="-1 for all cores")
+    add_restart_argument(demo)
+    reconstruct = commands.add("reconstruct", _reconstruct, "photos to an unscaled COLMAP model")
+    add_survey_arguments(reconstruct, "images", "camera", "mapper", "output")
+    add_restart_argument(reconstruct)
+    scale = commands.add("scale", _scale, "COLMAP model and ranges to the scale, with uncertainty and verdict")
+    add_survey_arguments(scale, *_SCALE_KEYS, has_model=True)
+    refine = commands.add("refine", _refine, "COLMAP model and ranges to a refined metric model")
+    add_survey_arguments(refine, *_SCALE_KEYS, "camera.refine_intrinsics", "refine", has_model=True)
+    join = commands.add(
+        "join", _join, "several surveys of one site to one metric map, through the anchors that they share"
+    )
+    join.add_argument("results", nargs="*", metavar="RESULT", help="output folders of runs, two or more")
+    add_flags(join, *_JOIN_KEYS, without=("scale.up_in_first_camera", "scale.distances", "scale.markers"))
+
+
+def _run(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """Photos and ranges to a metric model. Stages that an earlier run has done are used again.
+
+    example:
+      rangesfm run survey.toml --every_nth 3 --output_path out
+    """
+    survey = survey_from_arguments(args)
+    if survey.model_path is None:
+        _require_images(survey)
+        _require_ranges(survey)
+    else:
+        _require_model_and_ranges(survey)
+    if not args.live:
+        return Outcome(_run_or_refine(survey, progress, args.restart).lines)
+    from rangesfm.files.atomic import sole_writer
+    from rangesfm.report.live import live_page
+
+    with sole_writer(survey.output.path), live_page(progress, survey.output.path) as page:
+        page.message(f"this run can be watched in {page.path}")
+        result = _run_or_refine(survey, page, args.restart)
+        page.finish(survey.output.path / "report.html" if survey.report.enabled else None)
+    return Outcome(result.lines)
+
+
+def _run_or_refine(survey: Survey, progress: Progress, restart: bool) -> RunResult:
+    from rangesfm.workflows.run import refine_model, run_survey
+
+    if survey.model_path is None:
+        return run_survey(survey, progress=progress, restart=restart)
+    return refine_model(survey, progress=progress)
+
+
+def _demo(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """Make a small survey (photos that come with rangesfm, simulated UWB log, truth) and run it.
+
+    example:
+      rangesfm demo my_demo
+    """
+    if args.num_photos not in _NUM_PHOTOS:
+        raise InputError(f"--num_photos is {args.num_photos}, expected {_NUM_PHOTOS[0]} to {_NUM_PHOTOS[-1]}")
+    if args.seed < 0:
+        raise InputError(f"--seed is {args.seed}, expected 0 or more")
+    from rangesfm.demo.survey import make_demo_survey
+    from rangesfm.survey.settings import read_survey
+    from rangesfm.workflows.run import run_survey
+
+    folder = Path(args.folder)
+    made = make_demo_survey(folder, num_photos=args.num_photos, seed=args.seed)
+    overrides: dict[str, object] = {"output.seed": args.seed, "report.reference": folder / "reference.csv"}
+    if args.num_threads is not None:
+        overrides["mapper.num_threads"] = args.num_threads
+    survey = read_survey(made.survey_path, overrides)
+    return Outcome(run_survey(survey, progress=progress, restart=args.restart).lines)
+
+
+def _reconstruct(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """Photos to an unscaled COLMAP model: keyframes, features, matching, incremental mapping.
+
+    example:
+      rangesfm reconstruct --images photos --image_times images.csv --output_path out
+    """
+    survey = survey_from_arguments(args)
+    _require_images(survey)
+    from rangesfm.workflows.run import reconstruct_survey
+
+    return Outcome(reconstruct_survey(survey, progress=progress, restart=args.restart))
+
+
+def _scale(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """The scale of a COLMAP model (points are not needed) from ranges, and the rescaled model.
+
+    example:
+      rangesfm scale --input_path sparse/0 --ranges uwb.csv --images images.csv --output_path out
+    """
+    survey = survey_from_arguments(args)
+    _require_model_and_ranges(survey)
+    from rangesfm.workflows.run import scale_model
+
+    return Outcome(scale_model(survey, progress=progress).lines)
+
+
+def _refine(args: argparse.Namespace, progress: Progress) -> Outcome:
+    r"""Scale a COLMAP model by ranges, then adjust it with the ranges in its bundle adjustment.
+
+    example:
+      rangesfm refine --input_path sparse/0 --ranges uwb.csv --anchors anchors.csv \
+        --images images.csv --tag_in_cam -0.0012,-0.09,-0.0663 --output_path out
+    """
+    survey = survey_from_arguments(args)
+    _require_model_and_ranges(survey)
+    from rangesfm.workflows.run import refine_model
+
+    return Outcome(refine_model(survey, progress=progress).lines)
+
+
+def _join(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """Result folders of surveys that share anchors (other days, other cameras with their own tags) to one map
+    with one set of anchors; no common photo is needed. To the first one the others are joined. Anchors that
+    nobody surveyed join them too, if each has three or more with the others that are not on a line.
+
+    example:
+      rangesfm join monday/out tuesday/out --output_path site
+    """
+    survey = survey_from_arguments(args)
+    from rangesfm.workflows.join_surveys import join_surveys
+
+    return Outcome(join_surveys(survey, [Path(result) for result in args.results], progress=progress).lines)
+
+
+def _require_images(survey: Survey) -> None:
+    if survey.images.path is None:
+        raise InputError("no photos: give [images] path in a survey file, or --images FOLDER")
+    if not os.path.isdir(survey.images.path):
+        raise InputError("no such folder of photos", survey.images.path)
+
+
+def _require_model_and_ranges(survey: Survey) -> None:
+    if survey.model_path is None:
+        raise InputError("no model: give --input_path MODEL, the folder of a COLMAP model such as sparse/0")
+    if not os.path.isdir(survey.model_path):
+        raise InputError("no such folder of a COLMAP model", survey.model_path)
+    _require_ranges(survey)
+
+
+def _require_ranges(survey: Survey) -> None:
+    if survey.ranges.path is None:
+        raise InputError("no ranges: give [ranges] path in a survey file, or --ranges LOG")

@@ -1,0 +1,239 @@
+"""Cameras and map as other photogrammetry programs have them: nerfstudio, OpenSfM, the Open Photogrammetry Format."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from scipy.spatial.transform import Rotation
+
+from rangesfm.errors import InputError
+from rangesfm.export.metric_map import MetricMap, registered_images
+from rangesfm.export.ply import write_points
+from rangesfm.files.atomic import new_folder
+from rangesfm.files.records import write_json
+
+_POINTS_NAME = "transforms_points.ply"
+_FLIP_Y_AND_Z = np.diag([1.0, -1.0, -1.0, 1.0])
+# By COLMAP's camera model: what the parameters after focal lengths and principal point are.
+_DISTORTION: dict[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": (),
+    "PINHOLE": (),
+    "SIMPLE_RADIAL": ("k1",),
+    "RADIAL": ("k1", "k2"),
+    "OPENCV": ("k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "SIMPLE_RADIAL_FISHEYE": ("k1",),
+    "RADIAL_FISHEYE": ("k1", "k2"),
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+}
+# The programs' names of these models.
+_NERFSTUDIO = {name: "OPENCV_FISHEYE" if "FISHEYE" in name else "OPENCV" for name in _DISTORTION}
+_OPENSFM = {
+    **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), "brown"),
+    "OPENCV_FISHEYE": "fisheye_opencv",
+}
+_ALL_OF_OPENSFM = {"brown": ("k1", "k2", "k3", "p1", "p2"), "fisheye_opencv": ("k1", "k2", "k3", "k4")}
+_NUM_CONSTRAINTS = 10
+_MIN_TRACK_LENGTH = 3
+# Of marks that a feature detector made; a person's click is of 1.
+_MARK_ACCURACY = 1.0
+
+
+def _distortion(camera: pycolmap.Camera, program: str, known: Mapping[str, str]) -> tuple[str, dict[str, float]]:
+    """What a program calls a camera's model, and the camera's distortion by the parameters' names."""
+    name = camera.model.name
+    if name not in known:
+        raise InputError(f"{program} does not know the camera model {name}, expected one of: {', '.join(known)}")
+    named = {*camera.focal_length_idxs(), *camera.principal_point_idxs()}
+    values = [float(value) for index, value in enumerate(camera.params) if index not in named]
+    return known[name], dict(zip(_DISTORTION[name], values, strict=True))
+
+
+def write_nerfstudio(map_: MetricMap, folder: Path) -> Path:
+    """Write ``transforms.json`` and its points; photos are referred to as ``images/NAME``.
+
+    nerfstudio's cameras look along their -z with y up, and its worlds have z up. Its own loader centres and shrinks
+    what it reads unless it is told not to (``--auto-scale-poses False --center-method none
+    --orientation-method none``).
+
+    Raises:
+        InputError: a camera model that nerfstudio does not know.
+    """
+    points = write_points(map_.reconstruction, folder / _POINTS_NAME)
+    content = {
+        "applied_transform": np.eye(4)[:3].tolist(),
+        "ply_file_path": points.name,
+        "frames": [
+            _frame(map_.reconstruction.cameras[image.camera_id], image)
+            for image in registered_images(map_.reconstruction)
+        ],
+    }
+    write_json(content, folder / "transforms.json")
+    return folder / "transforms.json"
+
+
+def _frame(camera: pycolmap.Camera, image: pycolmap.Image) -> dict[str, Any]:
+    kind, distortion = _distortion(camera, "nerfstudio", _NERFSTUDIO)
+    world_from_cam = np.eye(4)
+    world_from_cam[:3] = image.cam_from_world().inverse().matrix()
+    return {
+        "file_path": f"images/{image.name}",
+        "transform_matrix": (world_from_cam @ _FLIP_Y_AND_Z).tolist(),
+        "camera_model": kind,
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.focal_length_x,
+        "fl_y": camera.focal_length_y,
+        "cx": camera.principal_point_x,
+        "cy": camera.principal_point_y,
+        **distortion,
+    }
+
+
+def write_opensfm(map_: MetricMap, path: Path) -> Path:
+    """Write one reconstruction with its cameras, shots and points; ``reference_lla`` where the map is georeferenced.
+
+    OpenSfM (and so OpenDroneMap) measures in photos in units of their longer side, from the photo's middle, and turns
+    by rotation vectors.
+
+    Raises:
+        InputError: a camera model that OpenSfM does not know.
+    """
+    model, origin = map_.reconstruction, map_.georeference
+    images = registered_images(model)
+    reconstruction: dict[str, Any] = {
+        "cameras": {str(i): _camera(model.cameras[i]) for i in sorted({image.camera_id for image in images})},
+        "shots": {image.name: _shot(image, map_) for image in images},
+        "points": {str(i): _point(model.point3D(i)) for i in sorted(model.point3D_ids())},
+    }
+    if origin is not None:
+        place = {"latitude": origin.lat_deg, "longitude": origin.lon_deg, "altitude": origin.height_m}
+        reconstruction["reference_lla"] = place
+    write_json([reconstruction], path)
+    return path
+
+
+def _camera(camera: pycolmap.Camera) -> dict[str, Any]:
+    projection, distortion = _distortion(camera, "OpenSfM", _OPENSFM)
+    size = max(camera.width, camera.height)
+    return {
+        "projection_type": projection,
+        "width": camera.width,
+        "height": camera.height,
+        "focal_x": camera.focal_length_x / size,
+        "focal_y": camera.focal_length_y / size,
+        "c_x": (camera.principal_point_x - camera.width / 2) / size,
+        "c_y": (camera.principal_point_y - camera.height / 2) / size,
+        **dict.fromkeys(_ALL_OF_OPENSFM[projection], 0.0),
+        **distortion,
+    }
+
+
+def _shot(image: pycolmap.Image, map_: MetricMap) -> dict[str, Any]:
+    cam_from_world = image.cam_from_world()
+    time = (map_.timestamps_s or {}).get(image.name)
+    return {
+        "camera": str(image.camera_id),
+        "rotation": Rotation.from_matrix(cam_from_world.rotation.matrix()).as_rotvec().tolist(),
+        "translation": cam_from_world.translation.tolist(),
+        "orientation": 1,
+        **({} if time is None else {"capture_time": time}),
+    }
+
+
+def _point(point: pycolmap.Point3D) -> dict[str, Any]:
+    return {"color": [float(channel) for channel in point.color], "coordinates": point.xyz.tolist()}
+
+
+def write_opf(map_: MetricMap, folder: Path) -> Path:
+    """Write ``camera_list.json``, ``input_control_points.json`` and ``constraints.json`` into ``folder``.
+
+    Pairs of well-seen points are manual tie points with their marks, and each pair's distance is a scale constraint
+    with the uncertainty of the scale: a program that maps the same photos then gets our scale.
+
+    Raises:
+        InputError: the map has no two points that three photos see, or its scale's stddev is not known.
+    """
+    model, stddev = map_.reconstruction, map_.relative_scale_stddev
+    if stddev is None:
+        raise InputError("the format 'opf' needs the stddev of the scale, which is not known of this model")
+    pairs = _distant_pairs(model)
+    point_ids = [point_id for pair in pairs for point_id in pair]
+    files = {
+        "camera_list.json": _file("camera-list", cameras=_cameras(model)),
+        "input_control_points.json": _file(
+            "input-control-points", gcps=[], mtps=[_tie_point(model, point_id) for point_id in point_ids]
+        ),
+        "constraints.json": _file(
+            "constraints",
+            scale_constraints=[_constraint(model, number, pair, stddev) for number, pair in enumerate(pairs)],
+            orientation_constraints=[],
+        ),
+    }
+    with new_folder(folder) as temporary:
+        for name, content in files.items():
+            write_json(content, temporary / name)
+    return folder
+
+
+def _file(kind: str, **content: Any) -> dict[str, Any]:
+    return {"format": f"application/opf-{kind}+json", "version": "1.0", **content}
+
+
+def _distant_pairs(model: pycolmap.Reconstruction) -> list[tuple[int, int]]:
+    """Pairs of points that many photos see, far from each other; each point in one pair only."""
+    seen = sorted(
+        (i for i, point in model.points3D.items() if point.track.length() >= _MIN_TRACK_LENGTH),
+        key=lambda i: (-model.point3D(i).track.length(), i),
+    )[: 20 * _NUM_CONSTRAINTS]
+    if len(seen) < 2:
+        raise InputError("the format 'opf' needs two points that three photos see, and the map has none")
+    places = np.array([model.point3D(i).xyz for i in seen])
+    pairs: list[tuple[int, int]] = []
+    left = np.ones(len(seen), dtype=bool)
+    while left.sum() >= 2 and len(pairs) < _NUM_CONSTRAINTS:
+        first = int(np.argmax(left))
+        left[first] = False
+        second = int(np.argmax(np.where(left, np.linalg.norm(places - places[first], axis=1), -1.0)))
+        left[second] = False
+        pairs.append((seen[first], seen[second]))
+    return pairs
+
+
+def _cameras(model: pycolmap.Reconstruction) -> list[dict[str, Any]]:
+    return [
+        {"id": _uid(image.name), "uri": image.name} for image in sorted(model.images.values(), key=lambda i: i.name)
+    ]
+
+
+def _uid(name: str) -> int:
+    """64 bits that depend on the photo's name alone."""
+    return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
+
+
+def _tie_point(model: pycolmap.Reconstruction, point_id: int) -> dict[str, Any]:
+    marks = []
+    for element in model.point3D(point_id).track.elements:
+        image = model.image(element.image_id)
+        at = image.points2D[element.point2D_idx].xy
+        marks.append({"camera_id": _uid(image.name), "position_px": at.tolist(), "accuracy": _MARK_ACCURACY})
+    return {"id": f"point{point_id}", "marks": marks, "is_checkpoint": False}
+
+
+def _constraint(
+    model: pycolmap.Reconstruction, number: int, pair: tuple[int, int], relative_stddev: float
+) -> dict[str, Any]:
+    first, second = (model.point3D(point_id).xyz for point_id in pair)
+    distance = float(np.linalg.norm(first - second))
+    return {
+        "id": f"distance{number}",
+        "id_from": f"point{pair[0]}",
+        "id_to": f"point{pair[1]}",
+        "distance": distance,
+        "sigma": distance * relative_stddev,
+    }
