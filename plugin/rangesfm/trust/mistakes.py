@@ -104,7 +104,7 @@ def _standing(problem: Linearized) -> list[Hypothesis]:
 
 def _causes(problem: Linearized, nominated: Sequence[Test], is_sure: bool) -> list[Cause]:
     """The likeliest explanation, and those as good; none if even that is no better than chance."""
-    before = learnt_noise(problem, []).deviance
+    before = learnt_noise(_settled(problem), []).deviance
     num = len(problem.residual_m)
     causes = []
     for test in _varied(nominated):
@@ -133,19 +133,26 @@ def _is_rival(best: Cause, other: Cause) -> bool:
 def _settled_test(problem: Linearized, hypothesis: Hypothesis) -> tuple[Test, RandomErrors]:
     """The test of a hypothesis with the noise that it leaves; of one that is not linear at the state that it leaves."""
     original, sizes, at = hypothesis, np.zeros(hypothesis.num), problem
-    for _ in range(0 if hypothesis.is_linear else _NUM_SETTLING):
+    for _ in range(_NUM_SETTLING):
         tester = Tester(at)
         [test] = tester.test([hypothesis], 0)
-        sizes = sizes + test.sizes
-        if np.linalg.norm(test.sizes) < _SETTLED * np.linalg.norm(sizes):
+        change = np.linalg.norm(test.sizes - sizes if original.is_linear else test.sizes)
+        sizes = test.sizes if original.is_linear else sizes + test.sizes
+        if change < _SETTLED * np.linalg.norm(sizes):
             break
         state = state_after((at.columns,), at.on_map.state, tester.step((hypothesis.effect, test.sizes)))
-        at = at_state(at, corrected(replace(problem.on_map, state=state), original.correction(sizes)))
+        moved = replace(problem.on_map, state=state)
+        if original.is_linear:
+            at = at_state(at, moved)
+            continue
+        at = at_state(at, corrected(moved, original.correction(sizes)))
         standing = _standing(at)
-        hypothesis = next(h for h in [*standing, *(n for h in standing for n in h.narrower)] if h.key == hypothesis.key)
+        hypothesis = next(
+            h for h in [*standing, *(n for h in standing for n in h.narrower)] if h.key == hypothesis.key
+        )
     noise = learnt_noise(at, [hypothesis])
     [test] = Tester(at.with_noise(noise)).test([hypothesis], 0)
-    return replace(test, hypothesis=original, sizes=sizes + test.sizes), noise
+    return replace(test, hypothesis=original, sizes=test.sizes if original.is_linear else sizes + test.sizes), noise
 
 
 def _narrowed(problem: Linearized, test: Test, wide: RandomErrors) -> Test:
