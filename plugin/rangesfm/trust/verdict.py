@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rangesfm.arrays import Indices
 from rangesfm.trust.evidence import evidence
 from rangesfm.trust.mistakes import Cause, Findings, find_mistakes
 from rangesfm.trust.ranges_on_map import RangesOnMap
@@ -22,11 +23,13 @@ class TrustVerdict:
         tests: the table; what was found first.
         reasons: sentences, the likeliest cause first; empty if nothing was found.
         causes: the likeliest, and those that cannot be told from it.
+        rows: (n,) of the log, the ranges that corrections are of.
     """
 
     tests: tuple[MistakeTest, ...]
     reasons: tuple[str, ...]
     causes: tuple[Cause, ...]
+    rows: Indices
 
 
 def trust_in(on_map: RangesOnMap, *, seed: int = 0) -> TrustVerdict:
@@ -35,7 +38,7 @@ def trust_in(on_map: RangesOnMap, *, seed: int = 0) -> TrustVerdict:
     shown = list(evidence(found.problem))
     rows = [*_of_causes(found), *(_row(test) for test in _others(found)), *shown]
     reasons = [*([sentence(found.causes)] if found.causes else []), *(_reason(row) for row in shown if row.rejected)]
-    return TrustVerdict(tuple(rows), tuple(reasons), found.causes)
+    return TrustVerdict(tuple(rows), tuple(reasons), found.causes, on_map.rows)
 
 
 def sentence(causes: Sequence[Cause]) -> str:
