@@ -33,7 +33,7 @@ from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.trust.ranges_on_map import ranges_on_map
+from rangesfm.trust.ranges_on_map import RangesOnMap, ranges_on_map
 from rangesfm.trust.verdict import TrustVerdict, trust_in
 
 Array = npt.NDArray[np.float64]
@@ -184,6 +184,7 @@ class Run:
 
     estimate: ScaleEstimate | None
     trust: TrustVerdict | None
+    on_map: RangesOnMap | None = None
     refusal: str = ""
 
     @property
@@ -208,12 +209,12 @@ def run(given: Given, seed: int) -> Run:
             observations, given.trajectory, anchors, anchor_frame=given.frame, options=options, seed=seed
         )
     except GeometryError as error:
-        return Run(None, None, str(error))
+        return Run(None, None, refusal=str(error))
     on_map = ranges_on_map(
         estimate.observations, given.trajectory, estimate.metric_from_sfm, estimate.anchors, estimate.errors,
         by_status(estimate), frame_is_free=estimate.frame == "site",
     )  # fmt: skip
-    return Run(estimate, trust_in(on_map, seed=seed))
+    return Run(estimate, trust_in(on_map, seed=seed), on_map)
 
 
 def by_status(estimate: ScaleEstimate) -> Array:

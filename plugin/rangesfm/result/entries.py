@@ -284,7 +284,7 @@ class RefineEntry(Record):
         return cls.model_validate({**vars(summary), **others})
 
 
-class TestEntry(Record):
+class MistakeEntry(Record):
     """A mistake that may have been made, and what the ranges say of it; see MistakeTest."""
 
     name: Text

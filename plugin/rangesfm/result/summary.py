@@ -22,13 +22,13 @@ from rangesfm.result.entries import (
     GeoreferenceEntry,
     InputEntry,
     MapEntry,
+    MistakeEntry,
     ModelEntry,
     RangesEntry,
     RefineEntry,
     ScaleEntry,
     Settings,
     SimilarityEntry,
-    TestEntry,
     TimeOffsetEntry,
 )
 from rangesfm.result.metric_result import MetricResult
@@ -67,7 +67,7 @@ class ResultSummary(Record):
     check_ranges: CheckRangesEntry
     refine: RefineEntry | None
     models: tuple[ModelEntry, ...]
-    tests: tuple[TestEntry, ...] = ()
+    tests: tuple[MistakeEntry, ...] = ()
     distances: tuple[DistanceRow, ...]
     comparison: tuple[ComparisonRow, ...] = ()
     georeference: GeoreferenceEntry | None
@@ -91,7 +91,7 @@ class ResultSummary(Record):
             ranges=RangesEntry.of(found),
             check_ranges=CheckRangesEntry.of(found),
             refine=RefineEntry.of(found),
-            tests=tuple(TestEntry.model_validate(test) for test in (found.trust.tests if found.trust else ())),
+            tests=tuple(MistakeEntry.model_validate(test) for test in (found.trust.tests if found.trust else ())),
             models=tuple(ModelEntry.of(model, estimate.metric_from_sfm) for model in found.models),
             **others,
         )

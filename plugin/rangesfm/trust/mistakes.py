@@ -17,15 +17,13 @@ from rangesfm.trust.noise_model import learnt_noise, usual_noise
 from rangesfm.trust.random_errors import RandomErrors
 from rangesfm.trust.ranges_on_map import RangesOnMap
 from rangesfm.trust.scanning import SCANNING
-from rangesfm.trust.testing import Test, Tester, overlap
+from rangesfm.trust.testing import Factorization, Test, overlap
 
 # Explanations that are tried with the noise that each of them leaves.
 _NUM_TRIED, _NUM_OF_KIND = 6, 2
 # Of two that differ by less in twice the logarithm of their likelihood, neither is named alone.
 _AS_LIKELY = 6.0
 _SAME = 0.95
-# Of a wider hypothesis a narrower one takes the place if it explains all but this much (chi-square, 2 numbers).
-_NEARLY_ALL = 6.0
 _MAX_NUM_RIVALS = 2
 _NUM_SETTLING, _SETTLED = 6, 0.05
 
@@ -80,12 +78,12 @@ def find_mistakes(on_map: RangesOnMap, *, seed: int = 0) -> Findings:
     standing = _standing(problem)
     hypotheses = standing + [hypothesis for of_kind in SCANNING for hypothesis in of_kind(problem)]
     problem = problem.with_noise(learnt_noise(problem, standing))
-    tests = _best_of_each(Tester(problem).test(hypotheses, seed), problem)
+    tests = _best_of_each(Factorization(problem).test(hypotheses, seed), problem)
     nominated = [test for test in tests if test.is_rejected and _is_possible(test)]
     is_sure = bool(nominated)
     if not nominated:
         usual = problem.with_noise(usual_noise(problem))
-        with_usual = _best_of_each(Tester(usual).test(hypotheses, seed), usual)
+        with_usual = _best_of_each(Factorization(usual).test(hypotheses, seed), usual)
         nominated = [test for test in with_usual if test.is_rejected and _is_possible(test)]
     if not nominated:
         return Findings(problem, tuple(tests), ())
@@ -94,7 +92,7 @@ def find_mistakes(on_map: RangesOnMap, *, seed: int = 0) -> Findings:
         return Findings(problem, tuple(tests), ())
     if causes[0].test is not None:
         problem = problem.with_noise(learnt_noise(problem, [*standing, causes[0].test.hypothesis]))
-        tests = _best_of_each(Tester(problem).test(hypotheses, seed), problem)
+        tests = _best_of_each(Factorization(problem).test(hypotheses, seed), problem)
     return Findings(problem, tuple(tests), tuple(causes))
 
 
@@ -134,13 +132,13 @@ def _settled_test(problem: Linearized, hypothesis: Hypothesis) -> tuple[Test, Ra
     """The test of a hypothesis with the noise that it leaves; of one that is not linear at the state that it leaves."""
     original, sizes, at = hypothesis, np.zeros(hypothesis.num), problem
     for _ in range(_NUM_SETTLING):
-        tester = Tester(at)
-        [test] = tester.test([hypothesis], 0)
+        factorized = Factorization(at)
+        [test] = factorized.test([hypothesis], 0)
         change = np.linalg.norm(test.sizes - sizes if original.is_linear else test.sizes)
         sizes = test.sizes if original.is_linear else sizes + test.sizes
         if change < _SETTLED * np.linalg.norm(sizes):
             break
-        state = state_after((at.columns,), at.on_map.state, tester.step((hypothesis.effect, test.sizes)))
+        state = state_after((at.columns,), at.on_map.state, factorized.step((hypothesis.effect, test.sizes)))
         moved = replace(problem.on_map, state=state)
         if original.is_linear:
             at = at_state(at, moved)
@@ -149,7 +147,7 @@ def _settled_test(problem: Linearized, hypothesis: Hypothesis) -> tuple[Test, Ra
         standing = _standing(at)
         hypothesis = next(h for h in [*standing, *(n for h in standing for n in h.narrower)] if h.key == hypothesis.key)
     noise = learnt_noise(at, [hypothesis])
-    [test] = Tester(at.with_noise(noise)).test([hypothesis], 0)
+    [test] = Factorization(at.with_noise(noise)).test([hypothesis], 0)
     return replace(test, hypothesis=original, sizes=test.sizes if original.is_linear else sizes + test.sizes), noise
 
 
@@ -159,7 +157,8 @@ def _narrowed(problem: Linearized, test: Test, wide: RandomErrors) -> Test:
         return test
     tried = [_settled_test(problem, h) for h in test.hypothesis.narrower]
     best, noise = min(tried, key=lambda each: each[1].deviance)
-    return best if noise.deviance < wide.deviance + _NEARLY_ALL else test
+    num = len(problem.residual_m)
+    return best if noise.deviance + _penalty(best, num) < wide.deviance + _penalty(test, num) else test
 
 
 def _cause(test: Test, gain: float, penalty: float) -> Cause:
@@ -186,7 +185,7 @@ def _alternatives(problem: Linearized, before: float) -> Iterator[Cause]:
 
 def _settled(problem: Linearized) -> Linearized:
     """At the likeliest state."""
-    step = Tester(problem.with_noise(usual_noise(problem))).step()
+    step = Factorization(problem.with_noise(usual_noise(problem))).step()
     state = state_after((problem.columns,), problem.on_map.state, step)
     return at_state(problem, replace(problem.on_map, state=state))
 

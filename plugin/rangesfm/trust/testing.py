@@ -56,7 +56,7 @@ class Test:
         return self.statistic > self.threshold
 
 
-class Tester:
+class Factorization:
     """The factorisation that all tests share."""
 
     def __init__(self, problem: Linearized):
