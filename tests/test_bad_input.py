@@ -124,13 +124,11 @@ def refusal(own_survey: WalkedSurvey, monkeypatch: pytest.MonkeyPatch, capfd: py
         (remove("uwb.csv"), r"\[ranges\] path: there is no file .*/uwb.csv"),
         (write("uwb.csv", ""), r"/uwb.csv: the file is empty, expected a log of ranges"),
         (write("uwb.csv", "timestamp_s,anchor_id,range_m\n"), r"/uwb.csv: no usable range: no records"),
-        (write("uwb.csv", "t,d\n1,2\n"), r"/uwb.csv: .*canonical"),
         (
             set_line("uwb.csv", 7, "103.0,A9,3.0"),
             r"/uwb.csv:7: anchor_id is 'A9', expected one of .*: A1, .*--use_anchors",
         ),
         (set_line("uwb.csv", 7, "103.0,A1,nan"), r"/uwb.csv:7: range_m is nan, expected a positive number of metres"),
-        (set_line("uwb.csv", 8, "103.0,A1,-3"), r"/uwb.csv:8: range_m is -3, expected a positive number of metres"),
         (set_line("uwb.csv", 9, "103.0,A1,x"), r"/uwb.csv:9: range_m is 'x', expected a positive number of metres"),
         (set_line("uwb.csv", 9, "103.0,A1,1e300"), r"/uwb.csv:9: a range of 1e\+300 m, expected at most 1e\+06"),
         (set_line("uwb.csv", 9, "now,A1,3"), r"/uwb.csv:9: timestamp_s is 'now', expected a time in s"),
@@ -247,19 +245,15 @@ def test_geometry_that_determines_nothing_is_status_3(
 
 @pytest.mark.parametrize("name", MODEL_FILES)
 @pytest.mark.parametrize("damage", ["cut", "noise", "gone"])
-def test_damaged_model_is_refused_at_once(
-    name: str, damage: str, own_survey: WalkedSurvey, rangesfm_command: Command
-) -> None:
+def test_damaged_model_is_refused_at_once(name: str, damage: str, own_survey: WalkedSurvey, refusal: Refusal) -> None:
     path = own_survey.folder / "sparse" / "0" / name
     data = path.read_bytes()
     if damage == "gone":
         path.unlink()
     else:
         path.write_bytes(data[: 2 * len(data) // 3] if damage == "cut" else b"\xff" * len(data))
-    # A process of its own: what COLMAP does with such files may take all memory, or never end.
-    flags = ("--output_path", "out", "--quiet")
-    done = rangesfm_command("scale", *own_survey.flags, *flags, cwd=own_survey.folder, status=2)
-    assert re.fullmatch(rf"rangesfm: error: {own_survey.folder}/sparse/0(/{name})?: .*\n", done.stderr)
+    said = refusal("scale", *own_survey.flags, "--output_path", "out")
+    assert re.fullmatch(rf"{own_survey.folder}/sparse/0(/{name})?: .*", said)
     assert not (own_survey.folder / "out").exists()
 
 

@@ -88,6 +88,22 @@ COMPARISON = {
     "rmse_sim3_m": NUMBER,
     "scale_error_percent": NUMBER,
 }
+# All that a refined model leaves with a reference, each model as one entry.
+REFINED_FILES = {
+    "sparse_scaled/0",
+    "sparse_metric/0",
+    "pose_covariance.csv",
+    "result.json",
+    "ranges.csv",
+    "images.csv",
+    "reference.csv",
+    "report.html",
+    "scale_bootstrap.csv",
+    "scale_candidates.csv",
+    "scale_consensus.csv",
+    "trajectory.tum",
+    "points.ply",
+}
 MODEL_FILES = {"cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin"}
 
 
@@ -178,30 +194,16 @@ def run_on(
 
 
 @pytest.fixture(scope="module")
-def refined(walked_survey: WalkedSurvey, rangesfm_command: Command, tmp_path_factory: pytest.TempPathFactory) -> Left:
+def refined(walked_survey: WalkedSurvey, rangesfm_process: Command, tmp_path_factory: pytest.TempPathFactory) -> Left:
     """The walked survey refined in its site frame, compared with the truth; not to be written to."""
     folder = tmp_path_factory.mktemp("refined") / "out"
     flags = ("--anchors", "anchors.csv", "--anchor_frame", "site", "--reference", "reference.csv")
-    return run_on(rangesfm_command, walked_survey, folder, "refine", *flags)
+    return run_on(rangesfm_process, walked_survey, folder, "refine", *flags)
 
 
 class TestRefineInASiteFrame:
     def test_leaves_every_file_and_nothing_half_written(self, refined: Left) -> None:
-        assert refined.files == {
-            "sparse_scaled/0",
-            "sparse_metric/0",
-            "pose_covariance.csv",
-            "result.json",
-            "ranges.csv",
-            "images.csv",
-            "reference.csv",
-            "report.html",
-            "scale_bootstrap.csv",
-            "scale_candidates.csv",
-            "scale_consensus.csv",
-            "trajectory.tum",
-            "points.ply",
-        }
+        assert refined.files == REFINED_FILES
 
     def test_result_has_every_key(self, refined: Left) -> None:
         assert_has(refined.result, {**RESULT, "refine": REFINE})
@@ -549,8 +551,8 @@ class TestResultFolder:
         assert len(read_ranges(out.parent / "log.csv")) == refined.result["ranges"]["num"]
 
 
-def test_doctor_finds_nothing_wrong(rangesfm_command: Command, tmp_path: Path) -> None:
-    lines = rangesfm_command("doctor", cwd=tmp_path).stdout.splitlines()
+def test_doctor_finds_nothing_wrong(rangesfm_process: Command, tmp_path: Path) -> None:
+    lines = rangesfm_process("doctor", cwd=tmp_path).stdout.splitlines()
     assert all(line.startswith("ok ") for line in lines)
     assert any("shares its types" in line or "pybind11" in line for line in lines)
 
@@ -562,25 +564,7 @@ def first_run(photo_run: PhotoRun) -> Left:
 
 class TestRunOnPhotos:
     def test_leaves_every_file(self, first_run: Left) -> None:
-        assert first_run.files == {
-            "database.db",
-            "reconstruct.json",
-            "mapper.log",
-            "sparse/0",
-            "sparse_scaled/0",
-            "sparse_metric/0",
-            "pose_covariance.csv",
-            "result.json",
-            "ranges.csv",
-            "images.csv",
-            "reference.csv",
-            "report.html",
-            "scale_bootstrap.csv",
-            "scale_candidates.csv",
-            "scale_consensus.csv",
-            "trajectory.tum",
-            "points.ply",
-        }
+        assert first_run.files == REFINED_FILES | {"database.db", "reconstruct.json", "mapper.log", "sparse/0"}
 
     def test_tells_of_each_stage(self, first_run: Left) -> None:
         lines = first_run.stderr.splitlines()
@@ -608,10 +592,10 @@ class TestRunOnPhotos:
         assert np.abs(first_run.metric_from_sfm.apply(sfm) - first_run.centers("sparse_scaled")).max() < 1e-9
 
     def test_again_and_quietly_takes_the_model_over_and_gives_the_same_result(
-        self, photo_run: PhotoRun, first_run: Left, rangesfm_command: Command, tmp_path: Path
+        self, photo_run: PhotoRun, first_run: Left, rangesfm_process: Command, tmp_path: Path
     ) -> None:
         out = shutil.copytree(photo_run.output_path, tmp_path / "out")
-        done = rangesfm_command(
+        done = rangesfm_process(
             "run", *photo_run.flags, "--output_path", str(out), "--quiet", cwd=photo_run.survey.folder
         )
         again = Left(out, done.stdout, done.stderr)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import re
+import runpy
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,12 +25,24 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 
 
-def run_example(name: str, *arguments: str, cwd: Path) -> str:
+def run_process(name: str, *arguments: str, cwd: Path) -> str:
+    """For those that say themselves what is imported, and in which order."""
     command = [sys.executable, str(EXAMPLES / name), *arguments]
     done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     return done.stdout
+
+
+def run_example(name: str, *arguments: str, cwd: Path) -> str:
+    """What it prints, run in this process, where most of what it imports has been imported already."""
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as out:
+        patch.chdir(cwd)
+        patch.setattr(sys, "argv", [name, *arguments])
+        with redirect_stderr(io.StringIO()) as err:
+            runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+    assert err.getvalue() == ""
+    return out.getvalue()
 
 
 def test_every_program_is_tested_here() -> None:
@@ -46,7 +61,7 @@ def test_the_reference_of_keys_is_up_to_date() -> None:
 
 
 def test_own_problem_converges_on_a_model_that_fits_its_ranges(walked_survey: WalkedSurvey) -> None:
-    printed = run_example("own_problem.py", "sparse/0", cwd=walked_survey.folder)
+    printed = run_process("own_problem.py", "sparse/0", cwd=walked_survey.folder)
     assert "CONVERGENCE" in printed
     initial, final = (float(re.search(rf"{name} cost: ([\d.e+-]+)", printed)[1]) for name in ("Initial", "Final"))  # type: ignore[index]
     assert 0 < final <= initial
@@ -58,7 +73,7 @@ def test_scale_existing_model_takes_it_to_metres(walked_survey: WalkedSurvey, tm
     shifted = [f"{float(line.split(',')[0]) + 2.0},{line.split(',', 1)[1]}" for line in lines[1:]]
     (tmp_path / "uwb.csv").write_text("\n".join([lines[0], *shifted]) + "\n")
     arguments = ("sparse/0", "images.csv", str(tmp_path / "uwb.csv"), str(tmp_path / "metric" / "0"))
-    printed = run_example("scale_existing_model.py", *arguments, cwd=walked_survey.folder)
+    printed = run_process("scale_existing_model.py", *arguments, cwd=walked_survey.folder)
     scale = float(printed.split()[0])
     assert scale == pytest.approx(walked_survey.site_from_sfm.scale, rel=0.02)
     images = sorted(pycolmap.Reconstruction(tmp_path / "metric" / "0").images.values(), key=lambda image: image.name)

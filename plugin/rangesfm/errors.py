@@ -46,9 +46,13 @@ def nearest_known(name: str, known: Iterable[str]) -> str:
 
 
 class RangesfmError(Exception):
-    """Root of all errors raised on purpose. Its text is one line for the user, whatever names the files hold."""
+    """Root of all errors raised on purpose. Its text is one line for the user, whatever names the files hold.
+
+    ``advice`` are further lines, for who sits at the terminal.
+    """
 
     exit_status = 4
+    advice: tuple[str, ...] = ()
 
     def __init__(self, message: str):
         super().__init__(one_line(message))
@@ -59,8 +63,16 @@ class InputError(RangesfmError):
 
     exit_status = 2
 
-    def __init__(self, message: str, path: str | Path | None = None, line: int | None = None):
+    def __init__(
+        self,
+        message: str,
+        path: str | Path | None = None,
+        line: int | None = None,
+        *,
+        advice: Iterable[str] = (),
+    ):
         self.path = None if path is None else Path(path)
+        self.advice = tuple(map(one_line, advice))
         self.line = line
         where = "" if path is None else f"{path}: " if line is None else f"{path}:{line}: "
         super().__init__(where + message)
@@ -95,16 +107,18 @@ class SolverError(RangesfmError):
 
 @dataclass(frozen=True)
 class Failure:
-    """One line for the user, and the exit status."""
+    """One line for the user, the exit status, and lines of advice."""
 
     message: str
     exit_status: int
+    advice: tuple[str, ...] = ()
 
 
 def failure_of(error: BaseException) -> Failure:
     """What to tell about any error at all; one that is not of our own classes may be a bug, and is called so."""
     message, status = _told(error)
-    return Failure(" ".join(one_line(message).split()), status)
+    advice = error.advice if isinstance(error, RangesfmError) else ()
+    return Failure(" ".join(one_line(message).split()), status, advice)
 
 
 def _told(error: BaseException) -> tuple[str, int]:

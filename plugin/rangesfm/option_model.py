@@ -16,7 +16,7 @@ from pydantic.fields import FieldInfo
 from rangesfm.errors import OptionError, nearest_known, printable, shown
 
 Same = TypeVar("Same", bound="Options")
-PathRole = Literal["file", "photos", "model", "output"]
+PathRole = Literal["file", "log", "photos", "model", "output"]
 _NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "text", Path: "a path", dict: "a table"}
 _TABLE_OF = "a table in which each value is "
 _UNITS = {"m": "metres", "s": "seconds", "deg": "degrees"}

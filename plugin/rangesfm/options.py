@@ -99,21 +99,22 @@ class LogOptions(Options):
 
     table: ClassVar[str] = "ranges"
 
-    path: Annotated[Path | None, Told(flag="ranges", metavar="LOG", role="file")] = None
-    """The radio's log."""
+    path: Annotated[Path | None, Told(flag="ranges", metavar="LOG", role="log")] = None
+    """The radio's log: a file, a folder of them, or a pattern as uwb_*.csv."""
     format: Annotated[str | None, Told(flag="ranges_format")] = None
     """Its format (default: recognised by content)."""
     columns: Annotated[dict[str, str], Told(metavar="QUANTITY=NAME,..")] = Field(default_factory=dict)
-    """Names of its columns for timestamp (or image_name), anchor_id, range, tag_id, range_stddev, los; without range,
-    the time stamps tx1, rx1, tx2, rx2 and possibly tx3, rx3 of two-way ranging."""
+    """Names of its columns (numbers, where they have none) for timestamp (or image_name), anchor_id, range, tag_id,
+    range_stddev, los; range:A1 for a column of one anchor; without range, the time stamps tx1, rx1, tx2, rx2 and
+    possibly tx3, rx3 of two-way ranging."""
     timestamp_unit: str | None = None
-    """One of s, ms, us, ns and iso (default: by format)."""
+    """One of s, ms, us, ns and iso (default: by format, name or values)."""
     range_unit: str | None = None
-    """One of m, cm and mm (default: by format)."""
+    """One of m, cm and mm (default: by format, name or values)."""
     separator: Annotated[
         Annotated[str, Field(min_length=1, max_length=1)] | None, Told(metavar="CHARACTER", expected="one character")
     ] = None
-    """Between cells (default: told from the header row)."""
+    """Between cells (default: told from the rows)."""
     ranging_interval_s: Annotated[float, Field(ge=1e-6, le=1e6)] | None = None
     """Between two rounds, for a Qorvo log without the host's times (default: 0.2)."""
     stamp_unit: Literal["ns", "us", "ms", "s", "ticks"] = "ns"

@@ -147,7 +147,7 @@ def test_interrupted_it_stops_its_workers_and_says_how_far_it_came(surveys: Path
         out, errors = process.communicate()
     assert (process.returncode, out) == (130, "")
     assert errors.splitlines()[-1] == "rangesfm: error: interrupted; stages that were done are kept"
-    assert psutil.wait_procs(processes, timeout=60)[1] == []
+    assert psutil.wait_procs(processes, timeout=600)[1] == []
     assert [row["status"] for row in rows_of(surveys).values()] == ["interrupted", "interrupted"]
     assert left_over(surveys) == []
 
@@ -186,7 +186,7 @@ def test_what_cannot_be_is_refused(
     assert not (tmp_path / "batch").exists()
 
 
-def test_the_workers_of_a_scheduler_do_what_they_are_given(surveys: Path, rangesfm_command: Command) -> None:
+def test_the_workers_of_a_scheduler_do_what_they_are_given(surveys: Path, rangesfm_process: Command) -> None:
     shutil.rmtree(surveys / "north" / "images")
     with LocalCluster(
         n_workers=1,
@@ -198,7 +198,7 @@ def test_the_workers_of_a_scheduler_do_what_they_are_given(surveys: Path, ranges
         local_directory=str(surveys / "scratch"),
         scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
     ) as cluster:
-        done = rangesfm_command(
+        done = rangesfm_process(
             "batch", "north/survey.toml", "--scheduler", cluster.scheduler_address, cwd=surveys, status=2
         )
     row = rows_of(surveys)["north/survey.toml"]

@@ -181,7 +181,7 @@ _UNITS = {"range_unit": "mm", "timestamp_unit": "us"}
 _STAMPED = {"timestamp": "t", "anchor_id": "node"}
 _LOG_FORMATS = (
     *("canonical", "starloc", "miluv", "uwb_init", "inrol", "leaps_meas", "leaps_lea", "dwm1001_lec", "dwm1001_les"),
-    *("qorvo", "mauwb", "arduino", "makerfabs_json"),
+    *("qorvo", "mauwb", "arduino", "makerfabs_json", "table", "librsf", "pyfg"),
 )
 
 TARGETS: tuple[Target, ...] = (

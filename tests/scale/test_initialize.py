@@ -62,13 +62,15 @@ def on_a_sphere() -> Array:
 
 
 class TestWithoutNoise:
-    @pytest.mark.parametrize(
-        ("scale", "tag_in_cam_m"),
-        [(1e-3, (0.0, 0.0, 0.0)), (1e3, (0.05, -0.12, -0.03))],
-        ids=["no lever arm", "lever arm"],
-    )
     @pytest.mark.parametrize("case", CASES)
-    def test_the_similarity_is_recovered(
+    def test_the_similarity_is_recovered(self, make_survey: MakeSurvey, case: str) -> None:
+        self.assert_recovered(make_survey, case, 1e3, (0.05, -0.12, -0.03))
+
+    @pytest.mark.parametrize("case", ["first camera, five anchors", "site, five anchors", "five unknown anchors"])
+    def test_so_it_is_from_millimetres_with_the_tag_in_the_camera(self, make_survey: MakeSurvey, case: str) -> None:
+        self.assert_recovered(make_survey, case, 1e-3, (0.0, 0.0, 0.0))
+
+    def assert_recovered(
         self, make_survey: MakeSurvey, case: str, scale: float, tag_in_cam_m: tuple[float, float, float]
     ) -> None:
         frame, anchors_m, known = CASES[case]
@@ -176,7 +178,8 @@ class TestRefused:
 
     def test_a_camera_that_moves_less_than_the_noise(self, make_survey: MakeSurvey) -> None:
         shaking = np.array([1.0, 2.0, 1.6]) + 0.002 * np.random.default_rng(0).standard_normal((40, 3))
-        self.refuse(make_survey(centers_m=shaking, radio=NOISE), "unknown", "", "that the camera moved|stands still")
+        survey = make_survey(centers_m=shaking, anchors_m=THREE_ANCHORS_M, radio=NOISE)
+        self.refuse(survey, "unknown", "", "that the camera moved|stands still")
 
     @pytest.mark.parametrize("seed", range(3))
     def test_a_flat_circle_round_one_unknown_anchor(self, make_survey: MakeSurvey, seed: int) -> None:
@@ -184,8 +187,9 @@ class TestRefused:
         survey = make_survey(centers_m=circle, anchors_m={"A": (1.0, 0.5, 0.3)}, radio=NOISE, seed=seed)
         self.refuse(survey, "unknown", "", "flat circle.*walk another shape")
 
-    @pytest.mark.parametrize("anchor_m", [(1.0, 0.5, 0.3), (7.0, 0.5, 0.3)], ids=["inside", "outside"])
-    @pytest.mark.parametrize("seed", range(3))
+    @pytest.mark.parametrize(
+        ("seed", "anchor_m"), [(0, (1.0, 0.5, 0.3)), (1, (7.0, 0.5, 0.3))], ids=["inside", "outside"]
+    )
     def test_a_path_on_a_sphere_and_one_unknown_anchor(
         self, make_survey: MakeSurvey, seed: int, anchor_m: tuple[float, float, float]
     ) -> None:
@@ -230,7 +234,7 @@ def test_an_anchor_of_the_log_that_is_not_given_is_bad_input(make_survey: MakeSu
 
 
 class TestOpenButNotFatal:
-    @pytest.mark.parametrize(("seed", "obstructed_share"), [(0, 0.0), (0, 0.3), (1, 0.5)])
+    @pytest.mark.parametrize(("seed", "obstructed_share"), [(0, 0.0), (1, 0.5)])
     def test_three_unknown_anchors_settle_the_scale_of_a_path_on_a_sphere(
         self, make_survey: MakeSurvey, seed: int, obstructed_share: float
     ) -> None:
@@ -373,7 +377,7 @@ def between_anchors(survey: Survey, stddev_m: float = 0.005) -> LocatedDistances
 
 
 def test_control_distances_between_cameras_hold_a_scale_that_long_ranges_would_spoil(make_survey: MakeSurvey) -> None:
-    survey = make_survey(radio=NOISE, num_epochs=2)
+    survey = make_survey(anchors_m=THREE_ANCHORS_M, radio=NOISE, num_epochs=2)
     long = survey.log_with(survey.simulated.log.range_m * 1.04)
     truth = survey.truth("first_camera").scale
     alone = survey.scale("unknown", log=long)

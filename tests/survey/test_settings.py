@@ -269,10 +269,21 @@ def test_missing_files_are_named_with_the_line_that_asks_for_them(folder: Path, 
     assert f"there is no file {folder / 'none.csv'}" in str(error)
 
 
-def test_folder_in_place_of_a_file_is_named_as_one(folder: Path) -> None:
+def test_log_may_be_files_in_a_folder_and_an_empty_one_is_refused(folder: Path) -> None:
     (folder / "logs").mkdir()
     error = refusal(write(folder, "[ranges]\npath = 'logs'\n"))
-    assert f"[ranges] path: {folder / 'logs'} is a folder, expected a file" in str(error)
+    assert f"[ranges] path: {folder / 'logs'}: no file there, expected the files of a log" in str(error)
+    for anchor_id in ("1", "2"):
+        (folder / "logs" / f"anchor_{anchor_id}.csv").touch()
+    for path in ("logs", "logs/anchor_*.csv"):
+        survey = read_survey(write(folder, f"[ranges]\npath = '{path}'\n"))
+        assert [item.path.name for item in survey.input_paths()] == ["anchor_1.csv", "anchor_2.csv"]
+
+
+def test_folder_in_place_of_a_file_is_named_as_one(folder: Path) -> None:
+    (folder / "curves").mkdir()
+    error = refusal(write(folder, "[ranges]\nerror_curve = 'curves'\n"))
+    assert f"[ranges] error_curve: {folder / 'curves'} is a folder, expected a file" in str(error)
 
 
 def test_marks_without_distances_are_refused(folder: Path) -> None:

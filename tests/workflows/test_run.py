@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import shutil
 import time
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,6 +29,7 @@ from rangesfm.result.tables import ScaleBootstrap, ScaleCandidates, ScaleConsens
 from rangesfm.survey.settings import KEYS, Survey
 from rangesfm.workflows.export_result import export_result
 from rangesfm.workflows.journal import Journal
+from rangesfm.workflows.results import RunResult
 from rangesfm.workflows.run import refine_model, scale_model
 
 if TYPE_CHECKING:
@@ -47,6 +50,10 @@ class Listener(SilentProgress):
 
 @pytest.fixture
 def survey(walked_survey: WalkedSurvey, tmp_path: Path) -> Survey:
+    return survey_of(walked_survey, tmp_path)
+
+
+def survey_of(walked_survey: WalkedSurvey, where: Path) -> Survey:
     """The walked survey with anchors in the site frame, the clocks' offset known."""
     folder = walked_survey.folder
     return Survey(model_path=folder / "sparse" / "0").changed(
@@ -57,21 +64,41 @@ def survey(walked_survey: WalkedSurvey, tmp_path: Path) -> Survey:
             "anchors.path": folder / "anchors.csv",
             "tag.tag_in_cam_m": (0.03, -0.12, -0.05),
             "scale.num_bootstrap": 20,
-            "output.path": tmp_path / "out",
+            "output.path": where / "out",
         }
     )
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a stage made of the survey as it is, and what it told. Not to be written to."""
+
+    survey: Survey
+    result: RunResult
+    listener: Listener
+
+
+@pytest.fixture(scope="module")
+def scaled(walked_survey: WalkedSurvey, tmp_path_factory: pytest.TempPathFactory) -> Done:
+    survey, listener = survey_of(walked_survey, tmp_path_factory.mktemp("scaled")), Listener()
+    return Done(survey, scale_model(survey, progress=listener), listener)
+
+
+@pytest.fixture(scope="module")
+def refined(walked_survey: WalkedSurvey, tmp_path_factory: pytest.TempPathFactory) -> Done:
+    survey, listener = survey_of(walked_survey, tmp_path_factory.mktemp("refined")), Listener()
+    return Done(survey, refine_model(survey, progress=listener), listener)
 
 
 def files_of(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-def test_result_and_summary_are_returned_as_written(survey: Survey) -> None:
-    listener = Listener()
-    done = refine_model(survey, progress=listener)
-    assert listener.stages == ["scale", "refinement", "results"]
-    assert done.output_path == survey.output.path
-    written = ResultSummary.read(survey.output.path / "result.json")
+def test_result_and_summary_are_returned_as_written(refined: Done) -> None:
+    done = refined.result
+    assert refined.listener.stages == ["scale", "refinement", "results"]
+    assert done.output_path == refined.survey.output.path
+    written = ResultSummary.read(done.output_path / "result.json")
     assert written == done.summary
     assert done.lines[0].startswith(f"scale: {done.summary.scale.value:.6g} m per SfM unit")
     assert "comparison" not in written.to_json()
@@ -88,9 +115,9 @@ def test_a_run_in_the_same_folder_leaves_nothing_of_the_one_before(survey: Surve
     assert left == {"sparse_scaled", "result.json", "ranges.csv", "images.csv", *scale_tables}
 
 
-def test_tables_beside_the_result_tell_how_the_scale_came_about(survey: Survey) -> None:
-    scale = scale_model(survey, progress=SilentProgress()).summary.scale
-    folder, paper = survey.output.path, known(scale.two_candidate)
+def test_tables_beside_the_result_tell_how_the_scale_came_about(scaled: Done) -> None:
+    scale = scaled.result.summary.scale
+    folder, paper = scaled.survey.output.path, known(scale.two_candidate)
     candidates, consensus = known(ScaleCandidates.read(folder)), known(ScaleConsensus.read(folder))
     bootstrap = known(ScaleBootstrap.read(folder))
     for values, branch in zip((candidates.alpha0, candidates.alpha1), (paper.alpha0, paper.alpha1)):
@@ -102,9 +129,9 @@ def test_tables_beside_the_result_tell_how_the_scale_came_about(survey: Survey) 
     assert spread == pytest.approx(scale.relative_stddev.bootstrap, rel=0.25)
 
 
-def test_the_result_names_its_inputs_by_their_hashes(survey: Survey) -> None:
-    inputs = scale_model(survey, progress=SilentProgress()).summary.inputs
-    by_path = {entry.path: entry.to_json() for entry in inputs}
+def test_the_result_names_its_inputs_by_their_hashes(scaled: Done) -> None:
+    survey = scaled.survey
+    by_path = {entry.path: entry.to_json() for entry in scaled.result.summary.inputs}
     assert survey.ranges.path is not None
     data = survey.ranges.path.read_bytes()
     expected = {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data), "hashed": "content"}
@@ -112,8 +139,8 @@ def test_the_result_names_its_inputs_by_their_hashes(survey: Survey) -> None:
     assert {Path(path).name for path in by_path} >= {"cameras.bin", "images.bin", "points3D.bin", "uwb.csv"}
 
 
-def test_refused_run_leaves_the_result_before_it(survey: Survey) -> None:
-    scale_model(survey, progress=SilentProgress())
+def test_refused_run_leaves_the_result_before_it(survey: Survey, scaled: Done) -> None:
+    shutil.copytree(scaled.survey.output.path, survey.output.path)
     before = {path: path.stat().st_mtime_ns for path in survey.output.path.rglob("*")}
     strict = survey.changed({"scale.max_relative_stddev": 1e-6})
     with pytest.raises(GeometryError, match="the scale is only known to"):
@@ -238,7 +265,7 @@ class TestSeveralTags:
         ]
 
 
-def test_what_the_refinement_found_beside_the_map_is_in_the_result(survey: Survey) -> None:
+def test_what_the_refinement_found_beside_the_map_is_in_the_result(survey: Survey, refined: Done) -> None:
     stddevs = {"lever_arm_stddev_m": 0.05, "time_offset_stddev_s": 0.05, "short_range_stddev_m": 0.1}
     freed = survey.changed({f"refine.{key}": stddev for key, stddev in stddevs.items()})
     result = refine_model(freed, progress=SilentProgress()).summary
@@ -247,7 +274,7 @@ def test_what_the_refinement_found_beside_the_map_is_in_the_result(survey: Surve
     assert 0 < np.linalg.norm(np.subtract(found.tag_in_cam_m[tag_id], survey.tag.tag_in_cam_m)) < 0.15
     assert 0 < abs(known(found.time_offset_change_s)) < 0.15
     assert 0 < abs(known(found.short_range_error_m)) < 0.3
-    held = known(refine_model(survey, progress=SilentProgress()).summary.refine)
+    held = known(refined.result.summary.refine)
     assert list(held.tag_in_cam_m.values()) == [survey.tag.tag_in_cam_m]
     assert (held.time_offset_change_s, held.short_range_error_m) == (None, None)
 
@@ -275,7 +302,7 @@ def test_covariances_of_the_centres_are_in_the_result_unless_unwanted(survey: Su
     assert not path.exists()
 
 
-def test_a_site_in_national_coordinates_loses_nothing(survey: Survey, tmp_path: Path) -> None:
+def test_a_site_in_national_coordinates_loses_nothing(survey: Survey, refined: Done, tmp_path: Path) -> None:
     far = np.array([2_600_000.0, 1_200_000.0, 400.0])
     header, *rows = (survey.anchors.path or Path()).read_text().splitlines()
     lines = []
@@ -283,7 +310,7 @@ def test_a_site_in_national_coordinates_loses_nothing(survey: Survey, tmp_path: 
         name, *numbers = row.split(",")
         lines.append(",".join([name, *(repr(float(n) + float(o)) for n, o in zip(numbers, far, strict=True))]))
     (tmp_path / "far.csv").write_text("\n".join([header, *lines]) + "\n")
-    near = refine_model(survey, progress=SilentProgress()).summary
+    near = refined.result.summary
     moved = survey.changed({"anchors.path": tmp_path / "far.csv", "output.path": tmp_path / "far"})
     away = refine_model(moved, progress=SilentProgress()).summary
     assert away.scale.value == pytest.approx(near.scale.value, rel=1e-9)
@@ -291,7 +318,7 @@ def test_a_site_in_national_coordinates_loses_nothing(survey: Survey, tmp_path: 
     for anchor_id, anchor in near.anchors.items():
         moved_m, own_m = known(away.anchors[anchor_id].position_m), known(anchor.position_m)
         np.testing.assert_allclose(np.subtract(moved_m, far), own_m, atol=1e-6)
-    paths = (survey.output.path, tmp_path / "far")
+    paths = (refined.survey.output.path, tmp_path / "far")
     models = [pycolmap.Reconstruction(path / "sparse_metric" / "0") for path in paths]
     for image_id, image in models[0].images.items():
         apart = models[1].image(image_id).projection_center() - far - image.projection_center()

@@ -46,5 +46,5 @@ def main(argv: Sequence[str] | None = None) -> int:
         failure = failure_of(error)
         if failure.exit_status == INTERNAL_ERROR and os.environ.get("RANGESFM_DEBUG"):
             traceback.print_exc()
-        print("rangesfm: error:", failure.message, file=sys.stderr)
+        print("rangesfm: error:", "\n  ".join([failure.message, *failure.advice]), file=sys.stderr)
         return failure.exit_status

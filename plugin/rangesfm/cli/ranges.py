@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from rangesfm.ranging.errors.calibration import Calibration
     from rangesfm.ranging.log import RangeLog
     from rangesfm.ranging.summary import AnchorSummary, PairSummary, RangeSummary
+
+# As of the times in a survey file.
+_MAX_TIME_S = 1e10
 
 _LOG_KEYS = (
     *("ranges.format", "ranges.columns", "ranges.timestamp_unit", "ranges.range_unit", "ranges.separator"),
@@ -63,7 +67,9 @@ def add_commands(commands: Commands) -> None:
 
 def _add_log_arguments(parser: Parser) -> None:
     """The log and how it is written."""
-    parser.add_argument("log", metavar="LOG", help="the radio's log")
+    parser.add_argument(
+        "log", nargs="+", metavar="LOG", help="the radio's log; a folder or several files: one an anchor"
+    )
     add_flags(parser, *_LOG_KEYS, by_own_names=True)
 
 
@@ -85,11 +91,11 @@ def _add_position_arguments(parser: Parser, *, max_interpolation_gap_s: float) -
     )
     parser.add_argument("--tag_id", metavar="ID", help="the tag whose positions these are, if the log has several")
     parser.add_argument(
-        "--time_offset", type=float, default=0.0, metavar="SECONDS", help="time of positions minus time of ranges"
+        "--time_offset", type=_seconds, default=0.0, metavar="SECONDS", help="time of positions minus time of ranges"
     )
     parser.add_argument(
         "--max_interpolation_gap_s",
-        type=float,
+        type=_seconds,
         default=max_interpolation_gap_s,
         metavar="S",
         help=f"between known positions further apart none is interpolated (default: {max_interpolation_gap_s:g})",
@@ -142,7 +148,7 @@ def _read_log(args: argparse.Namespace, anchor_ids: Sequence[str] = ()) -> Range
     """The log that the arguments name; ``anchor_ids`` as for ``read_ranges``."""
     from rangesfm.survey.inputs import read_log
 
-    return read_log(survey_from_arguments(args).ranges.changed(path=Path(args.log)), anchor_ids)
+    return read_log(survey_from_arguments(args).ranges.changed(path=Path(args.log[0])), anchor_ids, files=args.log)
 
 
 def _read_placed_log(args: argparse.Namespace) -> tuple[RangeLog, Array]:
@@ -170,7 +176,10 @@ def _ranges(args: argparse.Namespace, progress: Progress) -> Outcome:
 
     anchors = read_anchors(args.anchors) if args.anchors is not None else ()
     log = _read_log(args, [anchor.anchor_id for anchor in anchors])
-    lines = [*_summary(summarize_ranges(log)), *_places(read_anchors_in_log(args.log, format=log.format))]
+    lines = [
+        *_summary(summarize_ranges(log), _notes_of(log)),
+        *_places(read_anchors_in_log(args.log, format=log.format)),
+    ]
     if args.output_path is not None:
         write_ranges_csv(log, args.output_path)
         lines += ["", f"written to {args.output_path}"]
@@ -183,7 +192,12 @@ def _ranges(args: argparse.Namespace, progress: Progress) -> Outcome:
     return Outcome(lines)
 
 
-def _summary(summary: RangeSummary) -> list[str]:
+def _notes_of(log: RangeLog) -> list[str]:
+    """What was assumed of it."""
+    return [f"note    {note}" for note in log.notes]
+
+
+def _summary(summary: RangeSummary, of_reading: Sequence[str]) -> list[str]:
     from rangesfm.files.tables import align_rows
 
     step_m = summary.quantization_m
@@ -206,6 +220,7 @@ def _summary(summary: RangeSummary) -> list[str]:
         f"ranges  {summary.num}, and {summary.num_no_measurement} records without a measurement",
         f"tags    {', '.join(summary.tag_ids)}",
         f"time    {_time(summary)}",
+        *of_reading,
         *(f"note    {note}" for note, applies in notes.items() if applies),
         "",
         align_rows(rows),
@@ -251,7 +266,7 @@ def _calibrate(args: argparse.Namespace, progress: Progress) -> Outcome:
     anchors = read_anchors(args.anchors)
     log, tags_m = _read_placed_log(args)
     calibration = calibrate_ranges(log, tags_m, anchors)
-    lines = [*_calibrated(calibration, len(log)), "", f"written to {args.output_path}"]
+    lines = [*_notes_of(log), *_calibrated(calibration, len(log)), "", f"written to {args.output_path}"]
     if args.plot is not None:
         from rangesfm.report.pictures import write_picture
         from rangesfm.report.range_plots import plot_error_curve
@@ -303,7 +318,7 @@ def _trilaterate(args: argparse.Namespace, progress: Progress) -> Outcome:
     placements = trilaterate_anchors(log, tags_m, toward=_toward(args.side, log), options=options)
     if all(placement.found is None for placement in placements):
         raise GeometryError(f"anchor {placements[0].anchor_id}: {placements[0].why_not}")
-    lines = _placed(log, placements)
+    lines = [*_notes_of(log), *_placed(log, placements)]
     if args.output_path is not None:
         write_anchors([placement.anchor for placement in placements], args.output_path)
         lines += ["", f"written to {args.output_path}"]
@@ -342,3 +357,13 @@ def _placed(log: RangeLog, placements: Sequence[AnchorPlacement]) -> list[str]:
         "",
         *(line + note for line, note in zip(align_rows(rows).split("\n"), notes, strict=True)),
     ]
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= _MAX_TIME_S:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a time in seconds, expected at most {_MAX_TIME_S:g} of them")
+    return value

@@ -7,10 +7,12 @@ and quoted cells are understood. Whatever is wrong is an InputError with its lin
 from __future__ import annotations
 
 import csv
+import gzip
 import io
 import os
 import stat
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import zlib
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,6 +24,7 @@ from rangesfm.errors import InputError, printable
 from rangesfm.files.atomic import new_file
 
 _HEAD_BYTES = 1 << 16
+_GZIP_MARK = b"\x1f\x8b"
 _UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 _UNPACKED = (".gz", ".bz2", ".xz")  # by numpy, whatever such a file holds
 
@@ -88,6 +91,11 @@ class Table:
             texts = [text or empty for text in texts]
         return texts
 
+    def begins_with_number(self, column: str) -> bool:
+        """Whether the first cell is one, or there is none."""
+        cells = self.cells[column]
+        return not isinstance(cells, list) or not cells or _number(cells[0]) is not None
+
     def categories(self, column: str, *, empty: str | None = None) -> Categories:
         """The cells as ``text`` has them, told apart: fast where they are few."""
         raw = Categories.of(self._raw(column))
@@ -98,18 +106,26 @@ class Table:
         return Categories(kinds.names, kinds.index[raw.index])
 
     def numbers(
-        self, column: str, *, empty: float | None = None, expected: str = "a number"
+        self,
+        column: str,
+        *,
+        empty: float | None = None,
+        missing: Collection[str] = ("",),
+        expected: str = "a number",
     ) -> npt.NDArray[np.float64]:
         """The cells as finite numbers, (n,).
 
         Args:
             empty: stands for empty cells, which are refused if it is None.
+            missing: what an empty cell may look like, in small letters.
             expected: what the message calls a good cell.
         """
         cells = self.cells[column]
         values = np.array(list(map(_number, cells)), np.float64) if isinstance(cells, list) else cells
-        for row in np.flatnonzero(~np.isfinite(values)).tolist():
-            if empty is None or self._raw(column)[row].strip():
+        bad = np.flatnonzero(~np.isfinite(values)).tolist()
+        raw = self._raw(column) if bad else []
+        for row in bad:
+            if empty is None or raw[row].strip().lower() not in missing:
                 raise self.error(row, column, expected)
             values[row] = empty
         return values
@@ -137,6 +153,8 @@ def read_table(
     aliases: Mapping[str, str] | None = None,
     separator: str | None = ",",
     header: Sequence[str] | None = None,
+    num_skipped: int = 0,
+    decimal_comma: bool = False,
 ) -> Table:
     """Read the named columns of a file; others are ignored.
 
@@ -146,7 +164,9 @@ def read_table(
         text: those of them that are not numbers. Any column can be had as either; this way it is fast.
         aliases: other names by which a file may call them, ``{name in the file: name}``.
         separator: one character; a blank means any run of blanks; None: told from the header row.
-        header: names of all columns, of a file that has no header row, or one that is a comment.
+        header: names of all columns, of a file that has no header row, or one that is a comment; needs the separator.
+        num_skipped: lines before the first row, where ``header`` is given.
+        decimal_comma: numbers have a comma for a point; no comma is a separator then.
 
     Raises:
         InputError: the file is missing, empty or not text, lacks a column, or has a row with too
@@ -155,22 +175,31 @@ def read_table(
     path = Path(path)
     content = read_text(path)
     header_row, header_line, body = _split_header(content)
-    if header is not None and separator is not None:
-        header_row, header_line, body = separator.join(header), 0, content
     if not header_row:
         raise InputError(f"the file is empty, expected a header row with {_listed(required)}", path)
     if separator is None:
         separator = guess_separator(header_row)
     if len(separator) != 1 or separator in '"\r\n\0#':
         raise InputError(f"separator is {separator!r}, expected one character", path)
-    header = [cell.strip() for cell in _split_row(header_row, separator, path, header_line)]
     known, aliases = (*required, *optional), aliases or {}
-    names = [name if name in known else aliases.get(name, name) for name in header]
-    _check_header(names, required, optional, path, header_line)
+    if header is None:
+        found = [cell.strip() for cell in _split_row(header_row, separator, path, header_line)]
+        names = [name if name in known else aliases.get(name, name) for name in found]
+        _check_has_header(names, required, optional, path, header_line)
+    else:
+        names, header_line, body = list(header), num_skipped, "".join(content.split("\n", num_skipped)[num_skipped:])
+    _check_names(names, required, optional, path, header_line)
+    body = body.replace(",", ".") if decimal_comma else body
     wanted = {name: names.index(name) for name in known if name in names}
     reread = partial(_table_of_texts, path, names, wanted, header_line, body, separator)
     rows = None
-    if body and not body.isspace() and separator != " " and not any(character in body for character in '"#'):
+    if (
+        body
+        and not body.isspace()
+        and not decimal_comma
+        and separator != " "
+        and not any(character in body for character in '"#')
+    ):
         # Of the columns that nobody asked for only their number matters.
         types = ["U1" if name not in wanted else "O" if name in text else "f8" for name in names]
         rows = _plain_rows(path, header_line, types, separator)
@@ -256,16 +285,23 @@ def guess_separator(row: str) -> str:
 
 def _read_bytes(path: str | Path, num: int = -1) -> bytes:
     try:
-        mode = os.stat(path).st_mode
-        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # a device may never end, a pipe never begin
+        status = os.stat(path)
+        if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):  # may never end, or never begin
             raise InputError("is no regular file", path)
+        if stat.S_ISREG(status.st_mode) and status.st_size == 0:  # as the kernel's own, of which some never end
+            return b""
         with open(path, "rb") as file:
-            return file.read(num)
+            packed = file.read(len(_GZIP_MARK)) == _GZIP_MARK
+            file.seek(0)
+            if not packed:
+                return file.read(num)
+            with gzip.open(file) as unpacked:
+                return unpacked.read(num)
     except FileNotFoundError:
         raise InputError("no such file", path) from None
     except IsADirectoryError:
         raise InputError("is a folder, expected a file", path) from None
-    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+    except (OSError, ValueError, EOFError, zlib.error) as error:  # ValueError: a name that no file can have
         raise InputError(f"cannot be read ({getattr(error, 'strerror', None) or error})", path) from None
 
 
@@ -299,16 +335,25 @@ def _split_row(row: str, separator: str, path: Path | None = None, line: int | N
     return cells
 
 
-def _check_header(names: list[str], required: Sequence[str], optional: Sequence[str], path: Path, line: int) -> None:
-    expected = _listed(required) + (f" (and possibly {_listed(optional)})" if optional else "")
+def _check_has_header(
+    names: list[str], required: Sequence[str], optional: Sequence[str], path: Path, line: int
+) -> None:
     if all(_number(name) is not None for name in names):
-        raise InputError(f"no header row, expected {expected}", path, line)
+        raise InputError(f"no header row, expected {_expected(required, optional)}", path, line)
+
+
+def _check_names(names: list[str], required: Sequence[str], optional: Sequence[str], path: Path, line: int) -> None:
     for name in required:
         if name not in names:
-            raise InputError(f"no column {name}; found {_listed(names)}; expected {expected}", path, line)
+            found, expected = _listed(names), _expected(required, optional)
+            raise InputError(f"no column {name}; found {found}; expected {expected}", path, line)
     for name in (*required, *optional):
         if names.count(name) > 1:
             raise InputError(f"{names.count(name)} columns are {name}, expected one", path, line)
+
+
+def _expected(required: Sequence[str], optional: Sequence[str]) -> str:
+    return _listed(required) + (f" (and possibly {_listed(optional)})" if optional else "")
 
 
 def _number(cell: str) -> float | None:

@@ -65,6 +65,7 @@ class RangeLog:
         source: the file it came from, for messages; None if made in memory.
         format: name of the reader, for the record.
         num_no_measurement: how many records said that there was no measurement.
+        notes: what was assumed of the file in reading it.
         shared_stddev_m: (n,) stddev of what all ranges of about this length are off together, once the radio's
             error curve has been taken off them; None: it has not.
     """
@@ -83,6 +84,7 @@ class RangeLog:
     source: Path | None = None
     format: str = "memory"
     num_no_measurement: int = 0
+    notes: tuple[str, ...] = ()
     shared_stddev_m: npt.NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
@@ -222,6 +224,7 @@ class RangeLog:
         source: Path | None = None,
         format: str = "memory",
         num_no_measurement: int = 0,
+        notes: tuple[str, ...] = (),
         shared_stddev_m: npt.ArrayLike | None = None,
     ) -> RangeLog:
         """Build a log from one value (or one string) per range; optional columns may be left out.
@@ -249,6 +252,7 @@ class RangeLog:
             source=source,
             format=format,
             num_no_measurement=num_no_measurement,
+            notes=notes,
             shared_stddev_m=None if shared_stddev_m is None else np.asarray(shared_stddev_m, dtype=np.float64),
         )
 

@@ -110,12 +110,18 @@ def _without_known_errors(log: RangeLog, survey: Survey) -> tuple[RangeLog, list
     return (log, []) if curve_path is None else correct_ranges(log, read_error_curve(curve_path))
 
 
-def read_log(options: LogOptions, anchor_ids: Collection[str] = (), tag_ids: Collection[str] = ()) -> RangeLog:
-    """The radio's log as a survey describes it; see ``read_ranges``."""
+def read_log(
+    options: LogOptions,
+    anchor_ids: Collection[str] = (),
+    tag_ids: Collection[str] = (),
+    *,
+    files: Sequence[str] | None = None,
+) -> RangeLog:
+    """The radio's log as a survey describes it, or other files than it names; see ``read_ranges``."""
     if options.path is None:
         raise InputError("no ranges: give [ranges] path in a survey file, or --ranges LOG")
     return read_ranges(
-        options.path,
+        files or options.path,
         format=options.format,
         columns=options.columns or None,
         timestamp_unit=options.timestamp_unit,
@@ -245,7 +251,7 @@ def _check_anchors_known(log: RangeLog, anchors: Sequence[Anchor], survey: Surve
 
 def _notes(log: RangeLog, anchors: Sequence[Anchor], survey: Survey, *, anchors_are_of_log: bool) -> list[str]:
     silent = [anchor.anchor_id for anchor in anchors if anchor.anchor_id not in log.anchor_ids]
-    notes = [f"no ranges to anchor {', '.join(silent)}"] if silent else []
+    notes = [*log.notes, *([f"no ranges to anchor {', '.join(silent)}"] if silent else [])]
     silent = [tag_id for tag_id in survey.tag.lever_arms_m if tag_id not in log.tag_ids and survey.tag.tag_id is None]
     notes += [f"no ranges of tag {', '.join(silent)}"] if silent else []
     for kind, what in (

@@ -29,6 +29,7 @@ from rangesfm.options import (
     ScaleAndTapeOptions,
     TagOptions,
 )
+from rangesfm.ranging.readers.several import files_of_log
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -148,7 +149,11 @@ class Survey(BaseModel):
         for dotted_key, role in _ROLE_OF_PATH.items():
             table, _, name = dotted_key.partition(".")
             path = getattr(getattr(self, table), name)
-            if path is not None and role != "output":
+            if path is not None and role == "log":
+                yield from (
+                    InputPath(dotted_key, "log" if file.is_dir() else "file", file) for file in files_of_log(path)
+                )
+            elif path is not None and role != "output":
                 yield InputPath(dotted_key, role, path)
         if self.model_path is not None:
             yield InputPath("model_path", "model", self.model_path)
@@ -243,7 +248,11 @@ def _absolute(value: object, folder: Path) -> object:
 
 
 def _require_files(survey: Survey) -> None:
-    for item in survey.input_paths():
+    try:
+        paths = [*survey.input_paths()]
+    except InputError as error:
+        raise OptionError(f"[ranges] path: {error}", "ranges", "path") from None
+    for item in paths:
         if item.role == "file" and not os.path.isfile(item.path):
             is_folder = os.path.isdir(item.path)
             found = f"{item.path} is a folder, expected a file" if is_folder else f"there is no file {item.path}"

@@ -196,11 +196,17 @@ def _cause_of(each: Alternative, gain: float, penalty: float) -> Cause:
 
 def _best_of_each(tests: Sequence[Test], problem: Linearized) -> list[Test]:
     """Of each kind and subject the one that fits best; the likeliest first."""
-    best: dict[tuple[str, str], Test] = {}
+    of_key: dict[tuple[str, str], list[Test]] = {}
     for test in tests:
-        key = test.hypothesis.key
-        if key not in best or test.statistic > best[key].statistic:
-            best[key] = test
+        of_key.setdefault(test.hypothesis.key, []).append(test)
+    # Whoever makes such a mistake does not choose the time at which it is found best.
+    best = {
+        key: replace(
+            max(group, key=lambda test: test.statistic),
+            smallest_detectable=float(np.median([test.smallest_detectable for test in group])),
+        )
+        for key, group in of_key.items()
+    }
     num = len(problem.residual_m)
     return sorted(best.values(), key=lambda test: _penalty(test, num) - test.statistic)
 

@@ -10,7 +10,7 @@ from rangesfm.arrays import Array, Mask
 from rangesfm.trust.hypothesis import Correction, Hypothesis, of_cells
 from rangesfm.trust.linearized import Linearized
 
-_NUM_STEPS, _NUM_MOVES = 12, 8
+_NUM_STEPS, _NUM_MOVES = 16, 8
 # Shares of the survey that a stretch may last.
 _STRETCHES = (1 / 4, 1 / 8, 1 / 16)
 # Of fewer cells on either side nothing can be said.

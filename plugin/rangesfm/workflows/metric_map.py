@@ -18,6 +18,7 @@ from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruct
 from rangesfm.join.models import ModelVerdict, PathOfModel, Ranging, join_models
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock.estimate import TimeOffset, estimate_time_offset
+from rangesfm.ranging.clock.rivals import REMEDY, Rival
 from rangesfm.ranging.log import RangeKind
 from rangesfm.ranging.observations import RangeObservations, RangeStatus, hold_out
 from rangesfm.refine.radio import predicted_ranges
@@ -30,6 +31,10 @@ from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.trust_in_map import tested
+
+# Scales of two clock offsets further apart than this are no answer, unless one of the offsets is nearly certain.
+_MAX_SPREAD = 0.03
+_NEARLY_CERTAIN = 0.95
 
 
 def path_of_model(model: pycolmap.Reconstruction, times: ImageTimes | None) -> Trajectory:
@@ -214,7 +219,10 @@ def scale_by_survey(
     if inputs.tape is not None:
         distances = locate_distances(inputs.tape, sfm, observations.log.anchor_ids)
     estimate = estimate_scale(survey, inputs, observations, trajectory, inputs.anchor_frame, distances)
-    for doubt in estimate.reasons if estimate.verdict != "good" else ():
+    by_rivals = (
+        () if offset is None else doubts_by_rivals(survey, inputs, trajectory, distances, offset, estimate.value)
+    )
+    for doubt in (*by_rivals, *(estimate.reasons if estimate.verdict != "good" else ())):
         journal.warn(doubt)
     scaled = rescale(sfm, estimate.metric_from_sfm)
     predicted = predicted_ranges(
@@ -228,7 +236,61 @@ def scale_by_survey(
     weights = estimate.errors.robust_weights(predicted - inputs.log.range_m)
     offset_s = offset.value_s if offset is not None else survey.ranges.time_offset_s
     metric = MetricResult(trajectory, offset, offset_s, estimate, scaled, predicted, weights)
-    return tested(survey, metric, journal)
+    return tested(survey, metric.doubted(by_rivals), journal)
+
+
+def doubts_by_rivals(
+    survey: Survey,
+    inputs: RangingInputs,
+    trajectory: Trajectory,
+    distances: LocatedDistances | None,
+    offset: TimeOffset,
+    scale: float,
+) -> tuple[str, ...]:
+    """Solve the scale for every rival of an offset; its doubts in words, none if there is no rival.
+
+    Args:
+        distances: as the scale was estimated with.
+        scale: at the offset, metres per SfM unit.
+
+    Raises:
+        GeometryError: the offset is not certain, and another scale follows from a rival.
+    """
+    doubts, far_apart = [], []
+    for rival in offset.rivals:
+        said = f"{rival.value_s:+.2f} s ({rival.probability:.0%})"
+        other = _scale_of(rival, survey, inputs, trajectory, distances, offset)
+        if other is None:
+            doubts.append(f"the time offset may also be {said}, which gives no scale")
+            continue
+        change = other / scale - 1
+        doubts.append(f"the time offset may also be {said}, which gives a scale of {other:.6g} ({change:+.1%})")
+        if abs(change) > _MAX_SPREAD:
+            far_apart.append(f"{said} gives {other:.6g} ({change:+.1%})")
+    if far_apart and offset.probability < _NEARLY_CERTAIN:
+        raise GeometryError(
+            "the motion leaves the time offset open, and the scale with it: "
+            f"{offset.value_s:+.2f} s ({offset.probability:.0%}) gives {scale:.6g} m per unit, "
+            f"{', '.join(far_apart)}: {REMEDY}"
+        )
+    return tuple(doubts)
+
+
+def _scale_of(
+    rival: Rival,
+    survey: Survey,
+    inputs: RangingInputs,
+    trajectory: Trajectory,
+    distances: LocatedDistances | None,
+    offset: TimeOffset,
+) -> float | None:
+    assert inputs.log.timestamp_s is not None, "clocks belong to a log with times"
+    offsets_s = offset.of_rival(rival).at(inputs.log.timestamp_s)
+    try:
+        observations = ranges_on_path(survey, inputs, trajectory, offsets_s)
+        return estimate_scale(survey, inputs, observations, trajectory, inputs.anchor_frame, distances).value
+    except GeometryError:
+        return None
 
 
 def refine_map(survey: Survey, inputs: RangingInputs, metric: MetricResult, journal: Journal) -> MetricResult:

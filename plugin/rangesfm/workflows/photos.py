@@ -179,8 +179,9 @@ class AdjustmentWithRanges:
             include={"camera", "ranges", "anchors", "tag", "scale", "refine"},
             exclude={"ranges": {"path", "error_curve"}, "anchors": {"path"}, "scale": {"distances", "markers"}},
         )
-        files = (survey.ranges.path, survey.ranges.error_curve, survey.anchors.path, survey.images.times)
-        contents = [None if path is None else sha256_of(path) for path in files]
+        files = (survey.ranges.error_curve, survey.anchors.path, survey.images.times)
+        logs = [item.path for item in survey.input_paths() if item.key == "ranges.path" and item.role == "file"]
+        contents = [None if path is None else sha256_of(path) for path in (*logs, *files)]
         return [settings, self._inputs.anchor_frame, self._first_keyframe, contents]
 
     def adjust(self, model: pycolmap.Reconstruction) -> bool:
@@ -221,6 +222,8 @@ class AdjustmentWithRanges:
             found = estimate_time_offset(
                 inputs.log, path, inputs.tag_in_cam_m, association=survey.ranges, seed=survey.output.seed
             )
+            if found.rivals:
+                raise GeometryError("more than one time offset is likely")
             self._offset_s, self._num_with_offset = found.value_s, len(path)
         return ranges_on_path(survey, inputs, path, self._offset_s or 0.0)
 

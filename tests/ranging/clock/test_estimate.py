@@ -334,15 +334,18 @@ def test_bursts_of_a_moving_camera_are_not_said_to_be_still() -> None:
     assert found.note is None
 
 
-def test_bursts_that_suit_two_photos_are_refused() -> None:
-    """Two rounds past six stops, of which only one was photographed."""
+def test_bursts_that_suit_several_photos_leave_several_offsets() -> None:
+    """Two rounds past six stops, of which only one was photographed; half a round on, the stops are turned over."""
     stop_times = np.linspace(1000, 1066, 12)
     turn = np.pi / 3 * np.arange(12)
     stops = 4 * np.stack([np.cos(turn), np.sin(2 * turn), 0.5 * np.sin(turn)], axis=1)
     walk = Walk(lambda times: stops[np.rint((times - 1000) / 6).astype(int)], no_turn)
     log = walk.log((stop_times[:, None] + np.linspace(-1, 1, 80)).ravel(), 0.5, outlier_share=0)
-    with pytest.raises(GeometryError, match="--ranges_time_offset"):
-        estimate(log, walk.photos(stop_times[:6], center_stddev_m=0.003))
+    found = estimate(log, walk.photos(stop_times[:6], center_stddev_m=0.003))
+    offsets_s = sorted([found.value_s, *(rival.value_s for rival in found.rivals)])
+    assert offsets_s == pytest.approx([-35.5, -17.5, 0.5], abs=0.1)
+    assert found.probability + sum(rival.probability for rival in found.rivals) == pytest.approx(1.0)
+    assert found.probability < 0.95
 
 
 def still(times: Array) -> Array:
@@ -371,6 +374,22 @@ def test_motion_that_does_not_determine_the_offset_is_refused(
     log = walk.log(range_times(-1, 71), 3.0, num_anchors=num_anchors)
     with pytest.raises(GeometryError, match="--ranges_time_offset"):
         estimate(log, walk.photos(photo_times(70), center_stddev_m=center_stddev_m))
+
+
+def test_laps_that_differ_by_twice_the_noise_are_told_apart() -> None:
+    """One lap off, the residuals are about twice as large."""
+
+    def center(times: Array) -> Array:
+        wander = np.stack([np.sin(times / 5), np.cos(times / 7), np.sin(times / 3)], axis=1)
+        return repeated_figure(times) + 0.15 * wander
+
+    walk = Walk(center, no_turn)
+    found = estimate(walk.log(range_times(-1, 71), 3.0), walk.photos(photo_times(70)))
+    lap_off = np.abs(np.abs(found.curve.offsets_s - 3.0) - 9.0) < 0.5
+    assert found.curve.costs_m[lap_off].min() < 3 * found.curve.costs_m.min()
+    assert found.value_s == pytest.approx(3.0, abs=0.03)
+    assert found.probability > 0.99
+    assert not found.rivals
 
 
 @pytest.mark.parametrize("num_anchors", [1, 4])

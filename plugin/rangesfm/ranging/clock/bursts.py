@@ -63,8 +63,7 @@ class Pairing:
         burst, photo: (k,) the pairs.
         variance: of the medians' residuals, m^2.
         num_spare: how many medians there are beyond the unknowns.
-        variation: variance of the medians of each anchor, m^2.
-        num_varying: how many medians there are beyond the anchors.
+        chance: that the path suits the medians no better than no motion at all (F test).
     """
 
     offset_s: float
@@ -72,23 +71,17 @@ class Pairing:
     photo: Rows
     variance: float
     num_spare: float
-    variation: float
-    num_varying: float
-
-    @property
-    def is_testable(self) -> bool:
-        return self.num_spare >= _MIN_NUM_SPARE
+    chance: float
 
     def explains(self) -> bool:
-        """Whether the path explains the ranges better than no motion at all (F test)."""
-        return self._chance_of(self.variation, self.num_varying) < _MAX_CHANCE
+        """Whether there are medians enough, and the path explains them better than no motion at all."""
+        return self.num_spare >= _MIN_NUM_SPARE and self.chance < _MAX_CHANCE
 
-    def beats(self, rival: Pairing) -> bool:
-        """Whether the residuals are smaller than those of another pairing, beyond doubt (F test)."""
-        return self._chance_of(rival.variance, rival.num_spare) < _MAX_CHANCE
-
-    def _chance_of(self, variance: float, num: float) -> float:
-        return float(f_distribution.sf(variance / self.variance, num, self.num_spare))
+    def log_odds(self, rival: Pairing) -> float:
+        """Log of the ratio of their likelihoods; infinite if the rival is of too few medians to have one."""
+        if rival.num_spare < _MIN_NUM_SPARE:
+            return np.inf
+        return 0.5 * min(self.num_spare, rival.num_spare) * float(np.log(rival.variance / self.variance))
 
 
 def find_bursts(ranges: TimedRanges, photo_times_s: Array) -> Bursts | None:
@@ -127,7 +120,7 @@ def pair_bursts(bursts: Bursts, trajectory: Trajectory, tags_in_cam_m: Array) ->
         nearest = np.searchsorted(0.5 * (photo_times[1:] + photo_times[:-1]), times)
         burst = np.flatnonzero(np.abs(times - photo_times[nearest]) <= reach_s)
         pairings.append(_fit(bursts, trajectory, tags_in_cam_m, burst, nearest[burst]))
-    return sorted(pairings, key=lambda pairing: (not pairing.is_testable, pairing.variance))
+    return sorted(pairings, key=lambda pairing: (pairing.num_spare < _MIN_NUM_SPARE, pairing.variance))
 
 
 def offsets_that_keep(pairing: Pairing, bursts: Bursts, trajectory: Trajectory) -> tuple[float, float]:
@@ -179,15 +172,13 @@ def _fit(bursts: Bursts, trajectory: Trajectory, tags_in_cam_m: Array, burst: Ro
     tag_from_center = np.einsum("nij,nj->ni", trajectory.world_from_cam[photo[pair]], lever_arms)
     without_lever = fit_squares(centers, range_m, anchor, _LOSS_SCALE)
     squares = fit_squares(centers + tag_from_center / without_lever.scale, range_m, anchor, _LOSS_SCALE)
-    num_spare = float(squares.weights.sum()) - squares.num_unknowns
-    num_varying = float(len(range_m) - len(np.unique(anchor)))
-    means = np.bincount(anchor, range_m) / np.maximum(np.bincount(anchor), 1)
-    return Pairing(
-        offset_s=float(np.median(trajectory.timestamps_s[photo] - bursts.middle_s[burst])),
-        burst=burst,
-        photo=photo,
-        variance=max(float(np.sum(squares.weighted_residuals**2)) / max(num_spare, 1.0), MIN_RESIDUAL_M**2),
-        num_spare=num_spare,
-        variation=float(np.sum((range_m - means[anchor]) ** 2)) / max(num_varying, 1.0),
-        num_varying=num_varying,
-    )
+    num_spare = max(float(squares.weights.sum()) - squares.num_unknowns, 1e-3)
+    squared_m2 = float(np.sum(squares.weighted_residuals**2))
+    variance = max(squared_m2 / max(num_spare, 1.0), MIN_RESIDUAL_M**2)
+    num_of_anchor = np.bincount(anchor)
+    means = np.bincount(anchor, range_m) / np.maximum(num_of_anchor, 1)
+    num_varying = max(len(range_m) - int(np.count_nonzero(num_of_anchor)), 1)
+    variation = float(np.sum((range_m - means[anchor]) ** 2)) / num_varying
+    offset_s = float(np.median(trajectory.timestamps_s[photo] - bursts.middle_s[burst]))
+    chance = float(f_distribution.sf(variation / variance, num_varying, num_spare))
+    return Pairing(offset_s, burst, photo, variance, num_spare, chance)

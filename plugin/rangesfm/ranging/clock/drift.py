@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rangesfm.arrays import Array
 from rangesfm.ranging.clock.fit import OffsetFit, Timing, refine_offset
 from rangesfm.ranging.clock.path import PathSamples
 from rangesfm.ranging.clock.search import TimedRanges
@@ -22,40 +23,34 @@ class ClockFit(NamedTuple):
     Attributes:
         fit: at the offset, of ranges whose times are freed of the drift that is followed.
         timing: what that fit says of the offset, and of the drift that is left.
-        drift: estimate; what camera time gains on radio time, seconds a second.
-        followed_drift: the same where it is beyond doubt, else 0.
+        followed_drift: what camera time gains on radio time, seconds a second, where it is beyond doubt; else 0.
         reference_s: radio's time at which the offset holds.
     """
 
     fit: OffsetFit
     timing: Timing
-    drift: float
     followed_drift: float
     reference_s: float
 
 
-def fit_clocks(ranges: TimedRanges, path: PathSamples, offset_s: float, cell_s: float) -> ClockFit:
+def fit_clocks(ranges: TimedRanges, path: PathSamples, offset_s: float) -> ClockFit:
     """Descend to the offset; if the ranges then show a drift beyond doubt, to both.
 
     Args:
         ranges: (nearly) all are on the path at ``offset_s``.
         path: of the moving camera.
         offset_s: to start from.
-        cell_s: ranges to one anchor within such a time count as one measurement.
     """
     reference_s = float(ranges.times_s.mean())
-    fit = refine_offset(ranges, path, offset_s, cell_s)
-    timing = fit.timing()
-    if not abs(timing.drift) > _MIN_STDDEVS * timing.drift_stddev:
-        return ClockFit(fit, timing, timing.drift, 0.0, reference_s)
-    followed = 0.0
+    fit = refine_offset(ranges, path, offset_s)
+    timing, followed, least_stddevs = fit.timing(), 0.0, _MIN_STDDEVS
     for _ in range(_MAX_NUM_STEPS):
-        followed += timing.drift
-        fit = refine_offset(without_drift(ranges, followed, reference_s), path, fit.offset_s, cell_s)
-        timing = fit.timing()
-        if not abs(timing.drift) > _CONVERGED_STDDEVS * timing.drift_stddev:
+        if not abs(timing.drift) > least_stddevs * timing.drift_stddev:
             break
-    return ClockFit(fit, timing, followed, followed, reference_s)
+        followed, least_stddevs = followed + timing.drift, _CONVERGED_STDDEVS
+        fit = refine_offset(without_drift(ranges, followed, reference_s), path, fit.offset_s)
+        timing = fit.timing()
+    return ClockFit(fit, timing, followed, reference_s)
 
 
 def without_drift(ranges: TimedRanges, drift: float, reference_s: float) -> TimedRanges:
@@ -63,7 +58,7 @@ def without_drift(ranges: TimedRanges, drift: float, reference_s: float) -> Time
     return ranges._replace(times_s=ranges.times_s + drift * (ranges.times_s - reference_s))
 
 
-def drift_note(drift: float, stddev: float, times_s: np.ndarray[tuple[int], np.dtype[np.float64]]) -> str:
+def drift_note(drift: float, stddev: float, times_s: Array) -> str:
     """What a user should know of a drift that was found."""
     half_span_s = float(np.ptp(times_s)) / 2
     return (

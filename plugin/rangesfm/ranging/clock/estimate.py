@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -16,26 +16,19 @@ from rangesfm.ranging.association import associate, is_too_long, lever_arms
 from rangesfm.ranging.clock.bursts import Bursts, curve_of, find_bursts, offsets_that_keep, pair_bursts
 from rangesfm.ranging.clock.curve import CostCurve, cost_curve
 from rangesfm.ranging.clock.drift import drift_note, fit_clocks, without_drift
-from rangesfm.ranging.clock.fit import OffsetFit, refine_offset
+from rangesfm.ranging.clock.fit import refine_offset
 from rangesfm.ranging.clock.path import PathSamples, moving_path
+from rangesfm.ranging.clock.rivals import REMEDY, Rival, likely_fits, likely_offsets
 from rangesfm.ranging.clock.search import TimedRanges, ranges_on_path, scan_offsets
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.observations import RangeStatus
 
-_REMEDY = "give the time offset (--ranges_time_offset)"
 _MIN_NUM_KEYFRAMES = 4
 _MAX_NUM_CANDIDATES = 12
 _CANDIDATE_SEPARATION_S = 0.5
 # Enough ranges to tell candidates apart; enough to leave nothing to gain.
 _NUM_RANGES_PER_CANDIDATE = 3000
 _NUM_RANGES_OF_FINAL = 40000
-# Ranges to one anchor within a second say much the same where people carry the camera.
-_CELL_S = 1.0
-# Two descents that end this close, or within their stddevs, have found the same offset.
-_SAME_OFFSET_S = 0.25
-_SAME_OFFSET_STDDEVS = 5.0
-# An offset that puts fewer ranges on the path than this share of the best one's leaves much alone.
-_COVERING_SHARE = 0.7
 # So many of the ranges in bursts must stay at their photos for the offset not to matter.
 _MIN_SAME_SHARE = 0.95
 # Photos too far apart for ranges to be interpolated still show the motion: up to this many times their usual gap.
@@ -57,6 +50,8 @@ class TimeOffset:
         drift_is_followed: whether the drift is beyond doubt, so that ``at`` follows it.
         reference_s: radio's time at which the clocks differ by ``value_s``.
         note: what the user should know; None if nothing.
+        probability: that the value is the right offset and none of the rivals.
+        rivals: the other offsets that cannot be ruled out, the likeliest first.
     """
 
     value_s: float
@@ -69,6 +64,12 @@ class TimeOffset:
     drift_is_followed: bool
     reference_s: float
     note: str | None
+    probability: float = 1.0
+    rivals: tuple[Rival, ...] = ()
+
+    def of_rival(self, rival: Rival) -> TimeOffset:
+        """The same clocks at a rival's offset; a drift is that of the value alone."""
+        return replace(self, value_s=rival.value_s, drift_is_followed=False, probability=rival.probability, rivals=())
 
     def at(self, radio_times_s: Array) -> Array:
         """(n,) offsets at times of the radio's clock."""
@@ -101,7 +102,7 @@ def estimate_time_offset(
 
     Raises:
         InputError: log or photos have no times, or the log has more tags than lever arms.
-        GeometryError: the motion does not determine the offset.
+        GeometryError: the motion does not determine the offset, nor leaves the choice between a few.
     """
     if log.timestamp_s is None:
         raise InputError("the log has no timestamps, so that there is no time offset to find", log.source)
@@ -109,7 +110,7 @@ def estimate_time_offset(
         raise InputError("the photos have no times, so that there is no time offset to find: give image times")
     if len(trajectory) < _MIN_NUM_KEYFRAMES or not len(log):
         raise GeometryError(
-            f"{len(trajectory)} photos and {len(log)} ranges are too few to find the time offset by: {_REMEDY}"
+            f"{len(trajectory)} photos and {len(log)} ranges are too few to find the time offset by: {REMEDY}"
         )
     association = association or AssociationOptions()
     tags = lever_arms(log, tag_in_cam_m)
@@ -122,7 +123,8 @@ def estimate_time_offset(
             found = _offset_of_bursts(bursts, log, trajectory, tags, association)
             if found is not None:
                 return found
-        association = association.model_copy(update={"max_interpolation_gap_s": _MAX_GAPS * gap_s})
+    gap_s = max(_MAX_GAPS * gap_s, association.max_interpolation_gap_s)
+    association = association.model_copy(update={"max_interpolation_gap_s": gap_s})
     return _offset_of_motion(ranges, trajectory, tags, association, seed, progress or SilentProgress())
 
 
@@ -134,78 +136,55 @@ def _offset_of_motion(
     seed: int,
     progress: Progress,
 ) -> TimeOffset:
-    """Scan all offsets, descend from the best few, and make sure that one stands out."""
+    """Scan all offsets, descend from the best few, and see which of them are likely."""
     path = moving_path(trajectory, tags_in_cam_m, association)
     if np.count_nonzero(path.is_known) < 2:
-        raise GeometryError(f"no part of the path and the log can be compared to find the time offset: {_REMEDY}")
+        raise GeometryError(f"no part of the path and the log can be compared to find the time offset: {REMEDY}")
     scanned = scan_offsets(ranges, path)
+    # In one random order, so that different offsets are judged by the same ranges.
+    ranges = ranges.take(np.random.default_rng(seed).permutation(len(ranges.times_s)))
     candidates = scanned.peaks(_CANDIDATE_SEPARATION_S, _MAX_NUM_CANDIDATES)
     fits = []
     for num_done, offset_s in enumerate(candidates):
         progress.update(num_done, len(candidates))
-        near = ranges_on_path(ranges, path, offset_s, _NUM_RANGES_PER_CANDIDATE, seed)
+        near = ranges_on_path(ranges, path, offset_s, _NUM_RANGES_PER_CANDIDATE)
         if len(near.range_m):
-            fits.append(refine_offset(near, path, offset_s, _CELL_S))
+            fits.append(refine_offset(near, path, offset_s))
     progress.update(len(candidates), len(candidates))
-    best = _the_one_that_stands_out(fits, [_num_on_path(ranges, path, fit.offset_s) for fit in fits])
-    near = ranges_on_path(ranges, path, best.offset_s, _NUM_RANGES_OF_FINAL, seed)
-    clocks = fit_clocks(near, path, best.offset_s, _CELL_S)
-    final, timing = clocks.fit, clocks.timing
-    if not timing.stddev_s * timing.range_rate < final.residual_stddev_m:
+    if not any(fit.is_testable for fit in fits):
+        raise GeometryError(f"too few ranges along the camera's path to find the time offset by: {REMEDY}")
+    num_on_path = np.array([_num_on_path(ranges, path, fit.offset_s) for fit in fits])
+    (best, probability), *rivals = likely_fits(fits, num_on_path, path)
+    if not best.explains():
+        raise GeometryError(
+            "at no time offset do the ranges follow the camera's path (it hardly moves, its photos are "
+            f"too far apart, or the log belongs to other photos): {REMEDY}"
+        )
+    near = ranges_on_path(ranges, path, best.offset_s, _NUM_RANGES_OF_FINAL)
+    final, timing, drift, reference_s = fit_clocks(near, path, best.offset_s)
+    if not timing.stddev_s * np.sqrt(np.mean(final.rates**2)) < final.residual_stddev_m:
         raise GeometryError(
             f"the motion is too even to tell the time offset (about {final.offset_s:+.2f} s, "
-            f"stddev {timing.stddev_s:.2g} s): {_REMEDY}"
+            f"stddev {timing.stddev_s:.2g} s): {REMEDY}"
         )
-    drifts = clocks.followed_drift != 0
-    ranges = without_drift(ranges, clocks.followed_drift, clocks.reference_s)
     return TimeOffset(
         value_s=final.offset_s,
         stddev_s=timing.stddev_s,
-        curve=cost_curve(ranges, path, scanned, final, timing.stddev_s, _CELL_S),
-        num_ranges_on_path=_num_on_path(ranges, path, final.offset_s),
+        curve=cost_curve(final, path, timing.stddev_s),
+        num_ranges_on_path=_num_on_path(without_drift(ranges, drift, reference_s), path, final.offset_s),
         offset_matters=True,
-        drift=clocks.drift,
+        drift=drift or timing.drift,
         drift_stddev=timing.drift_stddev,
-        drift_is_followed=drifts,
-        reference_s=clocks.reference_s,
-        note=drift_note(clocks.drift, timing.drift_stddev, near.times_s) if drifts else None,
+        drift_is_followed=drift != 0,
+        reference_s=reference_s,
+        note=drift_note(drift, timing.drift_stddev, near.times_s) if drift else None,
+        probability=probability,
+        rivals=tuple(Rival(fit.offset_s, probability) for fit, probability in rivals),
     )
 
 
 def _num_on_path(ranges: TimedRanges, path: PathSamples, offset_s: float) -> int:
     return int(np.count_nonzero(path.knows(ranges.times_s + offset_s)))
-
-
-def _the_one_that_stands_out(fits: list[OffsetFit], num_on_path: list[int]) -> OffsetFit:
-    """The fit that explains most, if it does so beyond doubt.
-
-    Log and photos are usually meant to cover each other: an offset that leaves much more of
-    them alone is believed only if it fits better.
-    """
-    testable = [number for number, fit in enumerate(fits) if fit.is_testable]
-    if not testable:
-        raise GeometryError(f"too few ranges along the camera's path to find the time offset by: {_REMEDY}")
-    chosen = max(testable, key=lambda number: fits[number].score * num_on_path[number])
-    best = fits[chosen]
-    if not best.explains():
-        raise GeometryError(
-            "at no time offset do the ranges follow the camera's path (it hardly moves, its photos are "
-            f"too far apart, or the log belongs to other photos): {_REMEDY}"
-        )
-    same_s = max(_SAME_OFFSET_S, _SAME_OFFSET_STDDEVS * min(best.timing().stddev_s, 1.0))
-    for rival, num in zip(fits, num_on_path):
-        if abs(rival.offset_s - best.offset_s) > same_s:
-            covers = num >= _COVERING_SHARE * num_on_path[chosen]
-            if not (best.beats(rival) if covers else best.fits_better_than(rival)):
-                raise _ambiguity(best.offset_s, best.residual_stddev_m, rival.offset_s, rival.residual_stddev_m)
-    return best
-
-
-def _ambiguity(offset_s: float, stddev_m: float, other_offset_s: float, other_stddev_m: float) -> GeometryError:
-    return GeometryError(
-        f"the motion does not tell apart time offsets of {offset_s:+.2f} s and {other_offset_s:+.2f} s "
-        f"(residuals of {stddev_m:.2f} m and {other_stddev_m:.2f} m): {_REMEDY}"
-    )
 
 
 def _offset_of_bursts(
@@ -214,14 +193,12 @@ def _offset_of_bursts(
     """The offset that centres each burst on its photo; None if the camera did not stand still meanwhile."""
     pairings = pair_bursts(bursts, trajectory, tags_in_cam_m)
     best = pairings[0]
-    if not (best.is_testable and best.explains()):
+    if not best.explains():
         raise GeometryError(
             f"at no time offset do the {len(bursts.start_s)} bursts of ranges suit the {len(trajectory)} photos "
-            f"better than by chance: {_REMEDY}"
+            f"better than by chance: {REMEDY}"
         )
-    for rival in pairings[1:]:
-        if rival.is_testable and not best.beats(rival):
-            raise _ambiguity(best.offset_s, np.sqrt(best.variance), rival.offset_s, np.sqrt(rival.variance))
+    likely = likely_offsets([each.offset_s for each in pairings], [-best.log_odds(each) for each in pairings])
     earliest_s, latest_s = offsets_that_keep(best, bursts, trajectory)
     if earliest_s >= latest_s:
         return None
@@ -242,6 +219,8 @@ def _offset_of_bursts(
         reference_s=float(np.mean(bursts.middle_s)),
         note=f"the camera stands still at every photo: any time offset from {earliest_s:+.2f} s to {latest_s:+.2f} s "
         f"gives the same result; {value_s:+.2f} s centres the ranges on the photos",
+        probability=likely[0][1],
+        rivals=tuple(Rival(pairings[number].offset_s, probability) for number, probability in likely[1:]),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -13,8 +14,10 @@ from scipy.stats import t as student
 from rangesfm.arrays import Array
 from rangesfm.ranging.clock.path import PathSamples
 from rangesfm.ranging.clock.search import TimedRanges
-from rangesfm.ranging.clock.squares import MIN_RESIDUAL_M, SquaresFit, fit_squares, residual_stddev, rows_by_anchor
+from rangesfm.ranging.clock.squares import SquaresFit, fit_squares, residual_stddev, rows_by_anchor
 
+# Ranges to one anchor within a second say much the same where people carry the camera.
+_CELL_S = 1.0
 _MAX_NUM_STEPS = 12
 _MAX_STEP_S = 1.0
 _CONVERGED_STEP_S = 1e-4
@@ -33,9 +36,9 @@ _LONG_LOG_S = 240.0
 _MIN_LEFT_CURVATURE = 1e-6
 # The tag's delay makes all ranges read too long or too short by about this.
 _RANGE_BIAS_STDDEV_M = 0.05
-# A rival's mean log residual must exceed the best one's by this and by this many stddevs.
-_MIN_LEAD = 0.05
-_MIN_LEAD_STDDEVS = 3.0
+# The path explains the ranges if they are likelier on it by this many stddevs, as blocks of time have them: the best
+# of some hundred offsets of a log of another walk reaches 6, of Student's distribution with a dozen blocks.
+_MIN_GAIN_STDDEVS = 7.0
 
 
 class Timing(NamedTuple):
@@ -45,24 +48,11 @@ class Timing(NamedTuple):
         stddev_s: of the offset; infinite where the motion does not determine it.
         drift: what camera time gains on radio time, seconds a second.
         drift_stddev: of the drift.
-        range_rate: root mean square of the ranges' rate of change, m/s.
     """
 
     stddev_s: float
     drift: float
     drift_stddev: float
-    range_rate: float
-
-
-class _MeanLoss(NamedTuple):
-    """Mean Cauchy loss of residuals, and its variance if chance acts on blocks of time."""
-
-    mean: float
-    variance: float
-
-    def is_below(self, other: _MeanLoss) -> bool:
-        lead = other.mean - self.mean
-        return lead > _MIN_LEAD and lead > _MIN_LEAD_STDDEVS * np.sqrt(self.variance + other.variance)
 
 
 @dataclass(frozen=True)
@@ -88,11 +78,6 @@ class OffsetFit:
     rates: Array
 
     @property
-    def score(self) -> float:
-        """Natural log of how many times smaller the residuals are than the deviations (geometric means)."""
-        return float(np.mean(np.log(_at_least_tiny(self.deviations_m) / _at_least_tiny(self.residuals_m))))
-
-    @property
     def residual_stddev_m(self) -> float:
         return residual_stddev(self.residuals_m)
 
@@ -101,45 +86,43 @@ class OffsetFit:
         """Whether there are enough ranges to tell a fit from a coincidence."""
         return self.num_spare >= self.squares.num_unknowns
 
+    @cached_property
+    def losses(self) -> Array:
+        """(n,) negative log likelihood of each residual, up to a constant."""
+        return _losses(self.residuals_m)
+
+    @cached_property
+    def gains(self) -> Array:
+        """(n,) by how much each range's log likelihood is greater than if the camera stood still."""
+        return _losses(self.deviations_m) - self.losses
+
+    @property
+    def score(self) -> float:
+        """Mean gain: near the log of how many times smaller the residuals are than the deviations."""
+        return float(self.gains.mean())
+
+    @property
+    def num_independent(self) -> float:
+        """As many ranges that err each on its own say as much: errors that hang together vary more by block of time."""
+        variance = _variance_of_mean(self.losses, self.ranges.times_s)
+        return min(self.num_spare, float(np.var(self.losses)) / max(variance, 1e-300))
+
     def explains(self) -> bool:
         """Whether the path explains the ranges better than no motion at all."""
-        stddev_m = self.residual_stddev_m
-        return self._loss(self.residuals_m, stddev_m).is_below(self._loss(self.deviations_m, stddev_m))
-
-    def beats(self, rival: OffsetFit) -> bool:
-        """Whether, beyond doubt, the residuals are smaller than the rival's, or no larger while they explain more."""
-        stddev_m = self.residual_stddev_m
-        mine, other = self._loss(self.residuals_m, stddev_m), rival._loss(rival.residuals_m, stddev_m)
-        my_gain = self._loss(self.deviations_m, stddev_m, self.residuals_m)
-        other_gain = rival._loss(rival.deviations_m, stddev_m, rival.residuals_m)
-        return mine.is_below(other) or (mine.mean <= other.mean and other_gain.is_below(my_gain))
-
-    def fits_better_than(self, rival: OffsetFit) -> bool:
-        """Whether the residuals are smaller than the rival's, be it by chance."""
-        stddev_m = self.residual_stddev_m
-        return self._loss(self.residuals_m, stddev_m).mean < rival._loss(rival.residuals_m, stddev_m).mean
-
-    def _loss(self, errors_m: Array, stddev_m: float, less_errors_m: Array | None = None) -> _MeanLoss:
-        loss = 0.5 * np.log1p((errors_m / stddev_m) ** 2)
-        if less_errors_m is not None:
-            loss -= 0.5 * np.log1p((less_errors_m / stddev_m) ** 2)
-        block = _blocks(self.ranges.times_s)
-        mean = float(loss.mean())
-        excess = np.bincount(block, loss - mean)
-        return _MeanLoss(mean, float(excess @ excess) / len(loss) ** 2 * len(excess) / max(len(excess) - 1, 1))
+        least = _MIN_GAIN_STDDEVS * np.sqrt(_variance_of_mean(self.gains, self.ranges.times_s))
+        return bool(self.score > least)
 
     def timing(self) -> Timing:
         """Offset and drift with stddevs that allow for residuals correlated within blocks of time."""
         times = self.ranges.times_s - self.ranges.times_s.mean()
         own = self.squares.unexplained(np.stack([self.rates, self.rates * times], axis=1))
-        range_rate = float(np.sqrt(np.mean(self.rates**2)))
         if not _is_determined(own[:, 0], self.rates):
-            return Timing(np.inf, 0.0, np.inf, range_rate)
+            return Timing(np.inf, 0.0, np.inf)
         residuals = self.squares.weighted_residuals
         change = np.linalg.lstsq(own, residuals, rcond=None)[0]
         alone = self._variances(own[:, :1], residuals, times)
         both = self._variances(own, residuals - own @ change, times)
-        return Timing(float(np.sqrt(alone[0])), float(change[1]), float(np.sqrt(both[1])), range_rate)
+        return Timing(float(np.sqrt(alone[0])), float(change[1]), float(np.sqrt(both[1])))
 
     def _variances(self, own: Array, residuals: Array, times: Array) -> Array:
         """(k,) of the unknowns with columns ``own``, from chance and from a constant bias of all ranges."""
@@ -152,16 +135,15 @@ class OffsetFit:
         return np.asarray(np.mean(by_chance, axis=0) + by_bias**2)
 
 
-def refine_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, cell_s: float) -> OffsetFit:
+def refine_offset(ranges: TimedRanges, path: PathSamples, offset_s: float) -> OffsetFit:
     """Descend from an offset to the nearest one that explains the ranges best (Gauss-Newton).
 
     Args:
         ranges: (nearly) all are on the path at that offset.
         path: of a moving camera.
         offset_s: to start from.
-        cell_s: ranges to one anchor within such a time count as one measurement.
     """
-    found = fit_at_offset(ranges, path, offset_s, cell_s)
+    found = fit_at_offset(ranges, path, offset_s)
     for num_steps in range(_MAX_NUM_STEPS):
         own = found.squares.unexplained(found.rates[:, None])[:, 0]
         if not _is_determined(own, found.rates):
@@ -173,13 +155,11 @@ def refine_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, cell_
         offset_s = found.offset_s + float(np.clip(step_s, -_MAX_STEP_S, _MAX_STEP_S))
         if np.mean(path.knows(ranges.times_s + offset_s)) < _MIN_KEPT_SHARE:
             break
-        found = fit_at_offset(ranges, path, offset_s, cell_s, found.squares.scale)
+        found = fit_at_offset(ranges, path, offset_s, found.squares.scale)
     return found
 
 
-def fit_at_offset(
-    ranges: TimedRanges, path: PathSamples, offset_s: float, cell_s: float, scale: float = np.inf
-) -> OffsetFit:
+def fit_at_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, scale: float = np.inf) -> OffsetFit:
     """Fit the ranges that an offset puts on the path.
 
     Args:
@@ -191,15 +171,23 @@ def fit_at_offset(
     deviations = ranges.range_m.copy()
     for rows in rows_by_anchor(ranges.anchor):
         deviations[rows] -= np.median(deviations[rows])
-    num_cells = np.unique(np.stack([np.floor(ranges.times_s / cell_s), ranges.anchor]), axis=1).shape[1]
+    num_cells = np.unique(np.stack([np.floor(ranges.times_s / _CELL_S), ranges.anchor]), axis=1).shape[1]
     num_spare = num_cells - squares.num_unknowns - 1
     residuals = squares.residuals_m * np.sqrt(num_cells / max(num_spare, 0.5))
     rates = np.einsum("ni,ni->n", squares.gradient, velocities)
     return OffsetFit(offset_s, ranges, squares, residuals, num_spare, deviations, rates)
 
 
-def _at_least_tiny(values: Array) -> Array:
-    return np.maximum(np.abs(values), MIN_RESIDUAL_M)
+def _losses(errors_m: Array) -> Array:
+    """(n,) negative log likelihoods: Cauchy of the errors' own size, so that errors twice as large lose log 2."""
+    stddev_m = residual_stddev(errors_m)
+    return np.asarray(np.log(stddev_m) + np.log1p((errors_m / stddev_m) ** 2))
+
+
+def _variance_of_mean(values: Array, times: Array) -> float:
+    """Of n values if chance acts on blocks of time."""
+    sums = np.bincount(_blocks(times, max(_MIN_NUM_BLOCKS, int(np.ptp(times) / _BLOCK_S))), values - values.mean())
+    return float(sums @ sums) / len(values) ** 2 * len(sums) / max(len(sums) - 1, 1)
 
 
 def _is_determined(own: Array, rates: Array) -> bool:
@@ -207,10 +195,10 @@ def _is_determined(own: Array, rates: Array) -> bool:
     return bool(own @ own > _MIN_OWN_RATE**2 * (rates @ rates))
 
 
-def _blocks(times: Array) -> npt.NDArray[np.int64]:
+def _blocks(times: Array, num_blocks: int) -> npt.NDArray[np.int64]:
     """(n,) number of the block of time each range falls into, without gaps."""
-    block_s = max(min(_BLOCK_S, float(np.ptp(times)) / _MIN_NUM_BLOCKS), 1e-9)
-    return np.unique(np.floor((times - times.min()) / block_s), return_inverse=True)[1]
+    length_s = max(float(np.ptp(times)) / num_blocks, 1e-9)
+    return np.unique(np.minimum((times - times.min()) // length_s, num_blocks - 1), return_inverse=True)[1]
 
 
 def _jackknife_variances(own: Array, residuals: Array, squares: SquaresFit, times: Array, num_blocks: int) -> Array:
@@ -232,8 +220,7 @@ def _jackknife_variances(own: Array, residuals: Array, squares: SquaresFit, time
     curved = columns * (2 * squares.weights - 1)[:, None]
     gradients = columns * residuals[:, None]
     curvature = columns.T @ curved
-    length_s = max(float(np.ptp(times)) / num_blocks, 1e-9)
-    block = np.unique(np.minimum((times - times.min()) // length_s, num_blocks - 1), return_inverse=True)[1]
+    block = _blocks(times, num_blocks)
     num = int(block.max()) + 1
     changes = np.zeros((num, own.shape[1]))
     for number in range(num):

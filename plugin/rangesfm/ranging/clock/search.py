@@ -1,13 +1,12 @@
 """How well every offset of the clocks explains the ranges: all of them at once, by correlation.
 
-The sums in the normal equations of the linear fit (see ``clock_squares``) at every offset
+The sums in the normal equations of the linear fit (see ``squares``) at every offset
 are correlations in time of the ranges with products of |c|^2, c and 1 along the path, so that
 fast Fourier transforms give the best fit at all offsets in one pass.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -19,7 +18,7 @@ from scipy.ndimage import maximum_filter1d
 from rangesfm.arrays import Array
 from rangesfm.geometry.similarity import rounding_of
 from rangesfm.ranging.clock.path import PathSamples
-from rangesfm.ranging.clock.squares import MIN_RANGE_M
+from rangesfm.ranging.clock.squares import MIN_RANGE_M, rows_by_anchor
 
 # An offset that puts fewer ranges on the path than this share of the most possible is not tried.
 _MIN_COVERAGE = 0.5
@@ -42,12 +41,9 @@ class TimedRanges(NamedTuple):
         return TimedRanges(self.times_s[rows], self.range_m[rows], self.anchor[rows], self.tag[rows])
 
 
-def ranges_on_path(ranges: TimedRanges, path: PathSamples, offset_s: float, max_num: int, seed: int) -> TimedRanges:
-    """At most so many of the ranges that an offset puts on the path, at random."""
-    rows = np.flatnonzero(path.knows(ranges.times_s + offset_s))
-    if len(rows) > max_num:
-        rows = np.sort(np.random.default_rng(seed).permutation(rows)[:max_num])
-    return ranges.take(rows)
+def ranges_on_path(ranges: TimedRanges, path: PathSamples, offset_s: float, max_num: int) -> TimedRanges:
+    """The first ranges that an offset puts on the path, at most so many."""
+    return ranges.take(np.flatnonzero(path.knows(ranges.times_s + offset_s))[:max_num])
 
 
 @dataclass(frozen=True)
@@ -58,12 +54,12 @@ class OffsetCurve:
         offsets_s: (m,) increasing; only those that put a fair share of the ranges on the path.
         scores: (m,) natural log of how many times smaller the residuals on the path are than
             the ranges' own variation there; 0 explains nothing.
-        num_on_path: (m,) ranges on the path.
+        costs_m: (m,) root mean square of the residuals.
     """
 
     offsets_s: Array
     scores: Array
-    num_on_path: Array
+    costs_m: Array
 
     def peaks(self, separation_s: float, max_num: int) -> list[float]:
         """The offsets whose score is the highest within ``separation_s``, best first."""
@@ -76,39 +72,39 @@ class OffsetCurve:
         return list(map(float, self.offsets_s[best]))
 
 
-def scan_offsets(ranges: TimedRanges, path: PathSamples) -> OffsetCurve:
+def scan_offsets(ranges: TimedRanges, path: PathSamples, weights: Array | None = None) -> OffsetCurve:
     """Try every offset at which log and path overlap; the lever arm changes little at this resolution.
 
     Args:
         ranges: of all anchors, in any order.
         path: with some pose known.
+        weights: (n,) of the ranges; None: all weigh the same.
     """
-    scanned: list[tuple[Array, Array, Array]] = []
+    weights = np.ones(len(ranges.range_m)) if weights is None else weights
+    scanned: list[tuple[Array, Array, Array, Array]] = []
     most = 0.0
-    for part in sorted(_parts(ranges, len(path) * path.step_s), key=lambda part: -len(part.range_m)):
-        if len(part.range_m) < _MIN_COVERAGE * most:
+    for rows in sorted(_parts(ranges.times_s, len(path) * path.step_s), key=len, reverse=True):
+        if len(rows) < _MIN_COVERAGE * most:
             break
-        scanned.append(_scan(part, path))
-        most = max(most, float(scanned[-1][2].max()))
-    offsets, scores, num_on_path = (np.concatenate(column) for column in zip(*scanned))
+        scanned.append(_scan(ranges.take(rows), weights[rows], path))
+        most = max(most, float(scanned[-1][0].max()))
+    num_on_path, offsets, scores, costs = (np.concatenate(column) for column in zip(*scanned))
     tried = np.flatnonzero(num_on_path >= max(1.0, _MIN_COVERAGE * most))
     order = tried[np.argsort(offsets[tried], kind="stable")]
-    return OffsetCurve(offsets[order], scores[order], num_on_path[order])
+    return OffsetCurve(offsets[order], scores[order], costs[order])
 
 
-def _parts(ranges: TimedRanges, path_span_s: float) -> Iterator[TimedRanges]:
-    """The log cut where its pauses are longer than the path: no offset puts both sides on it.
+def _parts(times: Array, path_span_s: float) -> list[npt.NDArray[np.int64]]:
+    """The log's rows, cut where its pauses are longer than the path: no offset puts both sides on it.
 
     A clock that starts at zero and is set to the date later costs nothing so.
     """
-    order = np.argsort(ranges.times_s, kind="stable")
-    pauses = np.flatnonzero(np.diff(ranges.times_s[order]) > path_span_s) + 1
-    for rows in np.split(order, pauses):
-        yield ranges.take(rows)
+    order = np.argsort(times, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(times[order]) > path_span_s) + 1)
 
 
-def _scan(ranges: TimedRanges, path: PathSamples) -> tuple[Array, Array, Array]:
-    """(m,) offsets, scores and numbers on the path of one part of the log."""
+def _scan(ranges: TimedRanges, weights: Array, path: PathSamples) -> tuple[Array, Array, Array, Array]:
+    """(m,) numbers on the path (sums of weights), offsets, scores and costs of one part of the log."""
     first_s, last_s = float(ranges.times_s.min()), float(ranges.times_s.max())
     span_s = len(path) * path.step_s + last_s - first_s
     stride = max(1, round(max(_STEP_S, span_s / _MAX_NUM_STEPS) / path.step_s))
@@ -118,16 +114,15 @@ def _scan(ranges: TimedRanges, path: PathSamples) -> tuple[Array, Array, Array]:
     correlate = _Correlation(len(columns), int(cell.max()) + 1)
     products = {(i, j): correlate.transform(columns[:, i] * columns[:, j]) for i, j in _PAIRS}
 
-    sums = _Sums.zero(correlate.num_offsets)
-    for anchor in np.unique(ranges.anchor):
-        mine = ranges.anchor == anchor
-        sums = sums.plus(_sums_of_anchor(ranges.range_m[mine], cell[mine], products, correlate))
-    scale_squared = np.maximum(sums.cross, 0.0) / np.maximum(sums.column, 1e-12)
-    residual = sums.without - 2 * scale_squared * sums.cross + scale_squared**2 * sums.column
-    floor = 1e-12 * max(float(sums.variation.max()), 1e-300)
-    scores = 0.5 * np.log(np.maximum(sums.variation, floor) / np.maximum(residual, floor))
-    offsets = path.start_s - first_s + step_s * np.arange(1 - correlate.num_cells, len(columns))
-    return offsets.astype(np.float64), scores.astype(np.float64), np.rint(sums.num).astype(np.float64)
+    sums = np.zeros((5, correlate.num_offsets))
+    for rows in rows_by_anchor(ranges.anchor):
+        sums += _sums_of_anchor(ranges.range_m[rows], weights[rows], cell[rows], products, correlate)
+    num, variation, without, column, cross = sums
+    scale_squared = np.maximum(cross, 0.0) / np.maximum(column, 1e-12)
+    floor = 1e-12 * max(float(variation.max()), 1e-300)
+    residual = np.maximum(without - 2 * scale_squared * cross + scale_squared**2 * column, floor)
+    offsets = path.start_s - first_s + step_s * np.arange(1.0 - correlate.num_cells, len(columns))
+    return num, offsets, 0.5 * np.log(np.maximum(variation, floor) / residual), np.sqrt(residual / np.maximum(num, 1.0))
 
 
 def _columns(path: PathSamples, stride: int) -> Array:
@@ -159,59 +154,42 @@ class _Correlation:
         return np.concatenate([around[self._size - self.num_cells + 1 :], around[: self.num_samples]])
 
 
-class _Sums(NamedTuple):
-    """At each of m offsets, over the ranges on the path.
-
-    Attributes:
-        num: how many.
-        variation: squared deviation of the ranges from their anchor's mean.
-        without: that which c and 1 leave of it.
-        column: square of what they leave of the column |c|^2.
-        cross: product of what they leave of both.
-    """
-
-    num: Array
-    variation: Array
-    without: Array
-    column: Array
-    cross: Array
-
-    @classmethod
-    def zero(cls, m: int) -> _Sums:
-        return cls(*np.zeros((5, m)))
-
-    def plus(self, other: _Sums) -> _Sums:
-        return _Sums(*(mine + theirs for mine, theirs in zip(self, other)))
-
-
 def _sums_of_anchor(
     range_m: Array,
+    weights: Array,
     cell: npt.NDArray[np.int64],
     products: dict[tuple[int, int], npt.NDArray[np.complex128]],
     correlate: _Correlation,
-) -> _Sums:
+) -> Array:
+    """(5, num_offsets) sums over the ranges on the path.
+
+    How many they are; their squared deviation from the anchor's mean; that which c and 1 leave of it; the square of
+    what these leave of the column |c|^2; the product of what they leave of both.
+    """
     squared = range_m**2 - np.median(range_m**2)
     # The derivative of rho^2 turns residuals back into metres.
-    weight = 1 / (2 * np.maximum(range_m, MIN_RANGE_M)) ** 2
+    weight = weights / (2 * np.maximum(range_m, MIN_RANGE_M)) ** 2
 
     def cells(values: Array) -> npt.NDArray[np.complex128]:
         return correlate.transform(np.bincount(cell, values, minlength=correlate.num_cells).astype(np.float64))
 
-    weights, weighted = cells(weight), cells(weight * squared)
+    own_weights, weighted = cells(weight), cells(weight * squared)
     normal = np.empty((correlate.num_offsets, _NUM_COLUMNS, _NUM_COLUMNS))
     for i, j in _PAIRS:
-        normal[:, i, j] = normal[:, j, i] = correlate(products[i, j], weights)
+        normal[:, i, j] = normal[:, j, i] = correlate(products[i, j], own_weights)
     right = np.stack([correlate(products[i, 4], weighted) for i in range(_NUM_COLUMNS)], axis=1)
     total = correlate(products[4, 4], cells(weight * squared**2))
-    num = correlate(products[4, 4], cells(np.ones(len(cell))))
+    num = correlate(products[4, 4], cells(weights))
 
     # The anchor's own unknowns are eliminated; what they leave adds up over the anchors.
     own = normal[:, 1:, 1:] + (1e-6 * normal[:, 4, 4] + 1e-9 * weight.sum())[:, None, None] * np.eye(4)
     solved = np.linalg.solve(own, np.stack([normal[:, 1:, 0], right[:, 1:]], axis=2))
-    return _Sums(
-        num,
-        np.maximum(total - right[:, 4] ** 2 / own[:, 3, 3], 0.0),
-        total - np.einsum("mi,mi->m", right[:, 1:], solved[:, :, 1]),
-        normal[:, 0, 0] - np.einsum("mi,mi->m", normal[:, 1:, 0], solved[:, :, 0]),
-        right[:, 0] - np.einsum("mi,mi->m", normal[:, 1:, 0], solved[:, :, 1]),
+    return np.stack(
+        [
+            num,
+            np.maximum(total - right[:, 4] ** 2 / own[:, 3, 3], 0.0),
+            total - np.einsum("mi,mi->m", right[:, 1:], solved[:, :, 1]),
+            normal[:, 0, 0] - np.einsum("mi,mi->m", normal[:, 1:, 0], solved[:, :, 0]),
+            right[:, 0] - np.einsum("mi,mi->m", normal[:, 1:, 0], solved[:, :, 1]),
+        ]
     )

@@ -20,6 +20,7 @@ from rangesfm.ranging.readers.reader import Reader, ReadOptions
 _BY_TIME = Columns(
     required={"timestamp": "timestamp_s", "anchor_id": "anchor_id", "range": "range_m"},
     optional={"tag_id": "tag_id", "range_stddev": "range_stddev_m", "los": "los"},
+    is_strict=True,
 )
 _BY_IMAGE = replace(_BY_TIME, required={"image_name": "image_name", "anchor_id": "anchor_id", "range": "range_m"})
 
@@ -52,7 +53,8 @@ def write_ranges_csv(log: RangeLog, path: str | Path) -> None:
 
 
 def _recognizes(head: str) -> bool:
-    return not {"anchor_id", "range_m"}.isdisjoint(header_names(head))
+    names = {*header_names(head)}
+    return {"anchor_id", "range_m"} <= names and not names.isdisjoint({"timestamp_s", "image_name"})
 
 
 def _read(path: Path, options: ReadOptions) -> RangeLog:
@@ -60,7 +62,7 @@ def _read(path: Path, options: ReadOptions) -> RangeLog:
         raise InputError("the canonical CSV has fixed columns in seconds and metres; use format 'mapped'", path)
     names = header_names(read_head(path), options.separator)
     columns = _BY_IMAGE if "image_name" in names and "timestamp_s" not in names else _BY_TIME
-    return read_columns(path, replace(columns, separator=options.separator), READER.name)
+    return read_columns(path, replace(columns, separator=options.separator), options, READER.name)
 
 
 READER = Reader("canonical", "CSV with the columns timestamp_s (or image_name), anchor_id, range_m", _recognizes, _read)

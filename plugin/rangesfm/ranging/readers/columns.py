@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from itertools import compress
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import InputError
-from rangesfm.files.tables import Table, read_table
+from rangesfm.files.tables import Categories, Table, read_table
 from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
-from rangesfm.ranging.readers.time_units import SECONDS_PER_UNIT, seconds_from_iso
+from rangesfm.ranging.readers.layout import MISSING
+from rangesfm.ranging.readers.reader import ReadOptions
+from rangesfm.ranging.readers.time_units import SECONDS_PER_UNIT, TIME_OF_DAY, CivilClock, is_zoned
+from rangesfm.ranging.readers.units import UNITS_PER_METRE, UnclearUnitError, range_unit, time_unit
 from rangesfm.ranging.twr import StampOptions, double_sided_range, single_sided_range
 
-UNITS_PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 STAMPS = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
-QUANTITIES = ("timestamp", "image_name", "anchor_id", "range", "tag_id", "range_stddev", "los", *STAMPS)
+QUANTITIES = (
+    *("timestamp", "date", "nanoseconds", "image_name", "anchor_id", "range", "tag_id", "antenna", "range_stddev"),
+    *("los", "nlos", *STAMPS),
+)
 
-_TEXTS = ("image_name", "anchor_id", "tag_id")
-_EXPECTED_RANGE = "a positive number{unit}; 0 means no measurement"
+_NOTHING = 1e-12  # in any unit
+_TEXTS = ("image_name", "date", "anchor_id", "tag_id", "antenna")
 
 
 @dataclass(frozen=True)
@@ -29,80 +35,168 @@ class Columns:
     """Where a table has what a log needs.
 
     Attributes:
-        required: name in the file of each of QUANTITIES that it must have: anchor_id, range (or the first
-            four of STAMPS instead) and one of timestamp and image_name.
+        required: name in the file of each of QUANTITIES that it must have: range (or the first four of STAMPS
+            instead, or ``wide``) and one of timestamp and image_name.
         optional: the same for those that it may have.
-        timestamp_unit: one of TIMESTAMP_UNITS.
-        range_unit: one of UNITS_PER_METRE, also of range_stddev.
+        wide: names of columns of ranges that each are of one anchor and one tag, with the ids of these.
+        anchor_id: of all ranges, where neither a column nor ``wide`` says it.
+        timestamp_unit: one of TIMESTAMP_UNITS; None: by its name and its values.
+        range_unit: one of UNITS_PER_METRE, also of range_stddev; None: by its name and its values.
         separator: between cells; None: told from the header row.
-        header: names of all columns where the file's own header row is a comment; needs the separator.
-        negative_is_no_measurement: as 0 is, and as an empty cell is then; otherwise they are errors.
+        header: names of all columns where the file has no such row, or not as its first; needs the separator.
+        num_skipped: lines before the first row, where ``header`` is given.
+        decimal_comma: numbers have a comma for a point.
+        is_strict: a cell of ranges is a number, and ids are taken to the letter; otherwise it may also be empty (no
+            measurement), and 1.000 is the id 1.
         stamps: how time stamps become ranges, where there is no range.
+        notes: how all this was found.
     """
 
     required: Mapping[str, str]
-    optional: Mapping[str, str]
-    timestamp_unit: str = "s"
-    range_unit: str = "m"
+    optional: Mapping[str, str] = field(default_factory=dict)
+    wide: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    anchor_id: str | None = None
+    timestamp_unit: str | None = None
+    range_unit: str | None = None
     separator: str | None = None
     header: tuple[str, ...] | None = None
-    negative_is_no_measurement: bool = False
+    num_skipped: int = 0
+    decimal_comma: bool = False
+    is_strict: bool = False
     stamps: StampOptions = field(default_factory=StampOptions)
+    notes: tuple[str, ...] = ()
 
 
-def read_columns(path: Path, columns: Columns, format: str) -> RangeLog:
+def read_columns(path: Path, columns: Columns, options: ReadOptions, format: str) -> RangeLog:
     """Read a log off the named columns.
 
     Args:
+        options: what the user said, for the command that asks for a unit.
         format: name of the reader, for the record.
 
     Raises:
-        InputError: with the line, for whatever is not a time, an id or a range; also if no range is left.
+        InputError: with the line, for whatever is not a time, an id or a range; also if no range is left, or if a
+            unit may be one or another.
     """
     named = {**columns.optional, **columns.required}
     table = read_table(
         path,
-        [*columns.required.values()],
+        [*columns.required.values(), *columns.wide],
         [*columns.optional.values()],
         text=[named[key] for key in _TEXTS if key in named],
         separator=columns.separator,
         header=columns.header,
+        num_skipped=columns.num_skipped,
+        decimal_comma=columns.decimal_comma,
     )
     name = {key: column for key, column in named.items() if column in table}
-    ranges = _ranges(table, name["range"], columns) if "range" in name else _ranges_by_stamps(table, name, columns)
-    timestamps = _timestamps(table, name["timestamp"], columns.timestamp_unit) if "timestamp" in name else None
+    notes = [*columns.notes]
+    with _asking("timestamp", path, options):
+        timestamps = _timestamps(table, name, columns.timestamp_unit, notes) if "timestamp" in name else None
     image_name = table.text(name["image_name"]) if timestamps is None else None
-    anchor = table.categories(name["anchor_id"])
-    tag = table.categories(name["tag_id"], empty=DEFAULT_TAG_ID) if "tag_id" in name else None
-    stddevs = _stddevs(table, name["range_stddev"], columns) if "range_stddev" in name else None
-    los = _line_of_sight(table, name["los"]) if "los" in name else None
-    measured = ranges > 0
+    num_ends = max(1, len(columns.wide))
+    row = np.repeat(np.arange(len(table)), num_ends)
+    anchor, tag = _anchors(table, name, columns), _tags(table, name, columns)
+    ranges = _ranges(table, name, columns)
+    measured = ranges > _NOTHING
     if not np.any(measured):
-        said = f"all {len(table)} records say that there was no measurement" if len(table) else "no records"
+        said = f"all {len(ranges)} records say that there was no measurement" if len(ranges) else "no records"
         raise InputError(f"no usable range: {said}", path)
+    row, ranges, anchor = row[measured], ranges[measured], anchor.subset(measured)
+    tag = None if tag is None else tag.subset(measured)
+    times = None if timestamps is None else timestamps[row]
+    unit: str | None = "m"
+    if "range" in name or columns.wide:
+        with _asking("range", path, options):
+            pair = anchor.index if tag is None else anchor.index * len(tag.names) + tag.index
+            column = name.get("range") or next(iter(columns.wide))
+            unit = columns.range_unit or _noted(notes, range_unit(column, ranges, times, pair))
+    per_metre = UNITS_PER_METRE[unit or "m"]
+    stddevs = _stddevs(table, name["range_stddev"], per_metre) if "range_stddev" in name else None
+    los = _line_of_sight(table, name) if {"los", "nlos"} & set(name) else None
     return RangeLog.from_arrays(
-        anchor.subset(measured),
-        ranges[measured],
-        timestamp_s=None if timestamps is None else timestamps[measured],
-        image_name=None if image_name is None else list(compress(image_name, measured.tolist())),
-        range_stddev_m=None if stddevs is None else stddevs[measured],
-        tag_id=None if tag is None else tag.subset(measured),
-        los=None if los is None else los[measured],
-        line=table.line[measured],
+        anchor,
+        ranges / per_metre,
+        timestamp_s=times,
+        image_name=None if image_name is None else [image_name[k] for k in row.tolist()],
+        range_stddev_m=None if stddevs is None else stddevs[row],
+        tag_id=tag,
+        los=None if los is None else los[row],
+        line=table.line[row],
         source=path,
         format=format,
         num_no_measurement=int(np.count_nonzero(~measured)),
+        notes=tuple(notes),
     )
 
 
-def _ranges(table: Table, column: str, columns: Columns) -> npt.NDArray[np.float64]:
-    unit = " of metres" if columns.range_unit == "m" else f" of {columns.range_unit}"
-    expected = _EXPECTED_RANGE.format(unit=unit)
-    may_be_missing = columns.negative_is_no_measurement
-    ranges = table.numbers(column, empty=0.0 if may_be_missing else None, expected=expected)
-    if not may_be_missing and np.any(ranges < 0):
-        raise table.error(int(np.argmax(ranges < 0)), column, expected)
-    return ranges / UNITS_PER_METRE[columns.range_unit]
+@contextmanager
+def _asking(quantity: str, path: Path, options: ReadOptions) -> Iterator[None]:
+    """Ask the user for a unit that may be one or another, with the commands that say it."""
+    try:
+        yield
+    except UnclearUnitError as doubt:
+        flag = f"{quantity}_unit"
+        message = f"the {quantity} has {doubt}, which may be {' or '.join(doubt.units)}; say which by --{flag}"
+        raise InputError(
+            message, path, advice=[options.command(path, **{flag: unit}) for unit in doubt.units]
+        ) from None
+
+
+def _noted(notes: list[str], unit_and_note: tuple[str, str | None]) -> str:
+    unit, note = unit_and_note
+    notes += [] if note is None else [note]
+    return unit
+
+
+def _anchors(table: Table, name: Mapping[str, str], columns: Columns) -> Categories:
+    if columns.wide:
+        return _repeated([anchor_id for anchor_id, _ in columns.wide.values()], len(table))
+    if "anchor_id" not in name:
+        return _repeated([columns.anchor_id or ""], len(table))
+    return _ids(table, name["anchor_id"], columns, None)
+
+
+def _tags(table: Table, name: Mapping[str, str], columns: Columns) -> Categories | None:
+    """Tags with several antennas are one for each."""
+    if columns.wide and "tag_id" not in name:
+        return _repeated([tag_id or DEFAULT_TAG_ID for _, tag_id in columns.wide.values()], len(table))
+    tag = _ids(table, name["tag_id"], columns, DEFAULT_TAG_ID) if "tag_id" in name else None
+    if tag is not None and "antenna" in name:
+        antenna = _ids(table, name["antenna"], columns, "")
+        if len(antenna.names) > 1:
+            pairs = zip(tag.index.tolist(), antenna.index.tolist())
+            tag = Categories.of([f"{tag.names[one]}/{antenna.names[other]}" for one, other in pairs])
+    if tag is not None and columns.wide:
+        return Categories(tag.names, np.repeat(tag.index, len(columns.wide)))
+    return tag
+
+
+def _repeated(ids: list[str], num_rows: int) -> Categories:
+    """The same ids in every row."""
+    each = Categories.of(ids)
+    return Categories(each.names if num_rows else (), np.tile(each.index, num_rows))
+
+
+def _ids(table: Table, column: str, columns: Columns, empty: str | None) -> Categories:
+    ids = table.categories(column, empty=empty)
+    if columns.is_strict or not all(
+        re.fullmatch(r"\d{1,18}(?:\.\d*(?:[eE][+-]?0{0,3}\d{1,2})?)?", name) for name in ids.names
+    ):
+        return ids
+    whole = [str(int(float(name))) if float(name) == int(float(name)) else name for name in ids.names]
+    merged = Categories.of(whole)
+    return Categories(merged.names, merged.index[ids.index])
+
+
+def _ranges(table: Table, name: Mapping[str, str], columns: Columns) -> npt.NDArray[np.float64]:
+    """(n,) in the unit of the file, those of a row after each other; not positive: no measurement."""
+    if "range" not in name and not columns.wide:
+        return _ranges_by_stamps(table, name, columns)
+    unit = " of metres" if columns.range_unit in (None, "m") else f" of {columns.range_unit}"
+    empty, expected = None if columns.is_strict else 0.0, f"a positive number{unit}; 0 means no measurement"
+    names = columns.wide or [name["range"]]
+    return np.column_stack([table.numbers(k, empty=empty, missing=MISSING, expected=expected) for k in names]).ravel()
 
 
 def _ranges_by_stamps(table: Table, name: Mapping[str, str], columns: Columns) -> npt.NDArray[np.float64]:
@@ -119,30 +213,47 @@ def _ranges_by_stamps(table: Table, name: Mapping[str, str], columns: Columns) -
     return np.nan_to_num(ranges, nan=0.0)
 
 
-def _timestamps(table: Table, column: str, unit: str) -> npt.NDArray[np.float64]:
-    if unit != "iso":
-        return table.numbers(column, expected=f"a time in {unit}") * SECONDS_PER_UNIT[unit]
-    seconds = np.empty(len(table))
-    for row, cell in enumerate(table.text(column)):
+def _timestamps(table: Table, name: Mapping[str, str], unit: str | None, notes: list[str]) -> npt.NDArray[np.float64]:
+    column = name["timestamp"]
+    if unit == "iso" or "date" in name or (unit is None and not table.begins_with_number(column)):
+        return _civil_times(table, name, notes)
+    times = table.numbers(column, expected=f"a time in {unit or 's'}")
+    if unit is None:
+        unit = _noted(notes, time_unit(column, times))
+    seconds = times * SECONDS_PER_UNIT[unit]
+    return seconds + 1e-9 * table.numbers(name["nanoseconds"]) if "nanoseconds" in name else seconds
+
+
+def _civil_times(table: Table, name: Mapping[str, str], notes: list[str]) -> npt.NDArray[np.float64]:
+    texts = table.text(name["timestamp"])
+    if "date" in name:
+        texts = [f"{date} {time}" for date, time in zip(table.text(name["date"]), texts)]
+    clock, seconds = CivilClock(), np.empty(len(table))
+    for row, text in enumerate(texts):
         try:
-            seconds[row] = seconds_from_iso(cell)
+            seconds[row] = clock.seconds(text)
         except ValueError:
-            raise table.error(row, column, "a time as 2026-01-31T12:00:00.000Z") from None
+            raise table.error(row, name["timestamp"], "a time as 2026-01-31T12:00:00.000Z") from None
+    if texts and TIME_OF_DAY.fullmatch(texts[0]):
+        notes.append("times of day without a date: counted from the midnight before the first")
+    elif any(text and not is_zoned(text) for text in texts):
+        notes.append("civil times without a zone are read as UTC")
     return seconds
 
 
-def _stddevs(table: Table, column: str, columns: Columns) -> npt.NDArray[np.float64]:
+def _stddevs(table: Table, column: str, per_metre: float) -> npt.NDArray[np.float64]:
     expected = "a positive number or nothing"
-    stddevs = table.numbers(column, empty=np.nan, expected=expected) / UNITS_PER_METRE[columns.range_unit]
+    stddevs = table.numbers(column, empty=np.nan, expected=expected) / per_metre
     if np.any(stddevs <= 0):
         raise table.error(int(np.argmax(stddevs <= 0)), column, expected)
     return stddevs
 
 
-def _line_of_sight(table: Table, column: str) -> npt.NDArray[np.int8]:
+def _line_of_sight(table: Table, name: Mapping[str, str]) -> npt.NDArray[np.int8]:
+    column = name.get("los") or name["nlos"]
     expected = "1 (line of sight), 0 (none) or nothing"
     los = table.numbers(column, empty=-1.0, expected=expected)
     wrong = ~np.isin(los, (0.0, 1.0)) & (np.array(table.text(column, empty="")) != "")
     if np.any(wrong):
         raise table.error(int(np.argmax(wrong)), column, expected)
-    return los.astype(np.int8)
+    return np.where(los < 0, -1, los if "los" in name else 1 - los).astype(np.int8)

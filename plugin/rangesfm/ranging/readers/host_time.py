@@ -7,17 +7,20 @@ from pathlib import Path
 
 from rangesfm.errors import InputError
 from rangesfm.ranging.readers.reader import ReadOptions
-from rangesfm.ranging.readers.time_units import ISO_TIME, SECONDS_PER_UNIT, TIMESTAMP_UNITS, seconds_from_iso
+from rangesfm.ranging.readers.time_units import (
+    ISO_TIME,
+    SECONDS_PER_UNIT,
+    TIME_OF_DAY,
+    TIMESTAMP_UNITS,
+    CivilClock,
+    unit_by_digits,
+)
 
-_DAY_S = 86400.0
-_TIME_OF_DAY = re.compile(r"(?<![\d:])([01]?\d|2[0-3]):([0-5]\d):([0-5]\d(?:[.,]\d{1,9})?)(?![\d:])", re.ASCII)
-_NUMBER = re.compile(r"(?<![\w.+-])-?\d{1,19}(?:\.\d{1,12})?(?![\w.-]|:\d)", re.ASCII)
-# Of a time since 1970, the digits tell the unit: 1e11 s are three thousand years, 1e11 ms are three.
-_UNIT_ABOVE = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
+_NUMBER = re.compile(r"(?<![\w.+-])-?\d{1,19}(?:\.\d{1,18})?(?![\w.-]|:\d)", re.ASCII)
 
 
 class HostClock:
-    """Reads the times of one log; a time of day goes on counting after midnight."""
+    """Reads the times of one log."""
 
     def __init__(self, path: Path, options: ReadOptions):
         if options.timestamp_unit not in (None, *TIMESTAMP_UNITS):
@@ -25,25 +28,20 @@ class HostClock:
             raise InputError(f"timestamp_unit is '{options.timestamp_unit}', expected one of {expected}", path)
         self._path = path
         self._unit = options.timestamp_unit
-        self._days = 0
-        self._last_of_day_s = 0.0
+        self._civil = CivilClock()
 
     def find_seconds(self, prefix: str) -> float | None:
         """The time in ``prefix``: ISO 8601, a time of day, or a number of seconds, ms, us or ns; None without any."""
-        if self._unit in (None, "iso"):
-            if iso := ISO_TIME.search(prefix):
-                try:
-                    return seconds_from_iso(iso[0])
-                except ValueError:
-                    return None
-            if of_day := _TIME_OF_DAY.search(prefix):
-                return self._unwrapped(of_day)
+        if self._unit in (None, "iso") and (civil := ISO_TIME.search(prefix) or TIME_OF_DAY.search(prefix)):
+            try:
+                return self._civil.seconds(civil[0])
+            except ValueError:
+                return None
         number = _NUMBER.search(prefix)
         if number is None or self._unit == "iso":
             return None
         value = float(number[0])
-        unit = self._unit or next((unit for above, unit in _UNIT_ABOVE if abs(value) > above), "s")
-        return value * SECONDS_PER_UNIT[unit]
+        return value * SECONDS_PER_UNIT[self._unit or unit_by_digits(value) or "s"]
 
     def seconds(self, prefix: str, line: int) -> float:
         """As ``find_seconds``, but InputError if there is no time."""
@@ -56,10 +54,3 @@ class HostClock:
                 line,
             )
         return seconds
-
-    def _unwrapped(self, of_day: re.Match[str]) -> float:
-        seconds = int(of_day[1]) * 3600.0 + int(of_day[2]) * 60.0 + float(of_day[3].replace(",", "."))
-        if seconds < self._last_of_day_s - _DAY_S / 2:
-            self._days += 1
-        self._last_of_day_s = seconds
-        return self._days * _DAY_S + seconds

@@ -6,6 +6,7 @@ is whole in a damaged line survives, and what was begun and is not whole counts 
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ import numpy as np
 from rangesfm.errors import InputError
 from rangesfm.files.tables import read_text
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.host_time import HostClock
 from rangesfm.ranging.readers.reader import Reader, ReadOptions
 from rangesfm.ranging.readers.records import Records
@@ -27,8 +28,11 @@ AddPhrase = Callable[[Records, "re.Match[str]", float, int], None]
 
 
 def _add(records: Records, phrase: re.Match[str], timestamp_s: float, line: int) -> None:
-    """Take a range of metres, with the groups anchor_id and range."""
-    records.add(timestamp_s, phrase["anchor_id"], float(phrase["range"]), line)
+    """Take a range of metres, with the groups anchor_id and range, and possibly tag_id and variance."""
+    groups = phrase.groupdict()
+    tag_id, variance = groups.get("tag_id") or DEFAULT_TAG_ID, float(groups.get("variance") or 0)
+    stddev_m = math.sqrt(variance) if variance > 0 else math.nan
+    records.add(timestamp_s, phrase["anchor_id"], float(phrase["range"]), line, tag_id=tag_id, range_stddev_m=stddev_m)
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,8 @@ class _Phrases:
     Attributes:
         begin: begins a line's first range; the host's time stands before it.
         each: begins each range.
-        whole: all of it; groups x, y and z, if there are any, are where the anchor stands, in metres.
+        whole: all of it; groups x, y and z, if there are any, are where the anchor stands, in metres; a group time
+            is the time of the range, which stands in no other place then.
         add: puts the ranges of such a phrase, the time in seconds and the line into the records.
     """
 
@@ -59,7 +64,7 @@ def printed_reader(
     sides: Sides = Sides.TOLD,
 ) -> Reader:
     """The reader of lines with such phrases, given as patterns of ASCII."""
-    compiled = partial(re.compile, flags=re.ASCII)
+    compiled = partial(re.compile, flags=re.ASCII | re.MULTILINE)
     phrases = _Phrases(compiled(begin), compiled(each), compiled(whole), add)
 
     def read(path: Path, options: ReadOptions) -> RangeLog:
@@ -105,9 +110,11 @@ def _read(path: Path, options: ReadOptions, name: str, phrases: _Phrases) -> Ran
         begin = phrases.begin.search(text) if num_begun else None
         if begin is None:
             continue
-        timestamp_s = clock.seconds(text[: begin.start()], line)
+        has_time = "time" in phrases.whole.groupindex
+        timestamp_s = 0.0 if has_time else clock.seconds(text[: begin.start()], line)
         whole = list(phrases.whole.finditer(text))
         for phrase in whole:
+            timestamp_s = clock.seconds(phrase["time"], line) if has_time else timestamp_s
             phrases.add(records, phrase, timestamp_s, line)
         records.num_no_measurement += max(0, num_begun - len(whole))
     return records.to_log(path, name)
@@ -117,6 +124,8 @@ def _read_anchors(path: Path, phrases: _Phrases) -> tuple[Anchor, ...]:
     positions: dict[str, list[tuple[float, float, float]]] = {}
     for _, text in _numbered_lines(path):
         for phrase in phrases.whole.finditer(text):
+            if phrase["z"] is None:  # a place in the plane does not say how high
+                continue
             position = (float(phrase["x"]), float(phrase["y"]), float(phrase["z"]))
             positions.setdefault(phrase["anchor_id"], []).append(position)
     return positions_to_anchors(positions)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import shlex
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,6 +24,7 @@ class ReadOptions:
         separator: between cells; a blank means any run of blanks.
         ranging_interval_s: time between two rounds, of radios that count them instead of telling times.
         stamps: how time stamps of two-way ranging become ranges.
+        given: what the user called the log.
     """
 
     columns: Mapping[str, str] = field(default_factory=dict)
@@ -31,6 +33,15 @@ class ReadOptions:
     separator: str | None = None
     ranging_interval_s: float | None = None
     stamps: StampOptions = field(default_factory=StampOptions)
+    given: Sequence[str] = ()
+
+    def command(self, path: Path, **more: str) -> str:
+        """What to type to read the log with these options and some more."""
+        columns = ",".join(f"{quantity}={name}" for quantity, name in self.columns.items())
+        said = {"columns": columns, "timestamp_unit": self.timestamp_unit, "range_unit": self.range_unit}
+        flags = {**said, "separator": self.separator, **more}
+        typed = [word for flag, value in flags.items() if value for word in (f"--{flag}", value)]
+        return shlex.join(["rangesfm", "ranges", *(self.given or [str(path)]), *typed])
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from rangesfm.ranging.readers import canonical, dwm1001, inrol, makerfabs, mapped, mauwb, qorvo, ros
+from rangesfm.ranging.readers import canonical, dwm1001, factor_graphs, makerfabs, mauwb, qorvo, ros, table
 from rangesfm.ranging.readers.reader import Reader
 
 READERS: tuple[Reader, ...] = (
     ros.READER,
     canonical.READER,
-    *mapped.READERS,
-    inrol.READER,
+    *table.PRESETS,
+    table.MAPPED,
+    table.TABLE,
+    factor_graphs.LIBRSF,
+    factor_graphs.PYFG,
     dwm1001.MEAS,
     dwm1001.LEA,
     dwm1001.LEC,

@@ -1,0 +1,192 @@
+"""Any table: by the columns that the user names, by those of a known data set, or by what its names and values say."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from rangesfm.errors import InputError, printable
+from rangesfm.files.tables import header_names, read_head
+from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.readers.columns import QUANTITIES, STAMPS, Columns, read_columns
+from rangesfm.ranging.readers.guess import Guess, described, guess_columns
+from rangesfm.ranging.readers.layout import Layout, find_layout
+from rangesfm.ranging.readers.not_ranges import reason_without_ranges
+from rangesfm.ranging.readers.reader import Reader, ReadOptions
+from rangesfm.ranging.readers.roles import Sides
+from rangesfm.ranging.readers.several import anchor_of_file
+from rangesfm.ranging.readers.time_units import TIMESTAMP_UNITS
+from rangesfm.ranging.readers.units import UNITS_PER_METRE
+
+_PRESETS = {
+    "starloc": ("STAR-loc CSV", {"timestamp": "time_s", "range": "range", "tag_id": "from_id", "anchor_id": "to_id"}),
+    "miluv": ("MILUV CSV", {"timestamp": "timestamp", "range": "range", "tag_id": "from_id", "anchor_id": "to_id"}),
+    "uwb_init": ("uwb_init CSV", {"timestamp": "t", "range": "range", "tag_id": "ID_Tag", "anchor_id": "ID_Anchor"}),
+    "inrol": ("INRoL's text", {"timestamp": "timestamp", "range": "r", "anchor_id": "anchor_id"}),
+}
+_INROLS_HEADER = ("index", "timestamp", "anchor_id", "r")
+_INROLS_COMMENT = re.compile(
+    r"\s{0,99}#[ \t]{0,9}index[ \t]{1,9}timestamp[ \t]{1,9}anchor_id[ \t]{1,9}r[ \t]{0,9}(?:\n|$)"
+)
+_SPAN = re.compile(r"(\D*)(\d{1,4})-(\D*)(\d{1,4})", re.ASCII)
+
+
+def table_reader(path: Path, options: ReadOptions) -> Reader:
+    """The reader of one table that nobody described, if it can be understood.
+
+    Raises:
+        InputError: it cannot, or not for sure; with what was found, the closest guess and what to type.
+    """
+    layout = find_layout(path, options.separator)
+    guess = None if layout is None else guess_columns(layout)
+    if layout is None or guess is None or guess.missing or guess.doubts:
+        raise _question(path, options, layout, guess)
+    columns = replace(
+        _laid_out(layout, options),
+        required={**guess.columns},
+        wide=guess.wide,
+        anchor_id=anchor_of_file(path),
+        notes=tuple(_notes(path, layout, guess)),
+    )
+    read = partial(read_columns, columns=columns, format=TABLE.name)
+    return replace(TABLE, read=lambda path, options: read(path, options=options), sides=guess.sides)
+
+
+def _notes(path: Path, layout: Layout, guess: Guess) -> Iterable[str]:
+    said = ", ".join(f"{quantity} = {name}" for quantity, name in guess.columns.items())
+    yield f"columns taken: {said}" + (
+        "" if layout.has_names else " (by their numbers and values: the table has no names)"
+    )
+    yield from guess.notes
+    if layout.decimal_comma:
+        yield "numbers have decimal commas"
+    if "anchor_id" not in guess.columns and not guess.wide:
+        yield f"no column says which anchor it was: it is called '{anchor_of_file(path)}', as the file"
+
+
+def _question(path: Path, options: ReadOptions, layout: Layout | None, guess: Guess | None) -> InputError:
+    head = read_head(path)
+    if reason := reason_without_ranges(head):
+        return InputError(f"the log {reason}", path)
+    if layout is None or guess is None:
+        first_line = printable(head.strip().split("\n")[0])
+        return InputError(f"not a known log format, and no table; it begins with '{first_line}'", path)
+    found = f"found: {len(layout.columns)} columns: {', '.join(described(layout.columns))}"
+    told = {**guess.told, **dict.fromkeys(guess.missing, "NAME")}
+    command = replace(options, columns=told).command(path)
+    closest = ", ".join(f"{quantity} = {name}" for quantity, name in guess.told.items()) or "none"
+    why = "; ".join([*(f"no column seems to be the {missing}" for missing in guess.missing), *guess.doubts])
+    return InputError(
+        "a table whose columns are not known for sure",
+        path,
+        advice=[
+            found,
+            f"closest guess: {closest}",
+            f"not sure: {why}",
+            f"{'name the column' if guess.missing else 'if that is right'}: {command}",
+        ],
+    )
+
+
+def _laid_out(layout: Layout, options: ReadOptions) -> Columns:
+    return Columns(
+        required={},
+        timestamp_unit=options.timestamp_unit,
+        range_unit=options.range_unit,
+        separator=layout.separator,
+        header=layout.header,
+        num_skipped=layout.num_skipped,
+        decimal_comma=layout.decimal_comma,
+        stamps=options.stamps,
+    )
+
+
+def _recognizes(format: str, head: str) -> bool:
+    if format == "inrol":
+        return _INROLS_COMMENT.match(head) is not None
+    return set(_PRESETS[format][1].values()) <= set(header_names(head))
+
+
+def _read(path: Path, options: ReadOptions, *, format: str) -> RangeLog:
+    """By the columns of a preset, and those that the user named."""
+    told = {**_PRESETS.get(format, ("", {}))[1], **options.columns}
+    _check_choice("quantity in columns", (key.partition(":")[0] for key in told), QUANTITIES, path)
+    _check_choice("timestamp_unit", [options.timestamp_unit or "s"], TIMESTAMP_UNITS, path)
+    _check_choice("range_unit", [options.range_unit or "m"], UNITS_PER_METRE, path)
+    if not {"timestamp", "image_name"} & set(told):
+        raise InputError("columns must name range, timestamp (or image_name) and anchor_id where there is one", path)
+    wide = _wide(told, path)
+    columns = {key: name for key, name in told.items() if not key.startswith("range:")}
+    layout = find_layout(path, options.separator) if format == MAPPED.name else None
+    if layout is not None and {*columns.values(), *wide} <= {*layout.header}:
+        described = _laid_out(layout, options)
+    else:
+        described = Columns(
+            {},
+            timestamp_unit=options.timestamp_unit,
+            range_unit=options.range_unit,
+            separator=" " if format == "inrol" else options.separator,
+            header=_INROLS_HEADER if format == "inrol" else None,
+            stamps=options.stamps,
+        )
+    third_message = {}
+    if "range" not in columns and not wide:
+        names = header_names(read_head(path), options.separator) if described.header is None else described.header
+        stamps = {stamp: columns.get(stamp, stamp) for stamp in STAMPS}
+        if not {*(stamps[stamp] for stamp in STAMPS[:4])} <= set(names):
+            wanted, found = ", ".join(STAMPS[:4]), printable(", ".join(names))
+            raise InputError(f"columns name no column range, nor the time stamps {wanted}; found {found}", path)
+        columns = {**{stamp: stamps[stamp] for stamp in STAMPS[:4]}, **columns}
+        third_message = {stamp: stamps[stamp] for stamp in STAMPS[4:]}
+    described = replace(described, required=columns, optional=third_message, wide=wide, anchor_id=anchor_of_file(path))
+    return read_columns(path, described, options, format)
+
+
+def _wide(told: Mapping[str, str], path: Path) -> dict[str, tuple[str, str]]:
+    """Columns that are of one anchor and one tag each: ``range:A1=d1``, or many, ``range:0-7:T0-T2=2-25``."""
+    wide: dict[str, tuple[str, str]] = {}
+    for key, name in told.items():
+        quantity, _, ids = key.partition(":")
+        if quantity == "range" and ids:
+            anchors, tags = (_spanned(part) for part in (ids.partition(":")[0], ids.partition(":")[2]))
+            names = _spanned(name) if len(anchors) * len(tags) > 1 else [name]
+            if len(names) != len(anchors) * len(tags):
+                expected = f"{len(anchors)} x {len(tags)}"
+                raise InputError(f"columns: {key} is {len(names)} columns, expected {expected}, tags in turn", path)
+            wide |= dict(zip(names, ((anchor, tag) for anchor in anchors for tag in tags)))
+    return wide
+
+
+def _spanned(text: str) -> list[str]:
+    """T0, T1, T2 of T0-T2."""
+    span = _SPAN.fullmatch(text)
+    if span is None or span[3] not in ("", span[1]) or int(span[4]) < int(span[2]):
+        return [text]
+    return [f"{span[1]}{number}" for number in range(int(span[2]), int(span[4]) + 1)]
+
+
+def _check_choice(what: str, given: Iterable[str], choices: Collection[str], path: Path) -> None:
+    for value in given:
+        if value not in choices:
+            raise InputError(f"{what} is '{value}', expected one of {', '.join(choices)}", path)
+
+
+PRESETS = tuple(
+    Reader(
+        name,
+        description,
+        partial(_recognizes, name),
+        partial(_read, format=name),
+        sides=Sides.ASKED if "from_id" in preset.values() else Sides.TOLD,
+    )
+    for name, (description, preset) in _PRESETS.items()
+)
+MAPPED = Reader(
+    "mapped", "any CSV or TSV by a mapping of its columns", lambda head: False, partial(_read, format="mapped")
+)
+TABLE = Reader(
+    "table", "any table, by the names and values of its columns", lambda head: False, partial(_read, format="table")
+)

@@ -1,0 +1,109 @@
+"""Units of times and ranges: as a column's name says, else by what its values can only mean; doubts are asked."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.ranging.readers.time_units import SECONDS_PER_UNIT, unit_by_digits
+
+Array = npt.NDArray[np.float64]
+UNITS_PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
+
+_MIN_NUM = 20  # fewer values show nothing
+_TIMES = {
+    "s": "s sec secs second seconds",
+    "ms": "ms msec msecs millis millisec milliseconds millisecond",
+    "us": "us usec usecs micros microseconds",
+    "ns": "ns nsec nsecs nanos nanoseconds",
+}
+_LENGTHS = {
+    "m": "m meter meters metre metres",
+    "cm": "cm centimeter centimeters centimetre centimetres",
+    "mm": "mm millimeter millimeters millimetre millimetres",
+}
+_SECONDS_SINCE_1970 = (1e9, 4e9)
+# From one time of a log to the next: a log that is faster, were it in another unit than seconds, is none.
+_FASTEST_S, _SLOWEST_S = {"s": 0.0, "ms": 2e-3, "us": 2e-3, "ns": 2e-3}, 5.0
+_FASTEST_M_PER_S = 30.0
+_LARGEST_M = {"m": 1000.0, "cm": 300.0, "mm": 300.0}
+_NOISE_M = {"m": 3.0, "cm": 0.6, "mm": 0.6}
+# Most ranges are longer, were they in cm or mm; without a unit's name, decimals stand for metres.
+_NEAR_M, _NEAR_WITH_DECIMALS_M = 0.6, 2.0
+_MAX_SHARE_OF_JUMPS = 0.25
+
+
+class UnclearUnitError(Exception):
+    """Values that may be in several units: ``units``."""
+
+    def __init__(self, units: list[str], why: str):
+        super().__init__(why)
+        self.units = units
+
+
+def words_of(name: str) -> list[str]:
+    """The words of a column's name in small letters, digits apart; an id in hexadecimal digits is one."""
+    words: list[str] = []
+    for part in re.findall(r"[^\W_]+", name):
+        is_id = re.fullmatch("(?:0[xX])?[0-9A-F]{4,16}", part) and not part.isdigit()
+        pattern = r"\d+|[^\W\d][^\W\dA-Z]*|[A-Z]+"
+        words += [part] if is_id else re.findall(rf"[A-Z]{{2,}}(?![^\W\dA-Z])|{pattern}", part)
+    return [word.lower() for word in words]
+
+
+def time_unit(name: str, times: Array) -> tuple[str, str | None]:
+    """The unit of a column of numbers, and what to say of it where the name does not; or UnclearUnitError."""
+    named, distinct = _named(name, _TIMES), np.unique(times)
+    by_digits = unit_by_digits(float(np.median(times))) if len(times) else None
+    step = float(np.median(np.diff(distinct))) if len(distinct) > 1 else 0.0
+    is_so = by_digits is not None and step * SECONDS_PER_UNIT[by_digits] <= _SLOWEST_S
+    # A name may well say a finer unit, of a clock that began later than 1970.
+    if by_digits is not None and (is_so if named is None else SECONDS_PER_UNIT[named] > SECONDS_PER_UNIT[by_digits]):
+        return by_digits, f"{name} has as many digits as {by_digits} since 1970: taken as {by_digits}"
+    if named is not None or len(distinct) < _MIN_NUM:
+        return named or "s", None
+    can_be = [unit for unit, size in SECONDS_PER_UNIT.items() if _FASTEST_S[unit] <= step * size <= _SLOWEST_S]
+    if can_be == ["s"] or _SECONDS_SINCE_1970[0] <= distinct[0] < _SECONDS_SINCE_1970[1]:
+        return "s", None
+    if len(can_be) != 1:
+        raise UnclearUnitError(can_be or [*SECONDS_PER_UNIT], f"steps of {step:g} between its numbers")
+    return can_be[0], f"{name} looks like {can_be[0]} (steps of {step:g}): taken as such"
+
+
+def range_unit(name: str, ranges: Array, times: Array | None, pair: npt.NDArray[np.int64]) -> tuple[str, str | None]:
+    """As ``time_unit``, of positive ranges between some pairs of nodes; ``times`` in seconds."""
+    named = _named(name, _LENGTHS)
+    if named is not None or len(ranges) < _MIN_NUM:
+        return named or "m", None
+    most, are_whole = float(np.percentile(ranges, 95)), bool(np.all(ranges == np.round(ranges)))
+    can_be = [
+        unit
+        for unit, per_metre in UNITS_PER_METRE.items()
+        if (not are_whole if unit == "m" else most / per_metre >= (_NEAR_M if are_whole else _NEAR_WITH_DECIMALS_M))
+        and most / per_metre <= _LARGEST_M[unit]
+        and _share_of_jumps(ranges / per_metre, times, pair, _NOISE_M[unit]) <= _MAX_SHARE_OF_JUMPS
+    ]
+    if can_be == ["m"]:
+        return "m", None
+    kind = f"{'whole' if are_whole else 'decimal'} numbers, most of them up to {most:g}"
+    if len(can_be) != 1:
+        raise UnclearUnitError(can_be or [*UNITS_PER_METRE], kind)
+    return can_be[0], f"{name} looks like {can_be[0]} ({kind}): taken as such"
+
+
+def _share_of_jumps(ranges_m: Array, times: Array | None, pair: npt.NDArray[np.int64], noise_m: float) -> float:
+    """How many ranges are further from the one before, of their pair, than anybody moves in the time between."""
+    if times is None:
+        return 0.0
+    order = np.lexsort((times, pair))
+    same = np.diff(pair[order]) == 0
+    moved, seconds = np.abs(np.diff(ranges_m[order]))[same], np.diff(times[order])[same]
+    return float(np.mean(moved > noise_m + _FASTEST_M_PER_S * seconds)) if len(moved) else 0.0
+
+
+def _named(name: str, words_by_unit: dict[str, str]) -> str | None:
+    """The unit that the words of a name hold, the last one if there are several."""
+    units = {word: unit for unit, words in words_by_unit.items() for word in words.split()}
+    return next((units[word] for word in reversed(words_of(name)) if word in units), None)

@@ -1,0 +1,70 @@
+"""Offsets of the clocks that cannot be ruled out, and the scale."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rangesfm.errors import GeometryError
+from rangesfm.ranging.clock.curve import CostCurve
+from rangesfm.ranging.clock.estimate import TimeOffset
+from rangesfm.ranging.clock.rivals import Rival
+from rangesfm.ranging.log import RangeLog
+from rangesfm.workflows import metric_map
+
+VALUE_S, RIVAL_S = 1.0, 4.0
+
+
+@dataclass
+class Scales:
+    """A scale stage whose answer depends on the offset alone."""
+
+    by_offset_s: dict[float, float | None]
+
+    def doubts(self, monkeypatch: pytest.MonkeyPatch, probability: float) -> tuple[str, ...]:
+        monkeypatch.setattr(metric_map, "ranges_on_path", lambda *given: float(np.mean(given[3])))
+        monkeypatch.setattr(metric_map, "estimate_scale", self.estimate)
+        log = RangeLog.from_arrays(["A"] * 3, [1.0] * 3, timestamp_s=[0.0, 1.0, 2.0])
+        inputs: Any = SimpleNamespace(log=log, anchor_frame="unknown")
+        offset = time_offset(probability, (Rival(RIVAL_S, 1 - probability),))
+        unused: Any = None
+        return metric_map.doubts_by_rivals(unused, inputs, unused, None, offset, 2.0)
+
+    def estimate(self, survey: object, inputs: object, offset_s: float, *rest: object) -> SimpleNamespace:
+        scale = self.by_offset_s[offset_s]
+        if scale is None:
+            raise GeometryError("no scale")
+        return SimpleNamespace(value=scale)
+
+
+def time_offset(probability: float, rivals: tuple[Rival, ...]) -> TimeOffset:
+    curve = CostCurve(np.zeros(0), np.zeros(0))
+    return TimeOffset(VALUE_S, 0.01, curve, 3, True, 1e-3, 1e-5, True, 0.0, None, probability, rivals)
+
+
+def test_a_rival_of_nearly_the_same_scale_is_told_with_its_probability_and_its_scale(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    said = Scales({RIVAL_S: 2.04}).doubts(monkeypatch, probability=0.6)
+    assert said == ("the time offset may also be +4.00 s (40%), which gives a scale of 2.04 (+2.0%)",)
+
+
+def test_a_rival_of_another_scale_is_refused_with_how_far_apart_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(GeometryError, match=r"\+1.00 s \(60%\) gives 2 m per unit, \+4.00 s \(40%\) gives 2.2 \(\+10"):
+        Scales({RIVAL_S: 2.2}).doubts(monkeypatch, probability=0.6)
+
+
+def test_beside_an_offset_that_is_nearly_certain_a_rival_of_another_scale_is_a_doubt(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (said,) = Scales({RIVAL_S: 2.2}).doubts(monkeypatch, probability=0.96)
+    assert "+4.00 s (4%), which gives a scale of 2.2 (+10.0%)" in said
+
+
+def test_a_rival_that_gives_no_scale_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    (said,) = Scales({RIVAL_S: None}).doubts(monkeypatch, probability=0.6)
+    assert said == "the time offset may also be +4.00 s (40%), which gives no scale"
