@@ -61,6 +61,35 @@ def ranges_per_anchor(content: Content) -> Table:
     return Table("Ranges of each anchor", header, rows)
 
 
+def mistakes(content: Content) -> Table:
+    """Of each mistake that may have been made, whether it was found; a bar that is half full is at the threshold."""
+    rows = []
+    for test in content.summary.tests:
+        filled = min(test.statistic / (2 * test.threshold), 1.0) if test.threshold else 0.0
+        bar = Markup('<meter min="0" max="1" high="0.5" optimum="0" value="{:.3f}"></meter>').format(filled)
+        could_be = "not found" if test.smallest_detectable is not None else "would not be found"
+        unit = "" if test.unit == "1" else test.unit
+        rows.append(
+            [
+                f"{test.name} {test.subject}".strip(),
+                bar,
+                "found" if test.rejected else could_be,
+                signed(test.size, 3, unit),
+                fixed(test.stddev, 3, unit),
+                fixed(test.smallest_detectable, 3, unit),
+                fixed(None if test.effect_on_scale is None else 100 * test.effect_on_scale, 2),
+                fixed(test.effect_on_place_m, 3),
+            ]
+        )
+    return Table(
+        "Mistakes that may have been made",
+        ["mistake", "evidence", "", "size", "stddev", "smallest found", "unfound: scale %", "path m"],
+        rows,
+        "A bar more than half full is beyond chance. What is not found may still be there, smaller than the smallest that "
+        "is found; the last columns say what that would do.",
+    )
+
+
 def comparison(content: Content) -> Table:
     """The paper's table."""
     columns = dict.fromkeys(("rmse_m", "rmse_se3_m", "rmse_sim3_m"), partial(fixed, decimals=4))
