@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.studies.mistakes import SITES, Given, run, surveyed
+from tests.studies.erring_surveys import SITES, Given, run, surveyed
 
 from rangesfm.trust.verdict import TrustVerdict
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import stats
-from tests.studies.mistakes import SITES, run, surveyed
+from tests.studies.erring_surveys import SITES, run, surveyed
 
 from rangesfm.trust.catalogue import STANDING
 from rangesfm.trust.hypothesis import Hypothesis

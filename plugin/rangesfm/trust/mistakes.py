@@ -145,7 +145,8 @@ def _settled_test(problem: Linearized, hypothesis: Hypothesis) -> tuple[Test, Ra
             continue
         at = at_state(at, corrected(moved, original.correction(sizes)))
         standing = _standing(at)
-        hypothesis = next(h for h in [*standing, *(n for h in standing for n in h.narrower)] if h.key == hypothesis.key)
+        there = {h.key: h for h in [*standing, *(n for h in standing for n in h.narrower)]}
+        hypothesis = there.get(hypothesis.key, hypothesis)
     noise = learnt_noise(at, [hypothesis])
     [test] = Factorization(at.with_noise(noise)).test([hypothesis], 0)
     return replace(test, hypothesis=original, sizes=test.sizes if original.is_linear else sizes + test.sizes), noise

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from rangesfm.geometry.gravity import gravity_of
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.survey.settings import Survey
@@ -17,8 +19,12 @@ def tested(survey: Survey, metric: MetricResult, journal: Journal) -> MetricResu
 
     The scaled map is looked at, refined or not: a refinement bends a map to ranges that are wrong.
     """
-    with journal.timed("tests of mistakes"):
-        trust = trust_in(scaled_ranges(survey, metric), seed=survey.output.seed)
+    try:
+        with journal.timed("tests of mistakes"):
+            trust = trust_in(scaled_ranges(survey, metric), seed=survey.output.seed)
+    except np.linalg.LinAlgError as error:
+        journal.warn(f"mistakes were not looked for, as the ranges determine too little: {error}")
+        return metric
     for reason in trust.reasons:
         journal.warn(reason)
     return replace(metric, trust=trust).doubted(trust.reasons)
