@@ -282,10 +282,6 @@ class ScaleOptions(Options):
 
     method: Annotated[Literal["robust", "two-candidate"], Told(flag="scale_method")] = "robust"
     """How the scale is found; two-candidate is the paper's."""
-    num_bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 200
-    """Resamplings of the block bootstrap over time."""
-    bootstrap_block_s: Annotated[float, Field(ge=1e-3, le=1e9)] = 10.0
-    """Length of its blocks."""
     max_relative_stddev: Annotated[float, Field(ge=1e-9, le=1e3)] = 0.1
     """A scale less certain than this is refused."""
     up_in_first_camera: Annotated[

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 NAMES = ("north", "east")
 QUICK = """
 [scale]
-num_bootstrap = 5
 {scale}
 [refine]
 covariance = false

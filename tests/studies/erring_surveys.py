@@ -191,7 +191,7 @@ def run(given: Given, seed: int) -> Run:
     )
     observations = associate(log, given.trajectory, given.tag_in_cam_m, time_offset_s=given.time_offset_s)
     anchors = [Anchor(name, None if given.frame == "unknown" else at) for name, at in given.anchors_m.items()]
-    options = ScaleOptions(max_relative_stddev=0.5, num_bootstrap=50)
+    options = ScaleOptions(max_relative_stddev=0.5)
     try:
         estimate = initialize_scale(
             observations, given.trajectory, anchors, anchor_frame=given.frame, options=options, seed=seed

@@ -1,1 +1,1 @@
-"""Trust: every plausible mistake of a survey as a hypothesis that is tested."""
+"""How far to trust what was given and what was found: each mistake said, with its size and what to do."""

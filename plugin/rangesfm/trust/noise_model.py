@@ -7,13 +7,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.ranging.errors.shared_errors import ANTENNA_STDDEV_M, CURVE_STDDEV_M, antenna_modes, curve_modes
 from rangesfm.trust.hypothesis import Effect, Hypothesis
 from rangesfm.trust.linearized import Linearized
 from rangesfm.trust.random_errors import Component, RandomErrors, learn
 
 # Errors of radios stay alike for seconds (by 0.4 to 0.6 after one second on real logs).
 _MEMORY_S = 3.0
+# Of a radio's error curve over distance (Decawave application note APS011), and of anchors' antennas over directions
+# (Pelka, Cimdins and Hellbrück, 2018).
+ANTENNA_STDDEV_M, CURVE_STDDEV_M = 0.05, 0.07
+_CURVE_LOG_LENGTH, _NUM_CURVE_KNOTS, _MIN_DISTANCE_M = 1.0, 25, 0.05
 _LASTING_STDDEV_M, _BEND_STDDEV_M = 0.04, 0.02
 # Of a path's duration: a map bends over no shorter part.
 _BEND_SHARE = 1 / 8
@@ -65,3 +68,36 @@ def _known(problem: Linearized) -> Array:
     same_anchor = problem.anchor_index[:, None] == problem.anchor_index
     wandering = _WANDERING_STDDEV_M**2 * (1.0 + same_anchor) * np.exp(-apart / _WANDERING_MEMORY_S)
     return np.asarray(modes @ modes.T + wandering)
+
+
+def curve_modes(distance_m: Array, stddev_m: Array) -> Array:
+    """(n, k) what an unknown error curve adds to n ranges: times k independent numbers of stddev 1.
+
+    The curve is a random function, smooth in the logarithm of the distance.
+
+    Args:
+        distance_m: (n,) from anchor to tag. stddev_m: (n,) of the curve there.
+    """
+    place = np.log(np.maximum(distance_m, _MIN_DISTANCE_M))
+    knots = np.linspace(place.min(), place.max() + 1e-6, _NUM_CURVE_KNOTS)
+    hats = np.column_stack([np.interp(place, knots, unit) for unit in np.eye(_NUM_CURVE_KNOTS)])
+    correlation = np.exp(-0.5 * ((knots[:, None] - knots) / _CURVE_LOG_LENGTH) ** 2)
+    values, vectors = np.linalg.eigh(correlation)
+    strong = values > 1e-9 * values.max()
+    modes: Array = stddev_m[:, None] * (hats @ (vectors[:, strong] * np.sqrt(values[strong])))
+    return modes
+
+
+def antenna_modes(directions: Array) -> Array:
+    """(n, 12) what one anchor's antenna adds to its n ranges, likewise.
+
+    A random polynomial of the direction. Half of its variance is linear, half quadratic in the unit vector; the
+    constant part is the bias, which has its own prior. The covariance depends on the angle alone:
+    c / 2 + (3 c^2 - 1) / 4 with c its cosine.
+
+    Args:
+        directions: (n, 3) unit vectors from anchor to tag.
+    """
+    quadratic = np.sqrt(1.5) * (directions[:, :, None] * directions[:, None, :] - np.eye(3) / 3)
+    modes: Array = ANTENNA_STDDEV_M * np.sqrt(0.5) * np.column_stack([directions, quadratic.reshape(-1, 9)])
+    return modes

@@ -24,6 +24,7 @@ from rangesfm.ranging.observations import RangeObservations
 from rangesfm.result.folder import forget_result, refuse_to_overwrite
 from rangesfm.survey.inputs import RangingInputs, read_ranging_inputs
 from rangesfm.survey.settings import Survey
+from rangesfm.trust.before import notes_before_work, notes_on_model, notes_on_times
 from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images
 from rangesfm.vision.keyframes import select_keyframes
 from rangesfm.vision.mapping_loop import GlobalAdjustment
@@ -45,7 +46,7 @@ def read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
         apply_options(pycolmap.BundleAdjustmentOptions(), survey.refine.bundle_adjustment, "refine.bundle_adjustment")
     refuse_to_overwrite((item.path for item in survey.input_paths()), survey.output.path)
     inputs = read_ranging_inputs(survey)
-    for note in inputs.notes:
+    for note in (*inputs.notes, *notes_before_work(survey, inputs)):
         journal.warn(note)
     return inputs
 
@@ -55,6 +56,7 @@ def checked_inputs(survey: Survey, journal: Journal) -> tuple[RangingInputs, tup
     inputs = read_inputs(survey, journal)
     keyframes, times = find_keyframes(survey, journal, log_names_photos=inputs.log.image_name is not None)
     check_times(survey, inputs, _path_without_places(keyframes, times))
+    tell_of_times(survey, inputs, times, journal)
     return inputs, keyframes, times
 
 
@@ -67,16 +69,26 @@ def check_times(survey: Survey, inputs: RangingInputs, path: Trajectory) -> None
         ranges_on_path(survey, inputs, path, offset_s or 0.0)
 
 
+def tell_of_times(survey: Survey, inputs: RangingInputs, times: ImageTimes | None, journal: Journal) -> None:
+    """What is odd about two clocks whose offset nobody gave."""
+    if times is not None and inputs.log.timestamp_s is not None and survey.ranges.time_offset_s is None:
+        for note in notes_on_times(inputs.log.timestamp_s, times.timestamps_s):
+            journal.warn(note)
+
+
 def _path_without_places(keyframes: tuple[str, ...], times: ImageTimes | None) -> Trajectory:
     n = len(keyframes)
     timestamps_s = None if times is None else times.timestamps_s
     return Trajectory(np.arange(n), keyframes, timestamps_s, np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))
 
 
-def read_registered(path: Path) -> pycolmap.Reconstruction:
+def read_registered(path: Path, journal: Journal) -> pycolmap.Reconstruction:
+    """A model that was brought along; what is wrong with it by itself is told."""
     model = read_model(path)
     if not model.num_reg_images():
         raise InputError("the model has no registered images", path)
+    for note in notes_on_model(model):
+        journal.warn(note)
     return model
 
 

@@ -26,6 +26,7 @@ from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.metric_map import (
     find_time_offset,
     join_by_survey,
+    judge_map,
     path_with_times,
     ranges_on_paths,
     refine_map,
@@ -40,6 +41,7 @@ from rangesfm.workflows.photos import (
     noted,
     read_inputs,
     read_registered,
+    tell_of_times,
     with_photos,
 )
 from rangesfm.workflows.results import RunResult, write_results
@@ -99,12 +101,13 @@ def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResul
     inputs = read_inputs(survey, journal)
     if survey.model_path is None:
         raise InputError("no model: give --input_path MODEL, a COLMAP model as sparse/0")
-    sfm = read_registered(survey.model_path)
+    sfm = read_registered(survey.model_path, journal)
     if refine and not sfm.num_points3D():
         raise InputError("the model has no 3-D points to refine: a trajectory can only be scaled", survey.model_path)
     times = None
     if inputs.log.image_name is None:
         times = noted(times_of_model(survey, sfm, survey.model_path), journal)
+        tell_of_times(survey, inputs, times, journal)
     with sole_writer(survey.output.path):
         return to_metric(survey, inputs, [sfm], times, journal, refine=refine)
 
@@ -155,4 +158,4 @@ def map_in_metres(
         with journal.stage("refinement"):
             metric = refine_map(survey, inputs, metric, journal)
     # Comparison and results.
-    return write_results(survey, inputs, metric, journal)
+    return write_results(survey, inputs, judge_map(survey, metric, journal), journal)
