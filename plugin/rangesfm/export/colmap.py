@@ -30,8 +30,23 @@ def write_model(reconstruction: pycolmap.Reconstruction, path: Path, *, as_text:
     return path
 
 
-def write_transform(metric_from_sfm: Similarity | None, path: Path) -> Path:
-    """Write metric_from_sfm as ``scale qw qx qy qz tx ty tz`` on one line, losing no digit.
+def write_project(map_: MetricMap, path: Path, *, as_text: bool = False) -> Path:
+    """Write the model, and where the photos are known a ``project.ini`` beside it, which COLMAP's GUI looks for.
+
+    COLMAP takes no project whose folder of photos is not there; the database need not be.
+    """
+    write_model(map_.reconstruction, path, as_text=as_text)
+    if map_.images_path is not None and map_.images_path.is_dir():
+        database_path, images_path = (map_.database_path or path / "database.db").resolve(), map_.images_path.resolve()
+        write_text(f"database_path={database_path}\nimage_path={images_path}\n", path / "project.ini")
+    return path
+
+
+def write_transform(metric_from_sfm: Similarity | None, folder: Path) -> tuple[Path, Path]:
+    """Write metric_from_sfm for ``model_transformer``, losing no digit, in the two forms that COLMAP has had.
+
+    ``transform_colmap_4.txt``: ``scale qw qx qy qz tx ty tz`` on one line, which it reads since 3.9;
+    ``transform_colmap_3.8.txt``: a matrix of 4 x 4. Each takes the other's file without a word, and moves by anything.
 
     Raises:
         InputError: the similarity is not known.
@@ -40,8 +55,12 @@ def write_transform(metric_from_sfm: Similarity | None, path: Path) -> Path:
         raise InputError("the format 'transform' needs metric_from_sfm, which is not known of this model")
     qx, qy, qz, qw = Rotation.from_matrix(metric_from_sfm.rotation).as_quat()
     numbers = np.array([metric_from_sfm.scale, qw, qx, qy, qz, *metric_from_sfm.translation])
-    write_text(" ".join(f"{number:.17g}" for number in numbers) + "\n", path)
-    return path
+    matrix = np.eye(4)
+    matrix[:3] = np.column_stack([metric_from_sfm.scale * metric_from_sfm.rotation, metric_from_sfm.translation])
+    paths = folder / "transform_colmap_4.txt", folder / "transform_colmap_3.8.txt"
+    for path, rows in zip(paths, (numbers[None], matrix)):
+        write_text("".join(" ".join(f"{number:.17g}" for number in row) + "\n" for row in rows), path)
+    return paths
 
 
 def write_positions(reconstruction: pycolmap.Reconstruction, path: Path) -> Path:

@@ -82,6 +82,7 @@ def _read_map(result: ResultFolder, images_path: Path | None) -> MetricMap:
         metric_from_sfm=summary.metric_from_sfm.similarity,
         relative_scale_stddev=summary.scale.relative_stddev_empirical,
         images_path=images_path or result.images_path,
+        database_path=database if (database := result.path / "database.db").is_file() else None,
         is_site=summary.frame == "site",
         georeference=None if summary.georeference is None else summary.georeference.georeference,
         center_covariance_m2=None if covariances is None else covariances.by_photo_m2,
