@@ -21,7 +21,13 @@ from rangesfm.geometry.similarity import Similarity
 
 
 def write_model(reconstruction: pycolmap.Reconstruction, path: Path, *, as_text: bool = False) -> Path:
-    """Write the model as the folder ``path``, whole or not at all; an older one is replaced."""
+    """Write the model as the folder ``path``, whole or not at all; an older one is replaced.
+
+    Raises:
+        InputError: as text, a photo's name holds white space, at which COLMAP would split it.
+    """
+    if as_text:
+        _require_names_without_blanks(reconstruction, "colmap_text")
     with new_folder(path) as folder:
         if as_text:
             reconstruction.write_text(folder)
@@ -69,13 +75,19 @@ def write_positions(reconstruction: pycolmap.Reconstruction, path: Path) -> Path
     Raises:
         InputError: a photo's name holds white space, at which COLMAP would split it.
     """
-    lines = []
-    for image in registered_images(reconstruction):
-        if len(image.name.split()) != 1:
-            raise InputError(f"the format 'model_aligner' cannot hold white space in a photo's name: {image.name!r}")
-        lines.append(" ".join([image.name, *(f"{value:.17g}" for value in image.projection_center())]))
+    _require_names_without_blanks(reconstruction, "model_aligner")
+    lines = [
+        " ".join([image.name, *(f"{value:.17g}" for value in image.projection_center())])
+        for image in registered_images(reconstruction)
+    ]
     write_text("\n".join(lines) + "\n", path)
     return path
+
+
+def _require_names_without_blanks(reconstruction: pycolmap.Reconstruction, name: str) -> None:
+    for image in reconstruction.images.values():
+        if len(image.name.split()) != 1:
+            raise InputError(f"the format {name!r} cannot hold white space in a photo's name: {image.name!r}")
 
 
 def write_undistorted(map_: MetricMap, folder: Path) -> Path:

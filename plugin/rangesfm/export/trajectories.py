@@ -44,8 +44,8 @@ def write_kitti(trajectory: Trajectory, path: Path) -> Path:
 
 
 def _write_numbers(rows: Array, path: Path, formats: str | list[str] = "%.17g", header: str = "") -> Path:
-    with new_file(path) as temporary:
-        np.savetxt(temporary, rows, formats, header=header, comments="")
+    with new_file(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        np.savetxt(file, rows, formats, header=header, comments="")
     return path
 
 
