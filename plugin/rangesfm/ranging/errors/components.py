@@ -127,10 +127,10 @@ COMPONENTS = (
     Component("long_time", 0.03, 0.7, None, True, lambda c: _in_time(c, _LONG_TIME_S), "errors that last longer"),
     Component("bias", 0.045, 0.5, None, True, lambda c: _same(c.anchor_index), "each anchor's own bias"),
     Component("common_bias", 0.2, 0.5, 0.04, False, lambda c: np.ones((len(c), len(c))), "the bias of all ranges"),
-    Component("short", 0.25, 0.5, 0.08, False, _short, "short ranges"),
+    Component("short", 0.2, 0.5, 0.08, False, _short, "short ranges"),
     Component("curve", 0.04, 0.5, 0.02, False, _smooth, "the radio's error curve"),
     Component("rough_curve", 0.02, 0.3, 0.01, False, _rough, "unevenness of the error curve"),
-    Component("slope", 0.006, 0.7, 0.003, False, _proportional, "ranges long by a share"),
+    Component("slope", 0.004, 0.7, 0.003, False, _proportional, "ranges long by a share"),
     Component(
         "antenna",
         0.05,
