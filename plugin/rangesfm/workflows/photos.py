@@ -88,7 +88,7 @@ def find_keyframes(
     Args:
         log_names_photos: then no photo is left out for want of a time; None: there is no log.
     """
-    folder = _images_path(survey)
+    folder = images_path(survey)
     with journal.timed("keyframes"):
         names = list_images(folder)
         image_times = None
@@ -122,7 +122,7 @@ def with_photos(
     """Call ``reconstruct``, or a part of it, for the keyframes of a survey."""
     with survey.source.naming_lines():
         return do(
-            _images_path(survey),
+            images_path(survey),
             keyframes,
             survey.output.path,
             camera=survey.camera,
@@ -134,7 +134,8 @@ def with_photos(
         )
 
 
-def _images_path(survey: Survey) -> Path:
+def images_path(survey: Survey) -> Path:
+    """The folder of a survey's photos; InputError if none is given."""
     if survey.images.path is None:
         raise InputError("no photos: give [images] path in a survey file, or --images FOLDER")
     return survey.images.path
