@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 def add_commands(commands: Commands) -> None:
     init = commands.add("init", _init, "a survey file from folders of photos and logs")
     init.add_argument("folders", nargs="+", metavar="FOLDER", help="where photos, log, anchors, ... are")
-    init.add_argument("--output_path", metavar="TOML", help="the survey file (default: survey.toml in the first FOLDER)")
+    init.add_argument("--output_path", metavar="TOML", help="the file (default: survey.toml in the first FOLDER)")
     add_flags(init, without=("output.path",))
     check = commands.add("check", _check, "what a run would work with, and what is wrong with it, in seconds")
     add_survey_arguments(check)

@@ -198,7 +198,6 @@ def survey_from_arguments(args: argparse.Namespace, progress: Progress | None = 
         progress: is told what of a folder is left out.
     """
     from rangesfm.findings.survey_file import NAME
-    from rangesfm.findings.understood import understand
     from rangesfm.survey.settings import read_survey, survey_from_tables
 
     overrides = overrides_from_arguments(args)
@@ -207,9 +206,12 @@ def survey_from_arguments(args: argparse.Namespace, progress: Progress | None = 
     if path is None:
         survey = survey_from_tables({}, Path.cwd(), overrides)
     elif path.is_dir():
+        from rangesfm.findings.understood import understand
+
         understood = understand([path], {"output.path": path.absolute() / "out", **overrides})
-        for note in understood.notes if progress is not None else ():
-            progress.message(note)
+        if progress is not None:
+            for note in understood.notes:
+                progress.message(note)
         survey = understood.survey()
     else:
         survey = read_survey(path, overrides, args.base_path)

@@ -18,7 +18,7 @@ from rangesfm.files.tables import read_text
 _COLMAP_LINE = re.compile(r"\d+ ([A-Z][A-Z0-9_]+) (\d+) (\d+)((?: \S+)+)")
 # To OpenCV, and so to Kalibr and ROS, the centre of the first pixel is (0, 0); to COLMAP it is (0.5, 0.5).
 _CORNER_PX = 0.5
-# COLMAP's model and its number of parameters beside fx, fy, cx, cy. Its FULL_OPENCV has those of plumb_bob and four more.
+# COLMAP's model and how many parameters it has beside fx, fy, cx, cy.
 _OPENCV_MODELS = {
     "none": ("PINHOLE", 0),
     "radtan": ("OPENCV", 4),

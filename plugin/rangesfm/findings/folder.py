@@ -61,6 +61,7 @@ def look_into(folders: Sequence[Path]) -> Found:
     paths: dict[str, list[Path]] = defaultdict(list)
     calibrations: dict[Path, tuple[Calibration, ...]] = {}
     notes: list[str] = []
+    unsure: list[str] = []
     for path in _entries(folders):
         try:
             if path.suffix.lower() in _VIDEO_EXTENSIONS:
@@ -77,10 +78,11 @@ def look_into(folders: Sequence[Path]) -> Found:
                 if path.is_dir() or path.suffix in _BAG_EXTENSIONS:
                     notes.append(f"{path.name} is a bag: its ranges are read, images in it are not yet")
         except InputError as error:
-            notes.append(str(error))
             if error.advice:
-                notes.append(f"if that is the radio's log: rangesfm ranges {path} says what to type")
-    return Found(dict(paths), calibrations, tuple(notes))
+                unsure.append(f"{error}; if it is the radio's log, rangesfm ranges {path} asks for more")
+            else:
+                notes.append(str(error))
+    return Found(dict(paths), calibrations, (*notes, *([] if LOG in paths else unsure)))
 
 
 def _key_of(path: Path) -> str | None:

@@ -6,6 +6,7 @@ import glob
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -55,24 +56,25 @@ def understand(folders: Sequence[Path], given: Mapping[str, object]) -> Understo
     Raises:
         InputError: there is nothing, or several of a kind and nothing tells which is meant; its advice asks.
     """
-    found = look_into([Path(os.path.abspath(folder)) for folder in folders])
+    folders = [Path(os.path.abspath(folder)) for folder in folders]
+    found = look_into(folders)
     roles = {item.dotted: item.role for item in KEYS}
-    values = {
-        key: Path(os.path.abspath(str(value))) if roles[key] is not None else value for key, value in given.items()
-    }
+    values = {key: _path(value) if roles[key] is not None else value for key, value in given.items()}
     notes, questions = list(found.notes), []
-    for key, paths in found.paths.items():
-        if key in values or (key == "scale.markers" and "scale.distances" not in {*found.paths, *values}):
+    for item in KEYS:
+        key, paths = item.dotted, found.paths.get(item.dotted, [])
+        if key in values or not paths or (key == "scale.markers" and "scale.distances" not in values):
             continue
+        paths = _tops(paths, folders) if key == PHOTOS else paths
         chosen = _chosen(key, paths)
         if chosen is None:
-            flag = next(item.flag for item in KEYS if item.dotted == key)
             names = ", ".join(_shown(path, folders) for path in paths)
-            questions.append(f"{names}: any of them may be [{key.replace('.', '] ')}; say which by --{flag} PATH")
+            questions.append(f"{names}: any of them may be [{item.table}] {item.name}; say which by --{item.flag} PATH")
             continue
         values[key] = chosen
-        if others := [path for path in _roots(key, paths) if path != chosen and not glob.has_magic(str(chosen))]:
-            notes.append(f"left out, as {chosen.name} is there: {', '.join(_shown(path, folders) for path in others)}")
+        if chosen in paths and len(paths) > 1:
+            others = ", ".join(_shown(path, folders) for path in paths if path != chosen)
+            notes.append(f"left out, as {chosen.name} is there: {others}")
     if questions:
         raise InputError("more than one survey could be meant", folders[0], advice=questions)
     if not {PHOTOS, LOG} & values.keys():
@@ -81,30 +83,33 @@ def understand(folders: Sequence[Path], given: Mapping[str, object]) -> Understo
     return Understood(values, tuple(notes))
 
 
+def _path(value: object) -> Path:
+    return Path(os.path.abspath(str(value)))
+
+
 def _chosen(key: str, paths: Sequence[Path]) -> Path | None:
     """The only one, or the one of the usual name, or files of one anchor each as one log; None: nobody knows."""
-    roots = _roots(key, paths)
-    usual = [path for path in roots if path.stem.lower() in _USUAL_NAMES.get(key, ())]
-    for candidates in (roots, usual):
+    usual = [path for path in paths if path.stem.lower() in _USUAL_NAMES.get(key, ())]
+    for candidates in (paths, usual):
         if len(candidates) == 1:
             return candidates[0]
     return _pattern(paths) if key == LOG else None
 
 
-def _roots(key: str, paths: Sequence[Path]) -> list[Path]:
-    """Of folders of photos the highest one above that has a usual name, as photos/left: then photos."""
-    if key != PHOTOS:
-        return list(paths)
-    above = [[path, *path.parents] for path in paths]
-    named = [[folder for folder in folders if folder.name.lower() in _USUAL_NAMES[PHOTOS]] for folders in above]
-    return list(dict.fromkeys(folders[-1] if folders else path for path, folders in zip(paths, named)))
+def _tops(paths: Sequence[Path], folders: Sequence[Path]) -> list[Path]:
+    """Of folders of photos the highest one inside ``folders`` that has a usual name, as photos for photos/left."""
+    tops = []
+    for path in paths:
+        inside = [above for above in (path, *path.parents) if any(above.is_relative_to(folder) for folder in folders)]
+        tops.append(next((above for above in reversed(inside) if above.name.lower() in _USUAL_NAMES[PHOTOS]), path))
+    return list(dict.fromkeys(tops))
 
 
 def _pattern(paths: Sequence[Path]) -> Path | None:
     """A pattern for the files of one log, each of another anchor; None if they are no such files."""
     names, folder = [path.name for path in paths], paths[0].parent
-    prefix = os.path.commonprefix(names)
-    suffix = os.path.commonprefix([name[len(prefix) :][::-1] for name in names])[::-1]
+    prefix = _common_beginning(names)
+    suffix = _common_beginning([name[len(prefix) :][::-1] for name in names])[::-1]
     pattern = Path(folder, f"{prefix}*{suffix}")
     if glob.has_magic(f"{folder}{prefix}{suffix}") or {*map(Path, glob.glob(str(pattern)))} != {*paths}:
         return None
@@ -115,19 +120,25 @@ def _pattern(paths: Sequence[Path]) -> Path | None:
     return pattern if all(len(ids) == 1 for ids in anchors) and len({*anchors}) == len(paths) else None
 
 
+def _common_beginning(texts: Sequence[str]) -> str:
+    alike = takewhile(lambda characters: len({*characters}) == 1, zip(*texts))
+    return "".join(characters[0] for characters in alike)
+
+
 def _add_camera(values: dict[str, Any], found: Found, notes: list[str]) -> None:
     """Camera and lever arm of the one calibration that there is for photos of this size."""
     files = [*found.calibrations]
-    path = _chosen("camera", files) if files else None
+    path = _chosen("camera", files)
     if path is None:
-        several = ", ".join(file.name for file in files)
-        notes += [f"{several}: none of these cameras is taken, as nothing tells which; leave one there"] if files else []
+        if files:
+            several = ", ".join(file.name for file in files)
+            notes.append(f"{several}: nothing tells which of these cameras it is, none is taken; leave one there")
         return
     cameras = found.calibrations[path]
-    if len(arms := [camera.tag_in_cam_m for camera in cameras if camera.tag_in_cam_m is not None]) == 1:
-        if not values.keys() & {*_LEVER_ARMS}:
-            values["tag.tag_in_cam_m"] = arms[0]
-            notes.append(f"the lever arm is that of {path.name}")
+    arms = [camera.tag_in_cam_m for camera in cameras if camera.tag_in_cam_m is not None]
+    if len(arms) == 1 and not values.keys() & {*_LEVER_ARMS}:
+        values["tag.tag_in_cam_m"] = arms[0]
+        notes.append(f"the lever arm is that of {path.name}")
     if {"camera.model", "camera.params"} & values.keys():
         return
     fitting = _of_size(cameras, _size_px(values))
@@ -152,5 +163,5 @@ def _size_px(values: Mapping[str, Any]) -> tuple[int, int] | None:
 
 
 def _shown(path: Path, folders: Sequence[Path]) -> str:
-    inside = [os.path.relpath(path, folder) for folder in folders if path.is_relative_to(os.path.abspath(folder))]
+    inside = [os.path.relpath(path, folder) for folder in folders if path.is_relative_to(folder)]
     return inside[0] if inside else str(path)

@@ -72,7 +72,7 @@ def _check_photos(survey: Survey, checked: CheckedSurvey) -> None:
     checked.facts.append(f"photos: {len(photos.names)} of {photos.width} x {photos.height} pixels in {folder.name}")
     if photos.left_out:
         name, why = next(iter(photos.left_out.items()))
-        checked.warnings.append(f"{len(photos.left_out)} photos cannot be used beside these, the first is {name}: {why}")
+        checked.warnings.append(f"{len(photos.left_out)} photos cannot be used with these, first {name}: {why}")
     with survey.source.naming_lines():
         check_camera(survey.camera)
         camera = camera_of_photos(survey.camera, folder / photos.names[0], photos.width, photos.height)
@@ -125,8 +125,8 @@ def _tell_of_times(
         return
     photos_s, offset_s = times.timestamps_s, survey.ranges.time_offset_s
     checked.facts.append(
-        f"times: {len(keyframes)} keyframes from {photos_s[0]:.3f} to {photos_s[-1]:.3f} s ({times.source}), ranges from "
-        f"{radio_s.min():.3f} to {radio_s.max():.3f} s"
+        f"times: {len(keyframes)} keyframes from {photos_s[0]:.3f} to {photos_s[-1]:.3f} s ({times.source}), "
+        f"ranges from {radio_s.min():.3f} to {radio_s.max():.3f} s"
     )
     at_s = radio_s + (offset_s or 0.0)
     shared_s = max(min(at_s.max(), photos_s[-1]) - max(at_s.min(), photos_s[0]), 0.0)
