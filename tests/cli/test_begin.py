@@ -62,7 +62,9 @@ def test_init_never_overwrites(folder: Path, capsys: pytest.CaptureFixture[str])
 def test_init_says_what_is_missing_and_assumed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "uwb.csv").unlink()
     assert main(["init", str(folder)]) == 0
-    assert "\nmissing: no ranges: give [ranges] path in a survey file, or --ranges LOG\n" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "\nmissing: no ranges: give [ranges] path in a survey file, or --ranges LOG\n" in told
+    assert told.endswith(f"\nnext: write down what is missing, then rangesfm check '{folder}/survey.toml'\n")
     assert main(["check", str(folder)]) == 2
     assert "\nerror: no ranges: " in capsys.readouterr().out
 

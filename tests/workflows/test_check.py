@@ -76,5 +76,8 @@ def test_clocks_that_share_no_time_photos_without_times_and_missing_parts_are_fa
     write_photos(folder / "timeless", 5, has_times=False)
     (no_times,) = check_survey(survey_of(folder, images__path=folder / "timeless")).faults
     assert "no time for IMG_0.jpg: expected a CSV file" in str(no_times)
+    without_photos = check_survey(survey_from_tables({}, folder, {"ranges.path": folder / "uwb.csv"}))
+    assert [str(fault)[:9] for fault in without_photos.faults] == ["no photos"]
+    assert without_photos.facts[0].startswith("ranges: 60 of 1 tag")
     faults = check_survey(survey_from_tables({}, folder)).faults
     assert [str(fault)[:9] for fault in faults] == ["no photos", "no ranges"]

@@ -57,7 +57,8 @@ def _init(args: argparse.Namespace, progress: Progress) -> Outcome:
     write_text(survey_text({**understood.values, "output.path": folder / "out"}, folder), path)
     checked = check_survey(read_survey(path))
     lines = [f"wrote {path}", *told(checked, fault="missing"), *(f"note: {note}" for note in understood.notes)]
-    return Outcome([*lines, f"next: {shlex.join(['rangesfm', 'run', str(path)])}"])
+    command = shlex.join(["rangesfm", "check" if checked.faults else "run", str(path)])
+    return Outcome([*lines, f"next: {'write down what is missing, then ' if checked.faults else ''}{command}"])
 
 
 def _check(args: argparse.Namespace, progress: Progress) -> Outcome:

@@ -17,7 +17,7 @@ from rangesfm.vision.camera import camera_of_photos, check_camera
 from rangesfm.vision.image_times import ImageTimes, list_images
 from rangesfm.vision.photos import usable_photos
 from rangesfm.workflows.journal import Journal
-from rangesfm.workflows.photos import checked_inputs, images_path
+from rangesfm.workflows.photos import checked_keyframes, images_path, read_inputs
 
 
 @dataclass
@@ -59,8 +59,9 @@ def check_survey(survey: Survey) -> CheckedSurvey:
     with checked.finding_faults():
         _check_photos(survey, checked)
     with checked.finding_faults():
-        inputs, keyframes, times = checked_inputs(survey, journal)
+        inputs = read_inputs(survey, journal)
         _tell_of_radio(survey, inputs, checked)
+        keyframes, times = checked_keyframes(survey, inputs, journal)
         _tell_of_times(survey, inputs, keyframes, times, checked)
     checked.warnings += journal.warnings
     return checked

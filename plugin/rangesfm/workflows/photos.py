@@ -53,9 +53,16 @@ def read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
 def checked_inputs(survey: Survey, journal: Journal) -> tuple[RangingInputs, tuple[str, ...], ImageTimes | None]:
     """Ranges and photos that have to do with each other; the photos' times, where any are needed."""
     inputs = read_inputs(survey, journal)
+    return inputs, *checked_keyframes(survey, inputs, journal)
+
+
+def checked_keyframes(
+    survey: Survey, inputs: RangingInputs, journal: Journal
+) -> tuple[tuple[str, ...], ImageTimes | None]:
+    """The photos to reconstruct and their times, which have to do with those of the inputs."""
     keyframes, times = find_keyframes(survey, journal, log_names_photos=inputs.log.image_name is not None)
     check_times(survey, inputs, _path_without_places(keyframes, times))
-    return inputs, keyframes, times
+    return keyframes, times
 
 
 def check_times(survey: Survey, inputs: RangingInputs, path: Trajectory) -> None:
