@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from tests.ranging.readers.test_readers_ros import message, write_bag1
 from tests.simulated.phone_survey import write_photos
 
 from rangesfm.errors import InputError
@@ -67,18 +68,31 @@ def test_results_of_runs_hidden_files_single_pictures_and_prose_are_no_inputs(tm
 
 
 def test_what_cannot_be_used_is_said(tmp_path: Path) -> None:
-    (tmp_path / "walk.MP4").touch()
-    (tmp_path / "bag").mkdir()
-    (tmp_path / "bag" / "metadata.yaml").touch()
+    for name in ("walk.MP4", "walk2.mp4", "IMG_1.HEIC"):
+        (tmp_path / name).touch()
     (tmp_path / "sparse").mkdir()
     for name in ("cameras.txt", "images.txt", "points3D.txt"):
         (tmp_path / "sparse" / name).touch()
     found = look_into([tmp_path])
-    assert paths(found) == {"ranges.path": ["bag"]}
-    video, bag, model = sorted(found.notes, key=lambda note: "bag" in note or 2 * ("model" in note))
-    assert video.startswith("walk.MP4: videos are not read yet")
-    assert bag == "bag is a bag: its ranges are read, images in it are not yet"
+    assert found.paths == {}
+    model, photos, videos = found.notes
     assert model == f"sparse is a COLMAP model: rangesfm refine --input_path {tmp_path / 'sparse'} begins with it"
+    assert photos == "1 of .heic, as IMG_1.HEIC: these are not read: convert them to JPEG"
+    assert videos.startswith("2 of .mp4, as walk.MP4: videos are not read yet")
+
+
+def test_a_bag_is_a_log_if_it_has_ranges(tmp_path: Path) -> None:
+    name = "uwb_ros/msg/RangeStamped"
+    bag = write_bag1(tmp_path, [(name, message(1, name, range=2.5, from_id=1, to_id=3, covariance=0.04))])
+    found = look_into([tmp_path])
+    assert paths(found) == {"ranges.path": ["log.bag"]}
+    assert found.notes == ("log.bag is a bag: its ranges are read, images in it are not yet",)
+    bag.unlink()
+    node = "nlink_parser/msg/LinktrackNode2"
+    write_bag1(tmp_path, [(node, message(1, node, role=1, id=1, dis=1.0, fp_rssi=0.0, rx_rssi=0.0))])
+    found = look_into([tmp_path])
+    assert found.paths == {}
+    assert "no ranges in this bag" in found.notes[1]
 
 
 def test_a_table_that_may_be_a_log_is_told_unless_there_is_one(tmp_path: Path) -> None:

@@ -13,9 +13,9 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from rangesfm.errors import InputError
-from rangesfm.files.tables import read_text
+from rangesfm.files.tables import read_head
 
-_COLMAP_LINE = re.compile(r"\d+ ([A-Z][A-Z0-9_]+) (\d+) (\d+)((?: \S+)+)")
+_COLMAP_LINE = re.compile(r"\d+ ([A-Z][A-Z0-9_]+) (\d+) (\d+)((?: [-+.\deE]+)+)", re.ASCII)
 # To OpenCV, and so to Kalibr and ROS, the centre of the first pixel is (0, 0); to COLMAP it is (0.5, 0.5).
 _CORNER_PX = 0.5
 # COLMAP's model and how many parameters it has beside fx, fy, cx, cy.
@@ -54,13 +54,13 @@ def read_calibrations(path: Path) -> tuple[Calibration, ...]:
     """
     try:
         return tuple(_READERS[path.suffix.lower()](path)) if path.suffix.lower() in _READERS else ()
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         what = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise InputError(f"a camera's calibration that is not complete ({what})", path) from None
 
 
 def _read_colmap(path: Path) -> Iterator[Calibration]:
-    lines = [" ".join(line.split()) for line in read_text(path, errors="replace").split("\n")]
+    lines = [" ".join(line.split()) for line in read_head(path).split("\n")]
     found = [_COLMAP_LINE.fullmatch(line) for line in lines if line and not line.startswith("#")]
     for match in found if all(found) else ():
         assert match is not None
@@ -69,7 +69,7 @@ def _read_colmap(path: Path) -> Iterator[Calibration]:
 
 def _read_json(path: Path) -> Iterator[Calibration]:
     try:
-        camera = json.loads(read_text(path, errors="replace"))
+        camera = json.loads(read_head(path))
     except (ValueError, RecursionError):
         return
     if isinstance(camera, dict) and {"camera_model", "params"} <= camera.keys():
@@ -81,7 +81,7 @@ def _read_json(path: Path) -> Iterator[Calibration]:
 
 def _read_yaml(path: Path) -> Iterator[Calibration]:
     try:
-        content = YAML(typ="safe", pure=True).load(read_text(path, errors="replace"))
+        content = YAML(typ="safe", pure=True).load(read_head(path))
     except (YAMLError, ValueError, RecursionError):
         return
     if not isinstance(content, dict):

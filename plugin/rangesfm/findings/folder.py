@@ -15,13 +15,19 @@ from rangesfm.findings.calibration import Calibration, read_calibrations
 from rangesfm.geometry.reference import is_reference_file
 from rangesfm.ranging.anchors.anchor_file import is_anchor_file
 from rangesfm.ranging.errors.error_curve import is_error_curve_file
-from rangesfm.ranging.readers import find_log_reader
+from rangesfm.ranging.readers import find_log_reader, read_ranges
 from rangesfm.ranging.readers.ros import is_bag_folder
 from rangesfm.vision.image_times import IMAGE_EXTENSIONS, is_image_times_file
 from rangesfm.vision.photos import MIN_NUM_PHOTOS
 
 PHOTOS, LOG = "images.path", "ranges.path"
-_VIDEO_EXTENSIONS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mts", ".insv")
+_NOT_READ = {
+    **dict.fromkeys(
+        (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mts", ".insv"),
+        "videos are not read yet: take photos out of them (ffmpeg), with their times",
+    ),
+    **dict.fromkeys((".heic", ".heif", ".dng", ".cr2", ".nef", ".arw"), "these are not read: convert them to JPEG"),
+}
 _BAG_EXTENSIONS = (".bag", ".mcap", ".db3")
 _TABLE_EXTENSIONS = (".csv", ".tsv", ".txt", ".log", ".dat")
 # Files of earlier runs are no inputs.
@@ -62,10 +68,11 @@ def look_into(folders: Sequence[Path]) -> Found:
     calibrations: dict[Path, tuple[Calibration, ...]] = {}
     notes: list[str] = []
     unsure: list[str] = []
+    not_read: dict[str, list[Path]] = defaultdict(list)
     for path in _entries(folders):
         try:
-            if path.suffix.lower() in _VIDEO_EXTENSIONS:
-                notes.append(f"{path.name}: videos are not read yet, take photos out of it (ffmpeg) into a folder")
+            if path.suffix.lower() in _NOT_READ:
+                not_read[path.suffix.lower()].append(path)
             elif path.is_dir() and not is_bag_folder(path):
                 if _is_model(path):
                     notes.append(f"{path.name} is a COLMAP model: rangesfm refine --input_path {path} begins with it")
@@ -73,21 +80,29 @@ def look_into(folders: Sequence[Path]) -> Found:
                     paths[PHOTOS].append(path)
             elif cameras := read_calibrations(path):
                 calibrations[path] = cameras
-            elif key := _key_of(path):
-                paths[key].append(path)
-                if path.is_dir() or path.suffix in _BAG_EXTENSIONS:
+            else:
+                if _is_bag(path):
                     notes.append(f"{path.name} is a bag: its ranges are read, images in it are not yet")
+                if key := _key_of(path):
+                    paths[key].append(path)
         except InputError as error:
             if error.advice:
                 unsure.append(f"{error}; if it is the radio's log, rangesfm ranges {path} asks for more")
             else:
                 notes.append(str(error))
+    for suffix, those in not_read.items():
+        notes.append(f"{len(those)} of {suffix}, as {those[0].name}: {_NOT_READ[suffix]}")
     return Found(dict(paths), calibrations, (*notes, *([] if LOG in paths else unsure)))
+
+
+def _is_bag(path: Path) -> bool:
+    return is_bag_folder(path) or path.suffix in _BAG_EXTENSIONS
 
 
 def _key_of(path: Path) -> str | None:
     """The key that takes such a file; None: not known. InputError: it may be a log, and is not understood."""
-    if path.is_dir() or path.suffix in _BAG_EXTENSIONS:
+    if _is_bag(path):
+        read_ranges(path)
         return LOG
     head = read_head(path)
     if not head.strip() or "\0" in head:
