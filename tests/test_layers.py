@@ -24,6 +24,7 @@ LAYERS = (
     "findings",
     "refine",
     "join",
+    "trust",
     "result",
     "report",
     "comparison",

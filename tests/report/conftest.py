@@ -88,7 +88,6 @@ def _write_scale_tables(folder: Path, rows: list[list[Any]]) -> None:
     scales = np.geomspace(0.25, 2.2, 101)
     counts = np.round(2500 * np.exp(-(((scales - 0.742) / 0.1) ** 2))).astype(int)
     _write_csv(folder / "scale_consensus.csv", ["scale", "num_agreeing"], zip(scales, counts))
-    _write_csv(folder / "scale_bootstrap.csv", ["scale"], [[s] for s in rng.normal(0.742, 0.004, 200)])
     offsets = np.linspace(-2.0, 2.0, 81)
     _write_csv(folder / "time_offset_curve.csv", ["time_offset_s", "cost"], zip(offsets, (offsets - 0.012) ** 2))
 

@@ -146,7 +146,8 @@ def _scale(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _refine(args: argparse.Namespace, progress: Progress) -> Outcome:
-    r"""Scale a COLMAP model by ranges, then adjust it with the ranges in its bundle adjustment.
+    r"""Scale a COLMAP model by ranges, then adjust it with the ranges in its bundle adjustment. If that breaks the
+    map, the scaled one is the result, and the reason is said.
 
     example:
       rangesfm refine --input_path sparse/0 --ranges uwb.csv --anchors anchors.csv \

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
@@ -159,7 +160,7 @@ def _size_px(values: Mapping[str, Any]) -> tuple[int, int] | None:
     if PHOTOS not in values:
         return None
     photos = usable_photos(values[PHOTOS], list_images(values[PHOTOS]))
-    return photos.width, photos.height
+    return Counter(photos.sizes).most_common(1)[0][0]
 
 
 def _shown(path: Path, folders: Sequence[Path]) -> str:

@@ -47,12 +47,11 @@ SECTIONS = (
         "Scale",
         (
             figures_scale.scale_per_anchor,
-            figures_scale.bootstrap,
             figures_scale.consensus,
             figures_scale.clock_curve,
             figures_scale.candidates,
         ),
-        (tables.two_candidates, tables.sensitivity),
+        (tables.error_budget, tables.two_candidates, tables.sensitivity),
     ),
     Section(
         "ranges",

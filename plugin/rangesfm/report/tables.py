@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from rangesfm.ranging.errors.components import component_words
 from rangesfm.report.content import Content, in_natural_order
 from rangesfm.report.text import count, duration, fixed, keyed, plain, signed
 from rangesfm.result.entries import AnchorEntry, median, rms
@@ -160,6 +161,17 @@ def refinement(content: Content) -> Table:
     values = {} if refine is None else refine.to_json()
     rows = [[name.replace("_", " "), keyed(f"refine.{name}", value, plain(value))] for name, value in values.items()]
     return Table("Refinement", [], rows, is_narrow=True)
+
+
+def error_budget(content: Content) -> Table:
+    """What the scale's interval is made of, largest part first."""
+    parts = content.summary.scale.relative_stddev.components
+    words = component_words(parts)
+    rows = [
+        [words[name], keyed(f"scale.relative_stddev.components.{name}", stddev, f"{100 * stddev:.2f} %")]
+        for name, stddev in sorted(parts.items(), key=lambda part: -part[1])
+    ]
+    return Table("What the scale's stddev is made of", ["errors", "stddev"], rows, is_narrow=True)
 
 
 def sensitivity(content: Content) -> Table:

@@ -23,6 +23,7 @@ from rangesfm.result.entries import (
     InputEntry,
     MapEntry,
     ModelEntry,
+    PlaceEntry,
     RangesEntry,
     RefineEntry,
     ScaleEntry,
@@ -44,6 +45,7 @@ class ResultSummary(Record):
         metric_from_sfm: world of ``sparse/0`` to world of ``sparse_scaled/0``.
         frame: the world of the metric models.
         anchors: by id.
+        place: null where the frame is the first camera's.
         refine: null without a refinement.
         models: that were to be joined to what is one model here; empty where there was only one.
         distances: that were taped.
@@ -56,6 +58,7 @@ class ResultSummary(Record):
     NAME: ClassVar = "result.json"
 
     scale: ScaleEntry
+    place: PlaceEntry | None
     metric_from_sfm: SimilarityEntry
     frame: Literal["site", "first_camera"]
     map: MapEntry
@@ -80,6 +83,7 @@ class ResultSummary(Record):
         estimate = found.estimate
         return cls(
             scale=ScaleEntry.model_validate(estimate),
+            place=None if found.place is None else PlaceEntry.model_validate(found.place),
             metric_from_sfm=SimilarityEntry.of(estimate.metric_from_sfm),
             frame="site" if estimate.frame == "site" else "first_camera",
             map=MapEntry(num_photos=found.final.num_reg_images(), num_points3D=found.final.num_points3D()),
@@ -99,12 +103,20 @@ class ResultSummary(Record):
         interval = f"{_text(low, '.6g')} to {_text(high, '.6g')}"
         yield f"scale: {scale.value:.6g} m per SfM unit, 95 % interval {interval}"
         yield f"verdict: {scale.verdict}: {'; '.join(scale.reasons)}"
+        if self.place is not None:
+            # What speaks against both has just been said.
+            reasons = [reason for reason in self.place.reasons if reason not in scale.reasons]
+            yield f"place: {self.place.verdict}{': ' if reasons else ''}{'; '.join(reasons)}"
         for advice in scale.advice:
             yield f"next time: {advice}"
         yield from _notable(scale.sensitivity)
         if self.refine is not None:
             refined = _text(self.refine.scale_value, ".6g")
-            yield f"refined: {refined} m per SfM unit after {self.refine.iterations} iterations"
+            yield (
+                f"refined: {refined} m per SfM unit after {self.refine.iterations} iterations"
+                if self.refine.kept
+                else "the refinement broke the map: the result is the scaled map"
+            )
         rms, median = (_text(value, ".3f") for value in (ranges.rms_m, ranges.median_abs_m))
         residuals = f", rms {rms} m, median {median} m" if ranges.num_used else ""
         yield f"ranges: {ranges.num_used} of {ranges.num} used{residuals}"

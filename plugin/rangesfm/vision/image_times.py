@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import is_plain_name
 from rangesfm.files.tables import Table, has_columns, read_table
+from rangesfm.vision.exif import exif_tags
 
 IMAGE_EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 
@@ -25,7 +25,6 @@ _COLUMNS = ("image_name", "timestamp_s")
 _ALIASES = {"filename": "image_name", "timestamp": "timestamp_s"}
 _FINEST_RESOLUTION_S = 1e-3
 _MAX_TIMESTAMP_S = 1e11  # the year 5138: larger numbers are in another unit
-_EXIF_IFD = 0x8769
 _DATE_TIME_ORIGINAL, _SUB_SEC_TIME_ORIGINAL, _OFFSET_TIME_ORIGINAL = 0x9003, 0x9291, 0x9011
 # 2001 to 2096 since 1970. The same in ms, us or ns is never taken for another unit, and neither a
 # frame number nor a date written as digits (20260131...) is taken for any of them.
@@ -235,13 +234,8 @@ def _resolution(text: str) -> float:
 
 
 def _read_exif(path: Path) -> dict[int, str]:
-    """Text tags of the EXIF block about the exposure; none if the file has none or is no image."""
-    try:
-        with Image.open(path) as image:
-            tags = image.getexif().get_ifd(_EXIF_IFD)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # what Pillow's readers raise
-        return {}
-    return {tag: value.strip("\0 ") for tag, value in tags.items() if isinstance(value, str)}
+    """Text tags; none if the file has none or is no image."""
+    return {tag: value.strip("\0 ") for tag, value in exif_tags(path).items() if isinstance(value, str)}
 
 
 def _exif_stamp(exif: Mapping[int, str], default_offset: timedelta) -> _Stamp | None:

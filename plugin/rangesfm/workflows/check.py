@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -13,11 +14,14 @@ from rangesfm.progress import SilentProgress
 from rangesfm.ranging.log import RangeKind
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
-from rangesfm.vision.camera import camera_of_photos, check_camera
+from rangesfm.vision.camera import cameras_of_photos, check_camera
 from rangesfm.vision.image_times import ImageTimes, list_images
 from rangesfm.vision.photos import usable_photos
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.photos import checked_keyframes, images_path, read_inputs
+
+# More than these nobody reads.
+_MAX_NUM_SIZES = 4
 
 
 @dataclass
@@ -70,18 +74,23 @@ def check_survey(survey: Survey) -> CheckedSurvey:
 def _check_photos(survey: Survey, checked: CheckedSurvey) -> None:
     folder = images_path(survey)
     photos = usable_photos(folder, list_images(folder))
-    checked.facts.append(f"photos: {len(photos.names)} of {photos.width} x {photos.height} pixels in {folder.name}")
+    sizes = ", ".join(f"{num} of {w} x {h}" for (w, h), num in Counter(photos.sizes).most_common(_MAX_NUM_SIZES))
+    checked.facts.append(f"photos: {len(photos.names)} in {folder.name} ({sizes} pixels)")
     if photos.left_out:
         name, why = next(iter(photos.left_out.items()))
-        checked.warnings.append(f"{len(photos.left_out)} photos cannot be used with these, first {name}: {why}")
+        checked.warnings.append(f"{len(photos.left_out)} photos are left out, first {name}: {why}")
     with survey.source.naming_lines():
         check_camera(survey.camera)
-        camera = camera_of_photos(survey.camera, folder / photos.names[0], photos.width, photos.height)
-    if survey.camera.params is not None:
-        checked.facts.append(f"camera: {camera.model.name} as given")
-    else:
-        seen = "by the photos' EXIF" if camera.has_prior_focal_length else "a guess from the size of the photos"
-        checked.assumed.append(f"camera {camera.model.name}, f about {camera.mean_focal_length():.0f} pixels, {seen}")
+        found = cameras_of_photos(survey.camera, photos)
+    for number, camera in enumerate(found.cameras[:_MAX_NUM_SIZES]):
+        num_photos, focal_length_px = found.of_photo.count(number), camera.mean_focal_length()
+        what = f"{camera.model.name} for {num_photos} photos, f {focal_length_px:.0f} pixels"
+        is_guessed = photos.names[found.of_photo.index(number)] in found.guessed
+        if survey.camera.params is not None and not is_guessed:
+            checked.facts.append(f"camera: {what}, as given")
+        else:
+            seen = "by EXIF" if camera.has_prior_focal_length else "a guess from the photos' size"
+            checked.assumed.append(f"camera {what}, {seen}")
 
 
 def _tell_of_radio(survey: Survey, inputs: RangingInputs, checked: CheckedSurvey) -> None:
@@ -105,11 +114,6 @@ def _tell_of_radio(survey: Survey, inputs: RangingInputs, checked: CheckedSurvey
     if {"tag_in_cam_m", "lever_arms_m"} & survey.tag.model_fields_set:
         arms = (f"{', '.join(f'{x:g}' for x in arm)} m" for arm in inputs.tag_in_cam_m.tolist() if not np.isnan(arm[0]))
         checked.facts.append(f"lever arm: the tag is at {'; '.join(arms)} in the camera frame (right, down, forward)")
-    else:
-        checked.assumed.append(
-            "the lever arm is zero: the tag is where the lens is; measure it and give [tag] tag_in_cam_m (right, down, "
-            "forward, metres)"
-        )
     if inputs.tape is not None:
         checked.facts.append(f"taped distances: {len(inputs.tape.distances)}")
     if inputs.reference is not None:
