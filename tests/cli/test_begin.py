@@ -34,7 +34,7 @@ def test_init_writes_what_it_says_and_check_says_the_same(folder: Path, rangesfm
     first, *told, last = done.stdout.splitlines()
     assert first == f"wrote {folder.name}/survey.toml"
     assert last == f"next: rangesfm run '{folder.name}/survey.toml'"
-    assert "photos: 12 in DCIM (9 of 96 x 64, 3 of 64 x 96 pixels)" in told
+    assert "photos in DCIM: 9 of 96 x 64 pixels, 3 of 64 x 96 pixels" in told
     assert "anchors: 4 of 4 have positions in anchors.csv (frame site)" in told
     assert "lever arm: the tag is at 0, -0.1, 0 m in the camera frame (right, down, forward)" in told
     survey = read_survey(folder / "survey.toml")
@@ -53,8 +53,8 @@ def test_init_never_overwrites(folder: Path, capsys: pytest.CaptureFixture[str])
     (line,) = capsys.readouterr().err.splitlines()
     assert "survey.toml: is there already and is left as it is" in line
     assert written.read_text() == "# mine\n"
-    assert main(["init", str(folder), "--output_path", str(folder.parent / "new" / "other.toml")]) == 0
-    other = read_survey(folder.parent / "new" / "other.toml")
+    assert main(["init", str(folder), "--output_path", str(folder.parent / "new")]) == 0
+    other = read_survey(folder.parent / "new" / "survey.toml")
     assert other.ranges.path == folder / "uwb.csv"
     assert other.output.path == folder.parent / "new" / "out"
 
@@ -94,7 +94,7 @@ def test_a_folder_runs_without_a_file_and_says_first_what_it_is(
     monkeypatch.setattr("rangesfm.workflows.run.run_survey", run)
     assert main(["run", str(folder), "--every_nth", "2"]) == 0
     told = capsys.readouterr().err.splitlines()
-    assert "photos: 12 in DCIM (9 of 96 x 64, 3 of 64 x 96 pixels)" in told
+    assert "photos in DCIM: 9 of 96 x 64 pixels, 3 of 64 x 96 pixels" in told
     assert any(line.startswith("assumed: camera SIMPLE_RADIAL for 9 photos") for line in told)
     (survey,) = asked
     assert survey.output.path == folder / "out"

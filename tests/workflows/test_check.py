@@ -32,7 +32,7 @@ def test_a_good_survey_is_told_with_its_counts_times_and_what_is_assumed(folder:
     assert checked.faults == []
     assert checked.exit_status == 0
     assert checked.facts == [
-        "photos: 20 in images (17 of 96 x 64, 3 of 64 x 96 pixels)",
+        "photos in images: 17 of 96 x 64 pixels, 3 of 64 x 96 pixels",
         "ranges: 60 of 1 tag (tag) to 4 anchors (A1, A2, A3, A4) in uwb.csv (canonical)",
         "anchors: 4 of 4 have positions in anchors.csv (frame site)",
         f"times: 20 keyframes from {PHONE_START_S:.3f} to {PHONE_START_S + 19:.3f} s (exif), "

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 def add_commands(commands: Commands) -> None:
     init = commands.add("init", _init, "a survey file from folders of photos and logs")
     init.add_argument("folders", nargs="+", metavar="FOLDER", help="where photos, log, anchors, ... are")
-    init.add_argument("--output_path", metavar="TOML", help="the file (default: survey.toml in the first FOLDER)")
+    init.add_argument("--output_path", metavar="PATH", help="survey file, or its folder (default: the first FOLDER)")
     add_flags(init, without=("output.path",))
     check = commands.add("check", _check, "what a run would work with, and what is wrong with it, in seconds")
     add_survey_arguments(check)
@@ -47,9 +47,9 @@ def _init(args: argparse.Namespace, progress: Progress) -> Outcome:
 
     folders = [Path(folder) for folder in args.folders]
     path = Path(args.output_path or folders[0])
-    path = path / NAME if path.is_dir() or args.output_path is None else path
+    path = path if path.suffix == ".toml" else path / NAME
     if os.path.lexists(path):
-        raise InputError("is there already and is left as it is; --output_path TOML writes another", path)
+        raise InputError("is there already and is left as it is; --output_path PATH writes another", path)
     understood = understand(folders, overrides_from_arguments(args))
     understood.survey()  # refuses values that are none, before anything is written
     folder = path.absolute().parent

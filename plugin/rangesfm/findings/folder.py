@@ -30,6 +30,8 @@ _NOT_READ = {
 }
 _BAG_EXTENSIONS = (".bag", ".mcap", ".db3")
 _TABLE_EXTENSIONS = (".csv", ".tsv", ".txt", ".log", ".dat")
+# Of tables that may be the log, where there is none.
+_MAX_NUM_UNSURE = 3
 # Files of earlier runs are no inputs.
 _LEFT_BY_RUNS = {"result.json", "reconstruct.json"}
 # By the header row, once it is known that the file is no log.
@@ -92,7 +94,7 @@ def look_into(folders: Sequence[Path]) -> Found:
                 notes.append(str(error))
     for suffix, those in not_read.items():
         notes.append(f"{len(those)} of {suffix}, as {those[0].name}: {_NOT_READ[suffix]}")
-    return Found(dict(paths), calibrations, (*notes, *([] if LOG in paths else unsure)))
+    return Found(dict(paths), calibrations, (*notes, *([] if LOG in paths else unsure[:_MAX_NUM_UNSURE])))
 
 
 def _is_bag(path: Path) -> bool:

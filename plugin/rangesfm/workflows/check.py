@@ -74,8 +74,9 @@ def check_survey(survey: Survey) -> CheckedSurvey:
 def _check_photos(survey: Survey, checked: CheckedSurvey) -> None:
     folder = images_path(survey)
     photos = usable_photos(folder, list_images(folder))
-    sizes = ", ".join(f"{num} of {w} x {h}" for (w, h), num in Counter(photos.sizes).most_common(_MAX_NUM_SIZES))
-    checked.facts.append(f"photos: {len(photos.names)} in {folder.name} ({sizes} pixels)")
+    sizes = [f"{num} of {width} x {height} pixels" for (width, height), num in Counter(photos.sizes).most_common()]
+    more = [f"{len(sizes) - _MAX_NUM_SIZES} sizes more"] if len(sizes) > _MAX_NUM_SIZES else []
+    checked.facts.append(f"photos in {folder.name}: {', '.join(sizes[:_MAX_NUM_SIZES] + more)}")
     if photos.left_out:
         name, why = next(iter(photos.left_out.items()))
         checked.warnings.append(f"{len(photos.left_out)} photos are left out, first {name}: {why}")
