@@ -314,6 +314,9 @@ class ScaleOptions(Options):
     enough with it, and a mirror image is ruled out that would stand the map on its head."""
     camera_side: Literal["above", "below"] | None = None
     """Where the camera went, seen from surveyed anchors that are all in one plane."""
+    adopt: bool = False
+    """Where the tests find a mistake, run again as if its likeliest cause were so: an anchor unknown, a lever arm as it
+    fits, labels swapped, a stretch of ranges left out; what changed is said."""
 
 
 class ScaleAndTapeOptions(ScaleOptions):

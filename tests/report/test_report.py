@@ -21,7 +21,7 @@ from rangesfm.report.scene import scene_of, view_of
 from rangesfm.result.folder import read_result_folder
 
 MakeResult = Callable[..., Path]
-SECTIONS = ["verdict", "checks", "view-section", "path", "scale", "ranges", "anchors", "run"]
+SECTIONS = ["verdict", "checks", "view-section", "path", "scale", "ranges", "mistakes", "anchors", "run"]
 FIGURES = {
     "path": ["trajectory", "map_points", "local_scale"],
     "scale": ["scale_per_anchor", "scale_consensus", "time_offset_curve", "scale_candidates"],
@@ -327,3 +327,8 @@ def test_each_range_begins_at_its_own_tag(make_result: MakeResult) -> None:
     scene = scene_of(content)
     assert scene is not None
     assert sorted(view_of(scene)["ranges"]["tags_in_cam_m"]) == sorted(arms.values())
+
+
+def test_mistakes_are_listed_by_what_became_of_the_search_for_them(make_result: MakeResult) -> None:
+    texts = page_of(make_result()).texts
+    assert {"found", "not found", "would not be found"} <= set(texts)

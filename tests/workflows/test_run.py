@@ -369,3 +369,22 @@ def test_no_file_that_a_survey_reads_is_overwritten(key: str, survey: Survey) ->
         scale_model(survey.changed({**taped, key: path}), progress=SilentProgress())
     assert caught.value.path == path
     assert path.read_text() == "an input\n"
+
+
+def test_a_wrong_coordinate_is_said_and_mended_only_when_asked_for(survey: Survey, tmp_path: Path) -> None:
+    clean = scale_model(survey, progress=SilentProgress()).summary.scale
+    text = survey.anchors.path.read_text(encoding="utf-8") if survey.anchors.path else ""
+    head, first, *rest = text.splitlines()
+    cells = first.split(",")
+    cells[2] = str(float(cells[2]) + 3.0)
+    (tmp_path / "anchors.csv").write_text("\n".join([head, ",".join(cells), *rest]) + "\n", encoding="utf-8")
+    wrong = survey.changed({"anchors.path": tmp_path / "anchors.csv"})
+    told = scale_model(wrong, progress=SilentProgress()).summary
+    assert told.scale.verdict == "doubtful"
+    assert f"anchor {cells[0]}" in told.scale.reasons[0]
+    assert told.tests[0].rejected
+    assert told.tests[0].subject.startswith(cells[0])
+    mended = scale_model(wrong.changed({"scale.adopt": True}), progress=SilentProgress()).summary
+    assert mended.scale.verdict == "doubtful"
+    assert mended.scale.reasons[0].startswith("adopted: ")
+    assert mended.scale.value == pytest.approx(clean.value, rel=0.002)

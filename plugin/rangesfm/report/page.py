@@ -59,6 +59,7 @@ SECTIONS = (
         (figures_ranges.residuals_over_time, figures_ranges.residual_histogram, figures_ranges.absolute_errors),
         (tables.range_statuses, tables.ranges_per_anchor),
     ),
+    Section("mistakes", "Mistakes", (), (tables.mistakes,)),
     Section("anchors", "Anchors", (), (tables.anchors, tables.distances)),
     Section(
         "run",

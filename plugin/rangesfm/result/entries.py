@@ -303,6 +303,24 @@ class RefineEntry(Record):
         return cls.model_validate({**vars(summary), **others})
 
 
+class MistakeEntry(Record):
+    """A mistake that may have been made, and what the ranges say of it; see MistakeTest."""
+
+    name: Text
+    subject: Text
+    statistic: Number
+    threshold: Number
+    size: NumberOrNull
+    stddev: NumberOrNull
+    unit: Text
+    smallest_detectable: NumberOrNull
+    effect_on_scale: NumberOrNull
+    effect_on_place_m: NumberOrNull
+    rejected: Flag
+    words: Text
+    remedy: Text
+
+
 class ComparisonRow(Record):
     """One path against the reference: a row of the paper's table.
 

@@ -21,6 +21,7 @@ from rangesfm.refine.with_ranges import RefineSummary
 from rangesfm.scale.diagnostics import ScaleDiagnostics, scale_diagnostics
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.trust.finished_map import Place
+from rangesfm.trust.verdict import TrustVerdict
 
 USED = (RangeStatus.USED, RangeStatus.DOWN_WEIGHTED)
 """Of ranges with a say in the final model, however small."""
@@ -44,6 +45,7 @@ class MetricResult:
             one is the result.
         place: of the map in the site's frame; None where the frame is the first camera's, or nobody judged it yet.
         models: that were to be joined to what is one model here; empty where there was only one.
+        trust: what the tests of mistakes say of the scaled map.
     """
 
     trajectory: Trajectory
@@ -58,6 +60,7 @@ class MetricResult:
     why_broken: tuple[str, ...] = ()
     place: Place | None = None
     models: tuple[ModelVerdict, ...] = ()
+    trust: TrustVerdict | None = None
 
     @property
     def final(self) -> pycolmap.Reconstruction:

@@ -22,6 +22,7 @@ from rangesfm.result.entries import (
     GeoreferenceEntry,
     InputEntry,
     MapEntry,
+    MistakeEntry,
     ModelEntry,
     PlaceEntry,
     RangesEntry,
@@ -48,6 +49,7 @@ class ResultSummary(Record):
         place: null where the frame is the first camera's.
         refine: null without a refinement.
         models: that were to be joined to what is one model here; empty where there was only one.
+        tests: of mistakes that may have been made, those that were found first.
         distances: that were taped.
         comparison: only there where a reference was given.
         georeference: null if the anchors did not say.
@@ -68,6 +70,7 @@ class ResultSummary(Record):
     check_ranges: CheckRangesEntry
     refine: RefineEntry | None
     models: tuple[ModelEntry, ...]
+    tests: tuple[MistakeEntry, ...] = ()
     distances: tuple[DistanceRow, ...]
     comparison: tuple[ComparisonRow, ...] = ()
     georeference: GeoreferenceEntry | None
@@ -92,6 +95,7 @@ class ResultSummary(Record):
             ranges=RangesEntry.of(found),
             check_ranges=CheckRangesEntry.of(found),
             refine=RefineEntry.of(found),
+            tests=tuple(MistakeEntry.model_validate(test) for test in (found.trust.tests if found.trust else ())),
             models=tuple(ModelEntry.of(model, estimate.metric_from_sfm) for model in found.models),
             **others,
         )

@@ -33,6 +33,7 @@ from rangesfm.trust.broken_refinement import why_broken
 from rangesfm.trust.finished_map import Doubt, doubts_of_map, place_of_map
 from rangesfm.vision.image_times import ImageTimes
 from rangesfm.workflows.journal import Journal
+from rangesfm.workflows.trust_in_map import tested
 
 # Scales of two clock offsets further apart than this are no answer, unless one of the offsets is nearly certain.
 _MAX_SPREAD = 0.03
@@ -237,7 +238,8 @@ def scale_by_survey(
     )
     weights = estimate.errors.robust_weights(predicted - inputs.log.range_m)
     offset_s = offset.value_s if offset is not None else survey.ranges.time_offset_s
-    return MetricResult(trajectory, offset, offset_s, estimate, scaled, predicted, weights).doubted(by_rivals)
+    metric = MetricResult(trajectory, offset, offset_s, estimate, scaled, predicted, weights)
+    return tested(survey, metric.doubted(by_rivals), journal)
 
 
 def doubts_by_rivals(

@@ -19,6 +19,7 @@ from rangesfm.ranging.clock.estimate import TimeOffset
 from rangesfm.survey.inputs import RangingInputs, times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes
+from rangesfm.workflows.adoption import with_likeliest_cause
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.metric_map import (
     find_time_offset,
@@ -134,6 +135,8 @@ def map_in_metres(
     with journal.stage("scale"):
         path, verdicts = join_by_survey(survey, inputs, paths, journal, must_join=must_join)
         metric = replace(scale_by_survey(survey, inputs, path, offset, journal), models=verdicts)
+        if survey.scale.adopt:
+            inputs, metric = with_likeliest_cause(survey, inputs, path, metric, journal)
     # Global refinement: photos and ranges together.
     if refine:
         with journal.stage("refinement"):
