@@ -100,3 +100,14 @@ def test_a_folder_runs_without_a_file_and_says_first_what_it_is(
     assert survey.output.path == folder / "out"
     assert survey.images.every_nth == 2
     assert not (folder / "survey.toml").exists()
+
+
+def test_photos_and_log_may_lie_in_folders_of_their_own(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    radio = folder.parent / "radio"
+    radio.mkdir()
+    for name in ("uwb.csv", "anchors.csv"):
+        (folder / name).rename(radio / name)
+    assert main(["init", str(folder), str(radio)]) == 0
+    assert "missing" not in capsys.readouterr().out
+    survey = read_survey(folder / "survey.toml")
+    assert (survey.images.path, survey.ranges.path) == (folder / "DCIM", radio / "uwb.csv")
