@@ -67,17 +67,22 @@ def _in_time(cells: Cells, length_s: float) -> Array:
     return together
 
 
-def _log_distance(cells: Cells) -> Array:
-    return np.log(np.maximum(cells.distance_m, _MIN_DISTANCE_M))
+def _log_distance(distance_m: Array) -> Array:
+    return np.log(np.maximum(distance_m, _MIN_DISTANCE_M))
 
 
-def _smooth(cells: Cells) -> Array:
-    alike: Array = np.exp(-0.5 * (_apart(_log_distance(cells)) / _SMOOTH) ** 2)
+def alike_by_distance(distance_m: Array) -> Array:
+    """(c, c) of a random function, smooth in the logarithm of (c,) distances."""
+    alike: Array = np.exp(-0.5 * (_apart(_log_distance(distance_m)) / _SMOOTH) ** 2)
     return alike
 
 
+def _smooth(cells: Cells) -> Array:
+    return alike_by_distance(cells.distance_m)
+
+
 def _rough(cells: Cells) -> Array:
-    alike: Array = np.exp(-_apart(_log_distance(cells)) / _ROUGH)
+    alike: Array = np.exp(-_apart(_log_distance(cells.distance_m)) / _ROUGH)
     return alike
 
 
@@ -86,7 +91,7 @@ def _short(cells: Cells) -> Array:
     return np.outer(shortness, shortness)
 
 
-def _by_direction(directions: Array) -> Array:
+def alike_by_direction(directions: Array) -> Array:
     """Of a random polynomial of the direction, half of its variance linear and half quadratic in the unit vector."""
     cosine = directions @ directions.T
     alike: Array = cosine / 2 + (3 * cosine**2 - 1) / 4
@@ -102,11 +107,11 @@ def _proportional(cells: Cells) -> Array:
 
 
 def _antenna(cells: Cells) -> Array:
-    return _same(cells.anchor_index) * _by_direction(cells.from_anchor)
+    return _same(cells.anchor_index) * alike_by_direction(cells.from_anchor)
 
 
 def _tag_antenna(cells: Cells) -> Array:
-    return _same(cells.tag_index) * _by_direction(cells.in_cam)
+    return _same(cells.tag_index) * alike_by_direction(cells.in_cam)
 
 
 def _bending(cells: Cells) -> Array:
