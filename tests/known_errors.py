@@ -12,7 +12,6 @@ from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.observations import RangeObservations
 
 Array = npt.NDArray[np.float64]
-_BLOCK_S = 10.0
 
 
 def known_errors(
@@ -31,7 +30,7 @@ def known_errors(
     """
     rows, num = observations.placed_rows, len(observations.log)
     options = RangeModelOptions(common_bias_stddev_m=common_bias_stddev_m)
-    begun = RangeErrors.begin(observations, rows, options, _BLOCK_S)
+    begun = RangeErrors.begin(observations, rows, options)
     stddev = np.broadcast_to(stddev_m, num)[rows]
     noise = np.sqrt(np.maximum(stddev**2 - begun.shared_m**2, 1e-6))
     found = replace(

@@ -13,14 +13,7 @@ _SCALE = {
     "interval_95": [1.47, 1.53],
     "relative_stddev": {
         "formal": 0.003,
-        "bootstrap": 0.004,
-        "jackknife": None,
-        "range_model": 0.009,
-        "correlated": 0.003,
-        "num_blocks": 9,
-        "num_anchors": 2,
-        "antennas": 0.002,
-        "correlated_dof": 29.2,
+        "components": {"time": 0.004, "curve": 0.009},
     },
     "method": "robust",
     "verdict": "good",
@@ -41,6 +34,7 @@ _SCALE = {
 }
 _RESULT: dict[str, Any] = {
     "scale": _SCALE,
+    "place": None,
     "metric_from_sfm": {"scale": 1.5, "rotation_xyzw": [0.0, 0.0, 0.0, 1.0], "translation_m": [1.0, 2.0, 3.0]},
     "frame": "site",
     "map": {"num_photos": 40, "num_points3D": 900},
@@ -64,6 +58,8 @@ _RESULT: dict[str, Any] = {
     "warnings": [],
 }
 REFINE = {
+    "kept": True,
+    "why_not_kept": [],
     "iterations": 23,
     "keyframe_graph_steps": 4,
     "bend_m": 0.01,

@@ -20,12 +20,14 @@ from tests.simulated.path import loop_path
 import rangesfm
 from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.options import CameraOptions, MapperOptions, RefineOptions
+from rangesfm.progress import SilentProgress
 from rangesfm.refine.bundle_adjustment import bundle_adjustment
-from rangesfm.vision import submap_refinement
-from rangesfm.vision.camera import camera_of_photos
+from rangesfm.vision.camera import cameras_of_photos
 from rangesfm.vision.features import feature_options
 from rangesfm.vision.mapping import pipeline_options
 from rangesfm.vision.matching import matching_options
+from rangesfm.vision.matching_share import MatchingShare
+from rangesfm.vision.photos import Photos
 
 SEED = 3
 KNOWN_CAMERA = CameraOptions(model="SIMPLE_PINHOLE", params=(240.0, 128.0, 96.0))
@@ -41,7 +43,7 @@ def _changes(found: dict[str, Any], default: dict[str, Any]) -> Iterator[tuple[s
     for key, value in found.items():
         if isinstance(value, dict):
             yield from ((f"{key}.{inner}", changed) for inner, changed in _changes(value, default[key]))
-        elif value != default[key]:
+        elif not np.array_equal(value, default[key]):
             yield key, value
 
 
@@ -49,10 +51,19 @@ def test_features_are_found_as_colmap_finds_them() -> None:
     assert changes(feature_options(MapperOptions())) == {}
 
 
-@pytest.mark.parametrize(("num_photos", "pairing"), [(60, {"block_size": 8}), (61, {})], ids=["all", "neighbours"])
-def test_photos_are_matched_as_colmap_matches_them(num_photos: int, pairing: dict[str, Any]) -> None:
-    options = matching_options(MapperOptions(), num_photos, SEED)
-    assert changes(options.pairing) == pairing
+@pytest.mark.parametrize(
+    ("mapper", "num_photos", "pairing"),
+    [
+        (MapperOptions(), 60, pycolmap.ExhaustivePairingOptions),
+        (MapperOptions(), 61, pycolmap.SequentialPairingOptions),
+        (MapperOptions(matching="spatial"), 9, pycolmap.SpatialPairingOptions),
+    ],
+    ids=["all", "neighbours", "near ones"],
+)
+def test_photos_are_matched_as_colmap_matches_them(mapper: MapperOptions, num_photos: int, pairing: type) -> None:
+    options = matching_options(mapper, num_photos, SEED)
+    assert isinstance(options.pairing, pairing)
+    assert changes(options.pairing) == {}
     assert changes(options.matcher) == ({} if pycolmap.has_cuda else {"num_threads": 1})
     assert changes(options.verification) == {"ransac.random_seed": SEED}
 
@@ -64,38 +75,48 @@ AS_GIVEN = {
     "mapper.abs_pose_refine_focal_length": False,
     "mapper.abs_pose_refine_extra_params": False,
 }
+GLOBALLY_AS_GIVEN = {
+    "mapper.bundle_adjustment.refine_focal_length": False,
+    "mapper.bundle_adjustment.refine_extra_params": False,
+}
+
+
+def of_clusters(changes: dict[str, Any]) -> dict[str, Any]:
+    return {"num_workers": 3} | {f"incremental_options.{k}": v for k, v in ({"num_threads": 1} | changes).items()}
 
 
 @pytest.mark.parametrize(
-    ("camera", "expected"),
-    [(CameraOptions(), SEEDS), (KNOWN_CAMERA, SEEDS | AS_GIVEN)],
-    ids=["camera open", "camera given"],
+    ("method", "from_the_start", "as_given"),
+    [
+        ("incremental", SEEDS, AS_GIVEN),
+        ("global", {"random_seed": SEED}, GLOBALLY_AS_GIVEN),
+        ("hierarchical", of_clusters(SEEDS), of_clusters(AS_GIVEN)),
+    ],
 )
-def test_models_are_mapped_as_colmap_maps_them(camera: CameraOptions, expected: dict[str, Any]) -> None:
-    assert changes(pipeline_options(camera, MapperOptions(), SEED)) == expected
+def test_models_are_mapped_as_colmap_maps_them(
+    method: str, from_the_start: dict[str, Any], as_given: dict[str, Any]
+) -> None:
+    mapper, threads = MapperOptions(num_threads=3).changed(method=method), {"num_threads": 3}
+    assert changes(pipeline_options(CameraOptions(), mapper, SEED)) == threads | from_the_start
+    kept = KNOWN_CAMERA.changed(refine_intrinsics=False)
+    assert changes(pipeline_options(kept, mapper, SEED)) == threads | from_the_start | as_given
 
 
 def test_a_camera_is_guessed_as_colmap_guesses_it(monkeypatch: pytest.MonkeyPatch) -> None:
     handed: list[Any] = []
     monkeypatch.setattr(pycolmap, "infer_camera_from_image", lambda _, reader: handed.append(reader))
-    camera_of_photos(CameraOptions(model="OPENCV"), Path("photo.jpg"), 640, 480)
+    photos = Photos(Path(), ("photo.jpg",), ((640, 480),), {})
+    cameras_of_photos(CameraOptions(model="OPENCV"), photos)
     assert changes(handed[0]) == {"camera_model": "OPENCV"}
 
 
-def test_joined_submaps_see_the_database_as_colmap_does(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    class HandedError(Exception):
-        """Holds the options, before anything is done with them."""
-
-    class Cache:
-        @staticmethod
-        def create(_: pycolmap.Database, options: Any) -> None:
-            raise HandedError(options)
-
-    monkeypatch.setattr(pycolmap, "DatabaseCache", Cache)
-    options, token = pipeline_options(CameraOptions(), MapperOptions(), SEED), pycolmap.CancellationToken()
-    with pytest.raises(HandedError) as handed:
-        submap_refinement._refine(tmp_path / "database.db", tmp_path, pycolmap.Reconstruction(), options, token)
-    assert changes(handed.value.args[0]) == {"min_num_matches": options.min_num_matches}
+def test_shares_of_pairs_are_matched_as_colmap_matches_pairs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    handed: list[Any] = []
+    monkeypatch.setattr(pycolmap, "match_image_pairs", lambda _, *options, **__: handed.extend(options))
+    share = MatchingShare(tmp_path, [(1, 2)], "matcher", "verification")  # type: ignore[arg-type]
+    share.match(SilentProgress())
+    assert (handed[0], handed[2]) == ("matcher", "verification")
+    assert changes(handed[1]) == {"match_list_path": tmp_path / "pairs.txt", "block_size": 64}
 
 
 def test_a_model_is_adjusted_as_colmap_adjusts_it() -> None:
@@ -128,13 +149,16 @@ def test_no_other_options_of_colmaps_are_made_and_none_inside_of_others() -> Non
     assert not [ast.unparse(node) for node in made if any(map(_makes_options, list(ast.walk(node))[1:]))]
     assert {ast.unparse(node.func).removeprefix("pycolmap.") for node in made} == {
         "BundleAdjustmentOptions",
-        "DatabaseCacheOptions",
         "ExhaustivePairingOptions",
         "FeatureExtractionOptions",
         "FeatureMatchingOptions",
+        "GlobalPipelineOptions",
+        "HierarchicalPipelineOptions",
         "ImageReaderOptions",
+        "ImportedPairingOptions",
         "IncrementalPipelineOptions",
         "SequentialPairingOptions",
+        "SpatialPairingOptions",
         "TwoViewGeometryOptions",
     }, "one that this file does not look at"
 

@@ -31,7 +31,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def quick_flags(survey: WalkedSurvey, folder: Path | None = None) -> tuple[str, ...]:
     """All that ``rangesfm scale`` needs inside the survey's folder, or another like it, without resampling."""
-    ((folder or survey.folder) / "quick.toml").write_text("[scale]\nnum_bootstrap = 0\n")
+    ((folder or survey.folder) / "quick.toml").write_text("[scale]\nmax_relative_stddev = 0.1\n")
     return ("quick.toml", *survey.flags, "--anchors", "anchors.csv")
 
 

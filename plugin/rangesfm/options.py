@@ -6,6 +6,7 @@ commands' flags, their help, the reference of all keys and the settings in ``res
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -15,6 +16,7 @@ from rangesfm.errors import OptionError
 from rangesfm.option_model import Options, Told, looks_like
 
 DEFAULT_FORMATS = ("tum", "ply")
+_CALIBRATION_STDDEV = 0.005  # of a focal length, relative: what focus, warmth and another board make of it
 _LIKE_OURS = 0.85  # a [mapper] key this similar to one of ours is a slip; others are pycolmap's
 
 # Bounds keep out what only a slip can mean, and what would be infinite once it is squared or divided by.
@@ -77,21 +79,37 @@ class ImageOptions(KeyframeOptions):
 
 
 class CameraOptions(Options):
-    """One camera for all photos."""
+    """The cameras of the photos."""
 
     table: ClassVar[str] = "camera"
 
+    mode: Annotated[Literal["auto", "single", "per_folder", "per_image"], Told(flag="camera_mode")] = "auto"
+    """Which photos of one size share a camera: those of the same make, model, serial number and focal length by EXIF
+    (auto; without EXIF all), all of them, those of one folder, or none."""
     model: Annotated[str | None, Told(flag="camera_model")] = None
     """COLMAP camera model, as OPENCV (default: COLMAP guesses)."""
     params: Annotated[_Numbers | None, Told(flag="camera_params")] = None
-    """Its parameters in COLMAP's order."""
+    """Its parameters in COLMAP's order, for photos of the most common size; rescaled for others of the same shape."""
+    focal_length_stddev_px: _Uncertainty | None = None
+    """Of the focal lengths in params, a calibration, which mapping and refinement refine where the photos know better;
+    the other parameters' follow from it (default: 0.5 % of the focal length). 0 keeps them all to the digit."""
     refine_intrinsics: bool | None = None
-    """Whether mapping and refinement adjust them (default: mapping does if they are not given; the refinement keeps
-    what it finds, so that it does the same to a model just mapped and to one brought along)."""
+    """Whether mapping and refinement adjust them at all (default: mapping does; the refinement does to given ones, by
+    their stddev, and else keeps what it finds, so that it does the same to a model just mapped and one brought)."""
 
     @property
     def mapping_refines_intrinsics(self) -> bool:
-        return self.params is None if self.refine_intrinsics is None else self.refine_intrinsics
+        return self.focal_length_stddev_px != 0 if self.refine_intrinsics is None else self.refine_intrinsics
+
+    @property
+    def refinement_refines_intrinsics(self) -> bool:
+        if self.refine_intrinsics is None:
+            return self.params is not None and self.focal_length_stddev_px != 0
+        return self.refine_intrinsics
+
+    def calibration_stddev_px(self, focal_length_px: float) -> float:
+        """Of a given focal length."""
+        return self.focal_length_stddev_px or _CALIBRATION_STDDEV * focal_length_px
 
 
 class LogOptions(Options):
@@ -230,12 +248,17 @@ class TagOptions(Options):
 
 
 class MapperOptions(Options):
-    """Photos to unscaled model. Keys that are not here are pycolmap's IncrementalPipelineOptions', as in pipeline."""
+    """Photos to unscaled model. Keys that are not here are of pycolmap's options of the mapper, as in pipeline."""
 
     table: ClassVar[str] = "mapper"
 
-    matching: Literal["sequential", "exhaustive", "auto"] = "auto"
-    """Which photos are matched; auto: exhaustive up to 60 keyframes."""
+    method: Annotated[Literal["incremental", "global", "hierarchical"], Told(flag="mapper_method")] = "incremental"
+    """COLMAP's mapper: photo by photo; all at once; photo by photo in clusters, which are merged."""
+    matching: Literal["sequential", "exhaustive", "spatial", "auto"] = "auto"
+    """Which photos are matched: neighbours in time, all, neighbours by EXIF position; auto: all up to 60 keyframes,
+    else neighbours in time."""
+    pairs: Annotated[Path | None, Told(role="file")] = None
+    """Text file with the names of two photos a line, a tab between them: these pairs are matched, and no others."""
     features: dict[str, Any] = Field(default_factory=dict)
     """Passed through to pycolmap's FeatureExtractionOptions."""
     pairing: dict[str, Any] = Field(default_factory=dict)
@@ -243,22 +266,21 @@ class MapperOptions(Options):
     matcher: dict[str, Any] = Field(default_factory=dict)
     """Passed through to pycolmap's FeatureMatchingOptions."""
     pipeline: dict[str, Any] = Field(default_factory=dict)
-    """Passed through to pycolmap's IncrementalPipelineOptions."""
+    """Passed through to pycolmap's IncrementalPipelineOptions; of the other mappers GlobalPipelineOptions and
+    HierarchicalPipelineOptions."""
     ranges_in_mapping: bool = False
     """Each global bundle adjustment of the mapping carries the ranges, as soon as they determine the scale; takes much
     longer, and the refinement at the end mostly comes to the same map."""
     num_threads: Annotated[
         Literal[-1] | Annotated[int, Field(ge=1, le=4096)], Told(expected="1 or more up to 4096, or -1 for all cores")
     ] = -1
-    """-1 for all cores. Matching on the processor takes one thread all the same, as pycolmap 4.2 loses matches with
-    more; matcher.num_threads overrides that."""
-    submap_size: Annotated[int, Field(ge=10, le=1_000_000)] | None = None
-    """More photos than that are mapped in stretches of so many in their order, each on its own, which are joined by the
-    photos that they share (default: all in one piece)."""
-    submap_overlap: Annotated[int, Field(ge=3, le=1_000_000)] = 20
-    """Photos that a submap shares with the one before."""
-    num_submaps_at_once: Annotated[int, Field(ge=1, le=4096)] = 1
-    """Each is mapped by a process of its own; they share the threads."""
+    """-1 for all cores. Matching on the processor takes so many processes with one thread each, as pycolmap 4.2 loses
+    matches with more threads; matcher.num_threads overrides that one."""
+
+    @property
+    def num_cores(self) -> int:
+        """What ``num_threads`` comes to here."""
+        return self.num_threads if self.num_threads > 0 else os.cpu_count() or 1
 
     @model_validator(mode="before")
     @classmethod
@@ -282,10 +304,6 @@ class ScaleOptions(Options):
 
     method: Annotated[Literal["robust", "two-candidate"], Told(flag="scale_method")] = "robust"
     """How the scale is found; two-candidate is the paper's."""
-    num_bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 200
-    """Resamplings of the block bootstrap over time."""
-    bootstrap_block_s: Annotated[float, Field(ge=1e-3, le=1e9)] = 10.0
-    """Length of its blocks."""
     max_relative_stddev: Annotated[float, Field(ge=1e-9, le=1e3)] = 0.1
     """A scale less certain than this is refused."""
     up_in_first_camera: Annotated[
@@ -296,6 +314,9 @@ class ScaleOptions(Options):
     enough with it, and a mirror image is ruled out that would stand the map on its head."""
     camera_side: Literal["above", "below"] | None = None
     """Where the camera went, seen from surveyed anchors that are all in one plane."""
+    adopt: bool = False
+    """Where the tests find a mistake, run again as if its likeliest cause were so: an anchor unknown, a lever arm as it
+    fits, labels swapped, a stretch of ranges left out; what changed is said."""
 
 
 class ScaleAndTapeOptions(ScaleOptions):

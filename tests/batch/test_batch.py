@@ -30,16 +30,14 @@ if TYPE_CHECKING:
 NAMES = ("north", "east")
 QUICK = """
 [scale]
-num_bootstrap = 5
 {scale}
 [refine]
 covariance = false
 {mapper}
 """
-IN_SUBMAPS = """
+IN_CLUSTERS = """
 [mapper]
-submap_size = 10
-submap_overlap = 6
+method = "hierarchical"
 """
 
 
@@ -47,7 +45,7 @@ submap_overlap = 6
 def surveys(photo_run: PhotoRun, tmp_path: Path) -> Path:
     """Two surveys, the first of which is mapped already.
 
-    The second is to be mapped in submaps, and wants to know more of the scale than there is to know.
+    The second is to be mapped otherwise, and wants to know more of the scale than there is to know.
     """
     for name in NAMES:
         folder = shutil.copytree(photo_run.survey.folder, tmp_path / name)
@@ -58,7 +56,7 @@ def surveys(photo_run: PhotoRun, tmp_path: Path) -> Path:
         text = text.replace("[report]", "[report]\nenabled = false")
         scale = "max_relative_stddev = 1e-6" if name == "east" else ""
         (folder / "survey.toml").write_text(
-            text + QUICK.format(scale=scale, mapper=IN_SUBMAPS if name == "east" else "")
+            text + QUICK.format(scale=scale, mapper=IN_CLUSTERS if name == "east" else "")
         )
     (tmp_path / "broken.toml").write_text("[images\n")
     return tmp_path
@@ -122,11 +120,8 @@ def test_all_surveys_end_though_a_worker_is_killed_and_others_fail(surveys: Path
     assert float(rows["north/survey.toml"]["scale"]) == pytest.approx(scale, rel=0.02)
     assert (surveys / "north" / "out" / "result.json").is_file()
     assert pycolmap.Reconstruction(surveys / "east" / "out" / "sparse" / "0").num_reg_images() == 14
-    assert sorted(path.name for path in (surveys / "east" / "out" / "submaps").glob("*/*")) == sorted(
-        2 * ["mapper.log", "sparse", "submap.json"]
-    )
     told = [line.removeprefix("east/survey.toml: ") for line in errors.splitlines()]
-    assert [line for line in told if line in ("submaps", "features", "scale")] == ["submaps", "scale"]
+    assert [line for line in told if line in ("mapping", "features", "scale")] == ["mapping", "scale"]
     assert "Traceback" not in errors
     assert "begins again, attempt 2" in errors
     assert "3 of 3 surveys over, 2 of them failed" in errors

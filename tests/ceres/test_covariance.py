@@ -28,7 +28,7 @@ from rangesfm.ceres import (
 )
 from rangesfm.ceres.covariance import ResidualErrors, joint_covariance
 from rangesfm.errors import GeometryError
-from rangesfm.geometry.similarity import IDENTITY
+from rangesfm.geometry.similarity import IDENTITY, similarity_motions
 from rangesfm.geometry.trajectory import pose_of
 
 Array = npt.NDArray[np.float64]
@@ -181,13 +181,17 @@ def test_residuals_that_err_together_count_as_their_covariance_says() -> None:
     num_ranges = NUM_FRAMES * len(ANCHORS_M)
     num = survey.problem.num_residuals()
     rows = np.arange(num - len(survey.biases) - num_ranges, num - len(survey.biases))
-    errors = ResidualErrors(rows, 1.7, csr_matrix(np.random.default_rng(0).standard_normal((num_ranges, 3))))
+    rng = np.random.default_rng(0)
+    # Each on its own with a variance of 1.7, and three errors that they share.
+    by_error = np.hstack([np.eye(num_ranges), rng.standard_normal((num_ranges, 3))])
+    of_errors = np.diag(np.concatenate([np.full(num_ranges, 1.7), np.ones(3)]))
+    errors = ResidualErrors(rows, csr_matrix(by_error), of_errors)
     found = joint_covariance(
         survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases, errors=errors
     )
     jacobian = tangent_jacobian(survey.problem, variable(survey)).toarray()
     of_residuals = np.eye(num)
-    of_residuals[np.ix_(rows, rows)] = 1.7 * np.eye(num_ranges) + (errors.modes @ errors.modes.T).toarray()
+    of_residuals[np.ix_(rows, rows)] = by_error @ of_errors @ by_error.T
     gain = covariance_of_all(survey.problem, variable(survey)) @ jacobian.T
     expected = gain @ of_residuals @ gain.T
     first = 6 * (NUM_FRAMES - 1)
@@ -296,7 +300,8 @@ def test_surveys_err_as_the_covariance_says() -> None:
     rng = np.random.default_rng(7)
     times = np.arange(NUM_FRAMES, dtype=np.float64)
     truth = orbit_path(1.4 * NUM_FRAMES).centers(times)
-    centers, anchors, scales = [], [], []
+    motions = similarity_motions(truth - truth.mean(axis=0)).reshape(-1, 7)
+    centers, anchors, scales, maps = [], [], [], []
     for seed in range(60):
         noise = RANGE_STDDEV_M * rng.standard_normal((len(ANCHORS_M), NUM_FRAMES))
         biases = BIAS_STDDEV_M * rng.standard_normal((len(ANCHORS_M), 1))
@@ -310,10 +315,13 @@ def test_surveys_err_as_the_covariance_says() -> None:
         anchors.append([e @ np.linalg.solve(c, e) / 3 for e, c in zip(anchor_errors, found.anchors, strict=True)])
         middle = truth - truth.mean(axis=0)
         scales.append((np.sum(errors * middle) / np.sum(middle**2) / found.relative_scale_stddev) ** 2)
-    # 60 runs: about 180 degrees of freedom of each center and anchor, 60 of the scale.
+        similarity = np.linalg.lstsq(motions, errors.ravel(), rcond=None)[0]
+        maps.append(similarity @ np.linalg.solve(found.similarity, similarity) / 7)
+    # 60 runs: about 180 degrees of freedom of each center and anchor, 60 of the scale, 420 of scale, turn and shift.
     assert np.mean(centers) == pytest.approx(1.0, abs=0.2)
     assert np.mean(anchors) == pytest.approx(1.0, abs=0.2)
     assert np.mean(scales) == pytest.approx(1.0, abs=0.4)
+    assert np.mean(maps) == pytest.approx(1.0, abs=0.2)
 
 
 def test_a_motion_that_only_rounding_keeps_from_moving_nothing_is_none() -> None:

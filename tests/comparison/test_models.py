@@ -57,7 +57,6 @@ def survey_of(files: Path, others: Mapping[str, object] | None = None) -> Survey
         "ranges.time_offset": 2.0,
         "anchors.path": files / "anchors.csv",
         "tag.tag_in_cam_m": TAG_IN_CAM_M,
-        "scale.num_bootstrap": 20,
     }
     return Survey().changed({**keys, **(others or {})})
 

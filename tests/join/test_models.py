@@ -71,7 +71,7 @@ class Halves:
         if frame == "first_camera":
             positions = {name: (at - self.centers_m[0]) @ self.first_camera for name, at in positions.items()}
         anchors = [Anchor(name, None if frame == "unknown" else positions.get(name)) for name in self.log.anchor_ids]
-        options = ScaleOptions(num_bootstrap=0, max_relative_stddev=0.2)
+        options = ScaleOptions(max_relative_stddev=0.2)
         return Ranging(anchors, frame, options, RangeModelOptions(), None, 0)
 
     def off_m(self, centers: Array, *, with_scale: bool = True) -> float:
@@ -94,7 +94,6 @@ class Halves:
                 "ranges.time_offset": 0.0,
                 "anchors.frame": "unknown",
                 "tag.tag_in_cam_m": TAG_IN_CAM_M,
-                "scale.num_bootstrap": 0,
                 "scale.max_relative_stddev": 0.2,
                 "refine.enabled": False,
                 "export.formats": (),

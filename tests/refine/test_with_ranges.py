@@ -31,6 +31,8 @@ from rangesfm.geometry.trajectory import Trajectory, pose_of, trajectory_from_re
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.anchors.anchor import Anchor, AnchorEstimate
 from rangesfm.ranging.association import associate
+from rangesfm.ranging.errors.cells import cells
+from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.noise import shared_stddev
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.log import RangeLog
@@ -758,48 +760,57 @@ class TestBesideTheMap:
         assert summary.short_range_error_m == pytest.approx(-0.3, abs=0.05)
 
 
-@pytest.fixture
-def radio_without_shared_errors(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of which every range errs on its own, and which is known to do so."""
-    monkeypatch.setattr("rangesfm.ranging.errors.shared_errors.ANTENNA_STDDEV_M", 0.0)
-    monkeypatch.setattr("rangesfm.ranging.errors.shared_errors.CURVE_STDDEV_M", 0.0)
-
-
-def with_shared_errors(survey: Survey, seed: int) -> RangeObservations:
-    """An error of each anchor's antenna that depends on the direction, and one of all with the distance."""
-    rng, log, metric = np.random.default_rng(seed), survey.observations.log, survey.metric_from_sfm
+def shared_covariance(survey: Survey) -> Array:
+    """(n, n) of an error of each anchor's antenna that depends on the direction, and one of all with the distance."""
+    log, metric = survey.observations.log, survey.metric_from_sfm
     at = metric.apply(survey.observations.centers) + survey.observations.tag_from_center @ metric.rotation.T
     from_anchor = at - np.array([survey.anchors_m[name] for name in log.anchor_ids])[log.anchor_index]
     distance = np.linalg.norm(from_anchor, axis=1)
-    lobes = 0.05 * rng.standard_normal((len(log.anchor_ids), 3))
-    of_antenna = np.sum(lobes[log.anchor_index] * from_anchor, axis=1) / distance
-    of_radio = 0.07 * np.sqrt(2) * np.sin(np.log(distance) + rng.uniform(0, 2 * np.pi))
-    return replace(survey.observations, log=replace(log, range_m=log.range_m + of_antenna + of_radio))
+    directions = from_anchor / distance[:, None]
+    of_antenna = 0.05**2 * (directions @ directions.T) * (log.anchor_index[:, None] == log.anchor_index)
+    of_radio: Array = 0.07**2 * np.cos(np.log(distance)[:, None] - np.log(distance))
+    return np.asarray(of_antenna + of_radio)
+
+
+def with_shared_errors(survey: Survey, seed: int) -> RangeObservations:
+    log, covariance = survey.observations.log, shared_covariance(survey)
+    drawn = np.random.default_rng(seed).multivariate_normal(np.zeros(len(log)), covariance, method="svd")
+    return replace(survey.observations, log=replace(log, range_m=log.range_m + drawn))
+
+
+def told_of_shared_errors(survey: Survey, noise_m: float) -> RangeErrors:
+    """As if the scale stage had learnt exactly what the ranges get wrong."""
+    log = survey.observations.log
+    each, apart = np.arange(len(log)), np.tile([1.0, 0.0, 0.0], (len(log), 1))
+    turns = np.tile(np.eye(3), (len(log), 1, 1))
+    of_all = cells(log.anchor_index, log.tag_index, each.astype(float), apart, turns, np.ones(len(log)), np.ones(9))
+    covariance = noise_m**2 * np.eye(len(log)) + shared_covariance(survey)
+    learned = LearnedErrors(of_all, each, ("all",), np.ones(1), covariance[None])
+    return replace(known_errors(survey.observations, noise_m), learned=learned)
 
 
 class TestCovariance:
-    def mean_square(self, *, has_shared_errors: bool) -> float:
+    def mean_square(self, *, has_shared_errors: bool, is_told: bool = False) -> float:
         """Of the centres' errors in their stddevs."""
-        squares = []
+        squares, noise_m = [], 0.1
         for seed in range(6 if has_shared_errors else 4):
             survey = make_survey(
-                num_keyframes=15, pixel_stddev=0.5, radio=Radio(range_stddev_m=0.1), num_epochs=2, seed=seed
+                num_keyframes=15, pixel_stddev=0.5, radio=Radio(range_stddev_m=noise_m), num_epochs=2, seed=seed
             )
             observations = with_shared_errors(survey, seed) if has_shared_errors else survey.observations
-            refined, summary = survey.refine(survey.anchors(0.0), observations=observations)
+            errors = told_of_shared_errors(survey, noise_m) if is_told else noise_m
+            refined, summary = survey.refine(survey.anchors(0.0), observations=observations, errors=errors)
             assert summary.covariance is not None
-            errors = survey.centers(refined) - survey.centers_m
-            squares += [e @ np.linalg.solve(c, e) for e, c in zip(errors, summary.covariance.centers, strict=True)]
+            off = survey.centers(refined) - survey.centers_m
+            squares += [e @ np.linalg.solve(c, e) for e, c in zip(off, summary.covariance.centers, strict=True)]
         return float(np.mean(squares)) / 3
 
-    @pytest.mark.usefixtures("radio_without_shared_errors")
     def test_errors_of_centres_are_as_large_as_their_covariances_say(self) -> None:
         assert 0.5 < self.mean_square(has_shared_errors=False) < 2.0
 
     def test_so_they_are_where_antennas_and_radio_err_with_direction_and_distance(self) -> None:
-        assert 0.4 < self.mean_square(has_shared_errors=True) < 2.0
+        assert 0.4 < self.mean_square(has_shared_errors=True, is_told=True) < 2.0
 
-    @pytest.mark.usefixtures("radio_without_shared_errors")
     def test_covariances_that_leave_these_out_are_too_small(self) -> None:
         assert self.mean_square(has_shared_errors=True) > 2.5
 
@@ -809,17 +820,6 @@ class TestCovariance:
         assert all(0.01 < anchor.position_stddev_m < 2.0 for anchor in free.anchors)
         _, held = survey.refine(survey.anchors(0.0))
         assert all(anchor.position_stddev_m == 0.0 for anchor in held.anchors)
-
-    @pytest.mark.usefixtures("radio_without_shared_errors")
-    def test_correlated_ranges_widen_it(self) -> None:
-        survey = make_survey(pixel_stddev=0.5, radio=Radio(range_stddev_m=RANGE_STDDEV_M))
-        scale_stddevs = []
-        for inflation in (1.0, 5.0):
-            errors = known_errors(survey.observations, RANGE_STDDEV_M, inflation=inflation)
-            _, summary = survey.refine(survey.anchors(0.0), errors=errors)
-            assert summary.covariance is not None
-            scale_stddevs.append(summary.covariance.relative_scale_stddev)
-        assert scale_stddevs[1] > 2.5 * scale_stddevs[0]
 
     def test_none_is_found_where_none_is_wanted(self) -> None:
         survey = make_survey(pixel_stddev=0.5)

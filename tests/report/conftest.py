@@ -88,7 +88,6 @@ def _write_scale_tables(folder: Path, rows: list[list[Any]]) -> None:
     scales = np.geomspace(0.25, 2.2, 101)
     counts = np.round(2500 * np.exp(-(((scales - 0.742) / 0.1) ** 2))).astype(int)
     _write_csv(folder / "scale_consensus.csv", ["scale", "num_agreeing"], zip(scales, counts))
-    _write_csv(folder / "scale_bootstrap.csv", ["scale"], [[s] for s in rng.normal(0.742, 0.004, 200)])
     offsets = np.linspace(-2.0, 2.0, 81)
     _write_csv(folder / "time_offset_curve.csv", ["time_offset_s", "cost"], zip(offsets, (offsets - 0.012) ** 2))
 
@@ -271,6 +270,11 @@ def _summary(
                 "residual_m": 0.0127,
             }
         ],
+        "tests": [
+            _test("anchor coordinate", f"{anchor_ids[0]} y", 38.2, rejected=True),
+            _test("lever arm", "", 4.1, rejected=False),
+            {**_test("range share", "", 0.3, rejected=False), "smallest_detectable": None, "effect_on_scale": None},
+        ],
         "versions": {"rangesfm": "0.1.0", "pycolmap": "4.2.1", "pyceres": "2.6", "numpy": "2.3.1"},
         "settings": {
             "images": {"path": "images", "every_nth": 3},
@@ -284,6 +288,24 @@ def _summary(
     if not has_reference:
         del summary["comparison"]
     return result_document(**summary)
+
+
+def _test(name: str, subject: str, statistic: float, *, rejected: bool) -> dict[str, Any]:
+    return {
+        "name": name,
+        "subject": subject,
+        "statistic": statistic,
+        "threshold": 16.4,
+        "size": -0.4042,
+        "stddev": 0.0311,
+        "unit": "m",
+        "smallest_detectable": 0.1288,
+        "effect_on_scale": 0.0042,
+        "effect_on_place_m": 0.0711,
+        "rejected": rejected,
+        "words": f"{name} {subject}",
+        "remedy": "measure it again",
+    }
 
 
 def _rms(residuals: Array) -> float:

@@ -21,10 +21,10 @@ from rangesfm.report.scene import scene_of, view_of
 from rangesfm.result.folder import read_result_folder
 
 MakeResult = Callable[..., Path]
-SECTIONS = ["verdict", "checks", "view-section", "path", "scale", "ranges", "anchors", "run"]
+SECTIONS = ["verdict", "checks", "view-section", "path", "scale", "ranges", "mistakes", "anchors", "run"]
 FIGURES = {
     "path": ["trajectory", "map_points", "local_scale"],
-    "scale": ["scale_per_anchor", "scale_bootstrap", "scale_consensus", "time_offset_curve", "scale_candidates"],
+    "scale": ["scale_per_anchor", "scale_consensus", "time_offset_curve", "scale_candidates"],
     "ranges": ["range_residuals", "range_residual_histogram", "absolute_range_errors"],
 }
 
@@ -148,6 +148,20 @@ def test_every_number_of_the_result_stands_on_the_page_as_it_is(make_result: Mak
     counts = ("num_rejected", "num_anchor_anchor", "num_tag_tag", "num_keyframes", "num_without_root")
     others = [key for key in wanted if key.endswith(counts) or "surveyed" in key or "tag_in_cam_m" in key]
     assert set(wanted) - set(others) <= {key for key, _, _ in shown}
+
+
+def test_the_place_has_its_verdict_beside_that_of_the_scale(make_result: MakeResult) -> None:
+    place = {
+        "verdict": "doubtful",
+        "reasons": ["why not"],
+        "stddev_m": [0.03, 0.04, 0.12],
+        "heading_stddev_deg": 0.4,
+        "worst_keyframe_stddev_m": 0.21,
+    }
+    texts = page_of(make_result(changes={"place": place})).texts
+    assert "doubtful" in texts[texts.index("Place in the site") :]
+    assert any("middle ± 0.13" in text for text in texts)
+    assert "Place in the site" not in page_of(make_result("elsewhere", changes={"place": None})).texts
 
 
 def test_every_anchor_has_its_panel_and_its_row(make_result: MakeResult) -> None:
@@ -313,3 +327,8 @@ def test_each_range_begins_at_its_own_tag(make_result: MakeResult) -> None:
     scene = scene_of(content)
     assert scene is not None
     assert sorted(view_of(scene)["ranges"]["tags_in_cam_m"]) == sorted(arms.values())
+
+
+def test_mistakes_are_listed_by_what_became_of_the_search_for_them(make_result: MakeResult) -> None:
+    texts = page_of(make_result()).texts
+    assert {"found", "not found", "would not be found"} <= set(texts)

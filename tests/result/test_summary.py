@@ -56,7 +56,7 @@ def test_what_is_read_is_written_again(changes: dict[str, Any], tmp_path: Path) 
 
 
 def test_a_key_of_a_later_version_is_passed_over(tmp_path: Path) -> None:
-    (tmp_path / "result.json").write_text(json.dumps(result_document(place={"verdict": "good"}, scale={"new": 1})))
+    (tmp_path / "result.json").write_text(json.dumps(result_document(later={"verdict": "good"}, scale={"new": 1})))
     assert ResultSummary.read(tmp_path / "result.json") == ResultSummary.model_validate(result_document())
 
 

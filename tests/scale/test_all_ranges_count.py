@@ -27,7 +27,7 @@ TRUE_SCALE = 0.45
 RANGE_STDDEV_M = 0.1
 # Biases are known to be none, so that the bound is that of the scale alone.
 RANGE_MODEL = RangeModelOptions(range_bias_stddev_m=0.0, common_bias_stddev_m=0.0)
-OPTIONS = ScaleOptions(num_bootstrap=2, max_relative_stddev=1.0)
+OPTIONS = ScaleOptions(max_relative_stddev=1.0)
 
 
 def unscaled(path: CameraPath, times: Array) -> Trajectory:

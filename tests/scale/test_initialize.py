@@ -338,7 +338,7 @@ def test_order_of_the_ranges_does_not_matter(make_survey: MakeSurvey) -> None:
     first, second = survey.scale("first_camera", "ABCDE"), survey.scale("first_camera", "ABCDE", shuffled)
     assert second.value == pytest.approx(first.value, rel=1e-9)
     assert second.uncertainty.formal == pytest.approx(first.uncertainty.formal, rel=1e-6)
-    assert second.uncertainty.bootstrap == pytest.approx(first.uncertainty.bootstrap, rel=1e-6)
+    assert second.uncertainty.empirical == pytest.approx(first.uncertainty.empirical, rel=1e-6)
     np.testing.assert_array_equal(second.observations.status, first.observations.status[order])
 
 

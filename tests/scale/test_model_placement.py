@@ -9,12 +9,9 @@ import pytest
 from tests.scale.conftest import MakeSurvey
 
 from rangesfm.demo.ranges import Radio
-from rangesfm.options import ScaleOptions
 from rangesfm.scale import model_placement
 from rangesfm.scale.model_placement import ScaledModel
 from rangesfm.scale.range_equation import solve
-
-NO_RESAMPLING = ScaleOptions(num_bootstrap=0)
 
 
 def lingering_model(make_survey: MakeSurvey, seed: int = 0) -> ScaledModel:
@@ -27,7 +24,7 @@ def lingering_model(make_survey: MakeSurvey, seed: int = 0) -> ScaledModel:
     errors = 0.1 * rng.standard_normal(len(slow))[place] + 0.1 * slow[place]
     taken = np.isin(observations.before, [2, 3, 9]) | (np.arange(len(log)) % 40 < 5)
     taken_log = replace(log, range_m=log.range_m + errors).subset(taken)
-    estimate = survey.scale("site", "ABCDE", taken_log, options=NO_RESAMPLING)
+    estimate = survey.scale("site", "ABCDE", taken_log)
     return ScaledModel(survey.trajectory, estimate, is_in_anchor_frame=True)
 
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 def unknown_anchors(survey: Survey) -> RangeProblem:
     anchors = survey.anchors("unknown", "")
-    return scale_problem(survey.observations(), survey.trajectory, anchors, "unknown", RangeModelOptions(), 10.0).ranges
+    return scale_problem(survey.observations(), survey.trajectory, anchors, "unknown", RangeModelOptions()).ranges
 
 
 @pytest.mark.parametrize("seed", range(4))

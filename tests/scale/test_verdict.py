@@ -38,7 +38,7 @@ def test_far_anchors_and_little_noise_are_good(make_survey: MakeSurvey) -> None:
 
 
 def test_a_radio_without_error_curve_near_its_anchors_is_to_be_calibrated(make_survey: MakeSurvey) -> None:
-    centers = 0.4 * make_survey().centers_m
+    centers = 0.3 * make_survey().centers_m
     survey = make_survey(centers_m=centers, anchors_m=NEAR_ANCHORS_M, radio=Radio(range_stddev_m=0.02), num_epochs=5)
     estimate = survey.scale("unknown")
     assert estimate.verdict == "doubtful"
@@ -108,38 +108,37 @@ class TestAdvice:
 
     @staticmethod
     def advice(make_survey: MakeSurvey, frame: str, monkeypatch: pytest.MonkeyPatch, **parts: Any) -> tuple[str, ...]:
-        small = {"formal": 0.001, "bootstrap": 0.001, "jackknife": 0.001, "range_model": 0.001}
-        told = ScaleUncertainty(**(small | parts), num_anchors=5)
+        told = ScaleUncertainty(0.001, {"curve": 0.001, "bias": 0.001, "antenna": 0.001, "time": 0.001} | parts)
         monkeypatch.setattr("rangesfm.scale.initialize.scale_uncertainty", lambda *_, **__: told)
         return make_survey(radio=NOISE, num_epochs=3).scale(frame, "ABCDE").advice
 
     def test_an_error_curve(self, make_survey: MakeSurvey, monkeypatch: pytest.MonkeyPatch) -> None:
-        (advice,) = self.advice(make_survey, "first_camera", monkeypatch, range_model=0.04)
+        (advice,) = self.advice(make_survey, "first_camera", monkeypatch, curve=0.04)
         assert "calibrate the radio" in advice
         assert "tape a distance" in advice
 
     def test_calibration_is_named_once(self, make_survey: MakeSurvey, monkeypatch: pytest.MonkeyPatch) -> None:
         drifted = lambda tests: CutoffTest(2.0, 1.1 * tests[0].scale, 0.01)  # noqa: E731
         monkeypatch.setattr("rangesfm.scale.verdict.scale_drift", drifted)
-        (advice,) = self.advice(make_survey, "first_camera", monkeypatch, range_model=0.04)
+        (advice,) = self.advice(make_survey, "first_camera", monkeypatch, curve=0.04)
         assert advice.count("calibrate the radio") == 1
         assert "tape a distance" in advice
 
     def test_anchors_that_were_surveyed(self, make_survey: MakeSurvey, monkeypatch: pytest.MonkeyPatch) -> None:
-        (advice,) = self.advice(make_survey, "first_camera", monkeypatch, jackknife=0.04)
+        (advice,) = self.advice(make_survey, "first_camera", monkeypatch, bias=0.04)
         assert advice.startswith("check the surveyed positions of the anchors")
 
     def test_anchors_that_were_not(self, make_survey: MakeSurvey, monkeypatch: pytest.MonkeyPatch) -> None:
-        (advice,) = self.advice(make_survey, "unknown", monkeypatch, jackknife=0.04)
+        (advice,) = self.advice(make_survey, "unknown", monkeypatch, bias=0.04)
         assert advice.startswith("survey the anchors")
 
     def test_antennas(self, make_survey: MakeSurvey, monkeypatch: pytest.MonkeyPatch) -> None:
-        (advice,) = self.advice(make_survey, "first_camera", monkeypatch, antennas=0.04)
+        (advice,) = self.advice(make_survey, "first_camera", monkeypatch, antenna=0.04)
         assert advice.startswith("range to more anchors")
 
     def test_errors_in_time(self, make_survey: MakeSurvey, monkeypatch: pytest.MonkeyPatch) -> None:
-        assert self.advice(make_survey, "first_camera", monkeypatch, bootstrap=0.04) == ("walk a wider or longer loop",)
-        (advice,) = self.advice(make_survey, "unknown", monkeypatch, bootstrap=0.04)
+        assert self.advice(make_survey, "first_camera", monkeypatch, time=0.04) == ("walk a wider or longer loop",)
+        (advice,) = self.advice(make_survey, "unknown", monkeypatch, time=0.04)
         assert advice == "walk a wider or longer loop, or survey the anchors"
 
 

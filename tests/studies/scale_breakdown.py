@@ -120,7 +120,7 @@ def ours(case: Case, seed: int) -> float:
         case.trajectory,
         [Anchor("A", case.anchor_m)],
         anchor_frame="first_camera",
-        options=ScaleOptions(num_bootstrap=50),
+        options=ScaleOptions(),
         seed=seed,
     )
     return estimate.value

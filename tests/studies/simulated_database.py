@@ -23,7 +23,8 @@ def write_database(path: Path, model: pycolmap.Reconstruction, pixel_errors: Arr
     """
     image_ids = sorted(model.reg_image_ids())
     (camera,) = model.cameras.values()
-    create_database(path, [model.image(image_id).name for image_id in image_ids], pycolmap.Camera(camera.todict()))
+    names = [model.image(image_id).name for image_id in image_ids]
+    create_database(path, names, [pycolmap.Camera(camera.todict())], [0] * len(names))
     ends = np.cumsum([len(model.image(image_id).points2D) for image_id in image_ids])
     matches = _matches(model)
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):

@@ -76,7 +76,7 @@ def estimate_once(
         trajectory,
         [Anchor(name) for name in anchors_m],
         anchor_frame="unknown",
-        options=ScaleOptions(num_bootstrap=50),
+        options=ScaleOptions(),
         seed=seed,
     )
     return found.value / SCALE - 1, max(found.uncertainty.formal, found.uncertainty.empirical)

@@ -13,7 +13,7 @@ from rangesfm.cli.arguments import normalize, parse
 from rangesfm.cli.survey_flags import survey_from_arguments
 from rangesfm.errors import InputError
 from rangesfm.option_model import Key
-from rangesfm.options import CameraOptions, ScaleOptions
+from rangesfm.options import CameraOptions, OutputOptions, ScaleOptions
 from rangesfm.survey.settings import KEYS, Survey, read_survey
 
 EXTREMES = ("1e308", "-1e308", "1e-320", "9223372036854775807", "-9223372036854775808", "-1", "0", "nan", "inf", "-inf")
@@ -138,13 +138,13 @@ def test_a_flag_for_options_of_colmap_that_is_no_table_is_refused(capsys: pytest
 
 
 def test_options_are_checked_wherever_they_are_made() -> None:
-    with pytest.raises(InputError, match=r"\[scale\] num_bootstrap is -1, expected a whole number from 0 to 100000"):
-        ScaleOptions(num_bootstrap=-1)
+    with pytest.raises(InputError, match=r"\[output\] seed is -1, expected a whole number from 0"):
+        OutputOptions(seed=-1)
     with pytest.raises(InputError, match=r"unknown key 'modl' in \[camera\]; the nearest known one is 'model'"):
         CameraOptions(modl="OPENCV")  # type: ignore[call-arg]
     with pytest.raises(InputError, match="seed is 'x'"):
         Survey().changed({"output.seed": "x"})
-    assert ScaleOptions(num_bootstrap=3).changed(method="two-candidate").num_bootstrap == 3
+    assert ScaleOptions(max_relative_stddev=0.3).changed(method="two-candidate").max_relative_stddev == 0.3
 
 
 def test_every_path_that_is_read_is_in_one_list(tmp_path: Path) -> None:

@@ -55,7 +55,9 @@ def options() -> pycolmap.IncrementalPipelineOptions:
         "mapper": {"init_min_num_inliers": 20, "abs_pose_min_num_inliers": 15},
     }
     camera = CameraOptions(model="PINHOLE", params=(750.0, 750.0, 480.0, 320.0))
-    return pipeline_options(camera, MapperOptions(num_threads=1, pipeline=pipeline), seed=0)
+    options = pipeline_options(camera, MapperOptions(num_threads=1, pipeline=pipeline), seed=0)
+    assert isinstance(options, pycolmap.IncrementalPipelineOptions)
+    return options
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,6 @@ def survey(walked_survey: WalkedSurvey, tmp_path: Path) -> Survey:
             "ranges.time_offset": 2.0,
             "anchors.path": folder / "anchors.csv",
             "tag.tag_in_cam_m": (0.03, -0.12, -0.05),
-            "scale.num_bootstrap": 20,
             "output.path": tmp_path / "out",
         }
     )
@@ -181,7 +180,6 @@ def test_a_run_maps_with_ranges_where_it_is_asked_to(photo_run: PhotoRun, tmp_pa
         "mapper.ranges_in_mapping": True,
         "report.enabled": False,
         "refine.covariance": False,
-        "scale.num_bootstrap": 20,
     }
     result = run_survey(read_survey(photo_run.survey.survey_path, asked), progress=SilentProgress()).summary
     assert set(result.seconds) >= {"mapping", "scale", "refinement"}

@@ -25,7 +25,7 @@ from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.readers import read_ranges
 from rangesfm.result.summary import ResultSummary
-from rangesfm.result.tables import ScaleBootstrap, ScaleCandidates, ScaleConsensus
+from rangesfm.result.tables import ScaleCandidates, ScaleConsensus
 from rangesfm.survey.settings import KEYS, Survey
 from rangesfm.workflows.export_result import export_result
 from rangesfm.workflows.journal import Journal
@@ -63,7 +63,6 @@ def survey_of(walked_survey: WalkedSurvey, where: Path) -> Survey:
             "ranges.time_offset": 2.0,
             "anchors.path": folder / "anchors.csv",
             "tag.tag_in_cam_m": (0.03, -0.12, -0.05),
-            "scale.num_bootstrap": 20,
             "output.path": where / "out",
         }
     )
@@ -111,7 +110,7 @@ def test_a_run_in_the_same_folder_leaves_nothing_of_the_one_before(survey: Surve
     second = survey.changed({"export.formats": (), "report.enabled": False})
     scale_model(second, progress=SilentProgress())
     left = files_of(survey.output.path) - {"trajectory.tum", "points.ply"}  # exported by request, not part of a result
-    scale_tables = {"scale_candidates.csv", "scale_consensus.csv", "scale_bootstrap.csv"}
+    scale_tables = {"scale_candidates.csv", "scale_consensus.csv"}
     assert left == {"sparse_scaled", "result.json", "ranges.csv", "images.csv", *scale_tables}
 
 
@@ -119,14 +118,13 @@ def test_tables_beside_the_result_tell_how_the_scale_came_about(scaled: Done) ->
     scale = scaled.result.summary.scale
     folder, paper = scaled.survey.output.path, known(scale.two_candidate)
     candidates, consensus = known(ScaleCandidates.read(folder)), known(ScaleConsensus.read(folder))
-    bootstrap = known(ScaleBootstrap.read(folder))
     for values, branch in zip((candidates.alpha0, candidates.alpha1), (paper.alpha0, paper.alpha1)):
         assert values.mean() == pytest.approx(branch.mean, rel=1e-4)
         assert values.std(ddof=1) == pytest.approx(branch.std, rel=1e-4)
     assert consensus.scale[np.argmax(consensus.num_agreeing)] == pytest.approx(scale.value, rel=0.02)
     assert consensus.num_agreeing.max() > 0.95 * len(candidates.alpha0)
-    spread = np.diff(np.quantile(bootstrap.scale, [0.16, 0.84]))[0] / 2 / scale.value
-    assert spread == pytest.approx(scale.relative_stddev.bootstrap, rel=0.25)
+    parts = np.array(list(scale.relative_stddev.components.values()))
+    assert known(scale.stddev_empirical) == pytest.approx(scale.value * np.linalg.norm(parts), rel=1e-4)
 
 
 def test_the_result_names_its_inputs_by_their_hashes(scaled: Done) -> None:
@@ -230,7 +228,6 @@ class TestSeveralTags:
                 "ranges.path": tmp_path / "uwb.csv",
                 "anchors.path": tmp_path / "anchors.csv",
                 "tag.lever_arms_m": LEVER_ARMS_M,
-                "scale.num_bootstrap": 5,
                 "export.formats": (),
                 "output.path": tmp_path / "out",
             }
@@ -372,3 +369,22 @@ def test_no_file_that_a_survey_reads_is_overwritten(key: str, survey: Survey) ->
         scale_model(survey.changed({**taped, key: path}), progress=SilentProgress())
     assert caught.value.path == path
     assert path.read_text() == "an input\n"
+
+
+def test_a_wrong_coordinate_is_said_and_mended_only_when_asked_for(survey: Survey, tmp_path: Path) -> None:
+    clean = scale_model(survey, progress=SilentProgress()).summary.scale
+    text = survey.anchors.path.read_text(encoding="utf-8") if survey.anchors.path else ""
+    head, first, *rest = text.splitlines()
+    cells = first.split(",")
+    cells[2] = str(float(cells[2]) + 3.0)
+    (tmp_path / "anchors.csv").write_text("\n".join([head, ",".join(cells), *rest]) + "\n", encoding="utf-8")
+    wrong = survey.changed({"anchors.path": tmp_path / "anchors.csv"})
+    told = scale_model(wrong, progress=SilentProgress()).summary
+    assert told.scale.verdict == "doubtful"
+    assert f"anchor {cells[0]}" in told.scale.reasons[0]
+    assert told.tests[0].rejected
+    assert told.tests[0].subject.startswith(cells[0])
+    mended = scale_model(wrong.changed({"scale.adopt": True}), progress=SilentProgress()).summary
+    assert mended.scale.verdict == "doubtful"
+    assert mended.scale.reasons[0].startswith("adopted: ")
+    assert mended.scale.value == pytest.approx(clean.value, rel=0.002)

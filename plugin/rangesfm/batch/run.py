@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import queue
-import sys
 import uuid
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +29,6 @@ from rangesfm.errors import FAILED, Failure
 from rangesfm.files.atomic import sole_writer, write_text
 from rangesfm.files.records import write_json
 from rangesfm.files.tables import write_table
-from rangesfm.vision.submaps import Submap
 
 _POLL_INTERVAL_S = 0.2
 _NUM_RETRIES = 2  # of a survey whose process was killed; Dask itself counts the workers that were
@@ -69,61 +66,42 @@ def run_batch(jobs: Sequence[Job], options: BatchOptions, output_path: Path, lis
     course = Course(jobs)
     with sole_writer(output_path):
         if not course.is_over:
-            with _workers(options, jobs, listener) as (client, shares):
-                _Crew(client, course, output_path, listener, shares).run(jobs, options.restart)
+            with _workers(options, jobs, listener) as (client, share):
+                _Crew(client, course, output_path, listener, share).run(jobs, options.restart)
         write_results(course, output_path)
         listener.show(course)
     return course
 
 
-@dataclass(frozen=True)
-class _Shares:
-    """What a survey may use, and what a submap of one."""
-
-    of_survey: Share
-    of_submap: Share
-
-
 @contextmanager
-def _workers(options: BatchOptions, jobs: Sequence[Job], listener: BatchListener) -> Iterator[tuple[Client, _Shares]]:
+def _workers(options: BatchOptions, jobs: Sequence[Job], listener: BatchListener) -> Iterator[tuple[Client, Share]]:
     if options.scheduler is not None:
         with workers_of(options.scheduler) as client:
             at_once = num_at_once(client)
             if not at_once:
                 listener.message(f"{options.scheduler} has no workers yet: the surveys wait for some")
-            share = Share(options.num_threads, options.memory_limit_bytes, at_once)
-            yield client, _Shares(share, share)
+            yield client, Share(options.num_threads, options.memory_limit_bytes, at_once)
         return
-    surveys = [job.survey for job in jobs if job.survey is not None]
-    num_workers, of_survey, note = share_this_machine(options, len(surveys), *this_machine())
-    of_submap = of_survey
-    if any(survey.mapper.submap_size is not None for survey in surveys):
-        # There are as many submaps as anybody could want; while one survey is prepared, the others' workers rest.
-        num_workers, of_submap, note = share_this_machine(options, sys.maxsize, *this_machine())
+    num_surveys = sum(job.survey is not None for job in jobs)
+    num_workers, share, note = share_this_machine(options, num_surveys, *this_machine())
     if note is not None:
         listener.message(note)
     with local_workers(num_workers) as client:
-        yield client, _Shares(of_survey, of_submap)
+        yield client, share
 
 
 class _Crew:
-    """The workers of a batch, given its surveys, and listened to.
+    """The workers of a batch, given its surveys, and listened to."""
 
-    A survey that is mapped in submaps is prepared by one task, its submaps are a task each, and the last one finds them
-    mapped and does the rest.
-    """
-
-    def __init__(self, client: Client, course: Course, output_path: Path, listener: BatchListener, shares: _Shares):
+    def __init__(self, client: Client, course: Course, output_path: Path, listener: BatchListener, share: Share):
         self._client = client
         self._course = course
         self._output_path = output_path
         self._listener = listener
-        self._shares = shares
+        self._share = share
         self._batch = f"rangesfm-batch-{uuid.uuid4().hex}"
         self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._task_of: dict[Future, SurveyTask] = {}
-        self._num_submaps: dict[int, int] = {}
-        self._num_left: dict[int, int] = {}
 
     def run(self, jobs: Sequence[Job], restart: bool) -> None:
         """Until all surveys are over."""
@@ -132,9 +110,7 @@ class _Crew:
             self._client.subscribe_topic(self._batch, self._inbox.put)
             for index, job in enumerate(jobs):
                 if job.survey is not None:
-                    in_submaps = job.survey.mapper.submap_size is not None
-                    share = self._shares.of_survey
-                    self._submit(SurveyTask(self._batch, index, job.survey, share, restart, only_prepare=in_submaps))
+                    self._submit(SurveyTask(self._batch, index, job.survey, self._share, restart))
             while not self._course.is_over:
                 self._look()
         except BaseException:
@@ -171,42 +147,11 @@ class _Crew:
 
     def _take_end(self, future: Future) -> None:
         task = self._task_of[future]
-        if self._course.rows[task.index].status.is_final:  # another of its submaps has failed
-            return
         ending = _ending(future)
         if isinstance(ending, Failure):
-            self._fail(task, ending)
-        elif task.only_prepare:
-            self._begin_submaps(task, ending)
-        elif task.submap is not None:
-            self._end_submap(task)
+            self._course.failed(task.index, ending.message, ending.exit_status)
         else:
             self._course.done(task.index, Figures(**ending["figures"]), ending["reason"])
-
-    def _begin_submaps(self, task: SurveyTask, submaps: Sequence[Submap]) -> None:
-        self._num_submaps[task.index] = self._num_left[task.index] = len(submaps)
-        for submap in submaps:
-            self._submit(replace(_rest_of(task), submap=submap, share=self._shares.of_submap))
-        self._tell_submaps(task.index)
-        if not submaps:
-            self._submit(_rest_of(task))
-
-    def _end_submap(self, task: SurveyTask) -> None:
-        self._num_left[task.index] -= 1
-        self._tell_submaps(task.index)
-        if not self._num_left[task.index]:
-            self._submit(replace(_rest_of(task), share=self._shares.of_survey))
-
-    def _tell_submaps(self, index: int) -> None:
-        num_total = self._num_submaps[index]
-        self._course.tell(index, {"stage": "submaps"})
-        self._course.tell(index, {"num_done": num_total - self._num_left[index], "num_total": num_total})
-
-    def _fail(self, task: SurveyTask, failure: Failure) -> None:
-        where = "" if task.submap is None else f"submap {task.submap.folder.name}: "
-        self._course.failed(task.index, where + failure.message, failure.exit_status)
-        others = [future for future, other in self._task_of.items() if other.index == task.index and not future.done()]
-        self._client.cancel(others)
 
     def _stop(self) -> None:
         """Have the workers interrupt what they are at, and wait for it; then nothing is half-written."""
@@ -218,11 +163,6 @@ class _Crew:
             self._client.cancel(futures)
         except (OSError, RuntimeError):  # they are gone, or do not answer (TimeoutError): then they are ended
             pass
-
-
-def _rest_of(task: SurveyTask) -> SurveyTask:
-    """What is to be done of a survey once it is prepared, or once its submaps are mapped."""
-    return replace(task, only_prepare=False, submap=None, restart=False, begins=False)
 
 
 def _all_of(inbox: queue.SimpleQueue[Any]) -> list[Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import logging
 import os
 import pickle
@@ -24,7 +23,6 @@ from rangesfm.batch.jobs import Share
 from rangesfm.errors import FAILED, INTERRUPTED, Failure, InputError
 from rangesfm.processes.supervision import Ended, child_command, supervise
 from rangesfm.survey.settings import Survey
-from rangesfm.vision.submaps import Submap
 
 _CONNECT_S = 10
 # Nothing is served beside the work itself.
@@ -127,16 +125,13 @@ def _slots(dask_worker: Any) -> tuple[str, int]:
 
 @dataclass(frozen=True)
 class SurveyTask:
-    """What a worker is given: a survey, or a part of one that is mapped in submaps.
+    """What a worker is given.
 
     Attributes:
         batch: the batch's own name, under which the worker tells how far it is.
         index: of the survey in the batch.
         share: what it may use.
         restart: do anew what earlier runs have done.
-        only_prepare: find the submaps that are to be mapped, and no more.
-        submap: only map this one.
-        begins: whether the survey begins with it.
     """
 
     batch: str
@@ -144,9 +139,6 @@ class SurveyTask:
     survey: Survey
     share: Share
     restart: bool
-    only_prepare: bool = False
-    submap: Submap | None = None
-    begins: bool = True
 
 
 class KilledError(Exception):
@@ -159,11 +151,10 @@ def stop_batch(batch: str) -> None:
 
 
 def run_on_worker(task: SurveyTask) -> Any:
-    """Run a survey, or a part of one, in a process of its own.
+    """Run a survey in a process of its own.
 
     Returns:
-        The Failure, or what the process ended with: ``{"figures": ..., "reason": ...}``; of a survey only prepared a
-        tuple of Submap; of a submap None.
+        The Failure, or what the process ended with: ``{"figures": ..., "reason": ...}``.
 
     Raises:
         KilledError: the process was killed from outside, so that another attempt may well go through.
@@ -171,20 +162,19 @@ def run_on_worker(task: SurveyTask) -> Any:
     worker, host = get_worker(), socket.gethostname()
 
     def tell(message: dict[str, Any]) -> None:
-        if task.submap is None:  # of many at once the batch itself counts those that are done
-            worker.log_event(task.batch, {"index": task.index, **message})
+        worker.log_event(task.batch, {"index": task.index, **message})
 
     if task.batch in _stopped:
         return Failure("interrupted", INTERRUPTED)
-    if task.begins:
-        tell({"began_on": host})
+    tell({"began_on": host})
     # The limit of all of a worker's tasks, if it has one, as clusters' workers do.
     memory_bytes = getattr(worker.memory_manager, "memory_limit", None) or MEMORY_LIMIT
     num_threads, memory_limit_bytes = task.share.on(host, worker.state.nthreads, CPU_COUNT, memory_bytes)
-    module, given = _work(task, num_threads)
+    own = task.survey.mapper.num_threads  # no more, though the file may ask for fewer
+    survey = task.survey.changed({"mapper.num_threads": num_threads if own < 1 else min(own, num_threads)})
     ended = supervise(
-        child_command(module),
-        given,
+        child_command("rangesfm.batch.survey_process"),
+        pickle.dumps((survey, task.restart)),
         tell,
         environment={**os.environ, "OMP_NUM_THREADS": str(num_threads), "OPENBLAS_NUM_THREADS": "1"},
         memory_limit_bytes=memory_limit_bytes,
@@ -194,18 +184,7 @@ def run_on_worker(task: SurveyTask) -> Any:
         return _why_it_did_not_end(ended, memory_limit_bytes)
     if "failed" in ended.last:
         return Failure(**ended.last["failed"])
-    done = ended.last["done"]
-    return pickle.loads(base64.b64decode(done["submaps"])) if task.only_prepare else done
-
-
-def _work(task: SurveyTask, num_threads: int) -> tuple[str, bytes]:
-    """The module that does it, and what that is given; with no more threads, though the file may ask for fewer."""
-    own = task.survey.mapper.num_threads
-    num = num_threads if own < 1 else min(own, num_threads)
-    if task.submap is not None:
-        return "rangesfm.vision.submap_process", pickle.dumps(task.submap.with_threads(num))
-    survey = task.survey.changed({"mapper.num_threads": num})
-    return "rangesfm.batch.survey_process", pickle.dumps((survey, task.restart, task.only_prepare))
+    return ended.last["done"]
 
 
 def _why_it_did_not_end(ended: Ended, memory_limit_bytes: int) -> Failure:

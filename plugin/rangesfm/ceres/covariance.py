@@ -18,6 +18,7 @@ from rangesfm.arrays import Array, Mask
 from rangesfm.ceres import num_columns, tangent_jacobian
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.rotations import cross_matrices
+from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.geometry.trajectory import pose_of
 
 # A motion of the whole world that changes the residuals by less than this part of what its parts would do alone
@@ -28,6 +29,8 @@ _MIN_PIVOT = 1e-13
 # From this share of nonzeros on, a dense inverse is faster than a sparse one.
 _DENSE_FROM = 0.15
 _BLOCKS_AT_ONCE = 64
+# Of the squared extent of a path, across which it is straight.
+_NO_TURN = 1e-10
 
 
 @dataclass(frozen=True)
@@ -36,13 +39,13 @@ class ResidualErrors:
 
     Attributes:
         rows: (k,) which residuals, in the order of the problem; 3-D points have no part in them.
-        variance: of each, in squares of the residual stddev.
-        modes: (k, m) sparse: what they do together, in residual stddevs for each of m independent errors of stddev 1.
+        by_error: (k, m) sparse: how each of m errors changes them, in residual stddevs.
+        covariance: (m, m) of these errors: all that the residuals have.
     """
 
     rows: npt.NDArray[np.int64]
-    variance: float
-    modes: csr_matrix
+    by_error: csr_matrix
+    covariance: Array
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,8 @@ class JointCovariance:
         centers: (n, 3, 3) of the rig frames' origins in the world, square metres.
         anchors: (num_anchors, 3, 3) square metres.
         others: of each other block, (k, k) in its unit.
-        relative_scale_stddev: of the map about its middle: of the similarity between true and estimated centres.
+        similarity: (7, 7) of the map as a whole: of the logarithm of the scale, the turn (rad) and the shift (m) about
+            the middle of the centres, in the best similarity between true and estimated centres.
         num_free_directions: how many motions of the whole map nothing holds (7 without ranges and gauge); along
             these, covariances are those of the map that moves least (inner constraints). Blocks that are held
             constant have covariance 0.
@@ -66,8 +70,13 @@ class JointCovariance:
     centers: Array
     anchors: Array
     others: tuple[Array, ...]
-    relative_scale_stddev: float
+    similarity: Array
     num_free_directions: int
+
+    @property
+    def relative_scale_stddev(self) -> float:
+        """Of every length in the map, by the scale alone."""
+        return float(np.sqrt(self.similarity[0, 0]))
 
 
 def joint_covariance(
@@ -113,7 +122,7 @@ def joint_covariance(
         centers=to_center @ poses @ np.swapaxes(to_center, 1, 2),
         anchors=np.array([variance * columns.covariance(anchor, blocks) for anchor in anchors]).reshape(-1, 3, 3),
         others=tuple(variance * columns.covariance(block, blocks) for block in others),
-        relative_scale_stddev=residual_stddev * _scale_stddev(columns, inverse, len(kept)),
+        similarity=variance * _similarity_covariance(columns, inverse, len(kept)),
         num_free_directions=free.shape[1],
     )
 
@@ -195,21 +204,23 @@ class _Columns:
 class _Excess:
     """J^T (S - 1) J, in the columns that are kept."""
 
-    def __init__(self, weighted: csc_matrix, modes: Array) -> None:
-        self._weighted, self._modes = weighted, modes
+    def __init__(self, independent: csc_matrix, by_error: csc_matrix, covariance: Array) -> None:
+        self._independent, self._by_error, self._covariance = independent, by_error, covariance
 
     def between(self, left: Array, right: Array) -> Array:
         """(a, b) left^T (...) right, of (size, a) and (size, b)."""
-        shared: Array = (left.T @ self._modes) @ (self._modes.T @ right)
-        shared += left.T @ (self._weighted @ right)
+        of_left, of_right = self._by_error.T @ left, self._by_error.T @ right
+        shared: Array = of_left.T @ (self._covariance @ of_right)
+        shared -= left.T @ (self._independent @ right)
         return shared
 
 
 def _excess(kept: csc_matrix, errors: ResidualErrors | None) -> _Excess:
     if errors is None:
-        return _Excess(csc_matrix((kept.shape[1], kept.shape[1])), np.zeros((kept.shape[1], 0)))
+        size = kept.shape[1]
+        return _Excess(csc_matrix((size, size)), csc_matrix((size, 0)), np.zeros((0, 0)))
     rows = csr_matrix(kept)[errors.rows]
-    return _Excess(csc_matrix((errors.variance - 1) * (rows.T @ rows)), (rows.T @ errors.modes).toarray())
+    return _Excess(csc_matrix(rows.T @ rows), csc_matrix(rows.T @ errors.by_error), errors.covariance)
 
 
 def _address(block: Array) -> int:
@@ -311,10 +322,11 @@ class _Inverse:
                 blocks.append(of_block[span] + self._excess.between(of_block, of_block))
         return blocks
 
-    def variance(self, gradient: Array) -> float:
-        """Of the linear function with this (size, 1) gradient."""
-        solution = self.solve(gradient)
-        return float((gradient.T @ solution + self._excess.between(solution, solution)).item())
+    def of_functions(self, gradients: Array) -> Array:
+        """(k, k) of the linear functions with these (size, k) gradients."""
+        solution = self.solve(gradients)
+        covariance: Array = gradients.T @ solution + self._excess.between(solution, solution)
+        return covariance
 
 
 def _dense_solver(normal: csc_matrix, columns: _Columns) -> Callable[[Array], Array]:
@@ -346,19 +358,23 @@ def _not_determined(columns: _Columns, column: int) -> GeometryError:
     return GeometryError(f"the residuals do not determine the problem's {columns.name(column)}: no covariance")
 
 
-def _scale_stddev(columns: _Columns, inverse: _Inverse, num_rows: int) -> float:
-    """Of the scale in a similarity fitted, by least squares, to how the centres of all frames err."""
+def _similarity_covariance(columns: _Columns, inverse: _Inverse, num_rows: int) -> Array:
+    """(7, 7) of the similarity fitted, by least squares, to how the centres of all frames err."""
     centers = np.array([-_matrix(pose).T @ pose[4:] for pose in columns.poses])
     if len(centers) < 2:
-        return float("nan")
-    middle = centers.mean(axis=0)
-    spread = np.square(centers - middle).sum()
-    gradient = np.zeros((num_rows, 1))
-    for pose, center in zip(columns.poses, centers, strict=True):
+        return np.full((7, 7), np.nan)
+    motions = similarity_motions(centers - centers.mean(axis=0))
+    # Of lengths and angles alike: about a straight path no turn is seen, and none counts.
+    size = float(np.linalg.norm(centers - centers.mean(axis=0)) / np.sqrt(len(centers))) or 1.0
+    unit = np.array([size] * 4 + [1.0] * 3)
+    in_lengths = np.einsum("nik,nij->kj", motions, motions) / np.outer(unit, unit)
+    to_similarity = np.linalg.pinv(in_lengths, rcond=_NO_TURN, hermitian=True) / np.outer(unit, unit)
+    gradients = np.zeros((num_rows, 7))
+    for pose, motion in zip(columns.poses, motions, strict=True):
         index = columns.index_of.get(_address(pose))
         if index is not None:
-            gradient[columns.span(index), 0] = _center_from_step(pose).T @ ((center - middle) / spread)
-    return float(np.sqrt(max(inverse.variance(gradient), 0.0)))
+            gradients[columns.span(index)] = _center_from_step(pose).T @ motion @ to_similarity
+    return inverse.of_functions(gradients)
 
 
 def _center_from_step(pose: Array) -> Array:

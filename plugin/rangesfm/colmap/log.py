@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pycolmap
@@ -35,9 +35,14 @@ def colmap_log(path: Path) -> Iterator[None]:
         finally:
             _set_flags(flags)
             logging.set_log_destination(logging.INFO, "")
-            with path.open("ab") as log:
-                for part in sorted(folder.iterdir()):
-                    log.write(part.read_bytes())
+            for part in sorted(folder.iterdir()):
+                append_log(part, path)
+
+
+def append_log(part: Path, path: Path) -> None:
+    """Append what a process has left in a log of its own, if it has, to ``path``."""
+    with suppress(FileNotFoundError), path.open("ab") as log:
+        log.write(part.read_bytes())
 
 
 def _set_flags(flags: dict[str, bool | int]) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.arrays import Array
+from rangesfm.geometry.rotations import cross_matrices
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,9 @@ _ROUNDING = 1e-12
 # Of the extent of a path: nearer to the origin is only a camera that stands there, however far from its own origin the
 # world was in which the path was computed.
 _AT_ORIGIN = 1e-6
+# In medians of what all points are off, and how often they are looked at anew.
+_FAR_OFF = 5.0
+_NUM_TRIMMINGS = 5
 # Of a unit vector, which has one coordinate that is larger: far enough from 0 for its sign to be no accident.
 _OF_SOME_SIZE = 0.3
 
@@ -91,6 +95,26 @@ def align_points(source: Array, target: Array, weights: Array | None = None, *, 
     has_scale = with_scale and variance > rounding_of(source) ** 2
     scale = float(singular_values @ signs) / variance if has_scale else 1.0
     return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
+
+
+def align_most(source: Array, target: Array, start: Similarity) -> Similarity:
+    """``align_points`` without the points that lie elsewhere than most: a few that moved on their own have no say.
+
+    Args:
+        start: about how most of the points lie to each other.
+    """
+    found = start
+    for _ in range(_NUM_TRIMMINGS):
+        off = np.linalg.norm(found.apply(source) - target, axis=1)
+        kept = off <= _FAR_OFF * np.median(off) + rounding_of(target)
+        found = align_points(source[kept], target[kept])
+    return found
+
+
+def similarity_motions(from_middle: Array) -> Array:
+    """(n, 3, 7) how points (n, 3) move with the logarithm of the scale, a turn (rad) and a shift about the origin."""
+    shifts = np.tile(np.eye(3), (len(from_middle), 1, 1))
+    return np.concatenate([from_middle[:, :, None], -cross_matrices(from_middle), shifts], axis=2)
 
 
 def similarity_between(source: Array, target: Array) -> Similarity | None:

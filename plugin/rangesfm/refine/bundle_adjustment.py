@@ -208,7 +208,7 @@ def _bundle_adjuster(
     num_threads: int,
 ) -> pycolmap.CeresBundleAdjuster:
     ba = pycolmap.BundleAdjustmentOptions(print_summary=False)
-    ba.refine_focal_length = ba.refine_extra_params = camera.refine_intrinsics is True
+    ba.refine_focal_length = ba.refine_extra_params = camera.refinement_refines_intrinsics
     solver = ba.ceres.solver_options
     solver.initial_trust_region_radius = _INITIAL_TRUST_REGION_RADIUS
     solver.function_tolerance = _FUNCTION_TOLERANCE

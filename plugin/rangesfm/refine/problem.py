@@ -16,8 +16,8 @@ from rangesfm.geometry.trajectory import pose_of
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors
-from rangesfm.ranging.errors.shared_errors import curve_stddev
 from rangesfm.refine.bundle_adjustment import BundleAdjustment, bundle_adjustment
+from rangesfm.refine.calibration import add_calibration
 from rangesfm.refine.distances import MeasuredDistances, add_distances
 from rangesfm.refine.radio import RadioBlocks, RadioEstimate, RadioRanges, add_radio_priors, add_ranges
 from rangesfm.refine.residual_errors import residual_errors
@@ -84,6 +84,7 @@ class RefinementProblem:
         residual_rows = add_ranges(bundle, self.ranges, errors, blocks, self.options)
         blocks.others.extend(add_distances(bundle, self.distances, radio.anchors, blocks.positions, errors))
         add_radio_priors(bundle, radio, self.tags_in_cam_m, errors.common_bias_stddev_m, blocks, self.options)
+        add_calibration(bundle, self.camera)
         if self.gravity is not None:
             self._add_gravity(bundle, self.gravity)
         return AddedBlocks(blocks, residual_rows)
@@ -98,18 +99,12 @@ class RefinementProblem:
         pose = pose_of(bundle.metric.frame(self.first_frame_id)).params
         ceres.add_residual_block(bundle.adjuster, cost, None, [pose])
 
-    def residual_errors(self, added: AddedBlocks, errors: RangeErrors, num_absorbed: float) -> ResidualErrors:
-        """How the residuals of the ranges err."""
-        rows = self.ranges.rows
+    def residual_errors(self, added: AddedBlocks, errors: RangeErrors) -> ResidualErrors | None:
+        """How the residuals of the ranges err; None where nobody has learnt it."""
+        if errors.learned is None:
+            return None
         radio = added.blocks.estimate(RadioEstimate(self.anchors, self.tags_in_cam_m))
-        return residual_errors(
-            errors,
-            added.residual_rows,
-            self.residuals_m(radio)[rows],
-            self.ranges.from_anchor_m(self.metric, radio)[rows],
-            curve_stddev(self.ranges.observations.log)[rows],
-            num_absorbed,
-        )
+        return residual_errors(errors, errors.learned, added.residual_rows, self.residuals_m(radio)[self.ranges.rows])
 
     def residuals_m(self, radio: RadioEstimate) -> Array:
         """(n,) predicted minus measured; NaN without a place."""

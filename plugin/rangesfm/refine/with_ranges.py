@@ -233,7 +233,7 @@ def _adjust(problem: RefinementProblem, bundle: BundleAdjustment, start: Unbent)
     )
     more, is_still = solve_until_still(bundle, last.solutions[-1], _tolerance_m(errors), last.num_left)
     last = replace(last, radio=added.blocks.estimate(last.radio), solutions=(*last.solutions, *more))
-    covariance = _covariance(problem, bundle, added, errors, start.num_absorbed)
+    covariance = _covariance(problem, bundle, added, errors)
     problem.metric.update_point_3d_errors()
     return _summary(problem, start, bundle, last, errors, covariance, is_still=is_still)
 
@@ -243,7 +243,7 @@ def _tolerance_m(errors: RangeErrors) -> float:
 
 
 def _covariance(
-    problem: RefinementProblem, bundle: BundleAdjustment, added: AddedBlocks, errors: RangeErrors, num_absorbed: float
+    problem: RefinementProblem, bundle: BundleAdjustment, added: AddedBlocks, errors: RangeErrors
 ) -> JointCovariance | None:
     metric, limit = problem.metric, _MAX_NUM_IMAGES_FOR_COVARIANCE
     if not problem.options.covariance:
@@ -257,7 +257,7 @@ def _covariance(
             anchors=added.blocks.positions,
             others=added.blocks.all_but_positions,
             residual_stddev=bundle.pixel_stddev,
-            errors=problem.residual_errors(added, errors, num_absorbed),
+            errors=problem.residual_errors(added, errors),
         )
     except GeometryError as error:
         logging.getLogger(__name__).info("%s", error)

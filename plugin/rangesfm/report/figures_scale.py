@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from rangesfm.report.content import Content, in_natural_order
-from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Series, figure_of, from_zero, histogram, time_axis
+from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Series, figure_of, from_zero, time_axis
 from rangesfm.report.text import signed
-from rangesfm.result.tables import ScaleBootstrap, ScaleCandidates, ScaleConsensus, TimeOffsetCurve
+from rangesfm.result.tables import ScaleCandidates, ScaleConsensus, TimeOffsetCurve
 
-NUM_BOOTSTRAP_BINS = 40
 MAX_NUM_CANDIDATES = 3000
 CANDIDATE_AXIS = (-1.0, 4.0)
 """Ends of the axis of candidates, in units of the scale: they have no bounds of their own."""
@@ -91,29 +90,6 @@ def consensus(content: Content) -> Figure | None:
         (curve,),
         line=("scale found", content.summary.scale.value),
         y_range=from_zero([curve]),
-    )
-
-
-def bootstrap(content: Content) -> Figure | None:
-    """The scale when blocks of time are drawn anew."""
-    table = content.result.read(ScaleBootstrap)
-    if table is None or len(table.scale) < 2:
-        return None
-    low, high = np.quantile(table.scale, [0.005, 0.995])
-    margin = max(0.15 * (high - low), 1e-6 * abs(high))
-    edges = np.linspace(low - margin, high + margin, NUM_BOOTSTRAP_BINS + 1)
-    resampled = Series("resampled", "after", histogram(table.scale, edges), "filled")
-    scale = content.summary.scale
-    return figure_of(
-        "scale_bootstrap",
-        f"{len(table.scale)} scales from blocks of time drawn anew. The band is the 95 % interval of the scale.",
-        "Histogram of resampled scales",
-        ("scale m per unit", "resamples"),
-        (resampled,),
-        line=("scale found", scale.value),
-        band=None if scale.interval_95 is None else ("95 % interval", *scale.interval_95),
-        x_range=(float(edges[0]), float(edges[-1])),
-        y_range=from_zero([resampled]),
     )
 
 

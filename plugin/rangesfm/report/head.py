@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import reduce
 from typing import Any
@@ -11,7 +12,7 @@ from markupsafe import Markup
 
 from rangesfm.report.content import Content
 from rangesfm.report.text import count, decimals_for, duration, fixed, keyed, signed
-from rangesfm.result.entries import ScaleEntry
+from rangesfm.result.entries import PlaceEntry, ScaleEntry
 
 
 def stddevs(scale: ScaleEntry) -> list[str]:
@@ -41,6 +42,7 @@ def tiles(content: Content) -> list[tuple[str, str, str]]:
         return shown(key, fixed, 3, "m", within=within)
 
     return [
+        *_place(summary.place),
         ("Keyframes", count(None if path is None else len(path)), f"path of {fixed(length_m, 2, 'm')}"),
         ("Ranges used", shown("ranges.num_used", count), shown("ranges.num", count, within="of {} in the log")),
         ("Range RMS", metres("ranges.rms_m"), metres("ranges.median_abs_m", "median {}")),
@@ -54,3 +56,11 @@ def tiles(content: Content) -> list[tuple[str, str, str]]:
 def _total_seconds(seconds: dict[str, float | None]) -> float | None:
     known = [value for value in seconds.values() if value is not None]
     return seconds.get("total") or (sum(known) if known else None)
+
+
+def _place(place: PlaceEntry | None) -> list[tuple[str, str, str]]:
+    if place is None:
+        return []
+    middle, worst = fixed(math.hypot(*place.stddev_m), 2, "m"), fixed(place.worst_keyframe_stddev_m, 2, "m")
+    worst = keyed("place.worst_keyframe_stddev_m", place.worst_keyframe_stddev_m, worst)
+    return [("Place in the site", place.verdict, Markup("middle ± {}, worst keyframe ± {}").format(middle, worst))]

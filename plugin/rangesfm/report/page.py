@@ -47,12 +47,11 @@ SECTIONS = (
         "Scale",
         (
             figures_scale.scale_per_anchor,
-            figures_scale.bootstrap,
             figures_scale.consensus,
             figures_scale.clock_curve,
             figures_scale.candidates,
         ),
-        (tables.two_candidates, tables.sensitivity),
+        (tables.error_budget, tables.two_candidates, tables.sensitivity),
     ),
     Section(
         "ranges",
@@ -60,6 +59,7 @@ SECTIONS = (
         (figures_ranges.residuals_over_time, figures_ranges.residual_histogram, figures_ranges.absolute_errors),
         (tables.range_statuses, tables.ranges_per_anchor),
     ),
+    Section("mistakes", "Mistakes", (), (tables.mistakes,)),
     Section("anchors", "Anchors", (), (tables.anchors, tables.distances)),
     Section(
         "run",

@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from rangesfm.ranging.errors.components import component_words
 from rangesfm.report.content import Content, in_natural_order
 from rangesfm.report.text import count, duration, fixed, keyed, plain, signed
 from rangesfm.result.entries import AnchorEntry, median, rms
 
 _Columns = Mapping[str, Callable[[Any], str]]
+_to_4 = partial(fixed, decimals=4)
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,27 @@ def ranges_per_anchor(content: Content) -> Table:
         rows.append(row)
     header = ["anchor", "ranges", "used", "scaled: RMS m", "median m", "refined: RMS m", "median m"]
     return Table("Ranges of each anchor", header, rows)
+
+
+def mistakes(content: Content) -> Table:
+    """Of each mistake that may have been made, whether it was found; a bar that is half full is at the threshold."""
+    columns: dict[str, Callable[[Any], str]] = {"size": partial(signed, decimals=3)}
+    columns |= dict.fromkeys(("stddev", "smallest_detectable", "effect_on_scale", "effect_on_place_m"), _to_4)
+    rows = []
+    for i, test in enumerate(content.summary.tests):
+        filled = min(test.statistic / (2 * test.threshold), 1.0) if test.threshold else 0.0
+        bar = Markup('<meter min="0" max="1" high="0.5" optimum="0" value="{:.3f}"></meter>').format(filled)
+        unfound = "would not be found" if test.smallest_detectable is None else "not found"
+        name = f"{test.name} {test.subject}".strip()
+        verdict = "found" if test.rejected else unfound
+        rows.append([name, bar, verdict, test.unit, *_cells(f"tests.{i}", test, columns)])
+    return Table(
+        "Mistakes that may have been made",
+        ["mistake", "evidence", "", "unit", "size", "stddev", "smallest found", "of the scale", "of places m"],
+        rows,
+        "A bar more than half full is beyond chance. What is not found may still be there, smaller than the smallest "
+        "that is found; the last two columns say what that may do, to the scale as a share of it.",
+    )
 
 
 def comparison(content: Content) -> Table:
@@ -160,6 +183,17 @@ def refinement(content: Content) -> Table:
     values = {} if refine is None else refine.to_json()
     rows = [[name.replace("_", " "), keyed(f"refine.{name}", value, plain(value))] for name, value in values.items()]
     return Table("Refinement", [], rows, is_narrow=True)
+
+
+def error_budget(content: Content) -> Table:
+    """What the scale's interval is made of, largest part first."""
+    parts = content.summary.scale.relative_stddev.components
+    words = component_words(parts)
+    rows = [
+        [words[name], keyed(f"scale.relative_stddev.components.{name}", stddev, f"{100 * stddev:.2f} %")]
+        for name, stddev in sorted(parts.items(), key=lambda part: -part[1])
+    ]
+    return Table("What the scale's stddev is made of", ["errors", "stddev"], rows, is_narrow=True)
 
 
 def sensitivity(content: Content) -> Table:

@@ -244,9 +244,26 @@ def median(values: Array) -> float:
     return float(np.median(values)) if len(values) else np.nan
 
 
-class RefineEntry(Record):
-    """What the refinement did; see RefineSummary. What was not estimated is null."""
+class PlaceEntry(Record):
+    """Where the map is in the site's frame, and how far to trust that; see Place."""
 
+    verdict: Literal["good", "doubtful"]
+    reasons: tuple[Text, ...]
+    stddev_m: Vector
+    heading_stddev_deg: Number
+    worst_keyframe_stddev_m: Number
+
+
+class RefineEntry(Record):
+    """What the refinement did; see RefineSummary. What was not estimated is null.
+
+    Attributes:
+        kept: whether the final map is the refined one; else it is the scaled one.
+        why_not_kept: what the refined one could not be.
+    """
+
+    kept: Flag
+    why_not_kept: tuple[Text, ...]
     iterations: Count
     keyframe_graph_steps: Count
     bend_m: NumberOrNull
@@ -271,17 +288,37 @@ class RefineEntry(Record):
             return None
         tag_ids, covariance = found.observations.log.tag_ids, summary.covariance
         others = {
+            "kept": not found.why_broken,
+            "why_not_kept": found.why_broken,
             "iterations": summary.num_iterations,
             "keyframe_graph_steps": summary.num_graph_steps,
             "correlation_inflation": summary.errors.inflation,
-            "converged": summary.converged and not summary.misfits,
-            "message": "; ".join(summary.misfits) or summary.message,
+            "converged": summary.converged and not summary.misfits and not found.why_broken,
+            "message": "; ".join((*found.why_broken, *summary.misfits)) or summary.message,
             "scale_value": found.refined_scale,
             "relative_scale_stddev": None if covariance is None else covariance.relative_scale_stddev,
             "tag_in_cam_m": dict(zip(tag_ids, summary.tags_in_cam_m, strict=True)),
             "time_offset_change_s": summary.time_shift_s,
         }
         return cls.model_validate({**vars(summary), **others})
+
+
+class MistakeEntry(Record):
+    """A mistake that may have been made, and what the ranges say of it; see MistakeTest."""
+
+    name: Text
+    subject: Text
+    statistic: Number
+    threshold: Number
+    size: NumberOrNull
+    stddev: NumberOrNull
+    unit: Text
+    smallest_detectable: NumberOrNull
+    effect_on_scale: NumberOrNull
+    effect_on_place_m: NumberOrNull
+    rejected: Flag
+    words: Text
+    remedy: Text
 
 
 class ComparisonRow(Record):

@@ -21,7 +21,6 @@ from rangesfm.result.table_file import TableFile
 from rangesfm.result.tables import (
     CenterCovariances,
     PhotoTimes,
-    ScaleBootstrap,
     ScaleCandidates,
     ScaleConsensus,
     TimeOffsetCurve,
@@ -38,7 +37,6 @@ TABLES: tuple[type[TableFile], ...] = (
     CenterCovariances,
     ScaleCandidates,
     ScaleConsensus,
-    ScaleBootstrap,
     TimeOffsetCurve,
 )
 REPORT_NAME = "report.html"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -10,7 +11,7 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
-from rangesfm.geometry.similarity import Similarity, align_points
+from rangesfm.geometry.similarity import Similarity, align_most
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.join.models import ModelVerdict
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
@@ -19,6 +20,8 @@ from rangesfm.ranging.observations import RangeObservations, RangeStatus
 from rangesfm.refine.with_ranges import RefineSummary
 from rangesfm.scale.diagnostics import ScaleDiagnostics, scale_diagnostics
 from rangesfm.scale.estimate import ScaleEstimate
+from rangesfm.trust.finished_map import Place
+from rangesfm.trust.verdict import TrustVerdict
 
 USED = (RangeStatus.USED, RangeStatus.DOWN_WEIGHTED)
 """Of ranges with a say in the final model, however small."""
@@ -38,7 +41,11 @@ class MetricResult:
         scaled_weights: (n,) robust weights by it.
         refined: the model after refinement; None without.
         refinement: its summary; None without.
+        why_broken: what the refined model cannot be; empty if nothing speaks against it. Where it is broken, the scaled
+            one is the result.
+        place: of the map in the site's frame; None where the frame is the first camera's, or nobody judged it yet.
         models: that were to be joined to what is one model here; empty where there was only one.
+        trust: what the tests of mistakes say of the scaled map.
     """
 
     trajectory: Trajectory
@@ -50,36 +57,49 @@ class MetricResult:
     scaled_weights: Array
     refined: pycolmap.Reconstruction | None = None
     refinement: RefineSummary | None = None
+    why_broken: tuple[str, ...] = ()
+    place: Place | None = None
     models: tuple[ModelVerdict, ...] = ()
+    trust: TrustVerdict | None = None
 
     @property
     def final(self) -> pycolmap.Reconstruction:
         """The best metric model there is."""
-        return self.scaled if self.refined is None else self.refined
+        return self.scaled if self.refined is None or self.why_broken else self.refined
+
+    @property
+    def kept_refinement(self) -> RefineSummary | None:
+        """That of the final model; None where it is the scaled one."""
+        return None if self.why_broken else self.refinement
+
+    @property
+    def _stage(self) -> ScaleEstimate | RefineSummary:
+        """The one that the final model comes from."""
+        return self.kept_refinement or self.estimate
 
     @property
     def anchors(self) -> tuple[AnchorEstimate, ...]:
-        return self.estimate.anchors if self.refinement is None else self.refinement.anchors
+        return self._stage.anchors
 
     @property
     def observations(self) -> RangeObservations:
         """With the final status of each range."""
-        return self.estimate.observations if self.refinement is None else self.refinement.observations
+        return self._stage.observations
 
     @property
     def predicted_m(self) -> Array:
         """(n,) ranges by the final model."""
-        return self.predicted_scaled_m if self.refinement is None else self.refinement.predicted_m
+        return self.predicted_scaled_m if self.kept_refinement is None else self.kept_refinement.predicted_m
 
     @property
     def weights(self) -> Array:
         """(n,) robust weights by the final model."""
-        return self.scaled_weights if self.refinement is None else self.refinement.weights
+        return self.scaled_weights if self.kept_refinement is None else self.kept_refinement.weights
 
     @property
     def range_stddev_m(self) -> Array:
         """(n,) noise of each range as weighted last; NaN without a place."""
-        return (self.estimate if self.refinement is None else self.refinement).errors.stddev_m
+        return self._stage.errors.stddev_m
 
     @property
     def residuals_m(self) -> Array:
@@ -89,7 +109,7 @@ class MetricResult:
     @property
     def center_covariance_m2(self) -> dict[str, Array]:
         """(3, 3) of each keyframe's projection centre, by its photo; empty where it was not found."""
-        found = None if self.refinement is None else self.refinement.covariance
+        found = None if self.kept_refinement is None else self.kept_refinement.covariance
         if found is None:
             return {}
         index = np.searchsorted(found.frame_ids, self.trajectory.frame_ids)
@@ -102,10 +122,12 @@ class MetricResult:
 
     @property
     def refined_scale(self) -> float | None:
-        """Metres per SfM unit after refinement, by the keyframe centres."""
+        """Metres per SfM unit after refinement, by where most keyframe centres went."""
         if self.refined is None:
             return None
-        return align_points(self.trajectory.centers, self.trajectory.as_in(self.refined).centers).scale
+        return align_most(
+            self.trajectory.centers, self.trajectory.as_in(self.refined).centers, self.estimate.metric_from_sfm
+        ).scale
 
     def moved(self, offset_m: Array) -> MetricResult:
         """The same in a world whose coordinates are larger by ``offset_m`` (3,)."""
@@ -128,12 +150,15 @@ class MetricResult:
             refinement=refinement,
         )
 
-    def doubted(self, reasons: tuple[str, ...]) -> MetricResult:
-        """The same with further reasons to doubt it, if there are any."""
+    def doubted(self, reasons: Sequence[str], advice: Sequence[str] = ()) -> MetricResult:
+        """The same with further reasons to doubt it, if there are any, and what to do about them."""
         if not reasons:
             return self
-        kept = self.estimate.reasons if self.estimate.verdict == "doubtful" else ()
-        return replace(self, estimate=replace(self.estimate, verdict="doubtful", reasons=(*reasons, *kept)))
+        estimate = self.estimate
+        kept = estimate.reasons if estimate.verdict == "doubtful" else ()
+        all_advice = tuple(dict.fromkeys((*advice, *estimate.advice)))
+        doubted = replace(estimate, verdict="doubtful", reasons=(*reasons, *kept), advice=all_advice)
+        return replace(self, estimate=doubted)
 
 
 def _moved_anchor(anchor: AnchorEstimate, offset_m: Array) -> AnchorEstimate:

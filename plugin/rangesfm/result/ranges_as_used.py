@@ -71,7 +71,7 @@ class RangesAsUsed(TableFile):
             keyframe_after=tuple(names[i] for i in observations.after),
             weight=np.where(observations.before >= 0, observations.weight, np.nan),
             predicted_scaled_m=found.predicted_scaled_m,
-            predicted_refined_m=unknown if found.refinement is None else found.refinement.predicted_m,
+            predicted_refined_m=unknown if found.kept_refinement is None else found.kept_refinement.predicted_m,
             residual_m=found.residuals_m,
             robust_weight=np.where(has_say, found.weights, np.nan),
             status=tuple(labels[status] for status in observations.status.tolist()),

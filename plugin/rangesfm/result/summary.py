@@ -22,7 +22,9 @@ from rangesfm.result.entries import (
     GeoreferenceEntry,
     InputEntry,
     MapEntry,
+    MistakeEntry,
     ModelEntry,
+    PlaceEntry,
     RangesEntry,
     RefineEntry,
     ScaleEntry,
@@ -44,8 +46,10 @@ class ResultSummary(Record):
         metric_from_sfm: world of ``sparse/0`` to world of ``sparse_scaled/0``.
         frame: the world of the metric models.
         anchors: by id.
+        place: null where the frame is the first camera's.
         refine: null without a refinement.
         models: that were to be joined to what is one model here; empty where there was only one.
+        tests: of mistakes that may have been made, those that were found first.
         distances: that were taped.
         comparison: only there where a reference was given.
         georeference: null if the anchors did not say.
@@ -56,6 +60,7 @@ class ResultSummary(Record):
     NAME: ClassVar = "result.json"
 
     scale: ScaleEntry
+    place: PlaceEntry | None
     metric_from_sfm: SimilarityEntry
     frame: Literal["site", "first_camera"]
     map: MapEntry
@@ -65,6 +70,7 @@ class ResultSummary(Record):
     check_ranges: CheckRangesEntry
     refine: RefineEntry | None
     models: tuple[ModelEntry, ...]
+    tests: tuple[MistakeEntry, ...] = ()
     distances: tuple[DistanceRow, ...]
     comparison: tuple[ComparisonRow, ...] = ()
     georeference: GeoreferenceEntry | None
@@ -80,6 +86,7 @@ class ResultSummary(Record):
         estimate = found.estimate
         return cls(
             scale=ScaleEntry.model_validate(estimate),
+            place=None if found.place is None else PlaceEntry.model_validate(found.place),
             metric_from_sfm=SimilarityEntry.of(estimate.metric_from_sfm),
             frame="site" if estimate.frame == "site" else "first_camera",
             map=MapEntry(num_photos=found.final.num_reg_images(), num_points3D=found.final.num_points3D()),
@@ -88,6 +95,7 @@ class ResultSummary(Record):
             ranges=RangesEntry.of(found),
             check_ranges=CheckRangesEntry.of(found),
             refine=RefineEntry.of(found),
+            tests=tuple(MistakeEntry.model_validate(test) for test in (found.trust.tests if found.trust else ())),
             models=tuple(ModelEntry.of(model, estimate.metric_from_sfm) for model in found.models),
             **others,
         )
@@ -99,12 +107,20 @@ class ResultSummary(Record):
         interval = f"{_text(low, '.6g')} to {_text(high, '.6g')}"
         yield f"scale: {scale.value:.6g} m per SfM unit, 95 % interval {interval}"
         yield f"verdict: {scale.verdict}: {'; '.join(scale.reasons)}"
+        if self.place is not None:
+            # What speaks against both has just been said.
+            reasons = [reason for reason in self.place.reasons if reason not in scale.reasons]
+            yield f"place: {self.place.verdict}{': ' if reasons else ''}{'; '.join(reasons)}"
         for advice in scale.advice:
             yield f"next time: {advice}"
         yield from _notable(scale.sensitivity)
         if self.refine is not None:
             refined = _text(self.refine.scale_value, ".6g")
-            yield f"refined: {refined} m per SfM unit after {self.refine.iterations} iterations"
+            yield (
+                f"refined: {refined} m per SfM unit after {self.refine.iterations} iterations"
+                if self.refine.kept
+                else "the refinement broke the map: the result is the scaled map"
+            )
         rms, median = (_text(value, ".3f") for value in (ranges.rms_m, ranges.median_abs_m))
         residuals = f", rms {rms} m, median {median} m" if ranges.num_used else ""
         yield f"ranges: {ranges.num_used} of {ranges.num} used{residuals}"

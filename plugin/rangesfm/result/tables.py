@@ -95,18 +95,6 @@ class ScaleConsensus(TableFile):
 
 
 @dataclass(frozen=True)
-class ScaleBootstrap(TableFile):
-    """``scale_bootstrap.csv``: the scale from blocks of time drawn anew, metres per SfM unit."""
-
-    NAME: ClassVar = "scale_bootstrap.csv"
-    scale: Rounded
-
-    @classmethod
-    def of(cls, found: MetricResult) -> ScaleBootstrap:
-        return cls(found.diagnostics.resampled_scales)
-
-
-@dataclass(frozen=True)
 class TimeOffsetCurve(TableFile):
     """``time_offset_curve.csv``: what offsets of the clocks cost, metres, where one was searched for (CostCurve)."""
 

@@ -28,7 +28,7 @@ def write_models_and_tables(
     if found.refined is None:
         shutil.rmtree(folder / "sparse_metric", ignore_errors=True)
     else:
-        write_model(found.refined, folder / "sparse_metric" / "0")
+        write_model(found.final, folder / "sparse_metric" / "0")
     for kind in TABLES:
         table = kind.of(found)
         if table is None:

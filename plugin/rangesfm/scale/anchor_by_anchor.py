@@ -51,11 +51,15 @@ def _one_anchor(solution: Solution, k: int) -> tuple[RangeProblem, RangeState]:
     return spread_subset(alone, _MAX_RANGES_ALONE), start
 
 
-def anchor_estimates(solution: Solution, anchor_ids: tuple[str, ...]) -> tuple[AnchorEstimate, ...]:
-    """All anchors of the log, with stddev widened by the errors' correlation, and mirror places."""
+def anchor_estimates(solution: Solution, anchor_ids: tuple[str, ...], covariance: Array) -> tuple[AnchorEstimate, ...]:
+    """All anchors of the log, and mirror places.
+
+    Args:
+        covariance: (p, p) of all that the fit estimates.
+    """
     problem, state = solution.problem, solution.fit.state
-    covariance = solution.fit.anchor_covariance_m2() * solution.errors.inflation**2
-    stddev = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 3)
+    of_anchors = solution.fit.of_anchors(covariance)
+    stddev = np.sqrt(np.trace(of_anchors, axis1=1, axis2=2) / 3)
     mirrors = _mirror_places(solution)
     common_bias_m = _common_bias(problem, state)
     estimates = []
@@ -73,7 +77,7 @@ def anchor_estimates(solution: Solution, anchor_ids: tuple[str, ...]) -> tuple[A
                 prior_bias_m=float(problem.bias_mean_m[k]),
                 prior_bias_stddev_m=float(problem.bias_stddev_m[k] * solution.errors.inflation),
                 mirror_position_m=mirrors.get(k),
-                position_covariance_m2=covariance[k],
+                position_covariance_m2=of_anchors[k],
             )
         )
     return tuple(estimates)

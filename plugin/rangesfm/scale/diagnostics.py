@@ -1,4 +1,4 @@
-"""How the scale came about, in tables to plot: the paper's candidates, consensus, and resampling."""
+"""How the scale came about, in tables to plot: the paper's candidates and consensus."""
 
 from __future__ import annotations
 
@@ -27,14 +27,12 @@ class ScaleDiagnostics:
         candidates: (k, 2) of each, the smaller and the larger.
         curve_scales: (m,) increasing.
         num_agreeing: (m,) ranges that agree with each.
-        resampled_scales: the estimate from blocks of time drawn anew.
     """
 
     candidate_rows: npt.NDArray[np.int64]
     candidates: Array
     curve_scales: Array
     num_agreeing: npt.NDArray[np.int64]
-    resampled_scales: Array
 
 
 def scale_diagnostics(estimate: ScaleEstimate, trajectory: Trajectory) -> ScaleDiagnostics:
@@ -53,7 +51,6 @@ def scale_diagnostics(estimate: ScaleEstimate, trajectory: Trajectory) -> ScaleD
         candidates=candidates,
         curve_scales=scales,
         num_agreeing=_num_agreeing(estimate, trajectory, rows, anchor_of_range[rows], scales),
-        resampled_scales=estimate.resampled_scales,
     )
 
 

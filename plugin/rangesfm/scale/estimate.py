@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from rangesfm.arrays import Array
 from rangesfm.geometry.similarity import Similarity
@@ -23,50 +22,21 @@ class ScaleUncertainty:
 
     Attributes:
         formal: from the Jacobian, as if every range erred on its own (Cramer-Rao).
-        bootstrap: resampling blocks of time, so that correlated errors count.
-        jackknife: leaving out one anchor at a time; None with fewer than three.
-        range_model: what an unknown error curve of the radio would do.
-        correlated: the formal one, widened by how the residuals hang together in time.
-        num_blocks, num_anchors: that bootstrap and jackknife rest on.
-        antennas: what anchors' antennas would do that err with the direction.
-        correlated_dof: degrees of freedom that ``correlated`` rests on: stretches of ranges that err together, less
-            what was fitted to them.
+        components: what each component of the ranges' errors does, by its name.
     """
 
     formal: float
-    bootstrap: float
-    jackknife: float | None
-    range_model: float
-    correlated: float = 0.0
-    num_blocks: int = 1000
-    num_anchors: int = 1
-    antennas: float = 0.0
-    correlated_dof: float = 1000.0
+    components: dict[str, float]
 
     @property
     def empirical(self) -> float:
-        """The honest one: what the data show and what single antennas hide, and the range model beside it.
-
-        Leaving out anchors in turn shows what their antennas do, so it is not counted on top.
-        """
-        one_survey = np.hypot(max(self.bootstrap, self.correlated), self.antennas)
-        return float(np.hypot(max(one_survey, self.jackknife or 0.0), self.range_model))
+        """The honest one: all components together, and never less than the formal one."""
+        return max(float(np.linalg.norm(list(self.components.values()))), self.formal)
 
     @property
     def half_width_95(self) -> float:
-        """Of the 95 % interval of the scale's logarithm; few blocks or anchors widen it as Student's t does."""
-        in_time = max(
-            NORMAL_95 * self.formal,
-            _student_95(self.correlated_dof) * self.correlated,
-            _student_95(self.num_blocks - 1) * self.bootstrap,
-        )
-        by_anchor = _student_95(self.num_anchors - 1) * (self.jackknife or 0.0)
-        seen = max(np.hypot(in_time, NORMAL_95 * self.antennas), by_anchor)
-        return float(np.hypot(seen, NORMAL_95 * self.range_model))
-
-
-def _student_95(degrees_of_freedom: float) -> float:
-    return float(stats.t.ppf(0.975, max(degrees_of_freedom, 1.0)))
+        """Of the 95 % interval of the scale's logarithm."""
+        return NORMAL_95 * self.empirical
 
 
 @dataclass(frozen=True)
@@ -123,7 +93,8 @@ class ScaleEstimate:
         observations: all ranges, with status by their final weight.
         errors: of all n ranges of the log, as weighted; their inflation widens the formal stddev.
         noise_stddev_m: stddev of a range away from all special cases.
-        resampled_scales: (k,) the robust scale from blocks of time drawn anew, metres per SfM unit.
+        placement: (7, 7) covariance of the logarithm of the scale, of a turn (rad) and of a shift (m) of the map about
+            where the first camera is, by what the ranges get wrong; None where the frame is the first camera's.
     """
 
     metric_from_sfm: Similarity
@@ -141,7 +112,7 @@ class ScaleEstimate:
     observations: RangeObservations
     errors: RangeErrors
     noise_stddev_m: float
-    resampled_scales: Array
+    placement: Array | None = None
 
     @property
     def value(self) -> float:
@@ -155,7 +126,7 @@ class ScaleEstimate:
 
     @property
     def stddev_empirical(self) -> float:
-        """Metres per SfM unit, by resampling and by what the range model leaves out."""
+        """Metres per SfM unit, by all that ranges get wrong."""
         return self.value * self.uncertainty.empirical
 
     @property

@@ -15,7 +15,6 @@ from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.errors.shared_errors import curve_stddev
 from rangesfm.ranging.observations import RangeObservations, RangeStatus, status_by_weight
 from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
 from rangesfm.scale.cutoff import cutoff_test
@@ -25,7 +24,7 @@ from rangesfm.scale.problem import ScaleProblem, scale_problem
 from rangesfm.scale.sensitivity import scale_sensitivity
 from rangesfm.scale.solution import Solution, solve_scale
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
-from rangesfm.scale.uncertainty import resampled_log_scales, scale_uncertainty
+from rangesfm.scale.uncertainty import learned_errors, parameter_covariance, scale_uncertainty
 from rangesfm.scale.verdict import judge
 
 
@@ -57,15 +56,15 @@ def initialize_scale(
     """
     options, range_model = options or ScaleOptions(), range_model or RangeModelOptions()
     gravity = gravity_of(options.up_in_first_camera)
-    block_s = options.bootstrap_block_s
-    problem = scale_problem(observations, trajectory, anchors, anchor_frame, range_model, block_s, distances, gravity)
+    problem = scale_problem(observations, trajectory, anchors, anchor_frame, range_model, distances, gravity)
     solution = solve_scale(problem, camera_side=options.camera_side, seed=seed)
     table = _paper_table(solution)
-    uncertainty = scale_uncertainty(
-        solution, curve_stddev(observations.log)[problem.rows], num_bootstrap=options.num_bootstrap, seed=seed
-    )
+    model_from_cam = _model_from_cam(observations, trajectory, problem)
+    learned = learned_errors(problem, solution, observations, model_from_cam)
+    uncertainty = scale_uncertainty(solution, learned)
     per_anchor = scale_per_anchor(solution, observations.log.anchor_ids)
-    found = anchor_estimates(solution, observations.log.anchor_ids)
+    covariance = parameter_covariance(solution.fit, solution.problem, learned)
+    found = anchor_estimates(solution, observations.log.anchor_ids, covariance)
     tests = cutoff_test(solution)
     judged = judge(problem, solution, uncertainty, per_anchor, found, tests, options)
     verdict, reasons = judged.verdict, judged.reasons
@@ -87,22 +86,24 @@ def initialize_scale(
         reasons=reasons,
         advice=judged.advice,
         cutoff_test=tests,
-        sensitivity=scale_sensitivity(
-            solution, _model_from_cam(observations, trajectory, problem), observations.log.anchor_ids
-        ),
+        sensitivity=scale_sensitivity(solution, model_from_cam, observations.log.anchor_ids),
         per_anchor=per_anchor,
         two_candidate=table,
         anchors=found,
         observations=replace(observations, status=status),
-        errors=solution.errors.spread(problem.rows, len(observations.log)),
+        errors=replace(solution.errors, learned=learned).spread(problem.rows, len(observations.log)),
         noise_stddev_m=solution.noise_stddev_m,
-        resampled_scales=_resampled_scales(solution, options.num_bootstrap, seed),
+        placement=_placement(solution, covariance),
     )
 
 
-def _resampled_scales(solution: Solution, num: int, seed: int) -> Array:
-    steps = resampled_log_scales(solution.fit, solution.errors.block, num=num, seed=seed)
-    return np.asarray(solution.fit.state.metric_from_model.scale * np.exp(steps))
+def _placement(solution: Solution, covariance: Array) -> Array | None:
+    """As ``ScaleEstimate.placement``."""
+    columns = solution.fit.columns[0]
+    if columns.frame < 0:
+        return None
+    of_map = [columns.scale, *range(columns.frame, columns.frame + 6)]
+    return np.asarray(covariance[np.ix_(of_map, of_map)])
 
 
 def _model_from_cam(observations: RangeObservations, trajectory: Trajectory, problem: ScaleProblem) -> Array:

@@ -61,14 +61,12 @@ def scale_problem(
     anchors: Sequence[Anchor],
     anchor_frame: str,
     range_model: RangeModelOptions,
-    block_s: float,
     distances: LocatedDistances | None = None,
     gravity: Gravity | None = None,
 ) -> ScaleProblem:
     """Set up the estimation.
 
     Args:
-        block_s: length of the stretches of time in which errors may go together.
         distances: taped ones, with the anchors of the log in its order; those between anchors that the log holds
             are added.
         gravity: as somebody told it.
@@ -89,7 +87,7 @@ def scale_problem(
     left_out = tuple(a.anchor_id for a, k in zip(in_log, heard | placed, strict=True) if not k)
     first_camera_from_sfm = _first_camera_from_sfm(trajectory)
     noise = range_model.range_stddev_m or START_STDDEV_M
-    errors = RangeErrors.begin(observations, rows, range_model, block_s)
+    errors = RangeErrors.begin(observations, rows, range_model)
     ranges = RangeProblem(
         centers=_centers_in_first_camera(observations.centers[rows], trajectory),
         tag_from_center=observations.tag_from_center[rows] @ first_camera_from_sfm.rotation.T,

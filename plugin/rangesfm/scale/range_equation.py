@@ -163,14 +163,13 @@ class RangeFit:
         """(p, p); directions that nothing determines count as infinitely uncertain, not as certain."""
         return invert_information(self.information)
 
-    def anchor_covariance_m2(self) -> Array:
-        """(m, 3, 3) formal covariance of each anchor; 0 of one that is not estimated."""
-        covariance = self.covariance
-        of_anchors = np.zeros((len(self.state.anchors_m), 3, 3))
+    def of_anchors(self, covariance: Array) -> Array:
+        """(m, 3, 3) the part of each anchor in a covariance (p, p); 0 of one that is not estimated."""
+        parts = np.zeros((len(self.state.anchors_m), 3, 3))
         for k, column in enumerate(self.columns[0].anchor):
             if column >= 0:
-                of_anchors[k] = covariance[column : column + 3, column : column + 3]
-        return of_anchors
+                parts[k] = covariance[column : column + 3, column : column + 3]
+        return parts
 
 
 @dataclass(frozen=True)

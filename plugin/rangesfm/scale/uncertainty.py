@@ -1,55 +1,121 @@
-"""How wrong the scale may be: formal, by resampling, and by what the range model leaves out.
-
-All resamplings are single Newton steps from the estimate, which is exact to first order and costs
-one small solve each.
-"""
+"""How wrong the scale may be: what each component of the ranges' errors does to it."""
 
 from __future__ import annotations
 
-import numpy as np
-import numpy.typing as npt
+from dataclasses import replace
 
-from rangesfm.arrays import Array
-from rangesfm.ranging.errors.noise import inflation_before_fit
-from rangesfm.ranging.errors.shared_errors import antenna_modes, curve_modes
+import numpy as np
+
+from rangesfm.arrays import Array, Indices
+from rangesfm.ranging.errors.cells import Cells, cells
+from rangesfm.ranging.errors.learned import LearnedErrors, learn_errors
+from rangesfm.ranging.errors.noise import robust_stddev
+from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.estimate import ScaleUncertainty
-from rangesfm.scale.range_equation import RangeFit, RangeProblem, predicted_ranges, range_gradient
+from rangesfm.scale.problem import ScaleProblem
+from rangesfm.scale.range_equation import (
+    RangeFit,
+    RangeProblem,
+    RangeState,
+    columns_of,
+    invert_information,
+    predicted_ranges,
+    prior_jacobian,
+    range_gradient,
+    range_jacobian,
+)
 from rangesfm.scale.solution import Solution
 
-# Where most ranges are outliers, so that the curvature says nothing.
-_MIN_CURVATURE = 0.3
+_MIN_NOISINESS, _MAX_NOISINESS = 0.5, 3.0
+# Of fewer ranges of an anchor its noise is a guess.
+_MIN_NUM_OF_ANCHOR = 20
+# Where ranges have no times: a path of so many metres is walked in a second.
+_WALKING_M_PER_S = 1.0
 
 
-def scale_uncertainty(solution: Solution, curve_stddev_m: Array, *, num_bootstrap: int, seed: int) -> ScaleUncertainty:
-    """Relative stddevs of the scale.
+def learned_errors(
+    posed: ScaleProblem, solution: Solution, observations: RangeObservations, model_from_cam: Array
+) -> LearnedErrors:
+    """What the residuals of a solution say of the ranges' errors.
 
     Args:
-        curve_stddev_m: (n,) what ranges of about this length may be off together.
+        model_from_cam: (n, 3, 3) rotation of the camera at each range, into the world of the problem.
     """
-    problem, fit, blocks = solution.problem, solution.fit, solution.errors.block
-    anchor_blocks = problem.anchor_index
-    present = np.unique(anchor_blocks)
-    correlated, correlated_dof = _correlated(solution)
-    return ScaleUncertainty(
-        formal=fit.log_scale_stddev,
-        bootstrap=_bootstrap(fit, blocks, num_bootstrap, seed),
-        jackknife=_jackknife(fit, anchor_blocks) if len(present) >= 3 else None,
-        range_model=_range_model_stddev(problem, fit, curve_stddev_m),
-        correlated=correlated,
-        num_blocks=len(np.unique(blocks)),
-        num_anchors=len(present),
-        antennas=_antennas_stddev(problem, fit),
-        correlated_dof=correlated_dof,
+    problem, state, log = solution.problem, solution.fit.state, observations.log
+    unbiased = replace(state, bias_m=problem.bias_mean_m)
+    ones = np.ones(len(problem.range_m))
+    # Biases are among the errors here.
+    only_map = replace(problem, bias_stddev_m=np.zeros(problem.num_anchors), stddev_m=ones, share=None)
+    columns = columns_of([only_map])[0]
+    taken_off = log.shared_stddev_m
+    return learn_errors(
+        _cells(posed, solution, observations, model_from_cam),
+        off_m=problem.range_m - predicted_ranges(problem, unbiased),
+        design=range_jacobian(only_map, columns, state, state),
+        prior_design=prior_jacobian(only_map, columns, state, state),
+        noise_m=solution.noise_stddev_m,
+        curve_stddev_m=None if taken_off is None else taken_off[posed.rows],
+        ruled_out=_ruled_out(problem),
     )
 
 
-def _correlated(solution: Solution) -> tuple[float, float]:
-    """Formal, widened by errors that go together, and the degrees of freedom that show how much they do."""
-    fit, num_groups = solution.fit, len(np.unique(solution.errors.group))
-    from_ranges = fit.information - fit.prior_information
-    num_fitted = float(np.trace(np.linalg.lstsq(fit.information, from_ranges, rcond=1e-12)[0]))
-    stddev = fit.log_scale_stddev * inflation_before_fit(solution.errors.inflation, num_groups, num_fitted)
-    return stddev, num_groups - num_fitted
+def _ruled_out(problem: RangeProblem) -> list[str]:
+    """Biases of a stddev of 0 are none."""
+    stddevs = {"bias": float(problem.bias_stddev_m.max()), "common_bias": problem.common_bias_stddev_m}
+    return [name for name, stddev in stddevs.items() if stddev == 0]
+
+
+def _cells(posed: ScaleProblem, solution: Solution, observations: RangeObservations, model_from_cam: Array) -> Cells:
+    problem, state, log = solution.problem, solution.fit.state, observations.log
+    by = range_gradient(problem, state)
+    world_from_cam = state.metric_from_model.rotation @ model_from_cam
+    return cells(
+        problem.anchor_index,
+        log.tag_index[posed.rows],
+        _times(posed, problem, state, observations),
+        by.by_tag * by.distance_m[:, None],
+        np.swapaxes(world_from_cam, 1, 2),
+        solution.fit.weights,
+        _noisiness(problem.anchor_index, solution.fit.residuals_m, problem.num_anchors),
+    )
+
+
+def _times(posed: ScaleProblem, problem: RangeProblem, state: RangeState, observations: RangeObservations) -> Array:
+    """(n,) seconds; where the log names photos, by the way from photo to photo."""
+    if observations.log.timestamp_s is not None:
+        return observations.log.timestamp_s[posed.rows]
+    _, first, of_range = np.unique(observations.before[posed.rows], return_index=True, return_inverse=True)
+    steps_m = np.linalg.norm(np.diff(state.metric_from_model.scale * problem.centers[first], axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps_m)])[of_range] / _WALKING_M_PER_S
+
+
+def _noisiness(anchor_index: Indices, residuals_m: Array, num_anchors: int) -> Array:
+    """(m,) scatter of each anchor's ranges over that of all."""
+    scatter = np.full(num_anchors, np.nan)
+    for k in range(num_anchors):
+        own = residuals_m[anchor_index == k]
+        if len(own) >= _MIN_NUM_OF_ANCHOR:
+            scatter[k] = robust_stddev(own - np.median(own))
+    if np.isnan(scatter).all():
+        return np.ones(num_anchors)
+    relative = scatter / np.sqrt(np.nanmedian(scatter**2))
+    noisiness: Array = np.clip(np.nan_to_num(relative, nan=1.0), _MIN_NOISINESS, _MAX_NOISINESS)
+    return noisiness
+
+
+def scale_uncertainty(solution: Solution, learned: LearnedErrors) -> ScaleUncertainty:
+    """Relative stddevs of the scale."""
+    influence = scale_influence(solution.fit, solution.problem)
+    return ScaleUncertainty(formal=solution.fit.log_scale_stddev, components=learned.stddev_of(influence))
+
+
+def parameter_covariance(fit: RangeFit, problem: RangeProblem, learned: LearnedErrors) -> Array:
+    """(p, p) of all that a fit estimates, in the parameters of its columns: what the ranges' errors do to it."""
+    influence = np.linalg.lstsq(fit.information, fit.gradients.T, rcond=1e-12)[0] / problem.stddev_m
+    of_cells = np.stack([learned.cells.total(row) for row in influence])
+    of_priors = invert_information(fit.information) @ fit.prior_information @ invert_information(fit.information)
+    covariance: Array = of_cells @ learned.covariance_m2 @ of_cells.T + of_priors
+    return covariance
 
 
 def scale_influence(fit: RangeFit, problem: RangeProblem) -> Array:
@@ -57,78 +123,3 @@ def scale_influence(fit: RangeFit, problem: RangeProblem) -> Array:
     to_scale = np.linalg.lstsq(fit.information, np.eye(len(fit.information))[0], rcond=1e-12)[0]
     influence: Array = fit.gradients @ to_scale / problem.stddev_m
     return influence
-
-
-def _block_sums(fit: RangeFit, blocks: npt.NDArray[np.int64]) -> tuple[Array, Array]:
-    """(b, p, p) information and (b, p) gradient of each block; priors left out."""
-    labels, index = np.unique(blocks, return_inverse=True)
-    informations, gradients = [], []
-    curvature = _relative_curvature(fit)
-    root_weights = np.sqrt(fit.pulls)[:, None]
-    # gradients = weight * jacobian, so dividing by the root leaves what squares to the information.
-    rows = fit.gradients / np.maximum(root_weights, 1e-12)
-    for block in range(len(labels)):
-        inside = index == block
-        informations.append(curvature * rows[inside].T @ rows[inside])
-        gradients.append(fit.gradients[inside].T @ fit.scaled_residuals[inside])
-    return np.array(informations), np.array(gradients)
-
-
-def _relative_curvature(fit: RangeFit) -> float:
-    """Mean second derivative of the loss over the mean weight: 0.8 for Gaussian errors and a Cauchy loss.
-
-    The second derivative is less than the weight, and with the weight in its place the steps would be too short. The
-    mean keeps all informations positive.
-    """
-    return max(float(np.mean(fit.curvatures) / np.mean(fit.pulls)), _MIN_CURVATURE)
-
-
-def _steps(fit: RangeFit, informations: Array, gradients: Array, counts: Array) -> Array:
-    """Change of the log scale for each row of ``counts`` (k, b): how often each block is taken."""
-    steps = np.empty(len(counts))
-    for i, count in enumerate(counts):
-        information = np.tensordot(count, informations, axes=1) + fit.prior_information
-        gradient = count @ gradients + fit.prior_gradient
-        steps[i] = -np.linalg.lstsq(information, gradient, rcond=1e-12)[0][0]
-    return steps
-
-
-def resampled_log_scales(fit: RangeFit, blocks: npt.NDArray[np.int64], *, num: int, seed: int) -> Array:
-    """(num,) changes of the log scale when blocks of time are drawn anew; none from a single block."""
-    informations, gradients = _block_sums(fit, blocks)
-    num_blocks = len(informations)
-    if num_blocks < 2:
-        return np.zeros(0)
-    rng = np.random.default_rng(seed)
-    counts = rng.multinomial(num_blocks, np.full(num_blocks, 1 / num_blocks), size=num).astype(np.float64)
-    return _steps(fit, informations, gradients, counts)
-
-
-def _bootstrap(fit: RangeFit, blocks: npt.NDArray[np.int64], num: int, seed: int) -> float:
-    steps, num_blocks = resampled_log_scales(fit, blocks, num=num, seed=seed), len(np.unique(blocks))
-    if len(steps) < 2:
-        return fit.log_scale_stddev
-    # Quartiles, so that a resample that happens to leave out a whole side does not decide alone.
-    low, high = np.quantile(steps, [0.16, 0.84])
-    # Blocks drawn from a few scatter less than blocks drawn anew.
-    return float(max(high - low, 0.0) / 2 * np.sqrt(num_blocks / (num_blocks - 1)))
-
-
-def _jackknife(fit: RangeFit, anchor_blocks: npt.NDArray[np.int64]) -> float:
-    informations, gradients = _block_sums(fit, anchor_blocks)
-    num = len(informations)
-    steps = _steps(fit, informations, gradients, 1.0 - np.eye(num))
-    return float(np.sqrt((num - 1) / num * np.sum((steps - steps.mean()) ** 2)))
-
-
-def _range_model_stddev(problem: RangeProblem, fit: RangeFit, curve_stddev_m: Array) -> float:
-    """What an error curve with this stddev, smooth in the logarithm of distance, does to the scale."""
-    modes = curve_modes(predicted_ranges(problem, fit.state), curve_stddev_m)
-    return float(np.linalg.norm(scale_influence(fit, problem) @ modes))
-
-
-def _antennas_stddev(problem: RangeProblem, fit: RangeFit) -> float:
-    """What antennas do to the scale, each anchor's for itself."""
-    modes, influence = antenna_modes(range_gradient(problem, fit.state).by_tag), scale_influence(fit, problem)
-    of_anchors = [(problem.anchor_index == k) * influence @ modes for k in range(problem.num_anchors)]
-    return float(np.linalg.norm(of_anchors))

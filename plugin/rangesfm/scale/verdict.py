@@ -20,12 +20,21 @@ from rangesfm.scale.solution import WHY_SCALE_IS_OPEN, Solution
 # Half of the 95 % interval of the scale, relative, from which it is called doubtful.
 DOUBTFUL_ABOVE = 0.04
 # Smaller changes with the least range are no news to a surveyor.
-_MIN_DRIFT_PERCENT = 1.0
+_MIN_DRIFT = 0.01
 _MANY_OUTLIERS = 0.3
 _FEW_RANGES = 50
 # Relative stddev of a scale that may as well be nothing.
 _NOTHING_KNOWN = 1.0
-_MAX_ANCHOR_SPREAD = 0.03
+# Scatter of the scales from one anchor each: more than antennas and short stretches of a path make of it, and in
+# stddevs of the joint scale.
+_MAX_ANCHOR_SPREAD, _MAX_SPREAD_STDDEVS = 0.05, 0.75
+# Components of the ranges' errors that the same measure helps against.
+_KINDS = (
+    ("curve", "rough_curve", "slope", "short", "common_bias", "learnt_curve"),
+    ("antenna", "tag_antenna"),
+    ("bias",),
+    ("white", "moment", "time", "long_time", "bending"),
+)
 _CALIBRATE = "calibrate the radio at the distances of this survey (rangesfm ranges calibrate)"
 
 
@@ -71,11 +80,14 @@ def judge(
         *weak,
         *(_Doubt(note, "survey three anchors or more that are not on one line") for note in problem.notes),
         *_left_out_doubts(problem.left_out),
-        *_path_doubts(solution, anchors),
+        *_path_doubts(solution),
         *_range_doubts(solution.fit),
-        *_anchor_doubts(per_anchor),
-        *_drift_doubts(cutoff_tests),
+        *_anchor_doubts(per_anchor, uncertainty),
     ]
+    remarks = _remarks(solution, anchors)
+    if drift := _drift(cutoff_tests):
+        is_out = abs(drift.scale / cutoff_tests[0].scale - 1) > half_width
+        (doubts if is_out else remarks).append(_drift_in_words(drift, cutoff_tests[0]))
     if half_width > NORMAL_95 * options.max_relative_stddev:
         why = f"{doubts[0].reason}; " if doubts else ""
         raise GeometryError(
@@ -86,27 +98,33 @@ def judge(
     summary = f"the scale is known to {100 * half_width:.1f} % (95 % interval)"
     if half_width > DOUBTFUL_ABOVE:
         doubts.insert(0, _Doubt(f"{summary}, worse than {100 * DOUBTFUL_ABOVE:g} %", narrower))
-    if not doubts:
-        return Verdict("good", (summary,), ())
+    said = [*doubts, *remarks]
     advice: dict[str, str] = {}
-    for doubt in doubts:  # calibration is advised once, whatever else goes with it
-        advice.setdefault(_CALIBRATE if doubt.advice.startswith(_CALIBRATE) else doubt.advice, doubt.advice)
-    return Verdict("doubtful", tuple(doubt.reason for doubt in doubts), tuple(advice.values()))
+    for each in said:  # calibration is advised once, whatever else goes with it
+        advice.setdefault(_CALIBRATE if each.advice.startswith(_CALIBRATE) else each.advice, each.advice)
+    reasons = tuple(each.reason for each in said)
+    if not doubts:
+        return Verdict("good", (summary, *reasons), tuple(advice.values()))
+    return Verdict("doubtful", reasons, tuple(advice.values()))
 
 
 def _what_narrows_it(solution: Solution, uncertainty: ScaleUncertainty) -> str:
     """Advice by the largest part of the uncertainty."""
-    seen, by_anchor = max(uncertainty.bootstrap, uncertainty.correlated), uncertainty.jackknife or 0.0
     some_unknown = bool(np.isinf(solution.problem.anchor_stddev_m).any())
-    if uncertainty.range_model > max(seen, by_anchor, uncertainty.antennas):
+    parts = uncertainty.components
+    of_curve, of_antennas, of_biases, of_time = (
+        float(np.linalg.norm([parts.get(name, 0.0) for name in names])) for names in _KINDS
+    )
+    largest = max(of_curve, of_antennas, of_biases, of_time)
+    if largest == of_curve:
         return (
             f"{_CALIBRATE}, or tape a distance between two photos or points; failing both, keep the anchors farther "
             "from the path"
         )
-    if by_anchor > max(seen, uncertainty.antennas):
+    if largest == of_biases:
         survey = "survey the anchors" if some_unknown else "check the surveyed positions of the anchors"
         return f"{survey}, and place them where they see the whole path"
-    if uncertainty.antennas > seen:
+    if largest == of_antennas:
         return "range to more anchors, on all sides of the path: a single antenna errs with the direction"
     return "walk a wider or longer loop, or survey the anchors" if some_unknown else "walk a wider or longer loop"
 
@@ -133,7 +151,7 @@ def _weakness_doubts(solution: Solution, half_width: float) -> list[_Doubt]:
     return []
 
 
-def _path_doubts(solution: Solution, anchors: Sequence[AnchorEstimate]) -> list[_Doubt]:
+def _path_doubts(solution: Solution) -> list[_Doubt]:
     stddevs = path_shape(solution.problem.centers).stddevs
     if stddevs[1] < NEARLY_STRAIGHT * stddevs[0]:
         bend = "walk a bend or a loop instead of a straight line"
@@ -142,13 +160,18 @@ def _path_doubts(solution: Solution, anchors: Sequence[AnchorEstimate]) -> list[
             return [_Doubt(reason, f"{bend}, or survey the anchors")]
         if solution.problem.frame_is_free:
             return [_Doubt("the path is nearly straight: how far the map is rolled about it is uncertain", bend)]
-    elif stddevs[2] < NEARLY_FLAT * stddevs[0] and any(a.mirror_position_m is not None for a in anchors):
-        reason = (
-            "the path is nearly flat: on which side of it the unknown anchors stand is open; the scale does not "
-            "depend on it"
-        )
-        return [_Doubt(reason, "raise and lower the camera on the way, or survey the anchors")]
     return []
+
+
+def _remarks(solution: Solution, anchors: Sequence[AnchorEstimate]) -> list[_Doubt]:
+    """What is open and does not touch the scale."""
+    stddevs = path_shape(solution.problem.centers).stddevs
+    if stddevs[2] >= NEARLY_FLAT * stddevs[0] or all(a.mirror_position_m is None for a in anchors):
+        return []
+    reason = (
+        "the path is nearly flat: on which side of it the unknown anchors stand is open; the scale does not hang on it"
+    )
+    return [_Doubt(reason, "raise and lower the camera on the way, or survey the anchors")]
 
 
 def _range_doubts(fit: RangeFit) -> list[_Doubt]:
@@ -163,24 +186,26 @@ def _range_doubts(fit: RangeFit) -> list[_Doubt]:
     return doubts
 
 
-def _anchor_doubts(per_anchor: dict[str, float]) -> list[_Doubt]:
-    """Anchors that disagree on the scale."""
+def _anchor_doubts(per_anchor: dict[str, float], uncertainty: ScaleUncertainty) -> list[_Doubt]:
+    """Anchors that disagree on the scale, by more than its uncertainty lets expect."""
     if len(per_anchor) < 2:
         return []
     spread = float(np.std(np.log(np.array(list(per_anchor.values()))), ddof=1))
-    if spread <= _MAX_ANCHOR_SPREAD:
+    if spread <= max(_MAX_ANCHOR_SPREAD, _MAX_SPREAD_STDDEVS * uncertainty.empirical):
         return []
     reason = f"the anchors disagree: the scales found with each of them alone scatter by {100 * spread:.1f} %"
     return [_Doubt(reason, "check the anchors' positions and antenna delays, and place them in the open")]
 
 
-def _drift_doubts(tests: tuple[CutoffTest, ...]) -> list[_Doubt]:
-    """A scale that moves as short ranges are left out."""
+def _drift(tests: tuple[CutoffTest, ...]) -> CutoffTest | None:
+    """A scale that moves as short ranges are left out, by more than is news to a surveyor."""
     drift = scale_drift(tests)
-    if drift is None or abs(percent := 100 * (drift.scale / tests[0].scale - 1)) < _MIN_DRIFT_PERCENT:
-        return []
+    return None if drift is None or abs(drift.scale / tests[0].scale - 1) < _MIN_DRIFT else drift
+
+
+def _drift_in_words(drift: CutoffTest, with_all: CutoffTest) -> _Doubt:
     reason = (
         f"short ranges disagree with long ones: without those under {drift.min_range_m:g} m the scale would change by "
-        f"{percent:+.1f} %"
+        f"{100 * (drift.scale / with_all.scale - 1):+.1f} %"
     )
-    return [_Doubt(reason, f"{_CALIBRATE}, and keep the anchors farther from the path")]
+    return _Doubt(reason, f"{_CALIBRATE}, and keep the anchors farther from the path")

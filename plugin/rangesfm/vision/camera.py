@@ -1,15 +1,21 @@
-"""The camera of the photos: what the user knows of it, or COLMAP's guess."""
+"""The cameras of the photos: which photos share one, and what the user knows of it, or COLMAP's guess."""
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
 
 import pycolmap
 
+from rangesfm.colmap.calibration import calibrated_cameras
 from rangesfm.errors import InputError, nearest_known
 from rangesfm.options import CameraOptions
+from rangesfm.vision.exif import exif_tags
+from rangesfm.vision.photos import Photos
 
+_TELLING_TAGS = (0x010F, 0x0110, 0xA431, 0x920A)  # make, model, serial number, focal length
 _MODELS = {name: model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
 
 
@@ -19,6 +25,8 @@ def check_camera(options: CameraOptions) -> None:
     Raises:
         InputError: an unknown model, parameters without a model, too few or too many or impossible ones.
     """
+    if options.params is None and options.focal_length_stddev_px is not None:
+        raise InputError("[camera] has focal_length_stddev_px but no params, expected those that it is of")
     if options.model is None:
         if options.params is not None:
             raise InputError("[camera] has params but no model, expected COLMAP's camera model that they belong to")
@@ -39,29 +47,85 @@ def check_camera(options: CameraOptions) -> None:
         raise InputError(f"[camera] params are {list(options.params)}, expected {expected.params_info} with f above 0")
 
 
-def camera_of_photos(options: CameraOptions, photo: Path, width: int, height: int) -> pycolmap.Camera:
-    """The one camera of all photos.
+@dataclass(frozen=True)
+class PhotoCameras:
+    """The cameras of n photos.
+
+    Attributes:
+        cameras: without ids. of_photo: n places among them.
+        guessed: one of the photos of each camera that the given parameters are not of, if any are given.
+    """
+
+    cameras: tuple[pycolmap.Camera, ...]
+    of_photo: tuple[int, ...]
+    guessed: tuple[str, ...] = ()
+
+    @property
+    def inputs(self) -> list[Any]:
+        """Plain values that tell them from others."""
+        cameras = [
+            [camera.model_name, camera.params.tolist(), camera.width, camera.height, camera.has_prior_focal_length]
+            for camera in self.cameras
+        ]
+        return [*cameras, *([] if len(cameras) == 1 else [self.of_photo])]
+
+
+def cameras_of_photos(options: CameraOptions, photos: Photos) -> PhotoCameras:
+    """Which camera took each photo; photos of one camera are of one size.
 
     Args:
-        options: as checked by ``check_camera``.
-        photo: one of the photos, from whose EXIF COLMAP takes what ``options`` leave open.
-        width, height: of the photos, pixels.
+        options: as checked by ``check_camera``. Where they leave a camera open, COLMAP takes it from the EXIF data of
+            its first photo.
 
     Raises:
         InputError: parameters that belong to photos of another size.
     """
+    groups: dict[Any, int] = {}
+    of_photo = [groups.setdefault(key, len(groups)) for key in _keys(options.mode, photos)]
+    firsts = [of_photo.index(group) for group in range(len(groups))]
     if options.model is None or options.params is None:
-        reader = pycolmap.ImageReaderOptions()
-        if options.model is not None:
-            reader.camera_model = options.model
-        return pycolmap.infer_camera_from_image(photo, reader)
-    camera = pycolmap.Camera.create_from_model_name(pycolmap.INVALID_CAMERA_ID, options.model, 1.0, width, height)
-    camera.params = list(options.params)
-    camera.has_prior_focal_length = True
-    for index, size_px in zip(camera.principal_point_idxs(), (width, height), strict=False):
+        return PhotoCameras(tuple(_guessed(options.model, photos, first) for first in firsts), tuple(of_photo))
+    known = calibrated_cameras(options.model, options.params, photos.sizes)
+    for camera in known.values():
+        _check_size(camera)
+    cameras, guessed = [], []
+    for first in firsts:
+        if photos.sizes[first] in known:
+            cameras.append(pycolmap.Camera(known[photos.sizes[first]].todict()))
+        else:
+            cameras.append(_guessed(options.model, photos, first))
+            guessed.append(photos.names[first])
+    return PhotoCameras(tuple(cameras), tuple(of_photo), tuple(guessed))
+
+
+def _keys(mode: str, photos: Photos) -> list[Any]:
+    """The same for photos of one camera."""
+    if mode == "per_image":
+        return list(photos.names)
+    if mode == "per_folder":
+        return [(PurePosixPath(name).parent, size) for name, size in zip(photos.names, photos.sizes, strict=True)]
+    if mode == "single":
+        return list(photos.sizes)
+    return [(_maker(photos.folder / name), size) for name, size in zip(photos.names, photos.sizes, strict=True)]
+
+
+def _maker(path: Path) -> tuple[str, ...]:
+    """What EXIF tells one camera from another by, and one focal length from another; empty without EXIF."""
+    tags = exif_tags(path)
+    return tuple(str(tags[tag]).strip("\0 ") for tag in _TELLING_TAGS if tag in tags)
+
+
+def _guessed(model: str | None, photos: Photos, place: int) -> pycolmap.Camera:
+    reader = pycolmap.ImageReaderOptions()
+    if model is not None:
+        reader.camera_model = model
+    return pycolmap.infer_camera_from_image(photos.folder / photos.names[place], reader)
+
+
+def _check_size(camera: pycolmap.Camera) -> None:
+    for index, size_px in zip(camera.principal_point_idxs(), (camera.width, camera.height), strict=False):
         if not 0 < camera.params[index] < size_px:
             raise InputError(
-                f"[camera] params are {list(options.params)} ({camera.params_info}), expected a principal point inside"
-                f" the photos of {width} x {height} pixels: do they belong to another image size?"
+                f"[camera] params are {camera.params.tolist()} ({camera.params_info}), expected a principal point"
+                f" inside the photos of {camera.width} x {camera.height} pixels: do they belong to another image size?"
             )
-    return camera

@@ -7,33 +7,54 @@ process holds on it. The database is broken within seconds.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import combinations
 from pathlib import Path
 
 import pycolmap
 
 
-def create_database(path: Path, image_names: Sequence[str], camera: pycolmap.Camera) -> None:
-    """A new database with these photos of one camera, in the place of an old one.
+def create_database(
+    path: Path, image_names: Sequence[str], cameras: Sequence[pycolmap.Camera], of_photo: Sequence[int]
+) -> None:
+    """A new database with these photos, in the place of an old one; each camera is a rig of its own.
 
     COLMAP would enter photos as its threads come to them; entered here they have the same ids
     1, 2, ... in every run, and the same seed gives the same model.
+
+    Args:
+        of_photo: place of each photo's camera in ``cameras``.
     """
     remove_database(path)
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
-        camera.camera_id = database.write_camera(camera)
-        rig = pycolmap.Rig()
-        rig.add_ref_sensor(camera.sensor_id)
-        rig.rig_id = database.write_rig(rig)
-        for name in image_names:
-            image = pycolmap.Image(name=name, camera_id=camera.camera_id)
+        rigs = []
+        for camera in cameras:
+            camera.camera_id = database.write_camera(camera)
+            rigs.append(pycolmap.Rig())
+            rigs[-1].add_ref_sensor(camera.sensor_id)
+            rigs[-1].rig_id = database.write_rig(rigs[-1])
+        for name, place in zip(image_names, of_photo, strict=True):
+            image = pycolmap.Image(name=name, camera_id=cameras[place].camera_id)
             image.image_id = database.write_image(image)
             frame = pycolmap.Frame()
-            frame.rig_id = rig.rig_id
+            frame.rig_id = rigs[place].rig_id
             frame.add_data_id(image.data_id)
             database.write_frame(frame)
+
+
+def write_positions(path: Path, positions: Iterable[tuple[float, float, float] | None]) -> None:
+    """Where each photo was taken, by the order of their ids: latitude, longitude (degrees, WGS 84) and altitude (m).
+
+    COLMAP would write down those of photos that it enters itself.
+    """
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        for image_id, position in enumerate(positions, 1):
+            if position is not None:
+                prior = pycolmap.PosePrior(
+                    position=position, coordinate_system=pycolmap.PosePriorCoordinateSystem.WGS84
+                )
+                prior.corr_data_id = database.read_image(image_id).data_id
+                database.write_pose_prior(prior)
 
 
 def remove_database(path: Path) -> None:
@@ -42,12 +63,8 @@ def remove_database(path: Path) -> None:
         path.with_name(path.name + suffix).unlink(missing_ok=True)
 
 
-def copy_stretch(source_path: Path, path: Path, image_ids: Sequence[int]) -> None:
-    """A new database for mapping some of another one's photos, which keep their ids.
-
-    It has their features, without descriptors, and those of their matches that fit one geometry of two views.
-    """
-    remove_database(path)
+def copy_features(source_path: Path, path: Path, image_ids: Sequence[int]) -> None:
+    """A new database for matching some of another one's photos, which keep their ids and are called by them."""
     with (
         pycolmap.Database.open(source_path) as source,
         pycolmap.Database.open(path) as target,
@@ -59,12 +76,28 @@ def copy_stretch(source_path: Path, path: Path, image_ids: Sequence[int]) -> Non
             target.write_rig(rig, use_rig_id=True)
         for image_id in image_ids:
             image = source.read_image(image_id)
+            image.name = str(image_id)
             target.write_frame(source.read_frame(image.frame_id), use_frame_id=True)
             target.write_image(image, use_image_id=True)
             target.write_keypoints(image_id, source.read_keypoints(image_id))
-        for first, second in combinations(sorted(image_ids), 2):
-            if source.exists_two_view_geometry(first, second):
-                target.write_two_view_geometry(first, second, source.read_two_view_geometry(first, second))
+            target.write_descriptors(image_id, source.read_descriptors(image_id))
+
+
+def copy_matches(source_path: Path, path: Path, pairs: Iterable[tuple[tuple[int, int], tuple[int, int]]]) -> None:
+    """Matches of pairs of photos into another database, as far as there are any.
+
+    Args:
+        pairs: ids in the source, smaller first, and those of the same photos in the target, likewise.
+    """
+    with (
+        pycolmap.Database.open(source_path) as source,
+        pycolmap.Database.open(path) as target,
+        pycolmap.DatabaseTransaction(target),
+    ):
+        for old, new in pairs:
+            if is_compared(source, *old):
+                target.write_matches(*new, source.read_matches(*old))
+                target.write_two_view_geometry(*new, source.read_two_view_geometry(*old))
 
 
 def restore_names(path: Path, image_names: Sequence[str]) -> None:
@@ -101,6 +134,11 @@ def _rename(path: Path, image_names: Sequence[str]) -> None:
 def num_photos_with_features(database: pycolmap.Database) -> int:
     """How many photos COLMAP has been through, whether or not it found anything in them."""
     return sum(database.exists_keypoints(image_id) for image_id in range(1, database.num_images() + 1))
+
+
+def is_compared(database: pycolmap.Database, first: int, second: int) -> bool:
+    """Whether COLMAP has been through a pair of photos, whether or not they match."""
+    return bool(database.exists_two_view_geometry(first, second))
 
 
 def num_compared_pairs(database: pycolmap.Database) -> int:

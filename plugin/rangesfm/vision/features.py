@@ -70,7 +70,6 @@ def _call_colmap(
             database_path,
             photos.folder,
             image_names=photos.names[start : start + num_at_a_time],
-            camera_mode=pycolmap.CameraMode.SINGLE,
             extraction_options=options,
             cancellation_token=token,
         )

@@ -1,16 +1,16 @@
-"""Step 3: COLMAP's incremental mapper, and its models on disk."""
+"""Step 3: COLMAP's mappers, and their models on disk."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import pycolmap
 
 from rangesfm.colmap.model_files import read_model, write_binary_model
 from rangesfm.colmap.passthrough import apply_options
-from rangesfm.errors import ReconstructionError
+from rangesfm.errors import OptionError, ReconstructionError
 from rangesfm.files.atomic import new_folder, scratch_folder
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import Progress
@@ -19,21 +19,88 @@ from rangesfm.vision.database import num_matching_pairs
 from rangesfm.vision.mapping_loop import GlobalAdjustment, incremental_mapping
 from rangesfm.vision.photos import Photos
 from rangesfm.vision.snapshots import Snapshots, newest_snapshot, remove_snapshots
+from rangesfm.vision.whole_mapping import WholePipelineOptions, map_at_once
 
 
-class NoModelError(ReconstructionError):
-    """Nothing failed; the photos just do not give a model."""
+def pipeline_options(
+    camera: CameraOptions, mapper: MapperOptions, seed: int
+) -> pycolmap.IncrementalPipelineOptions | WholePipelineOptions:
+    """Of the mapper that is wanted.
+
+    Raises:
+        InputError: keys or values that are not COLMAP's, or that are the incremental mapper's alone.
+    """
+    if mapper.ranges_in_mapping and mapper.method != "incremental":
+        message = f"[mapper] ranges_in_mapping is true, expected false beside method '{mapper.method}'"
+        raise OptionError(message, "mapper", "ranges_in_mapping")
+    makers: Mapping[str, Callable[..., pycolmap.IncrementalPipelineOptions | WholePipelineOptions]]
+    makers = {"incremental": _incremental, "global": _global, "hierarchical": _hierarchical}
+    options = makers[mapper.method](camera, mapper, seed)
+    apply_options(options, mapper.pipeline, "mapper.pipeline")
+    return options
 
 
-def pipeline_options(camera: CameraOptions, mapper: MapperOptions, seed: int) -> pycolmap.IncrementalPipelineOptions:
-    """Raises InputError for keys or values that are not COLMAP's."""
-    options = pycolmap.IncrementalPipelineOptions(num_threads=mapper.num_threads, random_seed=seed)
-    options.mapper.random_seed = options.triangulation.random_seed = seed
+def _incremental(camera: CameraOptions, mapper: MapperOptions, seed: int) -> pycolmap.IncrementalPipelineOptions:
+    options = pycolmap.IncrementalPipelineOptions(num_threads=mapper.num_threads)
+    _set_incremental(options, camera, seed)
+    return options
+
+
+def _global(camera: CameraOptions, mapper: MapperOptions, seed: int) -> pycolmap.GlobalPipelineOptions:
+    options = pycolmap.GlobalPipelineOptions(num_threads=mapper.num_threads, random_seed=seed)
+    if not camera.mapping_refines_intrinsics:
+        adjustment = options.mapper.bundle_adjustment
+        adjustment.refine_focal_length = adjustment.refine_extra_params = False
+    return options
+
+
+def _hierarchical(camera: CameraOptions, mapper: MapperOptions, seed: int) -> pycolmap.HierarchicalPipelineOptions:
+    """Each cluster is mapped by one thread: with several the search for an initial pair is a race."""
+    options = pycolmap.HierarchicalPipelineOptions(num_threads=mapper.num_threads, num_workers=mapper.num_cores)
+    options.incremental_options.num_threads = 1
+    _set_incremental(options.incremental_options, camera, seed)
+    return options
+
+
+def _set_incremental(options: pycolmap.IncrementalPipelineOptions, camera: CameraOptions, seed: int) -> None:
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
     if not camera.mapping_refines_intrinsics:
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
-    apply_options(options, mapper.pipeline, "mapper.pipeline")
-    return options
+
+
+def map_photos(
+    database_path: Path,
+    photos: Photos,
+    models_path: Path,
+    snapshots_path: Path,
+    options: pycolmap.IncrementalPipelineOptions | WholePipelineOptions,
+    log: Path,
+    progress: Progress,
+    adjustment: GlobalAdjustment | None = None,
+) -> None:
+    """Write all models to ``models_path``/0, /1, ..., the one with the most photos first.
+
+    Args:
+        snapshots_path: of the incremental mapper, which goes on from the newest and has its own there until it is done.
+        log: what a mapper in a process of its own says is appended to it.
+
+    Raises:
+        ReconstructionError: there is not a single model, or COLMAP failed.
+    """
+    if isinstance(options, pycolmap.IncrementalPipelineOptions):
+        models = map_incrementally(database_path, photos, models_path, snapshots_path, options, progress, adjustment)
+    else:
+        models = map_at_once(database_path, photos.folder, options, log, progress)
+    if not models:
+        with pycolmap.Database.open(database_path) as database:
+            num_matching = num_matching_pairs(database)
+        raise ReconstructionError(
+            f"no model from {len(photos.names)} photos, of which {num_matching} pairs match: photos from"
+            " more places sideways to the view, or known camera parameters, may help"
+        )
+    write_models(models, models_path)
+    remove_snapshots(snapshots_path)
 
 
 def map_incrementally(
@@ -44,15 +111,8 @@ def map_incrementally(
     options: pycolmap.IncrementalPipelineOptions,
     progress: Progress,
     adjustment: GlobalAdjustment | None = None,
-) -> None:
-    """Write all models to ``models_path``/0, /1, ..., the one with the most photos first.
-
-    Goes on from the newest snapshot in ``snapshots_path``, if there is one, and has its own there until it is done.
-
-    Raises:
-        NoModelError: there is not a single one.
-        ReconstructionError: COLMAP failed.
-    """
+) -> list[pycolmap.Reconstruction]:
+    """All models that COLMAP's incremental mapper makes; there may be none. Raises ReconstructionError if it fails."""
     begun = newest_snapshot(snapshots_path)
     counter = _Counter(begun)
     if begun is not None:
@@ -85,15 +145,7 @@ def map_incrementally(
             lambda: counter.num_registered,
             len(photos.names),
         )
-    if not models:
-        with pycolmap.Database.open(database_path) as database:
-            num_matching = num_matching_pairs(database)
-        raise NoModelError(
-            f"no model from {len(photos.names)} photos, of which {num_matching} pairs match: photos from"
-            " more places sideways to the view, or known camera parameters, may help"
-        )
-    write_models(models.values(), models_path)
-    remove_snapshots(snapshots_path)
+    return list(models.values())
 
 
 def write_models(models: Iterable[pycolmap.Reconstruction], models_path: Path) -> None:

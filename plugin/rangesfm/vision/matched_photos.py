@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pycolmap
 
@@ -16,7 +14,7 @@ from rangesfm.errors import ReconstructionError
 from rangesfm.files.atomic import make_output_folder
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import Progress
-from rangesfm.vision.camera import camera_of_photos, check_camera
+from rangesfm.vision.camera import PhotoCameras, cameras_of_photos, check_camera
 from rangesfm.vision.features import extract_features, feature_options
 from rangesfm.vision.mapping import remove_models
 from rangesfm.vision.matching import match_features, matching_options
@@ -31,7 +29,7 @@ class Workspace:
 
     Attributes:
         output: the folder, which ``begin`` makes.
-        database, models, snapshots, submaps, log: in it.
+        database, models, snapshots, log: in it.
         steps: the record of what is done.
         progress: who listens.
     """
@@ -42,7 +40,6 @@ class Workspace:
         self.database = output / "database.db"
         self.models = output / "sparse"
         self.snapshots = output / "mapping_snapshot"
-        self.submaps = output / "submaps"
         self.log = output / "mapper.log"
         self.steps = Steps(output / "reconstruct.json", progress)
         self._before_change = before_change
@@ -53,7 +50,6 @@ class Workspace:
         if restart:
             self.steps.forget("features")
             forget_database(self.steps)
-            shutil.rmtree(self.submaps, ignore_errors=True)
 
     def remove_old_models(self) -> None:
         self._before_change()
@@ -76,17 +72,11 @@ class MatchedPhotos:
 
     Attributes:
         photos: in the order of their ids 1, 2, ...
-        contents: SHA-256 of each, by name.
         inputs: fingerprint of the matches.
-        match_inputs: of what they depend on beside the photos.
-        only_by_place: whether a pair is matched for the places of its photos in the order, not for their looks.
     """
 
     photos: Photos
-    contents: dict[str, str]
     inputs: str
-    match_inputs: str
-    only_by_place: bool
 
 
 def match_photos(
@@ -99,15 +89,16 @@ def match_photos(
     *,
     restart: bool,
 ) -> MatchedPhotos:
-    """Features and matches of photos of one camera; arguments and errors as of ``reconstruct``."""
+    """Features and matches of photos; arguments and errors as of ``reconstruct``."""
     check_camera(camera)
     for_features = feature_options(mapper)
     for_matching = matching_options(mapper, len(image_names), seed)
     photos = usable_photos(image_path, image_names)
-    its_camera = camera_of_photos(camera, photos.folder / photos.names[0], photos.width, photos.height)
+    cameras = cameras_of_photos(camera, photos)
     space.begin(restart=restart)
     steps, progress, database = space.steps, space.progress, space.database
     _say_left_out(photos, progress)
+    _say_guessed(cameras, progress)
 
     def prepare_features() -> None:
         space.remove_old_models()
@@ -122,11 +113,9 @@ def match_photos(
         steps.note("photos", photos.contents(steps.notes.get("photos", {})))
         contents = {name: sha256 for name, (_, sha256) in steps.notes["photos"].items()}
         of_features = fingerprint(pycolmap.__version__, mapper.features)
-        of_matches = fingerprint(
-            of_features, _plain(its_camera), for_matching.is_sequential, mapper.pairing, mapper.matcher, seed
-        )
-        renewed = RenewedDatabase(database, photos, contents, its_camera, for_matching, of_features, of_matches, steps)
-        inputs = fingerprint(of_features, _plain(its_camera), list(contents.items()))
+        of_matches = fingerprint(of_features, cameras.inputs, for_matching.pairing_inputs, mapper.matcher, seed)
+        renewed = RenewedDatabase(database, photos, contents, cameras, for_matching, of_features, of_matches, steps)
+        inputs = fingerprint(of_features, cameras.inputs, list(contents.items()))
         steps.run(
             "features",
             inputs,
@@ -140,13 +129,9 @@ def match_photos(
             inputs,
             database,
             prepare_matching,
-            lambda: match_features(database, photos, for_matching, progress),
+            lambda: match_features(database, photos, for_matching, space.log, progress),
         )
-    return MatchedPhotos(photos, contents, inputs, of_matches, for_matching.is_by_place)
-
-
-def _plain(camera: pycolmap.Camera) -> list[Any]:
-    return [camera.model_name, camera.params.tolist(), camera.width, camera.height, camera.has_prior_focal_length]
+    return MatchedPhotos(photos, inputs)
 
 
 def _say_left_out(photos: Photos, progress: Progress) -> None:
@@ -154,3 +139,11 @@ def _say_left_out(photos: Photos, progress: Progress) -> None:
         name, reason = next(iter(photos.left_out.items()))
         num = len(photos.left_out)
         progress.message(f"{num} of {num + len(photos.names)} photos are left out; the first, {name}, {reason}")
+
+
+def _say_guessed(cameras: PhotoCameras, progress: Progress) -> None:
+    if cameras.guessed:
+        progress.message(
+            f"the camera's parameters are of photos of another shape than {cameras.guessed[0]}: COLMAP guesses its"
+            f" camera ({len(cameras.guessed)} of {len(cameras.cameras)} cameras)"
+        )

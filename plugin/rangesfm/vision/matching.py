@@ -2,93 +2,108 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+import shutil
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pycolmap
 
+from rangesfm.colmap.log import append_log
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import ReconstructionError
+from rangesfm.files.atomic import scratch_folder
 from rangesfm.options import MapperOptions
+from rangesfm.processes.children import run_children
 from rangesfm.progress import Progress
-from rangesfm.vision.background import run_in_background
-from rangesfm.vision.database import named_by_place, num_compared_pairs, num_matching_pairs
+from rangesfm.vision.database import is_compared, num_matching_pairs
+from rangesfm.vision.matching_share import MatchingShare
+from rangesfm.vision.pairs import NamedPairs, Pairing, pairing_options, pairs_to_match
 from rangesfm.vision.photos import Photos
 
-_MAX_NUM_EXHAUSTIVE = 60  # 1770 pairs; beyond, the pairs outgrow the photos
-# COLMAP hears of a Ctrl-C between two blocks: 36 pairs of 8 by 8 photos instead of its default's 1225.
-_EXHAUSTIVE_BLOCK_SIZE = 8
+_PROCESS = "rangesfm.vision.matching_share"
+_MIN_NUM_PAIRS = 100  # for less, a second process does not pay
+_MAX_NUM_PAIRS = 2000  # of one share, whose database is one of at most some hundred photos
+# A tile's pairs are of few photos for one share, a small one's for COLMAP's memory.
+_TILE_SIZE, _SMALL_TILE_SIZE = 64, 8
 # pycolmap's wheels carry an OpenBLAS without locks. Of two threads that match at once, one now and then
 # computes in the other's memory: some pair keeps 50 of its 1100 matches, in every run another one.
-# [mapper.matcher] num_threads overrides this. On a GPU no BLAS is used.
+# Processes have memories of their own. [mapper.matcher] num_threads overrides this. On a GPU no BLAS is used.
 _NUM_CPU_THREADS = 1
 
 
 @dataclass(frozen=True)
 class MatchingOptions:
-    """COLMAP's options for the chosen way of matching; its type of pairing says which."""
+    """COLMAP's options for the chosen way of matching.
 
-    pairing: pycolmap.ExhaustivePairingOptions | pycolmap.SequentialPairingOptions
+    Attributes:
+        pairing: says which pairs.
+        num_processes: that match at once.
+    """
+
+    pairing: Pairing | NamedPairs
     matcher: pycolmap.FeatureMatchingOptions
     verification: pycolmap.TwoViewGeometryOptions
-
-    @property
-    def is_sequential(self) -> bool:
-        return isinstance(self.pairing, pycolmap.SequentialPairingOptions)
+    num_processes: int
 
     @property
     def is_by_place(self) -> bool:
-        """Whether it is the places of photos in the order that make a pair, and not what they look like."""
+        """Whether a pair is one before anything is known of the photos but their order and their names."""
+        if isinstance(self.pairing, pycolmap.SpatialPairingOptions):
+            return False
         return not (isinstance(self.pairing, pycolmap.SequentialPairingOptions) and self.pairing.loop_detection)
+
+    @property
+    def pairing_inputs(self) -> list[Any]:
+        """Plain values that tell these pairs from others of the same photos."""
+        if isinstance(self.pairing, tuple):
+            return list(self.pairing)
+        return [type(self.pairing).__name__, str(self.pairing.todict())]
 
 
 def matching_options(mapper: MapperOptions, num_photos: int, seed: int) -> MatchingOptions:
     """Raises InputError for keys or values that are not COLMAP's."""
-    is_sequential = mapper.matching == "sequential" or (mapper.matching == "auto" and num_photos > _MAX_NUM_EXHAUSTIVE)
     num_threads = mapper.num_threads if pycolmap.has_cuda else _NUM_CPU_THREADS
-    sequential, exhaustive = pycolmap.SequentialPairingOptions(), pycolmap.ExhaustivePairingOptions()
-    exhaustive.block_size = _EXHAUSTIVE_BLOCK_SIZE
     options = MatchingOptions(
-        pairing=sequential if is_sequential else exhaustive,
+        pairing=pairing_options(mapper, num_photos),
         matcher=pycolmap.FeatureMatchingOptions(num_threads=num_threads),
         verification=pycolmap.TwoViewGeometryOptions(),
+        num_processes=1 if pycolmap.has_cuda else mapper.num_cores,
     )
     # Within COLMAP's own: what it asks of two views is not what its RANSAC asks by itself.
     options.verification.ransac.random_seed = seed
-    apply_options(options.pairing, mapper.pairing, "mapper.pairing")
     apply_options(options.matcher, mapper.matcher, "mapper.matcher")
     return options
 
 
-def pairs_to_match(database_path: Path, photos: Photos, options: MatchingOptions) -> list[tuple[int, int]]:
-    """Ids of all pairs that will be compared, smaller first; none where only the photos' looks decide."""
-    pairing = options.pairing
-    if isinstance(pairing, pycolmap.SequentialPairingOptions):
-        if pairing.loop_detection:
-            return []
-        with named_by_place(database_path, photos.names), pycolmap.Database.open(database_path) as database:
-            pairs = pycolmap.SequentialPairGenerator(pairing, database).all_pairs()
-    else:
-        with pycolmap.Database.open(database_path) as database:
-            pairs = pycolmap.ExhaustivePairGenerator(pairing, database).all_pairs()
-    return sorted({(min(pair), max(pair)) for pair in pairs})
+def match_features(
+    database_path: Path, photos: Photos, options: MatchingOptions, log: Path, progress: Progress
+) -> None:
+    """Match the pairs of photos that have not been matched yet; with the same result whatever the number of processes.
 
-
-def match_features(database_path: Path, photos: Photos, options: MatchingOptions, progress: Progress) -> None:
-    """Match the pairs of photos that have not been matched yet.
+    Args:
+        log: what COLMAP says is appended to it.
 
     Raises:
         ReconstructionError: no two photos match.
     """
-    naming = named_by_place(database_path, photos.names) if options.is_sequential else nullcontext()
-    with naming, pycolmap.Database.open(database_path) as database:
-        run_in_background(
-            lambda token: _call_colmap(database_path, options, token),
-            progress,
-            lambda: num_compared_pairs(database),
-            _num_expected_pairs(len(photos.names), options.pairing),
+    pairs = pairs_to_match(database_path, photos, options.pairing)
+    with pycolmap.Database.open(database_path) as database:
+        missing = [pair for pair in pairs if not is_compared(database, *pair)]
+    num_there, num_all = len(pairs) - len(missing), len(pairs)
+    progress.update(num_there, num_all)
+    with scratch_folder(database_path.with_name("matching")) as folder:
+        shares = [
+            MatchingShare(folder / str(k), share, options.matcher, options.verification)
+            for k, share in enumerate(_shared_out(missing, options.num_processes))
+        ]
+        _match_shares(
+            shares, database_path, options.num_processes, log, lambda num: progress.update(num_there + num, num_all)
         )
+    with pycolmap.Database.open(database_path) as database:
         num_matching = num_matching_pairs(database)
     if num_matching == 0:
         raise ReconstructionError(
@@ -97,23 +112,38 @@ def match_features(database_path: Path, photos: Photos, options: MatchingOptions
         )
 
 
-def _call_colmap(database_path: Path, options: MatchingOptions, token: pycolmap.CancellationToken) -> None:
-    if isinstance(options.pairing, pycolmap.SequentialPairingOptions):
-        pycolmap.match_sequential(
-            database_path, options.matcher, options.pairing, options.verification, cancellation_token=token
-        )
-    else:
-        pycolmap.match_exhaustive(
-            database_path, options.matcher, options.pairing, options.verification, cancellation_token=token
-        )
+def _match_shares(
+    shares: Sequence[MatchingShare], database_path: Path, num_at_once: int, log: Path, update: Callable[[int], None]
+) -> None:
+    begun: deque[MatchingShare] = deque()
+
+    def prepared() -> Iterator[MatchingShare]:
+        for share in shares:
+            share.folder.mkdir()
+            share.prepare(database_path)
+            begun.append(share)
+            yield share
+
+    def take_first() -> None:
+        share = begun.popleft()
+        append_log(share.log, log)
+        share.hand_over(database_path)
+        shutil.rmtree(share.folder)
+
+    try:
+        with closing(run_children(_PROCESS, prepared(), num_at_once, update)) as ended:
+            for _ in ended:
+                take_first()
+    finally:  # interrupted: what there is saves the next run doing it
+        while begun:
+            with suppress(RuntimeError):  # a database that was only being made
+                take_first()
 
 
-def _num_expected_pairs(
-    num_photos: int, pairing: pycolmap.ExhaustivePairingOptions | pycolmap.SequentialPairingOptions
-) -> int | None:
-    if not isinstance(pairing, pycolmap.SequentialPairingOptions):
-        return num_photos * (num_photos - 1) // 2
-    if pairing.loop_detection:
-        return None
-    steps = [2**step if pairing.quadratic_overlap else step + 1 for step in range(min(pairing.overlap, num_photos))]
-    return sum(max(num_photos - step, 0) for step in steps)
+def _shared_out(pairs: Sequence[tuple[int, int]], num_processes: int) -> Iterator[list[tuple[int, int]]]:
+    """Shares for processes that work at the same time: of the same size, and of few photos."""
+    tiles = sorted(pairs, key=lambda pair: [id_ // size for size in (_TILE_SIZE, _SMALL_TILE_SIZE, 1) for id_ in pair])
+    num_at_once = max(1, min(num_processes, len(pairs) // _MIN_NUM_PAIRS))
+    for start in range(0, len(tiles), num_at_once * _MAX_NUM_PAIRS):
+        together = tiles[start : start + num_at_once * _MAX_NUM_PAIRS]
+        yield from (together[k::num_at_once] for k in range(num_at_once))

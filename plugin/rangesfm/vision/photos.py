@@ -1,8 +1,7 @@
-"""The photos that one camera can have taken: readable and all of one size."""
+"""The photos that can be read."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,19 +17,18 @@ MIN_NUM_PHOTOS = 2
 
 @dataclass(frozen=True)
 class Photos:
-    """Photos of one camera.
+    """Photos, of whatever size.
 
     Attributes:
         folder: of all of them.
         names: n names, relative to the folder, in the order given.
-        width, height: of each, pixels.
+        sizes: n times width and height, pixels, as stored: EXIF does not turn them, as COLMAP does not.
         left_out: photos that cannot be used, and why.
     """
 
     folder: Path
     names: tuple[str, ...]
-    width: int
-    height: int
+    sizes: tuple[tuple[int, int], ...]
     left_out: dict[str, str]
 
     def contents(self, known: Mapping[str, Any]) -> dict[str, tuple[list[int], str]]:
@@ -53,23 +51,21 @@ def _content(path: Path, known: Any) -> tuple[list[int], str]:
 
 
 def usable_photos(folder: Path, names: Sequence[str]) -> Photos:
-    """The photos of the most common size.
+    """Those that can be read.
 
     Raises:
         ReconstructionError: fewer than two of them.
     """
     sizes = {name: _size(folder / name) for name in names}
-    common = Counter(size for size in sizes.values() if size is not None).most_common(1)
-    width, height = common[0][0] if common else (0, 0)
-    usable = tuple(name for name in names if sizes[name] == (width, height))
-    left_out = {name: _reason(size) for name, size in sizes.items() if size != (width, height)}
+    usable = {name: size for name, size in sizes.items() if size is not None}
+    left_out = {name: "cannot be read as an image" for name in names if name not in usable}
     if len(usable) < MIN_NUM_PHOTOS:
         why = "".join(f"; {name} {reason}" for name, reason in list(left_out.items())[:1])
         raise ReconstructionError(
             f"{folder}: {len(usable)} of {len(names)} photos can be used, expected at least {MIN_NUM_PHOTOS}"
-            f" readable ones of one size{why}"
+            f" readable ones{why}"
         )
-    return Photos(folder, usable, width, height, left_out)
+    return Photos(folder, tuple(usable), tuple(usable.values()), left_out)
 
 
 def _size(path: Path) -> tuple[int, int] | None:
@@ -78,7 +74,3 @@ def _size(path: Path) -> tuple[int, int] | None:
             return int(image.width), int(image.height)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # what Pillow's readers raise
         return None
-
-
-def _reason(size: tuple[int, int] | None) -> str:
-    return "cannot be read as an image" if size is None else f"has another size ({size[0]} x {size[1]} pixels)"

@@ -11,8 +11,18 @@ import pycolmap
 
 from rangesfm.files.atomic import new_file
 from rangesfm.progress import Progress
-from rangesfm.vision.database import clear_matches, create_database, remove_database, restore_names
-from rangesfm.vision.matching import MatchingOptions, pairs_to_match
+from rangesfm.vision.camera import PhotoCameras
+from rangesfm.vision.database import (
+    clear_matches,
+    copy_matches,
+    create_database,
+    remove_database,
+    restore_names,
+    write_positions,
+)
+from rangesfm.vision.exif import exif_position
+from rangesfm.vision.matching import MatchingOptions
+from rangesfm.vision.pairs import pairs_to_match
 from rangesfm.vision.photos import Photos
 from rangesfm.vision.steps import Steps
 
@@ -29,7 +39,7 @@ class RenewedDatabase:
         path: of the database.
         photos: in the order of their ids.
         contents: SHA-256 of each photo, by name.
-        camera: that took them.
+        cameras: that took them.
         matching: how they will be matched.
         feature_inputs: fingerprint of what features depend on beside the photo itself.
         match_inputs: likewise, of matches beside the two photos.
@@ -39,7 +49,7 @@ class RenewedDatabase:
     path: Path
     photos: Photos
     contents: Mapping[str, str]
-    camera: pycolmap.Camera
+    cameras: PhotoCameras
     matching: MatchingOptions
     feature_inputs: str
     match_inputs: str
@@ -50,11 +60,11 @@ class RenewedDatabase:
         earlier = self.steps.notes.get(_NOTE, {})
         forget_database(self.steps)
         with new_file(self.path) as fresh:
-            create_database(fresh, self.photos.names, self.camera)
+            self._create(fresh)
             try:
                 num_taken = self._take_over(earlier, fresh)
             except RuntimeError:  # somebody has damaged the earlier one
-                create_database(fresh, self.photos.names, self.camera)
+                self._create(fresh)
                 num_taken = 0
             if num_taken:
                 progress.message(f"features: those of {num_taken} photos are taken over from an earlier run")
@@ -68,12 +78,16 @@ class RenewedDatabase:
             clear_matches(self.path)
         self._write_note()
 
+    def _create(self, path: Path) -> None:
+        create_database(path, self.photos.names, self.cameras.cameras, self.cameras.of_photo)
+        write_positions(path, (exif_position(self.photos.folder / name) for name in self.photos.names))
+
     def _take_over(self, earlier: Mapping[str, Any], fresh: Path) -> int:
         ids = self._earlier_ids(earlier)
         if not ids or not self.path.exists():
             return 0
-        same_matches = earlier.get("matches") == self.match_inputs
-        pairs = pairs_to_match(fresh, self.photos, self.matching) if same_matches else []
+        same_matches = self.matching.is_by_place and earlier.get("matches") == self.match_inputs
+        pairs = pairs_to_match(fresh, self.photos, self.matching.pairing) if same_matches else []
         return _copy(self.path, fresh, ids, pairs)
 
     def _earlier_ids(self, earlier: Mapping[str, Any]) -> dict[int, int]:
@@ -111,24 +125,10 @@ def _copy(earlier: Path, new: Path, earlier_ids: Mapping[int, int], pairs: Itera
         for new_id, old_id in taken.items():
             target.write_keypoints(new_id, source.read_keypoints(old_id))
             target.write_descriptors(new_id, source.read_descriptors(old_id))
-        _copy_pose_priors(source, target, taken)
-        for first, second in pairs:
-            old_first, old_second = taken.get(first, 0), taken.get(second, 0)
-            if 0 < old_first < old_second and source.exists_two_view_geometry(old_first, old_second):
-                target.write_matches(first, second, source.read_matches(old_first, old_second))
-                target.write_two_view_geometry(first, second, source.read_two_view_geometry(old_first, old_second))
+    of_pairs = (((taken.get(first, 0), taken.get(second, 0)), (first, second)) for first, second in pairs)
+    copy_matches(earlier, new, ((old, pair) for old, pair in of_pairs if 0 < old[0] < old[1]))
     return len(taken)
 
 
 def _has_features(database: pycolmap.Database, image_id: int) -> bool:
     return database.exists_keypoints(image_id) and database.exists_descriptors(image_id)
-
-
-def _copy_pose_priors(source: pycolmap.Database, target: pycolmap.Database, ids: Mapping[int, int]) -> None:
-    """What COLMAP read in the photos' EXIF data when it extracted their features."""
-    by_id = {prior.corr_data_id.id: prior for prior in source.read_all_pose_priors()}
-    for new_id, old_id in ids.items():
-        if old_id in by_id:
-            prior = by_id[old_id]
-            prior.corr_data_id = target.read_image(new_id).data_id
-            target.write_pose_prior(prior)

@@ -9,10 +9,11 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from rangesfm.colmap.reprojection import point_errors
 from rangesfm.colmap.transform import rescale, without_photos
 from rangesfm.distances.ends import LocatedDistances, locate_distances, surveyed_distances
 from rangesfm.distances.tape import Tape
-from rangesfm.errors import GeometryError, InputError
+from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.join.models import ModelVerdict, PathOfModel, Ranging, join_models
@@ -28,8 +29,11 @@ from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
+from rangesfm.trust.broken_refinement import why_broken
+from rangesfm.trust.finished_map import Doubt, doubts_of_map, place_of_map
 from rangesfm.vision.image_times import ImageTimes
 from rangesfm.workflows.journal import Journal
+from rangesfm.workflows.trust_in_map import tested
 
 # Scales of two clock offsets further apart than this are no answer, unless one of the offsets is nearly certain.
 _MAX_SPREAD = 0.03
@@ -234,7 +238,8 @@ def scale_by_survey(
     )
     weights = estimate.errors.robust_weights(predicted - inputs.log.range_m)
     offset_s = offset.value_s if offset is not None else survey.ranges.time_offset_s
-    return MetricResult(trajectory, offset, offset_s, estimate, scaled, predicted, weights).doubted(by_rivals)
+    metric = MetricResult(trajectory, offset, offset_s, estimate, scaled, predicted, weights)
+    return tested(survey, metric.doubted(by_rivals), journal)
 
 
 def doubts_by_rivals(
@@ -292,17 +297,49 @@ def _scale_of(
 
 
 def refine_map(survey: Survey, inputs: RangingInputs, metric: MetricResult, journal: Journal) -> MetricResult:
-    """The map refined with its ranges, and what speaks against the refinement told."""
+    """The map refined with its ranges; the scaled one stays the result where that broke it.
+
+    Raises:
+        SolverError: the scaled one is no map either.
+    """
     refined, summary = refine_by_survey(
         survey, inputs, metric.scaled, metric.trajectory, metric.estimate, _control(inputs, metric)
     )
-    if not summary.converged:
-        journal.warn(f"the refinement stopped before it converged: {summary.message}")
     if survey.refine.covariance and summary.covariance is None:
         journal.warn("no covariance of the poses: too many keyframes, or photos and ranges leave some of it open")
-    for misfit in summary.misfits:
-        journal.warn(f"after the refinement {misfit}")
-    return replace(metric, refined=refined, refinement=summary)
+    broken = why_broken(
+        metric.scaled, refined, metric.trajectory, metric.estimate, summary, survey.refine.range_loss_scale
+    )
+    if broken and not point_errors(metric.scaled).fit:
+        raise SolverError(
+            f"the refinement broke the map: {'; '.join(broken)}; nor do the points of the model that it began with fit "
+            "the photos: check that model, photos and the camera's parameters belong together (rangesfm scale gives "
+            "the path alone)"
+        )
+    return replace(metric, refined=refined, refinement=summary, why_broken=broken)
+
+
+def judge_map(survey: Survey, metric: MetricResult, journal: Journal) -> MetricResult:
+    """The finished map with all that speaks against it, which is told, and with the verdict on its place."""
+    log = metric.observations.log
+    doubts = []
+    if metric.why_broken:
+        reason = f"the refinement broke the map, which is left as scaled: {'; '.join(metric.why_broken)}"
+        doubts.append(Doubt(reason, "check the model's points and cameras, clocks, lever arm and anchors"))
+    doubts += doubts_of_map(
+        metric.estimate,
+        metric.kept_refinement,
+        None if metric.kept_refinement is None else metric.refined_scale,
+        point_errors(metric.final),
+        survey.ranges.common_bias_stddev_m,
+        noise_is_given=survey.ranges.range_stddev_m is not None or bool(np.isfinite(log.range_stddev_m).any()),
+    )
+    for doubt in doubts:
+        journal.warn(doubt.reason)
+    centers_m = metric.trajectory.as_in(metric.final).centers
+    place = place_of_map(metric.estimate, metric.kept_refinement, centers_m, doubts)
+    judged = replace(metric, place=place)
+    return judged.doubted([doubt.reason for doubt in doubts], [doubt.advice for doubt in doubts])
 
 
 def _control(inputs: RangingInputs, metric: MetricResult) -> Tape:

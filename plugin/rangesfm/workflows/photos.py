@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from contextlib import nullcontext, suppress
-from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -24,6 +22,7 @@ from rangesfm.ranging.observations import RangeObservations
 from rangesfm.result.folder import forget_result, refuse_to_overwrite
 from rangesfm.survey.inputs import RangingInputs, read_ranging_inputs
 from rangesfm.survey.settings import Survey
+from rangesfm.trust.before import notes_before_work, notes_on_model, notes_on_times
 from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images
 from rangesfm.vision.keyframes import select_keyframes
 from rangesfm.vision.mapping_loop import GlobalAdjustment
@@ -31,7 +30,6 @@ from rangesfm.vision.reconstruct import reconstruct
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.metric_map import estimate_scale, path_of_model, ranges_on_path, refine_by_survey
 
-_Done = TypeVar("_Done")
 # Fewer have no shape by which ranges could tell a scale.
 _MIN_NUM_KEYFRAMES = 5
 # By which factor the path must have grown for the clocks' offset to be looked for again.
@@ -45,7 +43,7 @@ def read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
         apply_options(pycolmap.BundleAdjustmentOptions(), survey.refine.bundle_adjustment, "refine.bundle_adjustment")
     refuse_to_overwrite((item.path for item in survey.input_paths()), survey.output.path)
     inputs = read_ranging_inputs(survey)
-    for note in inputs.notes:
+    for note in (*inputs.notes, *notes_before_work(survey, inputs)):
         journal.warn(note)
     return inputs
 
@@ -53,9 +51,17 @@ def read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
 def checked_inputs(survey: Survey, journal: Journal) -> tuple[RangingInputs, tuple[str, ...], ImageTimes | None]:
     """Ranges and photos that have to do with each other; the photos' times, where any are needed."""
     inputs = read_inputs(survey, journal)
+    return inputs, *checked_keyframes(survey, inputs, journal)
+
+
+def checked_keyframes(
+    survey: Survey, inputs: RangingInputs, journal: Journal
+) -> tuple[tuple[str, ...], ImageTimes | None]:
+    """The photos to reconstruct and their times, which have to do with those of the inputs."""
     keyframes, times = find_keyframes(survey, journal, log_names_photos=inputs.log.image_name is not None)
     check_times(survey, inputs, _path_without_places(keyframes, times))
-    return inputs, keyframes, times
+    tell_of_times(survey, inputs, times, journal)
+    return keyframes, times
 
 
 def check_times(survey: Survey, inputs: RangingInputs, path: Trajectory) -> None:
@@ -67,16 +73,26 @@ def check_times(survey: Survey, inputs: RangingInputs, path: Trajectory) -> None
         ranges_on_path(survey, inputs, path, offset_s or 0.0)
 
 
+def tell_of_times(survey: Survey, inputs: RangingInputs, times: ImageTimes | None, journal: Journal) -> None:
+    """What is odd about two clocks whose offset nobody gave."""
+    if times is not None and inputs.log.timestamp_s is not None and survey.ranges.time_offset_s is None:
+        for note in notes_on_times(inputs.log.timestamp_s, times.timestamps_s):
+            journal.warn(note)
+
+
 def _path_without_places(keyframes: tuple[str, ...], times: ImageTimes | None) -> Trajectory:
     n = len(keyframes)
     timestamps_s = None if times is None else times.timestamps_s
     return Trajectory(np.arange(n), keyframes, timestamps_s, np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))
 
 
-def read_registered(path: Path) -> pycolmap.Reconstruction:
+def read_registered(path: Path, journal: Journal) -> pycolmap.Reconstruction:
+    """A model that was brought along; what is wrong with it by itself is told."""
     model = read_model(path)
     if not model.num_reg_images():
         raise InputError("the model has no registered images", path)
+    for note in notes_on_model(model):
+        journal.warn(note)
     return model
 
 
@@ -88,7 +104,7 @@ def find_keyframes(
     Args:
         log_names_photos: then no photo is left out for want of a time; None: there is no log.
     """
-    folder = _images_path(survey)
+    folder = images_path(survey)
     with journal.timed("keyframes"):
         names = list_images(folder)
         image_times = None
@@ -108,21 +124,9 @@ def map_keyframes(
     adjustment: GlobalAdjustment | None = None,
 ) -> tuple[pycolmap.Reconstruction, ...]:
     """Map the keyframes into ``sparse``; returns ``sparse/0``, ``sparse/1``, ..."""
-    summary = with_photos(partial(reconstruct, adjustment=adjustment), survey, keyframes, journal, restart)
-    journal.seconds.update(summary.seconds)
-    if summary.num_registered < summary.num_keyframes:
-        which = "the model" if len(summary.models) == 1 else f"the largest of {len(summary.models)} models"
-        journal.warn(f"{summary.num_registered} of {summary.num_keyframes} keyframes are in {which}")
-    return summary.models
-
-
-def with_photos(
-    do: Callable[..., _Done], survey: Survey, keyframes: tuple[str, ...], journal: Journal, restart: bool
-) -> _Done:
-    """Call ``reconstruct``, or a part of it, for the keyframes of a survey."""
     with survey.source.naming_lines():
-        return do(
-            _images_path(survey),
+        summary = reconstruct(
+            images_path(survey),
             keyframes,
             survey.output.path,
             camera=survey.camera,
@@ -131,10 +135,17 @@ def with_photos(
             progress=journal.progress,
             restart=restart,
             before_change=lambda: forget_result(survey.output.path),
+            adjustment=adjustment,
         )
+    journal.seconds.update(summary.seconds)
+    if summary.num_registered < summary.num_keyframes:
+        which = "the model" if len(summary.models) == 1 else f"the largest of {len(summary.models)} models"
+        journal.warn(f"{summary.num_registered} of {summary.num_keyframes} keyframes are in {which}")
+    return summary.models
 
 
-def _images_path(survey: Survey) -> Path:
+def images_path(survey: Survey) -> Path:
+    """The folder of a survey's photos; InputError if none is given."""
     if survey.images.path is None:
         raise InputError("no photos: give [images] path in a survey file, or --images FOLDER")
     return survey.images.path

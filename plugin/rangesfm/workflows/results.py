@@ -92,7 +92,7 @@ def _comparison(survey: Survey, inputs: RangingInputs, metric: MetricResult) -> 
         return ()
     frame = metric.estimate.frame
     scaled = metric.trajectory.as_in(metric.scaled)
-    refined = None if metric.refined is None else metric.trajectory.as_in(metric.refined)
+    refined = None if metric.kept_refinement is None else metric.trajectory.as_in(metric.final)
     rows = papers_table(scaled, refined, inputs.reference, frame=frame)
     in_frame = reference_in_frame(refined or scaled, inputs.reference, frame=frame)
     if in_frame is not None:

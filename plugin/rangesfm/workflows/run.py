@@ -19,12 +19,12 @@ from rangesfm.ranging.clock.estimate import TimeOffset
 from rangesfm.survey.inputs import RangingInputs, times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes
-from rangesfm.vision.reconstruct import prepare_submaps
-from rangesfm.vision.submaps import Submap
+from rangesfm.workflows.adoption import with_likeliest_cause
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.metric_map import (
     find_time_offset,
     join_by_survey,
+    judge_map,
     path_with_times,
     ranges_on_paths,
     refine_map,
@@ -39,7 +39,7 @@ from rangesfm.workflows.photos import (
     noted,
     read_inputs,
     read_registered,
-    with_photos,
+    tell_of_times,
 )
 from rangesfm.workflows.results import RunResult, write_results
 
@@ -56,19 +56,6 @@ def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> 
         if note := adjustment.note():
             journal.warn(note)
         return to_metric(survey, inputs, models, times, journal, refine=survey.refine.enabled)
-
-
-def prepare_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> tuple[Submap, ...]:
-    """What ``run_survey`` does before it maps the photos.
-
-    Returns:
-        The submaps that are to be mapped yet; whoever has them mapped (``Submap.map``), wherever, in any order and at
-        once, saves ``run_survey`` doing it. None where the photos are mapped in one piece.
-    """
-    journal = Journal(progress)
-    _, keyframes, _ = checked_inputs(survey, journal)
-    with sole_writer(survey.output.path):
-        return with_photos(prepare_submaps, survey, keyframes, journal, restart)
 
 
 def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> list[str]:
@@ -98,12 +85,13 @@ def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResul
     inputs = read_inputs(survey, journal)
     if survey.model_path is None:
         raise InputError("no model: give --input_path MODEL, a COLMAP model as sparse/0")
-    sfm = read_registered(survey.model_path)
+    sfm = read_registered(survey.model_path, journal)
     if refine and not sfm.num_points3D():
         raise InputError("the model has no 3-D points to refine: a trajectory can only be scaled", survey.model_path)
     times = None
     if inputs.log.image_name is None:
         times = noted(times_of_model(survey, sfm, survey.model_path), journal)
+        tell_of_times(survey, inputs, times, journal)
     with sole_writer(survey.output.path):
         return to_metric(survey, inputs, [sfm], times, journal, refine=refine)
 
@@ -147,9 +135,11 @@ def map_in_metres(
     with journal.stage("scale"):
         path, verdicts = join_by_survey(survey, inputs, paths, journal, must_join=must_join)
         metric = replace(scale_by_survey(survey, inputs, path, offset, journal), models=verdicts)
+        if survey.scale.adopt:
+            inputs, metric = with_likeliest_cause(survey, inputs, path, metric, journal)
     # Global refinement: photos and ranges together.
     if refine:
         with journal.stage("refinement"):
             metric = refine_map(survey, inputs, metric, journal)
     # Comparison and results.
-    return write_results(survey, inputs, metric, journal)
+    return write_results(survey, inputs, judge_map(survey, metric, journal), journal)

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.errors.inlier_noise import InlierNoise, inlier_noise
+from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.noise import (
     START_STDDEV_M,
     correlation_inflation,
@@ -33,6 +34,8 @@ _SIGNIFICANT = 3.0
 _MIN_NUM_OF_ANCHOR = 20
 _NUM_MEAN_ROUNDS = 10
 _MIN_ORDINARY = 0.3
+# Errors may go together in stretches of time of this length; where the log names photos, those of a photo do.
+_STRETCH_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,7 @@ class RangeErrors:
         noise_m: of a range without special cases, as a map shows it that may only grow, turn and move; one that may
             bend shows no more.
         log_likelihood: of the likeliest residuals that the bounded loss has seen of these ranges.
+        learned: what the scale stage has learnt of all that they get wrong together; None before.
     """
 
     stddev_m: Array
@@ -70,17 +74,14 @@ class RangeErrors:
     common_bias_stddev_m: float
     noise_m: float = np.inf
     log_likelihood: float = -np.inf
+    learned: LearnedErrors | None = None
 
     @classmethod
-    def begin(
-        cls, observations: RangeObservations, rows: Indices, range_model: RangeModelOptions, block_s: float
-    ) -> RangeErrors:
+    def begin(cls, observations: RangeObservations, rows: Indices, range_model: RangeModelOptions) -> RangeErrors:
         """Of some of the ranges, before any map is looked at.
 
         Args:
             rows: (n,) of the observations, all with a place.
-            block_s: length of the stretches of time in which errors may go together; where the log names photos, the
-                ranges of a photo do.
         """
         log = observations.log
         given = log.range_stddev_m[rows]
@@ -96,7 +97,7 @@ class RangeErrors:
             shared_m=shared,
             placing_m=np.zeros(len(rows)),
             anchor_index=log.anchor_index[rows],
-            block=observations.before[rows] if times is None else stretch_labels(times, block_s),
+            block=observations.before[rows] if times is None else stretch_labels(times, _STRETCH_S),
             place=nothing,
             loss=GEMAN_MCCLURE,
             common_bias_stddev_m=range_model.common_bias_stddev_m,
@@ -126,7 +127,7 @@ class RangeErrors:
         """Of some of the ranges."""
         part: dict[str, Any] = {name: values[rows] for name, values in self._of_each_range()}
         part["place"] = np.unique(part["place"], return_inverse=True)[1]
-        return replace(self, **part)
+        return replace(self, learned=None if self.learned is None else self.learned.subset(rows), **part)
 
     def spread(self, rows: Indices, num: int) -> RangeErrors:
         """The same as ``rows`` of ``num`` ranges, of which the others have no place: NaN, or label 0."""
@@ -134,7 +135,7 @@ class RangeErrors:
         for name, values in self._of_each_range():
             spread[name] = np.full(num, np.nan if values.dtype == np.float64 else 0, dtype=values.dtype)
             spread[name][rows] = values
-        return replace(self, **spread)
+        return replace(self, learned=None if self.learned is None else self.learned.spread(rows, num), **spread)
 
     def _of_each_range(self) -> list[tuple[str, npt.NDArray[Any]]]:
         values = ((field.name, getattr(self, field.name)) for field in fields(self))

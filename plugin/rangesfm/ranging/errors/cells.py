@@ -1,0 +1,119 @@
+"""Cells: ranges to one anchor from one stretch of time, as one number each, so that how they err can be computed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rangesfm.arrays import Array, Indices
+
+# Their covariance is a full matrix, and learning it takes its inverse some twenty times.
+MAX_NUM_CELLS = 450
+_SHORTEST_S = 0.5
+_LONGER = 1.25
+
+
+@dataclass(frozen=True)
+class Cells:
+    """c averages of n ranges.
+
+    Attributes:
+        of_range: (n,) the cell of each range.
+        weight: (n,) by which the ranges of a cell are averaged.
+        worth: (c,) ranges that a cell is worth: the sum of their weights.
+        anchor_index, tag_index: (c,).
+        time_s: (c,) since the first range; without times, photos since the first.
+        distance_m: (c,) from anchor to tag.
+        from_anchor: (c, 3) unit vectors from anchor to tag. in_cam: (c, 3) the same in the camera's frame.
+        noisiness: (c,) noise of the cell's anchor over that of all.
+    """
+
+    of_range: Indices
+    weight: Array
+    worth: Array
+    anchor_index: Indices
+    tag_index: Indices
+    time_s: Array
+    distance_m: Array
+    from_anchor: Array
+    in_cam: Array
+    noisiness: Array
+
+    def __len__(self) -> int:
+        return len(self.worth)
+
+    def mean(self, values: Array) -> Array:
+        """(c, ...) of (n, ...) values of each range."""
+        flat = values.reshape(len(values), -1)
+        sums = np.stack([np.bincount(self.of_range, self.weight * column, len(self)) for column in flat.T], axis=1)
+        means: Array = sums / np.maximum(self.worth, 1e-12)[:, None]
+        return means.reshape(len(self), *values.shape[1:])
+
+    def total(self, values: Array) -> Array:
+        """(c,) sums of (n,) values of each range."""
+        return np.bincount(self.of_range, values, len(self)).astype(np.float64)
+
+
+def cells(
+    anchor_index: Indices,
+    tag_index: Indices,
+    time_s: Array,
+    from_anchor_m: Array,
+    cam_from_world: Array,
+    weight: Array,
+    noise_of_anchor: Array,
+) -> Cells:
+    """At most so many that their covariance is soon computed.
+
+    Args:
+        anchor_index, tag_index, time_s: (n,). from_anchor_m: (n, 3) from anchor to tag.
+        cam_from_world: (n, 3, 3) rotations. weight: (n,) robust. noise_of_anchor: (m,) over that of all.
+    """
+    since = time_s - time_s.min()
+    distance = np.linalg.norm(from_anchor_m, axis=1)
+    towards = from_anchor_m / np.maximum(distance, 1e-9)[:, None]
+    of_range = _labels(anchor_index, tag_index, since)
+    first = np.unique(of_range, return_index=True)[1]
+    weight = np.maximum(weight, 1e-6)
+    begun = Cells(
+        of_range=of_range,
+        weight=weight,
+        worth=np.bincount(of_range, weight).astype(np.float64),
+        anchor_index=anchor_index[first],
+        tag_index=tag_index[first],
+        time_s=since[first],
+        distance_m=distance[first],
+        from_anchor=towards[first],
+        in_cam=towards[first],
+        noisiness=noise_of_anchor[anchor_index[first]],
+    )
+    return Cells(
+        of_range=of_range,
+        weight=weight,
+        worth=begun.worth,
+        anchor_index=begun.anchor_index,
+        tag_index=begun.tag_index,
+        time_s=begun.mean(since),
+        distance_m=begun.mean(distance),
+        from_anchor=_unit(begun.mean(towards)),
+        in_cam=_unit(begun.mean(np.einsum("nij,nj->ni", cam_from_world, towards))),
+        noisiness=begun.noisiness,
+    )
+
+
+def _labels(anchor_index: Indices, tag_index: Indices, since_s: Array) -> Indices:
+    """(n,) counted from 0, of the shortest stretches of time that do not make too many cells."""
+    link = anchor_index * (int(tag_index.max()) + 2) + tag_index + 1
+    length_s = _SHORTEST_S
+    while True:
+        stretch = np.floor(since_s / length_s).astype(np.int64)
+        values, labels = np.unique(link * (int(stretch.max()) + 1) + stretch, return_inverse=True)
+        if len(values) <= max(MAX_NUM_CELLS, 2 * len(np.unique(link))):
+            return np.asarray(labels, dtype=np.int64)
+        length_s *= _LONGER
+
+
+def _unit(vectors: Array) -> Array:
+    units: Array = vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-9)[:, None]
+    return units

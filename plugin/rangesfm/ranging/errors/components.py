@@ -1,0 +1,162 @@
+"""What ranges get wrong: the components of their errors, each with what the population of radios lets expect of it.
+
+An error of two cells is covariant as their anchors, places, directions, distances and times are alike. The medians and
+spreads sum up what seven public logs of five radios with the true path show (the table in ``examples/radios.md``); each
+survey learns its own stddevs on top of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from rangesfm.arrays import Array, Indices
+from rangesfm.ranging.errors.cells import Cells
+
+_SHORT_M = 1.0
+_TIME_S, _LONG_TIME_S = 3.0, 15.0
+# In logarithms of distance.
+_SMOOTH, _ROUGH = 1.0, 0.5
+_MIN_DISTANCE_M = 0.05
+# Of the time a path takes, within which it bends one way.
+_BEND = 0.125
+
+
+@dataclass(frozen=True)
+class Component:
+    """One way in which ranges err.
+
+    Attributes:
+        name: of its stddev in ``result.json``.
+        median: stddev, metres (``slope``: share of the distance), over radios.
+        spread: stddev of the logarithm of that over radios.
+        calibrated_median: the same once a learnt error curve is taken off: its change from one day, mounting and
+            room to the next. None: no matter.
+        is_of_anchor: whether each anchor has it for itself, more where its ranges are noisier.
+        correlation: (c, c) of cells, for a stddev of 1.
+        words: for people.
+    """
+
+    name: str
+    median: float
+    spread: float
+    calibrated_median: float | None
+    is_of_anchor: bool
+    correlation: Callable[[Cells], Array]
+    words: str
+
+
+def _same(labels: Indices) -> Array:
+    alike: Array = (labels[:, None] == labels).astype(np.float64)
+    return alike
+
+
+def _same_link(cells: Cells) -> Array:
+    alike: Array = _same(cells.anchor_index) * _same(cells.tag_index)
+    return alike
+
+
+def _apart(values: Array) -> Array:
+    return np.abs(values[:, None] - values)
+
+
+def _in_time(cells: Cells, length_s: float) -> Array:
+    together: Array = np.exp(-_apart(cells.time_s) / length_s) * _same_link(cells)
+    return together
+
+
+def _log_distance(distance_m: Array) -> Array:
+    return np.log(np.maximum(distance_m, _MIN_DISTANCE_M))
+
+
+def alike_by_distance(distance_m: Array) -> Array:
+    """(c, c) of a random function, smooth in the logarithm of (c,) distances."""
+    alike: Array = np.exp(-0.5 * (_apart(_log_distance(distance_m)) / _SMOOTH) ** 2)
+    return alike
+
+
+def _smooth(cells: Cells) -> Array:
+    return alike_by_distance(cells.distance_m)
+
+
+def _rough(cells: Cells) -> Array:
+    alike: Array = np.exp(-_apart(_log_distance(cells.distance_m)) / _ROUGH)
+    return alike
+
+
+def _short(cells: Cells) -> Array:
+    shortness = np.exp(-cells.distance_m / _SHORT_M)
+    return np.outer(shortness, shortness)
+
+
+def alike_by_direction(directions: Array) -> Array:
+    """Of a random polynomial of the direction, half of its variance linear and half quadratic in the unit vector."""
+    cosine = directions @ directions.T
+    alike: Array = cosine / 2 + (3 * cosine**2 - 1) / 4
+    return alike
+
+
+def _white(cells: Cells) -> Array:
+    return np.diag(1 / np.maximum(cells.worth, 1e-6))
+
+
+def _proportional(cells: Cells) -> Array:
+    return np.outer(cells.distance_m, cells.distance_m)
+
+
+def _antenna(cells: Cells) -> Array:
+    return _same(cells.anchor_index) * alike_by_direction(cells.from_anchor)
+
+
+def _tag_antenna(cells: Cells) -> Array:
+    return _same(cells.tag_index) * alike_by_direction(cells.in_cam)
+
+
+def _bending(cells: Cells) -> Array:
+    length_s = max(_BEND * float(np.ptp(cells.time_s)), 1e-9)
+    alike: Array = (cells.from_anchor @ cells.from_anchor.T) * np.exp(-_apart(cells.time_s) / length_s)
+    return alike
+
+
+COMPONENTS = (
+    Component("white", 0.05, 1.0, None, True, _white, "noise of single ranges"),
+    Component("moment", 0.03, 1.0, None, True, lambda c: np.eye(len(c)), "errors of moments"),
+    Component("time", 0.04, 0.7, None, True, lambda c: _in_time(c, _TIME_S), "errors that last for seconds"),
+    Component("long_time", 0.03, 0.7, None, True, lambda c: _in_time(c, _LONG_TIME_S), "errors that last longer"),
+    Component("bias", 0.045, 0.5, None, True, lambda c: _same(c.anchor_index), "each anchor's own bias"),
+    Component("common_bias", 0.2, 0.5, 0.04, False, lambda c: np.ones((len(c), len(c))), "the bias of all ranges"),
+    Component("short", 0.2, 0.5, 0.08, False, _short, "short ranges"),
+    Component("curve", 0.04, 0.5, 0.02, False, _smooth, "the radio's error curve"),
+    Component("rough_curve", 0.02, 0.3, 0.01, False, _rough, "unevenness of the error curve"),
+    Component("slope", 0.004, 0.7, 0.003, False, _proportional, "ranges long by a share"),
+    Component(
+        "antenna",
+        0.05,
+        0.7,
+        None,
+        True,
+        _antenna,
+        "anchors' antennas by direction",
+    ),
+    Component(
+        "tag_antenna",
+        0.05,
+        0.7,
+        None,
+        False,
+        _tag_antenna,
+        "the tag's antenna by direction",
+    ),
+    Component("bending", 0.01, 0.8, None, False, _bending, "the map's own bending"),
+)
+
+LEARNT_CURVE = "learnt_curve"
+"""What is left of an error curve that has been taken off, as it was learnt with it."""
+
+
+def component_words(names: Iterable[str]) -> dict[str, str]:
+    """What each component is, for people."""
+    words = {component.name: component.words for component in COMPONENTS} | {LEARNT_CURVE: "the learnt error curve"}
+    return {name: words[name] for name in names}

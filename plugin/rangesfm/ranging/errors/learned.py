@@ -1,0 +1,182 @@
+"""How large each component of the ranges' errors is in a survey: learnt from residuals, on what radios let expect."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import cho_solve
+from scipy.optimize import minimize
+
+from rangesfm.arrays import Array, Indices
+from rangesfm.ranging.errors.cells import Cells
+from rangesfm.ranging.errors.components import COMPONENTS, LEARNT_CURVE, Component
+
+# Noise of single ranges up to which a radio is one of the population. Of one with more all else may be off by more, and
+# faster than in proportion: an old one with five times the noise reads 7 % long, where the others are right to a
+# percent.
+_USUAL_NOISE_M, _WIDENING_POWER = 0.1, 1.5
+_MAX_NUM_ITERATIONS = 25
+_TOLERANCE = 1e-6
+# Logarithms of stddevs, beside the median: farther away the likelihood is flat.
+_FARTHEST_BELOW, _FARTHEST_ABOVE = 5.0, 4.0
+# Of the trace of a covariance, which rounding may leave singular.
+_ROUNDING = 1e-12
+
+
+@dataclass(frozen=True)
+class LearnedErrors:
+    """What c cells of ranges get wrong.
+
+    Attributes:
+        cells: of the ranges.
+        of_range: (n,) the cell of each range; -1 of one that took no part.
+        names, stddevs: of the components; metres, ``slope`` a share of the distance.
+        covariances_m2: (k, c, c) that each of them adds.
+    """
+
+    cells: Cells
+    of_range: Indices
+    names: tuple[str, ...]
+    stddevs: Array
+    covariances_m2: Array
+
+    @property
+    def covariance_m2(self) -> Array:
+        """(c, c) of all of them."""
+        together: Array = self.covariances_m2.sum(axis=0)
+        return together
+
+    def subset(self, rows: Indices) -> LearnedErrors:
+        """Of some of the ranges."""
+        return replace(self, of_range=self.of_range[rows])
+
+    def spread(self, rows: Indices, num: int) -> LearnedErrors:
+        """The same as ``rows`` of ``num`` ranges, of which the others take no part."""
+        of_range = np.full(num, -1, dtype=np.int64)
+        of_range[rows] = self.of_range
+        return replace(self, of_range=of_range)
+
+    def stddev_of(self, influence: Array) -> dict[str, float]:
+        """What each component does to a number that moves by (n,) ``influence`` for each metre of a range."""
+        of_cells = self.cells.total(influence)
+        variances = np.einsum("i,kij,j->k", of_cells, self.covariances_m2, of_cells)
+        return dict(zip(self.names, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True))
+
+
+def learn_errors(
+    cells: Cells,
+    off_m: Array,
+    design: Array,
+    prior_design: Array,
+    noise_m: float,
+    curve_stddev_m: Array | None = None,
+    ruled_out: Collection[str] = (),
+) -> LearnedErrors:
+    """Restricted maximum likelihood (Patterson and Thompson, 1971) with lognormal priors on the stddevs.
+
+    Args:
+        off_m: (n,) measured minus predicted, without any bias.
+        design: (n, p) by how much each predicted range grows with the unknowns of the map.
+        prior_design: (r, p) what is known of these beforehand, in stddevs.
+        noise_m: of single ranges.
+        curve_stddev_m: (n,) of a learnt error curve that has been taken off; None if none has.
+        ruled_out: components that the user knows not to be there.
+    """
+    widening = max(1.0, noise_m / _USUAL_NOISE_M) ** _WIDENING_POWER
+    components = [component for component in COMPONENTS if component.name not in ruled_out]
+    of_cells = [_covariance(component, cells, widening) for component in components]
+    medians = [_median(component, curve_stddev_m is not None) for component in components]
+    likelihood = _Likelihood(
+        np.array(of_cells),
+        np.log(medians),
+        np.array([component.spread for component in components]),
+        _known(cells, curve_stddev_m),
+        cells.mean(off_m),
+        cells.mean(design),
+        prior_design,
+    )
+    stddevs = np.exp(likelihood.most_likely())
+    covariances = stddevs[:, None, None] ** 2 * likelihood.of_components
+    names = [component.name for component in components]
+    if curve_stddev_m is not None:
+        names.append(LEARNT_CURVE)
+        stddevs = np.append(stddevs, 1.0)
+        covariances = np.concatenate([covariances, likelihood.known[None]])
+    return LearnedErrors(cells, cells.of_range, tuple(names), stddevs, covariances)
+
+
+def _median(component: Component, is_calibrated: bool) -> float:
+    if is_calibrated and component.calibrated_median is not None:
+        return component.calibrated_median
+    return component.median
+
+
+def _covariance(component: Component, cells: Cells, widening: float) -> Array:
+    """(c, c) for a stddev of 1."""
+    covariance = component.correlation(cells)
+    if component.is_of_anchor:
+        covariance = covariance * np.outer(cells.noisiness, cells.noisiness)
+    # A map bends no more for a bad radio, and the noise says itself how large it is.
+    return covariance if component.name in ("bending", "white", "moment") else widening**2 * covariance
+
+
+def _known(cells: Cells, curve_stddev_m: Array | None) -> Array:
+    """(c, c) that nothing is to be learnt of."""
+    if curve_stddev_m is None:
+        return np.zeros((len(cells), len(cells)))
+    stddev = cells.mean(curve_stddev_m)
+    smooth = next(component for component in COMPONENTS if component.name == "curve")
+    return np.outer(stddev, stddev) * smooth.correlation(cells)
+
+
+@dataclass(frozen=True)
+class _Likelihood:
+    """Of the logarithms of k stddevs, given c cells."""
+
+    of_components: Array
+    log_medians: Array
+    spreads: Array
+    known: Array
+    off_m: Array
+    design: Array
+    prior_design: Array
+
+    def most_likely(self) -> Array:
+        """(k,)"""
+        bounds = [(median - _FARTHEST_BELOW, median + _FARTHEST_ABOVE) for median in self.log_medians]
+        options = {"maxiter": _MAX_NUM_ITERATIONS, "ftol": _TOLERANCE}
+        found = minimize(
+            self._negative_with_gradient, self.log_medians, jac=True, method="L-BFGS-B", bounds=bounds, options=options
+        )
+        logs: Array = found.x
+        return logs
+
+    def _negative_with_gradient(self, logs: Array) -> tuple[float, Array]:
+        variances = np.exp(2 * logs)
+        covariance = np.tensordot(variances, self.of_components, axes=1) + self.known
+        covariance[np.diag_indices_from(covariance)] += _ROUNDING * np.trace(covariance)
+        lower = np.linalg.cholesky(covariance)
+        inverse = cho_solve((lower, True), np.eye(len(covariance)))
+        whitened = inverse @ self.design
+        information = self.design.T @ whitened + self.prior_design.T @ self.prior_design
+        # Directions that nothing determines are as if they were determined a little, always alike.
+        scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-200))
+        values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+        values = np.maximum(values, 1e-13)
+        spread = (vectors / values) @ vectors.T * np.outer(scale, scale)
+        moved = spread @ (whitened.T @ self.off_m)
+        pulls = inverse @ self.off_m - whitened @ moved
+        projector = inverse - whitened @ spread @ whitened.T
+        off_median = (logs - self.log_medians) / self.spreads
+        negative = (
+            np.log(np.diag(lower)).sum()
+            + 0.5 * np.log(values).sum()
+            - np.log(scale).sum()
+            + 0.5 * float(self.off_m @ pulls)
+            + 0.5 * float(off_median @ off_median)
+        )
+        traces = np.einsum("ij,kij->k", projector, self.of_components)
+        squares = np.einsum("i,kij,j->k", pulls, self.of_components, pulls)
+        return negative, variances * (traces - squares) + off_median / self.spreads

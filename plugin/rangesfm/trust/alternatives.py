@@ -1,0 +1,195 @@
+"""Mistakes that cannot be a little wrong: labels swapped, axes mixed up, another unit. Each is tried as such."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.geometry.similarity import Similarity, align_points
+from rangesfm.ranging.anchors.multilateration import multilaterate
+from rangesfm.ranging.errors.robust_loss import CAUCHY
+from rangesfm.scale.range_equation import RangeProblem, RangeState, predicted_ranges, solve
+from rangesfm.scale.starts import spread_subset
+from rangesfm.trust.corrected import corrected
+from rangesfm.trust.hypothesis import Correction
+from rangesfm.trust.ranges_on_map import RangesOnMap
+
+_NUM_PER_ANCHOR, _NUM_EVALUATIONS = 25, 12
+_FOOT_M = 0.3048
+_SCALE_FACTORS = np.geomspace(1 / 4, 4, 13).tolist()
+_AXES_OF_ANCHORS = {
+    "x and y are swapped": np.eye(3)[[1, 0, 2]],
+    "y and z are swapped": np.eye(3)[[0, 2, 1]],
+    "x has the wrong sign": np.diag([-1.0, 1, 1]),
+    "heights have the wrong sign (they are depths)": np.diag([1.0, 1, -1]),
+}
+_AXES_OF_LEVER_ARM = {
+    "has the wrong sign (from the tag to the camera, not from the camera to the tag)": -np.eye(3),
+    "is given along x forward, y left, z up, not x right, y down, z forward": np.array(
+        [[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]
+    ),
+    "is given along x right, y up, z back, not x right, y down, z forward": np.diag([1.0, -1, -1]),
+    "is given along x right, y forward, z up, not x right, y down, z forward": np.array(
+        [[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]
+    ),
+    "is given along x forward, y right, z down, not x right, y down, z forward": np.array(
+        [[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """A mistake as it is corrected, and its words, as of a Hypothesis."""
+
+    name: str
+    subject: str
+    words: str
+    remedy: str
+    correction: Correction
+
+
+def labels_swapped(on_map: RangesOnMap) -> Iterator[Alternative]:
+    """Two anchors' labels, or their lines in the file."""
+    given = _given_m(on_map)
+    for first, second in combinations(given, 2):
+        yield Alternative(
+            "labels swapped",
+            f"{first}, {second}",
+            f"anchors {first} and {second} bear each other's label",
+            "compare the labels on the devices with the anchors' file",
+            Correction(anchors_m={first: given[second], second: given[first]}),
+        )
+
+
+def other_axes(on_map: RangesOnMap) -> Iterator[Alternative]:
+    """Of the anchors' coordinates."""
+    given = _given_m(on_map)
+    for words, axes in _AXES_OF_ANCHORS.items() if len(given) > 2 else ():
+        yield Alternative(
+            "anchors' axes",
+            "",
+            f"in the anchors' coordinates {words}",
+            "compare the anchors' file with a sketch of the site",
+            Correction(anchors_m={name: axes @ at for name, at in given.items()}),
+        )
+
+
+def other_units(on_map: RangesOnMap) -> Iterator[Alternative]:
+    """Feet."""
+    given = _given_m(on_map)
+    for words, metres in (("feet", _FOOT_M), ("metres, though converted as if from feet", 1 / _FOOT_M)):
+        if len(given) < 2:
+            return
+        middle = np.mean(list(given.values()), axis=0)
+        yield Alternative(
+            "anchors' unit",
+            "",
+            f"the anchors' coordinates are in {words}",
+            "check the unit of the anchors' file against a taped distance between two of them",
+            Correction(anchors_m={name: middle + metres * (at - middle) for name, at in given.items()}),
+        )
+
+
+def other_lever_arms(on_map: RangesOnMap) -> Iterator[Alternative]:
+    """Another convention of the camera's axes."""
+    arms = _lever_arms_m(on_map)
+    for words, axes in _AXES_OF_LEVER_ARM.items():
+        moves = {tag: axes @ arm - arm for tag, arm in arms.items()}
+        if max(np.linalg.norm(move) for move in moves.values()) > 1e-3:
+            yield Alternative(
+                "lever arm's axes",
+                "",
+                f"the lever arm {words}",
+                "give the tag's place in the camera, x to the right, y down, z forward (--tag_in_cam)",
+                Correction(tag_moves_m=moves),
+            )
+
+
+ALTERNATIVES: tuple[Callable[[RangesOnMap], Iterator[Alternative]], ...] = (
+    labels_swapped,
+    other_axes,
+    other_units,
+    other_lever_arms,
+)
+
+
+class Refits:
+    """Solutions of corrected problems, each found from where the map itself sees the anchors."""
+
+    def __init__(self, on_map: RangesOnMap, scatter_m: float):
+        self._on_map = on_map
+        self._scatter_m = scatter_m
+        self._seen = _anchors_by_map(self._thinned(on_map.problem))
+
+    def _thinned(self, problem: RangeProblem) -> RangeProblem:
+        thin = spread_subset(problem, _NUM_PER_ANCHOR)
+        return replace(thin, stddev_m=np.full(len(thin.range_m), self._scatter_m))
+
+    def of(self, correction: Correction) -> tuple[float, RangesOnMap]:
+        """The cost of the best fit of thinned ranges, and the map at it."""
+        right = corrected(self._on_map, correction)
+        thin = self._thinned(right.problem)
+        start = min(self._starts(right.problem), key=lambda state: _cost(thin, state))
+        fit = solve(thin, start, loss=CAUCHY, tolerance=1e-4, max_num_evaluations=_NUM_EVALUATIONS)
+        return fit.cost, replace(right, state=fit.state)
+
+    def _starts(self, problem: RangeProblem) -> Iterator[RangeState]:
+        known = np.asarray(np.isfinite(problem.anchor_mean_m).all(axis=1))
+        anchors_m = np.where(known[:, None], problem.anchor_mean_m, self._on_map.state.anchors_m)
+        yield replace(self._on_map.state, anchors_m=anchors_m)
+        if not problem.frame_is_free:
+            return
+        placed, seen_m = self._seen
+        usable = known & np.isfinite(seen_m).all(axis=1)
+        if usable.sum() >= 3:
+            motion = align_points(seen_m[usable], anchors_m[usable])
+            yield RangeState(motion @ placed, anchors_m, self._on_map.state.bias_m)
+
+
+def _cost(problem: RangeProblem, state: RangeState) -> float:
+    off = (predicted_ranges(problem, state) - problem.range_m) / problem.stddev_m
+    return float(CAUCHY.rho(off**2)[0].sum())
+
+
+def _anchors_by_map(problem: RangeProblem) -> tuple[Similarity, Array]:
+    """How the map lies, and where it sees the anchors (m, 3), if nothing is said of them."""
+    unknown = replace(
+        problem,
+        anchor_mean_m=np.full_like(problem.anchor_mean_m, np.nan),
+        anchor_stddev_m=np.where(np.isin(np.arange(problem.num_anchors), problem.anchor_index), np.inf, 0.0),
+        frame_is_free=False,
+        gravity=None,
+    )
+    starts = [_multilaterated(unknown, factor) for factor in _SCALE_FACTORS]
+    start = min(starts, key=lambda state: _cost(unknown, state))
+    state = solve(unknown, start, loss=CAUCHY, tolerance=1e-4, max_num_evaluations=_NUM_EVALUATIONS).state
+    return state.metric_from_model, state.anchors_m
+
+
+def _multilaterated(problem: RangeProblem, scale: float) -> RangeState:
+    """The anchors from the tag's places, the map being so much larger than it is thought to be."""
+    tags = scale * problem.centers + problem.tag_from_center
+    anchors_m = np.full((problem.num_anchors, 3), np.nan)
+    for k in np.unique(problem.anchor_index):
+        rows = problem.anchor_index == k
+        anchors_m[k], _ = multilaterate(tags[rows], problem.range_m[rows] - problem.bias_mean_m[k])
+    return RangeState(Similarity(scale, np.eye(3), np.zeros(3)), anchors_m, problem.bias_mean_m)
+
+
+def _given_m(on_map: RangesOnMap) -> Mapping[str, Array]:
+    problem = on_map.problem
+    heard = np.unique(problem.anchor_index)
+    return {
+        on_map.anchor_ids[k]: problem.anchor_mean_m[k] for k in heard if np.isfinite(problem.anchor_mean_m[k]).all()
+    }
+
+
+def _lever_arms_m(on_map: RangesOnMap) -> Mapping[str, Array]:
+    """As given, by the first range of each tag."""
+    arms = np.einsum("nji,nj->ni", on_map.world_from_cam, on_map.problem.tag_from_center)
+    return {on_map.tag_ids[k]: np.median(arms[on_map.tag_index == k], axis=0) for k in np.unique(on_map.tag_index)}

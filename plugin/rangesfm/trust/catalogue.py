@@ -1,0 +1,290 @@
+"""The catalogue of mistakes: each hypothesis in one place. One that is added here is tested, named and told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from rangesfm.arrays import Array, Mask
+from rangesfm.trust.hypothesis import Correction, Effect, Hypothesis, of_anchor_place, of_bias, of_cells
+from rangesfm.trust.linearized import Linearized
+
+_AXES = "xyz"
+_SAME_HEIGHT_M = 1e-3
+# Of an anchor's ranges: where they follow the distance by less, they hardly change at all.
+_STUCK = 0.3
+_MEASURE_AGAIN = "measure it again, or run with it unknown (leave its coordinates in the anchors' file empty)"
+
+
+def anchor_places(problem: Linearized) -> Iterator[Hypothesis]:
+    """An anchor is not where its coordinates say."""
+    given_m = problem.on_map.given_m
+    for k, name in enumerate(problem.on_map.anchor_ids):
+        found = of_anchor_place(problem, k, np.eye(3)) if np.any(problem.anchor_index == k) else None
+        if found is None:
+            continue
+
+        def unknown(_: Array, name: str = name) -> Correction:
+            return Correction(anchors_m={name: None})
+
+        def moved(size: Array, name: str = name, at: Array = given_m[k]) -> Correction:
+            return Correction(anchors_m={name: at + size})
+
+        coordinates = []
+        for axis, of_axis in enumerate(_AXES):
+
+            def typed(size: Array, name: str = name, axis: str = of_axis, at: float = given_m[k, axis]) -> str:
+                return (
+                    f"anchor {name}'s {axis} is given as {at:.3f} where about {at + size[0]:.2f} fits "
+                    f"({size[0]:+.2f} m)"
+                )
+
+            def along(size: Array, name: str = name, axis: int = axis, at: Array = given_m[k]) -> Correction:
+                return Correction(anchors_m={name: at + size[0] * np.eye(3)[axis]})
+
+            columns = of_anchor_place(problem, k, np.eye(3)[:, [axis]])
+            if columns is not None:
+                coordinates.append(
+                    Hypothesis(
+                        "anchor coordinate",
+                        f"{name} {of_axis}",
+                        unit="m",
+                        words=typed,
+                        remedy=f"check its {of_axis}, or {_MEASURE_AGAIN}",
+                        correction=along,
+                        adoption=unknown,
+                        effect=columns,
+                    )
+                )
+
+        def place(size: Array, name: str = name) -> str:
+            return (
+                f"anchor {name} is about {np.linalg.norm(size):.2f} m from where its coordinates say "
+                f"(by {size[0]:+.2f}, {size[1]:+.2f}, {size[2]:+.2f} m in x, y, z)"
+            )
+
+        yield Hypothesis(
+            "anchor place",
+            name,
+            unit="m",
+            words=place,
+            remedy=_MEASURE_AGAIN,
+            correction=moved,
+            adoption=unknown,
+            narrower=tuple(coordinates),
+            effect=found,
+        )
+
+
+def anchor_biases(problem: Linearized) -> Iterator[Hypothesis]:
+    """The ranges of one anchor, or of all, are off by a constant, by more than is usual."""
+    heard = np.unique(problem.anchor_index).tolist()
+    if len(heard) > 1:
+        for k in heard:
+            yield _bias(problem, [k], problem.on_map.anchor_ids[k], f"anchor {problem.on_map.anchor_ids[k]}")
+    yield _bias(problem, heard, "", "every anchor")
+
+
+def _bias(problem: Linearized, anchors: list[int], subject: str, whose: str) -> Hypothesis:
+    is_of = np.isin(problem.on_map.problem.anchor_index, anchors)
+
+    def words(size: Array) -> str:
+        return f"the ranges to {whose} read about {abs(size[0]):.2f} m too {_long(size[0])}"
+
+    def correction(size: Array) -> Correction:
+        return Correction(longer_m=np.where(is_of, size[0], 0.0))
+
+    return Hypothesis(
+        "anchor bias" if subject else "common bias",
+        subject,
+        unit="m",
+        words=words,
+        remedy="calibrate the radio's delay (range_bias_m in the anchors' file), or look for what stands in the way",
+        correction=correction,
+        is_linear=True,
+        effect=of_bias(problem, anchors),
+    )
+
+
+def range_shares(problem: Linearized) -> Iterator[Hypothesis]:
+    """Ranges grow by more or less than the distance does."""
+    by_distance, distance_m = -problem.gradient.distance_m, problem.on_map.problem.range_m
+
+    def words(size: Array) -> str:
+        return f"all ranges read about {100 * abs(size[0]):.1f} % too {_long(size[0])}"
+
+    yield Hypothesis(
+        "range share",
+        "",
+        unit="1",
+        words=words,
+        remedy="check the unit, and the propagation speed that the radio assumes, against a taped distance",
+        correction=lambda size: Correction(longer_m=distance_m * size[0] / (1 + size[0])),
+        most=0.5,
+        is_linear=True,
+        effect=of_cells(problem, by_distance),
+    )
+    heard = np.unique(problem.anchor_index)
+    for k in heard if len(heard) > 1 else []:
+        is_of, of_ranges = problem.anchor_index == k, problem.on_map.problem.anchor_index == k
+        mean = problem.gradient.distance_m[is_of].mean()
+
+        def of_one(size: Array, name: str = problem.on_map.anchor_ids[k]) -> str:
+            if 1 + size[0] < _STUCK:
+                return f"the ranges to anchor {name} hardly change with the distance: it reads nearly the same always"
+            return f"the ranges to anchor {name} grow by {1 + size[0]:.2f} m for each metre of distance"
+
+        def left_out(_: Array, of_ranges: Mask = of_ranges) -> Correction:
+            return Correction(left_out=of_ranges)
+
+        yield Hypothesis(
+            "anchor share",
+            problem.on_map.anchor_ids[k],
+            unit="1",
+            words=of_one,
+            remedy="look at its ranges in the log, and leave it out (use_anchors)",
+            correction=left_out,
+            is_linear=True,
+            effect=of_cells(problem, np.where(is_of, by_distance + mean, 0.0)),
+        )
+
+
+def anchors_in_another_scale(problem: Linearized) -> Iterator[Hypothesis]:
+    """The anchors' coordinates are in a unit that is not quite the metre."""
+    given_m = problem.on_map.given_m
+    known = np.flatnonzero(np.isfinite(given_m).all(axis=1))
+    if len(known) < 2:
+        return
+    middle = given_m[known].mean(axis=0)
+    parts = [of_anchor_place(problem, int(k), (given_m[k] - middle)[:, None]) for k in known]
+    found = [part for part in parts if part is not None]
+    if not found:
+        return
+
+    def words(size: Array) -> str:
+        return (
+            f"the anchors' coordinates are about {100 * abs(size[0]):.1f} % too {'small' if size[0] > 0 else 'large'}"
+        )
+
+    def correction(size: Array) -> Correction:
+        ids = problem.on_map.anchor_ids
+        return Correction(anchors_m={ids[k]: middle + (1 + size[0]) * (given_m[k] - middle) for k in known})
+
+    yield Hypothesis(
+        "anchors' scale",
+        "",
+        unit="1",
+        words=words,
+        remedy="check the unit of the anchors' coordinates against a taped distance between two of them",
+        correction=correction,
+        effect=Effect.of_sum(found),
+    )
+
+
+def heights_never_measured(problem: Linearized) -> Iterator[Hypothesis]:
+    """All anchors are given one height, and do not have it."""
+    given_m, ids = problem.on_map.given_m, problem.on_map.anchor_ids
+    heard = np.unique(problem.anchor_index)
+    known = heard[np.isfinite(given_m[heard]).all(axis=1)]
+    if len(known) < 3 or np.ptp(given_m[known, 2]) > _SAME_HEIGHT_M:
+        return
+    parts = [of_anchor_place(problem, int(k), np.eye(3)[:, 2:]) for k in known]
+    found = [part for part in parts if part is not None]
+    if len(found) < len(known):
+        return
+
+    def words(size: Array) -> str:
+        return (
+            f"the anchors are all given a height of {given_m[known[0], 2]:g} m where heights fit that differ by "
+            f"{np.ptp(size):.1f} m"
+        )
+
+    yield Hypothesis(
+        "anchor heights",
+        "",
+        unit="m",
+        words=words,
+        remedy="measure the heights of the antennas",
+        correction=lambda size: Correction(
+            anchors_m={ids[k]: given_m[k] + np.array([0.0, 0.0, h]) for k, h in zip(known.tolist(), size, strict=True)}
+        ),
+        effect=Effect.of_all(found),
+    )
+
+
+def lever_arms(problem: Linearized) -> Iterator[Hypothesis]:
+    """The tag is elsewhere on the camera."""
+    for k in np.unique(problem.tag_index).tolist():
+        name = problem.on_map.tag_ids[k] if len(problem.on_map.tag_ids) > 1 else ""
+        columns = np.where((problem.tag_index == k)[:, None], -problem.by_lever_arm, 0.0)
+
+        def words(size: Array, name: str = name) -> str:
+            of_tag = f" of tag {name}" if name else ""
+            return (
+                f"the lever arm{of_tag} is off by about {np.linalg.norm(size):.2f} m "
+                f"({size[0]:+.2f}, {size[1]:+.2f}, {size[2]:+.2f} m along the camera's x, y, z)"
+            )
+
+        def correction(size: Array, tag: str = problem.on_map.tag_ids[k]) -> Correction:
+            return Correction(tag_moves_m={tag: size})
+
+        yield Hypothesis(
+            "lever arm",
+            name,
+            unit="m",
+            words=words,
+            remedy="measure where the tag's antenna sits, x to the right, y down, z forward (--tag_in_cam)",
+            correction=correction,
+            effect=of_cells(problem, columns),
+        )
+
+
+def clocks(problem: Linearized) -> Iterator[Hypothesis]:
+    """The clocks of camera and radio differ otherwise than assumed."""
+    if problem.by_time is None:
+        return
+    since = problem.time_s - problem.time_s.mean()
+
+    def offset(size: Array) -> str:
+        return f"the clocks are off by about {abs(size[0]):.2f} s more than assumed ({size[0]:+.2f} s on the offset)"
+
+    def drift(size: Array) -> str:
+        return f"the radio's clock runs {1e6 * abs(size[0]):.0f} ppm too {'slow' if size[0] > 0 else 'fast'}"
+
+    remedy = "let the offset be searched for (ranges_time_offset auto), or film a sharp turn at both ends"
+    yield Hypothesis(
+        "clock offset",
+        "",
+        unit="s",
+        words=offset,
+        remedy=remedy,
+        correction=lambda size: Correction(time_shift_s=float(size[0])),
+        effect=of_cells(problem, -problem.by_time),
+    )
+    of_ranges = problem.on_map.time_s - problem.time_s.mean()
+    yield Hypothesis(
+        "clock drift",
+        "",
+        unit="s/s",
+        words=drift,
+        remedy=remedy,
+        correction=lambda size: Correction(time_shift_s=size[0] * of_ranges),
+        effect=of_cells(problem, -problem.by_time * since),
+    )
+
+
+def _long(size: float) -> str:
+    return "long" if size > 0 else "short"
+
+
+STANDING: tuple[Callable[[Linearized], Iterator[Hypothesis]], ...] = (
+    anchor_places,
+    anchor_biases,
+    range_shares,
+    anchors_in_another_scale,
+    heights_never_measured,
+    lever_arms,
+    clocks,
+)
+"""Mistakes that last for the whole survey."""

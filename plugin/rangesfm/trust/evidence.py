@@ -1,0 +1,56 @@
+"""What the ranges show that is no mistake of one size: noise that no radio has, anchors that have no say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from rangesfm.trust.linearized import Linearized
+from rangesfm.trust.table import MistakeTest
+
+# Real radios show 0.03 to 0.15 m beside outliers, old ones 0.2 m: of a stddev beyond that something else is the cause.
+_MOST_NOISE_M, _MOST_LASTING_M = 0.25, 0.25
+# In metres for a metre of distance: a radio on 70 m is noisier than one in a room.
+_NOISE_BY_DISTANCE = 0.005
+_LEAST_USED, _MOST_OUTLYING = 0.4, 0.35
+_FEW_OBSTRUCTED = "place the anchors where nothing stands between them and the path"
+
+
+def evidence(problem: Linearized) -> Iterator[MistakeTest]:
+    """Of the noise as learnt beside the likeliest mistake, and of each anchor's ranges."""
+    if problem.noise is not None:
+        far = _NOISE_BY_DISTANCE * float(problem.gradient.distance_m.mean())
+        yield _noise("range noise", problem.cells.scatter_m, _MOST_NOISE_M + far, "scatter")
+        yield _noise("lasting errors", problem.noise.stddev_m["lasting"], _MOST_LASTING_M + far, "err for seconds")
+    index, cells = problem.on_map.problem.anchor_index, problem.cells
+    for k in np.unique(index):
+        is_of, name = index == k, problem.on_map.anchor_ids[k]
+        unused = float(np.mean(problem.on_map.weights[is_of] < 0.1))
+        num = np.count_nonzero(is_of)
+        yield _share(
+            "anchor hardly used",
+            name,
+            unused,
+            1 - _LEAST_USED,
+            f"only {round((1 - unused) * num)} of {num} ranges to anchor {name} fit the map",
+            "look whether it is the anchor that it is taken for, and where it stands",
+        )
+        outlying = float(np.mean(cells.weights[is_of] == 0))
+        yield _share(
+            "anchor's outliers",
+            name,
+            outlying,
+            _MOST_OUTLYING,
+            f"{100 * outlying:.0f} % of the ranges to anchor {name} are far from those right before and after",
+            _FEW_OBSTRUCTED,
+        )
+
+
+def _noise(name: str, stddev_m: float, most_m: float, what: str) -> MistakeTest:
+    words = f"the ranges {what} by {stddev_m:.2f} m, which no radio does in the open ({most_m:.2f} m at most)"
+    return MistakeTest(name, "", stddev_m, most_m, stddev_m, None, "m", most_m, None, None, words, _FEW_OBSTRUCTED)
+
+
+def _share(name: str, subject: str, share: float, most: float, words: str, remedy: str) -> MistakeTest:
+    return MistakeTest(name, subject, share, most, share, None, "1", most, None, None, words, remedy)

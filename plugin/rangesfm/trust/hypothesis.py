@@ -1,0 +1,119 @@
+"""Hypothesis: one mistake that may have been made, all that is to be said of it, and what would correct it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rangesfm.arrays import Array, Mask
+from rangesfm.trust.linearized import Linearized
+
+
+@dataclass(frozen=True)
+class Correction:
+    """How the input is to be changed if a mistake was made.
+
+    Attributes:
+        anchors_m: other positions by id; None: the anchor counts as unknown.
+        tag_moves_m: by which lever arms are longer, by id.
+        time_shift_s: that the ranges were taken later.
+        left_out: (n,) ranges of the map that do not count.
+        longer_m: (n,) by how much they read too long.
+    """
+
+    anchors_m: Mapping[str, Array | None] = field(default_factory=dict)
+    tag_moves_m: Mapping[str, Array] = field(default_factory=dict)
+    time_shift_s: float | Array = 0.0
+    left_out: Mask | None = None
+    longer_m: Array | None = None
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What k numbers change.
+
+    Attributes:
+        columns: (c, k) how the residuals of the cells differ for one unit of each.
+        priors: (r, k) likewise, of what is known beforehand.
+    """
+
+    columns: Array
+    priors: Array
+
+    @classmethod
+    def of_all(cls, parts: Sequence[Effect]) -> Effect:
+        """Each with numbers of its own."""
+        return cls(np.hstack([part.columns for part in parts]), np.hstack([part.priors for part in parts]))
+
+    @classmethod
+    def of_sum(cls, parts: Sequence[Effect]) -> Effect:
+        """All by the same numbers."""
+        return cls(np.sum([part.columns for part in parts], axis=0), np.sum([part.priors for part in parts], axis=0))
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A mistake that k numbers describe.
+
+    Attributes:
+        name: the same for all of one kind. subject: which of them; an anchor's id, a time.
+        effect: on the residuals.
+        unit: of the numbers.
+        words: of an estimate (k,): what is probably the case.
+        remedy: what to measure or to change.
+        correction: of an estimate, what undoes it.
+        adoption: what takes its place where the mistake is adopted; None: the correction itself.
+        most: beyond which an estimate is not believed, in its unit.
+        narrower: of fewer numbers, which explain as much if the mistake was of their kind.
+        is_linear: whether one step finds its size, however large it is.
+    """
+
+    name: str
+    subject: str
+    effect: Effect
+    unit: str
+    words: Callable[[Array], str]
+    remedy: str
+    correction: Callable[[Array], Correction]
+    adoption: Callable[[Array], Correction] | None = None
+    most: float = np.inf
+    narrower: tuple[Hypothesis, ...] = ()
+    is_linear: bool = False
+
+    @property
+    def num(self) -> int:
+        return int(self.effect.columns.shape[1])
+
+    @property
+    def key(self) -> tuple[str, str]:
+        return self.name, self.subject
+
+
+def of_cells(problem: Linearized, columns: Array) -> Effect:
+    """What a mistake changes that has no part in what is known beforehand."""
+    columns = columns.reshape(len(problem.residual_m), -1)
+    return Effect(columns, np.zeros((problem.num_priors, columns.shape[1])))
+
+
+def of_anchor_place(problem: Linearized, anchor: int, directions: Array) -> Effect | None:
+    """That the anchor is off by numbers times directions (3, k), towards where it is; None if nobody said where."""
+    given = problem.on_map.problem
+    if not np.isfinite(given.anchor_mean_m[anchor]).all() or not np.isfinite(given.anchor_stddev_m[anchor]):
+        return None
+    column = problem.columns.anchor[anchor]
+    if column < 0:
+        is_of = (problem.anchor_index == anchor)[:, None]
+        return of_cells(problem, np.where(is_of, problem.gradient.by_tag @ directions, 0.0))
+    priors = problem.prior_design[:, column : column + 3] * problem.is_anchor_prior[:, None]
+    return Effect(np.zeros((len(problem.residual_m), directions.shape[1])), priors @ directions)
+
+
+def of_bias(problem: Linearized, anchors: list[int]) -> Effect:
+    """That the ranges of some anchors all read too long, by one number."""
+    fixed = [k for k in anchors if problem.columns.bias[k] < 0]
+    free = [problem.columns.bias[k] for k in anchors if problem.columns.bias[k] >= 0]
+    columns = -np.isin(problem.anchor_index, fixed).astype(np.float64)
+    priors = problem.prior_design[:, free].sum(axis=1) * problem.is_bias_prior
+    return Effect(columns[:, None], priors[:, None])

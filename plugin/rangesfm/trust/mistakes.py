@@ -1,0 +1,221 @@
+"""Which mistakes were made: the noise is learnt, every hypothesis tested, the likeliest one named."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rangesfm.scale.range_equation import state_after
+from rangesfm.trust.alternatives import ALTERNATIVES, Alternative, Refits
+from rangesfm.trust.catalogue import STANDING
+from rangesfm.trust.corrected import corrected
+from rangesfm.trust.hypothesis import Correction, Hypothesis
+from rangesfm.trust.linearized import Linearized, at_state, linearized
+from rangesfm.trust.noise_model import learnt_noise, usual_noise
+from rangesfm.trust.random_errors import RandomErrors
+from rangesfm.trust.ranges_on_map import RangesOnMap
+from rangesfm.trust.scanning import SCANNING
+from rangesfm.trust.testing import Factorization, Test, overlap
+
+# Explanations that are tried with the noise that each of them leaves.
+_NUM_TRIED, _NUM_OF_KIND = 6, 2
+# Of two that differ by less in twice the logarithm of their likelihood, neither is named alone.
+_AS_LIKELY = 6.0
+_SAME = 0.95
+_MAX_NUM_RIVALS = 2
+_NUM_SETTLING, _SETTLED = 6, 0.05
+
+
+@dataclass(frozen=True)
+class Cause:
+    """An explanation that beats chance.
+
+    Attributes:
+        name, subject, words, remedy: as of a Hypothesis; the words with the size that was found.
+        gain: by how much it makes the ranges likelier, as twice a logarithm, with the noise that it leaves.
+        penalty: for what it may choose.
+        correction: what would be right.
+        test: None for an alternative.
+    """
+
+    name: str
+    subject: str
+    words: str
+    remedy: str
+    gain: float
+    penalty: float
+    correction: Correction
+    test: Test | None
+
+    @property
+    def score(self) -> float:
+        return self.gain - self.penalty
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What was found of one map.
+
+    Attributes:
+        tests: of each kind and subject the one that fits best, the likeliest first.
+        causes: the likeliest, and those that cannot be told from it; empty if nothing was found.
+    """
+
+    problem: Linearized
+    tests: tuple[Test, ...]
+    causes: tuple[Cause, ...]
+
+
+def find_mistakes(on_map: RangesOnMap, *, seed: int = 0) -> Findings:
+    """Test all hypotheses with the noise that is left when those that stand explain what they can.
+
+    A mistake that does not stand, as a step, may pass for noise instead: it is looked for with the noise that is usual
+    too, and believed if it makes the ranges likelier with the noise that it leaves.
+    """
+    problem = linearized(on_map)
+    standing = _standing(problem)
+    hypotheses = standing + [hypothesis for of_kind in SCANNING for hypothesis in of_kind(problem)]
+    problem = problem.with_noise(learnt_noise(problem, standing))
+    tests = _best_of_each(Factorization(problem).test(hypotheses, seed), problem)
+    nominated = [test for test in tests if test.is_rejected and _is_possible(test)]
+    is_sure = bool(nominated)
+    if not nominated:
+        usual = problem.with_noise(usual_noise(problem))
+        with_usual = _best_of_each(Factorization(usual).test(hypotheses, seed), usual)
+        nominated = [test for test in with_usual if test.is_rejected and _is_possible(test)]
+    if not nominated:
+        return Findings(problem, tuple(tests), ())
+    causes = _causes(problem, nominated, is_sure)
+    if not causes:
+        return Findings(problem, tuple(tests), ())
+    if causes[0].test is not None:
+        problem = problem.with_noise(learnt_noise(problem, [*standing, causes[0].test.hypothesis]))
+        tests = _best_of_each(Factorization(problem).test(hypotheses, seed), problem)
+    return Findings(problem, tuple(tests), tuple(causes))
+
+
+def _standing(problem: Linearized) -> list[Hypothesis]:
+    return [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
+
+
+def _causes(problem: Linearized, nominated: Sequence[Test], is_sure: bool) -> list[Cause]:
+    """The likeliest explanation, and those as good; none if even that is no better than chance."""
+    before = learnt_noise(_settled(problem), []).deviance
+    num = len(problem.residual_m)
+    causes = []
+    for test in _varied(nominated):
+        again, noise = _settled_test(problem, test.hypothesis)
+        gain = before - noise.deviance
+        if _is_possible(again) and (is_sure or gain > test.threshold):
+            named = replace(_narrowed(problem, again, noise), threshold=test.threshold)
+            causes.append(_cause(named, gain, _penalty(again, num)))
+    causes += _alternatives(problem, before)
+    causes.sort(key=lambda cause: -cause.score)
+    return [cause for k, cause in enumerate(causes) if not k or _is_rival(causes[0], cause)][: 1 + _MAX_NUM_RIVALS]
+
+
+def _varied(tests: Sequence[Test]) -> list[Test]:
+    """The first ones, of each kind a few."""
+    kinds = [test.hypothesis.name for test in tests]
+    return [test for k, test in enumerate(tests) if kinds[:k].count(kinds[k]) < _NUM_OF_KIND][:_NUM_TRIED]
+
+
+def _is_rival(best: Cause, other: Cause) -> bool:
+    if best.score - other.score < _AS_LIKELY:
+        return True
+    return best.test is not None and other.test is not None and overlap(best.test, other.test) > _SAME
+
+
+def _settled_test(problem: Linearized, hypothesis: Hypothesis) -> tuple[Test, RandomErrors]:
+    """The test of a hypothesis with the noise that it leaves; of one that is not linear at the state that it leaves."""
+    original, sizes, at = hypothesis, np.zeros(hypothesis.num), problem
+    for _ in range(_NUM_SETTLING):
+        factorized = Factorization(at)
+        [test] = factorized.test([hypothesis], 0)
+        change = np.linalg.norm(test.sizes - sizes if original.is_linear else test.sizes)
+        sizes = test.sizes if original.is_linear else sizes + test.sizes
+        if change < _SETTLED * np.linalg.norm(sizes):
+            break
+        state = state_after((at.columns,), at.on_map.state, factorized.step((hypothesis.effect, test.sizes)))
+        moved = replace(problem.on_map, state=state)
+        if original.is_linear:
+            at = at_state(at, moved)
+            continue
+        at = at_state(at, corrected(moved, original.correction(sizes)))
+        standing = _standing(at)
+        there = {h.key: h for h in [*standing, *(n for h in standing for n in h.narrower)]}
+        hypothesis = there.get(hypothesis.key, hypothesis)
+    noise = learnt_noise(at, [hypothesis])
+    [test] = Factorization(at.with_noise(noise)).test([hypothesis], 0)
+    return replace(test, hypothesis=original, sizes=test.sizes if original.is_linear else sizes + test.sizes), noise
+
+
+def _narrowed(problem: Linearized, test: Test, wide: RandomErrors) -> Test:
+    """The one of fewer numbers that does as well, if there is one."""
+    if not test.hypothesis.narrower:
+        return test
+    tried = [_settled_test(problem, h) for h in test.hypothesis.narrower]
+    best, noise = min(tried, key=lambda each: each[1].deviance)
+    num = len(problem.residual_m)
+    return best if noise.deviance + _penalty(best, num) < wide.deviance + _penalty(test, num) else test
+
+
+def _cause(test: Test, gain: float, penalty: float) -> Cause:
+    h = test.hypothesis
+    adoption = (h.adoption or h.correction)(test.sizes)
+    return Cause(h.name, h.subject, h.words(test.sizes), h.remedy, gain, penalty, adoption, test)
+
+
+def _alternatives(problem: Linearized, before: float) -> Iterator[Cause]:
+    """Those that make the ranges likelier than chance would."""
+    on_map = problem.on_map
+    tried = [each for of_kind in ALTERNATIVES for each in of_kind(on_map)]
+    if not tried:
+        return
+    refits = Refits(on_map, problem.cells.scatter_m)
+    fits = sorted(((*refits.of(each.correction), each) for each in tried), key=lambda fit: fit[0])
+    for _, refitted, each in fits[:_NUM_TRIED]:
+        moved = _settled(at_state(problem, refitted))
+        gain = before - learnt_noise(moved, []).deviance
+        penalty = 2 * float(np.log(len(tried)))
+        if gain > penalty + _AS_LIKELY:
+            yield _cause_of(each, gain, penalty)
+
+
+def _settled(problem: Linearized) -> Linearized:
+    """At the likeliest state."""
+    step = Factorization(problem.with_noise(usual_noise(problem))).step()
+    state = state_after((problem.columns,), problem.on_map.state, step)
+    return at_state(problem, replace(problem.on_map, state=state))
+
+
+def _cause_of(each: Alternative, gain: float, penalty: float) -> Cause:
+    return Cause(each.name, each.subject, each.words, each.remedy, gain, penalty, each.correction, None)
+
+
+def _best_of_each(tests: Sequence[Test], problem: Linearized) -> list[Test]:
+    """Of each kind and subject the one that fits best; the likeliest first."""
+    of_key: dict[tuple[str, str], list[Test]] = {}
+    for test in tests:
+        of_key.setdefault(test.hypothesis.key, []).append(test)
+    # Whoever makes such a mistake does not choose the time at which it is found best.
+    best = {
+        key: replace(
+            max(group, key=lambda test: test.statistic),
+            smallest_detectable=float(np.median([test.smallest_detectable for test in group])),
+        )
+        for key, group in of_key.items()
+    }
+    num = len(problem.residual_m)
+    return sorted(best.values(), key=lambda test: _penalty(test, num) - test.statistic)
+
+
+def _penalty(test: Test, num: int) -> float:
+    """Each number that a hypothesis may choose costs (Schwarz, 1978)."""
+    return test.num * float(np.log(num))
+
+
+def _is_possible(test: Test) -> bool:
+    return bool(np.all(np.abs(test.sizes) <= test.hypothesis.most))

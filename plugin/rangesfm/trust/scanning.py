@@ -1,0 +1,171 @@
+"""Mistakes that begin or end at a time that nobody knows: looked for everywhere, each found once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from rangesfm.arrays import Array, Mask
+from rangesfm.trust.hypothesis import Correction, Hypothesis, of_cells
+from rangesfm.trust.linearized import Linearized
+
+_NUM_STEPS, _NUM_MOVES = 16, 8
+# Shares of the survey that a stretch may last.
+_STRETCHES = (1 / 4, 1 / 8, 1 / 16)
+# Of fewer cells on either side nothing can be said.
+_MIN_NUM_CELLS = 3
+
+
+def anchors_moved(problem: Linearized) -> Iterator[Hypothesis]:
+    """An anchor was moved at some time."""
+    for k in _heard(problem):
+        name = problem.on_map.anchor_ids[k]
+        for time in _times(problem, _NUM_MOVES):
+            is_after = (problem.anchor_index == k) & (problem.time_s > time)
+            is_before = (problem.anchor_index == k) & ~is_after
+            if min(is_after.sum(), is_before.sum()) < 3 * _MIN_NUM_CELLS:
+                continue
+
+            def words(size: Array, name: str = name, when: str = _when(problem, time)) -> str:
+                return (
+                    f"anchor {name} was moved by about {np.linalg.norm(size):.2f} m {when} "
+                    f"({size[0]:+.2f}, {size[1]:+.2f}, {size[2]:+.2f} m in x, y, z)"
+                )
+
+            yield Hypothesis(
+                "anchor moved",
+                name,
+                unit="m",
+                is_linear=True,
+                words=words,
+                remedy="fix anchors so that nobody bumps into them, and use its ranges from before only",
+                correction=_left_out(_of_ranges(problem, k) & (problem.on_map.time_s > time)),
+                effect=of_cells(problem, np.where(is_after[:, None], problem.gradient.by_tag, 0.0)),
+            )
+
+
+def steps(problem: Linearized) -> Iterator[Hypothesis]:
+    """From some time on ranges read longer, those of one anchor or of all."""
+    for k in [*(_heard(problem) if len(_heard(problem)) > 1 else []), None]:
+        name = "" if k is None else problem.on_map.anchor_ids[k]
+        is_of = np.ones(len(problem.time_s), dtype=bool) if k is None else problem.anchor_index == k
+        for time in _times(problem, _NUM_STEPS):
+            is_after = is_of & (problem.time_s > time)
+            if min(is_after.sum(), (is_of & ~is_after).sum()) < _MIN_NUM_CELLS:
+                continue
+            of_ranges = _of_ranges(problem, k) & (problem.on_map.time_s > time)
+
+            def words(size: Array, name: str = name, when: str = _when(problem, time)) -> str:
+                to, how = f" to anchor {name}" if name else "", "longer" if size[0] > 0 else "shorter"
+                return f"{when} on the ranges{to} read about {abs(size[0]):.2f} m {how}"
+
+            def correction(size: Array, of_ranges: Mask = of_ranges) -> Correction:
+                return Correction(longer_m=np.where(of_ranges, size[0], 0.0))
+
+            yield Hypothesis(
+                "anchor step" if name else "step",
+                name,
+                unit="m",
+                is_linear=True,
+                words=words,
+                remedy="see what changed then: a tag that slipped, a restarted radio, a door or a vehicle in between",
+                correction=correction,
+                effect=of_cells(problem, -is_after.astype(np.float64)),
+            )
+
+
+def stretches(problem: Linearized) -> Iterator[Hypothesis]:
+    """For a while ranges read longer."""
+    for k in [*(_heard(problem) if len(_heard(problem)) > 1 else []), None]:
+        name = "" if k is None else problem.on_map.anchor_ids[k]
+        is_of = np.ones(len(problem.time_s), dtype=bool) if k is None else problem.anchor_index == k
+        for start, end in _windows(problem):
+            inside = is_of & (problem.time_s >= start) & (problem.time_s < end)
+            if inside.sum() < _MIN_NUM_CELLS:
+                continue
+            times = problem.on_map.time_s
+
+            def words(size: Array, name: str = name, when: str = _when(problem, start, end)) -> str:
+                to = f" to anchor {name}" if name else ""
+                return f"{when} the ranges{to} read about {abs(size[0]):.2f} m too {'long' if size[0] > 0 else 'short'}"
+
+            yield Hypothesis(
+                "anchor stretch" if name else "stretch",
+                name,
+                unit="m",
+                is_linear=True,
+                words=words,
+                remedy="look for what stood in the line of sight, and leave that stretch out",
+                correction=_left_out(_of_ranges(problem, k) & (times >= start) & (times < end)),
+                effect=of_cells(problem, -inside.astype(np.float64)),
+            )
+
+
+def clock_jumps(problem: Linearized) -> Iterator[Hypothesis]:
+    """The clocks' offset jumped at some time."""
+    if problem.by_time is None:
+        return
+    for time in _times(problem, _NUM_STEPS):
+        after = problem.time_s > time
+        if min(after.sum(), (~after).sum()) < _MIN_NUM_CELLS:
+            continue
+        of_ranges = problem.on_map.time_s > time
+
+        def words(size: Array, when: str = _when(problem, time)) -> str:
+            return f"the clocks' offset jumped by about {size[0]:+.2f} s {when}"
+
+        def correction(size: Array, of_ranges: Mask = of_ranges) -> Correction:
+            return Correction(time_shift_s=np.where(of_ranges, size[0], 0.0))
+
+        yield Hypothesis(
+            "clock jump",
+            "",
+            unit="s",
+            is_linear=True,
+            words=words,
+            remedy="see whether a logger was restarted then, and run the two parts as surveys of their own",
+            correction=correction,
+            effect=of_cells(problem, np.where(after, -problem.by_time, 0.0)),
+        )
+
+
+def _heard(problem: Linearized) -> list[int]:
+    heard: list[int] = np.unique(problem.anchor_index).tolist()
+    return heard
+
+
+def _of_ranges(problem: Linearized, anchor: int | None) -> Mask:
+    index = problem.on_map.problem.anchor_index
+    return np.ones(len(index), dtype=bool) if anchor is None else np.asarray(index == anchor)
+
+
+def _left_out(rows: Mask) -> Callable[[Array], Correction]:
+    return lambda _: Correction(left_out=rows)
+
+
+def _times(problem: Linearized, num: int) -> Array:
+    """By the share of cells, so that there is something on either side of each."""
+    return np.quantile(problem.time_s, np.arange(1, num + 1) / (num + 1))
+
+
+def _windows(problem: Linearized) -> Iterator[tuple[float, float]]:
+    for share in _STRETCHES:
+        starts = np.arange(0.0, 1.0 - share + 1e-9, share / 2)
+        for start in starts:
+            first, last = np.quantile(problem.time_s, [start, min(start + share, 1.0)])
+            yield float(first), float(last)
+
+
+def _when(problem: Linearized, start: float, end: float | None = None) -> str:
+    begin = problem.on_map.time_s.min()
+    if problem.by_time is None:
+        unit, after = "m", "along the path"
+    else:
+        unit, after = "s", "after the first range"
+    if end is None:
+        return f"from {start - begin:.0f} {unit} {after}"
+    return f"from {start - begin:.0f} to {end - begin:.0f} {unit} {after}"
+
+
+SCANNING: tuple[Callable[[Linearized], Iterator[Hypothesis]], ...] = (anchors_moved, steps, stretches, clock_jumps)

@@ -1,0 +1,189 @@
+"""Tests of hypotheses: how much better each explains the observations than chance would (Baarda; Teunissen).
+
+With residuals e, their covariance Q, the design A and a mistake's columns H, all whitened and projected off A:
+T = e'H (H'H)^-1 H'e, chi-square with as many degrees of freedom as columns, and the size of the mistake is
+(H'H)^-1 H'e (Teunissen, Network Quality Control, 2024). One Cholesky decomposition and one QR serve all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+from scipy.linalg import solve_triangular
+
+from rangesfm.arrays import Array
+from rangesfm.trust.hypothesis import Effect, Hypothesis
+from rangesfm.trust.linearized import Linearized
+
+FALSE_ALARMS = 0.02
+# Baarda's: of the smallest mistake that is to be found, how often a single test at alpha misses it.
+_ALPHA, _BETA = 0.001, 0.2
+_NUM_DRAWS = 1000
+# Of what a mistake changes, squared: what is left of less once the unknowns have taken their part is rounding.
+_NOTHING_LEFT = 1e-7
+
+
+@dataclass(frozen=True)
+class Test:
+    """What the observations say of one hypothesis.
+
+    Attributes:
+        statistic: chi-square with ``num`` degrees of freedom if the mistake was not made.
+        threshold: for having looked at all hypotheses.
+        sizes, stddevs: (k,) estimate of its numbers.
+        smallest_detectable: in the direction in which it is found worst; inf: nothing can find it.
+        effect_on_log_scale, effect_on_place_m: the most that such a mistake would do unfound.
+        basis: (c + r, num) orthonormal, of what it explains.
+    """
+
+    hypothesis: Hypothesis
+    statistic: float
+    threshold: float
+    num: int
+    sizes: Array
+    stddevs: Array
+    smallest_detectable: float
+    effect_on_log_scale: float
+    effect_on_place_m: float
+    basis: Array
+
+    @property
+    def is_rejected(self) -> bool:
+        """Whether chance alone is out of the question."""
+        return self.statistic > self.threshold
+
+
+class Factorization:
+    """The factorisation that all tests share."""
+
+    def __init__(self, problem: Linearized):
+        self.problem = problem
+        self._factor = np.linalg.cholesky(problem.covariance_m2)
+        self._basis, triangle = np.linalg.qr(self._whitened(problem.design, problem.prior_design))
+        scale = np.maximum(np.abs(np.diag(triangle)), 1e-12)
+        self._triangle = triangle + np.diag(np.where(np.abs(np.diag(triangle)) < 1e-9, 1e-9, 0.0) * scale)
+        # Of the path's mean square displacement, by the unknowns.
+        place = problem.place.reshape(-1, problem.columns.num)
+        self._place = place.T @ place / len(problem.place)
+        self.residual = self._off(self._whitened(problem.residual_m[:, None], problem.prior_residual[:, None]))[:, 0]
+
+    def _whitened(self, cells: Array, priors: Array) -> Array:
+        return np.vstack([solve_triangular(self._factor, cells, lower=True), priors])
+
+    def _off(self, whitened: Array) -> Array:
+        """Without what the unknowns can take."""
+        left: Array = whitened - self._basis @ (self._basis.T @ whitened)
+        return left
+
+    @property
+    def misfit(self) -> float:
+        """Sum of squares of the residuals, whitened."""
+        return float(self.residual @ self.residual)
+
+    def step(self, made: tuple[Effect, Array] | None = None) -> Array:
+        """(p,) from the state to the likeliest one, if a mistake of some size (k,) was made."""
+        cells, priors = self.problem.residual_m, self.problem.prior_residual
+        if made is not None:
+            effect, sizes = made
+            cells, priors = cells - effect.columns @ sizes, priors - effect.priors @ sizes
+        return -self._solved(self._whitened(cells[:, None], priors[:, None]))[:, 0]
+
+    def _solved(self, whitened: Array) -> Array:
+        return np.asarray(solve_triangular(self._triangle, self._basis.T @ whitened))
+
+    def test(self, hypotheses: Sequence[Hypothesis], seed: int) -> list[Test]:
+        """All of them, with thresholds that hold for all together."""
+        effects = Effect.of_all([h.effect for h in hypotheses])
+        whitened = self._whitened(effects.columns, effects.priors)
+        left = self._off(whitened)
+        ends = np.cumsum([h.num for h in hypotheses])
+        parts = [slice(end - h.num, end) for end, h in zip(ends, hypotheses, strict=True)]
+        bases = [_basis_of(left[:, part], whitened[:, part]) for part in parts]
+        nums = np.array([basis.shape[1] for basis in bases])
+        thresholds = _thresholds(bases, nums, seed)
+        by_unknowns = -self._solved(whitened)
+        return [
+            self._test(h, left[:, part], basis, by_unknowns[:, part], threshold)
+            for h, part, basis, threshold in zip(hypotheses, parts, bases, thresholds, strict=True)
+        ]
+
+    def _test(self, hypothesis: Hypothesis, left: Array, basis: Array, by_unknowns: Array, threshold: float) -> Test:
+        inverse = np.asarray(np.linalg.pinv(left.T @ left, rcond=_NOTHING_LEFT, hermitian=True), dtype=np.float64)
+        is_whole = basis.shape[1] == left.shape[1]
+        worst, on_scale, on_place = np.inf, np.inf, np.inf
+        if is_whole:
+            needed = noncentrality(basis.shape[1])
+            worst = float(np.sqrt(needed * np.linalg.eigvalsh(inverse)[-1]))
+            # Of all mistakes on the edge of being found, the one that does most.
+            of_unit = by_unknowns @ _root(inverse)
+            on_scale = float(np.sqrt(needed) * np.linalg.norm(of_unit[0]))
+            on_place = float(np.sqrt(needed * max(np.linalg.eigvalsh(of_unit.T @ self._place @ of_unit)[-1], 0.0)))
+        return Test(
+            hypothesis=hypothesis,
+            statistic=float(np.sum((basis.T @ self.residual) ** 2)),
+            threshold=threshold,
+            num=basis.shape[1],
+            sizes=inverse @ (left.T @ self.residual),
+            stddevs=np.sqrt(np.diag(inverse)) if is_whole else np.full(len(inverse), np.inf),
+            smallest_detectable=worst,
+            effect_on_log_scale=on_scale,
+            effect_on_place_m=on_place,
+            basis=basis,
+        )
+
+
+def noncentrality(num: int) -> float:
+    """By which a mistake of so many numbers must raise the statistic to be found (Baarda's lambda_0)."""
+    if num not in _NONCENTRALITY:
+        critical = stats.chi2.isf(_ALPHA, num)
+        low, high = 0.0, 1000.0
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if stats.ncx2.sf(critical, num, middle) < 1 - _BETA else (low, middle)
+        _NONCENTRALITY[num] = high
+    return _NONCENTRALITY[num]
+
+
+_NONCENTRALITY: dict[int, float] = {}
+
+
+def _basis_of(left: Array, whitened: Array) -> Array:
+    """(c + r, k') orthonormal, of what is left of columns."""
+    sizes = np.maximum(np.linalg.norm(whitened, axis=0), 1e-12)
+    if left.shape[1] == 1:
+        length = np.linalg.norm(left)
+        return left / length if (length / sizes[0]) ** 2 > _NOTHING_LEFT else left[:, :0]
+    vectors, values, _ = np.linalg.svd(left / sizes, full_matrices=False)
+    return np.asarray(vectors[:, values**2 > _NOTHING_LEFT])
+
+
+def _thresholds(bases: Sequence[Array], nums: Array, seed: int) -> Array:
+    """(h,) for each its own, so that all together alarm as seldom as they should (Westfall and Young, 1993).
+
+    Drawn: of residuals without a mistake, the smallest of all p-values.
+    """
+    draws = np.random.default_rng(seed).standard_normal((_NUM_DRAWS, len(bases[0])))
+    projected = (draws @ np.hstack(bases)) ** 2
+    ends = np.cumsum(nums)
+    statistics = np.add.reduceat(np.hstack([projected, np.zeros((_NUM_DRAWS, 1))]), np.append(ends - nums, ends[-1]), 1)
+    statistics = np.where(nums > 0, statistics[:, :-1], 0.0)
+    smallest = np.ones(_NUM_DRAWS)
+    for num in np.unique(nums[nums > 0]):
+        smallest = np.minimum(smallest, stats.chi2.sf(statistics[:, nums == num].max(axis=1), num))
+    alpha = float(np.quantile(smallest, FALSE_ALARMS))
+    return np.array([stats.chi2.isf(alpha, num) if num else np.inf for num in nums])
+
+
+def overlap(first: Test, second: Test) -> float:
+    """How much of the one with fewer numbers the other can explain: 1: all of it, and nothing tells them apart."""
+    if not first.num or not second.num:
+        return 0.0
+    return float(np.linalg.norm(first.basis.T @ second.basis) / np.sqrt(min(first.num, second.num)))
+
+
+def _root(matrix: Array) -> Array:
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

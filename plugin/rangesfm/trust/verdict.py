@@ -1,0 +1,94 @@
+"""What the tests of a map say, for people: the table, and a sentence that names the likeliest cause."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rangesfm.arrays import Indices
+from rangesfm.trust.evidence import evidence
+from rangesfm.trust.mistakes import Cause, Findings, find_mistakes
+from rangesfm.trust.ranges_on_map import RangesOnMap
+from rangesfm.trust.table import MistakeTest, finite
+from rangesfm.trust.testing import Test
+
+
+@dataclass(frozen=True)
+class TrustVerdict:
+    """What was tested, and what speaks against the map.
+
+    Attributes:
+        tests: the table; what was found first.
+        reasons: sentences, the likeliest cause first; empty if nothing was found.
+        causes: the likeliest, and those that cannot be told from it.
+        rows: (n,) of the log, the ranges that corrections are of.
+    """
+
+    tests: tuple[MistakeTest, ...]
+    reasons: tuple[str, ...]
+    causes: tuple[Cause, ...]
+    rows: Indices
+
+
+def trust_in(on_map: RangesOnMap, *, seed: int = 0) -> TrustVerdict:
+    """Test all that may be wrong with the ranges on a map."""
+    found = find_mistakes(on_map, seed=seed)
+    shown = list(evidence(found.problem))
+    rows = [*_of_causes(found), *(_row(test) for test in _others(found)), *shown]
+    reasons = [*([sentence(found.causes)] if found.causes else []), *(_reason(row) for row in shown if row.rejected)]
+    return TrustVerdict(tuple(rows), tuple(reasons), found.causes, on_map.rows)
+
+
+def sentence(causes: Sequence[Cause]) -> str:
+    """The likeliest cause with what to do; several that nothing tells apart are all named."""
+    sure = f"{np.sqrt(max(causes[0].gain, 0.0)):.0f} stddevs"
+    if len(causes) == 1:
+        return f"probably {causes[0].words} ({sure}): {causes[0].remedy}"
+    either = ", or ".join(cause.words for cause in causes)
+    remedies = dict.fromkeys(cause.remedy for cause in causes)
+    return f"either {either} ({sure}; the ranges do not tell which): {'; or '.join(remedies)}"
+
+
+def _reason(row: MistakeTest) -> str:
+    return f"{row.words}: {row.remedy}"
+
+
+def _others(found: Findings) -> list[Test]:
+    named = {(cause.name, cause.subject) for cause in found.causes}
+    return [test for test in found.tests if test.hypothesis.key not in named]
+
+
+def _of_causes(found: Findings) -> list[MistakeTest]:
+    """With the statistic by which they were found: how much likelier they make the ranges."""
+    rows = []
+    for cause in found.causes:
+        if cause.test is None:
+            rows.append(
+                MistakeTest(
+                    cause.name, cause.subject, cause.gain, cause.penalty, None, None, "", None, None, None,
+                    cause.words, cause.remedy,
+                )
+            )  # fmt: skip
+            continue
+        rows.append(_row(cause.test, max(cause.test.statistic, cause.gain), cause.words))
+    return rows
+
+
+def _row(test: Test, statistic: float | None = None, words: str | None = None) -> MistakeTest:
+    one = len(test.sizes) == 1
+    return MistakeTest(
+        name=test.hypothesis.name,
+        subject=test.hypothesis.subject,
+        statistic=test.statistic if statistic is None else statistic,
+        threshold=test.threshold if np.isfinite(test.threshold) else 0.0,
+        size=finite(float(test.sizes[0] if one else np.linalg.norm(test.sizes))),
+        stddev=finite(float(test.stddevs[0] if one else np.linalg.norm(test.stddevs))),
+        unit=test.hypothesis.unit,
+        smallest_detectable=finite(test.smallest_detectable),
+        effect_on_scale=finite(test.effect_on_log_scale),
+        effect_on_place_m=finite(test.effect_on_place_m),
+        words=test.hypothesis.words(test.sizes) if words is None else words,
+        remedy=test.hypothesis.remedy,
+    )

@@ -1,0 +1,80 @@
+"""A share of the pairs of photos, matched in a process of its own with a database of its own.
+
+``python -m rangesfm.vision.matching_share PARENT`` matches one.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pycolmap
+
+from rangesfm.colmap.log import colmap_log
+from rangesfm.processes.supervision import MessagesToParent, work_for_parent
+from rangesfm.progress import Progress
+from rangesfm.vision.background import run_in_background
+from rangesfm.vision.database import copy_features, copy_matches, num_compared_pairs
+
+# Pairs after which COLMAP writes down what it has found; it keeps as many photos in memory.
+BLOCK_SIZE = 64
+
+
+@dataclass(frozen=True)
+class MatchingShare:
+    """Pairs of photos, and all that it takes to match them.
+
+    Attributes:
+        folder: of its own, which there is.
+        pairs: ids of photos, smaller first.
+        matcher, verification: COLMAP's options.
+    """
+
+    folder: Path
+    pairs: Sequence[tuple[int, int]]
+    matcher: pycolmap.FeatureMatchingOptions
+    verification: pycolmap.TwoViewGeometryOptions
+
+    @property
+    def database(self) -> Path:
+        return self.folder / "database.db"
+
+    @property
+    def log(self) -> Path:
+        """What COLMAP said."""
+        return self.folder / "mapper.log"
+
+    def prepare(self, source: Path) -> None:
+        """Take over the features of its photos; there each photo is called by its id."""
+        copy_features(source, self.database, sorted({id_ for pair in self.pairs for id_ in pair}))
+        (self.folder / "pairs.txt").write_text("".join(f"{first} {second}\n" for first, second in self.pairs))
+
+    def match(self, progress: Progress) -> int:
+        """Returns how many pairs have been compared."""
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path, pairing.block_size = self.folder / "pairs.txt", BLOCK_SIZE
+        with colmap_log(self.log), pycolmap.Database.open(self.database) as database:
+            run_in_background(
+                lambda token: pycolmap.match_image_pairs(
+                    self.database, self.matcher, pairing, self.verification, cancellation_token=token
+                ),
+                progress,
+                lambda: num_compared_pairs(database),
+                len(self.pairs),
+            )
+        return len(self.pairs)
+
+    def hand_over(self, target: Path) -> None:
+        """What it has found, also of pairs that do not match."""
+        copy_matches(self.database, target, ((pair, pair) for pair in self.pairs))
+
+
+def _run(share: MatchingShare, parent: MessagesToParent) -> int:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # at once: what is written down is whole
+    return share.match(parent)
+
+
+if __name__ == "__main__":
+    work_for_parent(_run)

@@ -1,0 +1,111 @@
+"""What ranges get wrong is learnt from their residuals, as far as it shows there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from rangesfm.ranging.errors.cells import MAX_NUM_CELLS, Cells, cells
+from rangesfm.ranging.errors.components import COMPONENTS
+from rangesfm.ranging.errors.learned import LearnedErrors, learn_errors
+
+Array = npt.NDArray[np.float64]
+
+NUM_ANCHORS, NUM_EPOCHS = 4, 100
+NO_MAP = np.zeros((0, 1))
+
+
+@pytest.fixture(scope="module")
+def walked() -> Cells:
+    """Ranges to four anchors every half second on a walk among them; each is a cell."""
+    rng = np.random.default_rng(0)
+    time_s = np.repeat(np.arange(NUM_EPOCHS) * 0.5, NUM_ANCHORS)
+    along = time_s / 50 * 2 * np.pi
+    tag_m = np.column_stack([3 * np.cos(along), 2 * np.sin(2 * along), 1 + 0.5 * np.sin(3 * along)])
+    anchor_index = np.tile(np.arange(NUM_ANCHORS), NUM_EPOCHS)
+    anchors_m = np.array([[6.0, 0, 2], [-6, 1, 0.5], [0, 7, 2.5], [1, -7, 0.3]])
+    turns = np.linalg.qr(rng.standard_normal((len(time_s), 3, 3)))[0]
+    num = len(time_s)
+    return cells(
+        anchor_index,
+        np.zeros(num, int),
+        time_s,
+        tag_m - anchors_m[anchor_index],
+        turns,
+        np.ones(num),
+        np.ones(NUM_ANCHORS),
+    )
+
+
+def learn(of: Cells, off_m: Array) -> LearnedErrors:
+    return learn_errors(of, off_m, np.zeros((len(off_m), 1)), NO_MAP, 0.05)
+
+
+def stddevs(learned: LearnedErrors) -> dict[str, float]:
+    return dict(zip(learned.names, learned.stddevs.tolist(), strict=True))
+
+
+@pytest.mark.parametrize("component", COMPONENTS, ids=lambda component: component.name)
+def test_every_component_is_a_covariance(component, walked: Cells) -> None:  # type: ignore[no-untyped-def]
+    correlation = component.correlation(walked)
+    np.testing.assert_allclose(correlation, correlation.T, atol=1e-12)
+    assert np.linalg.eigvalsh(correlation).min() > -1e-9 * len(walked)
+
+
+@pytest.mark.parametrize("name", ["antenna", "bending", "time", "moment", "bias"])
+def test_errors_ten_times_as_large_as_usual_are_seen_whatever_they_are_taken_for(name: str, walked: Cells) -> None:
+    component = next(each for each in COMPONENTS if each.name == name)
+    values, vectors = np.linalg.eigh(component.correlation(walked))
+    drawn = vectors @ (np.sqrt(np.maximum(values, 0)) * np.random.default_rng(1).standard_normal(len(values)))
+    off_m = 10 * component.median * drawn + 0.02 * np.random.default_rng(2).standard_normal(len(values))
+    learned = learn(walked, off_m)
+    size_m = np.sqrt(np.mean(off_m**2))
+    assert 0.7 < np.sqrt(np.mean(np.diag(learned.covariance_m2))) / size_m < 3.0
+
+
+def test_noise_alone_leaves_the_rest_at_what_radios_let_expect_or_less(walked: Cells) -> None:
+    off_m = 0.05 * np.random.default_rng(2).standard_normal(len(walked))
+    found = stddevs(learn(walked, off_m))
+    assert np.hypot(found["white"], found["moment"]) == pytest.approx(0.05, rel=0.15)
+    for component in COMPONENTS:
+        if component.name not in ("white", "moment"):
+            assert found[component.name] < 1.2 * component.median, component.name
+
+
+def test_a_learnt_curve_counts_as_it_is_stated(walked: Cells) -> None:
+    off_m = 0.02 * np.random.default_rng(3).standard_normal(len(walked))
+    learned = learn_errors(walked, off_m, np.zeros((len(off_m), 1)), NO_MAP, 0.02, np.full(len(off_m), 0.03))
+    assert learned.names[-1] == "learnt_curve"
+    np.testing.assert_allclose(np.diag(learned.covariances_m2[-1]), 0.03**2)
+
+
+def test_a_radio_with_far_more_noise_may_be_off_by_more_in_all_else(walked: Cells) -> None:
+    off_m = 0.05 * np.random.default_rng(4).standard_normal(len(walked))
+    usual, bad = (learn_errors(walked, k * off_m, np.zeros((len(off_m), 1)), NO_MAP, k * 0.05) for k in (1, 16))
+    ratio = [np.sqrt(each.covariances_m2[each.names.index("slope")].max()) for each in (usual, bad)]
+    assert ratio[1] > 5 * ratio[0]
+
+
+def test_cells_are_few_and_hold_all_ranges_of_an_anchor_and_a_moment() -> None:
+    num = 50_000
+    time_s = np.linspace(0, 1000, num)
+    anchor_index = np.arange(num) % 5
+    from_anchor_m = np.column_stack([5 + 0.001 * time_s, np.zeros(num), np.ones(num)])
+    turns = np.broadcast_to(np.eye(3), (num, 3, 3))
+    found = cells(anchor_index, np.zeros(num, int), time_s, from_anchor_m, turns, np.ones(num), np.ones(5))
+    assert 0.5 * MAX_NUM_CELLS < len(found) <= MAX_NUM_CELLS
+    np.testing.assert_allclose(found.mean(time_s), found.time_s)
+    np.testing.assert_array_equal(found.anchor_index[found.of_range], anchor_index)
+    assert found.worth.sum() == pytest.approx(num)
+    assert np.ptp(time_s[found.of_range == 7]) < 15
+
+
+def test_ranges_of_some_rows_keep_their_cells(walked: Cells) -> None:
+    learned = learn(walked, 0.05 * np.random.default_rng(5).standard_normal(len(walked)))
+    rows = np.array([3, 8, 20])
+    spread = replace(learned, of_range=learned.of_range[rows]).spread(rows, 30)
+    np.testing.assert_array_equal(spread.of_range[rows], learned.of_range[rows])
+    assert np.count_nonzero(spread.of_range < 0) == 27

@@ -1,0 +1,210 @@
+"""Simulated surveys without photos that may have a mistake in them, and the scale stage with its tests on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+from tests.simulated.path import loop_path
+from tests.studies.scale_coverage import drifting, error_curve
+
+from rangesfm.demo.ranges import CameraPath
+from rangesfm.errors import GeometryError
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.options import ScaleOptions
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.association import associate
+from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.observations import RangeStatus
+from rangesfm.scale.estimate import ScaleEstimate
+from rangesfm.scale.initialize import initialize_scale
+from rangesfm.trust.ranges_on_map import RangesOnMap, ranges_on_map
+from rangesfm.trust.verdict import TrustVerdict, trust_in
+
+Array = npt.NDArray[np.float64]
+
+METRES_PER_UNIT = 2.3
+LASTING_STDDEV_M, DIRECTION_STDDEV_M, CURVE_STDDEV_M, BIAS_STDDEV_M, COMMON_BIAS_STDDEV_M = 0.03, 0.03, 0.03, 0.01, 0.05
+OBSTRUCTED_SHARE, OBSTRUCTED_MEAN_M = 0.04, 0.7
+BEND_SHARE = 0.002
+# A camera's x right, y down, z forward by a robot's x forward, y left, z up.
+X_FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+
+
+@dataclass(frozen=True)
+class Site:
+    """A kind of survey; the anchor frame as of ``initialize_scale``."""
+
+    name: str
+    path: Callable[[int], CameraPath]
+    anchors_m: dict[str, tuple[float, float, float]]
+    frame: str
+    rate_hz: float
+    stddev_m: float
+    tag_in_cam_m: tuple[float, float, float]
+
+
+SITES = (
+    Site(
+        "hall",
+        lambda seed: loop_path(
+            120.0, center_m=(10, 7, 1.7), semi_axes_m=(7, 4.5), height_amplitude_m=0.4, num_turns=2.2,
+            unsteadiness_m=0.4, seed=seed,
+        ),
+        {"A1": (0.3, 0.2, 3.9), "A2": (19.6, 0.4, 1.2), "A3": (19.4, 13.6, 4.2), "A4": (0.2, 13.4, 0.9),
+         "A5": (9.8, 0.1, 2.6), "A6": (10.1, 13.8, 0.4)},
+        "site",
+        5.0,
+        0.06,
+        (0.06, -0.15, -0.04),
+    ),
+    Site(
+        "yard",
+        lambda seed: loop_path(
+            160.0, center_m=(0, 0, 1.6), semi_axes_m=(12, 9), height_amplitude_m=0.6, num_turns=1.7,
+            unsteadiness_m=0.6, seed=seed,
+        ),
+        {"N": (2.0, 17.0, 4.5), "E": (19.0, 1.5, 0.6), "S": (-3.0, -15.5, 3.2), "W": (-18.0, 2.0, 1.4)},
+        "site",
+        3.0,
+        0.1,
+        (0.1, -0.25, 0.02),
+    ),
+    Site(
+        "drone",
+        lambda seed: loop_path(
+            100.0, center_m=(0, 0, 6), semi_axes_m=(10, 7), height_amplitude_m=2.5, num_turns=2.1,
+            unsteadiness_m=1.0, seed=seed,
+        ),
+        {"B": (4.0, -5.0, 1.0)},
+        "unknown",
+        10.0,
+        0.08,
+        (0.02, 0.12, -0.06),
+    ),
+)  # fmt: skip
+
+
+@dataclass
+class Given:
+    """What a surveyor hands over, right or wrong; times in seconds of the camera's clock."""
+
+    trajectory: Trajectory
+    anchors_m: dict[str, Array]
+    frame: str
+    tag_in_cam_m: Array
+    time_s: Array
+    anchor: npt.NDArray[np.int64]
+    range_m: Array
+    tags_m: Array
+    true_anchors_m: dict[str, Array]
+    world_from_cam: Array
+    path: CameraPath
+    time_offset_s: float = 0.0
+
+    @property
+    def ids(self) -> list[str]:
+        return list(self.true_anchors_m)
+
+    def is_of(self, name: str) -> npt.NDArray[np.bool_]:
+        return np.asarray(self.anchor == self.ids.index(name))
+
+
+def surveyed(site: Site, seed: int) -> Given:
+    """A clean survey."""
+    rng = np.random.default_rng([seed, len(site.name)])
+    path = site.path(seed)
+    duration = path.end_s - path.start_s
+    ids = list(site.anchors_m)
+    turn = np.arange(int(duration * site.rate_hz) * len(ids))
+    times, anchor = path.start_s + turn / (site.rate_hz * len(ids)), turn % len(ids)
+    world_from_cam = path.world_from_cam(times)
+    tags = path.centers(times) + world_from_cam @ np.array(site.tag_in_cam_m)
+    anchors = {name: np.array(at) for name, at in site.anchors_m.items()}
+    given = Given(
+        mapped(path, rng), dict(anchors), site.frame, np.array(site.tag_in_cam_m), times, anchor, np.zeros(len(times)),
+        tags, anchors, world_from_cam, path,
+    )  # fmt: skip
+    given.range_m = distances(given) + radio_errors(given, site.stddev_m, rng)
+    return given
+
+
+def distances(given: Given) -> Array:
+    anchors_m = np.array(list(given.true_anchors_m.values()))
+    return np.asarray(np.linalg.norm(given.tags_m - anchors_m[given.anchor], axis=1))
+
+
+def mapped(path: CameraPath, rng: np.random.Generator) -> Trajectory:
+    """The path as a mapper leaves it: bent a little, in a unit and a world of its own."""
+    times = np.arange(path.start_s, path.end_s, 0.5)
+    centers, rotations = path.centers(times), path.world_from_cam(times)
+    knots = np.linspace(times[0], times[-1], 7)
+    extent = float(np.linalg.norm(np.std(centers, axis=0)))
+    bend = BEND_SHARE * extent * rng.standard_normal((len(knots), 3))
+    bent = centers + np.column_stack([np.interp(times, knots, bend[:, k]) for k in range(3)])
+    true = Trajectory(
+        np.arange(1, len(times) + 1), tuple(f"{k:04d}.jpg" for k in range(len(times))), times, bent, rotations
+    )
+    turn = Rotation.from_quat(rng.normal(size=4)).as_matrix()
+    return true.transformed(1 / METRES_PER_UNIT, turn, rng.normal(size=3))
+
+
+def radio_errors(given: Given, stddev_m: float, rng: np.random.Generator) -> Array:
+    distance = distances(given)
+    errors = stddev_m * rng.standard_normal(len(distance)) + COMMON_BIAS_STDDEV_M * rng.standard_normal()
+    errors += CURVE_STDDEV_M * error_curve(distance, rng)
+    for k, at in enumerate(given.true_anchors_m.values()):
+        rows = np.flatnonzero(given.anchor == k)
+        direction = (given.tags_m[rows] - at) / distance[rows, None]
+        form = rng.normal(0, DIRECTION_STDDEV_M, (3, 3))
+        errors[rows] += np.einsum("ni,ij,nj->n", direction, form, direction) + BIAS_STDDEV_M * rng.standard_normal()
+        errors[rows] += LASTING_STDDEV_M * drifting(given.time_s[rows], rng)
+    errors += (rng.random(len(errors)) < OBSTRUCTED_SHARE) * rng.exponential(OBSTRUCTED_MEAN_M, len(errors))
+    return np.asarray(errors)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One survey as it went; None where the scale was refused."""
+
+    estimate: ScaleEstimate | None
+    trust: TrustVerdict | None
+    on_map: RangesOnMap | None = None
+    refusal: str = ""
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether the scale lies outside its interval."""
+        if self.estimate is None:
+            return False
+        low, high = self.estimate.interval_95
+        return not low <= METRES_PER_UNIT <= high
+
+
+def run(given: Given, seed: int) -> Run:
+    """The scale stage and the tests after it."""
+    log = RangeLog.from_arrays(
+        np.array(given.ids)[given.anchor], np.maximum(given.range_m, 0.02), timestamp_s=given.time_s
+    )
+    observations = associate(log, given.trajectory, given.tag_in_cam_m, time_offset_s=given.time_offset_s)
+    anchors = [Anchor(name, None if given.frame == "unknown" else at) for name, at in given.anchors_m.items()]
+    options = ScaleOptions(max_relative_stddev=0.5)
+    try:
+        estimate = initialize_scale(
+            observations, given.trajectory, anchors, anchor_frame=given.frame, options=options, seed=seed
+        )
+    except GeometryError as error:
+        return Run(None, None, refusal=str(error))
+    on_map = ranges_on_map(
+        estimate.observations, given.trajectory, estimate.metric_from_sfm, estimate.anchors, estimate.errors,
+        by_status(estimate), frame_is_free=estimate.frame == "site",
+    )  # fmt: skip
+    return Run(estimate, trust_in(on_map, seed=seed), on_map)
+
+
+def by_status(estimate: ScaleEstimate) -> Array:
+    """(n,) robust weights, as far as the statuses tell them."""
+    return np.where(estimate.observations.status <= RangeStatus.DOWN_WEIGHTED, 1.0, 0.0)

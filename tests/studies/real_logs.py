@@ -1,0 +1,176 @@
+"""Error, 95 % interval and verdict of the scale on real logs with truth, in every way of knowing their anchors.
+
+Run: python -m tests.studies.real_logs --data FOLDER [--sets NAME ...] [--no_singles] [--by_photo]
+     [--turned SEED]
+
+The sets are described in real_logs.json: public logs below the folder, of each tag its place in the tracked body, the
+offset of the clocks (time of the truth minus time of the ranges) and the truth's longest gap. The path is the true
+one, at most ten poses a second, divided by a factor that is to be found again. A survey has all anchors surveyed
+(site frame), known in the
+first pose's frame, all unknown, or each alone unknown. With --by_photo ranges name the pose next to them instead of a
+time; with --turned the unscaled path lies in another frame, which should change nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from rangesfm.errors import GeometryError
+from rangesfm.geometry.reference import Reference, read_reference
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.options import AssociationOptions, ScaleOptions
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.anchor_file import read_anchors
+from rangesfm.ranging.association import associate
+from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.readers import read_ranges
+from rangesfm.scale.initialize import initialize_scale
+
+FACTOR, MIN_STEP_S, MAX_GAP_S = 4.63, 0.1, 0.25
+
+
+@dataclass(frozen=True)
+class Case:
+    """One way to survey with a log."""
+
+    name: str
+    frame: str
+    anchors: list[Anchor]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--sets", nargs="*")
+    parser.add_argument("--no_singles", action="store_true")
+    parser.add_argument("--by_photo", action="store_true")
+    parser.add_argument("--turned", type=int)
+    args = parser.parse_args()
+    sets = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))
+    found = []
+    for name in args.sets or sets:
+        log, anchors, reference = read_set(args.data, sets[name])
+        path = path_of(reference)
+        given = path if args.turned is None else turned(path, args.turned)
+        for case in cases(log, anchors, path):
+            if not (args.no_singles and case.name.startswith("only")):
+                found.append(
+                    one_survey(name, case, placed(log, case, given, sets[name], by_photo=args.by_photo), given)
+                )
+    known = np.array([row for row in found if row is not None])
+    if len(known):
+        pulls = 1.96 * known[:, 0] / known[:, 1]
+        print(
+            f"{len(known)} of {len(found)}: {100 * np.mean(np.abs(pulls) < 1.96):.0f} % covered, errors in their "
+            f"stddevs {np.sqrt(np.mean(pulls**2)):.2f} (rms), median half width {100 * np.median(known[:, 1]):.2f} %"
+        )
+
+
+def read_set(data: Path, described: dict[str, Any]) -> tuple[RangeLog, list[Anchor], Reference]:
+    ranges = data / described["ranges"]
+    if "truth" in described:
+        anchors = list(read_anchors(data / described["anchors"]))
+        reference = read_reference(data / described["truth"])
+    else:  # STAR-loc: the tag's place stands beside each range, the anchors' ids in a column without a name
+        anchors = [
+            Anchor(row[""], np.array([float(row[a]) for a in "xyz"])) for row in rows(data / described["anchors"])
+        ]
+        times, first = np.unique([float(row["time_s"]) for row in rows(ranges)], return_index=True)
+        places = np.array([[float(row[f"tag_pos_{a}"]) for a in "xyz"] for row in rows(ranges)])
+        reference = Reference(places[first], timestamps_s=times)
+    return read_ranges(ranges, anchor_ids=[anchor.anchor_id for anchor in anchors]), anchors, reference
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def path_of(reference: Reference) -> Trajectory:
+    times = reference.timestamps_s
+    assert times is not None, "the truth is by time"
+    kept = [0]
+    for i, at in enumerate(times):
+        if at - times[kept[-1]] >= MIN_STEP_S:
+            kept.append(i)
+    num, turns = len(kept), reference.world_from_cam
+    rotations = np.tile(np.eye(3), (num, 1, 1)) if turns is None else turns[kept]
+    names = tuple(f"{i:06d}" for i in range(num))
+    return Trajectory(np.arange(1, num + 1), names, times[kept], reference.positions_m[kept] / FACTOR, rotations)
+
+
+def turned(path: Trajectory, seed: int) -> Trajectory:
+    return path.transformed(1.0, Rotation.random(random_state=seed).as_matrix(), np.array([3.0, -2.0, 1.0]))
+
+
+def cases(log: RangeLog, anchors: list[Anchor], path: Trajectory) -> Iterator[Case]:
+    heard = [anchor for anchor in anchors if anchor.anchor_id in log.anchor_ids]
+    yield Case("surveyed", "site", heard)
+    turn, origin = path.world_from_cam[0], FACTOR * path.centers[0]
+    from_there = [replace(a, position_m=(np.asarray(a.position_m) - origin) @ turn) for a in heard]
+    yield Case("known", "first_camera", from_there)
+    yield Case("unknown", "unknown", heard)
+    for anchor in heard:
+        yield Case(f"only {anchor.anchor_id}", "unknown", [anchor])
+
+
+def placed(
+    log: RangeLog, case: Case, path: Trajectory, described: dict[str, Any], *, by_photo: bool
+) -> RangeObservations:
+    wanted = [anchor.anchor_id for anchor in case.anchors]
+    part = log.subset(np.isin(np.array(log.anchor_ids)[log.anchor_index], wanted))
+    arms: npt.ArrayLike = described.get("tag_in_body_m", (0.0, 0.0, 0.0))
+    if "tags_in_body_m" in described:
+        arms = [described["tags_in_body_m"][tag] for tag in part.tag_ids]
+    offset_s = described.get("time_offset_s", 0.0)
+    if by_photo:
+        part, path, offset_s = at_photos(part, path, offset_s)
+    options = AssociationOptions(max_interpolation_gap_s=max(described.get("max_gap_s", 0.0), MAX_GAP_S))
+    return associate(part, path, arms, time_offset_s=offset_s, options=options)
+
+
+def at_photos(log: RangeLog, path: Trajectory, offset_s: float) -> tuple[RangeLog, Trajectory, float]:
+    """Ranges within 50 ms of a pose, by its name."""
+    assert log.timestamp_s is not None
+    assert path.timestamps_s is not None
+    times = log.timestamp_s + offset_s
+    nearest = np.abs(times[:, None] - path.timestamps_s).argmin(axis=1)
+    near = np.abs(times - path.timestamps_s[nearest]) < 0.05
+    names = tuple(path.image_names[k] for k in nearest[near])
+    return replace(log.subset(near), timestamp_s=None, image_name=names), replace(path, timestamps_s=None), 0.0
+
+
+def one_survey(name: str, case: Case, observations: RangeObservations, path: Trajectory) -> tuple[float, float] | None:
+    """Error and half width of the logarithm of the scale; None if refused."""
+    began = time.process_time()
+    options = ScaleOptions(max_relative_stddev=1.0)
+    try:
+        found = initialize_scale(observations, path, case.anchors, anchor_frame=case.frame, options=options)
+    except GeometryError as refusal:
+        print(f"{name:16}{case.name:10} refused: {refusal}", flush=True)
+        return None
+    error, half_width = float(np.log(found.value / FACTOR)), found.uncertainty.half_width_95
+    largest = sorted(found.uncertainty.components.items(), key=lambda part: -part[1])[:3]
+    print(
+        f"{name:16}{case.name:10}{100 * error:+7.2f} % +-{100 * half_width:6.2f} % "
+        f"{'covered' if abs(error) <= half_width else 'MISSED '} {found.verdict:9}"
+        f"{time.process_time() - began:5.1f} s  {', '.join(f'{part} {196 * stddev:.1f}' for part, stddev in largest)}",
+        flush=True,
+    )
+    return error, half_width
+
+
+if __name__ == "__main__":
+    main()

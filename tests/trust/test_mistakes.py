@@ -1,0 +1,86 @@
+"""Mistakes in simulated surveys are found and named; clean surveys are left in peace."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tests.studies.erring_surveys import SITES, Given, run, surveyed
+
+from rangesfm.trust.verdict import TrustVerdict
+
+HALL, YARD, DRONE = SITES
+SEED = 3
+
+
+def trust(given: Given) -> TrustVerdict:
+    found = run(given, SEED).trust
+    assert found is not None
+    return found
+
+
+def test_a_clean_survey_is_not_doubted() -> None:
+    found = trust(surveyed(DRONE, SEED))
+    assert found.reasons == ()
+    assert not any(test.rejected for test in found.tests)
+    assert len({(test.name, test.subject) for test in found.tests}) == len(found.tests)
+
+
+def test_a_clock_that_is_off_is_named_with_its_size() -> None:
+    given = surveyed(DRONE, SEED)
+    given.time_offset_s = 0.15
+    found = trust(given)
+    assert [cause.name for cause in found.causes] == ["clock offset"]
+    assert found.causes[0].correction.time_shift_s == pytest.approx(-0.15, abs=0.03)
+
+
+def test_a_lever_arm_with_the_wrong_sign_is_named_as_such() -> None:
+    given = surveyed(DRONE, SEED)
+    given.tag_in_cam_m = -4 * given.tag_in_cam_m
+    given.tags_m = given.tags_m + given.world_from_cam @ (3 * np.array(DRONE.tag_in_cam_m))
+    given.range_m = given.range_m + np.linalg.norm(given.tags_m - given.true_anchors_m["B"], axis=1)
+    given.range_m -= np.linalg.norm(
+        given.tags_m - given.world_from_cam @ (3 * np.array(DRONE.tag_in_cam_m)) - given.true_anchors_m["B"], axis=1
+    )
+    found = trust(given)
+    assert "lever arm's axes" in {cause.name for cause in found.causes}
+    assert "wrong sign" in found.reasons[0]
+
+
+def test_what_no_survey_with_one_unknown_anchor_can_show_is_not_claimed() -> None:
+    given = surveyed(DRONE, SEED)
+    given.range_m = 1.05 * given.range_m
+    found = trust(given)
+    assert found.reasons == ()
+    share = next(test for test in found.tests if test.name == "range share")
+    assert share.effect_on_scale is None or share.effect_on_scale > 0.2
+
+
+def test_most_ranges_without_line_of_sight_are_a_finding() -> None:
+    given = surveyed(DRONE, SEED)
+    rng = np.random.default_rng(0)
+    given.range_m = given.range_m + (rng.random(len(given.range_m)) < 0.7) * rng.exponential(1.0, len(given.range_m))
+    assert any("no radio does" in reason for reason in trust(given).reasons)
+
+
+@pytest.mark.parametrize(("axis", "letter"), [(0, "x"), (1, "y")])
+def test_the_coordinate_that_was_typed_wrong_is_named(axis: int, letter: str) -> None:
+    given = surveyed(YARD, SEED)
+    given.anchors_m["S"] = given.anchors_m["S"] + 2.0 * np.eye(3)[axis]
+    found = trust(given)
+    assert f"anchor S's {letter} is given as {given.anchors_m['S'][axis]:.3f}" in found.reasons[0]
+    assert found.causes[0].correction.anchors_m == {"S": None}
+
+
+def test_two_labels_that_were_swapped_are_named() -> None:
+    given = surveyed(YARD, SEED)
+    anchors = given.anchors_m
+    given.anchors_m = {**anchors, "N": anchors["E"], "E": anchors["N"]}
+    found = trust(given)
+    assert found.causes[0].subject == "E, N"
+    np.testing.assert_array_equal(found.causes[0].correction.anchors_m["E"], anchors["E"])
+
+
+def test_long_ranges_and_small_coordinates_are_named_together() -> None:
+    given = surveyed(YARD, SEED)
+    given.range_m = 1.06 * given.range_m
+    assert {cause.name for cause in trust(given).causes} == {"range share", "anchors' scale"}

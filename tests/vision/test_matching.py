@@ -1,0 +1,126 @@
+"""Pairs of photos shared out among processes."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from tests.vision.matches import content_of
+
+from rangesfm.errors import ReconstructionError
+from rangesfm.options import MapperOptions
+from rangesfm.progress import SilentProgress
+from rangesfm.vision import matching
+from rangesfm.vision.camera import cameras_of_photos
+from rangesfm.vision.database import create_database
+from rangesfm.vision.features import extract_features, feature_options
+from rangesfm.vision.matching import match_features, matching_options
+from rangesfm.vision.matching_share import MatchingShare
+from rangesfm.vision.photos import Photos, usable_photos
+
+if TYPE_CHECKING:
+    from tests.vision.conftest import Listener, Room
+
+NUM_PHOTOS, NUM_PAIRS = 9, 36
+
+
+@pytest.fixture(scope="module")
+def photos(render_room: Callable[..., Room], tmp_path_factory: pytest.TempPathFactory) -> Photos:
+    """Photos, and beside them a database with their features."""
+    room = render_room(tmp_path_factory.mktemp("walk"), NUM_PHOTOS)
+    photos = usable_photos(room.folder, room.names)
+    cameras = cameras_of_photos(room.camera, photos)
+    create_database(room.folder / "database.db", room.names, cameras.cameras, cameras.of_photo)
+    options = feature_options(MapperOptions(features={"sift": {"max_num_features": 250}}))
+    extract_features(room.folder / "database.db", photos, options, SilentProgress())
+    return photos
+
+
+@pytest.fixture
+def database(photos: Photos, tmp_path: Path) -> Path:
+    """A copy of it, to match in."""
+    return Path(shutil.copy(photos.folder / "database.db", tmp_path))
+
+
+@pytest.fixture
+def small_shares(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Even few pairs are several shares of a process."""
+    monkeypatch.setattr(matching, "_MIN_NUM_PAIRS", 1)
+    monkeypatch.setattr(matching, "_MAX_NUM_PAIRS", 5)
+
+
+def match(photos: Photos, database: Path, listener: Listener, num_processes: int) -> None:
+    options = matching_options(MapperOptions(num_threads=num_processes), NUM_PHOTOS, seed=0)
+    match_features(database, photos, options, database.with_name("mapper.log"), listener)
+
+
+@pytest.mark.usefixtures("small_shares")
+def test_the_matches_are_the_same_row_for_row_whatever_the_number_of_processes(
+    photos: Photos, tmp_path: Path, listener: Listener
+) -> None:
+    found = []
+    for num_processes in (1, 2, 4):
+        (tmp_path / str(num_processes)).mkdir()
+        database = Path(shutil.copy(photos.folder / "database.db", tmp_path / str(num_processes)))
+        listener.stage(str(num_processes))
+        match(photos, database, listener, num_processes)
+        found.append(content_of(database))
+        assert listener.updates[str(num_processes)][-1] == (NUM_PAIRS, NUM_PAIRS)
+        assert sorted(os.listdir(database.parent)) == ["database.db", "mapper.log"]
+    assert len([pair for pair in found[0] if isinstance(pair[0], int)]) == NUM_PAIRS
+    assert found[1:] == [found[0]] * 2
+
+
+@pytest.mark.usefixtures("small_shares")
+def test_what_was_matched_before_an_interruption_is_kept_and_not_matched_again(
+    photos: Photos, database: Path, listener: Listener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class InterruptedError(Exception):
+        pass
+
+    class Impatient(type(listener)):  # type: ignore[misc]
+        def update(self, num_done: int, num_total: int | None = None) -> None:
+            if num_done >= NUM_PAIRS // 3:
+                raise InterruptedError
+
+    impatient = Impatient()
+    with pytest.raises(InterruptedError):
+        match(photos, database, impatient, 2)
+    num_kept = len(content_of(database)) - NUM_PHOTOS
+    assert NUM_PAIRS // 3 <= num_kept < NUM_PAIRS
+    asked: list[int] = []
+    prepare = MatchingShare.prepare
+
+    def counted(share: MatchingShare, source: Path) -> None:
+        asked.append(len(share.pairs))
+        prepare(share, source)
+
+    monkeypatch.setattr(MatchingShare, "prepare", counted)
+    listener.stage("again")
+    match(photos, database, listener, 2)
+    assert sum(asked) == NUM_PAIRS - num_kept
+    assert listener.updates["again"][0] == (num_kept, NUM_PAIRS)
+
+
+@pytest.mark.parametrize("num_processes", [1, 3])
+def test_shares_are_of_bounded_size_hold_each_pair_once_and_are_of_few_photos(num_processes: int) -> None:
+    pairs = [(first, second) for second in range(1, 401) for first in range(1, second)]
+    shares = list(matching._shared_out(pairs, num_processes))
+    assert Counter(pair for share in shares for pair in share) == Counter(pairs)
+    assert max(map(len, shares)) <= matching._MAX_NUM_PAIRS
+    assert max(len({photo for pair in share for photo in pair}) for share in shares) < 300
+
+
+def test_a_process_that_fails_is_told_of_and_ends_the_others(
+    photos: Photos, database: Path, listener: Listener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listener.stage("matching")
+    monkeypatch.setattr(MatchingShare, "prepare", lambda *_: None)  # so that there is no list of pairs
+    with pytest.raises(ReconstructionError, match=r"Could not open .*pairs\.txt"):
+        match(photos, database, listener, 2)
+    assert sorted(os.listdir(database.parent)) == ["database.db", "mapper.log"]

@@ -1,0 +1,90 @@
+"""COLMAP's mappers that take all photos at once."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+import pytest
+
+from rangesfm.errors import InputError, ReconstructionError
+from rangesfm.options import MapperOptions
+from rangesfm.vision.reconstruct import ReconstructionSummary, reconstruct
+
+if TYPE_CHECKING:
+    from tests.vision.conftest import Listener, Room
+
+MAPPER = MapperOptions(features={"sift": {"max_num_features": 250}}, num_threads=2)
+
+
+@pytest.fixture(scope="module")
+def done(room: Room, tmp_path_factory: pytest.TempPathFactory) -> ReconstructionSummary:
+    """The room, photo by photo."""
+    return reconstruct(room.folder, room.names, tmp_path_factory.mktemp("out"), camera=room.camera, mapper=MAPPER)
+
+
+@pytest.fixture
+def output(done: ReconstructionSummary, tmp_path: Path) -> Path:
+    """A copy of its output folder."""
+    return Path(shutil.copytree(done.log_path.parent, tmp_path / "out"))
+
+
+@pytest.mark.parametrize(
+    ("method", "other"),
+    [
+        ("global", {"min_num_matches": 14}),
+        ("hierarchical", {"incremental_options": {"min_num_matches": 14}}),
+    ],
+)
+def test_holds_every_photo_at_its_place_says_so_and_comes_again(
+    room: Room, done: ReconstructionSummary, output: Path, listener: Listener, method: str, other: dict[str, Any]
+) -> None:
+    before = (output / "database.db").read_bytes()
+    asked = MAPPER.changed(method=method)
+    summaries = [
+        reconstruct(room.folder, room.names, output, camera=room.camera, mapper=mapper, seed=0, progress=listener)
+        for mapper in (asked, asked.changed(pipeline=other), asked)
+    ]
+    assert [list(summary.seconds) for summary in summaries] == [["mapping"]] * 3
+    assert "mapping: this mapper does not say how far it is, and an interrupted one begins anew" in listener.messages
+    centers = [np.array([_center(summary.models[0], name) for name in room.names]) for summary in summaries]
+    world_from_sfm = pycolmap.estimate_sim3d(centers[0], room.centers)
+    assert world_from_sfm is not None
+    errors = np.linalg.norm([world_from_sfm * center for center in centers[0]] - room.centers, axis=1)
+    assert errors.max() < 0.02 * np.linalg.norm(np.ptp(room.centers, axis=0))
+    assert np.abs(centers[2] - centers[0]).max() < 1e-9
+    assert (output / "database.db").read_bytes() == before
+    assert (output / "mapper.log").stat().st_size > (done.log_path).stat().st_size
+
+
+def _center(model: pycolmap.Reconstruction, name: str) -> npt.NDArray[np.float64]:
+    image = model.find_image_with_name(name)
+    assert image is not None
+    return np.asarray(image.projection_center())
+
+
+def test_photos_that_give_no_model_are_told_of(room: Room, output: Path) -> None:
+    mapper = MAPPER.changed(method="hierarchical", pipeline={"incremental_options": {"min_num_matches": 10_000}})
+    with pytest.raises(ReconstructionError):
+        reconstruct(room.folder, room.names, output, camera=room.camera, mapper=mapper)
+    assert not (output / "sparse").exists()
+
+
+@pytest.mark.parametrize(
+    ("mapper", "said"),
+    [
+        (MAPPER.changed(method="global", pipeline={"ba_local_num_images": 9}), r"unknown key 'ba_local_num_images' in"),
+        (
+            MAPPER.changed(method="hierarchical", ranges_in_mapping=True),
+            r"\[mapper\] ranges_in_mapping is true, expected false beside method 'hierarchical'",
+        ),
+    ],
+)
+def test_options_of_another_mapper_are_refused(room: Room, tmp_path: Path, mapper: MapperOptions, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        reconstruct(room.folder, room.names, tmp_path / "out", camera=room.camera, mapper=mapper)
+    assert not (tmp_path / "out").exists()
