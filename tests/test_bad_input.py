@@ -443,6 +443,19 @@ def assert_nothing_half_written(folder: Path) -> None:
     assert not [name for name in names if name.endswith((".part", ".old")) or name.startswith(".")]
 
 
+def test_format_that_cannot_be_written_costs_neither_the_result_nor_the_others(
+    own_survey: WalkedSurvey, rangesfm_command: Command
+) -> None:
+    flags = ("--anchors", "anchors.csv", "--formats", "undistorted,kml,ply", "--output_path", "out", "--quiet")
+    done = rangesfm_command("scale", *own_survey.flags, *flags, cwd=own_survey.folder, status=2)
+    first, second, written = done.stderr.splitlines()
+    assert "2 of 3 formats could not be written: undistorted: the format 'undistorted' needs the photos" in first
+    assert "kml: the format 'kml' needs a georeferenced map" in second
+    assert written.endswith("/out/points.ply")
+    names = {path.name for path in (own_survey.folder / "out").iterdir()}
+    assert {"result.json", "report.html", "points.ply"} <= names
+
+
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
     """Start a command, as from a terminal, where Ctrl-C is not ignored."""

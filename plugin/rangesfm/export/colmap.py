@@ -43,8 +43,12 @@ def write_project(map_: MetricMap, path: Path, *, as_text: bool = False) -> Path
     """
     write_model(map_.reconstruction, path, as_text=as_text)
     if map_.images_path is not None and map_.images_path.is_dir():
-        database_path, images_path = (map_.database_path or path / "database.db").resolve(), map_.images_path.resolve()
-        write_text(f"database_path={database_path}\nimage_path={images_path}\n", path / "project.ini")
+        database_path = map_.database_path
+        if database_path is None or not database_path.is_file():
+            database_path = path / "database.db"
+        text = f"database_path={database_path.resolve()}\nimage_path={map_.images_path.resolve()}\n"
+        if "#" not in text:  # which begins a comment there
+            write_text(text, path / "project.ini")
     return path
 
 
