@@ -122,8 +122,8 @@ def _add_estimate_arguments(parser: Parser) -> None:
     add = parser.add_argument_group("estimate").add_argument
     add("--range_stddev_m", type=_positive, metavar="M", help="noise of a range (default: estimated)")
     add("--range_bias_m", type=float, default=0.0, metavar="M", help="what ranges read too long")
-    uncertain = "how uncertain that is; 0 fixes it (default: 0.2)"
-    add("--range_bias_stddev_m", type=_not_negative, default=0.2, metavar="M", help=uncertain)
+    uncertain = "how uncertain that is; 0 fixes it (default: 0.25)"
+    add("--range_bias_stddev_m", type=_not_negative, default=0.25, metavar="M", help=uncertain)
     refused = "an anchor less certain than this in any direction is refused (default: 1)"
     add("--max_position_stddev_m", type=_positive, default=1.0, metavar="M", help=refused)
 

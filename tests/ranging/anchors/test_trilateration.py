@@ -185,8 +185,9 @@ class TestCovariance:
                 assert placement.found is not None
                 off = placement.found.position_m - anchors[int(placement.anchor_id[1])]
                 pulls.append(off / np.sqrt(np.diag(placement.found.covariance_m2)))
-        assert np.mean(np.abs(pulls) < 1.96) > 0.9
-        assert 0.6 < np.sqrt(np.mean(np.square(pulls))) < 1.2
+        # Of 95 %, three standard errors of twelve radios with twelve coordinates that err together.
+        assert np.mean(np.abs(pulls) < 1.96) > 0.86
+        assert 0.7 < np.sqrt(np.mean(np.square(pulls))) < 1.3
 
     @pytest.mark.parametrize("draw", ["noise", "heteroscedastic", "bias"])
     def test_of_a_radio_better_than_others_is_not_too_small(self, draw: str) -> None:

@@ -46,13 +46,13 @@ class TrilaterationOptions:
     Attributes:
         range_stddev_m: noise of the ranges that do not say theirs; None: estimated from the residuals.
         range_bias_m: prior mean of what the ranges read too long.
-        range_bias_stddev_m: stddev of that prior; 0: exactly known.
+        range_bias_stddev_m: stddev of that prior, by default over the radios of ``components.py``; 0: exactly known.
         max_position_stddev_m: an anchor less certain than this in any direction is refused.
     """
 
     range_stddev_m: float | None = None
     range_bias_m: float = 0.0
-    range_bias_stddev_m: float = 0.2
+    range_bias_stddev_m: float = 0.25
     max_position_stddev_m: float = 1.0
 
 
@@ -172,6 +172,11 @@ class _Found:
     @property
     def x(self) -> Array:
         return self.fit.x
+
+    def judged_by(self, inflation: float) -> PointProblem:
+        """The problem with costs in which errors that go together count for what they are."""
+        problem = self.problem
+        return replace(problem, stddev_m=inflation * problem.stddev_m, prior=problem.prior / self.inflation)
 
 
 def trilaterate(
@@ -319,12 +324,14 @@ def _with_weak_direction(found: _Found, sandwich: Array, formal: Array) -> Array
 def _profile_stddev(found: _Found, along: Array, inflation: float) -> float:
     """How far the point moves ``along`` (4,) until the cost, all else adapted, has risen by that of one stddev."""
     num = len(found.problem.range_m)
-    part = found.problem.subset(np.linspace(0, num - 1, min(num, _MAX_RANGES_OF_PROFILE)).astype(np.int64))
+    rows = np.linspace(0, num - 1, min(num, _MAX_RANGES_OF_PROFILE)).astype(np.int64)
+    part = found.judged_by(inflation).subset(rows)
     hold = np.vstack([part.prior, _HOLD * np.sqrt(np.sum(part.stddev_m**-2)) * along])
-    allowed = part.cost(found.x) + 0.5 * inflation**2 * len(part.range_m) / num
+    best = improve(part, found.x)
+    allowed = part.cost(best) + 0.5 * len(rows) / num
 
     def is_far(step: float) -> bool:
-        moved = found.x + step * along
+        moved = best + step * along
         held = replace(part, prior_mean=np.append(moved[:3], part.prior_mean[3]), prior=hold)
         return held.cost(improve(held, moved)) > allowed
 
@@ -370,7 +377,7 @@ def _gap(found: _Found, mirror: Array) -> float:
     """
     problem = found.problem
     inflation = found.errors.inflation(found.fit, problem.residuals_m(mirror) - found.fit.residuals_m)
-    judged = replace(problem, stddev_m=inflation * problem.stddev_m, prior=problem.prior / found.inflation)
+    judged = found.judged_by(inflation)
     return judged.cost(mirror, GEMAN_MCCLURE) - judged.cost(found.x, GEMAN_MCCLURE)
 
 
