@@ -73,7 +73,7 @@ def test_anchors_are_found_and_written(
     for anchor in read_anchors("anchors.csv"):
         assert anchor.position_m is not None
         assert np.linalg.norm(anchor.position_m - ANCHORS_M[anchor.anchor_id]) < 0.08
-        assert 0 < anchor.position_stddev_m < 0.1
+        assert 0 < anchor.position_stddev_m < 0.2  # what radios get wrong by direction may hide in the place
         assert anchor.range_bias_stddev_m is not None
         assert f"\n{anchor.anchor_id}    " in text
     assert "written to anchors.csv" in text
@@ -131,6 +131,15 @@ class TestPlacesInAPlane:
             assert position is not None
             np.testing.assert_allclose(position, [*ANCHORS_M[anchor_id][:2], heights[anchor_id]], atol=0.01)
 
+    @pytest.mark.parametrize("height", ["A1=4.5,A2=-1.5", "4.5,A2=-1.5"])
+    def test_a_known_height_leaves_one_place(self, height: str, folder: Path) -> None:
+        write_flat(folder)
+        flags = ("--positions", "places.csv", "--height", height, "--output_path", "a.csv")
+        assert main(["trilaterate", "uwb_places.csv", *flags]) == 0
+        for anchor_id, position in positions_in(folder / "a.csv").items():
+            assert position is not None
+            np.testing.assert_allclose(position, ANCHORS_M[anchor_id], atol=0.01)
+
 
 def test_an_anchor_that_is_not_determined_is_told_beside_the_others(
     folder: Path, capsys: pytest.CaptureFixture[str]
@@ -162,6 +171,9 @@ class TestRefusal:
             (("--tag_in_cam", "0.1,0,0"), "a lever arm needs the rotations"),
             (("--side", "left"), "'left' is no side, expected one of above, below"),
             (("--side", "A7=above"), "--side: anchor 'A7' is not in the log (A1, A2)"),
+            (("--height", "high"), "'high' is not a height in metres"),
+            (("--height", "A1=inf"), "'inf' is not a height in metres"),
+            (("--height", "A7=1"), "--height: anchor 'A7' is not in the log (A1, A2)"),
             (("--tag_id", "T"), "tag 'T' is not in the log"),
             (("--range_stddev_m", "0"), "'0' is not a length in metres, expected more than 0"),
             (("--range_bias_stddev_m", "-1"), "'-1' is not a length in metres, expected 0 or more"),

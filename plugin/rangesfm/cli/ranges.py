@@ -6,7 +6,7 @@ import argparse
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from rangesfm.cli.arguments import Commands, Outcome, Parser
 from rangesfm.cli.survey_flags import add_flags, position, survey_from_arguments
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from rangesfm.ranging.errors.calibration import Calibration
     from rangesfm.ranging.log import RangeLog
     from rangesfm.ranging.summary import AnchorSummary, PairSummary, RangeSummary
+
+_Value = TypeVar("_Value")
 
 # As of the times in a survey file.
 _MAX_TIME_S = 1e10
@@ -110,22 +112,45 @@ def _add_estimate_arguments(parser: Parser) -> None:
         metavar="WORD|ID=WORD,..",
         help=f"of two possible places the one that lies {', '.join(_TOWARD)}; for all anchors or for each",
     )
+    parser.add_argument(
+        "--height",
+        type=_heights,
+        default={},
+        metavar="M|ID=M,..",
+        help="z of all anchors or of each, where it is known: then the positions may lie in a level plane",
+    )
     add = parser.add_argument_group("estimate").add_argument
     add("--range_stddev_m", type=_positive, metavar="M", help="noise of a range (default: estimated)")
     add("--range_bias_m", type=float, default=0.0, metavar="M", help="what ranges read too long")
-    uncertain = "how uncertain that is; 0 fixes it (default: 0.1)"
-    add("--range_bias_stddev_m", type=_not_negative, default=0.1, metavar="M", help=uncertain)
+    uncertain = "how uncertain that is; 0 fixes it (default: 0.25)"
+    add("--range_bias_stddev_m", type=_not_negative, default=0.25, metavar="M", help=uncertain)
     refused = "an anchor less certain than this in any direction is refused (default: 1)"
     add("--max_position_stddev_m", type=_positive, default=1.0, metavar="M", help=refused)
 
 
-def _side(text: str) -> dict[str, str]:
+def _by_anchor(text: str) -> dict[str, str]:
     """Words by anchor; by the empty id the word for all others."""
-    pairs = [part.strip().rpartition("=") for part in text.split(",")]
-    for _, _, word in pairs:
+    return {anchor_id: word for anchor_id, _, word in (part.strip().rpartition("=") for part in text.split(","))}
+
+
+def _side(text: str) -> dict[str, Sequence[float]]:
+    sides = _by_anchor(text)
+    for word in sides.values():
         if word not in _TOWARD:
             raise argparse.ArgumentTypeError(f"'{word}' is no side, expected one of {', '.join(_TOWARD)}")
-    return {anchor_id: word for anchor_id, _, word in pairs}
+    return {anchor_id: _TOWARD[word] for anchor_id, word in sides.items()}
+
+
+def _heights(text: str) -> dict[str, float]:
+    heights = {}
+    for anchor_id, word in _by_anchor(text).items():
+        try:
+            heights[anchor_id] = float(word)
+        except ValueError:
+            heights[anchor_id] = math.nan
+        if not math.isfinite(heights[anchor_id]):
+            raise argparse.ArgumentTypeError(f"'{word}' is not a height in metres")
+    return heights
 
 
 def _positive(text: str) -> float:
@@ -298,7 +323,8 @@ def _calibrated(calibration: Calibration, num_in_log: int) -> list[str]:
 
 def _trilaterate(args: argparse.Namespace, progress: Progress) -> Outcome:
     """Find where anchors stand from ranges that were taken at known positions of the tag, robustly. If these lie in a
-    plane, an anchor has two possible places, one on each side: --side says which.
+    plane, an anchor has two possible places, one on each side: --side says which. Where --height says how high it
+    stands, only x and y are sought, and positions in a level plane do.
 
     example:
       rangesfm trilaterate uwb.csv --positions total_station.csv --side above --output_path anchors.csv
@@ -315,7 +341,13 @@ def _trilaterate(args: argparse.Namespace, progress: Progress) -> Outcome:
         range_bias_stddev_m=args.range_bias_stddev_m,
         max_position_stddev_m=args.max_position_stddev_m,
     )
-    placements = trilaterate_anchors(log, tags_m, toward=_toward(args.side, log), options=options)
+    placements = trilaterate_anchors(
+        log,
+        tags_m,
+        toward=_of_anchors("--side", args.side, log),
+        height_m=_of_anchors("--height", args.height, log),
+        options=options,
+    )
     if all(placement.found is None for placement in placements):
         raise GeometryError(f"anchor {placements[0].anchor_id}: {placements[0].why_not}")
     lines = [*_notes_of(log), *_placed(log, placements)]
@@ -325,12 +357,13 @@ def _trilaterate(args: argparse.Namespace, progress: Progress) -> Outcome:
     return Outcome(lines)
 
 
-def _toward(side: dict[str, str], log: RangeLog) -> dict[str, Sequence[float]]:
-    for anchor_id in side:
+def _of_anchors(flag: str, given: dict[str, _Value], log: RangeLog) -> dict[str, _Value]:
+    """What was given for each anchor of the log, or for all others by the empty id."""
+    for anchor_id in given:
         if anchor_id and anchor_id not in log.anchor_ids:
-            raise InputError(f"--side: anchor '{anchor_id}' is not in the log ({', '.join(log.anchor_ids)})")
-    words = {anchor_id: side.get(anchor_id, side.get("")) for anchor_id in log.anchor_ids}
-    return {anchor_id: _TOWARD[word] for anchor_id, word in words.items() if word is not None}
+            raise InputError(f"{flag}: anchor '{anchor_id}' is not in the log ({', '.join(log.anchor_ids)})")
+    names = {anchor_id: anchor_id if anchor_id in given else "" for anchor_id in log.anchor_ids}
+    return {anchor_id: given[name] for anchor_id, name in names.items() if name in given}
 
 
 def _placed(log: RangeLog, placements: Sequence[AnchorPlacement]) -> list[str]:
@@ -350,7 +383,7 @@ def _placed(log: RangeLog, placements: Sequence[AnchorPlacement]) -> list[str]:
         notes.append("")
         if found.mirror_position_m is not None:
             rows.append(("", "", "or", *map(_number, found.mirror_position_m), "", "", ""))
-            notes.append("  (the tag's positions lie in a plane: say which by --side)")
+            notes.append("  (on the other side of the tag's positions: say which by --side)")
     num_known = sum(placement.num_ranges for placement in placements)
     return [
         f"{num_known} of {len(log)} ranges are at known positions of the tag",

@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from rangesfm.arrays import Array, Indices
-from rangesfm.ranging.errors.cells import Cells, cells
+from rangesfm.arrays import Array
+from rangesfm.ranging.errors.cells import Cells, cells, noisiness
 from rangesfm.ranging.errors.learned import LearnedErrors, learn_errors
-from rangesfm.ranging.errors.noise import robust_stddev
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.estimate import ScaleUncertainty
 from rangesfm.scale.problem import ScaleProblem
@@ -26,9 +25,6 @@ from rangesfm.scale.range_equation import (
 )
 from rangesfm.scale.solution import Solution
 
-_MIN_NOISINESS, _MAX_NOISINESS = 0.5, 3.0
-# Of fewer ranges of an anchor its noise is a guess.
-_MIN_NUM_OF_ANCHOR = 20
 # Where ranges have no times: a path of so many metres is walked in a second.
 _WALKING_M_PER_S = 1.0
 
@@ -76,7 +72,7 @@ def _cells(posed: ScaleProblem, solution: Solution, observations: RangeObservati
         by.by_tag * by.distance_m[:, None],
         np.swapaxes(world_from_cam, 1, 2),
         solution.fit.weights,
-        _noisiness(problem.anchor_index, solution.fit.residuals_m, problem.num_anchors),
+        noisiness(problem.anchor_index, solution.fit.residuals_m, problem.num_anchors),
     )
 
 
@@ -87,20 +83,6 @@ def _times(posed: ScaleProblem, problem: RangeProblem, state: RangeState, observ
     _, first, of_range = np.unique(observations.before[posed.rows], return_index=True, return_inverse=True)
     steps_m = np.linalg.norm(np.diff(state.metric_from_model.scale * problem.centers[first], axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps_m)])[of_range] / _WALKING_M_PER_S
-
-
-def _noisiness(anchor_index: Indices, residuals_m: Array, num_anchors: int) -> Array:
-    """(m,) scatter of each anchor's ranges over that of all."""
-    scatter = np.full(num_anchors, np.nan)
-    for k in range(num_anchors):
-        own = residuals_m[anchor_index == k]
-        if len(own) >= _MIN_NUM_OF_ANCHOR:
-            scatter[k] = robust_stddev(own - np.median(own))
-    if np.isnan(scatter).all():
-        return np.ones(num_anchors)
-    relative = scatter / np.sqrt(np.nanmedian(scatter**2))
-    noisiness: Array = np.clip(np.nan_to_num(relative, nan=1.0), _MIN_NOISINESS, _MAX_NOISINESS)
-    return noisiness
 
 
 def scale_uncertainty(solution: Solution, learned: LearnedErrors) -> ScaleUncertainty:

@@ -1,4 +1,4 @@
-"""All anchors of a log, each placed on its own by ranges taken at known positions of the tag."""
+"""All anchors of a log, placed by ranges taken at known positions of the tag."""
 
 from __future__ import annotations
 
@@ -10,8 +10,12 @@ import numpy.typing as npt
 
 from rangesfm.errors import GeometryError
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.anchors.trilateration import Trilateration, TrilaterationOptions, trilaterate
-from rangesfm.ranging.errors.noise import shared_stddev
+from rangesfm.ranging.anchors.trilateration import (
+    AnchorRanges,
+    Trilateration,
+    TrilaterationOptions,
+    trilaterate_together,
+)
 from rangesfm.ranging.log import RangeLog
 
 
@@ -47,43 +51,39 @@ def trilaterate_anchors(
     tag_positions_m: npt.NDArray[np.float64],
     *,
     toward: Mapping[str, Sequence[float]] | None = None,
+    height_m: Mapping[str, float] | None = None,
     options: TrilaterationOptions | None = None,
 ) -> tuple[AnchorPlacement, ...]:
-    """Place every anchor of a log.
+    """Place every anchor of a log; what the ranges get wrong is learnt from all of them together.
 
     Args:
         log: n ranges.
         tag_positions_m: (n, 3) where the tag was at each; NaN where unknown (see ``tag_positions``).
         toward: by anchor, the direction in which it lies of two places that fit alike (see ``trilaterate``).
+        height_m: by anchor, its z where that is known.
 
     Returns:
         one placement for each anchor, in the order of the log.
     """
     known = np.isfinite(tag_positions_m).all(axis=1)
-    return tuple(
-        _place(log, anchor_id, np.flatnonzero(known & (log.anchor_index == k)), tag_positions_m, toward, options)
-        for k, anchor_id in enumerate(log.anchor_ids)
-    )
-
-
-def _place(
-    log: RangeLog,
-    anchor_id: str,
-    rows: npt.NDArray[np.int64],
-    tag_positions_m: npt.NDArray[np.float64],
-    toward: Mapping[str, Sequence[float]] | None,
-    options: TrilaterationOptions | None,
-) -> AnchorPlacement:
-    try:
-        found = trilaterate(
-            tag_positions_m[rows],
-            log.range_m[rows],
-            range_stddev_m=log.range_stddev_m[rows],
-            shared_stddev_m=shared_stddev(log)[rows],
-            timestamp_s=None if log.timestamp_s is None else log.timestamp_s[rows],
-            toward=None if toward is None else toward.get(anchor_id),
-            options=options,
+    rows = [np.flatnonzero(known & (log.anchor_index == k)) for k in range(len(log.anchor_ids))]
+    anchors = [
+        AnchorRanges(
+            tag_positions_m[own],
+            log.range_m[own],
+            range_stddev_m=log.range_stddev_m[own],
+            shared_stddev_m=None if log.shared_stddev_m is None else log.shared_stddev_m[own],
+            timestamp_s=None if log.timestamp_s is None else log.timestamp_s[own],
+            tag_index=log.tag_index[own],
+            toward=None if toward is None or anchor_id not in toward else np.asarray(toward[anchor_id], np.float64),
+            height_m=None if height_m is None else height_m.get(anchor_id),
         )
-    except GeometryError as error:
-        return AnchorPlacement(anchor_id, len(rows), None, str(error))
-    return AnchorPlacement(anchor_id, len(rows), found, None)
+        for anchor_id, own in zip(log.anchor_ids, rows, strict=True)
+    ]
+    results = trilaterate_together(anchors, options or TrilaterationOptions())
+    return tuple(
+        AnchorPlacement(anchor_id, len(own), None, str(found))
+        if isinstance(found, GeometryError)
+        else AnchorPlacement(anchor_id, len(own), found, None)
+        for anchor_id, own, found in zip(log.anchor_ids, rows, results, strict=True)
+    )

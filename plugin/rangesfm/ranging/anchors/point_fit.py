@@ -27,6 +27,12 @@ _NUM_DIRECTIONS = 20
 _WIDTHS = (30.0, 10.0, 3.0, 1.0, 0.3)
 _NEARLY_CONVERGED = 1e-5
 _DISTINCT_M = 0.01
+_NUM_UNKNOWNS = 4
+_NUM_NOISE_ROUNDS = 4
+# What the noise is taken for before residuals say so, and the number of ranges that this counts as.
+_USUAL_NOISE_M = 0.1
+_USUAL_NOISE_COUNTS = 2.0
+_MIN_ORDINARY = 0.3
 
 
 @dataclass(frozen=True)
@@ -59,10 +65,14 @@ class PointProblem:
         residuals: Array = self._gradient(x).distance_m + x[3] - self.range_m
         return residuals
 
+    def slopes(self, x: Array) -> Array:
+        """(n, 4) derivatives of the residuals in metres."""
+        by_anchor = self._gradient(x).by_anchor
+        return np.column_stack([by_anchor, np.ones(len(by_anchor))])
+
     def jacobian(self, x: Array) -> Array:
         """(n, 4) derivatives of the residuals in stddevs."""
-        by_anchor = self._gradient(x).by_anchor
-        jacobian: Array = np.column_stack([by_anchor, np.ones(len(by_anchor))]) / self.stddev_m[:, None]
+        jacobian: Array = self.slopes(x) / self.stddev_m[:, None]
         return jacobian
 
     def _gradient(self, x: Array) -> RangeGradient:
@@ -72,6 +82,63 @@ class PointProblem:
         """Half the robust sum of squares, the prior included."""
         rho = loss.rho((self.residuals_m(x) / self.stddev_m) ** 2)[0]
         return float(np.sum(rho) + np.sum((self.prior @ (x - self.prior_mean)) ** 2)) / 2
+
+
+@dataclass(frozen=True)
+class PointFit:
+    """An estimate with its own noise.
+
+    Attributes:
+        problem: with the final stddevs.
+        x: (4,) position and bias.
+        own_stddev_m: (n,) noise of each range, without what it shares with others.
+    """
+
+    problem: PointProblem
+    x: Array
+    own_stddev_m: Array
+
+    @property
+    def noise_m(self) -> float:
+        """Of a range away from all special cases."""
+        return float(np.median(self.own_stddev_m))
+
+    @property
+    def residuals_m(self) -> Array:
+        return self.problem.residuals_m(self.x)
+
+    @property
+    def weights(self) -> Array:
+        """(n,) of the robust loss."""
+        return CAUCHY.weights(self.residuals_m / self.problem.stddev_m)
+
+
+def fit_with_own_noise(problem: PointProblem, given_m: Array) -> PointFit:
+    """The best fit; the noise is that of its residuals, and never less than what was given.
+
+    Args:
+        problem: of its stddevs only the shared ones are looked at.
+        given_m: (n,) noise of each range, NaN where it is to be found.
+    """
+    is_given = np.isfinite(given_m)
+    unit = np.where(is_given, given_m, np.median(given_m[is_given]) if is_given.any() else _USUAL_NOISE_M)
+    x, noise = best_start(problem, unit)
+    for _ in range(_NUM_NOISE_ROUNDS):
+        noise = max(noise, 1.0) if is_given.all() else noise
+        now = replace(problem, stddev_m=np.hypot(noise * unit, problem.shared_stddev_m))
+        fit = PointFit(now, improve(now, x), noise * unit)
+        x = fit.x
+        ordinary = problem.shared_stddev_m < noise * unit
+        rows = ordinary if np.mean(ordinary) > _MIN_ORDINARY else np.ones(len(unit), dtype=np.bool_)
+        noise = _noise_of(fit.residuals_m[rows] / unit[rows])
+    return fit
+
+
+def _noise_of(scaled: Array) -> float:
+    """Stddev of residuals in units, drawn to what is usual where there are few; four of them went into the fit."""
+    freedom = max(len(scaled) - _NUM_UNKNOWNS, 0)
+    found = inlier_noise(scaled).stddev ** 2 * len(scaled)
+    return float(np.sqrt((found + _USUAL_NOISE_COUNTS) / (freedom + _USUAL_NOISE_COUNTS)))
 
 
 def improve(problem: PointProblem, x: Array, tolerance: float = _CONVERGED) -> Array:

@@ -1,44 +1,42 @@
-"""Trilateration: where an anchor stands, from ranges taken at known positions of the tag.
+"""Trilateration: where anchors stand, from ranges taken at known positions of the tag.
 
-The first step of Lee, Zhu, Giorgi and Günther (2018), made robust and honest about its error.
+The first step of Lee, Zhu, Giorgi and Günther (2018), made robust and honest about its error: every anchor is found on
+its own, and what ranges get wrong is learnt from those of all anchors together.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import PathShape, oriented, path_shape
-from rangesfm.ranging.anchors.point_fit import PointProblem, best_start, improve
-from rangesfm.ranging.errors.inlier_noise import inlier_noise
-from rangesfm.ranging.errors.noise import correlation_inflation, inflation_before_fit, short_range_stddev
-from rangesfm.ranging.errors.robust_loss import CAUCHY, GEMAN_MCCLURE, SAME_COST
+from rangesfm.ranging.anchors.fit_errors import FitErrors, errors_of_fits
+from rangesfm.ranging.anchors.point_fit import PointFit, PointProblem, fit_with_own_noise, improve
+from rangesfm.ranging.errors.noise import short_range_stddev
+from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE, SAME_COST
 
 # Three numbers, and one range more to see that they fit.
 MIN_NUM_RANGES = 4
-_NUM_NOISE_ROUNDS = 4
-# What the noise is taken for before residuals say so, and the number of ranges that this counts as.
-_USUAL_NOISE_M = 0.1
-_USUAL_NOISE_COUNTS = 2.0
-_MIN_ORDINARY = 0.3
 # Half of 3 stddevs squared: a rival this close in cost is not ruled out.
 _MIN_COST_GAP = 4.5
-_MIN_CURVATURE = 0.2
 # Formal stddevs beyond this share of the distance are checked against the cost itself.
-_NONLINEAR = 0.02
+_NONLINEAR = 0.05
 _PROFILE_STEPS_M = np.geomspace(0.01, 100.0, 41)
 _HOLD = 100.0
 _MAX_RANGES_OF_PROFILE = 2000
 _NEARLY_STRAIGHT = 0.1
 _ACROSS = 0.9
-_MIN_BLOCKS = 16
-_NUM_UNKNOWNS = 4
 # Sine of the angle between a plane and a direction that is along it, but for rounding.
 _ALONG_PLANE = 1e-6
+# Of a height that is known.
+_HEIGHT_STDDEV_M = 0.01
+# A bias that is known is held by a prior far stronger than any ranges.
+_KNOWN_BIAS_STDDEV_M = 1e-6
 
 
 @dataclass(frozen=True)
@@ -48,16 +46,14 @@ class TrilaterationOptions:
     Attributes:
         range_stddev_m: noise of the ranges that do not say theirs; None: estimated from the residuals.
         range_bias_m: prior mean of what the ranges read too long.
-        range_bias_stddev_m: stddev of that prior; 0: exactly known.
+        range_bias_stddev_m: stddev of that prior, by default over the radios of ``components.py``; 0: exactly known.
         max_position_stddev_m: an anchor less certain than this in any direction is refused.
-        block_s: errors of ranges closer in time than this are taken to go together, if times are given.
     """
 
     range_stddev_m: float | None = None
     range_bias_m: float = 0.0
-    range_bias_stddev_m: float = 0.1
+    range_bias_stddev_m: float = 0.25
     max_position_stddev_m: float = 1.0
-    block_s: float = 10.0
 
 
 @dataclass(frozen=True)
@@ -90,28 +86,97 @@ class Trilateration:
 
 
 @dataclass(frozen=True)
-class _Fit:
-    """An estimate with its own noise.
+class AnchorRanges:
+    """n ranges of one anchor to known positions of the tag.
 
     Attributes:
-        problem: with the final stddevs.
-        x: (4,) position and bias.
-        noise_m: of a range away from all special cases.
-        inflation: of every stddev, by errors that go together.
+        tag_positions_m: (n, 3) positions of the tag's antenna.
+        range_m: (n,) measured distances.
+        range_stddev_m: (n,) noise of each, NaN where unknown; or None.
+        shared_stddev_m: (n,) what ranges of about this length may be off together, by the radio's error curve;
+            None: without one, short ranges weigh less.
+        timestamp_s: (n,) when they were taken; None: in their order.
+        tag_index: (n,) by which tag; None: all by the same.
+        toward: (3,) direction in which the anchor lies, seen from its mirror image; or None.
+        height_m: its z, if that is known.
     """
 
-    problem: PointProblem
-    x: Array
-    noise_m: float
+    tag_positions_m: Array
+    range_m: Array
+    range_stddev_m: Array | None = None
+    shared_stddev_m: Array | None = None
+    timestamp_s: Array | None = None
+    tag_index: Indices | None = None
+    toward: Array | None = None
+    height_m: float | None = None
+
+    @property
+    def times_s(self) -> Array:
+        """(n,); where there are none, of a tag that moves at a walking pace of 1 m/s."""
+        if self.timestamp_s is not None:
+            return self.timestamp_s
+        steps_m = np.linalg.norm(np.diff(self.tag_positions_m, axis=0), axis=1)
+        return np.concatenate([[0.0], np.cumsum(steps_m)])
+
+    @property
+    def shape(self) -> PathShape:
+        """Of the tag's positions about their mean; of a level one where the height is known: only that counts."""
+        centred = self.tag_positions_m - self.tag_positions_m.mean(axis=0)
+        return path_shape(centred if self.height_m is None else centred * [1.0, 1.0, 0.0])
+
+    def fit(self, options: TrilaterationOptions) -> PointFit:
+        """The most likely place, as if the ranges erred independently.
+
+        Raises:
+            GeometryError: too few ranges.
+        """
+        num = len(self.range_m)
+        if num < MIN_NUM_RANGES:
+            raise GeometryError(f"{num} ranges at known positions of the tag, {MIN_NUM_RANGES} are needed")
+        middle = self.tag_positions_m.mean(axis=0)
+        mean = np.array([0.0, 0.0, 0.0, options.range_bias_m])
+        prior = np.array([[0.0, 0.0, 0.0, 1 / max(options.range_bias_stddev_m, _KNOWN_BIAS_STDDEV_M)]])
+        if self.height_m is not None:
+            mean[2] = self.height_m - middle[2]
+            prior = np.vstack([prior, [0.0, 0.0, 1 / _HEIGHT_STDDEV_M, 0.0]])
+        shared = short_range_stddev(self.range_m) if self.shared_stddev_m is None else self.shared_stddev_m
+        problem = PointProblem(self.tag_positions_m - middle, self.range_m, np.ones(num), shared, mean, prior)
+        given = np.full(num, np.nan) if self.range_stddev_m is None else self.range_stddev_m
+        return fit_with_own_noise(problem, np.where(np.isfinite(given), given, options.range_stddev_m or np.nan))
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A fit and how wrong it may be.
+
+    Attributes:
+        fit: its prior holds by as much more as errors that go together take from the ranges.
+        errors: of its ranges.
+        inflation: of the bias, by errors that go together.
+    """
+
+    fit: PointFit
+    errors: FitErrors
     inflation: float
 
-    @property
-    def residuals_m(self) -> Array:
-        return self.problem.residuals_m(self.x)
+    @classmethod
+    def of(cls, fit: PointFit, errors: FitErrors) -> _Found:
+        inflation = errors.inflation_of_bias(fit)
+        problem = replace(fit.problem, prior=fit.problem.prior * inflation)
+        return cls(replace(fit, problem=problem, x=improve(problem, fit.x)), errors, inflation)
 
     @property
-    def scaled_residuals(self) -> Array:
-        return self.residuals_m / self.problem.stddev_m
+    def problem(self) -> PointProblem:
+        return self.fit.problem
+
+    @property
+    def x(self) -> Array:
+        return self.fit.x
+
+    def judged_by(self, inflation: float) -> PointProblem:
+        """The problem with costs in which errors that go together count for what they are."""
+        problem = self.problem
+        return replace(problem, stddev_m=inflation * problem.stddev_m, prior=problem.prior / self.inflation)
 
 
 def trilaterate(
@@ -122,134 +187,115 @@ def trilaterate(
     shared_stddev_m: npt.ArrayLike | None = None,
     timestamp_s: npt.ArrayLike | None = None,
     toward: npt.ArrayLike | None = None,
+    height_m: float | None = None,
     options: TrilaterationOptions | None = None,
 ) -> Trilateration:
     """Find an anchor from its ranges to known positions of the tag.
 
     Up to about half of the ranges may be wrong by any amount. If the positions lie in a plane, the anchor's
     mirror image in it fits as well: then both are returned, unless ``toward`` says which it is; the upper one first if
-    no range tells.
+    no range tells. Where the height is known, the same goes for positions that lie on a line, seen from above.
 
     Args:
-        tag_positions_m: (n, 3) positions of the tag's antenna, metres.
-        range_m: (n,) measured distances.
-        range_stddev_m: (n,) noise of each range, NaN where unknown; or None.
-        shared_stddev_m: (n,) what ranges of about this length may be off together, by the radio's error curve;
-            None: without one, short ranges weigh less.
-        timestamp_s: (n,) when they were taken, so that errors that last count for what they are; or None.
-        toward: (3,) direction in which the anchor lies, seen from its mirror image; or None.
+        tag_positions_m, range_m, range_stddev_m, shared_stddev_m, timestamp_s, toward, height_m: as in
+            ``AnchorRanges``.
 
     Raises:
         GeometryError: too few ranges, positions on a line or all close together, or else an anchor less
             certain than ``options.max_position_stddev_m``.
     """
-    options = options or TrilaterationOptions()
-    positions, ranges = np.asarray(tag_positions_m, dtype=np.float64), np.asarray(range_m, dtype=np.float64)
-    if len(ranges) < MIN_NUM_RANGES:
-        raise GeometryError(f"{len(ranges)} ranges at known positions of the tag, {MIN_NUM_RANGES} are needed")
-    # A bias that is known is held by a prior far stronger than any ranges.
-    bias_stddev_m = max(options.range_bias_stddev_m, 1e-6)
-    middle = positions.mean(axis=0)
-    problem = PointProblem(
-        positions - middle,
-        ranges,
-        np.full(len(ranges), _USUAL_NOISE_M),
-        short_range_stddev(ranges) if shared_stddev_m is None else np.asarray(shared_stddev_m, dtype=np.float64),
-        np.array([0.0, 0.0, 0.0, options.range_bias_m]),
-        np.array([[0.0, 0.0, 0.0, 1 / bias_stddev_m]]),
+
+    def array(values: npt.ArrayLike | None) -> Array | None:
+        return None if values is None else np.asarray(values, dtype=np.float64)
+
+    ranges = AnchorRanges(
+        np.asarray(tag_positions_m, dtype=np.float64),
+        np.asarray(range_m, dtype=np.float64),
+        range_stddev_m=array(range_stddev_m),
+        shared_stddev_m=array(shared_stddev_m),
+        timestamp_s=array(timestamp_s),
+        toward=array(toward),
+        height_m=height_m,
     )
-    fit = _fit_with_own_noise(problem, range_stddev_m, _groups(timestamp_s, options.block_s), options)
-    covariance, shape = _covariance(fit), path_shape(problem.positions_m)
+    (found,) = trilaterate_together([ranges], options or TrilaterationOptions())
+    if isinstance(found, GeometryError):
+        raise found
+    return found
+
+
+def trilaterate_together(
+    anchors: Sequence[AnchorRanges], options: TrilaterationOptions
+) -> list[Trilateration | GeometryError]:
+    """Find anchors of one radio, whose ranges err alike; of each the reason instead if it is not determined."""
+    fits: dict[int, PointFit] = {}
+    results: dict[int, Trilateration | GeometryError] = {}
+    for k, anchor in enumerate(anchors):
+        try:
+            fits[k] = anchor.fit(options)
+        except GeometryError as error:
+            results[k] = error
+    errors = _errors([anchors[k] for k in fits], list(fits.values()))
+    for (k, fit), of_fit in zip(fits.items(), errors, strict=True):
+        try:
+            results[k] = _conclude(anchors[k], _Found.of(fit, of_fit), options)
+        except GeometryError as error:
+            results[k] = error
+    return [results[k] for k in range(len(anchors))]
+
+
+def _errors(anchors: Sequence[AnchorRanges], fits: Sequence[PointFit]) -> list[FitErrors]:
+    if not fits:
+        return []
+    tags = [
+        np.zeros(len(anchor.range_m), dtype=np.int64) if anchor.tag_index is None else anchor.tag_index
+        for anchor in anchors
+    ]
+    is_calibrated = all(anchor.shared_stddev_m is not None for anchor in anchors)
+    return errors_of_fits(fits, [anchor.times_s for anchor in anchors], tags, is_calibrated=is_calibrated)
+
+
+def _conclude(anchor: AnchorRanges, found: _Found, options: TrilaterationOptions) -> Trilateration:
+    covariance, shape = _covariance(found), anchor.shape
     _refuse_uncertain(covariance, shape, options)
-    mirror = _mirror(fit, covariance, shape)
+    # Between two places of one height lies an upright plane.
+    level = np.cross([0.0, 0.0, 1.0], shape.axes[:, 0])
+    across = shape.axes[:, 2] if anchor.height_m is None else oriented(level[:, None])[:, 0]
+    mirror = _mirror(found, covariance, shape.centroid, across)
     if mirror is not None:
-        across = (mirror - fit.x)[:3]
-        told = None if toward is None else _unless_along_plane(np.asarray(toward, dtype=np.float64), across)
+        apart = (mirror - found.x)[:3]
+        told = None if anchor.toward is None else _unless_along_plane(anchor.toward, apart)
         # Where no range tells the two apart, rounding would choose.
-        is_free = told is not None or abs(_gap(fit, mirror)) < SAME_COST
-        if is_free and across @ (shape.axes[:, 2] if told is None else told) > 0:
-            fit, mirror = replace(fit, x=mirror), fit.x
-            covariance = _covariance(fit)
+        is_free = told is not None or abs(_gap(found, mirror)) < SAME_COST
+        if is_free and apart @ (across if told is None else told) > 0:
+            found, mirror = replace(found, fit=replace(found.fit, x=mirror)), found.x
+            covariance = _covariance(found)
         mirror = mirror if told is None else None
+    middle = anchor.tag_positions_m.mean(axis=0)
     return Trilateration(
-        position_m=middle + fit.x[:3],
+        position_m=middle + found.x[:3],
         covariance_m2=covariance[:3, :3],
         mirror_position_m=None if mirror is None else middle + mirror[:3],
-        range_bias_m=float(fit.x[3]),
+        range_bias_m=float(found.x[3]),
         range_bias_stddev_m=float(np.sqrt(covariance[3, 3])) if options.range_bias_stddev_m > 0 else 0.0,
-        noise_stddev_m=fit.noise_m,
-        residuals_m=fit.residuals_m,
-        weights=CAUCHY.weights(fit.scaled_residuals),
+        noise_stddev_m=found.fit.noise_m,
+        residuals_m=found.fit.residuals_m,
+        weights=found.fit.weights,
     )
 
 
-def _groups(timestamp_s: npt.ArrayLike | None, block_s: float) -> npt.NDArray[np.int64] | None:
-    """(n,) labels of stretches of time, at least sixteen of them."""
-    if timestamp_s is None:
-        return None
-    since = np.asarray(timestamp_s, dtype=np.float64) - np.min(timestamp_s)
-    length = max(min(block_s, float(since.max()) / _MIN_BLOCKS), 1e-9)
-    labels: npt.NDArray[np.int64] = np.floor(since / length).astype(np.int64)
-    return labels
+def _covariance(found: _Found) -> Array:
+    """(4, 4) of position and bias: what the errors of the ranges do to the weighted least squares at the minimum.
 
-
-def _fit_with_own_noise(
-    problem: PointProblem,
-    range_stddev_m: npt.ArrayLike | None,
-    groups: npt.NDArray[np.int64] | None,
-    options: TrilaterationOptions,
-) -> _Fit:
-    """The best fit; the noise is that of its residuals, and never less than what was given."""
-    num = len(problem.range_m)
-    given = np.full(num, np.nan) if range_stddev_m is None else np.asarray(range_stddev_m, dtype=np.float64)
-    given = np.where(np.isfinite(given), given, options.range_stddev_m or np.nan)
-    is_given = np.isfinite(given)
-    unit = np.where(is_given, given, np.median(given[is_given]) if is_given.any() else _USUAL_NOISE_M)
-    x, noise = best_start(problem, unit)
-    inflation = 1.0
-    for _ in range(_NUM_NOISE_ROUNDS):
-        noise = max(noise, 1.0) if is_given.all() else noise
-        # Ranges keep their weight among themselves; the prior gains by what correlated errors cost them.
-        stddev = np.hypot(noise * unit, problem.shared_stddev_m)
-        now = replace(problem, stddev_m=stddev, prior=problem.prior * inflation)
-        fit = _Fit(now, improve(now, x), noise * float(np.median(unit)), inflation)
-        x = fit.x
-        ordinary = problem.shared_stddev_m < noise * unit
-        rows = ordinary if np.mean(ordinary) > _MIN_ORDINARY else np.ones(num, dtype=np.bool_)
-        noise = _noise_of(fit.residuals_m[rows] / unit[rows])
-        if groups is not None:
-            inflation = _inflation(fit.scaled_residuals, groups)
-    return replace(fit, inflation=inflation)
-
-
-def _inflation(scaled: Array, groups: npt.NDArray[np.int64]) -> float:
-    """Of every stddev by errors that go together."""
-    seen = correlation_inflation(scaled, CAUCHY.weights(scaled), groups)
-    return inflation_before_fit(seen, len(np.unique(groups)), _NUM_UNKNOWNS)
-
-
-def _noise_of(scaled: Array) -> float:
-    """Stddev of residuals in units, drawn to what is usual where there are few; four of them went into the fit."""
-    freedom = max(len(scaled) - _NUM_UNKNOWNS, 0)
-    found = inlier_noise(scaled).stddev ** 2 * len(scaled)
-    return float(np.sqrt((found + _USUAL_NOISE_COUNTS) / (freedom + _USUAL_NOISE_COUNTS)))
-
-
-def _covariance(fit: _Fit) -> Array:
-    """(4, 4) of position and bias, by the curvature of the cost; the weakest direction by the cost itself.
-
-    Huber and Ronchetti, "Robust Statistics" (2009), section 7.6: for M-estimates the information is that of
-    the weighted Jacobian, scaled by the loss' mean squared slope over its squared mean curvature.
+    Huber and Ronchetti, "Robust Statistics" (2009), section 6.3: the sandwich of the covariance of the gradient between
+    inverses of the information. The weakest direction by the cost itself.
     """
-    scaled, jacobian = fit.scaled_residuals, fit.problem.jacobian(fit.x)
-    weights = CAUCHY.weights(scaled)
-    curvature = max(float(np.mean(weights * (2 * weights - 1)) / np.mean(weights)), _MIN_CURVATURE)
-    slope = float(np.mean((weights * scaled) ** 2) / np.mean(weights))
-    shrinking = curvature**2 / max(slope, 1e-12) / fit.inflation**2
-    prior = fit.problem.prior / fit.inflation
-    information = (jacobian * weights[:, None]).T @ jacobian * min(shrinking, 1 / fit.inflation**2) + prior.T @ prior
-    covariance = _inverse(information)
-    return _with_weak_direction(fit, covariance)
+    problem, weights = found.problem, found.fit.weights
+    jacobian = problem.jacobian(found.x)
+    of_prior = problem.prior.T @ problem.prior
+    inverse = _inverse((jacobian * weights[:, None]).T @ jacobian + of_prior)
+    influence = inverse @ (jacobian * (weights / problem.stddev_m)[:, None]).T
+    sandwich = found.errors.of_sums(influence) + found.inflation**2 * inverse @ of_prior @ inverse
+    return _with_weak_direction(found, sandwich, inverse)
 
 
 def _inverse(information: Array) -> Array:
@@ -261,27 +307,31 @@ def _inverse(information: Array) -> Array:
     return inverse
 
 
-def _with_weak_direction(fit: _Fit, covariance: Array) -> Array:
+def _with_weak_direction(found: _Found, sandwich: Array, formal: Array) -> Array:
     """Near the plane of the tag's positions the curvature across it vanishes, but the cost rises further off."""
-    variances, axes = np.linalg.eigh(covariance[:3, :3])
-    if np.sqrt(variances[2]) < _NONLINEAR * float(np.median(fit.problem.range_m)):
-        return covariance
+    variances, axes = np.linalg.eigh(formal[:3, :3])
     along = np.append(axes[:, 2], 0.0)
     # The other numbers follow along as they do where the curvature holds.
-    tied = covariance @ along / variances[2]
-    changed: Array = covariance + (_profile_stddev(fit, along) ** 2 - variances[2]) * np.outer(tied, tied)
+    tied = formal @ along / variances[2]
+    inflation = found.errors.inflation(found.fit, found.problem.slopes(found.x) @ tied)
+    if inflation * np.sqrt(variances[2]) < _NONLINEAR * float(np.median(found.problem.range_m)):
+        return sandwich
+    rest = np.eye(4) - np.outer(tied, along)
+    changed: Array = rest @ sandwich @ rest.T + _profile_stddev(found, along, inflation) ** 2 * np.outer(tied, tied)
     return changed
 
 
-def _profile_stddev(fit: _Fit, along: Array) -> float:
+def _profile_stddev(found: _Found, along: Array, inflation: float) -> float:
     """How far the point moves ``along`` (4,) until the cost, all else adapted, has risen by that of one stddev."""
-    num = len(fit.problem.range_m)
-    part = fit.problem.subset(np.linspace(0, num - 1, min(num, _MAX_RANGES_OF_PROFILE)).astype(np.int64))
+    num = len(found.problem.range_m)
+    rows = np.linspace(0, num - 1, min(num, _MAX_RANGES_OF_PROFILE)).astype(np.int64)
+    part = found.judged_by(inflation).subset(rows)
     hold = np.vstack([part.prior, _HOLD * np.sqrt(np.sum(part.stddev_m**-2)) * along])
-    allowed = part.cost(fit.x) + 0.5 * fit.inflation**2 * len(part.range_m) / num
+    best = improve(part, found.x)
+    allowed = part.cost(best) + 0.5 * len(rows) / num
 
     def is_far(step: float) -> bool:
-        moved = fit.x + step * along
+        moved = best + step * along
         held = replace(part, prior_mean=np.append(moved[:3], part.prior_mean[3]), prior=hold)
         return held.cost(improve(held, moved)) > allowed
 
@@ -310,20 +360,25 @@ def _refuse_uncertain(covariance: Array, shape: PathShape, options: Trilateratio
     )
 
 
-def _mirror(fit: _Fit, covariance: Array, shape: PathShape) -> Array | None:
+def _mirror(found: _Found, covariance: Array, centroid: Array, across: Array) -> Array | None:
     """(4,) the place on the other side of the tag's positions, if it is another one and fits as well."""
-    normal = np.append(shape.axes[:, 2], 0.0)
-    height = float((fit.x[:3] - shape.centroid) @ shape.axes[:, 2])
-    found = improve(fit.problem, fit.x - 2 * height * normal)
-    apart = (found - fit.x)[:3]
+    height = float((found.x[:3] - centroid) @ across)
+    other = improve(found.problem, found.x - 2 * height * np.append(across, 0.0))
+    apart = (other - found.x)[:3]
     distance = float(np.linalg.norm(apart))
     stddev = float(np.sqrt(apart @ covariance[:3, :3] @ apart)) / max(distance, 1e-12)
-    return found if distance > 2 * stddev and _gap(fit, found) < _MIN_COST_GAP * fit.inflation**2 else None
+    return other if distance > 2 * stddev and _gap(found, other) < _MIN_COST_GAP else None
 
 
-def _gap(fit: _Fit, mirror: Array) -> float:
-    """How much worse the mirror image fits, by a bounded loss: outliers cost the same wherever the point is."""
-    return fit.problem.cost(mirror, GEMAN_MCCLURE) - fit.problem.cost(fit.x, GEMAN_MCCLURE)
+def _gap(found: _Found, mirror: Array) -> float:
+    """How much worse the mirror image fits, beside what errors that go together do to the difference.
+
+    By a bounded loss: outliers cost the same wherever the point is.
+    """
+    problem = found.problem
+    inflation = found.errors.inflation(found.fit, problem.residuals_m(mirror) - found.fit.residuals_m)
+    judged = found.judged_by(inflation)
+    return judged.cost(mirror, GEMAN_MCCLURE) - judged.cost(found.x, GEMAN_MCCLURE)
 
 
 def _unless_along_plane(direction: Array, across: Array) -> Array | None:

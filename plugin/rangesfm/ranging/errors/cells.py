@@ -7,11 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.ranging.errors.noise import robust_stddev
 
 # Their covariance is a full matrix, and learning it takes its inverse some twenty times.
 MAX_NUM_CELLS = 450
 _SHORTEST_S = 0.5
 _LONGER = 1.25
+_MIN_NOISINESS, _MAX_NOISINESS = 0.5, 3.0
+# Of fewer ranges of an anchor its noise is a guess.
+_MIN_NUM_OF_ANCHOR = 20
 
 
 @dataclass(frozen=True)
@@ -100,6 +104,20 @@ def cells(
         in_cam=_unit(begun.mean(np.einsum("nij,nj->ni", cam_from_world, towards))),
         noisiness=begun.noisiness,
     )
+
+
+def noisiness(anchor_index: Indices, residuals_m: Array, num_anchors: int) -> Array:
+    """(m,) scatter of each anchor's ranges over that of all."""
+    scatter = np.full(num_anchors, np.nan)
+    for k in range(num_anchors):
+        own = residuals_m[anchor_index == k]
+        if len(own) >= _MIN_NUM_OF_ANCHOR:
+            scatter[k] = robust_stddev(own - np.median(own))
+    if np.isnan(scatter).all():
+        return np.ones(num_anchors)
+    relative = scatter / np.sqrt(np.nanmedian(scatter**2))
+    clipped: Array = np.clip(np.nan_to_num(relative, nan=1.0), _MIN_NOISINESS, _MAX_NOISINESS)
+    return clipped
 
 
 def _labels(anchor_index: Indices, tag_index: Indices, since_s: Array) -> Indices:

@@ -88,15 +88,3 @@ def correlation_inflation(
     if squares <= NO_ERROR**2 * np.sum(shares) or len(sums) < 2:
         return 1.0
     return float(np.clip(np.sqrt(np.sum(sums**2) / squares), 1.0, _MAX_INFLATION))
-
-
-def inflation_before_fit(inflation: float, num_groups: int, num_fitted: float) -> float:
-    """The inflation of errors that go together, of which a fit has taken its share out of the residuals.
-
-    Args:
-        inflation: as the residuals show it.
-        num_groups: of ranges that err together.
-        num_fitted: parameters that the ranges determine.
-    """
-    excess = (inflation**2 - 1) * num_groups / max(num_groups - num_fitted, 1.0)
-    return float(np.sqrt(1 + excess))
