@@ -194,7 +194,7 @@ def _with_own_errors(posed: ScaleProblem, start: RangeState) -> Solution:
 
     def fit(errors: RangeErrors, before: RangeFit | None) -> RangeFit:
         state = start if before is None else before.state
-        return solve(_weighted(given, errors), state, loss=errors.loss)
+        return solve(weighted(given, errors), state, loss=errors.loss)
 
     fitted, used, shown = fit_with_own_errors(
         fit,
@@ -203,10 +203,10 @@ def _with_own_errors(posed: ScaleProblem, start: RangeState) -> Solution:
         max_num_rounds=_NUM_NOISE_ROUNDS,
     )
     errors = replace(used, inflation=shown.inflation)
-    return Solution(_weighted(given, used), fitted, errors, shown.noise_m)
+    return Solution(weighted(given, used), fitted, errors, shown.noise_m)
 
 
-def _weighted(problem: RangeProblem, errors: RangeErrors) -> RangeProblem:
+def weighted(problem: RangeProblem, errors: RangeErrors) -> RangeProblem:
     """The problem as set up, weighted by the errors.
 
     Correlated errors are worth fewer ranges; the ranges keep their nominal weight among themselves and the priors gain

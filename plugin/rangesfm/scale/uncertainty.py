@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.errors.cells import Cells, cells
-from rangesfm.ranging.errors.learned import LearnedErrors, learn_errors
+from rangesfm.ranging.errors.learned import LearnedErrors, learn_errors, usual_errors
 from rangesfm.ranging.errors.noise import robust_stddev
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.estimate import ScaleUncertainty
@@ -56,6 +57,27 @@ def learned_errors(
         noise_m=solution.noise_stddev_m,
         curve_stddev_m=None if taken_off is None else taken_off[posed.rows],
         ruled_out=_ruled_out(problem),
+    )
+
+
+def errors_to_expect(
+    posed: ScaleProblem,
+    solution: Solution,
+    observations: RangeObservations,
+    model_from_cam: Array,
+    stddevs: Mapping[str, float],
+) -> LearnedErrors:
+    """The same before anything is measured, as radios let expect.
+
+    Args:
+        stddevs: of components of which more is known, by name.
+    """
+    taken_off = observations.log.shared_stddev_m
+    return usual_errors(
+        _cells(posed, solution, observations, model_from_cam),
+        curve_stddev_m=None if taken_off is None else taken_off[posed.rows],
+        ruled_out=_ruled_out(solution.problem),
+        stddevs=stddevs,
     )
 
 
@@ -111,11 +133,16 @@ def scale_uncertainty(solution: Solution, learned: LearnedErrors) -> ScaleUncert
 
 def parameter_covariance(fit: RangeFit, problem: RangeProblem, learned: LearnedErrors) -> Array:
     """(p, p) of all that a fit estimates, in the parameters of its columns: what the ranges' errors do to it."""
-    influence = np.linalg.lstsq(fit.information, fit.gradients.T, rcond=1e-12)[0] / problem.stddev_m
-    of_cells = np.stack([learned.cells.total(row) for row in influence])
+    of_cells = parameter_influence(fit, problem, learned)
     of_priors = invert_information(fit.information) @ fit.prior_information @ invert_information(fit.information)
     covariance: Array = of_cells @ learned.covariance_m2 @ of_cells.T + of_priors
     return covariance
+
+
+def parameter_influence(fit: RangeFit, problem: RangeProblem, learned: LearnedErrors) -> Array:
+    """(p, c) change of all that a fit estimates for each metre by which the ranges of a cell are longer."""
+    influence = np.linalg.lstsq(fit.information, fit.gradients.T, rcond=1e-12)[0] / problem.stddev_m
+    return np.stack([learned.cells.total(row) for row in influence])
 
 
 def scale_influence(fit: RangeFit, problem: RangeProblem) -> Array:
