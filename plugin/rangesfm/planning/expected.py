@@ -9,6 +9,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.options import ScaleOptions
 from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.ranging.errors.cells import MAX_NUM_CELLS
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.noise import START_STDDEV_M
 from rangesfm.ranging.errors.place import shares_of_places
@@ -24,8 +25,8 @@ from rangesfm.scale.verdict import Verdict, judge
 from rangesfm.trust.finished_map import by_similarity
 
 _NUM_NOISE_ROUNDS = 2
-# Of a number that nothing determines, least squares say millions of metres.
-_OPEN = 1e3
+OPEN = 1e3
+"""Metres, or radians: a number this uncertain is one that nothing determines."""
 
 
 @dataclass(frozen=True)
@@ -75,11 +76,14 @@ class Expected:
 
 def _stddevs(variances: Array) -> Array:
     stddevs = np.sqrt(np.maximum(variances, 0.0))
-    return np.where(stddevs < _OPEN, stddevs, np.inf)
+    return np.where(stddevs < OPEN, stddevs, np.inf)
 
 
-def expect(planned: PlannedSurvey) -> Expected:
+def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expected:
     """Find the noise that the run will see, and with its weights what it will state.
+
+    Args:
+        max_num_cells: in which how ranges err together is computed; as a run has it, or fewer to compare plans.
 
     Raises:
         GeometryError: the run will find too few ranges on the path.
@@ -92,7 +96,7 @@ def expect(planned: PlannedSurvey) -> Expected:
     errors = posed.errors.at(tags, scale * posed.center_stddev)
     solution = _weighed(posed, errors, fit_at(weighted(posed.ranges, errors), state, num_alike))
     rotations = model_from_cam(observations, planned.trajectory, posed)
-    learned = errors_to_expect(posed, solution, observations, rotations, planned.component_stddevs)
+    learned = errors_to_expect(posed, solution, observations, rotations, planned.component_stddevs, max_num_cells)
     for _ in range(_NUM_NOISE_ROUNDS):
         errors = _as_seen(solution, learned, num_alike)
         solution = _weighed(posed, errors, fit_at(weighted(posed.ranges, errors), state, num_alike))
@@ -113,7 +117,7 @@ def _undetermined(fit: RangeFit) -> Array:
     nothing = vectors[:, values < 1e-10] / sizes[:, None]
     lengths = np.linalg.norm(nothing, axis=0)
     nothing = nothing / np.where(lengths > 0, lengths, 1.0)
-    return np.asarray(_OPEN**4 * nothing @ nothing.T)
+    return np.asarray(OPEN**4 * nothing @ nothing.T)
 
 
 def _as_seen(solution: Solution, learned: LearnedErrors, num_alike: Array) -> RangeErrors:

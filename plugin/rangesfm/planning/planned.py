@@ -36,6 +36,8 @@ class PlannedSurvey:
         curve_stddev_m: of the radio's error curve once it has been learnt; None: nobody calibrated it.
         component_stddevs: of components of the ranges' errors of which more is known, by name.
         taped: distances between points of the map: pairs of a length and its stddev, metres.
+        heights_m: between which anchors may stand; None: not below the ground, which is 0 or the lowest of all.
+        path_is_level: the camera cannot go up and down, as on a rover.
     """
 
     trajectory: Trajectory
@@ -47,11 +49,18 @@ class PlannedSurvey:
     curve_stddev_m: float | None = None
     component_stddevs: Mapping[str, float] = field(default_factory=dict)
     taped: tuple[tuple[float, float], ...] = ()
+    heights_m: tuple[float, float] | None = None
+    path_is_level: bool = False
 
     @property
     def anchors_m(self) -> Array:
         """(m, 3)"""
         return np.array([anchor.position_m for anchor in self.anchors], dtype=np.float64)
+
+    @property
+    def places_m(self) -> Array:
+        """(m + n, 3) of all anchors and keyframes."""
+        return np.vstack([self.anchors_m, self.trajectory.centers])
 
     @property
     def duration_s(self) -> float:

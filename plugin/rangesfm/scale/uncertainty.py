@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.ranging.errors.cells import Cells, cells
+from rangesfm.ranging.errors.cells import MAX_NUM_CELLS, Cells, cells
+from rangesfm.ranging.errors.components import GIVEN
 from rangesfm.ranging.errors.learned import LearnedErrors, learn_errors, usual_errors
 from rangesfm.ranging.errors.noise import robust_stddev
 from rangesfm.ranging.observations import RangeObservations
@@ -66,15 +67,17 @@ def errors_to_expect(
     observations: RangeObservations,
     model_from_cam: Array,
     stddevs: Mapping[str, float],
+    max_num_cells: int = MAX_NUM_CELLS,
 ) -> LearnedErrors:
     """The same before anything is measured, as radios let expect.
 
     Args:
         stddevs: of components of which more is known, by name.
+        max_num_cells: fewer are coarser, and sooner computed.
     """
     taken_off = observations.log.shared_stddev_m
     return usual_errors(
-        _cells(posed, solution, observations, model_from_cam),
+        _cells(posed, solution, observations, model_from_cam, max_num_cells),
         curve_stddev_m=None if taken_off is None else taken_off[posed.rows],
         ruled_out=_ruled_out(solution.problem),
         stddevs=stddevs,
@@ -87,7 +90,13 @@ def _ruled_out(problem: RangeProblem) -> list[str]:
     return [name for name, stddev in stddevs.items() if stddev == 0]
 
 
-def _cells(posed: ScaleProblem, solution: Solution, observations: RangeObservations, model_from_cam: Array) -> Cells:
+def _cells(
+    posed: ScaleProblem,
+    solution: Solution,
+    observations: RangeObservations,
+    model_from_cam: Array,
+    max_num: int = MAX_NUM_CELLS,
+) -> Cells:
     problem, state, log = solution.problem, solution.fit.state, observations.log
     by = range_gradient(problem, state)
     world_from_cam = state.metric_from_model.rotation @ model_from_cam
@@ -99,6 +108,7 @@ def _cells(posed: ScaleProblem, solution: Solution, observations: RangeObservati
         np.swapaxes(world_from_cam, 1, 2),
         solution.fit.weights,
         _noisiness(problem.anchor_index, solution.fit.residuals_m, problem.num_anchors),
+        max_num,
     )
 
 
@@ -127,8 +137,24 @@ def _noisiness(anchor_index: Indices, residuals_m: Array, num_anchors: int) -> A
 
 def scale_uncertainty(solution: Solution, learned: LearnedErrors) -> ScaleUncertainty:
     """Relative stddevs of the scale."""
-    influence = scale_influence(solution.fit, solution.problem)
-    return ScaleUncertainty(formal=solution.fit.log_scale_stddev, components=learned.stddev_of(influence))
+    components = learned.stddev_of(scale_influence(solution.fit, solution.problem))
+    if (given := _by_what_was_given(solution)) > 0:
+        components[GIVEN] = given
+    return ScaleUncertainty(formal=solution.fit.log_scale_stddev, components=components)
+
+
+def _by_what_was_given(solution: Solution) -> float:
+    """What taped distances, positions of anchors and the upward direction do to the scale by not being exact.
+
+    Biases are among the ranges' errors. All priors weigh as against independent ranges: their stddevs were divided by
+    the inflation.
+    """
+    fit = solution.fit
+    given = fit.prior_information.copy()
+    biases = fit.columns[0].bias[fit.columns[0].bias >= 0]
+    given[biases] = given[:, biases] = 0.0
+    to_scale = np.linalg.lstsq(fit.information, np.eye(len(fit.information))[0], rcond=1e-12)[0]
+    return float(solution.errors.inflation * np.sqrt(max(to_scale @ given @ to_scale, 0.0)))
 
 
 def parameter_covariance(fit: RangeFit, problem: RangeProblem, learned: LearnedErrors) -> Array:
