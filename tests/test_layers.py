@@ -24,6 +24,7 @@ LAYERS = (
     "refine",
     "join",
     "trust",
+    "planning",
     "result",
     "report",
     "comparison",

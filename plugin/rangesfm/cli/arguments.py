@@ -18,6 +18,7 @@ from rangesfm.progress import Progress
 _COMMANDS_OF = {
     "stages": ("run", "demo", "reconstruct", "scale", "refine", "join"),
     "batch": ("batch",),
+    "planning": ("plan",),
     "results": ("export", "compare", "report"),
     "ranges": ("ranges", "ranges calibrate", "trilaterate"),
     "doctor": ("doctor",),

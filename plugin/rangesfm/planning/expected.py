@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rangesfm.arrays import Array
+from rangesfm.errors import GeometryError
 from rangesfm.options import ScaleOptions
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.errors.cells import MAX_NUM_CELLS
@@ -15,11 +16,12 @@ from rangesfm.ranging.errors.noise import START_STDDEV_M
 from rangesfm.ranging.errors.place import shares_of_places
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.observations import RangeObservations
+from rangesfm.scale.anchor_plane import mirrored_map
 from rangesfm.scale.estimate import ScaleUncertainty
 from rangesfm.scale.initialize import model_from_cam, placement_covariance
 from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import RangeFit, fit_at, range_jacobian, tag_positions
-from rangesfm.scale.solution import Solution, weighted
+from rangesfm.scale.solution import Solution, refuse_ambiguity, weighted
 from rangesfm.scale.uncertainty import errors_to_expect, parameter_covariance, parameter_influence, scale_uncertainty
 from rangesfm.scale.verdict import Verdict, judge
 from rangesfm.trust.finished_map import by_similarity
@@ -58,6 +60,21 @@ class Expected:
             GeometryError: it will refuse the scale.
         """
         return judge(self.posed, self.solution, self.uncertainty, {}, (), (), ScaleOptions())
+
+    def mirror_image(self) -> str | None:
+        """Why the run will refuse the map's place: its mirror image in the anchors' plane fits as well; None if not."""
+        problem, fit = self.solution.problem, self.solution.fit
+        mirrored = mirrored_map(problem, fit.state) if problem.frame_is_free else None
+        if mirrored is None:
+            return None
+        counted = replace(problem, share=fit.pulls)
+        try:
+            # Of a path in that plane nothing determines the height, which the solver meets as 0 / 0.
+            with np.errstate(invalid="ignore", divide="ignore"):
+                refuse_ambiguity(replace(self.solution, problem=counted), [mirrored], None)
+        except GeometryError as error:
+            return str(error)
+        return None
 
     def place(self) -> tuple[Array, Array] | None:
         """(7,) stddevs of the map about its middle, and (n,) of each keyframe's place; inf where they are open."""

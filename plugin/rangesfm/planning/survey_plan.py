@@ -82,7 +82,7 @@ class SurveyPlan:
         scale_interval_95: relative, its ends.
         components: what each component of the ranges' errors does to the scale, by name.
         place: None where the frame is the first camera's.
-        verdict, reasons: on the scale, as the run will judge it.
+        verdict, reasons: on the scale, as the run will judge it; "doubtful" too where it will refuse the place.
         mistakes: what would be found of each, those that do most first.
         advice: changes that would gain something.
     """
@@ -132,7 +132,7 @@ def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
         GeometryError: a run will refuse the scale.
     """
     expected = expect(planned)
-    verdict = expected.verdict
+    verdict, mirror_image = expected.verdict, expected.mirror_image()
     half_width = expected.uncertainty.half_width_95
     return SurveyPlan(
         num_ranges=planned.num_ranges,
@@ -143,8 +143,8 @@ def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
         scale_interval_95=(float(np.expm1(-half_width)), float(np.expm1(half_width))),
         components=expected.uncertainty.components,
         place=_place(expected),
-        verdict=verdict.verdict,
-        reasons=verdict.reasons,
+        verdict=verdict.verdict if mirror_image is None else "doubtful",
+        reasons=verdict.reasons if mirror_image is None else (f"a run will refuse: {mirror_image}", *verdict.reasons),
         mistakes=_mistakes(expected),
         advice=advise(expected),
     )

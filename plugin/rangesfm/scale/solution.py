@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -92,7 +93,7 @@ def solve_scale(posed: ScaleProblem, *, camera_side: str | None, seed: int) -> S
     solutions = [_with_own_errors(posed, start) for start in _likeliest_each_once(problem, errors, starts)]
     solutions.sort(key=lambda solution: _unlikeliness(problem, errors, solution.fit.state))
     on_side(problem, [solutions[0].fit], camera_side)
-    _refuse_ambiguity(solutions[0], [solution.fit.state for solution in solutions[1:]], camera_side)
+    refuse_ambiguity(solutions[0], [solution.fit.state for solution in solutions[1:]], camera_side)
     return solutions[0]
 
 
@@ -224,7 +225,8 @@ def weighted(problem: RangeProblem, errors: RangeErrors) -> RangeProblem:
     )
 
 
-def _refuse_ambiguity(solution: Solution, rivals: list[RangeState], camera_side: str | None) -> None:
+def refuse_ambiguity(solution: Solution, rivals: Sequence[RangeState], camera_side: str | None) -> None:
+    """GeometryError where the map of a rival fits as well."""
     problem = solution.problem
     for rival in rivals:
         other = solve(solution.problem, rival, loss=solution.errors.loss, tolerance=1e-8)
