@@ -82,7 +82,7 @@ class PlannedSurvey:
         return Similarity(1.0, self.trajectory.world_from_cam[0], self.trajectory.centers[0])
 
     def observations(self) -> RangeObservations:
-        """Ranges without any error, on the path: of so many alike one, as what they are worth grows with their number."""
+        """Ranges without any error, on the path; of more than some thousand, each stands for several."""
         num_anchors = len(self.anchors)
         turn = np.arange(self.num_ranges // self.num_alike)
         first_s = 0.0 if self.trajectory.timestamps_s is None else float(self.trajectory.timestamps_s[0])

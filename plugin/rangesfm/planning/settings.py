@@ -124,9 +124,10 @@ def read_plan(path: str | Path) -> PlannedSurvey:
     folder = Path(path).absolute().parent
     with source.naming_lines():
         refuse_unknown_tables(tables, _TABLES)
-        plan = Plan(
-            **{name: model(**_absolute(tables.get(name, {}), model, folder)) for name, model in _TABLES.items()}
-        )
+        options: dict[str, Any] = {
+            name: model(**_absolute(tables.get(name, {}), model, folder)) for name, model in _TABLES.items()
+        }
+        plan = Plan(**options)
         return _planned(plan)
 
 

@@ -16,7 +16,6 @@ from rangesfm.planning.detectable import detectable_mistakes
 from rangesfm.planning.expected import OPEN, Expected, expect
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.errors.components import component_words
-from rangesfm.scale.estimate import NORMAL_95
 from rangesfm.trust.table import MistakeTest
 
 _MAX_NUM_SHOWN = 5
