@@ -21,6 +21,7 @@ LAYERS = (
     "distances",
     "vision scale export",
     "survey",
+    "findings",
     "refine",
     "join",
     "trust",

@@ -125,7 +125,7 @@ def test_ranges_writes_the_canonical_csv_from_mapped_columns(folder: Path) -> No
         (["refine", "--input_path", "model"], "no ranges"),
         (["ranges", "none.csv"], "none.csv: no such file"),
         (["ranges", "uwb.csv", "--output_path", "none/ranges.csv"], "cannot be written"),
-        (["ranges", "photos"], "is a folder"),
+        (["ranges", "photos"], "no file there, expected the files of a log"),
         (["report", "photos"], "photos"),
         (["compare", "photos"], "photos"),
         (["export", "photos"], "photos"),

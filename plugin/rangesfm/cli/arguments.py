@@ -16,6 +16,7 @@ from rangesfm.errors import InputError
 from rangesfm.progress import Progress
 
 _COMMANDS_OF = {
+    "begin": ("init", "check"),
     "stages": ("run", "demo", "reconstruct", "scale", "refine", "join"),
     "batch": ("batch",),
     "planning": ("plan",),

@@ -59,12 +59,18 @@ def add_commands(commands: Commands) -> None:
 
 
 def _run(args: argparse.Namespace, progress: Progress) -> Outcome:
-    """Photos and ranges to a metric model. Stages that an earlier run has done are used again.
+    """Photos and ranges to a metric model. Stages that an earlier run has done are used again. Instead of a survey file
+    a folder will do, if it is clear what is what in it.
 
     example:
       rangesfm run survey.toml --every_nth 3 --output_path out
     """
-    survey = survey_from_arguments(args)
+    survey = survey_from_arguments(args, progress)
+    if args.survey is not None and survey.source.path is None:  # a folder
+        from rangesfm.workflows.check import check_survey
+
+        for fact in check_survey(survey).understood():
+            progress.message(fact)
     if survey.model_path is None:
         _require_images(survey)
         _require_ranges(survey)

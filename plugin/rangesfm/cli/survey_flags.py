@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin
 
 from rangesfm.cli.arguments import Parser
 from rangesfm.errors import InputError
+from rangesfm.progress import Progress
 
 if TYPE_CHECKING:
     from rangesfm.option_model import Key
@@ -22,7 +23,12 @@ _WORDS = {"m": "METRES", "s": "SECONDS"}
 
 def add_survey_arguments(parser: Parser, *keys: str, has_model: bool = False) -> None:
     """The survey file, perhaps an existing model, and flags for the file's keys, as ``add_flags`` has them."""
-    parser.add_argument("survey", nargs="?", metavar="SURVEY.toml", help="survey file; flags override its keys")
+    parser.add_argument(
+        "survey",
+        nargs="?",
+        metavar="SURVEY.toml",
+        help="survey file, or a folder in which to look for one, or for what init would write; flags override its keys",
+    )
     parser.add_argument(
         "--base_path", metavar="FOLDER", help="what the file's paths are relative to (default: its folder)"
     )
@@ -185,15 +191,30 @@ def flags_given(args: argparse.Namespace, *keys: str) -> list[str]:
     return [f"--{item.flag}" for item in chosen_keys(keys) if getattr(args, item.dotted, None) is not None]
 
 
-def survey_from_arguments(args: argparse.Namespace) -> Survey:
-    """The survey file, if any, with the flags in place of its keys."""
+def survey_from_arguments(args: argparse.Namespace, progress: Progress | None = None) -> Survey:
+    """The survey file, if any, with the flags in place of its keys; of a folder without one what is understood of it.
+
+    Args:
+        progress: is told what of a folder is left out.
+    """
+    from rangesfm.findings.survey_file import NAME
     from rangesfm.survey.settings import read_survey, survey_from_tables
 
     overrides = overrides_from_arguments(args)
-    if getattr(args, "survey", None) is None:
+    path = None if getattr(args, "survey", None) is None else Path(args.survey)
+    path = path / NAME if path is not None and (path / NAME).is_file() else path
+    if path is None:
         survey = survey_from_tables({}, Path.cwd(), overrides)
+    elif path.is_dir():
+        from rangesfm.findings.understood import understand
+
+        understood = understand([path], {"output.path": path.absolute() / "out", **overrides})
+        if progress is not None:
+            for note in understood.notes:
+                progress.message(note)
+        survey = understood.survey()
     else:
-        survey = read_survey(args.survey, overrides, args.base_path)
+        survey = read_survey(path, overrides, args.base_path)
     model = getattr(args, "input_path", None)
     return survey if model is None else survey.model_copy(update={"model_path": Path.cwd() / model})
 

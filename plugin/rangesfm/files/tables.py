@@ -277,6 +277,11 @@ def header_names(text: str, separator: str | None = None) -> list[str]:
         return []
 
 
+def has_columns(text: str, required: Collection[str], aliases: Mapping[str, str] | None = None) -> bool:
+    """Whether the header row of a file that begins like this names some columns, as ``read_table`` understands it."""
+    return {*required} <= {(aliases or {}).get(name, name) for name in header_names(text)}
+
+
 def guess_separator(row: str) -> str:
     """The most frequent of comma, semicolon and tab in a row; a blank if there is none of them."""
     separator = max(",;\t", key=row.count)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
-from rangesfm.files.tables import Table, header_names, read_head, read_table, read_text, write_table
+from rangesfm.files.tables import Table, has_columns, header_names, read_head, read_table, read_text, write_table
 from rangesfm.geometry.trajectory import ROUNDING_S, Trajectory
 
 POSITION_COLUMNS = ("x_m", "y_m", "z_m")
@@ -115,6 +115,14 @@ class Reference:
     def _at_index(self, index: npt.NDArray[np.int64]) -> tuple[Array, Array | None]:
         rotations = None if self.world_from_cam is None else _rows(self.world_from_cam, index)
         return _rows(self.positions_m, index), rotations
+
+
+def is_reference_file(head: str) -> bool:
+    """Whether a file that begins like this is a reference: positions by photo or time, or a TUM trajectory."""
+    names = header_names(head)
+    if _are_numbers(names):
+        return abs(float(np.linalg.norm([float(name) for name in names[-4:]])) - 1.0) <= QUATERNION_TOLERANCE
+    return any(has_columns(head, [key, *POSITION_COLUMNS]) for key in ("image_name", "timestamp_s"))
 
 
 def read_reference(path: str | Path) -> Reference:

@@ -29,7 +29,6 @@ from rangesfm.options import (
     ScaleAndTapeOptions,
     TagOptions,
 )
-from rangesfm.ranging.readers.several import files_of_log
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -146,6 +145,8 @@ class Survey(BaseModel):
 
     def input_paths(self) -> Iterator[InputPath]:
         """Every path that is read: what must be there, what is hashed and what no result may overwrite."""
+        from rangesfm.ranging.readers.several import files_of_log  # numpy, which --help needs not
+
         for dotted_key, role in _ROLE_OF_PATH.items():
             table, _, name = dotted_key.partition(".")
             path = getattr(getattr(self, table), name)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rangesfm.arrays import Array
+from rangesfm.ranging.errors.components import alike_by_direction, alike_by_distance
 from rangesfm.trust.hypothesis import Effect, Hypothesis
 from rangesfm.trust.linearized import Linearized
 from rangesfm.trust.random_errors import Component, RandomErrors, learn
@@ -15,8 +16,7 @@ from rangesfm.trust.random_errors import Component, RandomErrors, learn
 _MEMORY_S = 3.0
 # Of a radio's error curve over distance (Decawave application note APS011), and of anchors' antennas over directions
 # (Pelka, Cimdins and Hellbrück, 2018).
-ANTENNA_STDDEV_M, CURVE_STDDEV_M = 0.05, 0.07
-_CURVE_LOG_LENGTH, _NUM_CURVE_KNOTS, _MIN_DISTANCE_M = 1.0, 25, 0.05
+_ANTENNA_STDDEV_M, _CURVE_STDDEV_M = 0.05, 0.07
 _LASTING_STDDEV_M, _BEND_STDDEV_M = 0.04, 0.02
 # Of a path's duration: a map bends over no shorter part.
 _BEND_SHARE = 1 / 8
@@ -49,55 +49,20 @@ def _components(problem: Linearized) -> list[Component]:
     apart = np.abs(problem.time_s[:, None] - problem.time_s)
     same_anchor = problem.anchor_index[:, None] == problem.anchor_index
     directions = problem.gradient.by_tag
-    antennas = antenna_modes(directions) / ANTENNA_STDDEV_M
     duration = max(float(np.ptp(problem.time_s)), 1e-6)
     bend = np.exp(-0.5 * (apart / (_BEND_SHARE * duration)) ** 2)
     return [
         Component("white", np.diag(1 / problem.cells.num_ranges), problem.cells.scatter_m, 0.3),
         Component("lasting", same_anchor * np.exp(-apart / _MEMORY_S), _LASTING_STDDEV_M, 0.7),
-        Component("antennas", same_anchor * (antennas @ antennas.T), ANTENNA_STDDEV_M, 0.5),
+        Component("antennas", same_anchor * alike_by_direction(directions), _ANTENNA_STDDEV_M, 0.5),
         Component("bend", (directions @ directions.T) * bend, _BEND_STDDEV_M, 1.0),
     ]
 
 
 def _known(problem: Linearized) -> Array:
     """(c, c) of an error curve that nobody learnt, and of what wanders too slowly to be learnt."""
-    distance = problem.gradient.distance_m
-    modes = curve_modes(distance, np.full(len(distance), CURVE_STDDEV_M))
+    curve = _CURVE_STDDEV_M**2 * alike_by_distance(problem.gradient.distance_m)
     apart = np.abs(problem.time_s[:, None] - problem.time_s)
     same_anchor = problem.anchor_index[:, None] == problem.anchor_index
     wandering = _WANDERING_STDDEV_M**2 * (1.0 + same_anchor) * np.exp(-apart / _WANDERING_MEMORY_S)
-    return np.asarray(modes @ modes.T + wandering)
-
-
-def curve_modes(distance_m: Array, stddev_m: Array) -> Array:
-    """(n, k) what an unknown error curve adds to n ranges: times k independent numbers of stddev 1.
-
-    The curve is a random function, smooth in the logarithm of the distance.
-
-    Args:
-        distance_m: (n,) from anchor to tag. stddev_m: (n,) of the curve there.
-    """
-    place = np.log(np.maximum(distance_m, _MIN_DISTANCE_M))
-    knots = np.linspace(place.min(), place.max() + 1e-6, _NUM_CURVE_KNOTS)
-    hats = np.column_stack([np.interp(place, knots, unit) for unit in np.eye(_NUM_CURVE_KNOTS)])
-    correlation = np.exp(-0.5 * ((knots[:, None] - knots) / _CURVE_LOG_LENGTH) ** 2)
-    values, vectors = np.linalg.eigh(correlation)
-    strong = values > 1e-9 * values.max()
-    modes: Array = stddev_m[:, None] * (hats @ (vectors[:, strong] * np.sqrt(values[strong])))
-    return modes
-
-
-def antenna_modes(directions: Array) -> Array:
-    """(n, 12) what one anchor's antenna adds to its n ranges, likewise.
-
-    A random polynomial of the direction. Half of its variance is linear, half quadratic in the unit vector; the
-    constant part is the bias, which has its own prior. The covariance depends on the angle alone:
-    c / 2 + (3 c^2 - 1) / 4 with c its cosine.
-
-    Args:
-        directions: (n, 3) unit vectors from anchor to tag.
-    """
-    quadratic = np.sqrt(1.5) * (directions[:, :, None] * directions[:, None, :] - np.eye(3) / 3)
-    modes: Array = ANTENNA_STDDEV_M * np.sqrt(0.5) * np.column_stack([directions, quadratic.reshape(-1, 9)])
-    return modes
+    return np.asarray(curve + wandering)

@@ -16,11 +16,13 @@ import numpy.typing as npt
 
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import is_plain_name
-from rangesfm.files.tables import Table, read_table
+from rangesfm.files.tables import Table, has_columns, read_table
 from rangesfm.vision.exif import exif_tags
 
 IMAGE_EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 
+_COLUMNS = ("image_name", "timestamp_s")
+_ALIASES = {"filename": "image_name", "timestamp": "timestamp_s"}
 _FINEST_RESOLUTION_S = 1e-3
 _MAX_TIMESTAMP_S = 1e11  # the year 5138: larger numbers are in another unit
 _DATE_TIME_ORIGINAL, _SUB_SEC_TIME_ORIGINAL, _OFFSET_TIME_ORIGINAL = 0x9003, 0x9291, 0x9011
@@ -111,6 +113,11 @@ def find_image_times(folder: str | Path, names: Sequence[str], csv_path: str | P
     )
 
 
+def is_image_times_file(head: str) -> bool:
+    """Whether a file that begins like this tells when photos were taken."""
+    return has_columns(head, _COLUMNS, _ALIASES)
+
+
 def read_image_times_csv(path: str | Path, names: Sequence[str] | None = None) -> ImageTimes:
     """Read ``image_name,timestamp_s`` (the header may say ``filename`` and ``timestamp`` as well).
 
@@ -122,12 +129,7 @@ def read_image_times_csv(path: str | Path, names: Sequence[str] | None = None) -
         InputError: with the line: a column missing, a cell that is no time in seconds, a photo
             that does not exist, a photo or a time that stands there twice.
     """
-    table = read_table(
-        path,
-        ["image_name", "timestamp_s"],
-        aliases={"filename": "image_name", "timestamp": "timestamp_s"},
-        separator=None,
-    )
+    table = read_table(path, _COLUMNS, aliases=_ALIASES, separator=None)
     if not len(table):
         raise InputError("no rows below the header, expected one per photo", path)
     image_names, times = table.text("image_name"), table.numbers("timestamp_s", expected="seconds")

@@ -51,10 +51,17 @@ def read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
 def checked_inputs(survey: Survey, journal: Journal) -> tuple[RangingInputs, tuple[str, ...], ImageTimes | None]:
     """Ranges and photos that have to do with each other; the photos' times, where any are needed."""
     inputs = read_inputs(survey, journal)
+    return inputs, *checked_keyframes(survey, inputs, journal)
+
+
+def checked_keyframes(
+    survey: Survey, inputs: RangingInputs, journal: Journal
+) -> tuple[tuple[str, ...], ImageTimes | None]:
+    """The photos to reconstruct and their times, which have to do with those of the inputs."""
     keyframes, times = find_keyframes(survey, journal, log_names_photos=inputs.log.image_name is not None)
     check_times(survey, inputs, _path_without_places(keyframes, times))
     tell_of_times(survey, inputs, times, journal)
-    return inputs, keyframes, times
+    return keyframes, times
 
 
 def check_times(survey: Survey, inputs: RangingInputs, path: Trajectory) -> None:
@@ -97,7 +104,7 @@ def find_keyframes(
     Args:
         log_names_photos: then no photo is left out for want of a time; None: there is no log.
     """
-    folder = _images_path(survey)
+    folder = images_path(survey)
     with journal.timed("keyframes"):
         names = list_images(folder)
         image_times = None
@@ -119,7 +126,7 @@ def map_keyframes(
     """Map the keyframes into ``sparse``; returns ``sparse/0``, ``sparse/1``, ..."""
     with survey.source.naming_lines():
         summary = reconstruct(
-            _images_path(survey),
+            images_path(survey),
             keyframes,
             survey.output.path,
             camera=survey.camera,
@@ -137,7 +144,8 @@ def map_keyframes(
     return summary.models
 
 
-def _images_path(survey: Survey) -> Path:
+def images_path(survey: Survey) -> Path:
+    """The folder of a survey's photos; InputError if none is given."""
     if survey.images.path is None:
         raise InputError("no photos: give [images] path in a survey file, or --images FOLDER")
     return survey.images.path

@@ -9,12 +9,17 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import InputError
-from rangesfm.files.tables import Table, read_table, write_table
+from rangesfm.files.tables import Table, has_columns, read_table, write_table
 from rangesfm.ranging.anchors.anchor import Anchor
 
 _COORDINATES = ("x_m", "y_m", "z_m")
 _OPTIONAL = ("position_stddev_m", "range_bias_m", "range_bias_stddev_m")
 _ALIASES = {"": "anchor_id", "id": "anchor_id", "Anchor_ID": "anchor_id", "x": "x_m", "y": "y_m", "z": "z_m"}
+
+
+def is_anchor_file(head: str) -> bool:
+    """Whether a file that begins like this is one of anchors."""
+    return has_columns(head, ["anchor_id", *_COORDINATES], _ALIASES)
 
 
 def read_anchors(path: str | Path) -> tuple[Anchor, ...]:

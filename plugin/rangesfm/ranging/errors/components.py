@@ -1,7 +1,7 @@
 """What ranges get wrong: the components of their errors, each with what the population of radios lets expect of it.
 
 An error of two cells is covariant as their anchors, places, directions, distances and times are alike. The medians and
-spreads sum up what seven public logs of five radios with the true path show (the table in ``examples/radios.md``); each
+spreads sum up what eight public logs of seven radios with the true path show (the table in ``examples/radios.md``); each
 survey learns its own stddevs on top of them.
 """
 
@@ -67,17 +67,22 @@ def _in_time(cells: Cells, length_s: float) -> Array:
     return together
 
 
-def _log_distance(cells: Cells) -> Array:
-    return np.log(np.maximum(cells.distance_m, _MIN_DISTANCE_M))
+def _log_distance(distance_m: Array) -> Array:
+    return np.log(np.maximum(distance_m, _MIN_DISTANCE_M))
 
 
-def _smooth(cells: Cells) -> Array:
-    alike: Array = np.exp(-0.5 * (_apart(_log_distance(cells)) / _SMOOTH) ** 2)
+def alike_by_distance(distance_m: Array) -> Array:
+    """(c, c) of a random function, smooth in the logarithm of (c,) distances."""
+    alike: Array = np.exp(-0.5 * (_apart(_log_distance(distance_m)) / _SMOOTH) ** 2)
     return alike
 
 
+def _smooth(cells: Cells) -> Array:
+    return alike_by_distance(cells.distance_m)
+
+
 def _rough(cells: Cells) -> Array:
-    alike: Array = np.exp(-_apart(_log_distance(cells)) / _ROUGH)
+    alike: Array = np.exp(-_apart(_log_distance(cells.distance_m)) / _ROUGH)
     return alike
 
 
@@ -86,7 +91,7 @@ def _short(cells: Cells) -> Array:
     return np.outer(shortness, shortness)
 
 
-def _by_direction(directions: Array) -> Array:
+def alike_by_direction(directions: Array) -> Array:
     """Of a random polynomial of the direction, half of its variance linear and half quadratic in the unit vector."""
     cosine = directions @ directions.T
     alike: Array = cosine / 2 + (3 * cosine**2 - 1) / 4
@@ -102,11 +107,11 @@ def _proportional(cells: Cells) -> Array:
 
 
 def _antenna(cells: Cells) -> Array:
-    return _same(cells.anchor_index) * _by_direction(cells.from_anchor)
+    return _same(cells.anchor_index) * alike_by_direction(cells.from_anchor)
 
 
 def _tag_antenna(cells: Cells) -> Array:
-    return _same(cells.tag_index) * _by_direction(cells.in_cam)
+    return _same(cells.tag_index) * alike_by_direction(cells.in_cam)
 
 
 def _bending(cells: Cells) -> Array:
@@ -122,10 +127,10 @@ COMPONENTS = (
     Component("long_time", 0.03, 0.7, None, True, lambda c: _in_time(c, _LONG_TIME_S), "errors that last longer"),
     Component("bias", 0.045, 0.5, None, True, lambda c: _same(c.anchor_index), "each anchor's own bias"),
     Component("common_bias", 0.2, 0.5, 0.04, False, lambda c: np.ones((len(c), len(c))), "the bias of all ranges"),
-    Component("short", 0.25, 0.5, 0.08, False, _short, "short ranges"),
+    Component("short", 0.2, 0.5, 0.08, False, _short, "short ranges"),
     Component("curve", 0.04, 0.5, 0.02, False, _smooth, "the radio's error curve"),
     Component("rough_curve", 0.02, 0.3, 0.01, False, _rough, "unevenness of the error curve"),
-    Component("slope", 0.006, 0.7, 0.003, False, _proportional, "ranges long by a share"),
+    Component("slope", 0.004, 0.7, 0.003, False, _proportional, "ranges long by a share"),
     Component(
         "antenna",
         0.05,

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.files.tables import Table, read_table, write_table
+from rangesfm.files.tables import Table, has_columns, read_table, write_table
 from rangesfm.ranging.log import RangeLog
 
 COLUMNS = ("distance_m", "error_m", "stddev_m", "noise_stddev_m")
@@ -72,6 +72,11 @@ def write_error_curve(curve: ErrorCurve, path: str | Path) -> None:
     """Write ``distance_m,error_m,stddev_m,noise_stddev_m``."""
     rows = np.column_stack([curve.distance_m, curve.error_m, curve.stddev_m, curve.noise_stddev_m])
     write_table(Path(path), COLUMNS, ([f"{value:.5f}" for value in row] for row in rows.tolist()))
+
+
+def is_error_curve_file(head: str) -> bool:
+    """Whether a file that begins like this is an error curve."""
+    return has_columns(head, COLUMNS)
 
 
 def read_error_curve(path: str | Path) -> ErrorCurve:

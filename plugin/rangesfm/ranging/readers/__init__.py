@@ -22,7 +22,7 @@ from rangesfm.ranging.readers.several import files_of_log, join_logs
 from rangesfm.ranging.readers.table import TABLE, table_reader
 from rangesfm.ranging.twr import StampOptions
 
-__all__ = ["read_anchors_in_log", "read_ranges", "reader_names", "write_ranges_csv"]
+__all__ = ["find_log_reader", "read_anchors_in_log", "read_ranges", "reader_names", "write_ranges_csv"]
 
 
 def read_ranges(
@@ -149,3 +149,12 @@ def _choose_reader(path: Path, options: ReadOptions, format: str | None) -> Read
         raise InputError("the file is empty, expected a log of ranges", path)
     reader = None if format == TABLE.name else recognize(head)
     return table_reader(path, options) if reader is None else reader
+
+
+def find_log_reader(path: Path) -> Reader:
+    """The reader of a file of which nothing is said.
+
+    Raises:
+        InputError: it is no radio's log, or not for sure; a table that may be one has advice.
+    """
+    return _choose_reader(path, ReadOptions(), None)

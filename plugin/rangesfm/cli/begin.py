@@ -1,0 +1,83 @@
+"""The commands before a first run: ``init`` and ``check``."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rangesfm.cli.arguments import Commands, Outcome
+from rangesfm.cli.survey_flags import (
+    add_flags,
+    add_survey_arguments,
+    overrides_from_arguments,
+    survey_from_arguments,
+)
+from rangesfm.errors import InputError
+from rangesfm.progress import Progress
+
+if TYPE_CHECKING:
+    from rangesfm.workflows.check import CheckedSurvey
+
+
+def add_commands(commands: Commands) -> None:
+    init = commands.add("init", _init, "a survey file from folders of photos and logs")
+    init.add_argument("folders", nargs="+", metavar="FOLDER", help="where photos, log, anchors, ... are")
+    init.add_argument("--output_path", metavar="PATH", help="survey file, or its folder (default: the first FOLDER)")
+    add_flags(init, without=("output.path",))
+    check = commands.add("check", _check, "what a run would work with, and what is wrong with it, in seconds")
+    add_survey_arguments(check)
+
+
+def _init(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """Look into folders for photos, the radio's log, anchors, times, calibration and truth (each file by what it
+    holds), and write a survey file that runs, with comments. Says what was understood, assumed and what is missing;
+    flags say what it cannot find. An existing file is left as it is.
+
+    example:
+      rangesfm init my_survey --tag_in_cam 0.03,-0.12,-0.05
+    """
+    from rangesfm.files.atomic import write_text
+    from rangesfm.findings.survey_file import NAME, survey_text
+    from rangesfm.findings.understood import understand
+    from rangesfm.survey.settings import read_survey
+    from rangesfm.workflows.check import check_survey
+
+    folders = [Path(folder) for folder in args.folders]
+    path = Path(args.output_path or folders[0])
+    path = path if path.suffix == ".toml" else path / NAME
+    if os.path.lexists(path):
+        raise InputError("is there already and is left as it is; --output_path PATH writes another", path)
+    understood = understand(folders, overrides_from_arguments(args))
+    understood.survey()  # refuses values that are none, before anything is written
+    folder = path.absolute().parent
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(survey_text({**understood.values, "output.path": folder / "out"}, folder), path)
+    checked = check_survey(read_survey(path))
+    lines = [f"wrote {path}", *told(checked, fault="missing"), *(f"note: {note}" for note in understood.notes)]
+    command = shlex.join(["rangesfm", "check" if checked.faults else "run", str(path)])
+    return Outcome([*lines, f"next: {'write down what is missing, then ' if checked.faults else ''}{command}"])
+
+
+def _check(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """Read all that a run would read and say what it is, what is assumed and what is wrong: photos, times, ranges,
+    anchors, camera, reference. Takes seconds and writes nothing.
+
+    example:
+      rangesfm check survey.toml
+    """
+    from rangesfm.workflows.check import check_survey
+
+    checked = check_survey(survey_from_arguments(args, progress))
+    return Outcome(told(checked, fault="error"), checked.exit_status)
+
+
+def told(checked: CheckedSurvey, *, fault: str) -> list[str]:
+    """A line for each finding; faults are called as the command has it."""
+    return [
+        *checked.understood(),
+        *(f"warning: {text}" for text in checked.warnings),
+        *(f"{fault}: {line}" for error in checked.faults for line in (str(error), *error.advice)),
+    ]

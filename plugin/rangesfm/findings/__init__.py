@@ -1,0 +1,1 @@
+"""What lies in somebody's folders, and the survey that it makes."""

@@ -1,0 +1,120 @@
+"""Calibrated cameras by the files of others: COLMAP's, Kalibr's, ROS's, and a camera as JSON."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from rangesfm.errors import InputError
+from rangesfm.files.tables import read_head
+
+_COLMAP_LINE = re.compile(r"\d+ ([A-Z][A-Z0-9_]+) (\d+) (\d+)((?: [-+.\deE]+)+)", re.ASCII)
+# To OpenCV, and so to Kalibr and ROS, the centre of the first pixel is (0, 0); to COLMAP it is (0.5, 0.5).
+_CORNER_PX = 0.5
+# COLMAP's model and how many parameters it has beside fx, fy, cx, cy.
+_OPENCV_MODELS = {
+    "none": ("PINHOLE", 0),
+    "radtan": ("OPENCV", 4),
+    "plumb_bob": ("OPENCV", 4),
+    "rational_polynomial": ("FULL_OPENCV", 8),
+    "equidistant": ("OPENCV_FISHEYE", 4),
+    "fisheye": ("OPENCV_FISHEYE", 4),
+}
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """One camera as COLMAP has it.
+
+    Attributes:
+        model: COLMAP's name of the camera model.
+        params: in COLMAP's order and convention of pixels.
+        size_px: width and height of its photos; None: not said.
+        tag_in_cam_m: lever arm of the radio's tag; None: not said.
+    """
+
+    model: str
+    params: tuple[float, ...]
+    size_px: tuple[int, int] | None = None
+    tag_in_cam_m: tuple[float, float, float] | None = None
+
+
+def read_calibrations(path: Path) -> tuple[Calibration, ...]:
+    """The cameras of a file; none if it is no calibration.
+
+    Raises:
+        InputError: it is one, but lacks something, or has a model that COLMAP does not know.
+    """
+    try:
+        return tuple(_READERS[path.suffix.lower()](path)) if path.suffix.lower() in _READERS else ()
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        what = f"no {error}" if isinstance(error, KeyError) else str(error)
+        raise InputError(f"a camera's calibration that is not complete ({what})", path) from None
+
+
+def _read_colmap(path: Path) -> Iterator[Calibration]:
+    lines = [" ".join(line.split()) for line in read_head(path).split("\n")]
+    found = [_COLMAP_LINE.fullmatch(line) for line in lines if line and not line.startswith("#")]
+    for match in found if all(found) else ():
+        assert match is not None
+        yield Calibration(match[1], tuple(map(float, match[4].split())), (int(match[2]), int(match[3])))
+
+
+def _read_json(path: Path) -> Iterator[Calibration]:
+    try:
+        camera = json.loads(read_head(path))
+    except (ValueError, RecursionError):
+        return
+    if isinstance(camera, dict) and {"camera_model", "params"} <= camera.keys():
+        size_px = (int(camera["width"]), int(camera["height"])) if "width" in camera else None
+        arm = camera.get("tag_in_cam_m")
+        tag_in_cam_m = None if arm is None else (float(arm[0]), float(arm[1]), float(arm[2]))
+        yield Calibration(camera["camera_model"], tuple(map(float, camera["params"])), size_px, tag_in_cam_m)
+
+
+def _read_yaml(path: Path) -> Iterator[Calibration]:
+    try:
+        content = YAML(typ="safe", pure=True).load(read_head(path))
+    except (YAMLError, ValueError, RecursionError):
+        return
+    if not isinstance(content, dict):
+        return
+    if "camera_matrix" in content:
+        (fx, _, cx, _, fy, cy), coefficients = (
+            content["camera_matrix"]["data"][:6],
+            content["distortion_coefficients"]["data"],
+        )
+        size = (content["image_width"], content["image_height"])
+        yield _of_opencv(path, content["distortion_model"], (fx, fy, cx, cy), coefficients, size)
+    for name, camera in content.items():
+        if re.fullmatch(r"cam\d+", str(name)) and isinstance(camera, dict) and "camera_model" in camera:
+            yield _of_kalibr(path, camera)
+
+
+def _of_kalibr(path: Path, camera: Mapping[str, Any]) -> Calibration:
+    if camera["camera_model"] != "pinhole":
+        raise InputError(f"camera_model is '{camera['camera_model']}', expected pinhole: COLMAP has no other", path)
+    model = camera.get("distortion_model", "none")
+    return _of_opencv(path, model, camera["intrinsics"], camera.get("distortion_coeffs", ()), camera["resolution"])
+
+
+def _of_opencv(path: Path, distortion: str, pinhole: Any, coefficients: Any, size: Any) -> Calibration:
+    if distortion not in _OPENCV_MODELS:
+        raise InputError(f"distortion_model is '{distortion}', expected one of {', '.join(_OPENCV_MODELS)}", path)
+    model, num = _OPENCV_MODELS[distortion]
+    given = [*map(float, coefficients)]
+    if model == "OPENCV" and any(given[num:]):  # a third radial coefficient
+        model, num = "FULL_OPENCV", 8
+    fx, fy, cx, cy = map(float, pinhole)
+    params = (fx, fy, cx + _CORNER_PX, cy + _CORNER_PX, *[*given, *[0.0] * num][:num])
+    return Calibration(model, params, (int(size[0]), int(size[1])))
+
+
+_READERS = {".txt": _read_colmap, ".json": _read_json, ".yaml": _read_yaml, ".yml": _read_yaml}

@@ -1,0 +1,168 @@
+"""A survey as its folders tell it: of what was found one of each, or the question which."""
+
+from __future__ import annotations
+
+import glob
+import os
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import takewhile
+from pathlib import Path
+from typing import Any
+
+from rangesfm.errors import InputError
+from rangesfm.findings.calibration import Calibration
+from rangesfm.findings.folder import LOG, PHOTOS, Found, look_into
+from rangesfm.ranging.readers import read_ranges
+from rangesfm.survey.settings import KEYS, Survey, survey_from_tables
+from rangesfm.vision.image_times import list_images
+from rangesfm.vision.photos import usable_photos
+
+# Of several candidates one that is called so is meant.
+_USUAL_NAMES = {
+    PHOTOS: ("images", "photos", "dcim", "rgb", "frames"),
+    LOG: ("uwb", "ranges"),
+    "images.times": ("images", "times", "image_times", "timestamps"),
+    "anchors.path": ("anchors",),
+    "report.reference": ("reference", "groundtruth", "ground_truth", "truth"),
+    "camera": ("camera", "cameras"),
+}
+_LEVER_ARMS = ("tag.tag_in_cam_m", "tag.lever_arms_m")
+
+
+@dataclass(frozen=True)
+class Understood:
+    """A survey file's values.
+
+    Attributes:
+        values: by dotted key; paths are absolute.
+        notes: what was left out and why, a line each.
+    """
+
+    values: dict[str, Any]
+    notes: tuple[str, ...]
+
+    def survey(self) -> Survey:
+        """All of it as a run takes it; InputError for a value given that is none."""
+        return survey_from_tables({}, Path.cwd(), self.values)
+
+
+def understand(folders: Sequence[Path], given: Mapping[str, object]) -> Understood:
+    """Look into folders and choose what a run needs.
+
+    Args:
+        given: values by dotted key that the user says; what they stand for is not looked for.
+
+    Raises:
+        InputError: there is nothing, or several of a kind and nothing tells which is meant; its advice asks.
+    """
+    folders = [Path(os.path.abspath(folder)) for folder in folders]
+    found = look_into(folders)
+    roles = {item.dotted: item.role for item in KEYS}
+    values = {key: _path(value) if roles[key] is not None else value for key, value in given.items()}
+    notes, questions = list(found.notes), []
+    for item in KEYS:
+        key, paths = item.dotted, found.paths.get(item.dotted, [])
+        if key in values or not paths or (key == "scale.markers" and "scale.distances" not in values):
+            continue
+        paths = _tops(paths, folders) if key == PHOTOS else paths
+        chosen = _chosen(key, paths)
+        if chosen is None:
+            names = ", ".join(_shown(path, folders) for path in paths)
+            questions.append(f"{names}: any of them may be [{item.table}] {item.name}; say which by --{item.flag} PATH")
+            continue
+        values[key] = chosen
+        if chosen in paths and len(paths) > 1:
+            others = ", ".join(_shown(path, folders) for path in paths if path != chosen)
+            notes.append(f"left out, as {chosen.name} is there: {others}")
+    if questions:
+        raise InputError("more than one survey could be meant", folders[0], advice=questions)
+    if not {PHOTOS, LOG} & values.keys():
+        raise InputError("neither photos nor a radio's log in there", folders[0], advice=notes)
+    _add_camera(values, found, notes)
+    return Understood(values, tuple(notes))
+
+
+def _path(value: object) -> Path:
+    return Path(os.path.abspath(str(value)))
+
+
+def _chosen(key: str, paths: Sequence[Path]) -> Path | None:
+    """The only one, or the one of the usual name, or files of one anchor each as one log; None: nobody knows."""
+    usual = [path for path in paths if path.stem.lower() in _USUAL_NAMES.get(key, ())]
+    for candidates in (paths, usual):
+        if len(candidates) == 1:
+            return candidates[0]
+    return _pattern(paths) if key == LOG else None
+
+
+def _tops(paths: Sequence[Path], folders: Sequence[Path]) -> list[Path]:
+    """Of folders of photos the highest one inside ``folders`` that has a usual name, as photos for photos/left."""
+    tops = []
+    for path in paths:
+        inside = [above for above in (path, *path.parents) if any(above.is_relative_to(folder) for folder in folders)]
+        tops.append(next((above for above in reversed(inside) if above.name.lower() in _USUAL_NAMES[PHOTOS]), path))
+    return list(dict.fromkeys(tops))
+
+
+def _pattern(paths: Sequence[Path]) -> Path | None:
+    """A pattern for the files of one log, each of another anchor; None if they are no such files."""
+    names, folder = [path.name for path in paths], paths[0].parent
+    prefix = _common_beginning(names)
+    suffix = _common_beginning([name[len(prefix) :][::-1] for name in names])[::-1]
+    pattern = Path(folder, f"{prefix}*{suffix}")
+    if glob.has_magic(f"{folder}{prefix}{suffix}") or {*map(Path, glob.glob(str(pattern)))} != {*paths}:
+        return None
+    try:
+        anchors = [read_ranges(path).anchor_ids for path in paths]
+    except InputError:
+        return None
+    return pattern if all(len(ids) == 1 for ids in anchors) and len({*anchors}) == len(paths) else None
+
+
+def _common_beginning(texts: Sequence[str]) -> str:
+    alike = takewhile(lambda characters: len({*characters}) == 1, zip(*texts))
+    return "".join(characters[0] for characters in alike)
+
+
+def _add_camera(values: dict[str, Any], found: Found, notes: list[str]) -> None:
+    """Camera and lever arm of the one calibration that there is for photos of this size."""
+    files = [*found.calibrations]
+    path = _chosen("camera", files)
+    if path is None:
+        if files:
+            several = ", ".join(file.name for file in files)
+            notes.append(f"{several}: nothing tells which of these cameras it is, none is taken; leave one there")
+        return
+    cameras = found.calibrations[path]
+    arms = [camera.tag_in_cam_m for camera in cameras if camera.tag_in_cam_m is not None]
+    if len(arms) == 1 and not values.keys() & {*_LEVER_ARMS}:
+        values["tag.tag_in_cam_m"] = arms[0]
+        notes.append(f"the lever arm is that of {path.name}")
+    if {"camera.model", "camera.params"} & values.keys():
+        return
+    fitting = _of_size(cameras, _size_px(values))
+    if len(fitting) == 1:
+        values |= {"camera.model": fitting[0].model, "camera.params": fitting[0].params}
+        notes.append(f"the camera is that of {path.name}")
+    else:
+        sizes = ", ".join(" x ".join(map(str, camera.size_px)) for camera in cameras if camera.size_px)
+        notes.append(f"{path.name}: {len(fitting)} of its cameras ({sizes} pixels) fit the photos: none is taken")
+
+
+def _of_size(cameras: Sequence[Calibration], size_px: tuple[int, int] | None) -> list[Calibration]:
+    return [camera for camera in cameras if None in (camera.size_px, size_px) or camera.size_px == size_px]
+
+
+def _size_px(values: Mapping[str, Any]) -> tuple[int, int] | None:
+    """The most common size of the photos; None without any."""
+    if PHOTOS not in values:
+        return None
+    photos = usable_photos(values[PHOTOS], list_images(values[PHOTOS]))
+    return Counter(photos.sizes).most_common(1)[0][0]
+
+
+def _shown(path: Path, folders: Sequence[Path]) -> str:
+    inside = [os.path.relpath(path, folder) for folder in folders if path.is_relative_to(folder)]
+    return inside[0] if inside else str(path)

@@ -1,0 +1,147 @@
+"""What a survey is, and all that can be known to be wrong with it, before any long work."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rangesfm.errors import RangesfmError
+from rangesfm.progress import SilentProgress
+from rangesfm.ranging.log import RangeKind
+from rangesfm.survey.inputs import RangingInputs
+from rangesfm.survey.settings import Survey
+from rangesfm.vision.camera import cameras_of_photos, check_camera
+from rangesfm.vision.image_times import ImageTimes, list_images
+from rangesfm.vision.photos import usable_photos
+from rangesfm.workflows.journal import Journal
+from rangesfm.workflows.photos import checked_keyframes, images_path, read_inputs
+
+# More than these nobody reads.
+_MAX_NUM_SIZES = 4
+
+
+@dataclass
+class CheckedSurvey:
+    """What was found, in words.
+
+    Attributes:
+        facts: what a run will work with.
+        assumed: what it will take for true, as nobody said otherwise.
+        warnings: what a run would warn of before its long work.
+        faults: why it would not come so far.
+    """
+
+    facts: list[str] = field(default_factory=list)
+    assumed: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    faults: list[RangesfmError] = field(default_factory=list)
+
+    @property
+    def exit_status(self) -> int:
+        return self.faults[0].exit_status if self.faults else 0
+
+    def understood(self) -> list[str]:
+        """What a run works with, known or assumed."""
+        return [*self.facts, *(f"assumed: {text}" for text in self.assumed)]
+
+    @contextmanager
+    def finding_faults(self) -> Iterator[None]:
+        try:
+            yield
+        except RangesfmError as error:
+            if str(error) not in map(str, self.faults):
+                self.faults.append(error)
+
+
+def check_survey(survey: Survey) -> CheckedSurvey:
+    """Read all inputs of a run as the run does, and tell what they are."""
+    checked, journal = CheckedSurvey(), Journal(SilentProgress())
+    with checked.finding_faults():
+        _check_photos(survey, checked)
+    with checked.finding_faults():
+        inputs = read_inputs(survey, journal)
+        _tell_of_radio(survey, inputs, checked)
+        keyframes, times = checked_keyframes(survey, inputs, journal)
+        _tell_of_times(survey, inputs, keyframes, times, checked)
+    checked.warnings += journal.warnings
+    return checked
+
+
+def _check_photos(survey: Survey, checked: CheckedSurvey) -> None:
+    folder = images_path(survey)
+    photos = usable_photos(folder, list_images(folder))
+    sizes = [f"{num} of {width} x {height} pixels" for (width, height), num in Counter(photos.sizes).most_common()]
+    more = [f"{len(sizes) - _MAX_NUM_SIZES} sizes more"] if len(sizes) > _MAX_NUM_SIZES else []
+    checked.facts.append(f"photos in {folder.name}: {', '.join(sizes[:_MAX_NUM_SIZES] + more)}")
+    if photos.left_out:
+        name, why = next(iter(photos.left_out.items()))
+        checked.warnings.append(f"{len(photos.left_out)} photos are left out, first {name}: {why}")
+    with survey.source.naming_lines():
+        check_camera(survey.camera)
+        found = cameras_of_photos(survey.camera, photos)
+    for number, camera in enumerate(found.cameras[:_MAX_NUM_SIZES]):
+        num_photos, focal_length_px = found.of_photo.count(number), camera.mean_focal_length()
+        what = f"{camera.model.name} for {num_photos} photos, f {focal_length_px:.0f} pixels"
+        is_guessed = photos.names[found.of_photo.index(number)] in found.guessed
+        if survey.camera.params is not None and not is_guessed:
+            checked.facts.append(f"camera: {what}, as given")
+        else:
+            seen = "by EXIF" if camera.has_prior_focal_length else "a guess from the photos' size"
+            checked.assumed.append(f"camera {what}, {seen}")
+
+
+def _tell_of_radio(survey: Survey, inputs: RangingInputs, checked: CheckedSurvey) -> None:
+    log, anchors = inputs.log, inputs.anchors
+    num_used = int(np.count_nonzero(log.kind == RangeKind.TAG_ANCHOR))
+    name = "" if survey.ranges.path is None else survey.ranges.path.name
+    checked.facts.append(
+        f"ranges: {num_used} of {_counted(log.tag_ids, 'tag')} to {_counted(log.anchor_ids, 'anchor')} in {name} "
+        f"({log.format})"
+    )
+    surveyed = [anchor.anchor_id for anchor in anchors if anchor.position_m is not None]
+    if surveyed and inputs.anchor_frame != "unknown":
+        source = "the log" if survey.anchors.path is None else survey.anchors.path.name
+        checked.facts.append(
+            f"anchors: {len(surveyed)} of {len(anchors)} have positions in {source} (frame {inputs.anchor_frame})"
+        )
+    else:
+        checked.assumed.append(
+            "no anchor's position is known: all are estimated, and the map is in the first camera's frame"
+        )
+    if {"tag_in_cam_m", "lever_arms_m"} & survey.tag.model_fields_set:
+        arms = (f"{', '.join(f'{x:g}' for x in arm)} m" for arm in inputs.tag_in_cam_m.tolist() if not np.isnan(arm[0]))
+        checked.facts.append(f"lever arm: the tag is at {'; '.join(arms)} in the camera frame (right, down, forward)")
+    if inputs.tape is not None:
+        checked.facts.append(f"taped distances: {len(inputs.tape.distances)}")
+    if inputs.reference is not None:
+        name = "" if survey.report.reference is None else f" in {survey.report.reference.name}"
+        checked.facts.append(f"reference: {len(inputs.reference)} positions{name}, only to compare with")
+
+
+def _tell_of_times(
+    survey: Survey, inputs: RangingInputs, keyframes: Sequence[str], times: ImageTimes | None, checked: CheckedSurvey
+) -> None:
+    radio_s = inputs.log.timestamp_s
+    if times is None or radio_s is None:
+        checked.facts.append(f"times: none are needed for {len(keyframes)} keyframes, the ranges name their photos")
+        return
+    photos_s, offset_s = times.timestamps_s, survey.ranges.time_offset_s
+    checked.facts.append(
+        f"times: {len(keyframes)} keyframes from {photos_s[0]:.3f} to {photos_s[-1]:.3f} s ({times.source}), "
+        f"ranges from {radio_s.min():.3f} to {radio_s.max():.3f} s"
+    )
+    at_s = radio_s + (offset_s or 0.0)
+    shared_s = max(min(at_s.max(), photos_s[-1]) - max(at_s.min(), photos_s[0]), 0.0)
+    overlap = f"the ranges cover {shared_s:.1f} of the {photos_s[-1] - photos_s[0]:.1f} s of the photos"
+    if offset_s is not None:
+        checked.facts.append(f"clocks: with the offset of {offset_s:g} s {overlap}")
+    else:
+        checked.assumed.append(f"the clocks differ by an offset, which is searched for; without any {overlap}")
+
+
+def _counted(ids: Sequence[str], what: str) -> str:
+    return f"{len(ids)} {what}{'s' * (len(ids) != 1)} ({', '.join(ids)})"

@@ -1,0 +1,30 @@
+"""What somebody brings home who has a phone and a radio: photos with EXIF times, and a log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from PIL import Image
+from PIL.ExifTags import IFD, Base
+
+
+def write_photos(folder: Path, num: int, *, num_upright: int = 0, has_times: bool = True) -> None:
+    """Photos of 96 x 64 pixels a second apart, of which the last ones stand upright."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for k in range(num):
+        size = (64, 96) if k >= num - num_upright else (96, 64)
+        exif = Image.Exif()
+        if has_times:
+            exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = f"2026:05:04 10:00:{k:02d}"
+        Image.new("RGB", size, (9 * k, 40, 40)).save(folder / f"IMG_{k}.jpg", exif=exif)
+
+
+def write_log(path: Path, start_s: float, *, anchors: tuple[str, ...] = ("A1", "A2", "A3", "A4")) -> None:
+    """Ranges twice a second, to one anchor after the other."""
+    rows = [f"{start_s + 0.5 * k},{anchors[k % len(anchors)]},{3 + 0.01 * k:.2f}" for k in range(60)]
+    path.write_text("timestamp_s,anchor_id,range_m\n" + "\n".join(rows) + "\n", encoding="utf-8")
+
+
+def write_anchors(path: Path) -> None:
+    rows = [f"A{k},{5 * (k % 2)},{4 * (k // 3)},{0.5 * k}" for k in range(1, 5)]
+    path.write_text("anchor_id,x_m,y_m,z_m\n" + "\n".join(rows) + "\n", encoding="utf-8")

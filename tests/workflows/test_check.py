@@ -1,0 +1,82 @@
+"""A check tells what a run would work with, and all that would stop it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from tests.simulated.phone_survey import write_anchors, write_log, write_photos
+
+from rangesfm.survey.settings import Survey, survey_from_tables
+from rangesfm.workflows.check import check_survey
+
+PHONE_START_S = 1777888800.0  # 2026-05-04 10:00:00 UTC
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_photos(tmp_path / "images", 20, num_upright=3)
+    write_log(tmp_path / "uwb.csv", PHONE_START_S + 5)
+    write_anchors(tmp_path / "anchors.csv")
+    return tmp_path
+
+
+def survey_of(folder: Path, **keys: object) -> Survey:
+    values = {key.replace("__", "."): value for key, value in keys.items()}
+    paths = {"images.path": folder / "images", "ranges.path": folder / "uwb.csv", "output.path": folder / "out"}
+    return survey_from_tables({}, folder, {**paths, **values})
+
+
+def test_a_good_survey_is_told_with_its_counts_times_and_what_is_assumed(folder: Path) -> None:
+    checked = check_survey(survey_of(folder, anchors__path=folder / "anchors.csv"))
+    assert checked.faults == []
+    assert checked.exit_status == 0
+    assert checked.facts == [
+        "photos in images: 17 of 96 x 64 pixels, 3 of 64 x 96 pixels",
+        "ranges: 60 of 1 tag (tag) to 4 anchors (A1, A2, A3, A4) in uwb.csv (canonical)",
+        "anchors: 4 of 4 have positions in anchors.csv (frame site)",
+        f"times: 20 keyframes from {PHONE_START_S:.3f} to {PHONE_START_S + 19:.3f} s (exif), "
+        f"ranges from {PHONE_START_S + 5:.3f} to {PHONE_START_S + 34.5:.3f} s",
+    ]
+    camera, upright, clocks = checked.assumed
+    assert camera == "camera SIMPLE_RADIAL for 17 photos, f 115 pixels, a guess from the photos' size"
+    assert upright.startswith("camera SIMPLE_RADIAL for 3 photos")
+    assert "without any the ranges cover 14.0 of the 19.0 s of the photos" in clocks
+    assert any(warning.startswith("the tag's place on the camera is not given") for warning in checked.warnings)
+    assert any(warning.startswith("image times are whole seconds") for warning in checked.warnings)
+    assert not (folder / "out").exists()
+
+
+def test_a_given_lever_arm_offset_and_camera_are_facts_and_unknown_anchors_assumed(folder: Path) -> None:
+    given = {"tag__tag_in_cam_m": (0, -0.1, 0), "ranges__time_offset": 3.0}
+    camera = {"camera__model": "PINHOLE", "camera__params": (90, 90, 48, 32)}
+    checked = check_survey(survey_of(folder, **given, **camera))
+    assert "camera: PINHOLE for 17 photos, f 90 pixels, as given" in checked.facts
+    assert "lever arm: the tag is at 0, -0.1, 0 m in the camera frame (right, down, forward)" in checked.facts
+    assert "clocks: with the offset of 3 s the ranges cover 11.0 of the 19.0 s of the photos" in checked.facts
+    assert checked.assumed == [
+        "camera PINHOLE for 3 photos, f 115 pixels, a guess from the photos' size",
+        "no anchor's position is known: all are estimated, and the map is in the first camera's frame",
+    ]
+
+
+def test_faults_of_photos_and_of_the_radio_are_both_told(folder: Path) -> None:
+    (folder / "uwb.csv").write_text("timestamp_s,anchor_id,range_m\n0.1,A1,far\n")
+    checked = check_survey(survey_of(folder, camera__model="PINHOLE", camera__params=(90, 90, 480, 32)))
+    assert checked.exit_status == 2
+    camera, radio = map(str, checked.faults)
+    assert "do they belong to another image size?" in camera
+    assert "uwb.csv:2: range_m is 'far'" in radio
+
+
+def test_clocks_that_share_no_time_photos_without_times_and_missing_parts_are_faults(folder: Path) -> None:
+    (nothing_shared,) = check_survey(survey_of(folder, ranges__time_offset=1e4)).faults
+    assert "uwb.csv" in str(nothing_shared)
+    write_photos(folder / "timeless", 5, has_times=False)
+    (no_times,) = check_survey(survey_of(folder, images__path=folder / "timeless")).faults
+    assert "no time for IMG_0.jpg: expected a CSV file" in str(no_times)
+    without_photos = check_survey(survey_from_tables({}, folder, {"ranges.path": folder / "uwb.csv"}))
+    assert [str(fault)[:9] for fault in without_photos.faults] == ["no photos"]
+    assert without_photos.facts[0].startswith("ranges: 60 of 1 tag")
+    faults = check_survey(survey_from_tables({}, folder)).faults
+    assert [str(fault)[:9] for fault in faults] == ["no photos", "no ranges"]
