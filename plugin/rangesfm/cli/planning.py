@@ -22,9 +22,10 @@ def _plan(args: argparse.Namespace, progress: Progress) -> Outcome:
     example:
       rangesfm plan plan.toml --output_path plan
     """
+    from rangesfm.planning.placement import place_anchors
     from rangesfm.planning.settings import read_plan
     from rangesfm.planning.survey_plan import plan_survey, write_plan
 
-    plan = plan_survey(read_plan(args.plan))
+    plan = plan_survey(place_anchors(read_plan(args.plan), progress))
     written = [] if args.output_path is None else [str(write_plan(plan, Path(args.output_path)))]
     return Outcome([*plan.lines, *written])

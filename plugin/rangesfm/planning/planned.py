@@ -38,6 +38,7 @@ class PlannedSurvey:
         taped: distances between points of the map: pairs of a length and its stddev, metres.
         heights_m: between which anchors may stand; None: not below the ground, which is 0 or the lowest of all.
         path_is_level: the camera cannot go up and down, as on a rover.
+        region_m: two corners of a box in which the anchors may stand anywhere; None: they stand where they do.
     """
 
     trajectory: Trajectory
@@ -51,6 +52,7 @@ class PlannedSurvey:
     taped: tuple[tuple[float, float], ...] = ()
     heights_m: tuple[float, float] | None = None
     path_is_level: bool = False
+    region_m: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
 
     @property
     def anchors_m(self) -> Array:

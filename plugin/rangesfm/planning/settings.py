@@ -13,6 +13,7 @@ from rangesfm.files.atomic import path_of
 from rangesfm.option_model import Options, Told
 from rangesfm.options import RangeModelOptions, TagOptions
 from rangesfm.planning.paths import path_from_file, path_from_model, path_through
+from rangesfm.planning.placement import spread_anchors
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.anchor_file import read_anchors
@@ -32,6 +33,12 @@ def _ascending(heights: tuple[float, float]) -> tuple[float, float]:
     return heights
 
 
+def _corners(corners: tuple[tuple[float, ...], tuple[float, ...]]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    if any(low > high for low, high in zip(*corners, strict=True)) or corners[0][:2] == corners[1][:2]:
+        raise ValueError("are no box")
+    return corners
+
+
 class PlannedAnchorOptions(Options):
     """The anchors: where they will stand in the site, metres, z up."""
 
@@ -47,6 +54,13 @@ class PlannedAnchorOptions(Options):
     """As what a run will know them: surveyed in the site, known in the first camera's frame, or not at all."""
     position_stddev_m: _Stddev = 0.0
     """How well each coordinate in places will be known."""
+    num_to_place: Annotated[int, Field(ge=1, le=_MAX_NUM_ANCHORS)] | None = None
+    """So many anchors are put where they help most, instead of places and path."""
+    region_m: Annotated[
+        Annotated[tuple[_Place, _Place], Field(strict=False), AfterValidator(_corners)] | None,
+        Told(expected="two places, the second one in no coordinate smaller"),
+    ] = None
+    """Two corners x, y, z of the box in which they may be put."""
     heights_m: Annotated[
         Annotated[tuple[_Coordinate, _Coordinate], Field(strict=False), AfterValidator(_ascending)] | None,
         Told(expected="a list of 2 numbers, the larger one last"),
@@ -175,6 +189,7 @@ def _planned(plan: Plan) -> PlannedSurvey:
         component_stddevs=radio.stddevs,
         heights_m=plan.anchors.heights_m,
         path_is_level=path.is_level,
+        region_m=plan.anchors.region_m,
     )
     if planned.duration_s > _MAX_DURATION_S:
         message = f"[path] takes {planned.duration_s:.3g} s, expected at most {_MAX_DURATION_S:g}"
@@ -183,9 +198,14 @@ def _planned(plan: Plan) -> PlannedSurvey:
 
 
 def _anchors(options: PlannedAnchorOptions) -> tuple[Anchor, ...]:
-    if (options.path is None) == (not options.places):
-        found = "both" if options.places else "none"
-        raise OptionError(f"[anchors] has {found} of path and places, expected one", "anchors")
+    given = [name for name in ("path", "places", "num_to_place") if getattr(options, name)]
+    if len(given) != 1:
+        found = " and ".join(given) or "none"
+        raise OptionError(f"[anchors] has {found} of path, places and num_to_place, expected one", "anchors")
+    if (options.num_to_place is None) != (options.region_m is None):
+        raise OptionError("[anchors] num_to_place and region_m go together, expected both or none", "anchors")
+    if options.num_to_place is not None and options.region_m is not None:
+        return spread_anchors(options.num_to_place, *options.region_m, options.position_stddev_m)
     if options.path is None:
         anchors = tuple(
             Anchor(anchor_id, np.array(place), options.position_stddev_m) for anchor_id, place in options.places.items()

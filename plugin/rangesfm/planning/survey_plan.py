@@ -76,6 +76,7 @@ class SurveyPlan:
 
     Attributes:
         num_ranges: that the radio will measure, in ``duration_s``.
+        anchors_m: where they will stand in the site, by id.
         frame: of the result, "site" or "first_camera".
         scale_stddev: relative. scale_stddev_formal: as if every range erred on its own.
         scale_interval_95: relative, its ends.
@@ -88,6 +89,7 @@ class SurveyPlan:
 
     num_ranges: int
     duration_s: float
+    anchors_m: dict[str, tuple[float, ...]]
     frame: str
     scale_stddev: float
     scale_stddev_formal: float
@@ -136,6 +138,7 @@ def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
     return SurveyPlan(
         num_ranges=planned.num_ranges,
         duration_s=planned.duration_s,
+        anchors_m={a.anchor_id: tuple(at.tolist()) for a, at in zip(planned.anchors, planned.anchors_m, strict=True)},
         frame=expected.posed.frame,
         scale_stddev=expected.uncertainty.empirical,
         scale_stddev_formal=expected.uncertainty.formal,
@@ -185,6 +188,8 @@ def _most(mistake: DetectableMistake) -> float:
 def _known(plan: SurveyPlan) -> Iterator[str]:
     low, high = (100 * end for end in plan.scale_interval_95)
     yield f"{plan.num_ranges} ranges in {plan.duration_s:.0f} s, result in the {plan.frame.replace('_', ' ')}'s frame"
+    places = (f"{name} {', '.join(f'{x:.4g}' for x in place)}" for name, place in plan.anchors_m.items())
+    yield f"anchors at {'; '.join(places)}"
     yield f"scale: +-{100 * plan.scale_stddev:.2g} % (1 stddev), {low:+.2g} to {high:+.2g} % (95 %); {plan.verdict}"
     yield from (f"  {reason}" for reason in plan.reasons)
     if plan.place is not None:
