@@ -20,6 +20,9 @@ from rangesfm.scale.problem import ScaleProblem, scale_problem
 from rangesfm.scale.range_equation import RangeState
 
 _MAX_NUM_RANGES = 2000
+# Nobody puts an anchor in line with a path, or into its plane, to a decimetre; and where one that is to be found stands
+# exactly there, the linear problem does not see what is open.
+_OFF_LINE_M = (0.07, 0.07, 0.1)
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,11 @@ class PlannedSurvey:
         return np.array([anchor.position_m for anchor in self.anchors], dtype=np.float64)
 
     @property
+    def _standing_m(self) -> Array:
+        """(m, 3) where the anchors are taken to stand."""
+        return self.anchors_m + _OFF_LINE_M if self.anchor_frame == "unknown" else self.anchors_m
+
+    @property
     def places_m(self) -> Array:
         """(m + n, 3) of all anchors and keyframes."""
         return np.vstack([self.anchors_m, self.trajectory.centers])
@@ -92,7 +100,7 @@ class PlannedSurvey:
         ids = [anchor.anchor_id for anchor in self.anchors]
         log = RangeLog.from_arrays([ids[k] for k in turn % num_anchors], np.ones(len(turn)), timestamp_s=times)
         places = associate(log, self.trajectory, self.tag_in_cam_m)
-        at = np.array([self.anchors_m[ids.index(anchor_id)] for anchor_id in log.anchor_ids])
+        at = np.array([self._standing_m[ids.index(anchor_id)] for anchor_id in log.anchor_ids])
         distances = np.linalg.norm(places.centers + places.tag_from_center - at[log.anchor_index], axis=1)
         curve = None if self.curve_stddev_m is None else np.full(len(log), self.curve_stddev_m)
         # One without a place has no say.
@@ -120,7 +128,7 @@ class PlannedSurvey:
 
     def state(self, posed: ScaleProblem, anchor_ids: tuple[str, ...]) -> RangeState:
         """The truth, in the frame of the problem."""
-        at = {anchor.anchor_id: place for anchor, place in zip(self.anchors, self.anchors_m, strict=True)}
+        at = {anchor.anchor_id: place for anchor, place in zip(self.anchors, self._standing_m, strict=True)}
         places, first = np.array([at[anchor_id] for anchor_id in anchor_ids]), self._site_from_first_camera
         biases = posed.ranges.bias_mean_m.copy()
         if posed.frame == "site":
