@@ -82,6 +82,10 @@ class PlannedSurvey:
         """That the radio will measure."""
         return int(self.duration_s * self.rate_hz) * len(self.anchors)
 
+    def ranging(self, num_ranges: int) -> PlannedSurvey:
+        """The same at such a rate that so many ranges come of it."""
+        return replace(self, rate_hz=(num_ranges / len(self.anchors) + 0.5) / self.duration_s)
+
     @property
     def num_alike(self) -> int:
         """How many ranges each simulated one stands for."""
