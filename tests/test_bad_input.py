@@ -20,6 +20,7 @@ from PIL import Image
 from tests.result_document import result_document
 
 from rangesfm.cli import main
+from rangesfm.files.atomic import LOCK_NAME
 
 if TYPE_CHECKING:
     from tests.conftest import Command, PhotoRun, WalkedSurvey
@@ -442,6 +443,19 @@ def assert_nothing_half_written(folder: Path) -> None:
     assert not [name for name in names if name.endswith((".part", ".old")) or name.startswith(".")]
 
 
+def test_format_that_cannot_be_written_costs_neither_the_result_nor_the_others(
+    own_survey: WalkedSurvey, rangesfm_command: Command
+) -> None:
+    flags = ("--anchors", "anchors.csv", "--formats", "undistorted,kml,ply", "--output_path", "out", "--quiet")
+    done = rangesfm_command("scale", *own_survey.flags, *flags, cwd=own_survey.folder, status=2)
+    first, second, written = done.stderr.splitlines()
+    assert "2 of 3 formats could not be written: undistorted: the format 'undistorted' needs the photos" in first
+    assert "kml: the format 'kml' needs a georeferenced map" in second
+    assert written.endswith("/out/points.ply")
+    names = {path.name for path in (own_survey.folder / "out").iterdir()}
+    assert {"result.json", "report.html", "points.ply"} <= names
+
+
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
     """Start a command, as from a terminal, where Ctrl-C is not ignored."""
@@ -468,19 +482,43 @@ def start(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
 HANGS_AFTER_S = 600.0  # far beyond any time that a loaded machine takes
 
 
-def interrupt_when(happened: Callable[[], bool], process: subprocess.Popen[str]) -> list[str]:
-    """Send Ctrl-C as soon as something has happened; what the process said."""
+def interrupt_when(
+    happened: Callable[[], bool], process: subprocess.Popen[str], by: signal.Signals = signal.SIGINT
+) -> list[str]:
+    """Send Ctrl-C, or another signal, as soon as something has happened; what the process said."""
     deadline = time.monotonic() + HANGS_AFTER_S
     while not happened():
         assert process.poll() is None, "the process ended before"
         assert time.monotonic() < deadline
         time.sleep(0.002)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(by)
     out, err = process.communicate(timeout=HANGS_AFTER_S)
     assert process.returncode == 130
     assert out == ""
     assert "Traceback" not in err
     return err.splitlines()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="sees in /proc what has been loaded")
+def test_sigterm_ends_a_command_as_ctrl_c_does(
+    own_survey: WalkedSurvey, start: Callable[..., subprocess.Popen[str]]
+) -> None:
+    flags = ("--anchors", "anchors.csv", "--output_path", "out")
+    process = start("refine", *own_survey.flags, *flags, cwd=own_survey.folder)
+    maps = Path(f"/proc/{process.pid}/maps")
+    lock = own_survey.folder / "out" / LOCK_NAME
+    # It is these two that would print a stack trace.
+    lines = interrupt_when(
+        lambda: lock.exists() and {"_core", "pyceres"} <= loaded(maps.read_text()), process, by=signal.SIGTERM
+    )
+    assert lines[-1] == "rangesfm: error: interrupted; stages that were done are kept"
+    assert all(line.startswith(("scale", "refinement", "rangesfm: error")) for line in lines)
+    assert not (own_survey.folder / "out").exists()
+
+
+def loaded(maps: str) -> set[str]:
+    """Names of the libraries that a process has loaded, up to their first dot."""
+    return {Path(line.split()[-1]).name.partition(".")[0] for line in maps.splitlines() if "/" in line}
 
 
 class TestCtrlC:

@@ -510,7 +510,7 @@ class TestResultFolder:
         flags = ("--formats", "colmap_text,ply_cameras,ply_anchors,transform,model_aligner", "--output_path", "more")
         done = rangesfm_command("export", out, *flags, cwd=out.parent)
         written = [out.parent / line for line in done.stdout.splitlines()]
-        assert len(written) == 5
+        assert len(written) == 6  # two transforms
         assert all(path.exists() for path in written)
         assert pycolmap.Reconstruction(out.parent / "more" / "colmap_text").num_reg_images() == 40
 

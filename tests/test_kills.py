@@ -34,7 +34,7 @@ def function_or_death(*arguments, **options):
 setattr(module, name, function_or_death)
 sys.exit(main(argv))
 """
-IN_MATCHING = ("rangesfm.vision.matching", "num_compared_pairs", 0)
+IN_MATCHING = ("rangesfm.vision.matching", "append_log", 0)
 IN_MAPPING = ("rangesfm.vision.snapshots", "_keep", 3)
 AMONG_TABLES = ("rangesfm.result.table_file", "write_table", 2)
 BEFORE_THE_RESULT = ("rangesfm.workflows.results", "input_hashes", 0)

@@ -123,6 +123,7 @@ def test_full_disk_is_one_line_and_leaves_nothing_half_written(
     assert done.stderr.startswith(b"rangesfm: error: ")
     assert done.stderr.count(b"\n") == 1
     assert b"internal error" not in done.stderr
+    assert b"/out/" in done.stderr  # of what it could not write
     left = (
         [path.name for path in (own_survey.folder / "out").rglob("*")] if (own_survey.folder / "out").exists() else []
     )
@@ -144,7 +145,45 @@ def test_full_device_for_a_file_is_one_line(command: Callable[..., subprocess.Co
     with open("/dev/full", "wb") as full:
         done = command("ranges", "uwb.csv", stdout=full)
     assert done.returncode == 4
-    assert done.stderr == b"rangesfm: error: No space left on device\n"
+    assert done.stderr == b"rangesfm: error: standard output: No space left on device\n"
+
+
+def test_output_that_cannot_be_written_to_is_one_line(
+    command: Callable[..., subprocess.CompletedProcess[bytes]],
+) -> None:
+    with open(os.devnull, "rb") as readable:
+        done = command("ranges", "uwb.csv", stdout=readable)
+    assert done.returncode == 4
+    assert done.stderr == b"rangesfm: error: standard output: Bad file descriptor\n"
+
+
+def test_working_folder_that_was_deleted_is_one_line(tmp_path: Path) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    program = "import os; os.rmdir(os.getcwd()); from rangesfm.cli import main; raise SystemExit(main(['ranges', 'a']))"
+    done = subprocess.run([sys.executable, "-c", program], cwd=gone, capture_output=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr == b"rangesfm: error: the working folder has been deleted: change to one that is there\n"
+
+
+def test_too_little_memory_to_begin_with_is_one_line(
+    command: Callable[..., subprocess.CompletedProcess[bytes]], own_survey: WalkedSurvey
+) -> None:
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (300_000 << 10, 300_000 << 10))
+
+    flags = ("scale", *quick_flags(own_survey), "--output_path", "out", "--quiet")
+    done = command(*flags, preexec_fn=limit)
+    assert (done.returncode, done.stderr) == (4, b"rangesfm: error: out of memory\n")
+
+
+def test_root_of_the_file_system_is_no_output_folder(
+    own_survey: WalkedSurvey, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(own_survey.folder)
+    assert main(["scale", *quick_flags(own_survey), "--output_path", "/"]) == 2
+    said = "rangesfm: error: /: is the root of the file system, expected a folder for the results\n"
+    assert capfd.readouterr().err.endswith(said)
 
 
 @pytest.mark.parametrize("path", ["/dev/zero", "fifo"])

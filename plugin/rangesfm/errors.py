@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import errno
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +13,8 @@ INTERNAL_ERROR, BAD_INPUT, FAILED = 1, 2, 4
 """Exit statuses; the first is of what nobody should ever see."""
 INTERRUPTED = 130
 """As shells have it."""
+# A library that finds no room as it is loaded or begins a thread says it in these words.
+_WANT_OF_MEMORY = ("failed to map segment", "cannot allocate memory", "can't start new thread")
 _UNUSABLE_PATH = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG)
 
 
@@ -124,12 +126,23 @@ def failure_of(error: BaseException) -> Failure:
 def _told(error: BaseException) -> tuple[str, int]:
     if isinstance(error, RangesfmError):
         return str(error), error.exit_status
-    if isinstance(error, KeyboardInterrupt):
+    if any(isinstance(cause, KeyboardInterrupt) for cause in _with_causes(error)):
         return "interrupted; stages that were done are kept", INTERRUPTED
+    if any(map(_is_want_of_memory, _with_causes(error))):
+        return "out of memory", FAILED
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename is not None else ""
         return f"{where}{error.strerror or error}", BAD_INPUT if error.errno in _UNUSABLE_PATH else FAILED
-    if isinstance(error, MemoryError):
-        return "out of memory", FAILED
     what = f"{type(error).__name__}: {error}"
     return f"internal error, please report it (RANGESFM_DEBUG=1 shows where): {what}", INTERNAL_ERROR
+
+
+def _with_causes(error: BaseException | None) -> Iterator[BaseException]:
+    """It and what it came from: a library that is being loaded makes an error of its own of whatever happens."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def _is_want_of_memory(error: BaseException) -> bool:
+    return isinstance(error, MemoryError) or any(words in str(error).lower() for words in _WANT_OF_MEMORY)

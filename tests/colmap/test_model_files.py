@@ -66,6 +66,29 @@ def test_folder_above_the_model_is_told_from_the_model(rigs: Path, tmp_path: Pat
         read_model(tmp_path)
 
 
+@pytest.mark.parametrize("ending", [".bin", ".txt"])
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_missing_file_is_named(name: str, ending: str, rigs: Path, tmp_path: Path) -> None:
+    model = read_model(rigs)
+    (model.write_binary if ending == ".bin" else model.write_text)(tmp_path)
+    (tmp_path / (name + ending)).unlink()
+    with pytest.raises(InputError, match=f"not a whole COLMAP model, there is no {name}{ending};"):
+        read_model(tmp_path)
+
+
+def test_name_with_blanks_in_a_text_model_is_named_with_its_line(rigs: Path, tmp_path: Path) -> None:
+    model = read_model(rigs)
+    for image in model.images.values():
+        image.name = f"my {image.name}"
+    model.write_binary(tmp_path)
+    assert all(image.name.startswith("my ") for image in read_model(tmp_path).images.values())
+    (tmp_path / "text").mkdir()
+    model.write_text(tmp_path / "text")
+    with pytest.raises(InputError, match=r"the photo's name 'my .*' holds blanks") as caught:
+        read_model(tmp_path / "text")
+    assert (caught.value.path, caught.value.line) == (tmp_path / "text" / "images.txt", 5)
+
+
 def test_pose_that_is_not_finite_is_named(walked_survey: WalkedSurvey, tmp_path: Path) -> None:
     model = read_model(walked_survey.folder / "sparse" / "0")
     model.frame(3).rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.full(3, np.nan))

@@ -15,8 +15,8 @@ import numpy.typing as npt
 import pycolmap
 import pytest
 from PIL import Image
-from pyopf.cameras import CameraList
-from pyopf.cps import Constraints, InputControlPoints
+from pyopf.io import load as load_opf
+from pyopf.resolve import resolve
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
@@ -126,6 +126,7 @@ def test_nerfstudio_projects_points_where_colmap_does(camera_model: str, tmp_pat
     model = made(camera_model)
     content = load(export(model, "nerfstudio", tmp_path))
     assert (tmp_path / content["ply_file_path"]).is_file()
+    assert content["camera_model"] == ("OPENCV_FISHEYE" if camera_model == "OPENCV_FISHEYE" else "OPENCV")
     for frame in content["frames"]:
         image = model.find_image_with_name(frame["file_path"].removeprefix("images/"))
         assert image is not None
@@ -135,10 +136,37 @@ def test_nerfstudio_projects_points_where_colmap_does(camera_model: str, tmp_pat
                 xyz = model.point3D(point.point3D_id).xyz
                 in_gl = np.linalg.solve(world_from_gl, [*xyz, 1.0])[:3]
                 assert in_gl[2] < 0
-                at = opencv_projection(frame, in_gl * [1, -1, -1])
+                at = opencv_projection({**content, **frame}, in_gl * [1, -1, -1])
                 expected = image.project_point(xyz)
                 assert expected is not None
                 np.testing.assert_allclose(at, expected, atol=1e-6)
+
+
+def of_two_cameras(first: str, second: str) -> pycolmap.Reconstruction:
+    """Twelve photos, six of each camera."""
+    pycolmap.set_random_seed(3)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 2, 6, 60
+    model = pycolmap.synthesize_dataset(options)
+    for camera, name, focal_length in zip(model.cameras.values(), (first, second), (500.0, 700.0)):
+        camera.model = pycolmap.CameraModelId.__members__[name]
+        camera.params = [focal_length, focal_length, 310.0, 245.0, 0.02, -0.01, 1e-3, -2e-3]
+    return model
+
+
+def test_nerfstudio_is_told_of_every_camera(tmp_path: Path) -> None:
+    content = load(export(of_two_cameras("OPENCV_FISHEYE", "OPENCV_FISHEYE"), "nerfstudio", tmp_path))
+    assert content["camera_model"] == "OPENCV_FISHEYE"
+    # What stands at the top would hold for all.
+    assert not {"fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "p1", "p2"} & content.keys()
+    assert sorted(frame["fl_x"] for frame in content["frames"]) == [500.0] * 6 + [700.0] * 6
+    assert not any("camera_model" in frame for frame in content["frames"])
+
+
+def test_nerfstudio_has_no_place_for_fisheyes_beside_others(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="one camera model for all photos"):
+        export(of_two_cameras("OPENCV", "OPENCV_FISHEYE"), "nerfstudio", tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def opencv_projection(frame: dict[str, Any], xyz: Array) -> Array:
@@ -191,12 +219,12 @@ def test_scale_constraints_are_distances_of_the_map_between_points_that_are_mark
         assert constraint["sigma"] == pytest.approx(0.02 * length, rel=1e-6)
 
 
-def test_the_formats_own_library_reads_the_constraints(tmp_path: Path) -> None:
+def test_the_formats_own_library_opens_the_project(tmp_path: Path) -> None:
     folder = export(made(), "opf", tmp_path)
-    constraints = Constraints.from_dict(load(folder / "constraints.json"))
-    control = InputControlPoints.from_dict(load(folder / "input_control_points.json"))
-    cameras = CameraList.from_dict(load(folder / "camera_list.json"))
+    project = resolve(load_opf(folder / "project.opf"))
+    constraints, control, cameras = project.constraints, project.input_control_points, project.camera_list
     points, photos = {point.id for point in control.mtps}, {camera.id for camera in cameras.cameras}
+    assert len(cameras.cameras) == 6
     assert len(constraints.scale_constraints) == 10
     for constraint in constraints.scale_constraints:
         assert {constraint.id_from, constraint.id_to} <= points
@@ -265,6 +293,13 @@ def test_photos_that_have_no_room_are_not_begun(tmp_path: Path, monkeypatch: pyt
 def test_what_a_format_cannot_hold_is_said(name: str, camera_model: str, said: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=said):
         export(made(camera_model), name, tmp_path)
+
+
+def test_laz_without_what_compresses_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("laspy.LazBackend.detect_available", lambda: ())
+    with pytest.raises(InputError, match=r"needs lazrs beside laspy: pip install 'rangesfm\[geo\]'"):
+        export(made(), "laz", tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_missing_photos_are_named(tmp_path: Path) -> None:

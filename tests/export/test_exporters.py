@@ -152,14 +152,17 @@ def test_an_empty_model_gives_empty_files(tmp_path: Path) -> None:
 def test_the_transform_carries_the_unscaled_model_to_the_metric_one(
     tmp_path: Path, model: pycolmap.Reconstruction
 ) -> None:
-    (path,) = export_model(model, ["transform"], tmp_path, metric_from_sfm=METRIC_FROM_SFM)
-    scale, qw, qx, qy, qz, *translation = map(float, path.read_text().split())
+    line, matrix = export_model(model, ["transform"], tmp_path, metric_from_sfm=METRIC_FROM_SFM)
+    assert [line.name, matrix.name] == ["transform_colmap_4.txt", "transform_colmap_3.8.txt"]
+    scale, qw, qx, qy, qz, *translation = map(float, line.read_text().split())
     assert scale == METRIC_FROM_SFM.scale
     np.testing.assert_array_equal(translation, METRIC_FROM_SFM.translation)
     moved = pycolmap.Reconstruction(model)
     moved.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(np.array([qx, qy, qz, qw])), np.array(translation)))
     for name, center in centers_of(model).items():
-        np.testing.assert_allclose(centers_of(moved)[name], METRIC_FROM_SFM.apply(center), rtol=1e-12)
+        expected = METRIC_FROM_SFM.apply(center)
+        np.testing.assert_allclose(centers_of(moved)[name], expected, rtol=1e-12)
+        np.testing.assert_allclose(np.loadtxt(matrix) @ [*center, 1.0], [*expected, 1.0], rtol=1e-12)
 
 
 def test_a_transform_that_is_not_known_cannot_be_written(tmp_path: Path, model: pycolmap.Reconstruction) -> None:
@@ -211,6 +214,17 @@ def test_an_unknown_format_is_named_with_the_known_ones_before_anything_is_writt
     assert not (tmp_path / "out").exists()
 
 
+def test_formats_after_one_that_fails_are_written_and_all_failures_told(
+    tmp_path: Path, model: pycolmap.Reconstruction
+) -> None:
+    with pytest.raises(InputError, match=r"2 of 4 formats could not be written: transform: .* needs metric") as error:
+        export_model(model, ["transform", "tum", "opf", "ply"], tmp_path)
+    failed, written = error.value.advice
+    assert failed.startswith("opf: the format 'opf' needs the stddev")
+    assert written == f"written all the same: {tmp_path / 'trajectory.tum'}, {tmp_path / 'points.ply'}"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["points.ply", "trajectory.tum"]
+
+
 def write_photos(folder: Path, model: pycolmap.Reconstruction) -> Path:
     folder.mkdir()
     for image in model.images.values():
@@ -251,14 +265,14 @@ def test_a_result_is_exported_in_its_best_form_in_every_format(
     photos = write_photos(tmp_path / "photos", model)
     formats = [name for name in EXPORTERS if is_refined or name not in COVARIANCE_FORMATS]
     exported = export_result(tmp_path / "out", formats, tmp_path / "exports", images_path=photos)
-    paths = dict(zip(formats, exported, strict=True))
-    assert all(path.exists() and path.parent == tmp_path / "exports" for path in paths.values())
+    paths = {path.name: path for path in exported}
+    assert all(path.exists() and path.parent == tmp_path / "exports" for path in exported)
     expected = np.mean(list(centers_of(model).values()), axis=0) + ([0, 0, 0] if is_refined else [1000, 0, 0])
-    rows = np.loadtxt(paths["tum"])
+    rows = np.loadtxt(paths["trajectory.tum"])
     np.testing.assert_allclose(rows[:, 1:4].mean(axis=0), expected)
     assert rows[0, 0] == 1.7e9
-    np.testing.assert_array_equal(xyz(read_ply(paths["ply_anchors"])), [[1, 2, 3]])
-    assert paths["transform"].read_text().split()[0] == "2"
+    np.testing.assert_array_equal(xyz(read_ply(paths["anchors.ply"])), [[1, 2, 3]])
+    assert paths["transform_colmap_4.txt"].read_text().split()[0] == "2"
     assert not list((tmp_path / "exports").glob(".*"))
 
 

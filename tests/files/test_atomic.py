@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import subprocess
@@ -12,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from rangesfm.files.atomic import new_folder, scratch_folder
+from rangesfm.files.atomic import new_file, new_folder, scratch_folder
 
 
 def interrupting_once(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -27,6 +28,25 @@ def interrupting_once(function: Callable[..., Any]) -> Callable[..., Any]:
         function(*arguments, **options)
 
     return called
+
+
+class TestNewFile:
+    def test_clears_away_what_killed_processes_left_of_the_same_file(self, tmp_path: Path) -> None:
+        ended = subprocess.Popen([sys.executable, "-c", ""])
+        ended.wait()
+        dead, alive, other = (
+            tmp_path / name for name in (f".a.{ended.pid}.part.csv", f".a.{os.getppid()}.part.csv", ".b.1.part.csv")
+        )
+        for path in (dead, alive, other):
+            path.write_text("half")
+        with new_file(tmp_path / "a.csv") as temporary:
+            temporary.write_text("whole")
+        assert sorted(tmp_path.iterdir()) == sorted([alive, other, tmp_path / "a.csv"])
+
+    def test_names_the_file_that_a_full_disk_has_no_room_for(self, tmp_path: Path) -> None:
+        with pytest.raises(OSError, match="No space left") as caught, new_file(tmp_path / "a.csv"):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        assert caught.value.filename == str(tmp_path / "a.csv")
 
 
 class TestScratchFolder:

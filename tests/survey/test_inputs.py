@@ -101,3 +101,15 @@ def test_stranger_among_the_anchors_is_named_with_its_line(survey: Survey, tmp_p
     error = refusal(survey.changed({"tag.lever_arms_m": {"right": RIGHT, "left": LEFT}}))
     assert "anchor_id is 'C'" in str(error)
     assert error.line == 7
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("millimetres", 1000.0), ("centimetres", 100.0)])
+def test_positions_of_anchors_in_another_unit_are_told_from_metres(survey: Survey, unit: str, factor: float) -> None:
+    assert survey.anchors.path is not None
+    of_tag = survey.changed({"tag.tag_id": "left"})
+    assert read_ranging_inputs(of_tag).anchors[1].position_m is not None
+    survey.anchors.path.write_text(f"anchor_id,x_m,y_m,z_m\nA,0,0,0\nB,{1.5 * factor},0,0\n")
+    error = refusal(of_tag)
+    assert f"the ranges to them 1 and 2 m: are the positions in {unit}? expected metres" in str(error)
+    assert error.path == survey.anchors.path
+    read_ranging_inputs(of_tag.changed({"anchors.frame": "unknown"}))

@@ -62,8 +62,11 @@ def local_workers(num: int) -> Iterator[Client]:
             silence_logs=_SILENT,
             memory_limit=0,  # surveys are watched, and named
             local_directory=scratch,
-            # A Ctrl-C in the terminal is for the command, which stops them in order.
-            preload=["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
+            # A Ctrl-C in the terminal is for the command, which stops them in order, and by SIGTERM.
+            preload=[
+                "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
+                "if hasattr(signal, 'pthread_sigmask'): signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})"
+            ],
         ) as cluster,
         Client(cluster, set_as_default=False) as client,
     ):

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import _thread
 import io
 import os
+import signal
 import sys
+import threading
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 from rangesfm.cli.arguments import Outcome, normalize, parse
 from rangesfm.cli.terminal import terminal_progress
-from rangesfm.errors import INTERNAL_ERROR, failure_of, one_line
+from rangesfm.errors import INTERNAL_ERROR, InputError, failure_of, one_line
 
 _BROKEN_PIPE = 141  # as shells have it
 
@@ -26,16 +30,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):  # whatever the locale, a name that it cannot spell is no failure
             stream.reconfigure(errors="backslashreplace")
     try:
+        _require_working_folder()
         args = parse(normalize(sys.argv[1:] if argv is None else argv))
         if args.command != "doctor":  # which says more
             from rangesfm.installed_versions import check_versions
 
             check_versions()
         # There is no sys.stderr where the shell closed it.
-        with terminal_progress(sys.stderr or io.StringIO(), quiet=args.quiet) as progress:
+        with _sigterm_as_ctrl_c(), terminal_progress(sys.stderr or io.StringIO(), quiet=args.quiet) as progress:
             outcome: Outcome = args.execute(args, progress)
-        # A table is one text of several lines.
-        print("\n".join(one_line(line) for text in outcome.lines for line in text.split("\n")), flush=True)
+        _print(outcome.lines)
         return outcome.status
     except SystemExit as ended:  # --help and --version
         return int(ended.code or 0)
@@ -48,3 +52,52 @@ def main(argv: Sequence[str] | None = None) -> int:
             traceback.print_exc()
         print("rangesfm: error:", "\n  ".join([failure.message, *failure.advice]), file=sys.stderr)
         return failure.exit_status
+
+
+def _require_working_folder() -> None:
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        raise InputError("the working folder has been deleted: change to one that is there") from None
+
+
+def _print(texts: Sequence[str]) -> None:
+    """Texts of one or several lines, as a table is."""
+    try:
+        print("\n".join(one_line(line) for text in texts for line in text.split("\n")), flush=True)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        error.filename = "standard output"
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # or Python tries again when it exits, and complains
+        raise
+
+
+@contextmanager
+def _sigterm_as_ctrl_c() -> Iterator[None]:
+    """Have SIGTERM end what is done inside the block as Ctrl-C does.
+
+    pycolmap and pyceres, once they are imported, take it for a crash and print a stack trace. So it is blocked, which
+    keeps it from any handler; a thread waits for it and calls Python's.
+    """
+    if sys.platform == "win32" or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    has_ended = threading.Event()
+
+    def wait() -> None:
+        while signal.sigwait({signal.SIGTERM}) and not has_ended.is_set():
+            _thread.interrupt_main(signal.SIGTERM)
+
+    handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+    waiting = threading.Thread(target=wait, daemon=True)
+    waiting.start()
+    try:
+        yield
+    finally:
+        has_ended.set()
+        signal.pthread_kill(waiting.ident or 0, signal.SIGTERM)
+        waiting.join()
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        signal.signal(signal.SIGTERM, handler)

@@ -252,8 +252,8 @@ def _number(value: float | None) -> str:
 
 def _calibrate(args: argparse.Namespace, progress: Progress) -> Outcome:
     r"""Learn by how much a radio reads long or short at each distance, from a log whose tag positions are known (a
-    total station, motion capture) and surveyed anchors. Every command takes the file that this writes as
-    --error_curve, or as error_curve in [ranges].
+    total station, motion capture) and surveyed anchors. run, batch, init, check, scale, refine and compare take the
+    file that this writes as --error_curve; in a survey file it is error_curve in [ranges].
 
     example:
       rangesfm ranges calibrate log.csv --anchors anchors.csv --positions truth.csv \

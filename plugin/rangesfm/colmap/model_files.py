@@ -16,6 +16,7 @@ import pycolmap
 
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import is_plain_name
+from rangesfm.files.tables import read_text
 
 MAX_COORDINATE = 1e12
 """Of points and poses, in any unit: twice across the solar system in metres. Squares of it are still exact enough."""
@@ -30,6 +31,9 @@ _NO_POINT = 2**64 - 1
 _FEATURE = np.dtype([("xy", "<f8", 2), ("point_id", "<u8")])
 _ELEMENT = np.dtype([("image_id", "<u4"), ("feature", "<u4")])
 _POINT = np.dtype([("point_id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")])
+_NEEDED = ("cameras", "images", "points3D")
+# On a line of images.txt: id, quaternion, translation, camera.
+_NUM_BEFORE_NAME = 9
 _EXPECTED = "expected cameras, images and points3D files that COLMAP wrote"
 # Text files round quaternions, and some programs write a few digits only.
 _MAX_QUATERNION_ERROR = 1e-2
@@ -201,9 +205,7 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
         InputError: there is none, or its files are damaged: COLMAP takes much of them for granted, and what it does
             with the rest later, in its own code, is not for a user to meet.
     """
-    if not any((path / f"cameras{ending}").is_file() for ending in (".bin", ".txt")):
-        nested = f"; is it {path / '0'}?" if (path / "0").is_dir() else ""
-        raise InputError(f"not a COLMAP model, {_EXPECTED}{nested}", path)
+    _require_whole(path)
     records = {name: read_records(path / name) for name in MODEL_FILES if (path / name).is_file()}
     try:
         model = pycolmap.Reconstruction(path)
@@ -217,6 +219,35 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
     else:
         _check_map_of_text(model, path)
     return model
+
+
+def _require_whole(path: Path) -> None:
+    """Refuse what COLMAP would not find, or find and read wrongly: it takes binary files before text."""
+    here = {ending: [name for name in _NEEDED if (path / f"{name}{ending}").is_file()] for ending in (".bin", ".txt")}
+    ending = max(here, key=lambda ending: len(here[ending]))
+    missing = [name + ending for name in _NEEDED if name not in here[ending]]
+    if not here[ending]:
+        nested = f"; is it {path / '0'}?" if (path / "0").is_dir() else ""
+        raise InputError(f"not a COLMAP model, {_EXPECTED}{nested}", path)
+    if missing:
+        raise InputError(f"not a whole COLMAP model, there is no {missing[0]}; {_EXPECTED}", path)
+    if ending == ".txt":
+        _check_names_of_text(path / "images.txt")
+
+
+def _check_names_of_text(path: Path) -> None:
+    lines = enumerate(read_text(path, errors="replace").split("\n"), 1)
+    for number, line in lines:
+        words = line.split(maxsplit=_NUM_BEFORE_NAME)
+        if not words or words[0].startswith("#"):
+            continue
+        name = words[-1].strip()
+        if len(words) > _NUM_BEFORE_NAME and len(name.split()) > 1:
+            what = f"the photo's name {name!r} holds blanks, at which COLMAP ends it in text files"
+            raise InputError(
+                f"{what}: convert the model to binary where it was made, or rename the photos", path, number
+            )
+        next(lines, None)  # its features
 
 
 def write_binary_model(model: pycolmap.Reconstruction, folder: Path) -> None:

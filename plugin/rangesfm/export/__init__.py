@@ -6,19 +6,18 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rangesfm.errors import InputError
+from rangesfm.errors import InputError, RangesfmError, failure_of
 from rangesfm.export.apply import apply_to, best_similarity
-from rangesfm.export.colmap import write_model, write_positions, write_transform, write_undistorted
+from rangesfm.export.colmap import write_model, write_positions, write_project, write_transform, write_undistorted
 from rangesfm.export.gis import write_features, write_laz
 from rangesfm.export.metric_map import MetricMap, in_frame
 from rangesfm.export.photogrammetry import write_nerfstudio, write_opensfm, write_opf
 from rangesfm.export.ply import write_anchors, write_cameras, write_points
 from rangesfm.export.trajectories import (
     COVARIANCE_FORMATS,
+    write_covariances,
     write_kitti,
-    write_kitti_covariance,
     write_trajectory,
-    write_tum_covariance,
 )
 from rangesfm.files.atomic import make_output_folder
 from rangesfm.options import ExportOptions
@@ -43,16 +42,22 @@ __all__ = [
     "write_positions",
 ]
 
-Exporter = Callable[[MetricMap, Path], Path]
+Exporter = Callable[[MetricMap, Path], Path | tuple[Path, ...]]
 
 EXPORTERS: dict[str, Exporter] = {
-    "colmap": lambda map_, folder: write_model(map_.reconstruction, folder / "colmap"),
-    "colmap_text": lambda map_, folder: write_model(map_.reconstruction, folder / "colmap_text", as_text=True),
+    "colmap": lambda map_, folder: write_project(map_, folder / "colmap"),
+    "colmap_text": lambda map_, folder: write_project(map_, folder / "colmap_text", as_text=True),
     "undistorted": lambda map_, folder: write_undistorted(map_, folder / "undistorted"),
     "tum": lambda map_, folder: write_trajectory(map_.trajectory, folder / "trajectory.tum"),
     "kitti": lambda map_, folder: write_kitti(map_.trajectory, folder / "trajectory.kitti"),
-    "tum_covariance": lambda map_, folder: write_tum_covariance(map_, folder / "trajectory_covariance.tum"),
-    "kitti_covariance": lambda map_, folder: write_kitti_covariance(map_, folder / "trajectory_covariance.kitti"),
+    "tum_covariance": lambda map_, folder: (
+        write_covariances(map_, folder / "trajectory_covariance.csv"),
+        write_trajectory(map_.trajectory, folder / "trajectory.tum"),
+    ),
+    "kitti_covariance": lambda map_, folder: (
+        write_covariances(map_, folder / "trajectory_covariance.csv"),
+        write_kitti(map_.trajectory, folder / "trajectory.kitti"),
+    ),
     "ply": lambda map_, folder: write_points(map_.reconstruction, folder / "points.ply"),
     "ply_cameras": lambda map_, folder: write_cameras(map_.trajectory, folder / "cameras.ply"),
     "ply_anchors": lambda map_, folder: write_anchors(map_.anchors_m or {}, folder / "anchors.ply"),
@@ -60,13 +65,13 @@ EXPORTERS: dict[str, Exporter] = {
     "gpkg": lambda map_, folder: write_features(map_, folder / "survey.gpkg", "GPKG"),
     "geojson": lambda map_, folder: write_features(map_, folder / "survey.geojson", "GeoJSON"),
     "kml": lambda map_, folder: write_features(map_, folder / "survey.kml", "KML"),
-    "transform": lambda map_, folder: write_transform(map_.metric_from_sfm, folder / "transform.txt"),
+    "transform": lambda map_, folder: write_transform(map_.metric_from_sfm, folder),
     "model_aligner": lambda map_, folder: write_positions(map_.reconstruction, folder / "positions.txt"),
     "nerfstudio": lambda map_, folder: write_nerfstudio(map_, folder),
     "opensfm": lambda map_, folder: write_opensfm(map_, folder / "reconstruction.json"),
     "opf": lambda map_, folder: write_opf(map_, folder / "opf"),
 }
-"""Each writes one format of a map into a folder and returns the path written."""
+"""Each writes one format of a map into a folder and returns what it wrote."""
 
 
 def export_model(
@@ -96,12 +101,39 @@ def export_model(
 
 
 def export_map(map_: MetricMap, output_path: Path, options: ExportOptions) -> tuple[Path, ...]:
-    """The same of a map with all that is known of it, in the frame that the options ask for."""
+    """The same of a map with all that is known of it, in the frame that the options ask for.
+
+    One format that cannot be written does not stop those after it; which could not, the error says at the end.
+    """
     chosen = list(dict.fromkeys(options.formats))
     check_formats(chosen)
     map_ = in_frame(map_, options)
     make_output_folder(output_path)
-    return tuple(EXPORTERS[name](map_, output_path) for name in chosen)
+    written: list[Path] = []
+    failures: dict[str, Exception] = {}
+    for name in chosen:
+        try:
+            paths = EXPORTERS[name](map_, output_path)
+            written += [paths] if isinstance(paths, Path) else paths
+        except (RangesfmError, OSError) as error:
+            failures[name] = error
+    if failures:
+        raise _not_all(failures, written, num_chosen=len(chosen))
+    return tuple(dict.fromkeys(written))
+
+
+def _not_all(failures: Mapping[str, Exception], written: list[Path], num_chosen: int) -> Exception:
+    """One error for those of all formats: each has its line, and what was written has one."""
+    if num_chosen == 1:
+        return next(iter(failures.values()))
+    told = [failure_of(error) for error in failures.values()]
+    lines = [f"{name}: {failure.message}" for name, failure in zip(failures, told)]
+    error = InputError(
+        f"{len(failures)} of {num_chosen} formats could not be written: {lines[0]}",
+        advice=[*lines[1:], *(["written all the same: " + ", ".join(map(str, written))] if written else [])],
+    )
+    error.exit_status = max(failure.exit_status for failure in told)
+    return error
 
 
 def check_formats(formats: Iterable[str]) -> None:

@@ -21,7 +21,13 @@ from rangesfm.geometry.similarity import Similarity
 
 
 def write_model(reconstruction: pycolmap.Reconstruction, path: Path, *, as_text: bool = False) -> Path:
-    """Write the model as the folder ``path``, whole or not at all; an older one is replaced."""
+    """Write the model as the folder ``path``, whole or not at all; an older one is replaced.
+
+    Raises:
+        InputError: as text, a photo's name holds white space, at which COLMAP would split it.
+    """
+    if as_text:
+        _require_names_without_blanks(reconstruction, "colmap_text")
     with new_folder(path) as folder:
         if as_text:
             reconstruction.write_text(folder)
@@ -30,8 +36,27 @@ def write_model(reconstruction: pycolmap.Reconstruction, path: Path, *, as_text:
     return path
 
 
-def write_transform(metric_from_sfm: Similarity | None, path: Path) -> Path:
-    """Write metric_from_sfm as ``scale qw qx qy qz tx ty tz`` on one line, losing no digit.
+def write_project(map_: MetricMap, path: Path, *, as_text: bool = False) -> Path:
+    """Write the model, and where the photos are known a ``project.ini`` beside it, which COLMAP's GUI looks for.
+
+    COLMAP takes no project whose folder of photos is not there; the database need not be.
+    """
+    write_model(map_.reconstruction, path, as_text=as_text)
+    if map_.images_path is not None and map_.images_path.is_dir():
+        database_path = map_.database_path
+        if database_path is None or not database_path.is_file():
+            database_path = path / "database.db"
+        text = f"database_path={database_path.resolve()}\nimage_path={map_.images_path.resolve()}\n"
+        if "#" not in text:  # which begins a comment there
+            write_text(text, path / "project.ini")
+    return path
+
+
+def write_transform(metric_from_sfm: Similarity | None, folder: Path) -> tuple[Path, Path]:
+    """Write metric_from_sfm for ``model_transformer``, losing no digit, in the two forms that COLMAP has had.
+
+    ``transform_colmap_4.txt``: ``scale qw qx qy qz tx ty tz`` on one line, which it reads since 3.9;
+    ``transform_colmap_3.8.txt``: a matrix of 4 x 4. Each takes the other's file without a word, and moves by anything.
 
     Raises:
         InputError: the similarity is not known.
@@ -40,8 +65,12 @@ def write_transform(metric_from_sfm: Similarity | None, path: Path) -> Path:
         raise InputError("the format 'transform' needs metric_from_sfm, which is not known of this model")
     qx, qy, qz, qw = Rotation.from_matrix(metric_from_sfm.rotation).as_quat()
     numbers = np.array([metric_from_sfm.scale, qw, qx, qy, qz, *metric_from_sfm.translation])
-    write_text(" ".join(f"{number:.17g}" for number in numbers) + "\n", path)
-    return path
+    matrix = np.eye(4)
+    matrix[:3] = np.column_stack([metric_from_sfm.scale * metric_from_sfm.rotation, metric_from_sfm.translation])
+    paths = folder / "transform_colmap_4.txt", folder / "transform_colmap_3.8.txt"
+    for path, rows in zip(paths, (numbers[None], matrix)):
+        write_text("".join(" ".join(f"{number:.17g}" for number in row) + "\n" for row in rows), path)
+    return paths
 
 
 def write_positions(reconstruction: pycolmap.Reconstruction, path: Path) -> Path:
@@ -50,13 +79,19 @@ def write_positions(reconstruction: pycolmap.Reconstruction, path: Path) -> Path
     Raises:
         InputError: a photo's name holds white space, at which COLMAP would split it.
     """
-    lines = []
-    for image in registered_images(reconstruction):
-        if len(image.name.split()) != 1:
-            raise InputError(f"the format 'model_aligner' cannot hold white space in a photo's name: {image.name!r}")
-        lines.append(" ".join([image.name, *(f"{value:.17g}" for value in image.projection_center())]))
+    _require_names_without_blanks(reconstruction, "model_aligner")
+    lines = [
+        " ".join([image.name, *(f"{value:.17g}" for value in image.projection_center())])
+        for image in registered_images(reconstruction)
+    ]
     write_text("\n".join(lines) + "\n", path)
     return path
+
+
+def _require_names_without_blanks(reconstruction: pycolmap.Reconstruction, name: str) -> None:
+    for image in reconstruction.images.values():
+        if len(image.name.split()) != 1:
+            raise InputError(f"the format {name!r} cannot hold white space in a photo's name: {image.name!r}")
 
 
 def write_undistorted(map_: MetricMap, folder: Path) -> Path:

@@ -25,12 +25,14 @@ def write_laz(map_: MetricMap, path: Path) -> Path:
     """Write the 3-D points with their colours, in tenths of a millimetre.
 
     Raises:
-        InputError: laspy is not installed.
+        InputError: laspy, or what it compresses with, is not installed.
     """
     try:
         import laspy
     except ImportError:
         raise InputError("the format 'laz' needs laspy: pip install 'rangesfm[geo]'") from None
+    if not laspy.LazBackend.detect_available():
+        raise InputError("the format 'laz' needs lazrs beside laspy: pip install 'rangesfm[geo]'")
     places, colors = points_of(map_.reconstruction)
     xyz, steps = _coordinates(map_, places)
     header = laspy.LasHeader(version="1.4", point_format=_POINT_FORMAT_WITH_COLOR)

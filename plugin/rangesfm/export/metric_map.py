@@ -39,6 +39,7 @@ class MetricMap:
         metric_from_sfm: from the unscaled model's world to this one's; None if unknown.
         relative_scale_stddev: of every length in the map, by the scale alone; None if unknown.
         images_path: folder of the photos; None if unknown.
+        database_path: COLMAP's database of them; None if unknown.
         center_covariance_m2: (3, 3) of each keyframe's projection centre, by its photo; None if unknown.
         is_site: whether the model's world is the anchors' site frame, in which z is up by custom.
         georeference: where the model's world lies on the Earth; None if unknown.
@@ -50,6 +51,7 @@ class MetricMap:
     metric_from_sfm: Similarity | None = None
     relative_scale_stddev: float | None = None
     images_path: Path | None = None
+    database_path: Path | None = None
     is_site: bool = False
     georeference: Georeference | None = None
     center_covariance_m2: Mapping[str, Array] | None = None

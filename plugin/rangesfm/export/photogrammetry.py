@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import uuid
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -32,7 +34,9 @@ _DISTORTION: dict[str, tuple[str, ...]] = {
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
 }
 # The programs' names of these models.
-_NERFSTUDIO = {name: "OPENCV_FISHEYE" if "FISHEYE" in name else "OPENCV" for name in _DISTORTION}
+_NERFSTUDIO = {
+    name: "OPENCV_FISHEYE" if "FISHEYE" in name else "OPENCV" for name in _DISTORTION if name != "FULL_OPENCV"
+}
 _OPENSFM = {
     **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), "brown"),
     "OPENCV_FISHEYE": "fisheye_opencv",
@@ -57,33 +61,42 @@ def _distortion(camera: pycolmap.Camera, program: str, known: Mapping[str, str])
 def write_nerfstudio(map_: MetricMap, folder: Path) -> Path:
     """Write ``transforms.json`` and its points; photos are referred to as ``images/NAME``.
 
+    nerfstudio looks for the camera model at the top level alone and takes a missing one for perspective; what else is
+    there holds for all photos, so that of several cameras each photo says its own.
+
     nerfstudio's cameras look along their -z with y up, and its worlds have z up. Its own loader centres and shrinks
     what it reads unless it is told not to (``--auto-scale-poses False --center-method none
     --orientation-method none``).
 
     Raises:
-        InputError: a camera model that nerfstudio does not know.
+        InputError: a camera model that nerfstudio does not know, or photos of which some are fisheyes and some not.
     """
-    points = write_points(map_.reconstruction, folder / _POINTS_NAME)
+    model, images = map_.reconstruction, registered_images(map_.reconstruction)
+    cameras = {i: _intrinsics(model.cameras[i]) for i in sorted({image.camera_id for image in images})}
+    kinds = {camera.pop("camera_model") for camera in cameras.values()}
+    if len(kinds) > 1:
+        raise InputError("nerfstudio has one camera model for all photos, and some of these are fisheyes and some not")
+    common = next(iter(cameras.values())) if len(cameras) == 1 else {}
     content = {
+        **({"camera_model": kinds.pop()} if kinds else {}),
+        **common,
         "applied_transform": np.eye(4)[:3].tolist(),
-        "ply_file_path": points.name,
-        "frames": [
-            _frame(map_.reconstruction.cameras[image.camera_id], image)
-            for image in registered_images(map_.reconstruction)
-        ],
+        "ply_file_path": write_points(model, folder / _POINTS_NAME).name,
+        "frames": [{**_frame(image), **({} if common else cameras[image.camera_id])} for image in images],
     }
     write_json(content, folder / "transforms.json")
     return folder / "transforms.json"
 
 
-def _frame(camera: pycolmap.Camera, image: pycolmap.Image) -> dict[str, Any]:
-    kind, distortion = _distortion(camera, "nerfstudio", _NERFSTUDIO)
+def _frame(image: pycolmap.Image) -> dict[str, Any]:
     world_from_cam = np.eye(4)
     world_from_cam[:3] = image.cam_from_world().inverse().matrix()
+    return {"file_path": f"images/{image.name}", "transform_matrix": (world_from_cam @ _FLIP_Y_AND_Z).tolist()}
+
+
+def _intrinsics(camera: pycolmap.Camera) -> dict[str, Any]:
+    kind, distortion = _distortion(camera, "nerfstudio", _NERFSTUDIO)
     return {
-        "file_path": f"images/{image.name}",
-        "transform_matrix": (world_from_cam @ _FLIP_Y_AND_Z).tolist(),
         "camera_model": kind,
         "w": camera.width,
         "h": camera.height,
@@ -151,7 +164,7 @@ def _point(point: pycolmap.Point3D) -> dict[str, Any]:
 
 
 def write_opf(map_: MetricMap, folder: Path) -> Path:
-    """Write ``camera_list.json``, ``input_control_points.json`` and ``constraints.json`` into ``folder``.
+    """Write ``project.opf`` and its ``camera_list.json``, ``input_control_points.json`` and ``constraints.json``.
 
     Pairs of well-seen points are manual tie points with their marks, and each pair's distance is a scale constraint
     with the uncertainty of the scale: a program that maps the same photos then gets our scale.
@@ -175,10 +188,22 @@ def write_opf(map_: MetricMap, folder: Path) -> Path:
             orientation_constraints=[],
         ),
     }
+    files["project.opf"] = _project(files)
     with new_folder(folder) as temporary:
         for name, content in files.items():
             write_json(content, temporary / name)
     return folder
+
+
+def _project(files: Mapping[str, Any]) -> dict[str, Any]:
+    """What lists the other files; its ids follow from what they hold."""
+    items = []
+    for name, content in files.items():
+        kind, resource = name.removesuffix(".json"), {"format": content["format"], "uri": name}
+        identity = str(uuid.uuid5(uuid.NAMESPACE_URL, json.dumps(content)))
+        items.append({"id": identity, "type": kind, "name": kind, "resources": [resource], "sources": []})
+    identity = str(uuid.uuid5(uuid.NAMESPACE_URL, json.dumps(items)))
+    return _file("project", id=identity, name="rangesfm", description="scale of a metric map, in metres", items=items)
 
 
 def _file(kind: str, **content: Any) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import json
 import os
@@ -11,7 +12,7 @@ import socket
 import sys
 import tempfile
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from datetime import datetime
@@ -68,6 +69,8 @@ def is_plain_name(name: str) -> bool:
 
 def make_output_folder(path: Path) -> None:
     """Make ``path`` and check that it can be written to; raise InputError if not."""
+    if path.resolve() == Path(path.resolve().anchor):
+        raise InputError("is the root of the file system, expected a folder for the results", path)
     try:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
@@ -81,9 +84,13 @@ def new_file(path: Path) -> Iterator[Path]:
     """Yield a temporary sibling to write to; on success it takes the place of ``path``."""
     # With the same ending, by which libraries tell the format.
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    _remove_dead(path.parent.glob(f".{glob.escape(path.stem)}.*.part{glob.escape(path.suffix)}"))
     try:
         yield temporary
         os.replace(temporary, path)
+    except OSError as error:  # of a full disk, which says nothing of the file
+        error.filename = error.filename or str(path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -200,7 +207,12 @@ def _holder(lock: Path) -> str:
 def remove_leftovers(folder: Path) -> None:
     """Remove what killed processes left half-written in ``folder`` and in the folders in it."""
     inside = [path for path in folder.iterdir() if path.is_dir() and not path.is_symlink()]
-    for path in [path for parent in (folder, *inside) for path in _entries(parent)]:
+    _remove_dead(path for parent in (folder, *inside) for path in _entries(parent))
+
+
+def _remove_dead(paths: Iterable[Path]) -> None:
+    """Remove those that a process which is no more had in the making."""
+    for path in paths:
         found = re.fullmatch(LEFTOVER, path.name)
         if found is None or _is_alive(int(found["pid"])):
             continue

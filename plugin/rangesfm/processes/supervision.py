@@ -66,8 +66,10 @@ def work_for_parent(work: Callable[[Any, MessagesToParent], Any]) -> None:
         work: called with what the process is given; what it returns (plain values), or the error that it raises, is
             the process's last message.
     """
-    # It may have been started where Ctrl-C is ignored.
+    # It may have been started where Ctrl-C is ignored, and by a command that waits for SIGTERM in its own way.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    if sys.platform != "win32":
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     parent = MessagesToParent(_own_stdout())
     try:
         given = pickle.load(sys.stdin.buffer)

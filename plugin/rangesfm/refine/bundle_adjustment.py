@@ -25,6 +25,9 @@ from rangesfm.refine.stillness import Stillness, farthest, keyframe_centers
 _INITIAL_TRUST_REGION_RADIUS = 1e10
 # Relative, of the cost: all that rounding leaves. When it is enough, the keyframes tell, not the cost.
 _FUNCTION_TOLERANCE = 1e-12
+# Below this one thread does it: more add up in the order in which they happen to end, and the same command would give
+# other last digits each time.
+_MIN_NUM_RESIDUALS_FOR_THREADS = 1_000_000
 # No feature is located better; weighed against a smaller one, ranges lose all say in a model without noise.
 _MIN_PIXEL_STDDEV = 0.05
 _MAX_NUM_TIE_POINTS = 500
@@ -214,6 +217,7 @@ def _bundle_adjuster(
     solver.max_num_iterations = max_num_iterations
     solver.num_threads = num_threads
     ba.ceres.solver_options = solver
+    ba.ceres.min_num_residuals_for_cpu_multi_threading = _MIN_NUM_RESIDUALS_FOR_THREADS
     limit = ba.ceres.max_num_images_direct_sparse_cpu_solver
     if metric.num_reg_images() > limit:
         ba.ceres.max_num_images_direct_sparse_cpu_solver = max_num_images_direct(overlaps_in(metric), limit)

@@ -40,6 +40,7 @@ TABLES: tuple[type[TableFile], ...] = (
     TimeOffsetCurve,
 )
 REPORT_NAME = "report.html"
+DATABASE_NAME = "database.db"
 REFERENCE_NAME = "reference.csv"
 # The first says that a result is whole: it is the last to be written and the first to go.
 RESULT_FILES = (ResultSummary.NAME, REPORT_NAME, REFERENCE_NAME, *(table.NAME for table in TABLES))

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 # Beyond it a unit is wrong, or the file: no such radio reaches so far.
 _MAX_RANGE_M = 1e6
+# How far anchors are apart, as a share of the ranges to them (at most 1 where all is in metres), is above this in:
+_UNITS_OF_ANCHORS = (("millimetres", 100.0), ("centimetres", 10.0))
 # Times in coarser steps than this are worth a word.
 _COARSE_STEP_S = 0.1
 
@@ -86,6 +88,8 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
             f"anchor frame {frame!r} needs anchor positions and there are none: give anchors.csv, or frame unknown",
             survey.anchors.path,
         )
+    if frame != "unknown":
+        _check_unit_of_anchors(log, anchors, survey.anchors.path)
     _check_held_out(survey, anchors, frame)
     log, curve_notes = _without_known_errors(log, survey)
     tape = None if survey.scale.distances is None else read_tape(survey.scale.distances, survey.scale.markers)
@@ -186,6 +190,30 @@ def _check_lengths(log: RangeLog) -> None:
         first = int(np.argmax(too_long))
         message = f"a range of {log.range_m[first]:g} m, expected at most {_MAX_RANGE_M:g}: is its unit right?"
         raise InputError(message, log.source, int(log.line[first]))
+
+
+def _check_unit_of_anchors(log: RangeLog, anchors: Sequence[Anchor], path: Path | None) -> None:
+    """Two anchors heard one after the other are no further apart than their two ranges are long together."""
+    known = {anchor.anchor_id: anchor.position_m for anchor in anchors if anchor.position_m is not None}
+    nowhere = np.full(3, np.nan)
+    position_m = np.array([known.get(anchor_id, nowhere) for anchor_id in log.anchor_ids]).reshape(-1, 3)
+    of_camera = np.flatnonzero((log.anchor_index >= 0) & (log.peer_index < 0))
+    if log.timestamp_s is None or len(of_camera) < 2:
+        return
+    order = of_camera[np.argsort(log.timestamp_s[of_camera], kind="stable")]
+    first, second = order[:-1], order[1:]
+    apart_m = np.linalg.norm(position_m[log.anchor_index[first]] - position_m[log.anchor_index[second]], axis=1)
+    is_close = (log.timestamp_s[second] - log.timestamp_s[first] <= 1.0) & (apart_m > 0)
+    if not is_close.any():
+        return
+    share = apart_m[is_close] / (log.range_m[first] + log.range_m[second])[is_close]
+    unit = next((unit for unit, least in _UNITS_OF_ANCHORS if np.median(share) > least), None)
+    if unit is not None:
+        rows = [end[int(np.argmax(is_close))] for end in (first, second)]
+        ids = " and ".join(log.anchor_ids[log.anchor_index[row]] for row in rows)
+        ranges_m = " and ".join(f"{log.range_m[row]:.3g}" for row in rows)
+        message = f"anchors {ids} are {apart_m[is_close][0]:.6g} m apart here, and the ranges to them {ranges_m} m"
+        raise InputError(f"{message}: are the positions in {unit}? expected metres", path)
 
 
 def _anchors_of_log(log: RangeLog) -> tuple[Anchor, ...]:

@@ -11,7 +11,7 @@ from rangesfm.export import MetricMap, apply_to, best_similarity, check_formats,
 from rangesfm.export.metric_map import in_frame
 from rangesfm.files.atomic import sole_writer
 from rangesfm.options import ExportOptions
-from rangesfm.result.folder import ResultFolder, read_result_folder
+from rangesfm.result.folder import DATABASE_NAME, ResultFolder, read_result_folder
 from rangesfm.result.tables import CenterCovariances
 
 
@@ -82,6 +82,7 @@ def _read_map(result: ResultFolder, images_path: Path | None) -> MetricMap:
         metric_from_sfm=summary.metric_from_sfm.similarity,
         relative_scale_stddev=summary.scale.relative_stddev_empirical,
         images_path=images_path or result.images_path,
+        database_path=result.path / DATABASE_NAME,
         is_site=summary.frame == "site",
         georeference=None if summary.georeference is None else summary.georeference.georeference,
         center_covariance_m2=None if covariances is None else covariances.by_photo_m2,

@@ -40,7 +40,11 @@ class RunResult:
 
 
 def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, journal: Journal) -> RunResult:
-    """All files of the result, ``result.json`` after all others, and the report on them."""
+    """All files of the result, ``result.json`` after all others, and the report on them.
+
+    Raises:
+        InputError: a format of [export] cannot be written; all else has been.
+    """
     if not metric.center_covariance_m2 and (left_out := set(COVARIANCE_FORMATS) & set(survey.export.formats)):
         journal.warn(f"without covariances of the poses there is no {', '.join(sorted(left_out))}")
     if metric.estimate.frame == "site":
@@ -56,7 +60,7 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
             comparison = _comparison(survey, inputs, metric)
             # Of the final map: that of the anchors, if the map could be carried to them.
             georeference = inputs.site.georeference if metric.estimate.frame == "site" else None
-            write_models_and_tables(
+            not_exported = write_models_and_tables(
                 metric, survey.export, folder, images_path=survey.images.path, georeference=georeference
             )
         summary = ResultSummary.of(
@@ -74,6 +78,8 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
     lines = [*summary.lines(folder, format_table(comparison) if comparison else None)]
     if survey.report.enabled:
         lines.append(f"report: {write_report(folder)}")
+    if not_exported is not None:
+        raise not_exported
     return RunResult(folder, summary, tuple(lines))
 
 

@@ -1,8 +1,8 @@
 """What ranges get wrong: the components of their errors, each with what the population of radios lets expect of it.
 
 An error of two cells is covariant as their anchors, places, directions, distances and times are alike. The medians and
-spreads sum up what eight public logs of seven radios with the true path show (the table in ``examples/radios.md``); each
-survey learns its own stddevs on top of them.
+spreads sum up what eight public logs of seven radios with the true path show (the table in ``examples/radios.md``);
+each survey learns its own stddevs on top of them.
 """
 
 from __future__ import annotations
