@@ -380,8 +380,8 @@ class TestModelWithoutSurveyedAnchors:
                 true = np.array([float(row[key]) for key in ("x_m", "y_m", "z_m")])
                 found = left.result["anchors"][row["anchor_id"]]
                 error_m = np.linalg.norm(np.array(found["position_m"]) - true)
-                # A refined one's counts what bias, antenna and radio may err by, together more than 0.1 m.
-                assert error_m <= 3 * np.sqrt(3) * found["stddev_m"] < 1.0
+                # A refined one's counts what all ranges may read long alike (0.2 m), and antennas and radio beside it.
+                assert error_m <= 3 * np.sqrt(3) * found["stddev_m"] < 1.5
 
     def test_may_be_a_path_without_points(
         self, own_survey: WalkedSurvey, rangesfm_command: Command, refined: Left, tmp_path: Path
@@ -575,7 +575,7 @@ class TestRunOnPhotos:
         result = copy.deepcopy(first_run.result)
         assert_has(result, {**RESULT, "refine": REFINE})
         total_s = result["seconds"].pop("total")
-        stages = {"keyframes", "features", "matching", "mapping", "scale", "refinement", "results"}
+        stages = {"keyframes", "features", "matching", "mapping", "scale", "tests of mistakes", "refinement", "results"}
         assert result["seconds"].keys() == stages
         assert 0 < sum(result["seconds"].values()) <= total_s
 
