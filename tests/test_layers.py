@@ -25,6 +25,7 @@ LAYERS = (
     "refine",
     "join",
     "trust",
+    "planning",
     "result",
     "report",
     "comparison",

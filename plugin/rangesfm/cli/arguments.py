@@ -19,6 +19,7 @@ _COMMANDS_OF = {
     "begin": ("init", "check"),
     "stages": ("run", "demo", "reconstruct", "scale", "refine", "join"),
     "batch": ("batch",),
+    "planning": ("plan",),
     "results": ("export", "compare", "report"),
     "ranges": ("ranges", "ranges calibrate", "trilaterate"),
     "doctor": ("doctor",),

@@ -59,8 +59,8 @@ def initialize_scale(
     problem = scale_problem(observations, trajectory, anchors, anchor_frame, range_model, distances, gravity)
     solution = solve_scale(problem, camera_side=options.camera_side, seed=seed)
     table = _paper_table(solution)
-    model_from_cam = _model_from_cam(observations, trajectory, problem)
-    learned = learned_errors(problem, solution, observations, model_from_cam)
+    rotations = model_from_cam(observations, trajectory, problem)
+    learned = learned_errors(problem, solution, observations, rotations)
     uncertainty = scale_uncertainty(solution, learned)
     per_anchor = scale_per_anchor(solution, observations.log.anchor_ids)
     covariance = parameter_covariance(solution.fit, solution.problem, learned)
@@ -86,18 +86,18 @@ def initialize_scale(
         reasons=reasons,
         advice=judged.advice,
         cutoff_test=tests,
-        sensitivity=scale_sensitivity(solution, model_from_cam, observations.log.anchor_ids),
+        sensitivity=scale_sensitivity(solution, rotations, observations.log.anchor_ids),
         per_anchor=per_anchor,
         two_candidate=table,
         anchors=found,
         observations=replace(observations, status=status),
         errors=replace(solution.errors, learned=learned).spread(problem.rows, len(observations.log)),
         noise_stddev_m=solution.noise_stddev_m,
-        placement=_placement(solution, covariance),
+        placement=placement_covariance(solution, covariance),
     )
 
 
-def _placement(solution: Solution, covariance: Array) -> Array | None:
+def placement_covariance(solution: Solution, covariance: Array) -> Array | None:
     """As ``ScaleEstimate.placement``."""
     columns = solution.fit.columns[0]
     if columns.frame < 0:
@@ -106,7 +106,7 @@ def _placement(solution: Solution, covariance: Array) -> Array | None:
     return np.asarray(covariance[np.ix_(of_map, of_map)])
 
 
-def _model_from_cam(observations: RangeObservations, trajectory: Trajectory, problem: ScaleProblem) -> Array:
+def model_from_cam(observations: RangeObservations, trajectory: Trajectory, problem: ScaleProblem) -> Array:
     """(k, 3, 3) rotation at the keyframe nearest to each range, into the first camera's frame."""
     nearest = np.where(observations.weight < 0.5, observations.before, observations.after)[problem.rows]
     turned: Array = problem.first_camera_from_sfm.rotation @ trajectory.world_from_cam[nearest]

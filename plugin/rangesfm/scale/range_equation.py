@@ -262,6 +262,15 @@ def solve(
     return system.fit(system.state_after(x), float(result.cost))
 
 
+def fit_at(problem: RangeProblem, state: RangeState, weights: Array) -> RangeFit:
+    """What a fit would be that ends at this state, before anything is measured.
+
+    Args:
+        weights: (n,) of the ranges; how many it stands for, of one that stands for several.
+    """
+    return _System((problem,), columns_of((problem,)), state, CAUCHY).fit(state, 0.0, weights)
+
+
 def _settled(system: _System, x: Array) -> Array:
     """The bottom itself, by reweighted steps, which go by the gradient alone.
 
@@ -314,9 +323,10 @@ class _System:
         priors = prior_jacobian(self.parts[0], self.columns[0], self.start, state)
         return np.concatenate([range_jacobian(*each) for each in of_parts]), priors
 
-    def fit(self, state: RangeState, cost: float) -> RangeFit:
+    def fit(self, state: RangeState, cost: float, weights: Array | None = None) -> RangeFit:
+        """``weights``: (n,) None: by the loss."""
         (scaled, off_priors), (jacobian, of_priors) = self.residuals(state), self.jacobian(state)
-        weights, share = self.loss.weights(scaled), self.share
+        weights, share = self.loss.weights(scaled) if weights is None else weights, self.share
         pulls, prior_information = share * weights, of_priors.T @ of_priors
         return RangeFit(
             state=state,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -92,7 +93,7 @@ def solve_scale(posed: ScaleProblem, *, camera_side: str | None, seed: int) -> S
     solutions = [_with_own_errors(posed, start) for start in _likeliest_each_once(problem, errors, starts)]
     solutions.sort(key=lambda solution: _unlikeliness(problem, errors, solution.fit.state))
     on_side(problem, [solutions[0].fit], camera_side)
-    _refuse_ambiguity(solutions[0], [solution.fit.state for solution in solutions[1:]], camera_side)
+    refuse_ambiguity(solutions[0], [solution.fit.state for solution in solutions[1:]], camera_side)
     return solutions[0]
 
 
@@ -194,7 +195,7 @@ def _with_own_errors(posed: ScaleProblem, start: RangeState) -> Solution:
 
     def fit(errors: RangeErrors, before: RangeFit | None) -> RangeFit:
         state = start if before is None else before.state
-        return solve(_weighted(given, errors), state, loss=errors.loss)
+        return solve(weighted(given, errors), state, loss=errors.loss)
 
     fitted, used, shown = fit_with_own_errors(
         fit,
@@ -203,10 +204,10 @@ def _with_own_errors(posed: ScaleProblem, start: RangeState) -> Solution:
         max_num_rounds=_NUM_NOISE_ROUNDS,
     )
     errors = replace(used, inflation=shown.inflation)
-    return Solution(_weighted(given, used), fitted, errors, shown.noise_m)
+    return Solution(weighted(given, used), fitted, errors, shown.noise_m)
 
 
-def _weighted(problem: RangeProblem, errors: RangeErrors) -> RangeProblem:
+def weighted(problem: RangeProblem, errors: RangeErrors) -> RangeProblem:
     """The problem as set up, weighted by the errors.
 
     Correlated errors are worth fewer ranges; the ranges keep their nominal weight among themselves and the priors gain
@@ -224,7 +225,8 @@ def _weighted(problem: RangeProblem, errors: RangeErrors) -> RangeProblem:
     )
 
 
-def _refuse_ambiguity(solution: Solution, rivals: list[RangeState], camera_side: str | None) -> None:
+def refuse_ambiguity(solution: Solution, rivals: Sequence[RangeState], camera_side: str | None) -> None:
+    """GeometryError where the map of a rival fits as well."""
     problem = solution.problem
     for rival in rivals:
         other = solve(solution.problem, rival, loss=solution.errors.loss, tolerance=1e-8)

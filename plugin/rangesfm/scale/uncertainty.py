@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.ranging.errors.cells import Cells, cells, noisiness
-from rangesfm.ranging.errors.learned import LearnedErrors, learn_errors
+from rangesfm.ranging.errors.cells import MAX_NUM_CELLS, Cells, cells, noisiness
+from rangesfm.ranging.errors.components import GIVEN
+from rangesfm.ranging.errors.learned import LearnedErrors, learn_errors, usual_errors
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.estimate import ScaleUncertainty
 from rangesfm.scale.problem import ScaleProblem
@@ -55,13 +57,42 @@ def learned_errors(
     )
 
 
+def errors_to_expect(
+    posed: ScaleProblem,
+    solution: Solution,
+    observations: RangeObservations,
+    model_from_cam: Array,
+    stddevs: Mapping[str, float],
+    max_num_cells: int = MAX_NUM_CELLS,
+) -> LearnedErrors:
+    """The same before anything is measured, as radios let expect.
+
+    Args:
+        stddevs: of components of which more is known, by name.
+        max_num_cells: fewer are coarser, and sooner computed.
+    """
+    taken_off = observations.log.shared_stddev_m
+    return usual_errors(
+        _cells(posed, solution, observations, model_from_cam, max_num_cells),
+        curve_stddev_m=None if taken_off is None else taken_off[posed.rows],
+        ruled_out=_ruled_out(solution.problem),
+        stddevs=stddevs,
+    )
+
+
 def _ruled_out(problem: RangeProblem) -> list[str]:
     """Biases of a stddev of 0 are none."""
     stddevs = {"bias": float(problem.bias_stddev_m.max()), "common_bias": problem.common_bias_stddev_m}
     return [name for name, stddev in stddevs.items() if stddev == 0]
 
 
-def _cells(posed: ScaleProblem, solution: Solution, observations: RangeObservations, model_from_cam: Array) -> Cells:
+def _cells(
+    posed: ScaleProblem,
+    solution: Solution,
+    observations: RangeObservations,
+    model_from_cam: Array,
+    max_num: int = MAX_NUM_CELLS,
+) -> Cells:
     problem, state, log = solution.problem, solution.fit.state, observations.log
     by = range_gradient(problem, state)
     world_from_cam = state.metric_from_model.rotation @ model_from_cam
@@ -73,6 +104,7 @@ def _cells(posed: ScaleProblem, solution: Solution, observations: RangeObservati
         np.swapaxes(world_from_cam, 1, 2),
         solution.fit.weights,
         noisiness(problem.anchor_index, solution.fit.residuals_m, problem.num_anchors),
+        max_num,
     )
 
 
@@ -87,17 +119,38 @@ def _times(posed: ScaleProblem, problem: RangeProblem, state: RangeState, observ
 
 def scale_uncertainty(solution: Solution, learned: LearnedErrors) -> ScaleUncertainty:
     """Relative stddevs of the scale."""
-    influence = scale_influence(solution.fit, solution.problem)
-    return ScaleUncertainty(formal=solution.fit.log_scale_stddev, components=learned.stddev_of(influence))
+    components = learned.stddev_of(scale_influence(solution.fit, solution.problem))
+    if (given := _by_what_was_given(solution)) > 0:
+        components[GIVEN] = given
+    return ScaleUncertainty(formal=solution.fit.log_scale_stddev, components=components)
+
+
+def _by_what_was_given(solution: Solution) -> float:
+    """What taped distances, positions of anchors and the upward direction do to the scale by not being exact.
+
+    Biases are among the ranges' errors. All priors weigh as against independent ranges: their stddevs were divided by
+    the inflation.
+    """
+    fit = solution.fit
+    given = fit.prior_information.copy()
+    biases = fit.columns[0].bias[fit.columns[0].bias >= 0]
+    given[biases] = given[:, biases] = 0.0
+    to_scale = np.linalg.lstsq(fit.information, np.eye(len(fit.information))[0], rcond=1e-12)[0]
+    return float(solution.errors.inflation * np.sqrt(max(to_scale @ given @ to_scale, 0.0)))
 
 
 def parameter_covariance(fit: RangeFit, problem: RangeProblem, learned: LearnedErrors) -> Array:
     """(p, p) of all that a fit estimates, in the parameters of its columns: what the ranges' errors do to it."""
-    influence = np.linalg.lstsq(fit.information, fit.gradients.T, rcond=1e-12)[0] / problem.stddev_m
-    of_cells = np.stack([learned.cells.total(row) for row in influence])
+    of_cells = parameter_influence(fit, problem, learned)
     of_priors = invert_information(fit.information) @ fit.prior_information @ invert_information(fit.information)
     covariance: Array = of_cells @ learned.covariance_m2 @ of_cells.T + of_priors
     return covariance
+
+
+def parameter_influence(fit: RangeFit, problem: RangeProblem, learned: LearnedErrors) -> Array:
+    """(p, c) change of all that a fit estimates for each metre by which the ranges of a cell are longer."""
+    influence = np.linalg.lstsq(fit.information, fit.gradients.T, rcond=1e-12)[0] / problem.stddev_m
+    return np.stack([learned.cells.total(row) for row in influence])
 
 
 def scale_influence(fit: RangeFit, problem: RangeProblem) -> Array:

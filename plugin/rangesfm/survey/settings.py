@@ -216,7 +216,7 @@ def survey_from_tables(
 def _survey(tables: Mapping[str, Any], folder: Path, overrides: Mapping[str, object], source: Source) -> Survey:
     source = replace(source, overridden=tuple(overrides))
     with source.naming_lines():
-        _refuse_unknown_tables(tables)
+        refuse_unknown_tables(tables, TABLES)
         given: dict[str, dict[Any, Any]] = {name: dict(tables.get(name, {})) for name in TABLES}
         given["output"].setdefault("path", "out")
         for dotted_key in _ROLE_OF_PATH:
@@ -233,10 +233,11 @@ def _survey(tables: Mapping[str, Any], folder: Path, overrides: Mapping[str, obj
     return survey
 
 
-def _refuse_unknown_tables(tables: Mapping[str, Any]) -> None:
+def refuse_unknown_tables(tables: Mapping[str, Any], known: Collection[str]) -> None:
+    """OptionError for one that is not known, with the nearest that is, and for what is no table."""
     for name, table in tables.items():
-        if name not in TABLES:
-            nearest = nearest_known(name, TABLES)
+        if name not in known:
+            nearest = nearest_known(name, known)
             message = f"unknown table [{printable(name)}]; the nearest known one is '{nearest}'"
             raise OptionError(message, "", name)
         if not isinstance(table, Mapping):

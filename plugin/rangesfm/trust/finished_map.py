@@ -194,7 +194,7 @@ def place_of_map(
         return None
     found = None if summary is None else summary.covariance
     if found is None:
-        of_map, of_keyframes = _by_similarity(estimate.placement, centers_m)
+        of_map, of_keyframes = by_similarity(estimate.placement, centers_m)
     else:
         of_map, of_keyframes = found.similarity, found.centers
     stddevs = np.sqrt(np.maximum(np.diag(of_map), 0.0))
@@ -212,7 +212,7 @@ def place_of_map(
     return Place("doubtful" if is_wide or doubts else "good", reasons, (x_m, y_m, z_m), heading_deg, worst_m)
 
 
-def _by_similarity(placement: Array, centers_m: Array) -> tuple[Array, Array]:
+def by_similarity(placement: Array, centers_m: Array) -> tuple[Array, Array]:
     """(7, 7) about the middle of the centres and (n, 3, 3) of each, of a map that is one piece."""
     from_first = similarity_motions(centers_m - centers_m[0])
     to_middle = np.eye(7)

@@ -36,7 +36,7 @@ def trust_in(on_map: RangesOnMap, *, seed: int = 0) -> TrustVerdict:
     """Test all that may be wrong with the ranges on a map."""
     found = find_mistakes(on_map, seed=seed)
     shown = list(evidence(found.problem))
-    rows = [*_of_causes(found), *(_row(test) for test in _others(found)), *shown]
+    rows = [*_of_causes(found), *(row_of(test) for test in _others(found)), *shown]
     reasons = [*([sentence(found.causes)] if found.causes else []), *(_reason(row) for row in shown if row.rejected)]
     return TrustVerdict(tuple(rows), tuple(reasons), found.causes, on_map.rows)
 
@@ -72,11 +72,11 @@ def _of_causes(found: Findings) -> list[MistakeTest]:
                 )
             )  # fmt: skip
             continue
-        rows.append(_row(cause.test, max(cause.test.statistic, cause.gain), cause.words))
+        rows.append(row_of(cause.test, max(cause.test.statistic, cause.gain), cause.words))
     return rows
 
 
-def _row(test: Test, statistic: float | None = None, words: str | None = None) -> MistakeTest:
+def row_of(test: Test, statistic: float | None = None, words: str | None = None) -> MistakeTest:
     one = len(test.sizes) == 1
     return MistakeTest(
         name=test.hypothesis.name,

@@ -67,6 +67,7 @@ def cells(
     cam_from_world: Array,
     weight: Array,
     noise_of_anchor: Array,
+    max_num: int = MAX_NUM_CELLS,
 ) -> Cells:
     """At most so many that their covariance is soon computed.
 
@@ -77,7 +78,7 @@ def cells(
     since = time_s - time_s.min()
     distance = np.linalg.norm(from_anchor_m, axis=1)
     towards = from_anchor_m / np.maximum(distance, 1e-9)[:, None]
-    of_range = _labels(anchor_index, tag_index, since)
+    of_range = _labels(anchor_index, tag_index, since, max_num)
     first = np.unique(of_range, return_index=True)[1]
     weight = np.maximum(weight, 1e-6)
     begun = Cells(
@@ -120,14 +121,14 @@ def noisiness(anchor_index: Indices, residuals_m: Array, num_anchors: int) -> Ar
     return clipped
 
 
-def _labels(anchor_index: Indices, tag_index: Indices, since_s: Array) -> Indices:
+def _labels(anchor_index: Indices, tag_index: Indices, since_s: Array, max_num: int) -> Indices:
     """(n,) counted from 0, of the shortest stretches of time that do not make too many cells."""
     link = anchor_index * (int(tag_index.max()) + 2) + tag_index + 1
     length_s = _SHORTEST_S
     while True:
         stretch = np.floor(since_s / length_s).astype(np.int64)
         values, labels = np.unique(link * (int(stretch.max()) + 1) + stretch, return_inverse=True)
-        if len(values) <= max(MAX_NUM_CELLS, 2 * len(np.unique(link))):
+        if len(values) <= max(max_num, 2 * len(np.unique(link))):
             return np.asarray(labels, dtype=np.int64)
         length_s *= _LONGER
 

@@ -155,8 +155,12 @@ COMPONENTS = (
 LEARNT_CURVE = "learnt_curve"
 """What is left of an error curve that has been taken off, as it was learnt with it."""
 
+GIVEN = "given"
+"""No component of the ranges' errors: what is known beforehand of the map and the anchors."""
+
 
 def component_words(names: Iterable[str]) -> dict[str, str]:
     """What each component is, for people."""
-    words = {component.name: component.words for component in COMPONENTS} | {LEARNT_CURVE: "the learnt error curve"}
+    words = {component.name: component.words for component in COMPONENTS}
+    words |= {LEARNT_CURVE: "the learnt error curve", GIVEN: "tapes, anchors' positions and what else was given"}
     return {name: words[name] for name in names}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -99,11 +99,39 @@ def learn_errors(
     )
     stddevs = np.exp(likelihood.most_likely())
     covariances = stddevs[:, None, None] ** 2 * likelihood.of_components
+    return _of_components(cells, components, stddevs, covariances, None if curve_stddev_m is None else likelihood.known)
+
+
+def usual_errors(
+    cells: Cells,
+    *,
+    curve_stddev_m: Array | None = None,
+    ruled_out: Collection[str] = (),
+    stddevs: Mapping[str, float] | None = None,
+) -> LearnedErrors:
+    """What radios let expect before anything is measured: the medians, or what is known better.
+
+    Args:
+        curve_stddev_m, ruled_out: as of ``learn_errors``.
+        stddevs: of some components, by name, in place of their medians.
+    """
+    components = [component for component in COMPONENTS if component.name not in ruled_out]
+    is_calibrated = curve_stddev_m is not None
+    sizes = np.array([(stddevs or {}).get(c.name, _median(c, is_calibrated)) for c in components])
+    covariances = np.array([size**2 * _covariance(c, cells, 1.0) for c, size in zip(components, sizes, strict=True)])
+    known = _known(cells, curve_stddev_m) if is_calibrated else None
+    return _of_components(cells, components, sizes, covariances, known)
+
+
+def _of_components(
+    cells: Cells, components: Sequence[Component], stddevs: Array, covariances: Array, known: Array | None
+) -> LearnedErrors:
+    """With what a learnt curve leaves, if there is one."""
     names = [component.name for component in components]
-    if curve_stddev_m is not None:
+    if known is not None:
         names.append(LEARNT_CURVE)
         stddevs = np.append(stddevs, 1.0)
-        covariances = np.concatenate([covariances, likelihood.known[None]])
+        covariances = np.concatenate([covariances, known[None]])
     return LearnedErrors(cells, cells.of_range, tuple(names), stddevs, covariances)
 
 

@@ -1,0 +1,173 @@
+"""What a run of a planned survey will state, before a range is measured: its own formulas, at the true map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.errors import GeometryError
+from rangesfm.options import ScaleOptions
+from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.ranging.errors.cells import MAX_NUM_CELLS
+from rangesfm.ranging.errors.learned import LearnedErrors
+from rangesfm.ranging.errors.noise import START_STDDEV_M
+from rangesfm.ranging.errors.place import shares_of_places
+from rangesfm.ranging.errors.range_errors import RangeErrors
+from rangesfm.ranging.observations import RangeObservations
+from rangesfm.scale.anchor_plane import mirrored_map
+from rangesfm.scale.estimate import ScaleUncertainty
+from rangesfm.scale.initialize import model_from_cam, placement_covariance
+from rangesfm.scale.problem import ScaleProblem
+from rangesfm.scale.range_equation import RangeFit, fit_at, range_jacobian, tag_positions
+from rangesfm.scale.solution import Solution, refuse_ambiguity, weighted
+from rangesfm.scale.uncertainty import errors_to_expect, parameter_covariance, parameter_influence, scale_uncertainty
+from rangesfm.scale.verdict import Verdict, judge
+from rangesfm.trust.finished_map import by_similarity
+
+_NUM_NOISE_ROUNDS = 2
+OPEN = 1e3
+"""Metres, or radians: a number this uncertain is one that nothing determines."""
+
+
+@dataclass(frozen=True)
+class Expected:
+    """The estimate that a run will make.
+
+    Attributes:
+        observations: simulated ranges. posed: the problem. solution: the fit, at the truth.
+        learned: what the ranges will get wrong.
+        uncertainty: of the scale.
+        covariance: (p, p) of all that the fit estimates.
+        placement: (7, 7) as of a ScaleEstimate; None without a place in the site.
+    """
+
+    planned: PlannedSurvey
+    observations: RangeObservations
+    posed: ScaleProblem
+    solution: Solution
+    learned: LearnedErrors
+    uncertainty: ScaleUncertainty
+    covariance: Array
+    placement: Array | None
+
+    @property
+    def verdict(self) -> Verdict:
+        """As the run will judge.
+
+        Raises:
+            GeometryError: it will refuse the scale.
+        """
+        return judge(self.posed, self.solution, self.uncertainty, {}, (), (), ScaleOptions())
+
+    def mirror_image(self) -> str | None:
+        """Why the run will refuse the map's place: its mirror image in the anchors' plane fits as well; None if not."""
+        problem, fit = self.solution.problem, self.solution.fit
+        mirrored = mirrored_map(problem, fit.state) if problem.frame_is_free else None
+        if mirrored is None:
+            return None
+        counted = replace(problem, share=fit.pulls)
+        try:
+            # Of a path in that plane nothing determines the height, which the solver meets as 0 / 0.
+            with np.errstate(invalid="ignore", divide="ignore"):
+                refuse_ambiguity(replace(self.solution, problem=counted), [mirrored], None)
+        except GeometryError as error:
+            return str(error)
+        return None
+
+    def place(self) -> tuple[Array, Array] | None:
+        """(7,) stddevs of the map about its middle, and (n,) of each keyframe's place; inf where they are open."""
+        if self.placement is None:
+            return None
+        of_map, of_keyframes = by_similarity(self.placement, self.planned.trajectory.centers)
+        keyframes = np.trace(of_keyframes, axis1=1, axis2=2)
+        return _stddevs(np.diag(of_map)), _stddevs(keyframes)
+
+    @property
+    def worst_keyframe_m(self) -> float:
+        """Stddev of the place that is known least; NaN without a place."""
+        place = self.place()
+        return float("nan") if place is None else float(place[1].max())
+
+
+def _stddevs(variances: Array) -> Array:
+    stddevs = np.sqrt(np.maximum(variances, 0.0))
+    return np.where(stddevs < OPEN, stddevs, np.inf)
+
+
+def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expected:
+    """Find the noise that the run will see, and with its weights what it will state.
+
+    Args:
+        max_num_cells: in which how ranges err together is computed; as a run has it, or fewer to compare plans.
+
+    Raises:
+        GeometryError: the run will find too few ranges on the path.
+    """
+    observations = planned.observations()
+    posed = planned.posed(observations)
+    state = planned.state(posed, observations.log.anchor_ids)
+    num_alike = np.full(len(posed.rows), float(planned.num_alike))
+    tags, scale = tag_positions(posed.ranges, state.metric_from_model), state.metric_from_model.scale
+    errors = posed.errors.at(tags, scale * posed.center_stddev)
+    solution = _weighed(posed, errors, fit_at(weighted(posed.ranges, errors), state, num_alike))
+    rotations = model_from_cam(observations, planned.trajectory, posed)
+    learned = errors_to_expect(posed, solution, observations, rotations, planned.component_stddevs, max_num_cells)
+    for _ in range(_NUM_NOISE_ROUNDS):
+        errors = _as_seen(solution, learned, num_alike)
+        solution = _weighed(posed, errors, fit_at(weighted(posed.ranges, errors), state, num_alike))
+    covariance = parameter_covariance(solution.fit, solution.problem, learned) + _undetermined(solution.fit)
+    uncertainty = scale_uncertainty(solution, learned)
+    placement = placement_covariance(solution, covariance)
+    return Expected(planned, observations, posed, solution, learned, uncertainty, covariance, placement)
+
+
+def _weighed(posed: ScaleProblem, errors: RangeErrors, fit: RangeFit) -> Solution:
+    return Solution(weighted(posed.ranges, errors), fit, errors, errors.noise_m)
+
+
+def _undetermined(fit: RangeFit) -> Array:
+    """(p, p) variances without limit in the directions that nothing determines, which least squares leave alone."""
+    sizes = np.sqrt(np.maximum(np.diag(fit.information), 1e-200))
+    values, vectors = np.linalg.eigh(fit.information / np.outer(sizes, sizes))
+    nothing = vectors[:, values < 1e-10] / sizes[:, None]
+    lengths = np.linalg.norm(nothing, axis=0)
+    nothing = nothing / np.where(lengths > 0, lengths, 1.0)
+    return np.asarray(OPEN**4 * nothing @ nothing.T)
+
+
+def _as_seen(solution: Solution, learned: LearnedErrors, num_alike: Array) -> RangeErrors:
+    """As ``RangeErrors.seen_by_rigid_map`` and ``inflated`` will find it, in the mean over all surveys like this one.
+
+    Of the cells' covariance the fit takes its part; what single ranges scatter by about their cell comes on top.
+    """
+    errors, problem, cells = solution.errors, solution.problem, learned.cells
+    ones = replace(problem, stddev_m=np.ones_like(problem.stddev_m))
+    design = cells.mean(range_jacobian(ones, solution.fit.columns[0], solution.fit.state, solution.fit.state))
+    left = np.eye(len(cells)) - design @ parameter_influence(solution.fit, problem, learned)
+    residuals_m2 = left @ learned.covariance_m2 @ left.T
+    white_m2 = _white_m2(learned)
+    together_m2 = np.maximum(np.diag(residuals_m2), 1e-12)
+    alone_m2 = white_m2 * (1 - 1 / np.maximum(cells.worth, 1.0))
+    ordinary = np.hypot(errors.shared_m, errors.placing_m) < START_STDDEV_M
+    rows = learned.of_range[ordinary] if ordinary.any() else learned.of_range
+    noise_m2 = float(np.mean((together_m2 + alone_m2)[rows]))
+    alike = 1 - min(float(np.mean((white_m2 * np.ones(len(cells)))[rows])) / noise_m2, 1.0)
+    share = shares_of_places(np.repeat(errors.place, int(num_alike[0])), alike)[:: int(num_alike[0])]
+    base = np.where(errors.is_estimated, np.sqrt(noise_m2), errors.given_m)
+    stddev_m = np.sqrt(base**2 + errors.placing_m**2 + errors.shared_m**2)
+    weights = cells.total(num_alike * share / stddev_m)
+    group = np.zeros(len(cells), dtype=np.int64)
+    group[learned.of_range] = errors.group
+    same = group[:, None] == group
+    in_groups = float(np.sum(np.outer(weights, weights) * residuals_m2 * same))
+    apart = float(np.sum(cells.total(num_alike * share / stddev_m**2) * (together_m2 + alone_m2)))
+    inflation = max(float(np.sqrt(in_groups / apart)), 1.0)
+    return replace(errors, stddev_m=stddev_m, share=share, inflation=inflation, noise_m=float(np.sqrt(noise_m2)))
+
+
+def _white_m2(learned: LearnedErrors) -> Array:
+    """(c,) variance of single ranges."""
+    white: Array = np.diag(learned.covariances_m2[learned.names.index("white")]) * learned.cells.worth
+    return white

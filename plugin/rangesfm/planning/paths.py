@@ -1,0 +1,91 @@
+"""Paths that a camera is to go: through waypoints, along a trajectory, or as in a model of an earlier survey."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.errors import InputError, OptionError
+from rangesfm.geometry.reference import read_reference
+from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+
+_MAX_NUM_KEYFRAMES = 20_000
+# A camera whose way is this steep looks level all the same.
+_STEEP = 1e-6
+
+
+def path_through(
+    waypoints: Sequence[Sequence[float]], speed_m_per_s: float, photo_rate_hz: float, num_rounds: int = 1
+) -> Trajectory:
+    """A walk at constant speed from each waypoint straight to the next, looking ahead, upright.
+
+    Args:
+        waypoints: (3,) each, metres, z up. num_rounds: how often they are walked.
+    """
+    corners = np.array(waypoints, dtype=np.float64).reshape(-1, 3)
+    if len(corners):
+        corners = np.vstack([corners] * num_rounds)
+    steps = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    if not steps.sum() > 0:
+        raise OptionError("[path] waypoints go nowhere, expected two different places or more", "path", "waypoints")
+    kept = np.concatenate([[True], steps > 0])
+    way = np.concatenate([[0.0], np.cumsum(steps)])[kept]
+    corners = corners[kept]
+    num = int(way[-1] / speed_m_per_s * photo_rate_hz) + 1
+    _require_possible(num)
+    times = np.arange(num) / photo_rate_hz
+    at = speed_m_per_s * times
+    centers = np.column_stack([np.interp(at, way, column) for column in corners.T])
+    leg = np.clip(np.searchsorted(way, at, side="right") - 1, 0, len(corners) - 2)
+    return _trajectory(times, centers, _looking(np.diff(corners, axis=0)[leg]))
+
+
+def path_from_file(path: Path, photo_rate_hz: float) -> Trajectory:
+    """As recorded, thinned to a rate of photos.
+
+    Raises:
+        InputError: no times or no rotations, or whatever else is wrong with the file.
+    """
+    recorded = read_reference(path)
+    if recorded.timestamps_s is None or recorded.world_from_cam is None:
+        raise InputError("has no times or no rotations, expected timestamp tx ty tz qx qy qz qw", path)
+    _, chosen = np.unique(
+        np.floor((recorded.timestamps_s - recorded.timestamps_s[0]) * photo_rate_hz), return_index=True
+    )
+    _require_possible(len(chosen))
+    times = recorded.timestamps_s[chosen]
+    return _trajectory(times - times[0], recorded.positions_m[chosen], recorded.world_from_cam[chosen])
+
+
+def path_from_model(path: Path, photo_rate_hz: float) -> Trajectory:
+    """The keyframes of a metric model in the site's frame, in the order of their names, evenly in time."""
+    from rangesfm.colmap.model_files import read_model
+
+    found = trajectory_from_reconstruction(read_model(path))
+    _require_possible(len(found))
+    return _trajectory(np.arange(len(found)) / photo_rate_hz, found.centers, found.world_from_cam)
+
+
+def _require_possible(num_keyframes: int) -> None:
+    if num_keyframes > _MAX_NUM_KEYFRAMES:
+        message = f"[path] has {num_keyframes} keyframes, expected at most {_MAX_NUM_KEYFRAMES} (photo_rate_hz)"
+        raise OptionError(message, "path", "photo_rate_hz")
+
+
+def _trajectory(times: Array, centers: Array, world_from_cam: Array) -> Trajectory:
+    num = len(times)
+    names = tuple(f"{number:06d}" for number in range(num))
+    return Trajectory(np.arange(1, num + 1), names, times, centers, world_from_cam)
+
+
+def _looking(ahead: Array) -> Array:
+    """(n, 3, 3) world_from_cam of level cameras, x right, y down, z along the (n, 3) directions as seen from above."""
+    forward = ahead * [1.0, 1.0, 0.0]
+    level = np.linalg.norm(forward, axis=1) > _STEEP * np.linalg.norm(ahead, axis=1)
+    forward = np.where(level[:, None], forward, [1.0, 0.0, 0.0])
+    forward = forward / np.linalg.norm(forward, axis=1)[:, None]
+    down = np.broadcast_to([0.0, 0.0, -1.0], forward.shape)
+    return np.stack([np.cross(down, forward), down, forward], axis=2)

@@ -1,0 +1,140 @@
+"""PlannedSurvey: where the anchors will stand, where the camera will go, and what the radio is like."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.distances.ends import LocatedDistances
+from rangesfm.geometry.similarity import IDENTITY, Similarity
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.options import RangeModelOptions
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.association import associate
+from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.observations import RangeObservations
+from rangesfm.scale.problem import ScaleProblem, scale_problem
+from rangesfm.scale.range_equation import RangeState
+
+_MAX_NUM_RANGES = 2000
+# Nobody puts an anchor in line with a path, or into its plane, to a decimetre; and where one that is to be found stands
+# exactly there, the linear problem does not see what is open.
+_OFF_LINE_M = (0.07, 0.07, 0.1)
+
+
+@dataclass(frozen=True)
+class PlannedSurvey:
+    """A survey that nobody has made yet, in the site's frame and metres.
+
+    Attributes:
+        trajectory: of the keyframes, with times.
+        anchors: where they will stand, all with a position, and how well that will be known.
+        anchor_frame: as of a survey: in which frame their positions will be known, if at all.
+        rate_hz: ranges to each anchor in a second.
+        tag_in_cam_m: (3,) lever arm.
+        range_model: what a run will assume of the radio.
+        curve_stddev_m: of the radio's error curve once it has been learnt; None: nobody calibrated it.
+        component_stddevs: of components of the ranges' errors of which more is known, by name.
+        taped: distances between points of the map: pairs of a length and its stddev, metres.
+        heights_m: between which anchors may stand; None: not below the ground, which is 0 or the lowest of all.
+        path_is_level: the camera cannot go up and down, as on a rover.
+        region_m: two corners of a box in which the anchors may stand anywhere; None: they stand where they do.
+    """
+
+    trajectory: Trajectory
+    anchors: tuple[Anchor, ...]
+    anchor_frame: str
+    rate_hz: float
+    tag_in_cam_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    range_model: RangeModelOptions = field(default_factory=RangeModelOptions)
+    curve_stddev_m: float | None = None
+    component_stddevs: Mapping[str, float] = field(default_factory=dict)
+    taped: tuple[tuple[float, float], ...] = ()
+    heights_m: tuple[float, float] | None = None
+    path_is_level: bool = False
+    region_m: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+
+    @property
+    def anchors_m(self) -> Array:
+        """(m, 3)"""
+        return np.array([anchor.position_m for anchor in self.anchors], dtype=np.float64)
+
+    @property
+    def _standing_m(self) -> Array:
+        """(m, 3) where the anchors are taken to stand."""
+        return self.anchors_m + _OFF_LINE_M if self.anchor_frame == "unknown" else self.anchors_m
+
+    @property
+    def places_m(self) -> Array:
+        """(m + n, 3) of all anchors and keyframes."""
+        return np.vstack([self.anchors_m, self.trajectory.centers])
+
+    @property
+    def duration_s(self) -> float:
+        times = self.trajectory.timestamps_s
+        return 0.0 if times is None else float(times[-1] - times[0])
+
+    @property
+    def num_ranges(self) -> int:
+        """That the radio will measure."""
+        return int(self.duration_s * self.rate_hz) * len(self.anchors)
+
+    def ranging(self, num_ranges: int) -> PlannedSurvey:
+        """The same at such a rate that so many ranges come of it."""
+        return replace(self, rate_hz=(num_ranges / len(self.anchors) + 0.5) / self.duration_s)
+
+    @property
+    def num_alike(self) -> int:
+        """How many ranges each simulated one stands for."""
+        return -(-self.num_ranges // _MAX_NUM_RANGES) or 1
+
+    @property
+    def _site_from_first_camera(self) -> Similarity:
+        return Similarity(1.0, self.trajectory.world_from_cam[0], self.trajectory.centers[0])
+
+    def observations(self) -> RangeObservations:
+        """Ranges without any error, on the path; of more than some thousand, each stands for several."""
+        num_anchors = len(self.anchors)
+        turn = np.arange(self.num_ranges // self.num_alike)
+        first_s = 0.0 if self.trajectory.timestamps_s is None else float(self.trajectory.timestamps_s[0])
+        times = first_s + (turn + 0.5) * self.num_alike / (self.rate_hz * num_anchors)
+        ids = [anchor.anchor_id for anchor in self.anchors]
+        log = RangeLog.from_arrays([ids[k] for k in turn % num_anchors], np.ones(len(turn)), timestamp_s=times)
+        places = associate(log, self.trajectory, self.tag_in_cam_m)
+        at = np.array([self._standing_m[ids.index(anchor_id)] for anchor_id in log.anchor_ids])
+        distances = np.linalg.norm(places.centers + places.tag_from_center - at[log.anchor_index], axis=1)
+        curve = None if self.curve_stddev_m is None else np.full(len(log), self.curve_stddev_m)
+        # One without a place has no say.
+        measured = replace(log, range_m=np.nan_to_num(distances, nan=1.0), shared_stddev_m=curve)
+        return replace(places, log=measured)
+
+    def posed(self, observations: RangeObservations) -> ScaleProblem:
+        """The problem that a run will pose, with what it will be told.
+
+        Raises:
+            GeometryError: as the run will.
+        """
+        from_site = self._site_from_first_camera.inverse() if self.anchor_frame == "first_camera" else IDENTITY
+        told = [replace(a, position_m=from_site.apply(at)) for a, at in zip(self.anchors, self.anchors_m, strict=True)]
+        return scale_problem(
+            observations, self.trajectory, told, self.anchor_frame, self.range_model, self._located_distances()
+        )
+
+    def _located_distances(self) -> LocatedDistances | None:
+        if not self.taped:
+            return None
+        lengths, stddevs = np.array(self.taped, dtype=np.float64).T
+        nowhere = np.full((len(lengths), 2), -1, dtype=np.int64)
+        return LocatedDistances(lengths, nowhere, lengths, stddevs, np.zeros(len(lengths), dtype=bool))
+
+    def state(self, posed: ScaleProblem, anchor_ids: tuple[str, ...]) -> RangeState:
+        """The truth, in the frame of the problem."""
+        at = {anchor.anchor_id: place for anchor, place in zip(self.anchors, self._standing_m, strict=True)}
+        places, first = np.array([at[anchor_id] for anchor_id in anchor_ids]), self._site_from_first_camera
+        biases = posed.ranges.bias_mean_m.copy()
+        if posed.frame == "site":
+            return RangeState(first, places, biases)
+        return RangeState(IDENTITY, first.inverse().apply(places), biases)

@@ -1,0 +1,221 @@
+"""The file of a plan: of each key its type, bounds and meaning; read as a survey file is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from rangesfm.errors import InputError, OptionError
+from rangesfm.files.atomic import path_of
+from rangesfm.option_model import Options, Told
+from rangesfm.options import RangeModelOptions, TagOptions
+from rangesfm.planning.paths import path_from_file, path_from_model, path_through
+from rangesfm.planning.placement import spread_anchors
+from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.anchor_file import read_anchors
+from rangesfm.ranging.errors.components import COMPONENTS
+from rangesfm.survey.settings import parse_toml, refuse_unknown_tables
+
+_Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
+_Place = Annotated[tuple[_Coordinate, _Coordinate, _Coordinate], Field(strict=False)]
+_Stddev = Annotated[float, Field(ge=0, le=10)]
+_MAX_NUM_ANCHORS = 64
+_MAX_DURATION_S = 1e5
+
+
+def _ascending(heights: tuple[float, float]) -> tuple[float, float]:
+    if not heights[0] < heights[1]:
+        raise ValueError("are not ascending")
+    return heights
+
+
+def _corners(corners: tuple[tuple[float, ...], tuple[float, ...]]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    if any(low > high for low, high in zip(*corners, strict=True)) or corners[0][:2] == corners[1][:2]:
+        raise ValueError("are no box")
+    return corners
+
+
+class PlannedAnchorOptions(Options):
+    """The anchors: where they will stand in the site, metres, z up."""
+
+    table: ClassVar[str] = "anchors"
+
+    path: Annotated[Path | None, Told(role="file")] = None
+    """CSV anchor_id,x_m,y_m,z_m[,position_stddev_m,range_bias_m,range_bias_stddev_m], all with a position."""
+    places: Annotated[dict[str, _Place], Told(expected="a table in which each value is a list of 3 numbers")] = Field(
+        default_factory=dict
+    )
+    """The same by anchor id: x, y, z."""
+    frame: Literal["site", "first_camera", "unknown"] = "site"
+    """As what a run will know them: surveyed in the site, known in the first camera's frame, or not at all."""
+    position_stddev_m: _Stddev = 0.0
+    """How well each coordinate in places will be known."""
+    num_to_place: Annotated[int, Field(ge=1, le=_MAX_NUM_ANCHORS)] | None = None
+    """So many anchors are put where they help most, instead of places and path."""
+    region_m: Annotated[
+        Annotated[tuple[_Place, _Place], Field(strict=False), AfterValidator(_corners)] | None,
+        Told(expected="two places, the second one in no coordinate smaller"),
+    ] = None
+    """Two corners x, y, z of the box in which they may be put."""
+    heights_m: Annotated[
+        Annotated[tuple[_Coordinate, _Coordinate], Field(strict=False), AfterValidator(_ascending)] | None,
+        Told(expected="a list of 2 numbers, the larger one last"),
+    ] = None
+    """Between which they may stand (default: not below the ground)."""
+
+
+class PlannedPathOptions(Options):
+    """The camera's path: waypoints, a trajectory, or a model."""
+
+    table: ClassVar[str] = "path"
+
+    waypoints: Annotated[
+        Annotated[tuple[_Place, ...], Field(strict=False)] | None, Told(expected="a list of lists of 3 numbers")
+    ] = None
+    """Places x, y, z that the camera passes, in the site; it looks ahead."""
+    speed_m_per_s: Annotated[float, Field(ge=0.01, le=100)] = 0.8
+    """Along the waypoints."""
+    num_rounds: Annotated[int, Field(ge=1, le=1000)] = 1
+    """How often the waypoints are walked; from the second round on back to the first."""
+    file: Annotated[Path | None, Told(role="file")] = None
+    """A trajectory instead, TUM or CSV, with rotations."""
+    model: Annotated[Path | None, Told(role="model")] = None
+    """A metric COLMAP model in the site's frame instead, its photos in the order of their names."""
+    photo_rate_hz: Annotated[float, Field(ge=0.5, le=100)] = 2.0
+    """Keyframes in a second."""
+    is_level: bool = False
+    """Whether the camera cannot go up and down, as on a rover."""
+
+
+class PlannedRadioOptions(RangeModelOptions):
+    """The radio."""
+
+    table: ClassVar[str] = "radio"
+
+    rate_hz: Annotated[float, Field(ge=1e-3, le=1e4)] = 5.0
+    """Ranges to each anchor in a second."""
+    curve_stddev_m: Annotated[float, Field(ge=1e-4, le=1)] | None = None
+    """Of the radio's error curve, where it was learnt (default: it was not)."""
+    stddevs: dict[str, Annotated[float, Field(ge=1e-9, le=10)]] = Field(default_factory=dict)
+    """Of components of the ranges' errors by name, as in result.json (default: as radios are known to have them)."""
+
+
+class Plan(BaseModel):
+    """A plan's tables.
+
+    Attributes:
+        anchors, path, radio, tag: its tables.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    anchors: PlannedAnchorOptions
+    path: PlannedPathOptions
+    radio: PlannedRadioOptions
+    tag: TagOptions
+
+
+_TABLES: dict[str, type[Options]] = {
+    "anchors": PlannedAnchorOptions,
+    "path": PlannedPathOptions,
+    "radio": PlannedRadioOptions,
+    "tag": TagOptions,
+}
+
+
+def read_plan(path: str | Path) -> PlannedSurvey:
+    """Read a plan's file; paths in it are relative to it.
+
+    Raises:
+        InputError: with the line where possible, for an unknown table or key, a value of the wrong type or out of
+            bounds, a plan without anchors or path, and a file that does not exist.
+    """
+    tables, source = parse_toml(Path(path))
+    folder = Path(path).absolute().parent
+    with source.naming_lines():
+        refuse_unknown_tables(tables, _TABLES)
+        options: dict[str, Any] = {
+            name: model(**_absolute(tables.get(name, {}), model, folder)) for name, model in _TABLES.items()
+        }
+        plan = Plan(**options)
+        return _planned(plan)
+
+
+def _absolute(table: dict[str, Any], model: type[Options], folder: Path) -> dict[str, Any]:
+    """With whole paths."""
+    keys = model.keys()
+    return {
+        name: folder / path_of(value) if name in keys and keys[name].role and isinstance(value, str) else value
+        for name, value in table.items()
+    }
+
+
+def _planned(plan: Plan) -> PlannedSurvey:
+    path, radio, tag = plan.path, plan.radio, plan.tag
+    if tag.lever_arms_m:
+        raise OptionError(
+            "[tag] lever_arms_m is given, expected tag_in_cam_m: a plan has one tag", "tag", "lever_arms_m"
+        )
+    known = [component.name for component in COMPONENTS]
+    if unknown := [name for name in radio.stddevs if name not in known]:
+        message = f"[radio] stddevs: there is no component {unknown[0]!r}, expected some of {', '.join(known)}"
+        raise OptionError(message, "radio", f"stddevs.{unknown[0]}")
+    given = [name for name in ("waypoints", "file", "model") if getattr(path, name) is not None]
+    if len(given) != 1:
+        raise OptionError(
+            f"[path] has {' and '.join(given) or 'none'} of waypoints, file and model, expected one", "path"
+        )
+    if path.waypoints is not None:
+        trajectory = path_through(path.waypoints, path.speed_m_per_s, path.photo_rate_hz, path.num_rounds)
+    elif path.file is not None:
+        trajectory = path_from_file(path.file, path.photo_rate_hz)
+    else:
+        assert path.model is not None
+        trajectory = path_from_model(path.model, path.photo_rate_hz)
+    planned = PlannedSurvey(
+        trajectory=trajectory,
+        anchors=_anchors(plan.anchors),
+        anchor_frame=plan.anchors.frame,
+        rate_hz=radio.rate_hz,
+        tag_in_cam_m=tag.tag_in_cam_m,
+        range_model=RangeModelOptions(
+            **{name: getattr(radio, name) for name in RangeModelOptions.model_fields if name in radio.model_fields_set}
+        ),
+        curve_stddev_m=radio.curve_stddev_m,
+        component_stddevs=radio.stddevs,
+        heights_m=plan.anchors.heights_m,
+        path_is_level=path.is_level,
+        region_m=plan.anchors.region_m,
+    )
+    if planned.duration_s > _MAX_DURATION_S:
+        message = f"[path] takes {planned.duration_s:.3g} s, expected at most {_MAX_DURATION_S:g}"
+        raise OptionError(message, "path")
+    return planned
+
+
+def _anchors(options: PlannedAnchorOptions) -> tuple[Anchor, ...]:
+    given = [name for name in ("path", "places", "num_to_place") if getattr(options, name)]
+    if len(given) != 1:
+        found = " and ".join(given) or "none"
+        raise OptionError(f"[anchors] has {found} of path, places and num_to_place, expected one", "anchors")
+    if (options.num_to_place is None) != (options.region_m is None):
+        raise OptionError("[anchors] num_to_place and region_m go together, expected both or none", "anchors")
+    if options.num_to_place is not None and options.region_m is not None:
+        return spread_anchors(options.num_to_place, *options.region_m, options.position_stddev_m)
+    if options.path is None:
+        anchors = tuple(
+            Anchor(anchor_id, np.array(place), options.position_stddev_m) for anchor_id, place in options.places.items()
+        )
+    else:
+        anchors = read_anchors(options.path)
+    for anchor in anchors:
+        if anchor.position_m is None:
+            expected = "where it will stand (what a run will know of it says [anchors] frame)"
+            raise InputError(f"anchor {anchor.anchor_id} has no position, expected {expected}", options.path)
+    if len(anchors) > _MAX_NUM_ANCHORS:
+        raise OptionError(f"[anchors] are {len(anchors)}, expected at most {_MAX_NUM_ANCHORS}", "anchors")
+    return anchors

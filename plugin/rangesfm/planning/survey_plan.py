@@ -1,0 +1,257 @@
+"""SurveyPlan: what a survey will know, in numbers and in words."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rangesfm.files.atomic import make_output_folder, write_text
+from rangesfm.planning.advice import Advice, advise, ranked
+from rangesfm.planning.detectable import detectable_mistakes
+from rangesfm.planning.expected import OPEN, Expected, expect
+from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.ranging.errors.components import component_words
+from rangesfm.trust.table import MistakeTest
+
+_MAX_NUM_SHOWN = 5
+
+
+@dataclass(frozen=True)
+class PlannedPlace:
+    """How well the map's place in the site will be known; inf where nothing determines it.
+
+    Attributes:
+        stddev_m: (3,) of the map's middle, in x, y, z.
+        heading_stddev_deg: of its turn about z. tilt_stddev_deg: of z against the plumb line.
+        worst_keyframe: which keyframe is known least. worst_keyframe_stddev_m: root of its summed variances.
+        keyframe_stddevs_m: (n,) of each, likewise.
+    """
+
+    stddev_m: tuple[float, float, float]
+    heading_stddev_deg: float
+    tilt_stddev_deg: float
+    worst_keyframe: int
+    worst_keyframe_stddev_m: float
+    keyframe_stddevs_m: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class DetectableMistake:
+    """A mistake that may be made, as of a MistakeTest: None where there is no limit.
+
+    Attributes:
+        name, subject: of which kind, and of what.
+        unit: of ``smallest_detectable``; "1": a share.
+        smallest_detectable: that will be found, in four cases of five.
+        effect_on_scale, effect_on_place_m: the most that one of that size does.
+    """
+
+    name: str
+    subject: str
+    unit: str
+    smallest_detectable: float | None
+    effect_on_scale: float | None
+    effect_on_place_m: float | None
+
+    @classmethod
+    def of(cls, test: MistakeTest) -> DetectableMistake:
+        return cls(
+            test.name,
+            test.subject,
+            test.unit,
+            _limited(test.smallest_detectable),
+            _limited(test.effect_on_scale),
+            _limited(test.effect_on_place_m),
+        )
+
+
+@dataclass(frozen=True)
+class SurveyPlan:
+    """What a run of the planned survey will state.
+
+    Attributes:
+        num_ranges: that the radio will measure, in ``duration_s``.
+        anchors_m: where they will stand in the site, by id.
+        frame: of the result, "site" or "first_camera".
+        scale_stddev: relative. scale_stddev_formal: as if every range erred on its own.
+        scale_interval_95: relative, its ends.
+        components: what each component of the ranges' errors does to the scale, by name.
+        place: None where the frame is the first camera's.
+        verdict, reasons: on the scale, as the run will judge it; "doubtful" too where it will refuse the place.
+        mistakes: what would be found of each, those that do most first.
+        advice: changes that would gain something.
+    """
+
+    num_ranges: int
+    duration_s: float
+    anchors_m: dict[str, tuple[float, ...]]
+    frame: str
+    scale_stddev: float
+    scale_stddev_formal: float
+    scale_interval_95: tuple[float, float]
+    components: dict[str, float]
+    place: PlannedPlace | None
+    verdict: str
+    reasons: tuple[str, ...]
+    mistakes: tuple[DetectableMistake, ...]
+    advice: tuple[Advice, ...]
+
+    @property
+    def advice_for_scale(self) -> list[Advice]:
+        """What gains most for the scale first."""
+        return ranked(self.advice, lambda advice: advice.scale_gain)
+
+    @property
+    def advice_for_place(self) -> list[Advice]:
+        """What gains most for the place of the keyframe known least first."""
+        return ranked(self.advice, lambda advice: advice.place_gain)
+
+    @property
+    def lines(self) -> list[str]:
+        """For people."""
+        return [*_known(self), *_budget(self), *_found(self), *_advised(self)]
+
+    def as_json(self) -> dict[str, Any]:
+        """What is infinite or not a number is null; advice in both orders."""
+        content: dict[str, Any] = asdict(self)
+        del content["advice"]
+        content["advice_for_scale"] = [asdict(advice) for advice in self.advice_for_scale]
+        content["advice_for_place"] = [asdict(advice) for advice in self.advice_for_place]
+        finite: dict[str, Any] = _finite(content)
+        return finite
+
+
+def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
+    """What a survey will know, by the formulas of a run at the true map, and which change would gain most.
+
+    Raises:
+        GeometryError: a run will refuse the scale.
+    """
+    expected = expect(planned)
+    verdict, mirror_image = expected.verdict, expected.mirror_image()
+    half_width = expected.uncertainty.half_width_95
+    return SurveyPlan(
+        num_ranges=planned.num_ranges,
+        duration_s=planned.duration_s,
+        anchors_m={a.anchor_id: tuple(at.tolist()) for a, at in zip(planned.anchors, planned.anchors_m, strict=True)},
+        frame=expected.posed.frame,
+        scale_stddev=expected.uncertainty.empirical,
+        scale_stddev_formal=expected.uncertainty.formal,
+        scale_interval_95=(float(np.expm1(-half_width)), float(np.expm1(half_width))),
+        components=expected.uncertainty.components,
+        place=_place(expected),
+        verdict=verdict.verdict if mirror_image is None else "doubtful",
+        reasons=verdict.reasons if mirror_image is None else (f"a run will refuse: {mirror_image}", *verdict.reasons),
+        mistakes=_mistakes(expected),
+        advice=advise(expected),
+    )
+
+
+def write_plan(plan: SurveyPlan, folder: Path) -> Path:
+    """Write ``plan.json`` there."""
+    make_output_folder(folder)
+    path = folder / "plan.json"
+    write_text(json.dumps(plan.as_json(), indent=2) + "\n", path)
+    return path
+
+
+def _place(expected: Expected) -> PlannedPlace | None:
+    place = expected.place()
+    if place is None:
+        return None
+    of_map, of_keyframes = place
+    x_m, y_m, z_m = of_map[4:].tolist()
+    return PlannedPlace(
+        stddev_m=(x_m, y_m, z_m),
+        heading_stddev_deg=float(np.rad2deg(of_map[3])),
+        tilt_stddev_deg=float(np.rad2deg(np.linalg.norm(of_map[1:3]))),
+        worst_keyframe=int(np.argmax(of_keyframes)),
+        worst_keyframe_stddev_m=float(of_keyframes.max()),
+        keyframe_stddevs_m=tuple(of_keyframes.tolist()),
+    )
+
+
+def _mistakes(expected: Expected) -> tuple[DetectableMistake, ...]:
+    found = [DetectableMistake.of(test) for test in detectable_mistakes(expected)]
+    return tuple(sorted(found, key=lambda each: -_most(each)))
+
+
+def _most(mistake: DetectableMistake) -> float:
+    return np.inf if mistake.effect_on_scale is None else mistake.effect_on_scale
+
+
+def _known(plan: SurveyPlan) -> Iterator[str]:
+    low, high = (100 * end for end in plan.scale_interval_95)
+    yield f"{plan.num_ranges} ranges in {plan.duration_s:.0f} s, result in the {plan.frame.replace('_', ' ')}'s frame"
+    places = (f"{name} {', '.join(f'{x:.4g}' for x in place)}" for name, place in plan.anchors_m.items())
+    yield f"anchors at {'; '.join(places)}"
+    yield f"scale: +-{100 * plan.scale_stddev:.2g} % (1 stddev), {low:+.2g} to {high:+.2g} % (95 %); {plan.verdict}"
+    yield from (f"  {reason}" for reason in plan.reasons)
+    if plan.place is not None:
+        place = plan.place
+        x, y, z = (_metres(stddev_m) for stddev_m in place.stddev_m)
+        yield (
+            f"place: x {x}, y {y}, z {z}, heading {_degrees(place.heading_stddev_deg)}, tilt "
+            f"{_degrees(place.tilt_stddev_deg)}; keyframe {place.worst_keyframe} is known least, to "
+            f"{_metres(place.worst_keyframe_stddev_m)} (1 stddev)"
+        )
+
+
+def _budget(plan: SurveyPlan) -> Iterator[str]:
+    largest = sorted(plan.components.items(), key=lambda item: -item[1])[:_MAX_NUM_SHOWN]
+    words = component_words(name for name, _ in largest)
+    yield "what makes the scale uncertain: " + ", ".join(f"{words[name]} {100 * part:.2g} %" for name, part in largest)
+
+
+def _found(plan: SurveyPlan) -> Iterator[str]:
+    yield "mistakes just too small to be found, and the most that they would do:"
+    of_kind: dict[str, DetectableMistake] = {}
+    for mistake in plan.mistakes:
+        of_kind.setdefault(mistake.name, mistake)
+    for mistake in list(of_kind.values())[:_MAX_NUM_SHOWN]:
+        what = f"  {mistake.name} {mistake.subject}".rstrip()
+        if mistake.smallest_detectable is None:
+            yield f"{what}: none is ever found"
+            continue
+        unit = "" if mistake.unit == "1" else f" {mistake.unit}"
+        scale = "open" if mistake.effect_on_scale is None else f"{100 * mistake.effect_on_scale:.2g} %"
+        place_m = np.inf if mistake.effect_on_place_m is None else mistake.effect_on_place_m
+        yield f"{what}: {mistake.smallest_detectable:.2g}{unit}; scale {scale}, place {_metres(place_m)}"
+
+
+def _advised(plan: SurveyPlan) -> Iterator[str]:
+    if not plan.advice:
+        yield "no single change gains much"
+    if for_scale := plan.advice_for_scale[:_MAX_NUM_SHOWN]:
+        yield "what would gain most for the scale:"
+        for number, advice in enumerate(for_scale, 1):
+            yield f"  {number}. {advice.words}: +-{100 * advice.scale_stddev:.2g} %"
+    if for_place := plan.advice_for_place[:_MAX_NUM_SHOWN]:
+        yield "what would gain most for the place of the keyframe known least:"
+        for number, advice in enumerate(for_place, 1):
+            yield f"  {number}. {advice.words}: {_metres(advice.place_stddev_m)}"
+
+
+def _limited(value: float | None) -> float | None:
+    return None if value is None or value > OPEN else value
+
+
+def _metres(stddev_m: float) -> str:
+    return f"{stddev_m:.2g} m" if np.isfinite(stddev_m) else "open"
+
+
+def _degrees(stddev_deg: float) -> str:
+    return f"{stddev_deg:.2g} deg" if np.isfinite(stddev_deg) else "open"
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _finite(part) for name, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(part) for part in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value

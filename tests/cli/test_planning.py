@@ -1,0 +1,50 @@
+"""``rangesfm plan`` prints what a survey will know, or why it is no plan."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rangesfm.cli import main
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "plan.toml"
+STRAIGHT = """
+[anchors]
+frame = "unknown"
+places = {A = [2, 8, 1.6]}
+[path]
+waypoints = [[0, 0, 1.6], [4, 0, 1.6]]
+"""
+
+
+def test_the_example_is_planned_and_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plan", str(EXAMPLE), "--output_path", str(tmp_path / "plan")]) == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    assert "scale: +-" in printed.out
+    assert "what would gain most for the place" in printed.out
+    content = json.loads((tmp_path / "plan" / "plan.json").read_text())
+    assert 0 < content["scale_stddev"] < 0.1
+    # All its anchors stand at one height, and the path is flat.
+    assert any("mirror image" in reason for reason in content["reasons"])
+
+
+def test_a_scale_that_a_run_would_refuse_is_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "plan.toml").write_text(STRAIGHT)
+    assert main(["plan", str(tmp_path / "plan.toml")]) == 3
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith("rangesfm: error: the scale is only known to")
+    assert printed.err.count("\n") == 1
+
+
+def test_a_key_that_is_not_known_is_named_with_its_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "plan.toml"
+    path.write_text(STRAIGHT + "speed = 1.0\n")
+    assert main(["plan", str(path)]) == 2
+    assert capsys.readouterr().err.startswith(f"rangesfm: error: {path}:7: unknown key 'speed' in [path]")
+    assert not (tmp_path / "plan").exists()

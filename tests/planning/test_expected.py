@@ -1,0 +1,113 @@
+"""What a plan expects is what runs of such surveys state."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.planning.surveys import COPLANAR_M, FIVE_ANCHORS_M, Place, loop, planned, turned_out
+
+from rangesfm.errors import GeometryError
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.planning.expected import expect
+from rangesfm.planning.paths import path_through
+from rangesfm.scale.initialize import initialize_scale
+from rangesfm.trust.finished_map import by_similarity
+
+
+@pytest.mark.parametrize(
+    ("anchors_m", "frame", "rate_hz"),
+    [(FIVE_ANCHORS_M, "first_camera", 5.0), (FIVE_ANCHORS_M[:1], "unknown", 20.0)],
+    ids=["five known anchors", "one unknown anchor"],
+)
+def test_the_expected_stddev_of_the_scale_is_what_runs_state(
+    anchors_m: tuple[Place, ...], frame: str, rate_hz: float
+) -> None:
+    plan = planned(anchors_m, frame, rate_hz=rate_hz)
+    assert plan.num_alike == 1
+    expected = expect(plan)
+    path = plan.trajectory
+    first = Similarity(1.0, path.world_from_cam[0], path.centers[0]).inverse()
+    told = [replace(a, position_m=first.apply(at)) for a, at in zip(plan.anchors, plan.anchors_m, strict=True)]
+    stated = [
+        initialize_scale(turned_out(expected, seed), path, told, anchor_frame=frame).uncertainty.empirical
+        for seed in range(5)
+    ]
+    assert expected.uncertainty.empirical == pytest.approx(np.median(stated), rel=0.3)
+
+
+def test_the_expected_place_is_as_certain_as_runs_state() -> None:
+    plan = planned(FIVE_ANCHORS_M, "site")
+    expected = expect(plan)
+    stated = []
+    for seed in range(3):
+        estimate = initialize_scale(
+            turned_out(expected, seed), plan.trajectory, plan.anchors, anchor_frame="site", seed=seed
+        )
+        assert estimate.placement is not None
+        of_keyframes = by_similarity(estimate.placement, plan.trajectory.centers)[1]
+        stated.append(np.sqrt(np.trace(of_keyframes, axis1=1, axis2=2).max()))
+    assert expected.worst_keyframe_m == pytest.approx(np.median(stated), rel=0.3)
+
+
+def test_ranges_that_stand_for_several_say_what_all_would(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = planned(FIVE_ANCHORS_M, "site", rate_hz=20.0)
+    thinned = expect(plan)
+    assert plan.num_alike > 1
+    monkeypatch.setattr("rangesfm.planning.planned._MAX_NUM_RANGES", 100_000)
+    assert plan.num_alike == 1
+    whole = expect(plan)
+    assert len(whole.posed.rows) > 2 * len(thinned.posed.rows)
+    assert thinned.uncertainty.empirical == pytest.approx(whole.uncertainty.empirical, rel=0.05)
+    assert thinned.worst_keyframe_m == pytest.approx(whole.worst_keyframe_m, rel=0.05)
+
+
+def test_anchors_at_the_height_of_a_level_path_leave_the_height_open() -> None:
+    path = loop(height_amplitude_m=0.0)
+    level = replace(path, centers=path.centers * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.6])
+    place = expect(planned(COPLANAR_M, "site", level)).place()
+    assert place is not None
+    x_m, y_m, z_m = place[0][4:]
+    assert max(x_m, y_m) < 0.1
+    assert np.isinf(z_m)
+
+
+def test_a_flat_path_below_anchors_of_one_height_has_a_mirror_image() -> None:
+    path = loop(height_amplitude_m=0.0)
+    at_the_ceiling = tuple((x, y, 3.0) for x, y, _ in COPLANAR_M)
+    why = expect(planned(at_the_ceiling, "site", path)).mirror_image()
+    assert why is not None
+    assert "mirror image" in why
+    assert expect(planned(FIVE_ANCHORS_M, "site", path)).mirror_image() is None
+
+
+def test_one_unknown_anchor_beside_a_short_straight_path_is_refused_as_a_run_would() -> None:
+    straight = path_through([(0.0, 0.0, 1.6), (4.0, 0.0, 1.6)], speed_m_per_s=0.5, photo_rate_hz=2.0)
+    expected = expect(planned([(2.0, 8.0, 1.6)], "unknown", straight))
+    with pytest.raises(GeometryError, match=r"only known to .* nearly straight"):
+        _ = expected.verdict
+
+
+def test_an_unknown_anchor_in_line_with_a_straight_path_leaves_the_scale_as_open_as_in_a_run() -> None:
+    straight = path_through([(0.0, 0.0, 1.6), (8.0, 0.0, 1.6)], speed_m_per_s=0.5, photo_rate_hz=2.0)
+    in_line = planned([(14.0, 0.0, 1.6)], "unknown", straight, rate_hz=20.0)
+    expected = expect(in_line)
+    stated = initialize_scale(turned_out(expected, 0), straight, in_line.anchors, anchor_frame="unknown")
+    assert expected.uncertainty.empirical == pytest.approx(stated.uncertainty.empirical, rel=0.3)
+    # One beside the line tells much more.
+    beside = expect(planned([(8.0, 6.0, 1.6)], "unknown", straight, rate_hz=20.0))
+    assert beside.uncertainty.empirical < 0.9 * expected.uncertainty.empirical
+
+
+def test_what_is_known_of_the_radio_counts() -> None:
+    usual = expect(planned(FIVE_ANCHORS_M, "site"))
+    better = expect(planned(FIVE_ANCHORS_M, "site", component_stddevs={"tag_antenna": 0.005}))
+    assert better.uncertainty.components["tag_antenna"] < 0.2 * usual.uncertainty.components["tag_antenna"]
+    assert better.uncertainty.empirical < 0.9 * usual.uncertainty.empirical
+
+
+def test_a_taped_length_makes_the_scale_no_better_than_itself() -> None:
+    taped = expect(planned(FIVE_ANCHORS_M, "site", taped=((5.0, 0.005),)))
+    assert 0.0005 < taped.uncertainty.components["given"] < 0.001
+    assert 0.0008 < taped.uncertainty.empirical < 0.002

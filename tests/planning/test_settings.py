@@ -1,0 +1,78 @@
+"""A plan's file is read or refused in one line that says where."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rangesfm.errors import InputError
+from rangesfm.planning.settings import read_plan
+
+ANCHORS = "[anchors.places]\nA = [0, 0, 2]\nB = [6.0, 0, 2.5]\nC = [3, 5, 1]\n"
+PATH = "[path]\nwaypoints = [[1, 1, 1.5], [5, 1, 1.5], [3, 3, 1.5]]\nspeed_m_per_s = 0.5\n"
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "plan.toml"
+    path.write_text(text)
+    return path
+
+
+def test_waypoints_are_walked_at_their_speed(tmp_path: Path) -> None:
+    plan = read_plan(written(tmp_path, ANCHORS + PATH + "[radio]\nrate_hz = 10\n".replace("10", "10.0")))
+    assert [anchor.anchor_id for anchor in plan.anchors] == ["A", "B", "C"]
+    assert plan.duration_s == pytest.approx((4 + np.hypot(2, 2)) / 0.5, abs=0.5)
+    steps = np.linalg.norm(np.diff(plan.trajectory.centers, axis=0), axis=1)
+    assert np.median(steps) == pytest.approx(0.25)
+    # Along x, level: the camera's z is the way, its y is down.
+    np.testing.assert_allclose(plan.trajectory.world_from_cam[0] @ [0, 0, 1], [1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(plan.trajectory.world_from_cam[0] @ [0, 1, 0], [0, 0, -1], atol=1e-12)
+    assert np.linalg.det(plan.trajectory.world_from_cam) == pytest.approx(1.0)
+
+
+def test_a_trajectory_and_anchors_may_stand_in_files(tmp_path: Path) -> None:
+    (tmp_path / "anchors.csv").write_text("anchor_id,x_m,y_m,z_m,position_stddev_m\nA,0,0,2,0.02\nB,6,0,2,0.02\n")
+    rows = [f"{0.1 * k:.1f} {0.05 * k:.2f} 0 1.5 0 0 0 1" for k in range(101)]
+    (tmp_path / "walk.tum").write_text("\n".join(rows) + "\n")
+    text = '[anchors]\npath = "anchors.csv"\nframe = "unknown"\n[path]\nfile = "walk.tum"\nphoto_rate_hz = 2.0\n'
+    plan = read_plan(written(tmp_path, text))
+    assert [anchor.position_stddev_m for anchor in plan.anchors] == [0.02, 0.02]
+    assert len(plan.trajectory) == 21
+    assert plan.duration_s == pytest.approx(10.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        (ANCHORS + PATH + "[radoi]\n", "nearest known one is 'radio'"),
+        (ANCHORS + PATH + "[radio]\nrate = 5\n", r":\d+: unknown key 'rate' in \[radio\]; .* 'rate_hz'"),
+        (ANCHORS + PATH + "[radio]\nrate_hz = -1.0\n", "from 0.001 to 10000"),
+        (ANCHORS + PATH + "[radio.stddevs]\nantena = 0.1\n", "no component 'antena', expected some of"),
+        (ANCHORS, "none of waypoints, file and model, expected one"),
+        (ANCHORS + PATH + 'file = "walk.tum"\n', "waypoints and file"),
+        (ANCHORS + "[path]\nwaypoints = [[1, 1, 1]]\n", "go nowhere"),
+        (ANCHORS + "[path]\nwaypoints = [[1, 1], [2, 2]]\n", "expected a list of lists of 3 numbers"),
+        (PATH, "none of path, places and num_to_place"),
+        ("[anchors]\nnum_to_place = 4\n" + PATH, "num_to_place and region_m go together"),
+        ("[anchors]\nnum_to_place = 4\nregion_m = [[0, 0, 0], [5, -1, 3]]\n" + PATH, "the second one in no coordinate"),
+        ("[anchors]\nheights_m = [3.0, 1.0]\n" + ANCHORS + PATH, "the larger one last"),
+        ("[anchors]\nplaces = {A = [1, 2]}\n" + PATH, "3 numbers"),
+        (ANCHORS + '[path]\nfile = "nothing.tum"\n', "nothing.tum"),
+        (ANCHORS + '[path]\nmodel = "nothing"\n', "nothing"),
+        ("[anchors\n", "not a TOML file"),
+        (ANCHORS + PATH + "[tag.lever_arms_m]\n1 = [0, 0, 0]\n", "a plan has one tag"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(text: str, found: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=found) as refused:
+        read_plan(written(tmp_path, text))
+    assert "\n" not in str(refused.value)
+    assert refused.value.exit_status == 2
+
+
+def test_an_anchor_without_a_place_is_no_plan(tmp_path: Path) -> None:
+    (tmp_path / "anchors.csv").write_text("anchor_id,x_m,y_m,z_m\nA,0,0,2\nB,,,\n")
+    with pytest.raises(InputError, match="anchor B has no position"):
+        read_plan(written(tmp_path, '[anchors]\npath = "anchors.csv"\n' + PATH))

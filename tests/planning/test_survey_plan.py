@@ -1,0 +1,103 @@
+"""A plan says what will be known, what would be found, and what to change, in numbers that hold."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.planning.surveys import COPLANAR_M, FIVE_ANCHORS_M, loop, planned
+
+from rangesfm.planning.expected import expect
+from rangesfm.planning.survey_plan import SurveyPlan, plan_survey, write_plan
+
+
+@pytest.fixture(scope="module")
+def plan() -> SurveyPlan:
+    return plan_survey(planned(FIVE_ANCHORS_M, "site"))
+
+
+def test_the_budget_adds_up_to_the_stddev_and_the_interval_is_1_96_of_it(plan: SurveyPlan) -> None:
+    assert np.linalg.norm(list(plan.components.values())) == pytest.approx(plan.scale_stddev)
+    assert np.log1p(plan.scale_interval_95) == pytest.approx([-1.96 * plan.scale_stddev, 1.96 * plan.scale_stddev])
+
+
+def test_advice_that_is_followed_gains_what_it_promised(plan: SurveyPlan) -> None:
+    survey = planned(FIVE_ANCHORS_M, "site")
+    learn = next(advice for advice in plan.advice_for_scale if advice.kind == "calibration")
+    followed = expect(replace(survey, curve_stddev_m=0.02))
+    assert followed.uncertainty.empirical == pytest.approx(learn.scale_stddev, rel=0.1)
+    raised = next(advice for advice in plan.advice_for_place if advice.kind == "anchor height")
+    height_m = float(raised.words.split()[-2])
+    anchors = tuple(
+        replace(a, position_m=np.array([*at[:2], height_m])) if a.anchor_id == raised.subject else a
+        for a, at in zip(survey.anchors, survey.anchors_m, strict=True)
+    )
+    assert expect(replace(survey, anchors=anchors)).worst_keyframe_m == pytest.approx(raised.place_stddev_m, rel=0.1)
+
+
+def test_advice_is_ranked_by_its_gain_and_each_thing_is_advised_once(plan: SurveyPlan) -> None:
+    for ranking, gain in (
+        (plan.advice_for_scale, [advice.scale_gain for advice in plan.advice_for_scale]),
+        (plan.advice_for_place, [advice.place_gain for advice in plan.advice_for_place]),
+    ):
+        assert gain == sorted(gain, reverse=True)
+        assert min(gain) > 0
+        assert len({(advice.kind, advice.subject) for advice in ranking}) == len(ranking)
+
+
+def test_with_all_anchors_at_a_rovers_height_the_first_advice_is_to_raise_one() -> None:
+    path = loop(height_amplitude_m=0.0)
+    level = replace(path, centers=path.centers * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.6])
+    plan = plan_survey(planned(COPLANAR_M, "site", level, path_is_level=True))
+    assert plan.place is not None
+    assert np.isinf(plan.place.stddev_m[2])
+    first = plan.advice_for_place[0]
+    assert first.kind == "anchor height"
+    assert first.words.startswith("raise anchor")
+    assert first.place_stddev_m < 2.0
+    assert any("z open" in line for line in plan.lines)
+
+
+def test_anchors_stay_within_the_heights_that_are_allowed() -> None:
+    plan = plan_survey(planned(FIVE_ANCHORS_M, "site", heights_m=(0.0, 2.0)))
+    heights = [float(a.words.split()[-2]) for a in plan.advice if a.kind == "anchor height"]
+    assert heights
+    assert all(0.0 <= height <= 2.0 for height in heights)
+
+
+def test_mistakes_that_would_be_found_have_a_size_and_an_effect(plan: SurveyPlan) -> None:
+    places = [mistake for mistake in plan.mistakes if mistake.name == "anchor place"]
+    assert {mistake.subject for mistake in places} == {
+        anchor.anchor_id for anchor in planned(FIVE_ANCHORS_M, "site").anchors
+    }
+    for mistake in places:
+        assert mistake.smallest_detectable is not None
+        assert 0.05 < mistake.smallest_detectable < 5.0
+        assert mistake.effect_on_scale is not None
+
+
+def test_ten_times_the_ranges_average_out_their_noise_and_nothing_else() -> None:
+    few, many = (plan_survey(planned(FIVE_ANCHORS_M, "site", rate_hz=rate)) for rate in (1.0, 10.0))
+    assert many.num_ranges == 10 * few.num_ranges
+    assert many.components["white"] < 0.5 * few.components["white"]
+    assert many.scale_stddev == pytest.approx(few.scale_stddev, rel=0.05)
+
+
+def test_plan_json_holds_it_all_and_what_is_open_is_null(tmp_path: Path) -> None:
+    path = loop(height_amplitude_m=0.0)
+    level = replace(path, centers=path.centers * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.6])
+    plan = plan_survey(planned(COPLANAR_M, "site", level))
+    content = json.loads(write_plan(plan, tmp_path / "plan").read_text())
+    assert content["scale_stddev"] == plan.scale_stddev
+    assert content["place"]["stddev_m"][2] is None
+    assert len(content["advice_for_place"]) == len(plan.advice_for_place)
+
+
+def test_a_survey_with_unknown_anchors_has_no_place() -> None:
+    plan = plan_survey(planned(FIVE_ANCHORS_M[:2], "unknown"))
+    assert plan.frame == "first_camera"
+    assert plan.place is None
+    assert not plan.advice_for_place

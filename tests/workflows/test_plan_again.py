@@ -1,0 +1,45 @@
+"""A finished survey is planned again: the plan says what its run said, and what to change next time."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from rangesfm.errors import InputError
+from rangesfm.workflows.plan_again import plan_of_result
+
+if TYPE_CHECKING:
+    from tests.conftest import Command, WalkedSurvey
+
+
+@pytest.mark.parametrize(
+    "anchors",
+    [("--anchors", "anchors.csv", "--anchor_frame", "site"), ("--anchor_frame", "unknown")],
+    ids=["site", "unknown"],
+)
+def test_the_plan_is_of_the_map_that_the_run_found(
+    anchors: tuple[str, ...], walked_survey: WalkedSurvey, rangesfm_command: Command, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    flags = (*walked_survey.flags, "--no_report", "--output_path", out)
+    rangesfm_command("scale", *flags, *anchors, cwd=walked_survey.folder)
+    planned = plan_of_result(out)
+    result = json.loads((out / "result.json").read_text())
+    assert planned.anchor_frame == anchors[-1]
+    assert len(planned.trajectory) == 40
+    assert planned.num_ranges == pytest.approx(result["ranges"]["num_used"], rel=0.01)
+    # The camera was held upright, at a height that changes by some decimetres on a loop of metres.
+    assert np.ptp(planned.trajectory.centers[:, 2]) < 0.5 * np.ptp(planned.trajectory.centers[:, 0])
+    printed = rangesfm_command("plan", "--from", out, cwd=tmp_path).stdout
+    assert "what would gain most for the scale" in printed
+    assert ("place: x" in printed) == (anchors[-1] == "site")
+
+
+def test_a_folder_that_holds_no_result_is_refused(tmp_path: Path, rangesfm_command: Command) -> None:
+    with pytest.raises(InputError, match="not a result folder"):
+        plan_of_result(tmp_path)
+    assert rangesfm_command("plan", cwd=tmp_path, status=2).stderr.count("\n") == 1
