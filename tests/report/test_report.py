@@ -250,7 +250,7 @@ def test_a_result_without_ranges_or_models_has_a_page(make_result: MakeResult) -
         for file in (folder / stage / "0").iterdir():
             file.unlink()
         (folder / stage / "0").rmdir()
-    assert sections_of(page_of(folder)) == ["verdict", "checks", "path", "scale", "anchors", "run"]
+    assert sections_of(page_of(folder)) == ["verdict", "checks", "path", "scale", "mistakes", "anchors", "run"]
 
 
 def test_a_log_by_photo_without_times_is_drawn_in_its_order(make_result: MakeResult) -> None:

@@ -189,11 +189,8 @@ def error_budget(content: Content) -> Table:
     """What the scale's interval is made of, largest part first."""
     parts = content.summary.scale.relative_stddev.components
     words = component_words(parts)
-    rows = [
-        [words[name], keyed(f"scale.relative_stddev.components.{name}", stddev, f"{100 * stddev:.2f} %")]
-        for name, stddev in sorted(parts.items(), key=lambda part: -part[1])
-    ]
-    return Table("What the scale's stddev is made of", ["errors", "stddev"], rows, is_narrow=True)
+    rows = [[words[name], f"{100 * stddev:.2f}"] for name, stddev in sorted(parts.items(), key=lambda part: -part[1])]
+    return Table("What the scale's stddev is made of", ["errors", "stddev %"], rows, is_narrow=True)
 
 
 def sensitivity(content: Content) -> Table:

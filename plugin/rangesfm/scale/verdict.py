@@ -25,9 +25,8 @@ _MANY_OUTLIERS = 0.3
 _FEW_RANGES = 50
 # Relative stddev of a scale that may as well be nothing.
 _NOTHING_KNOWN = 1.0
-# Scatter of the scales from one anchor each: more than antennas and short stretches of a path make of it, and in
-# stddevs of the joint scale.
-_MAX_ANCHOR_SPREAD, _MAX_SPREAD_STDDEVS = 0.05, 0.75
+# Scatter of the scales from one anchor each: more than antennas and short stretches of a path make of it.
+_MAX_ANCHOR_SPREAD = 0.05
 # Components of the ranges' errors that the same measure helps against.
 _KINDS = (
     ("curve", "rough_curve", "slope", "short", "common_bias", "learnt_curve"),
@@ -82,7 +81,7 @@ def judge(
         *_left_out_doubts(problem.left_out),
         *_path_doubts(solution),
         *_range_doubts(solution.fit),
-        *_anchor_doubts(per_anchor, uncertainty),
+        *_anchor_doubts(per_anchor),
     ]
     remarks = _remarks(solution, anchors)
     if drift := _drift(cutoff_tests):
@@ -186,12 +185,12 @@ def _range_doubts(fit: RangeFit) -> list[_Doubt]:
     return doubts
 
 
-def _anchor_doubts(per_anchor: dict[str, float], uncertainty: ScaleUncertainty) -> list[_Doubt]:
-    """Anchors that disagree on the scale, by more than its uncertainty lets expect."""
+def _anchor_doubts(per_anchor: dict[str, float]) -> list[_Doubt]:
+    """Anchors that disagree on the scale."""
     if len(per_anchor) < 2:
         return []
     spread = float(np.std(np.log(np.array(list(per_anchor.values()))), ddof=1))
-    if spread <= max(_MAX_ANCHOR_SPREAD, _MAX_SPREAD_STDDEVS * uncertainty.empirical):
+    if spread <= _MAX_ANCHOR_SPREAD:
         return []
     reason = f"the anchors disagree: the scales found with each of them alone scatter by {100 * spread:.1f} %"
     return [_Doubt(reason, "check the anchors' positions and antenna delays, and place them in the open")]
