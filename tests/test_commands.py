@@ -575,7 +575,7 @@ class TestRunOnPhotos:
         result = copy.deepcopy(first_run.result)
         assert_has(result, {**RESULT, "refine": REFINE})
         total_s = result["seconds"].pop("total")
-        stages = {"keyframes", "features", "matching", "mapping", "scale", "tests of mistakes", "refinement", "results"}
+        stages = {"keyframes", "features", "matching", "mapping", "scale", "refinement", "results"}
         assert result["seconds"].keys() == stages
         assert 0 < sum(result["seconds"].values()) <= total_s
 

@@ -303,7 +303,7 @@ RESULT = json.dumps(result_document())
         ({}, "not a result folder: it has no result.json"),
         ({"result.json": "{\n,"}, r"result\.json:2: not JSON"),
         ({"result.json": RESULT}, "no scaled model"),
-        ({"result.json": RESULT, "sparse_scaled/0/cameras.bin": ""}, r"cameras\.bin: is damaged or cut off"),
+        ({"result.json": RESULT, "sparse_scaled/0/cameras.bin": ""}, r"there is no images\.bin"),
         (
             {"result.json": RESULT, "images.csv": "image_name,timestamp_s\na.jpg,x\n"},
             r"images\.csv:2: timestamp_s is 'x'",

@@ -20,8 +20,7 @@ def tested(survey: Survey, metric: MetricResult, journal: Journal) -> MetricResu
     The scaled map is looked at, refined or not: a refinement bends a map to ranges that are wrong.
     """
     try:
-        with journal.timed("tests of mistakes"):
-            trust = trust_in(scaled_ranges(survey, metric), seed=survey.output.seed)
+        trust = trust_in(scaled_ranges(survey, metric), seed=survey.output.seed)
     except np.linalg.LinAlgError as error:
         journal.warn(f"mistakes were not looked for, as the ranges determine too little: {error}")
         return metric
