@@ -94,11 +94,12 @@ def centers(path_of_model: str, survey: Survey) -> Array:
 
 
 @pytest.mark.parametrize("spoil", [leave_as_it_is, throw_camera_a_little])
-def test_a_refinement_that_did_its_work_stays_good(survey: Survey, spoil: Spoil, own_survey: WalkedSurvey) -> None:
+def test_a_refinement_that_did_its_work_is_kept(survey: Survey, spoil: Spoil, own_survey: WalkedSurvey) -> None:
     summary = refined(spoilt(survey, spoil)).summary
     refine, place = known(summary.refine), known(summary.place)
-    assert (summary.scale.verdict, place.verdict) == ("good", "good")
-    assert len(summary.warnings) == (spoil is throw_camera_a_little)
+    assert place.verdict == "good"
+    # A camera that was out of place before is told of, though it is in place now.
+    assert (summary.scale.verdict == "good") == (not summary.warnings) == (spoil is leave_as_it_is)
     assert refine.kept
     assert refine.converged
     assert refine.why_not_kept == ()
