@@ -89,8 +89,10 @@ def test_ends_soon_leaves_nothing_half_done_and_the_next_run_goes_on(
     interrupt(many_photos, tmp_path, step, min_num_done)
     left = set(os.listdir(tmp_path)) - {"mapping_snapshot"}  # there is one, or it was too soon
     assert left == {"database.db", "mapper.log", "reconstruct.json"}
+    # Ctrl-C may come when the last of few pairs has just been matched: then this step may be left or done.
+    came_late = step in ALL and num_done(tmp_path)[step] == ALL[step]
     if step in ALL:
-        assert min_num_done <= num_done(tmp_path)[step] < ALL[step]
+        assert min_num_done <= num_done(tmp_path)[step] <= ALL[step]
     summary = reconstruct(
         many_photos.folder,
         many_photos.names,
@@ -99,9 +101,9 @@ def test_ends_soon_leaves_nothing_half_done_and_the_next_run_goes_on(
         mapper=MAPPER,
         progress=listener,
     )
-    assert listener.stages == steps_left
+    assert listener.stages == steps_left or (came_late and listener.stages == steps_left[1:])
     assert summary.num_registered == NUM_PHOTOS
-    if step != "mapping":
+    if step != "mapping" and not came_late:
         assert listener.updates[step][0][0] >= min_num_done  # it did not begin at nothing
     with pycolmap.Database.open(tmp_path / "database.db") as database:
         assert {image.name for image in database.read_all_images()} == set(many_photos.names)
