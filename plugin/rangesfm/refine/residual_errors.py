@@ -21,5 +21,6 @@ def residual_errors(errors: RangeErrors, learned: LearnedErrors, rows: Indices, 
     in_residuals = np.sqrt(errors.weight) * errors.loss.slopes(residuals_m / errors.stddev_m) / errors.stddev_m
     num, has_cell = len(rows), np.flatnonzero(learned.of_range >= 0)
     places = (has_cell, learned.of_range[has_cell])
-    of_cells = csr_matrix((in_residuals[has_cell], places), shape=(num, len(learned.covariance_m2)))
-    return ResidualErrors(rows, of_cells, learned.covariance_m2)
+    covariance_m2 = learned.covariance_m2
+    of_cells = csr_matrix((in_residuals[has_cell], places), shape=(num, len(covariance_m2)))
+    return ResidualErrors(rows, of_cells, covariance_m2)

@@ -142,7 +142,8 @@ def _by_what_was_given(solution: Solution) -> float:
 def parameter_covariance(fit: RangeFit, problem: RangeProblem, learned: LearnedErrors) -> Array:
     """(p, p) of all that a fit estimates, in the parameters of its columns: what the ranges' errors do to it."""
     of_cells = parameter_influence(fit, problem, learned)
-    of_priors = invert_information(fit.information) @ fit.prior_information @ invert_information(fit.information)
+    inverse = invert_information(fit.information)
+    of_priors = inverse @ fit.prior_information @ inverse
     covariance: Array = of_cells @ learned.covariance_m2 @ of_cells.T + of_priors
     return covariance
 
