@@ -18,7 +18,6 @@ from rangesfm.options import ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.observations import RangeStatus
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.trust.ranges_on_map import RangesOnMap, ranges_on_map
@@ -198,13 +197,5 @@ def run(given: Given, seed: int) -> Run:
         )
     except GeometryError as error:
         return Run(None, None, refusal=str(error))
-    on_map = ranges_on_map(
-        estimate.observations, given.trajectory, estimate.metric_from_sfm, estimate.anchors, estimate.errors,
-        by_status(estimate), frame_is_free=estimate.frame == "site",
-    )  # fmt: skip
+    on_map = ranges_on_map(estimate.problem, estimate.solution, estimate.observations, given.trajectory)
     return Run(estimate, trust_in(on_map, seed=seed), on_map)
-
-
-def by_status(estimate: ScaleEstimate) -> Array:
-    """(n,) robust weights, as far as the statuses tell them."""
-    return np.where(estimate.observations.status <= RangeStatus.DOWN_WEIGHTED, 1.0, 0.0)
