@@ -24,7 +24,7 @@ from rangesfm.scale.range_equation import (
 from rangesfm.trust.ranges_on_map import RangesOnMap
 
 # The tests learn the errors many times over: fewer cells than an interval has.
-_MAX_NUM_CELLS = 240
+_MAX_NUM_CELLS = 160
 _NUM_NEIGHBOURS = 8
 # In stddevs from the median of its neighbours, of which the noise is at least this: what is further off is an outlier
 # among them. A radio may repeat itself to a centimetre and err by ten from one place to the next.

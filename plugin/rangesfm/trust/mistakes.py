@@ -109,11 +109,11 @@ def _causes(problem: Linearized, nominated: Sequence[Test], is_sure: bool) -> li
         again, deviance = _settled_test(problem, test.hypothesis)
         gain = before - deviance
         if _is_possible(again) and (is_sure or gain > test.threshold):
-            named = replace(_narrowed(problem, again, deviance), threshold=test.threshold)
-            causes.append(_cause(named, gain, _penalty(again, num)))
+            causes.append(_cause(replace(again, threshold=test.threshold), gain, _penalty(again, num)))
     causes += _alternatives(problem, before)
     causes.sort(key=lambda cause: -cause.score)
-    return [cause for k, cause in enumerate(causes) if not k or _is_rival(causes[0], cause)][: 1 + _MAX_NUM_RIVALS]
+    likeliest = [cause for k, cause in enumerate(causes) if not k or _is_rival(causes[0], cause)]
+    return [_narrowed(problem, cause, before) for cause in likeliest[: 1 + _MAX_NUM_RIVALS]]
 
 
 def _varied(tests: Sequence[Test]) -> list[Test]:
@@ -153,14 +153,15 @@ def _settled_test(problem: Linearized, hypothesis: Hypothesis) -> tuple[Test, fl
     return replace(test, hypothesis=original, sizes=sizes), factorized.deviance(test)
 
 
-def _narrowed(problem: Linearized, test: Test, wide: float) -> Test:
+def _narrowed(problem: Linearized, cause: Cause, before: float) -> Cause:
     """The one of fewer numbers that does as well, if there is one."""
-    if not test.hypothesis.narrower:
-        return test
-    tried = [_settled_test(problem, h) for h in test.hypothesis.narrower]
+    if cause.test is None or not cause.test.hypothesis.narrower:
+        return cause
+    tried = [_settled_test(problem, h) for h in cause.test.hypothesis.narrower]
     best, deviance = min(tried, key=lambda each: each[1])
-    num = len(problem.residual_m)
-    return best if deviance + _penalty(best, num) < wide + _penalty(test, num) else test
+    test = replace(best, threshold=cause.test.threshold)
+    narrow = _cause(test, before - deviance, _penalty(best, len(problem.residual_m)))
+    return narrow if narrow.score > cause.score else cause
 
 
 def _cause(test: Test, gain: float, penalty: float) -> Cause:
@@ -176,8 +177,9 @@ def _alternatives(problem: Linearized, before: float) -> Iterator[Cause]:
     if not tried:
         return
     refits = Refits(on_map, problem.scatter_m)
+    as_given, _ = refits.of(Correction())
     fits = sorted(((*refits.of(each.correction), each) for each in tried), key=lambda fit: fit[0])
-    for _, refitted, each in fits[:_NUM_TRIED]:
+    for _, refitted, each in [fit for fit in fits if fit[0] < as_given][:_NUM_TRIED]:
         moved = _settled(at_state(problem, refitted))
         gain = before - Factorization(_learnt(moved, [])).deviance()
         penalty = 2 * float(np.log(len(tried)))
