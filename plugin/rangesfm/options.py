@@ -259,6 +259,9 @@ class MapperOptions(Options):
     else neighbours in time."""
     pairs: Annotated[Path | None, Told(role="file")] = None
     """Text file with the names of two photos a line, a tab between them: these pairs are matched, and no others."""
+    database_path: Annotated[Path | None, Told(metavar="DB", role="file")] = None
+    """Database of COLMAP's or hloc's, which is copied: its features, matches and (where [camera] says neither model nor
+    params) cameras are used, and only what it lacks is computed; photos that it does not know are left out."""
     features: dict[str, Any] = Field(default_factory=dict)
     """Passed through to pycolmap's FeatureExtractionOptions."""
     pairing: dict[str, Any] = Field(default_factory=dict)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,11 @@ class Photos:
     names: tuple[str, ...]
     sizes: tuple[tuple[int, int], ...]
     left_out: dict[str, str]
+
+    def of(self, names: Collection[str]) -> Photos:
+        """Some of them."""
+        kept = [(name, size) for name, size in zip(self.names, self.sizes, strict=True) if name in names]
+        return replace(self, names=tuple(name for name, _ in kept), sizes=tuple(size for _, size in kept))
 
     def contents(self, known: Mapping[str, Any]) -> dict[str, tuple[list[int], str]]:
         """State and SHA-256 of each file, by name in the order given: what tells these photos from others.
