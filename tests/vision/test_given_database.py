@@ -80,7 +80,7 @@ def test_of_hloc_without_descriptors_and_two_view_geometries_the_matches_are_ver
     assert reconstructed(room, given, listener).num_registered == len(room.names)
     with pycolmap.Database.open(given) as database:
         database.clear_matches()
-    with pytest.raises(InputError, match="given.db: has neither matches nor a descriptor of photo000.png"):
+    with pytest.raises(InputError, match=r"given.db: has neither matches nor a descriptor of photo000.png"):
         reconstructed(room, given, listener)
 
 
@@ -102,12 +102,12 @@ def test_one_that_is_none_or_of_other_photos_is_refused(room: Room, given: Path,
         camera = database.read_camera(1)
         camera.width = 300
         database.update_camera(camera)
-    with pytest.raises(InputError, match="photo000.png is of 300 x 192 pixels there, expected 256 x 192 as its file"):
+    with pytest.raises(InputError, match=r"photo000.png is of 300 x 192 pixels there, expected 256 x 192 as its file"):
         reconstructed(room, given, listener)
     with pycolmap.Database.open(given) as database:
         database.clear_keypoints()
     with pytest.raises(InputError, match=r"given.db: has features of 0 of 6 photos, expected at least 2"):
         reconstructed(room, given, listener)
     given.write_text("no database")
-    with pytest.raises(InputError, match="given.db: is no database of COLMAP's"):
+    with pytest.raises(InputError, match=r"given.db: is no database of COLMAP's"):
         reconstructed(room, given, listener)

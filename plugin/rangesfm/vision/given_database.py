@@ -53,10 +53,10 @@ class GivenDatabase:
         places = tuple(ids.index(id_) for id_ in of_photo)
         for name, size, place in zip(self.photos.names, self.photos.sizes, places, strict=True):
             if (found := (cameras[place].width, cameras[place].height)) != size:
-                message = (
-                    f"{name} is of {found[0]} x {found[1]} pixels there, expected {size[0]} x {size[1]} as its file"
+                raise InputError(
+                    f"{name} is of {found[0]} x {found[1]} pixels there, expected {size[0]} x {size[1]} as its file",
+                    self.source,
                 )
-                raise InputError(message, self.source)
         return PhotoCameras(cameras, places)
 
     def copy_to(self, path: Path) -> None:
