@@ -28,17 +28,24 @@ def feature_options(mapper: MapperOptions) -> pycolmap.FeatureExtractionOptions:
 
 
 def extract_features(
-    database_path: Path, photos: Photos, options: pycolmap.FeatureExtractionOptions, progress: Progress
+    database_path: Path,
+    photos: Photos,
+    options: pycolmap.FeatureExtractionOptions,
+    progress: Progress,
+    mask_path: Path | None = None,
 ) -> None:
-    """Find features in the photos of the database that have none yet.
+    """Find features in the photos of the database that have none yet, where their masks are not black.
 
     Raises:
         ReconstructionError: hardly any photo has features.
     """
+    reader = pycolmap.ImageReaderOptions()
+    if mask_path is not None:
+        reader.mask_path = mask_path
     with pycolmap.Database.open(database_path) as database:
         missing = [name for id_, name in enumerate(photos.names, 1) if not database.exists_keypoints(id_)]
         run_in_background(
-            lambda token: _call_colmap(database_path, photos.folder, missing, options, token),
+            lambda token: _call_colmap(database_path, photos.folder, missing, reader, options, token),
             progress,
             lambda: num_photos_with_features(database),
             len(photos.names),
@@ -62,6 +69,7 @@ def _call_colmap(
     database_path: Path,
     folder: Path,
     names: Sequence[str],
+    reader: pycolmap.ImageReaderOptions,
     options: pycolmap.FeatureExtractionOptions,
     token: pycolmap.CancellationToken,
 ) -> None:
@@ -73,6 +81,7 @@ def _call_colmap(
             database_path,
             folder,
             image_names=names[start : start + num_at_a_time],
+            reader_options=reader,
             extraction_options=options,
             cancellation_token=token,
         )

@@ -18,6 +18,7 @@ from rangesfm.vision.camera import PhotoCameras, cameras_of_photos, check_camera
 from rangesfm.vision.features import extract_features, feature_options
 from rangesfm.vision.given_database import GivenDatabase, opened
 from rangesfm.vision.mapping import remove_models
+from rangesfm.vision.masks import contents_of_masks
 from rangesfm.vision.matching import MatchingOptions, match_features, matching_options, verify_matches
 from rangesfm.vision.photos import Photos, usable_photos
 from rangesfm.vision.renewed_database import RenewedDatabase, forget_database
@@ -96,6 +97,7 @@ def match_photos(
     for_matching = matching_options(mapper, len(image_names), seed)
     photos = usable_photos(image_path, image_names)
     cameras = cameras_of_photos(camera, photos)
+    masks = contents_of_masks(mapper.mask_path, photos)
     space.begin(restart=restart)
     _say_left_out(photos, space.progress)
     with opened(mapper.database_path, photos, space.output) as given:
@@ -104,13 +106,14 @@ def match_photos(
             photos = given.photos
             cameras = given.cameras() if camera.model is None else cameras_of_photos(camera, photos)
         _say_guessed(cameras, space.progress)
-        return _match(photos, cameras, given, mapper, for_features, for_matching, space)
+        return _match(photos, cameras, given, masks, mapper, for_features, for_matching, space)
 
 
 def _match(
     photos: Photos,
     cameras: PhotoCameras,
     given: GivenDatabase | None,
+    masks: dict[str, str],
     mapper: MapperOptions,
     for_features: pycolmap.FeatureExtractionOptions,
     for_matching: MatchingOptions,
@@ -137,7 +140,8 @@ def _match(
     with space.logged():
         steps.note("photos", photos.contents(steps.notes.get("photos", {})))
         contents = {name: sha256 for name, (_, sha256) in steps.notes["photos"].items()}
-        of_features = fingerprint(pycolmap.__version__, mapper.features if given is None else given.inputs)
+        sources = [mapper.features, *([masks] if masks else [])] if given is None else given.inputs
+        of_features = fingerprint(pycolmap.__version__, *sources)
         how = [] if has_matches else [for_matching.pairing_inputs, mapper.matcher, for_matching.seed]
         of_matches = fingerprint(of_features, cameras.inputs, *how)
         renewed = RenewedDatabase(
@@ -149,7 +153,7 @@ def _match(
             inputs,
             database,
             prepare_features,
-            lambda: extract_features(database, photos, for_features, progress),
+            lambda: extract_features(database, photos, for_features, progress, mapper.mask_path),
         )
         inputs = fingerprint(inputs, of_matches)
         steps.run("matching", inputs, database, prepare_matching, match)

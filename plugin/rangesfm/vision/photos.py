@@ -61,7 +61,7 @@ def usable_photos(folder: Path, names: Sequence[str]) -> Photos:
     Raises:
         ReconstructionError: fewer than two of them.
     """
-    sizes = {name: _size(folder / name) for name in names}
+    sizes = {name: image_size(folder / name) for name in names}
     usable = {name: size for name, size in sizes.items() if size is not None}
     left_out = {name: "cannot be read as an image" for name in names if name not in usable}
     if len(usable) < MIN_NUM_PHOTOS:
@@ -73,7 +73,8 @@ def usable_photos(folder: Path, names: Sequence[str]) -> Photos:
     return Photos(folder, tuple(usable), tuple(usable.values()), left_out)
 
 
-def _size(path: Path) -> tuple[int, int] | None:
+def image_size(path: Path) -> tuple[int, int] | None:
+    """Width and height, pixels; None of what is no image."""
     try:
         with Image.open(path) as image:
             return int(image.width), int(image.height)
