@@ -73,7 +73,8 @@ class ImageOptions(KeyframeOptions):
     """The photos."""
 
     path: Annotated[Path | None, Told(flag="images", metavar="PATH", role="photos")] = None
-    """Folder of the photos; as a flag also the CSV of their times."""
+    """Folder of the photos and of folders of them, a video, or a ROS bag with images; as a flag also the CSV of the
+    photos' times."""
     times: Annotated[Path | None, Told(flag="image_times", role="file")] = None
     """CSV image_name,timestamp_s (default: EXIF, else file names)."""
     rig_config: Annotated[Path | None, Told(flag="rig_config_path", metavar="JSON", role="file")] = None
@@ -83,6 +84,10 @@ class ImageOptions(KeyframeOptions):
     by a model made without the rig first."""
     baseline_stddev_m: _Positive = 0.001
     """Of each known distance of a rig's camera from its reference camera."""
+    rate_hz: Annotated[float, Field(ge=1e-3, le=1e3), Told(flag="image_rate_hz")] = 2.0
+    """Photos a second of a video or a bag: of each such interval the sharpest one."""
+    topic: Annotated[str | None, Told(flag="image_topic")] = None
+    """Of the images, for a bag with several such topics."""
 
 
 class CameraOptions(Options):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pycolmap
 
-from rangesfm.errors import ReconstructionError
+from rangesfm.errors import InputError, ReconstructionError
 from rangesfm.files.atomic import scratch_folder
 from rangesfm.vision.mapping import map_photos, read_models
 from rangesfm.vision.matched_photos import Workspace
@@ -36,7 +36,7 @@ def place_cameras(photos: Photos, rigs: Rigs, options: PipelineOptions, space: W
     rigs.rescale(model)
     try:
         rigs.apply(space.database, model)
-    except ValueError as error:  # there are frames of which it has no other camera's photo
+    except InputError as error:  # there are frames of which it has no other camera's photo
         raise ReconstructionError(_why_not(rigs)) from error
     with pycolmap.Database.open(space.database) as database:
         if any(pose is None for rig in database.read_all_rigs() for pose in rig.non_ref_sensors.values()):

@@ -84,11 +84,18 @@ class Rigs:
 
         Args:
             model: of the photos without rigs, by which cameras are placed of which the configuration says nothing.
+
+        Raises:
+            InputError: COLMAP cannot make rigs of these photos, for want of some or of others in the model.
         """
         if not self.configs:
             return
         with pycolmap.Database.open(database_path) as database, pycolmap.DatabaseTransaction(database):
-            pycolmap.apply_rig_config(list(self.configs), database, model)
+            try:
+                pycolmap.apply_rig_config(list(self.configs), database, model)
+            except ValueError as error:
+                reason = " ".join(str(error).partition("Check failed: ")[2].split())
+                raise InputError(f"does not go with the photos ({reason})", self.path) from None
 
     def ids_of_known(self, database_path: Path) -> set[int]:
         """Ids in a database of the rigs whose cameras' places are all known: COLMAP enters rigs by their order."""
