@@ -123,7 +123,7 @@ def ranges_on_map(
 
 def _velocities(path: Trajectory, keyframe: Indices) -> Array | None:
     times = path.timestamps_s
-    if times is None or len(times) < 2:
+    if times is None or len(times) < 2 or (np.diff(times) <= 0).any():  # two cameras at once have no one way
         return None
     return np.asarray(np.gradient(path.centers, times, axis=0)[keyframe])
 
