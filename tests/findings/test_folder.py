@@ -68,7 +68,7 @@ def test_results_of_runs_hidden_files_single_pictures_and_prose_are_no_inputs(tm
 
 
 def test_what_cannot_be_used_is_said(tmp_path: Path) -> None:
-    for name in ("walk.MP4", "walk2.mp4", "IMG_1.HEIC"):
+    for name in ("walk.INSV", "walk2.insv", "IMG_1.HEIC"):
         (tmp_path / name).touch()
     (tmp_path / "sparse").mkdir()
     for name in ("cameras.txt", "images.txt", "points3D.txt"):
@@ -78,7 +78,7 @@ def test_what_cannot_be_used_is_said(tmp_path: Path) -> None:
     model, photos, videos = found.notes
     assert model == f"sparse is a COLMAP model: rangesfm refine --input_path {tmp_path / 'sparse'} begins with it"
     assert photos == "1 of .heic, as IMG_1.HEIC: these are not read: convert them to JPEG"
-    assert videos.startswith("2 of .mp4, as walk.MP4: videos are not read yet")
+    assert videos.startswith("2 of .insv, as walk.INSV: videos of 360 degrees are not read")
 
 
 def test_a_bag_is_a_log_if_it_has_ranges(tmp_path: Path) -> None:

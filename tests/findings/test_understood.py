@@ -75,7 +75,7 @@ def test_files_of_one_anchor_each_are_one_log(tmp_path: Path) -> None:
 
 
 def test_a_folder_of_nothing_is_refused_with_what_is_there(tmp_path: Path) -> None:
-    (tmp_path / "walk.mp4").touch()
+    (tmp_path / "walk.insv").touch()
     with pytest.raises(InputError, match="neither photos nor a radio's log") as caught:
         understand([tmp_path], {})
     assert "videos are not read yet" in caught.value.advice[0]

@@ -177,8 +177,10 @@ def _join(args: argparse.Namespace, progress: Progress) -> Outcome:
 def _require_images(survey: Survey) -> None:
     if survey.images.path is None:
         raise InputError("no photos: give [images] path in a survey file, or --images FOLDER")
-    if not os.path.isdir(survey.images.path):
-        raise InputError("no such folder of photos", survey.images.path)
+    from rangesfm.sources.source import is_source
+
+    if not (os.path.isdir(survey.images.path) or (is_source(survey.images.path) and survey.images.path.is_file())):
+        raise InputError("no such folder of photos, video or bag", survey.images.path)
 
 
 def _require_model_and_ranges(survey: Survey) -> None:

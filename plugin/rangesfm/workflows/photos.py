@@ -20,6 +20,8 @@ from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.clock.estimate import estimate_time_offset
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.result.folder import forget_result, refuse_to_overwrite
+from rangesfm.sources.extract import TIMES_NAME, take_photos
+from rangesfm.sources.source import is_source
 from rangesfm.survey.inputs import RangingInputs, read_ranging_inputs
 from rangesfm.survey.settings import Survey
 from rangesfm.trust.before import notes_before_work, notes_on_model, notes_on_times
@@ -46,12 +48,6 @@ def read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
     for note in (*inputs.notes, *notes_before_work(survey, inputs)):
         journal.warn(note)
     return inputs
-
-
-def checked_inputs(survey: Survey, journal: Journal) -> tuple[RangingInputs, tuple[str, ...], ImageTimes | None]:
-    """Ranges and photos that have to do with each other; the photos' times, where any are needed."""
-    inputs = read_inputs(survey, journal)
-    return inputs, *checked_keyframes(survey, inputs, journal)
 
 
 def checked_keyframes(
@@ -94,6 +90,34 @@ def read_registered(path: Path, journal: Journal) -> pycolmap.Reconstruction:
     for note in notes_on_model(model):
         journal.warn(note)
     return model
+
+
+def with_photos_in_folder(survey: Survey, journal: Journal, *, restart: bool = False) -> Survey:
+    """The survey, with the photos of a video or a bag taken out into the output folder, and with the camera it tells.
+
+    Photos that an earlier run took are used again, unless it is to ``restart``.
+    """
+    path = survey.images.path
+    if path is None or not is_source(path):
+        return survey
+    if survey.images.times is not None:
+        raise InputError("its images have their times: expected no other ones ([images] times)", path)
+    folder = survey.output.path / "photos"
+    with journal.timed("photos"):
+        taken = take_photos(
+            path,
+            folder,
+            rate_hz=survey.images.rate_hz,
+            topic=survey.images.topic,
+            progress=journal.progress,
+            restart=restart,
+        )
+    for note in taken.notes:
+        journal.warn(note)
+    values: dict[str, Any] = {"images.path": folder, "images.times": folder / TIMES_NAME}
+    if taken.camera is not None and survey.camera.model is None and survey.camera.params is None:
+        values["camera.model"], values["camera.params"] = taken.camera
+    return survey.changed(values)
 
 
 def find_keyframes(
