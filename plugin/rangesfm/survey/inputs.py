@@ -308,7 +308,7 @@ def input_hashes(survey: Survey) -> list[dict[str, Any]]:
         if item.role == "photos":
             entries += [_folder(item.path)] if item.path.is_dir() else []
         else:
-            files = sorted(item.path.glob("*.bin")) if item.role == "model" else [item.path]
+            files = sorted(item.path.glob("*.bin" if item.role == "model" else "*")) or [item.path]
             entries += [_file(path) for path in files if path.is_file()]
     return entries
 
