@@ -264,6 +264,11 @@ class MapperOptions(Options):
     else neighbours in time."""
     pairs: Annotated[Path | None, Told(role="file")] = None
     """Text file with the names of two photos a line, a tab between them: these pairs are matched, and no others."""
+    mask_path: Annotated[Path | None, Told(role="photos")] = None
+    """Folder of masks: for photo a/b.jpg the image a/b.jpg.png of the same size, black where no features are wanted."""
+    database_path: Annotated[Path | None, Told(metavar="DB", role="file")] = None
+    """Database of COLMAP's or hloc's, which is copied: its features, matches and (where [camera] says neither model nor
+    params) cameras are used, and only what it lacks is computed; photos that it does not know are left out."""
     features: dict[str, Any] = Field(default_factory=dict)
     """Passed through to pycolmap's FeatureExtractionOptions."""
     pairing: dict[str, Any] = Field(default_factory=dict)
@@ -286,6 +291,15 @@ class MapperOptions(Options):
     def num_cores(self) -> int:
         """What ``num_threads`` comes to here."""
         return self.num_threads if self.num_threads > 0 else os.cpu_count() or 1
+
+    @model_validator(mode="after")
+    def _features_are_from_photos(self) -> MapperOptions:
+        if self.mask_path is not None and self.database_path is not None:
+            message = (
+                "[mapper] mask_path is given beside database_path, expected one of them: there are features already"
+            )
+            raise OptionError(message, "mapper", "mask_path")
+        return self
 
     @model_validator(mode="before")
     @classmethod

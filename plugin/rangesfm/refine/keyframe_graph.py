@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.ceres.factored import Factored, SingularError, factor
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import rounding_of
@@ -112,7 +112,11 @@ def solve_graph(graph: KeyframeGraph, start: GraphState, *, tolerance_m: float) 
     step_count = 0
     while step_count < _MAX_NUM_STEPS and damping < _MAX_DAMPING:
         step_count += 1
-        step = _factor(terms.hessian, layout, damping).solve(-terms.gradient[layout.free])
+        try:
+            step = _factor(terms.hessian, layout, damping).solve(-terms.gradient[layout.free])
+        except SingularError:  # by rounding
+            damping *= 10
+            continue
         trial = _moved(state, layout, step)
         trial_terms = _Terms.at(graph, layout, trial)
         if not trial_terms.cost < terms.cost:
@@ -297,12 +301,12 @@ def _prior_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tup
     return np.array(residuals), sparse.coo_array((values, (rows, columns)), shape=shape).tocsr()
 
 
-def _factor(hessian: sparse.csc_array, layout: _Layout, damping: float) -> SuperLU:
+def _factor(hessian: sparse.csc_array, layout: _Layout, damping: float) -> Factored:
     part = hessian[layout.free][:, layout.free]
     diagonal = part.diagonal()
     # The floor keeps a pose that nothing holds in place.
     damped = part + sparse.diags_array(damping * diagonal + 1e-12 * diagonal.max())
-    return splu(damped.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return factor(damped.tocsc())
 
 
 def _moved(state: GraphState, layout: _Layout, free_step: Array) -> GraphState:
@@ -321,7 +325,7 @@ def _num_absorbed(terms: _Terms, layout: _Layout) -> float:
     whitened = terms.whitened[:, layout.free]
     probes = rng.choice([-1.0, 1.0], (whitened.shape[0], _NUM_PROBES))
     back = whitened.T @ probes
-    solved = _factor(terms.hessian, layout, 0.0).solve(np.ascontiguousarray(back))
+    solved = _factor(terms.hessian, layout, _INITIAL_DAMPING).solve(np.ascontiguousarray(back))
     return float(np.sum(back * solved) / _NUM_PROBES)
 
 

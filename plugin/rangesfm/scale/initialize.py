@@ -93,6 +93,8 @@ def initialize_scale(
         observations=replace(observations, status=status),
         errors=replace(solution.errors, learned=learned).spread(problem.rows, len(observations.log)),
         noise_stddev_m=solution.noise_stddev_m,
+        problem=problem,
+        solution=solution,
         placement=placement_covariance(solution, covariance),
     )
 

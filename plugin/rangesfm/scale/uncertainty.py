@@ -17,7 +17,6 @@ from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import (
     RangeFit,
     RangeProblem,
-    RangeState,
     columns_of,
     invert_information,
     predicted_ranges,
@@ -53,7 +52,7 @@ def learned_errors(
         prior_design=prior_jacobian(only_map, columns, state, state),
         noise_m=solution.noise_stddev_m,
         curve_stddev_m=None if taken_off is None else taken_off[posed.rows],
-        ruled_out=_ruled_out(problem),
+        ruled_out=ruled_out(problem),
     )
 
 
@@ -75,13 +74,13 @@ def errors_to_expect(
     return usual_errors(
         _cells(posed, solution, observations, model_from_cam, max_num_cells),
         curve_stddev_m=None if taken_off is None else taken_off[posed.rows],
-        ruled_out=_ruled_out(solution.problem),
+        ruled_out=ruled_out(solution.problem),
         stddevs=stddevs,
     )
 
 
-def _ruled_out(problem: RangeProblem) -> list[str]:
-    """Biases of a stddev of 0 are none."""
+def ruled_out(problem: RangeProblem) -> list[str]:
+    """Components that are not there: biases of a stddev of 0."""
     stddevs = {"bias": float(problem.bias_stddev_m.max()), "common_bias": problem.common_bias_stddev_m}
     return [name for name, stddev in stddevs.items() if stddev == 0]
 
@@ -99,7 +98,7 @@ def _cells(
     return cells(
         problem.anchor_index,
         log.tag_index[posed.rows],
-        _times(posed, problem, state, observations),
+        times_of_ranges(posed, solution, observations),
         by.by_tag * by.distance_m[:, None],
         np.swapaxes(world_from_cam, 1, 2),
         solution.fit.weights,
@@ -108,12 +107,13 @@ def _cells(
     )
 
 
-def _times(posed: ScaleProblem, problem: RangeProblem, state: RangeState, observations: RangeObservations) -> Array:
+def times_of_ranges(posed: ScaleProblem, solution: Solution, observations: RangeObservations) -> Array:
     """(n,) seconds; where the log names photos, by the way from photo to photo."""
     if observations.log.timestamp_s is not None:
         return observations.log.timestamp_s[posed.rows]
     _, first, of_range = np.unique(observations.before[posed.rows], return_index=True, return_inverse=True)
-    steps_m = np.linalg.norm(np.diff(state.metric_from_model.scale * problem.centers[first], axis=0), axis=1)
+    scale = solution.fit.state.metric_from_model.scale
+    steps_m = scale * np.linalg.norm(np.diff(posed.ranges.centers[first], axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps_m)])[of_range] / _WALKING_M_PER_S
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,11 @@ class Photos:
     sizes: tuple[tuple[int, int], ...]
     left_out: dict[str, str]
 
+    def of(self, names: Collection[str]) -> Photos:
+        """Some of them."""
+        kept = [(name, size) for name, size in zip(self.names, self.sizes, strict=True) if name in names]
+        return replace(self, names=tuple(name for name, _ in kept), sizes=tuple(size for _, size in kept))
+
     def contents(self, known: Mapping[str, Any]) -> dict[str, tuple[tuple[int, int, int], str]]:
         """State and SHA-256 of each file, by name in the order given: what tells these photos from others.
 
@@ -47,7 +52,7 @@ def usable_photos(folder: Path, names: Sequence[str]) -> Photos:
     Raises:
         ReconstructionError: fewer than two of them.
     """
-    sizes = {name: _size(folder / name) for name in names}
+    sizes = {name: image_size(folder / name) for name in names}
     usable = {name: size for name, size in sizes.items() if size is not None}
     left_out = {name: "cannot be read as an image" for name in names if name not in usable}
     if len(usable) < MIN_NUM_PHOTOS:
@@ -59,7 +64,8 @@ def usable_photos(folder: Path, names: Sequence[str]) -> Photos:
     return Photos(folder, tuple(usable), tuple(usable.values()), left_out)
 
 
-def _size(path: Path) -> tuple[int, int] | None:
+def image_size(path: Path) -> tuple[int, int] | None:
+    """Width and height, pixels; None of what is no image."""
     try:
         with Image.open(path) as image:
             return int(image.width), int(image.height)

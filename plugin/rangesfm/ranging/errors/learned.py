@@ -48,6 +48,18 @@ class LearnedErrors:
         together: Array = self.covariances_m2.sum(axis=0)
         return together
 
+    @property
+    def unlikeliness(self) -> float:
+        """What radios let expect has against these stddevs, as -2 times a logarithm."""
+        known = {component.name: component for component in COMPONENTS}
+        is_calibrated = LEARNT_CURVE in self.names
+        off = [
+            np.log(stddev / _median(known[name], is_calibrated)) / known[name].spread
+            for name, stddev in zip(self.names, self.stddevs, strict=True)
+            if name in known
+        ]
+        return float(np.sum(np.square(off)))
+
     def subset(self, rows: Indices) -> LearnedErrors:
         """Of some of the ranges."""
         return replace(self, of_range=self.of_range[rows])
