@@ -114,4 +114,5 @@ def test_a_folder_with_one_bag_of_camera_and_radio_is_a_whole_survey(
     assert (bag.name, photos.name) == ("refined", "refined")
     noise_percent = 100 * of_photos.scale.relative_stddev.formal
     assert bag.scale_error_percent == pytest.approx(photos.scale_error_percent, abs=noise_percent)
+    assert of_photos.place is not None
     assert bag.rmse_m == pytest.approx(photos.rmse_m, abs=float(np.linalg.norm(of_photos.place.stddev_m)))

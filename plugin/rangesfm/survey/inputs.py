@@ -14,6 +14,7 @@ import numpy.typing as npt
 from rangesfm.distances.tape import Tape, read_tape
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import sha256_of
+from rangesfm.files.folders import walk
 from rangesfm.geometry.reference import Reference, read_reference
 from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
@@ -318,7 +319,8 @@ def _file(path: Path) -> dict[str, Any]:
 
 
 def _folder(path: Path) -> dict[str, Any]:
-    sizes = {file.relative_to(path).as_posix(): file.stat().st_size for file in path.rglob("*") if file.is_file()}
+    files = (parent / name for parent, _, names in walk(path) for name in names)
+    sizes = {file.relative_to(path).as_posix(): file.stat().st_size for file in files if file.is_file()}
     listing = "".join(f"{name}\t{size}\n" for name, size in sorted(sizes.items()))
     return {
         "path": str(path),
