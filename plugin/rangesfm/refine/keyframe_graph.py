@@ -112,11 +112,7 @@ def solve_graph(graph: KeyframeGraph, start: GraphState, *, tolerance_m: float) 
     step_count = 0
     while step_count < _MAX_NUM_STEPS and damping < _MAX_DAMPING:
         step_count += 1
-        try:
-            step = _factor(terms.hessian, layout, damping).solve(-terms.gradient[layout.free])
-        except SingularError:  # by rounding
-            damping *= 10
-            continue
+        step = _factor(terms.hessian, layout, damping).solve(-terms.gradient[layout.free])
         trial = _moved(state, layout, step)
         trial_terms = _Terms.at(graph, layout, trial)
         if not trial_terms.cost < terms.cost:
@@ -302,11 +298,17 @@ def _prior_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tup
 
 
 def _factor(hessian: sparse.csc_array, layout: _Layout, damping: float) -> Factored:
+    """With more damping where rounding makes it indefinite, as it does in a map without sense."""
     part = hessian[layout.free][:, layout.free]
     diagonal = part.diagonal()
     # The floor keeps a pose that nothing holds in place.
     damped = part + sparse.diags_array(damping * diagonal + 1e-12 * diagonal.max())
-    return factor(damped.tocsc())
+    try:
+        return factor(damped.tocsc())
+    except SingularError:
+        if damping > _MAX_DAMPING:  # then it is not of numbers
+            raise
+        return _factor(hessian, layout, max(10 * damping, _INITIAL_DAMPING))
 
 
 def _moved(state: GraphState, layout: _Layout, free_step: Array) -> GraphState:
@@ -325,7 +327,7 @@ def _num_absorbed(terms: _Terms, layout: _Layout) -> float:
     whitened = terms.whitened[:, layout.free]
     probes = rng.choice([-1.0, 1.0], (whitened.shape[0], _NUM_PROBES))
     back = whitened.T @ probes
-    solved = _factor(terms.hessian, layout, _INITIAL_DAMPING).solve(np.ascontiguousarray(back))
+    solved = _factor(terms.hessian, layout, 0.0).solve(np.ascontiguousarray(back))
     return float(np.sum(back * solved) / _NUM_PROBES)
 
 
