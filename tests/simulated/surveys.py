@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
-from tests.studies.scale_coverage import error_curve
 
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.geometry.similarity import Similarity
@@ -158,6 +157,14 @@ def _lobes(direction: Array, rng: np.random.Generator) -> Array:
     form = rng.standard_normal((3, 3))
     quadratic = np.einsum("ni,ij,nj->n", direction, form, direction) - np.trace(form) / 3
     return np.asarray(direction @ rng.standard_normal(3) / np.sqrt(2) + np.sqrt(3) / 2 * quadratic)
+
+
+def error_curve(distance: Array, rng: np.random.Generator) -> Array:
+    """A draw of a Gaussian process in the logarithm of distance, of stddev 1 and one e-fold's length."""
+    knots = np.linspace(np.log(0.3), np.log(30.0), 40)
+    covariance = np.exp(-0.5 * (knots[:, None] - knots) ** 2) + 1e-9 * np.eye(len(knots))
+    curve = np.linalg.cholesky(covariance) @ rng.standard_normal(len(knots))
+    return np.interp(np.log(distance), knots, curve)
 
 
 def _uneven(distance: Array, rng: np.random.Generator) -> Array:
