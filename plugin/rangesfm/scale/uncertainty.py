@@ -29,6 +29,8 @@ from rangesfm.scale.solution import Solution
 
 # Where ranges have no times: a path of so many metres is walked in a second.
 _WALKING_M_PER_S = 1.0
+# Of a normal variable's square, in variances.
+_MEDIAN_SQUARE = 0.455
 
 
 def learned_errors(
@@ -148,32 +150,39 @@ def scale_uncertainty(posed: ScaleProblem, solution: Solution, learned: LearnedE
     the errors are what they are taken for, and say how far off the scale is that was found: as far as theirs, give or
     take the stddev of theirs. Where that leaves more open than the errors' sum, it is no help.
     """
-    summed = expected_scale_uncertainty(solution, learned)
-    reweighted = replace(summed, components=_reweighted(_linear(posed, solution), learned))
+    summed, reweighted, change = _by_both_weights(posed, solution, learned)
+    reweighted.components[REWEIGHTING] = change
     return min(summed, reweighted, key=lambda each: each.empirical)
 
 
-def expected_scale_uncertainty(solution: Solution, learned: LearnedErrors) -> ScaleUncertainty:
-    """The same by the errors' sum alone, before anything is measured."""
-    components = learned.stddev_of(scale_influence(solution.fit, solution.problem))
-    if (given := _by_what_was_given(solution)[0, 0]) > 0:
-        components[GIVEN] = float(np.sqrt(given))
-    return ScaleUncertainty(formal=solution.fit.log_scale_stddev, components=components)
+def expected_scale_uncertainty(posed: ScaleProblem, solution: Solution, learned: LearnedErrors) -> ScaleUncertainty:
+    """The same before anything is measured: what half of the surveys will state at most."""
+    summed, reweighted, _ = _by_both_weights(posed, solution, learned)
+    # The best estimate and its distance from any other are independent.
+    variance = summed.empirical**2 - reweighted.empirical**2
+    reweighted.components[REWEIGHTING] = float(np.sqrt(_MEDIAN_SQUARE * max(variance, 0.0)))
+    return min(summed, reweighted, key=lambda each: each.empirical)
 
 
-def _reweighted(linear: _Linear, learned: LearnedErrors) -> dict[str, float]:
-    """By component, of the scale that the best weights find, and how far that is from the one at hand."""
+def _by_both_weights(
+    posed: ScaleProblem, solution: Solution, learned: LearnedErrors
+) -> tuple[ScaleUncertainty, ScaleUncertainty, float]:
+    """Of the scale at hand; of the scale that the best weights find; and how far they are apart."""
+    formal, linear = solution.fit.log_scale_stddev, _linear(posed, solution)
+    summed = learned.stddev_of(scale_influence(solution.fit, solution.problem))
+    if (given := float(_by_what_was_given(solution)[0, 0])) > 0:
+        summed[GIVEN] = float(np.sqrt(given))
     design, off_m = learned.cells.mean(linear.design), learned.cells.mean(linear.off_m)
     covariance = learned.covariance_m2
     covariance[np.diag_indices_from(covariance)] += ROUNDING * np.trace(covariance)
     whitened = np.linalg.solve(covariance, design)
     inverse = invert_information(design.T @ whitened + linear.prior_design.T @ linear.prior_design)
     of_cells, of_priors = whitened @ inverse[0], linear.prior_design @ inverse[0]
-    components = learned.stddev_of_cells(of_cells)
+    reweighted = learned.stddev_of_cells(of_cells)
     if (given := float(np.linalg.norm(of_priors))) > 0:
-        components[GIVEN] = given
-    components[REWEIGHTING] = abs(float(of_cells @ off_m + of_priors @ linear.prior_off))
-    return components
+        reweighted[GIVEN] = given
+    change = abs(float(of_cells @ off_m + of_priors @ linear.prior_off))
+    return ScaleUncertainty(formal, summed), ScaleUncertainty(formal, reweighted), change
 
 
 def _by_what_was_given(solution: Solution) -> Array:
