@@ -255,19 +255,20 @@ def refuse_ambiguity(solution: Solution, rivals: Sequence[RangeState], camera_si
             if min(ours, theirs) * extent < solution.noise_stddev_m:
                 raise GeometryError("the scale is not determined: a camera that stands still fits the ranges as well")
             if abs(np.log(ours / theirs)) <= _SAME_LOG_SCALE:
-                raise OpenPlaceError(_what_is_open(solution.problem), solution.fit.state)
+                raise _another_place(solution)
             raise GeometryError(
                 f"two scales fit the ranges equally well ({ours:.4g} and {theirs:.4g} m per unit): "
                 f"{'; '.join(WHY_SCALE_IS_OPEN[path_kind(problem.centers)])}"
             )
 
 
-def _what_is_open(problem: RangeProblem) -> str:
+def _another_place(solution: Solution) -> GeometryError:
     """Why two maps of the same scale fit in the site frame."""
-    stddevs = path_shape(problem.centers).stddevs
+    stddevs = path_shape(solution.problem.centers).stddevs
     if stddevs[1] < NEARLY_STRAIGHT * stddevs[0]:
-        return "the map fits the ranges turned about the path, which is nearly straight: walk a bend"
-    return (
+        return GeometryError("the map fits the ranges turned about the path, which is nearly straight: walk a bend")
+    return OpenPlaceError(
         "the map and its mirror image in the anchors' plane fit the ranges equally well, as the path is flat too: "
-        "add an anchor at another height, or say on which side of that plane the camera went (camera_side)"
+        "add an anchor at another height, or say on which side of that plane the camera went (camera_side)",
+        solution.fit.state,
     )
