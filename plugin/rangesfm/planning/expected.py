@@ -19,6 +19,7 @@ from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.anchor_plane import mirrored_map
 from rangesfm.scale.estimate import ScaleUncertainty
 from rangesfm.scale.initialize import model_from_cam, placement_covariance
+from rangesfm.scale.lengths import BENDING
 from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import RangeFit, fit_at, range_jacobian, tag_positions
 from rangesfm.scale.solution import Solution, refuse_ambiguity, weighted
@@ -118,7 +119,7 @@ def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expect
         errors = _as_seen(solution, learned, num_alike)
         solution = _weighed(posed, errors, fit_at(weighted(posed.ranges, errors), state, num_alike))
     covariance = parameter_covariance(solution.fit, solution.problem, learned) + _undetermined(solution.fit)
-    uncertainty = scale_uncertainty(solution, learned)
+    uncertainty = scale_uncertainty(solution, learned, BENDING)
     placement = placement_covariance(solution, covariance)
     return Expected(planned, observations, posed, solution, learned, uncertainty, covariance, placement)
 

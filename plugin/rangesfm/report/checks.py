@@ -88,13 +88,16 @@ def quality_checks(summary: ResultSummary) -> tuple[Check, ...]:
     of_clocks = "Standard deviation of the offset between the camera's and the radio's clock."
     of_points = "RMS distance of the map's points from where the photos show them."
     no_matter = _why_no_offset_matters(offset)
-    return (
-        Check("Scale uncertainty", of_scale, uncertainty, "%", 1.0, 5.0, 2),
+    of_ranges = (
         Check("Anchor agreement", of_anchors, _anchor_spread_percent(scale), "%", 2.0, 5.0, 2),
         Check("Check ranges", of_check_ranges, summary.check_ranges.rms_m, "m", 0.20, 0.40, 3),
         Check("Range residuals", "RMS of the ranges used.", ranges.rms_m, "m", 0.15, 0.30, 3),
         Check("Ranges used", of_share, share_used, "%", 70.0, 40.0, 1, larger_is_better=True),
         Check("Clock offset", of_clocks, offset.stddev_s, "s", 0.02, 0.10, 4, no_matter=no_matter),
+    )
+    return (
+        Check("Scale uncertainty", of_scale, uncertainty, "%", 1.0, 5.0, 2),
+        *(of_ranges if ranges.num else ()),
         Check("Reprojection", of_points, reprojection_px, "px", 1.0, 2.0, 2),
     )
 

@@ -41,14 +41,17 @@ def tiles(content: Content) -> list[tuple[str, str, str]]:
     def metres(key: str, within: str = "{}") -> str:
         return shown(key, fixed, 3, "m", within=within)
 
-    return [
-        *_place(summary.place),
-        ("Keyframes", count(None if path is None else len(path)), f"path of {fixed(length_m, 2, 'm')}"),
+    of_ranges = [
         ("Ranges used", shown("ranges.num_used", count), shown("ranges.num", count, within="of {} in the log")),
         ("Range RMS", metres("ranges.rms_m"), metres("ranges.median_abs_m", "median {}")),
         ("Check range RMS", metres("check_ranges.rms_m"), shown("check_ranges.num", count, within="{} held out")),
-        ("Reprojection RMS", shown("refine.reprojection_rms_px", fixed, 2, "px"), f"{count(num_points)} map points"),
         ("Clock offset", offset("time_offset.value_s", signed), offset("time_offset.stddev_s", fixed, "± {}")),
+    ]
+    return [
+        *_place(summary.place),
+        ("Keyframes", count(None if path is None else len(path)), f"path of {fixed(length_m, 2, 'm')}"),
+        *(of_ranges if summary.ranges.num else []),
+        ("Reprojection RMS", shown("refine.reprojection_rms_px", fixed, 2, "px"), f"{count(num_points)} map points"),
         ("Time taken", duration(_total_seconds(summary.seconds)), "all stages"),
     ]
 

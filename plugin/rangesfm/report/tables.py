@@ -195,7 +195,18 @@ def error_budget(content: Content) -> Table:
 
 def sensitivity(content: Content) -> Table:
     """By how much the scale would change."""
-    return Table("How the scale answers to what was assumed", [], _flat(content.summary.scale.to_json()["sensitivity"]))
+    rows = _flat(content.summary.scale.to_json()["sensitivity"]) if content.summary.ranges.num else []
+    return Table("How the scale answers to what was assumed", [], rows)
+
+
+def scale_by_kind(content: Content) -> Table:
+    """The scale by ranges alone and by measured lengths alone."""
+    columns = dict.fromkeys(("value", "stddev"), plain)
+    rows = [
+        [f"{kind} alone", *_cells(f"scale.by_kind.{kind}", entry, columns)]
+        for kind, entry in content.summary.scale.by_kind.items()
+    ]
+    return Table("The scale by what was measured", ["by", "metres per unit", "stddev"], rows, is_narrow=True)
 
 
 def versions(content: Content) -> Table:

@@ -74,7 +74,9 @@ class ScaleCandidates(TableFile):
     alpha1: Rounded
 
     @classmethod
-    def of(cls, found: MetricResult) -> ScaleCandidates:
+    def of(cls, found: MetricResult) -> ScaleCandidates | None:
+        if not len(found.observations.log):
+            return None
         rows, log = found.diagnostics.candidate_rows, found.observations.log
         times = np.full(len(rows), np.nan) if log.timestamp_s is None else log.timestamp_s[rows]
         ids = tuple(log.anchor_ids[k] for k in log.anchor_index[rows])
@@ -90,7 +92,9 @@ class ScaleConsensus(TableFile):
     num_agreeing: Annotated[Array, Column(".0f")]
 
     @classmethod
-    def of(cls, found: MetricResult) -> ScaleConsensus:
+    def of(cls, found: MetricResult) -> ScaleConsensus | None:
+        if not len(found.observations.log):
+            return None
         return cls(found.diagnostics.curve_scales, found.diagnostics.num_agreeing.astype(np.float64))
 
 

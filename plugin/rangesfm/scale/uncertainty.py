@@ -117,12 +117,29 @@ def _times(posed: ScaleProblem, problem: RangeProblem, state: RangeState, observ
     return np.concatenate([[0.0], np.cumsum(steps_m)])[of_range] / _WALKING_M_PER_S
 
 
-def scale_uncertainty(solution: Solution, learned: LearnedErrors) -> ScaleUncertainty:
-    """Relative stddevs of the scale."""
+def scale_uncertainty(
+    solution: Solution, learned: LearnedErrors, bending_of_lengths: float = 0.0
+) -> ScaleUncertainty:
+    """Relative stddevs of the scale.
+
+    Args:
+        bending_of_lengths: relative, of the scale by measured lengths.
+    """
     components = learned.stddev_of(scale_influence(solution.fit, solution.problem))
-    if (given := _by_what_was_given(solution)) > 0:
-        components[GIVEN] = given
+    given = np.hypot(_by_what_was_given(solution), _say_of_lengths(solution) * bending_of_lengths)
+    if given > 0:
+        components[GIVEN] = float(given)
     return ScaleUncertainty(formal=solution.fit.log_scale_stddev, components=components)
+
+
+def _say_of_lengths(solution: Solution) -> float:
+    """By how much the scale changes, relative to a change of all lengths between points."""
+    distances, fit = solution.problem.distances, solution.fit
+    if distances is None:
+        return 0.0
+    of_points = distances.subset(distances.is_between_points)
+    slopes = fit.state.metric_from_model.scale * of_points.model_length / of_points.stddev_m
+    return float(invert_information(fit.information)[0, 0] * (slopes @ slopes))
 
 
 def _by_what_was_given(solution: Solution) -> float:

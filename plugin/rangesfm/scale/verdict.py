@@ -13,6 +13,7 @@ from rangesfm.options import ScaleOptions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.scale.cutoff import scale_drift
 from rangesfm.scale.estimate import NORMAL_95, CutoffTest, ScaleUncertainty
+from rangesfm.scale.lengths import LengthScale
 from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import RangeFit
 from rangesfm.scale.solution import WHY_SCALE_IS_OPEN, Solution
@@ -87,6 +88,22 @@ def judge(
     if drift := _drift(cutoff_tests):
         is_out = abs(drift.scale / cutoff_tests[0].scale - 1) > half_width
         (doubts if is_out else remarks).append(_drift_in_words(drift, cutoff_tests[0]))
+    return _verdict(doubts, remarks, half_width, narrower, options)
+
+
+def judge_lengths(lengths: LengthScale, uncertainty: ScaleUncertainty, options: ScaleOptions) -> Verdict:
+    """The same where there is nothing but measured lengths."""
+    another = "measure another length, far from the first and in another direction"
+    doubts = []
+    if len(lengths.rows) == 1:
+        reason = "the scale hangs on one length that nothing checks: a mistake in it is one of the whole map"
+        doubts.append(_Doubt(reason, another))
+    return _verdict(doubts, [], uncertainty.half_width_95, "measure more lengths, and longer ones", options)
+
+
+def _verdict(
+    doubts: list[_Doubt], remarks: list[_Doubt], half_width: float, narrower: str, options: ScaleOptions
+) -> Verdict:
     if half_width > NORMAL_95 * options.max_relative_stddev:
         why = f"{doubts[0].reason}; " if doubts else ""
         raise GeometryError(

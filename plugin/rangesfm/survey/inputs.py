@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     import pycolmap
 
 
+NOTHING_MEASURED = "no ranges and no lengths: give a radio's log (--ranges LOG) or taped distances (--distances CSV)"
+
 # Beyond it a unit is wrong, or the file: no such radio reaches so far.
 _MAX_RANGE_M = 1e6
 # How far anchors are apart, as a share of the ranges to them (at most 1 where all is in metres), is above this in:
@@ -42,10 +44,10 @@ _COARSE_STEP_S = 0.1
 
 @dataclass(frozen=True)
 class RangingInputs:
-    """The radio's side of a survey.
+    """What is measured in metres: the radio's side of a survey, and lengths.
 
     Attributes:
-        log: ranges of the wanted tags to the wanted anchors, and those between two of a kind.
+        log: ranges of the wanted tags to the wanted anchors, and those between two of a kind; empty without a radio.
         tag_in_cam_m: (num_tags, 3) lever arms in the order of ``log.tag_ids``; NaN for a tag that ranges with
             tags only.
         anchors: every anchor of the log.
@@ -74,10 +76,13 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     """
     given = read_anchors(survey.anchors.path) if survey.anchors.path is not None else None
     tag_ids = [*survey.tag.lever_arms_m, *([] if survey.tag.tag_id is None else [survey.tag.tag_id])]
-    log = read_log(survey.ranges, [anchor.anchor_id for anchor in given or ()], tag_ids)
-    _check_lengths(log)
-    log = _of_wanted_anchors(_of_wanted_tag(log, survey.tag.tag_id), survey.anchors.use)
-    _check_camera_is_heard(log)
+    if survey.measures_lengths and survey.ranges.path is None:
+        log = RangeLog.from_arrays([], [], image_name=[])
+    else:
+        log = read_log(survey.ranges, [anchor.anchor_id for anchor in given or ()], tag_ids)
+        _check_lengths(log)
+        log = _of_wanted_anchors(_of_wanted_tag(log, survey.tag.tag_id), survey.anchors.use)
+        _check_camera_is_heard(log)
     tag_in_cam_m = _lever_arms_of_log(log, survey)
     anchors = _anchors_of_log(log) if given is None else given
     _check_anchors_known(log, anchors, survey)
@@ -123,7 +128,7 @@ def read_log(
 ) -> RangeLog:
     """The radio's log as a survey describes it, or other files than it names; see ``read_ranges``."""
     if options.path is None:
-        raise InputError("no ranges: give [ranges] path in a survey file, or --ranges LOG")
+        raise InputError(NOTHING_MEASURED)
     return read_ranges(
         files or options.path,
         format=options.format,

@@ -139,6 +139,11 @@ class Survey(BaseModel):
             tables[table] = tables.get(table, getattr(self, table)).changed(**{name: value})
         return self.model_copy(update=tables)
 
+    @property
+    def measures_lengths(self) -> bool:
+        """Whether there is something beside ranges that says how long a metre is."""
+        return self.scale.distances is not None
+
     def to_dict(self) -> dict[str, Any]:
         """Plain values, fit for JSON."""
         return self.model_dump(mode="json")

@@ -9,6 +9,7 @@ import numpy as np
 from rangesfm.geometry.gravity import gravity_of
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.survey.settings import Survey
+from rangesfm.trust.lengths import trust_in_lengths
 from rangesfm.trust.ranges_on_map import RangesOnMap, ranges_on_map
 from rangesfm.trust.verdict import trust_in
 from rangesfm.workflows.journal import Journal
@@ -19,11 +20,12 @@ def tested(survey: Survey, metric: MetricResult, journal: Journal) -> MetricResu
 
     The scaled map is looked at, refined or not: a refinement bends a map to ranges that are wrong.
     """
+    trust = trust_in_lengths(metric.estimate, metric.tape)
     try:
-        trust = trust_in(scaled_ranges(survey, metric), seed=survey.output.seed)
+        if len(metric.observations.log):
+            trust = trust_in(scaled_ranges(survey, metric), seed=survey.output.seed).with_more(trust)
     except np.linalg.LinAlgError as error:
         journal.warn(f"mistakes were not looked for, as the ranges determine too little: {error}")
-        return metric
     for reason in trust.reasons:
         journal.warn(reason)
     return replace(metric, trust=trust).doubted(trust.reasons)

@@ -163,4 +163,5 @@ def component_words(names: Iterable[str]) -> dict[str, str]:
     """What each component is, for people."""
     words = {component.name: component.words for component in COMPONENTS}
     words |= {LEARNT_CURVE: "the learnt error curve", GIVEN: "tapes, anchors' positions and what else was given"}
+    words |= {"tape": "how the lengths were measured", "marks": "where their ends are in the photos"}
     return {name: words[name] for name in names}
