@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _SCALE_KEYS = (
     *("images.path", "images.times", "ranges", "anchors", "tag", "mapper.num_threads", "scale"),
-    *("export", "report", "output"),
+    *("markers", "export", "report", "output"),
 )
 _DEMO_FOLDER = "rangesfm_demo"
 _NUM_PHOTOS = range(10, 41)  # fewer do not make a map, more are not in the package
@@ -73,7 +73,7 @@ def _run(args: argparse.Namespace, progress: Progress) -> Outcome:
             progress.message(fact)
     if survey.model_path is None:
         _require_images(survey)
-        _require_metres(survey)
+        survey.require_metres()
     else:
         _require_model_and_metres(survey)
     if not args.live:
@@ -186,11 +186,4 @@ def _require_model_and_metres(survey: Survey) -> None:
         raise InputError("no model: give --input_path MODEL, the folder of a COLMAP model such as sparse/0")
     if not os.path.isdir(survey.model_path):
         raise InputError("no such folder of a COLMAP model", survey.model_path)
-    _require_metres(survey)
-
-
-def _require_metres(survey: Survey) -> None:
-    from rangesfm.survey.inputs import NOTHING_MEASURED
-
-    if survey.ranges.path is None and not survey.measures_lengths:
-        raise InputError(NOTHING_MEASURED)
+    survey.require_metres()

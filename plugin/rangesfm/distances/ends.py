@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pycolmap
 
 from rangesfm.arrays import Array
-from rangesfm.distances.tape import CONTROL, FOUND_STDDEV_PX, Marker, Tape, TapedDistance
+from rangesfm.distances.tape import CONTROL, Marker, Tape, TapedDistance
 from rangesfm.errors import InputError
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.noise import shared_stddev
@@ -117,7 +117,8 @@ def locate_distances(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Seq
         start, end = taped.ends
         if start in points and end in points:
             ends[row] = points[start], points[end]
-            of_ends = [_mark_covariance(tape.markers[n], points[n], images) for n in taped.ends if n in markers]
+            marked = [((tape.markers or {})[name], points[name]) for name in taped.ends if name in markers]
+            of_ends = [_mark_covariance(marker, point, images) for marker, point in marked]
             along = (ends[row, 1] - ends[row, 0]) / max(float(np.linalg.norm(ends[row, 1] - ends[row, 0])), 1e-12)
             mark_stddev[row] = np.sqrt(sum(along @ covariance @ along for covariance in of_ends))
         elif start in anchor_ids and end in anchor_ids:
@@ -211,18 +212,18 @@ def _mark_covariance(marker: Marker, point: Array, images: dict[str, pycolmap.Im
     information = np.zeros((3, 3))
     for view in (images[name] for name in marker.image_names if name in images):
         step = 1e-4 * float(np.linalg.norm(point - view.projection_center()))
-        moved = [(view.project_point(point + by), view.project_point(point - by)) for by in step * np.eye(3)]
-        if all(at is not None for pair in moved for at in pair):
-            slopes = np.array([(np.ravel(plus) - np.ravel(minus)) / (2 * step) for plus, minus in moved])
+        moved = [view.project_point(point + by) for by in step * np.vstack([np.eye(3), -np.eye(3)])]
+        if all(at is not None for at in moved):
+            plus, minus = np.array(moved, dtype=np.float64).reshape(2, 3, 2)
+            slopes = (plus - minus) / (2 * step)
             information += slopes @ slopes.T / marker.stddev_px**2
     return np.asarray(np.linalg.pinv(information, hermitian=True))
 
 
 def locatable(tape: Tape, model: pycolmap.Reconstruction) -> Tape:
     """Without the tags of which a corner has no place in the model; what somebody marked is his to correct."""
-    found = {name: marker for name, marker in (tape.markers or {}).items() if marker.stddev_px == FOUND_STDDEV_PX}
     images, lost = images_by_name(model), set[str]()
-    for name, marker in found.items():
+    for name, marker in tape.found_markers.items():
         try:
             _triangulate(name, marker, images, tape)
         except InputError:

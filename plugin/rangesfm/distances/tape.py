@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -88,6 +88,15 @@ class Tape:
         """The distances that are to be kept to."""
         return replace(self, distances=tuple(taped for taped in self.distances if taped.kind == CONTROL))
 
+    @property
+    def found_markers(self) -> dict[str, Marker]:
+        """Those that nobody marked by hand."""
+        of_all = (self.markers or {}).items()
+        return {name: marker for name, marker in of_all if marker.stddev_px == FOUND_STDDEV_PX}
+
+    def with_tags(self, markers: Mapping[str, Marker], sides: tuple[TapedDistance, ...]) -> Tape:
+        """With what was found in photos as well; names that somebody gave to marks of his own stay his."""
+        return replace(self, distances=self.distances + sides, markers={**markers, **(self.markers or {})})
 
     def without(self, rows: Collection[int]) -> Tape:
         """With some of the distances, by their numbers, as left out."""
@@ -199,8 +208,7 @@ def disagreements(rows: Iterable[DistanceRow], relative_scale_stddev: float, ben
     for row in rows:
         of_scale = relative_scale_stddev if row.kind == CHECK else 0.0
         stddev_m = math.hypot(row.stddev_m, of_scale * row.measured_m, bending * row.measured_m)
-        is_told = row.kind == LEFT_OUT or row.residual_m is None
-        if not is_told and abs(row.residual_m) > _DISAGREES * stddev_m:
+        if row.kind != LEFT_OUT and row.residual_m is not None and abs(row.residual_m) > _DISAGREES * stddev_m:
             yield (
                 f"{row.kind} distance from {row.from_} to {row.to}: {row.estimated_m:.3f} m in the map, "
                 f"{row.measured_m:.3f} m by tape ({row.residual_m:+.3f} m, expected within "

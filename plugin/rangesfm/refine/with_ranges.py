@@ -175,9 +175,10 @@ def _errors_to_begin_with(problem: RefinementProblem, errors: RangeErrors, metre
 def _between_anchors(
     observations: RangeObservations, anchors: Sequence[AnchorEstimate], errors: RangeErrors
 ) -> LocatedDistances:
+    used_m = errors.stddev_m[observations.has_place]
     return distances_by_radio(
         observations.log,
-        float(np.median(errors.stddev_m[observations.has_place])),
+        float(np.median(used_m)) if len(used_m) else 0.0,
         np.array([anchor.prior_bias_m for anchor in anchors]),
         np.array([anchor.prior_bias_stddev_m for anchor in anchors]),
         common_bias_stddev_m=0.0,

@@ -64,6 +64,27 @@ class CenterCovariances(TableFile):
 
 
 @dataclass(frozen=True)
+class TagCorners(TableFile):
+    """``markers.csv``: where corners of printed tags were found in photos, in pixels; to be a survey's markers."""
+
+    NAME: ClassVar = "markers.csv"
+    marker: Texts
+    image_name: Texts
+    x_px: Rounded
+    y_px: Rounded
+
+    @classmethod
+    def of(cls, found: MetricResult) -> TagCorners | None:
+        markers = {} if found.tape is None else found.tape.found_markers
+        if not markers:
+            return None
+        names = [name for name, marker in markers.items() for _ in marker.image_names]
+        photos = [name for marker in markers.values() for name in marker.image_names]
+        pixels = np.concatenate([marker.pixels for marker in markers.values()])
+        return cls(tuple(names), tuple(photos), *pixels.T)
+
+
+@dataclass(frozen=True)
 class ScaleCandidates(TableFile):
     """``scale_candidates.csv``: the paper's two candidates of each range that has them, metres per SfM unit."""
 

@@ -60,7 +60,9 @@ def initialize_scale(
     """
     options, range_model = options or ScaleOptions(), range_model or RangeModelOptions()
     lengths = scale_by_lengths(distances, trajectory.centers)
-    if lengths is not None and not len(observations.log):
+    if not len(observations.log):
+        if lengths is None:
+            raise GeometryError("the scale is not determined: no measured length has both its ends in the map")
         return _by_lengths_alone(lengths, observations, trajectory, range_model, options)
     if lengths is not None and distances is not None:
         distances = lengths.beside_ranges(distances)

@@ -7,6 +7,7 @@ much it varies is learnt from how the lengths disagree, on what maps let expect.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +23,7 @@ from rangesfm.geometry.similarity import path_shape
 # the path's extent it is alike. Of a room mapped from a hand-held camera, lengths of 0.5 to 5 m against the truth.
 BENDING = 0.008
 _BENDING_SPREAD, _ALIKE_WITHIN = 0.6, 0.25
-_NUM_TRIED, _NUM_PLACES, _NUM_ROUNDS = 31, 8, 3
+_NUM_TRIED, _NUM_PLACES, _NUM_ROUNDS = 21, 8, 2
 # Of how many surveys one has an honest length set aside.
 FALSE_ALARMS = 0.02
 _NUM_SUSPECTS = 3
@@ -172,11 +173,11 @@ class _Lengths:
         logs = np.linspace(-4 * _BENDING_SPREAD, 6 * _BENDING_SPREAD, _NUM_TRIED)
         for _ in range(_NUM_ROUNDS):
             of_sizes = [self._parts(chosen, scale, BENDING * np.exp(each)) for each in logs]
-            unlikeliness = np.array([_unlikeliness(sum(p.values()), model, metric) for p in of_sizes])
+            unlikeliness = np.array([_unlikeliness(_total(p), model, metric) for p in of_sizes])
             weights = np.exp(-(unlikeliness - unlikeliness.min()) - 0.5 * (logs / _BENDING_SPREAD) ** 2)
             bending = BENDING * float(np.sqrt(weights @ np.exp(2 * logs) / weights.sum()))
             parts = self._parts(chosen, scale, bending)
-            by_model = np.linalg.solve(sum(parts.values()), model)
+            by_model = np.linalg.solve(_total(parts), model)
             gains = by_model / (model @ by_model)
             scale = float(gains @ metric)
         return _Fit(scale, bending, parts, gains)
@@ -192,10 +193,15 @@ class _Lengths:
         fit = fit or self.fit(kept)
         chosen = kept | (np.arange(len(kept)) == k)
         at, model = int(chosen[:k].sum()), self.model[chosen]
-        inverse = np.linalg.inv(sum(self._parts(chosen, fit.scale, fit.bending).values()))
+        inverse = np.linalg.inv(_total(self._parts(chosen, fit.scale, fit.bending)))
         by_model = inverse @ model
         off = inverse - np.outer(by_model, by_model) / (model @ by_model)
         return float(off[at] @ self.metric[chosen] / off[at, at]), float(off[at, at] ** -0.5)
+
+
+def _total(parts: Mapping[str, Array]) -> Array:
+    total: Array = np.sum(list(parts.values()), axis=0)
+    return total
 
 
 def _unlikeliness(covariance: Array, model: Array, metric: Array) -> float:

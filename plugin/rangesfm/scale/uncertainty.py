@@ -117,9 +117,7 @@ def _times(posed: ScaleProblem, problem: RangeProblem, state: RangeState, observ
     return np.concatenate([[0.0], np.cumsum(steps_m)])[of_range] / _WALKING_M_PER_S
 
 
-def scale_uncertainty(
-    solution: Solution, learned: LearnedErrors, bending_of_lengths: float = 0.0
-) -> ScaleUncertainty:
+def scale_uncertainty(solution: Solution, learned: LearnedErrors, bending_of_lengths: float = 0.0) -> ScaleUncertainty:
     """Relative stddevs of the scale.
 
     Args:

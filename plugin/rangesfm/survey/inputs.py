@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-NOTHING_MEASURED = "no ranges and no lengths: give a radio's log (--ranges LOG) or taped distances (--distances CSV)"
-
 # Beyond it a unit is wrong, or the file: no such radio reaches so far.
 _MAX_RANGE_M = 1e6
 # How far anchors are apart, as a share of the ranges to them (at most 1 where all is in metres), is above this in:
@@ -74,9 +72,10 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     Raises:
         InputError: a file is missing or wrong, or the log has an anchor or tags that nobody explained.
     """
+    survey.require_metres()
     given = read_anchors(survey.anchors.path) if survey.anchors.path is not None else None
     tag_ids = [*survey.tag.lever_arms_m, *([] if survey.tag.tag_id is None else [survey.tag.tag_id])]
-    if survey.measures_lengths and survey.ranges.path is None:
+    if survey.ranges.path is None:
         log = RangeLog.from_arrays([], [], image_name=[])
     else:
         log = read_log(survey.ranges, [anchor.anchor_id for anchor in given or ()], tag_ids)
@@ -128,7 +127,7 @@ def read_log(
 ) -> RangeLog:
     """The radio's log as a survey describes it, or other files than it names; see ``read_ranges``."""
     if options.path is None:
-        raise InputError(NOTHING_MEASURED)
+        raise InputError("no ranges: give [ranges] path in a survey file, or --ranges LOG")
     return read_ranges(
         files or options.path,
         format=options.format,

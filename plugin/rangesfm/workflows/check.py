@@ -123,6 +123,9 @@ def _tell_of_others(survey: Survey, inputs: RangingInputs, checked: CheckedSurve
     if inputs.tape is not None:
         only = "" if len(inputs.log) else ", which alone say how long a metre is (no ranges)"
         checked.facts.append(f"taped distances: {len(inputs.tape.distances)}{only}")
+    if survey.markers.dictionary is not None:
+        side = "" if survey.markers.side_m is None else f" of {survey.markers.side_m:g} m"
+        checked.facts.append(f"tags: those of {survey.markers.dictionary}{side} will be looked for in the photos")
     if inputs.reference is not None:
         name = "" if survey.report.reference is None else f" in {survey.report.reference.name}"
         checked.facts.append(f"reference: {len(inputs.reference)} positions{name}, only to compare with")
