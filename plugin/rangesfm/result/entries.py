@@ -89,7 +89,7 @@ class ScaleEntry(Record):
         validation_alias=AliasChoices("correlation_inflation", AliasPath("errors", "inflation"))
     )
     two_candidate: TwoCandidateEntry | None
-    by_kind: dict[Text, ScaleByKindEntry] = {}
+    by_kind: dict[Text, ScaleByKindEntry] = Field(default_factory=dict)
 
     @property
     def larger_stddev(self) -> float | None:

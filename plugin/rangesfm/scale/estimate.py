@@ -13,6 +13,8 @@ from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.lengths import LengthScale
+from rangesfm.scale.problem import ScaleProblem
+from rangesfm.scale.solution import Solution
 from rangesfm.scale.two_candidate import TwoCandidate
 
 NORMAL_95 = 1.96
@@ -107,6 +109,7 @@ class ScaleEstimate:
         observations: all ranges, with status by their final weight.
         errors: of all n ranges of the log, as weighted; their inflation widens the formal stddev.
         noise_stddev_m: stddev of a range away from all special cases.
+        problem, solution: from which all of this was found; None where there were no ranges.
         placement: (7, 7) covariance of the logarithm of the scale, of a turn (rad) and of a shift (m) of the map about
             where the first camera is, by what the ranges get wrong; None where the frame is the first camera's.
         lengths: what measured lengths say by themselves; None: there are none between points of the map.
@@ -128,6 +131,8 @@ class ScaleEstimate:
     observations: RangeObservations
     errors: RangeErrors
     noise_stddev_m: float
+    problem: ScaleProblem | None = None
+    solution: Solution | None = None
     placement: Array | None = None
     lengths: LengthScale | None = None
     by_kind: Mapping[str, ScaleByKind] = field(default_factory=dict)

@@ -24,7 +24,7 @@ from rangesfm.scale.estimate import ScaleByKind, ScaleEstimate, ScaleSensitivity
 from rangesfm.scale.lengths import LengthScale, scale_by_lengths
 from rangesfm.scale.levelled_places import levelled_places
 from rangesfm.scale.problem import ScaleProblem, first_camera_from, scale_problem
-from rangesfm.scale.range_equation import solve
+from rangesfm.scale.range_equation import RangeProblem, solve
 from rangesfm.scale.sensitivity import scale_sensitivity
 from rangesfm.scale.solution import Solution, solve_scale
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
@@ -72,9 +72,10 @@ def initialize_scale(
     table = _paper_table(solution)
     rotations = model_from_cam(observations, trajectory, problem)
     learned = learned_errors(problem, solution, observations, rotations)
-    uncertainty = scale_uncertainty(solution, learned, 0.0 if lengths is None else lengths.components["bending"])
+    posed = problem if lengths is None else _bent(problem, lengths)
+    uncertainty = scale_uncertainty(posed, solution, learned, lengths.components["bending"] if lengths else 0.0)
     per_anchor = scale_per_anchor(solution, observations.log.anchor_ids)
-    covariance = parameter_covariance(solution.fit, solution.problem, learned)
+    covariance = parameter_covariance(solution, learned)
     found = anchor_estimates(solution, observations.log.anchor_ids, covariance)
     tests = cutoff_test(solution)
     judged = judge(problem, solution, uncertainty, per_anchor, found, tests, options)
@@ -104,9 +105,11 @@ def initialize_scale(
         observations=replace(observations, status=status),
         errors=replace(solution.errors, learned=learned).spread(problem.rows, len(observations.log)),
         noise_stddev_m=solution.noise_stddev_m,
+        problem=posed,
+        solution=solution,
         placement=placement_covariance(solution, covariance),
         lengths=lengths,
-        by_kind={} if lengths is None else {"ranges": _by_ranges(solution, learned), **_by_lengths(lengths)},
+        by_kind={} if lengths is None else {"ranges": _by_ranges(problem, solution, learned), **_by_lengths(lengths)},
     )
 
 
@@ -142,18 +145,30 @@ def _by_lengths_alone(
     )
 
 
+def _bent(problem: ScaleProblem, lengths: LengthScale) -> ScaleProblem:
+    """With the lengths as uncertain as they are: what the map bends is no reason to believe the ranges, in solving."""
+    if problem.ranges.distances is None:
+        return problem
+    distances = lengths.beside_ranges(problem.ranges.distances, with_bending=True)
+    return replace(problem, ranges=replace(problem.ranges, distances=distances))
+
+
 def _by_lengths(lengths: LengthScale) -> dict[str, ScaleByKind]:
     return {"lengths": ScaleByKind(lengths.value, lengths.value * lengths.relative_stddev)}
 
 
-def _by_ranges(solution: Solution, learned: LearnedErrors) -> ScaleByKind:
+def _by_ranges(posed: ScaleProblem, solution: Solution, learned: LearnedErrors) -> ScaleByKind:
     """From the solution on without lengths between points."""
-    distances = solution.problem.distances
-    between_anchors = None if distances is None else distances.subset(~distances.is_between_points)
-    problem = replace(solution.problem, distances=between_anchors)
+    posed = replace(posed, ranges=_without_lengths(posed.ranges))
+    problem = _without_lengths(solution.problem)
     alone = replace(solution, problem=problem, fit=solve(problem, solution.fit.state, loss=solution.errors.loss))
     value = alone.fit.state.metric_from_model.scale
-    return ScaleByKind(value, value * scale_uncertainty(alone, learned).empirical)
+    return ScaleByKind(value, value * scale_uncertainty(posed, alone, learned).empirical)
+
+
+def _without_lengths(problem: RangeProblem) -> RangeProblem:
+    distances = problem.distances
+    return problem if distances is None else replace(problem, distances=distances.subset(~distances.is_between_points))
 
 
 def placement_covariance(solution: Solution, covariance: Array) -> Array | None:

@@ -63,14 +63,15 @@ class LengthScale:
         squared: Array = (self.too_long_m / self.stddev_m) ** 2
         return squared
 
-    def beside_ranges(self, distances: LocatedDistances) -> LocatedDistances:
+    def beside_ranges(self, distances: LocatedDistances, *, with_bending: bool = False) -> LocatedDistances:
         """The distances with all lengths between points as the one that says the same of the scale.
 
         It weighs by how well it was measured: the bending widens the interval alone, as most of what radios get
         wrong beyond their noise does.
         """
         unit = np.array([1.0])
-        stddev_m = self.value * np.hypot(self.components["tape"], self.components["marks"]) * unit
+        measured = float(np.hypot(self.components["tape"], self.components["marks"]))
+        stddev_m = self.value * (self.relative_stddev if with_bending else measured) * unit
         one = LocatedDistances.of(self.value * unit, stddev_m, model_length=unit)
         return one.joined(distances.subset(~distances.is_between_points))
 

@@ -152,8 +152,8 @@ class Survey(BaseModel):
             )
         if self.ranges.path is None:
             raise InputError(
-                "no ranges and no lengths: give a radio's log (--ranges LOG), taped distances (--distances CSV), or the "
-                "size of printed tags (--marker_side_m)"
+                "no ranges and no lengths: give a radio's log (--ranges LOG), taped distances (--distances CSV), or "
+                "the size of printed tags (--marker_side_m)"
             )
 
     def to_dict(self) -> dict[str, Any]:

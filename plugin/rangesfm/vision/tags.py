@@ -114,7 +114,8 @@ def _refined(cv2: Any, pixels: npt.NDArray[np.uint8], quad: Array, num_modules: 
     start = (quad - [left, top]).astype(np.float32).reshape(-1, 1, 2)
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 50, 1e-3)
     found = cv2.cornerSubPix(light, start, (window, window), (-1, -1), criteria)
-    return np.asarray(found.reshape(-1, 2) + [left, top], dtype=np.float64)
+    corners: Array = np.asarray(found, dtype=np.float64).reshape(-1, 2) + np.array([left, top])
+    return corners
 
 
 def _opencv() -> Any:

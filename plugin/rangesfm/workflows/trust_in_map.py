@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from rangesfm.geometry.gravity import gravity_of
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.survey.settings import Survey
 from rangesfm.trust.lengths import trust_in_lengths
@@ -22,8 +21,8 @@ def tested(survey: Survey, metric: MetricResult, journal: Journal) -> MetricResu
     """
     trust = trust_in_lengths(metric.estimate, metric.tape)
     try:
-        if len(metric.observations.log):
-            trust = trust_in(scaled_ranges(survey, metric), seed=survey.output.seed).with_more(trust)
+        if (on_map := scaled_ranges(metric)) is not None:
+            trust = trust_in(on_map, seed=survey.output.seed).with_more(trust)
     except np.linalg.LinAlgError as error:
         journal.warn(f"mistakes were not looked for, as the ranges determine too little: {error}")
     for reason in trust.reasons:
@@ -31,16 +30,9 @@ def tested(survey: Survey, metric: MetricResult, journal: Journal) -> MetricResu
     return replace(metric, trust=trust).doubted(trust.reasons)
 
 
-def scaled_ranges(survey: Survey, metric: MetricResult) -> RangesOnMap:
-    """The ranges on the scaled map."""
+def scaled_ranges(metric: MetricResult) -> RangesOnMap | None:
+    """The ranges on the scaled map; None where there are none."""
     estimate = metric.estimate
-    return ranges_on_map(
-        estimate.observations,
-        metric.trajectory,
-        estimate.metric_from_sfm,
-        estimate.anchors,
-        estimate.errors,
-        metric.scaled_weights,
-        frame_is_free=estimate.frame == "site",
-        gravity=gravity_of(survey.scale.up_in_first_camera),
-    )
+    if estimate.problem is None or estimate.solution is None:
+        return None
+    return ranges_on_map(estimate.problem, estimate.solution, estimate.observations, metric.trajectory)
