@@ -16,6 +16,7 @@ from rangesfm.errors import InputError
 from rangesfm.files.atomic import sha256_of
 from rangesfm.files.folders import walk
 from rangesfm.geometry.reference import Reference, read_reference
+from rangesfm.geometry.trajectory import photos_by_frame
 from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.anchor_file import default_anchor_frame, read_anchors
@@ -226,10 +227,10 @@ def _anchors_of_log(log: RangeLog) -> tuple[Anchor, ...]:
 
 def times_of_model(survey: Survey, sfm: pycolmap.Reconstruction, model_path: Path) -> ImageTimes:
     """Times of a model's photos; the table may list others, which did not become keyframes."""
+    frames = photos_by_frame(sfm)
     if survey.images.times is not None:
-        return read_image_times_csv(survey.images.times)
-    names = tuple(sorted(image.name for image in sfm.images.values()))
-    return find_image_times(survey.images.path or model_path, names)
+        return read_image_times_csv(survey.images.times, frames=frames)
+    return find_image_times(survey.images.path or model_path, tuple(sorted(frames)))
 
 
 def of_one_tag(log: RangeLog, tag_id: str | None) -> RangeLog:
