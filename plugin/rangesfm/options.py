@@ -77,6 +77,13 @@ class ImageOptions(KeyframeOptions):
     photos' times."""
     times: Annotated[Path | None, Told(flag="image_times", role="file")] = None
     """CSV image_name,timestamp_s (default: EXIF, else file names)."""
+    rig_config: Annotated[Path | None, Told(flag="rig_config_path", metavar="JSON", role="file")] = None
+    """COLMAP's rig_config.json, lengths in metres: photos of one rig whose names go on alike after their image_prefix
+    were taken at once, when the reference camera's was. A cam_from_rig is kept while mapping, and the length of its
+    translation is a measured distance, which checks the ranges and is checked by them; cameras without one are placed
+    by a model made without the rig first."""
+    baseline_stddev_m: _Positive = 0.001
+    """Of each known distance of a rig's camera from its reference camera."""
     rate_hz: Annotated[float, Field(ge=1e-3, le=1e3), Told(flag="image_rate_hz")] = 2.0
     """Photos a second of a video or a bag: of each such interval the sharpest one."""
     topic: Annotated[str | None, Told(flag="image_topic")] = None
@@ -232,7 +239,8 @@ class TagOptions(Options):
     table: ClassVar[str] = "tag"
 
     tag_in_cam_m: Annotated[_LeverArm, Told(flag="tag_in_cam", metavar="[ID:]X,Y,Z")] = (0.0, 0.0, 0.0)
-    """Lever arm: the tag's antenna in the camera frame, metres; of several tags, the flag once for each with its ID."""
+    """Lever arm: the tag's antenna in the camera frame, of a rig its reference camera's, metres; of several tags, the
+    flag once for each with its ID."""
     lever_arms_m: Annotated[dict[str, _LeverArm], Told(flag="tag_in_cam", metavar="ID:X,Y,Z")] = Field(
         default_factory=dict
     )

@@ -152,7 +152,8 @@ class _Columns:
         poses = [pose_of(reconstruction.frame(frame)).params for frame in frames]
         blocks = [("pose", pose) for pose in poses]
         for rig in reconstruction.rigs.values():
-            blocks += [("sensor", rig.sensor_from_rig(sensor).params) for sensor in rig.non_ref_sensors]
+            # Not by sensor_from_rig(), which hands out copies.
+            blocks += [("sensor", pose.params) for pose in rig.non_ref_sensors.values() if pose is not None]
         blocks += [("other", camera.params) for camera in reconstruction.cameras.values()]
         blocks += [("anchor", anchor) for anchor in anchors]
         blocks += [("other", other) for other in others]

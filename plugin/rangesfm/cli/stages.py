@@ -18,7 +18,17 @@ if TYPE_CHECKING:
 
 
 _SCALE_KEYS = (
-    *("images.path", "images.times", "ranges", "anchors", "tag", "mapper.num_threads", "scale"),
+    *(
+        "images.path",
+        "images.times",
+        "images.rig_config",
+        "images.baseline_stddev_m",
+        "ranges",
+        "anchors",
+        "tag",
+        "mapper.num_threads",
+        "scale",
+    ),
     *("export", "report", "output"),
 )
 _DEMO_FOLDER = "rangesfm_demo"

@@ -68,8 +68,8 @@ def _chosen(num_by_topic: dict[str, int], topic: str | None, path: Path) -> str:
         return str(topic)
     if not num_by_topic:
         raise InputError(f"no images in this bag, expected {_RAW} or {_COMPRESSED} of sensor_msgs", path)
-    which = "several topics" if topic is None else f"no images of {topic}, but"
-    raise InputError(f"{which} of images: {several}; choose by [images] topic, or --image_topic", path)
+    which = "several topics of images" if topic is None else f"no images of {topic}, but of"
+    raise InputError(f"{which}: {several}; choose by [images] topic, or --image_topic", path)
 
 
 def _messages(bag: AnyReader, topic: str) -> Iterator[tuple[str, Any, float]]:

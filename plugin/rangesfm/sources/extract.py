@@ -81,7 +81,7 @@ def take_photos(
     with new_folder(folder) as new:
         times_s, num_bytes = _write(source, new, rate_hz, progress)
         if len(times_s) < _MIN_NUM_PHOTOS:
-            raise InputError(f"{len(times_s)} photos at {rate_hz:g} Hz, expected at least {_MIN_NUM_PHOTOS}", path)
+            raise InputError(f"fewer than {_MIN_NUM_PHOTOS} photos at {rate_hz:g} Hz ([images] rate_hz)", path)
         what = f"the photos are the sharpest of each {1 / rate_hz:.3g} s of {path.name}; their times are {source.clock}"
         found = {"image_names": tuple(times_s), "camera": source.camera, "notes": (what, *source.notes)}
         taken = wanted.model_copy(update=found)

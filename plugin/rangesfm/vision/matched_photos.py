@@ -22,6 +22,7 @@ from rangesfm.vision.masks import contents_of_masks
 from rangesfm.vision.matching import MatchingOptions, match_features, matching_options, verify_matches
 from rangesfm.vision.photos import Photos, usable_photos
 from rangesfm.vision.renewed_database import RenewedDatabase, forget_database
+from rangesfm.vision.rigs import Rigs
 from rangesfm.vision.snapshots import remove_snapshots
 from rangesfm.vision.steps import Steps, fingerprint
 
@@ -86,6 +87,7 @@ def match_photos(
     image_names: Sequence[str],
     camera: CameraOptions,
     mapper: MapperOptions,
+    rigs: Rigs,
     seed: int,
     space: Workspace,
     *,
@@ -96,7 +98,7 @@ def match_photos(
     for_features = feature_options(mapper)
     for_matching = matching_options(mapper, len(image_names), seed)
     photos = usable_photos(image_path, image_names)
-    cameras = cameras_of_photos(camera, photos)
+    cameras = cameras_of_photos(camera, photos, rigs)
     masks = contents_of_masks(mapper.mask_path, photos)
     space.begin(restart=restart)
     _say_left_out(photos, space.progress)
@@ -104,14 +106,15 @@ def match_photos(
         if given is not None:
             space.progress.message(given.note)
             photos = given.photos
-            cameras = given.cameras() if camera.model is None else cameras_of_photos(camera, photos)
+            cameras = given.cameras() if camera.model is None else cameras_of_photos(camera, photos, rigs)
         _say_guessed(cameras, space.progress)
-        return _match(photos, cameras, given, masks, mapper, for_features, for_matching, space)
+        return _match(photos, cameras, rigs, given, masks, mapper, for_features, for_matching, space)
 
 
 def _match(
     photos: Photos,
     cameras: PhotoCameras,
+    rigs: Rigs,
     given: GivenDatabase | None,
     masks: dict[str, str],
     mapper: MapperOptions,
@@ -145,9 +148,9 @@ def _match(
         how = [] if has_matches else [for_matching.pairing_inputs, mapper.matcher, for_matching.seed]
         of_matches = fingerprint(of_features, cameras.inputs, *how)
         renewed = RenewedDatabase(
-            database, photos, contents, cameras, given, for_matching, of_features, of_matches, steps
+            database, photos, contents, cameras, rigs, given, for_matching, of_features, of_matches, steps
         )
-        inputs = fingerprint(of_features, cameras.inputs, list(contents.items()))
+        inputs = fingerprint(of_features, cameras.inputs, list(contents.items()), *rigs.inputs)
         steps.run(
             "features",
             inputs,

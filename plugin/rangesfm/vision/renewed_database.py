@@ -25,6 +25,7 @@ from rangesfm.vision.given_database import GivenDatabase
 from rangesfm.vision.matching import MatchingOptions
 from rangesfm.vision.pairs import pairs_to_match
 from rangesfm.vision.photos import Photos
+from rangesfm.vision.rigs import Rigs
 from rangesfm.vision.steps import Steps
 
 _NOTE = "database"
@@ -40,7 +41,7 @@ class RenewedDatabase:
         path: of the database.
         photos: in the order of their ids.
         contents: SHA-256 of each photo, by name.
-        cameras: that took them.
+        cameras: that took them. rigs: that the cameras are on.
         given: the user's database, whose features take the place of all that an earlier run has found.
         matching: how they will be matched.
         feature_inputs: fingerprint of what features depend on beside the photo itself.
@@ -52,6 +53,7 @@ class RenewedDatabase:
     photos: Photos
     contents: Mapping[str, str]
     cameras: PhotoCameras
+    rigs: Rigs
     given: GivenDatabase | None
     matching: MatchingOptions
     feature_inputs: str
@@ -80,6 +82,7 @@ class RenewedDatabase:
 
     def _create(self, path: Path) -> None:
         create_database(path, self.photos.names, self.cameras.cameras, self.cameras.of_photo)
+        self.rigs.apply(path)
         write_positions(path, (exif_position(self.photos.folder / name) for name in self.photos.names))
 
     def _taken_over(self, earlier: Mapping[str, Any], fresh: Path) -> int:

@@ -29,6 +29,7 @@ from rangesfm.vision.image_times import ImageTimes, find_image_times, list_image
 from rangesfm.vision.keyframes import select_keyframes
 from rangesfm.vision.mapping_loop import GlobalAdjustment
 from rangesfm.vision.reconstruct import reconstruct
+from rangesfm.vision.rigs import read_rigs
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.metric_map import estimate_scale, path_of_model, ranges_on_path, refine_by_survey
 
@@ -125,15 +126,18 @@ def find_keyframes(
 ) -> tuple[tuple[str, ...], ImageTimes | None]:
     """The photos to reconstruct and their times; without times, where none are needed, in the order of their names.
 
+    Of photos that a rig took at once only the one that stands for them.
+
     Args:
         log_names_photos: then no photo is left out for want of a time; None: there is no log.
     """
     folder = images_path(survey)
     with journal.timed("keyframes"):
-        names = list_images(folder)
+        frames = read_rigs(survey.images.rig_config).frames(list_images(folder))
+        names = tuple(frames)
         image_times = None
         with nullcontext() if survey.images.times or log_names_photos is False else suppress(InputError):
-            image_times = find_image_times(folder, names, survey.images.times)
+            image_times = find_image_times(folder, names, survey.images.times, frames)
         if image_times is None or (log_names_photos and not survey.images.times and image_times.num_left_out):
             return select_keyframes(names, survey.images), None
         keyframes = select_keyframes(image_times, survey.images)
@@ -148,13 +152,16 @@ def map_keyframes(
     adjustment: GlobalAdjustment | None = None,
 ) -> tuple[pycolmap.Reconstruction, ...]:
     """Map the keyframes into ``sparse``; returns ``sparse/0``, ``sparse/1``, ..."""
+    rigs = read_rigs(survey.images.rig_config)
+    frames = rigs.frames(list_images(images_path(survey)))
     with survey.source.naming_lines():
         summary = reconstruct(
             images_path(survey),
-            keyframes,
+            [photo for keyframe in keyframes for photo in frames[keyframe]],
             survey.output.path,
             camera=survey.camera,
             mapper=survey.mapper,
+            rigs=rigs,
             seed=survey.output.seed,
             progress=journal.progress,
             restart=restart,
