@@ -73,7 +73,9 @@ def main() -> None:
             unit = ("{:14.3f} m" if what == "place" else "{:14.5f}") if is_open else "{:11.2f} of it"
             told = "".join(f"{unit.format(gain):>20}" for gain in gains)
             print(f"{name:30}{what:>6}{told}{gains[0] / gains[1]:7.2f}  {advice.words}", flush=True)
-    print(f"{sum(np.array(off) > 0.25)} of {len(off)} off by more than 25 %, {100 * np.median(off):.0f} % in the median")
+    print(
+        f"{sum(np.array(off) > 0.25)} of {len(off)} off by more than 25 %, {100 * np.median(off):.0f} % in the median"
+    )
 
 
 if __name__ == "__main__":
