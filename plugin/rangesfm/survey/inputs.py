@@ -23,7 +23,7 @@ from rangesfm.ranging.clock.time_resolution import time_resolution_s
 from rangesfm.ranging.errors.error_curve import correct_ranges, read_error_curve
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges
-from rangesfm.ranging.readers.time_units import SECONDS_PER_UNIT
+from rangesfm.ranging.readers.times import SECONDS_PER_UNIT
 from rangesfm.ranging.twr import AIR_M_PER_S, DW1000_TICK_S, VACUUM_M_PER_S, StampOptions
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes, find_image_times, read_image_times_csv

@@ -13,16 +13,25 @@ from rangesfm.files.tables import read_head
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.quantization import find_quantization_m, quantization_stddev_m
 from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.readers import ros
+from rangesfm.ranging.readers import canonical, ros
 from rangesfm.ranging.readers.canonical import write_ranges_csv
+from rangesfm.ranging.readers.printed_formats import PRINTED
 from rangesfm.ranging.readers.reader import Reader, ReadOptions
-from rangesfm.ranging.readers.registry import find_reader, reader_names, recognize
 from rangesfm.ranging.readers.roles import tell_roles
 from rangesfm.ranging.readers.several import files_of_log, join_logs
-from rangesfm.ranging.readers.table import TABLE, table_reader
+from rangesfm.ranging.readers.table import MAPPED, PRESETS, TABLE, table_reader
+from rangesfm.ranging.readers.times import TIMESTAMP_UNITS
+from rangesfm.ranging.readers.units import UNITS_PER_METRE
 from rangesfm.ranging.twr import StampOptions
 
 __all__ = ["find_log_reader", "read_anchors_in_log", "read_ranges", "reader_names", "write_ranges_csv"]
+
+_READERS = (ros.READER, canonical.READER, *PRESETS, MAPPED, TABLE, *PRINTED)
+
+
+def reader_names() -> tuple[str, ...]:
+    """All log formats. A new one is a declaration beside this and a name in the tuple above."""
+    return tuple(reader.name for reader in _READERS)
 
 
 def read_ranges(
@@ -64,10 +73,16 @@ def read_ranges(
         InputError: with the line where there is one, for a file that is missing, empty, not understood for sure
             (its advice says what to type), broken, or without any usable range.
     """
+    paths = _paths(path)
+    for what, given, choices in (
+        ("timestamp_unit", timestamp_unit, TIMESTAMP_UNITS),
+        ("range_unit", range_unit, tuple(UNITS_PER_METRE)),
+    ):
+        if given not in (None, *choices):
+            raise InputError(f"{what} is '{given}', expected one of {', '.join(choices)}", paths[0])
     if ranging_interval_s is not None and not 0 < ranging_interval_s < float("inf"):
         message = f"ranging_interval_s is {ranging_interval_s}, expected a positive number of seconds"
-        raise InputError(message, path if isinstance(path, (str, Path)) else None)
-    paths = [Path(one) for one in ([path] if isinstance(path, (str, Path)) else path)]
+        raise InputError(message, paths[0])
     options = ReadOptions(
         columns=dict(columns or {}),
         timestamp_unit=timestamp_unit,
@@ -98,11 +113,12 @@ def read_anchors_in_log(path: str | Path | Sequence[str | Path], *, format: str 
     Raises:
         InputError: for a file that is missing, empty or of no known format.
     """
-    paths = [Path(one) for one in ([path] if isinstance(path, (str, Path)) else path)]
-    chosen = _choose_readers(paths, ReadOptions(), format)
-    return tuple(
-        anchor for file, reader in chosen if reader.read_anchors is not None for anchor in reader.read_anchors(file)
-    )
+    chosen = _choose_readers(_paths(path), ReadOptions(), format)
+    return tuple(anchor for file, reader in chosen for anchor in reader.read_anchors(file))
+
+
+def _paths(path: str | Path | Sequence[str | Path]) -> list[Path]:
+    return [Path(one) for one in ([path] if isinstance(path, (str, Path)) else path)]
 
 
 def _not_better_than_rounding(log: RangeLog) -> RangeLog:
@@ -138,17 +154,17 @@ def _choose_readers(paths: Sequence[Path], options: ReadOptions, format: str | N
 
 def _choose_reader(path: Path, options: ReadOptions, format: str | None) -> Reader:
     if format is not None and format != TABLE.name:
-        reader = find_reader(format)
-        if reader is None:
+        named = next((reader for reader in _READERS if reader.name == format), None)
+        if named is None:
             raise InputError(f"no log format is named '{format}', expected one of {', '.join(reader_names())}", path)
-        return reader
+        return named
     if ros.is_bag_folder(path):
         return ros.READER
     head = read_head(path)
     if not head.strip():
         raise InputError("the file is empty, expected a log of ranges", path)
-    reader = None if format == TABLE.name else recognize(head)
-    return table_reader(path, options) if reader is None else reader
+    known = () if format == TABLE.name else _READERS
+    return next((reader for reader in known if reader.recognizes(head)), None) or table_reader(path, options)
 
 
 def find_log_reader(path: Path) -> Reader:

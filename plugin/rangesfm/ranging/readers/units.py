@@ -7,7 +7,7 @@ import re
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.ranging.readers.time_units import SECONDS_PER_UNIT, unit_by_digits
+from rangesfm.ranging.readers.times import SECONDS_PER_UNIT, unit_by_digits
 
 Array = npt.NDArray[np.float64]
 UNITS_PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
