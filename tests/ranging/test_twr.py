@@ -16,7 +16,6 @@ from rangesfm.ranging.twr import (
     VACUUM_M_PER_S,
     StampOptions,
     double_sided_range,
-    range_from_round_trips,
     single_sided_range,
 )
 
@@ -99,12 +98,6 @@ def test_range_a_little_below_zero_is_not_a_whole_wrap() -> None:
     wrap = options.wrap_s / options.unit_s
     ranges = single_sided_range([0.0], [0.0], [wrap - 1.0], [wrap - 3.0], options)
     np.testing.assert_allclose(ranges, [-AIR_M_PER_S * 1e-9], atol=1e-6)
-
-
-def test_repeated_round_trips_are_averaged_before_the_delay_is_taken_off() -> None:
-    trips = [[100e-9, 104e-9, np.nan], [50e-9, 50e-9, 50e-9], [np.nan] * 3]
-    ranges = range_from_round_trips(trips, t_off_s=2e-9, propagation_speed_m_per_s=VACUUM_M_PER_S)
-    np.testing.assert_allclose(ranges, [14.98962290, 7.19501899, np.nan], atol=1e-5)
 
 
 def test_computed_range_is_the_one_that_a_real_radio_logged() -> None:

@@ -43,25 +43,6 @@ class StampOptions:
         return np.asarray(interval * self.unit_s, np.float64)
 
 
-def range_from_round_trips(
-    round_trip_s: npt.ArrayLike, *, t_off_s: float = 0.0, propagation_speed_m_per_s: float = AIR_M_PER_S
-) -> npt.NDArray[np.float64]:
-    """Range from repeated round trips: d = c/2 (mean round-trip time - t_off), Lee et al. 2018.
-
-    Args:
-        round_trip_s: (..., k) times from sending to receiving the answer, without the responder's known
-            delay; NaN where a repetition failed.
-
-    Returns:
-        (...,) metres; NaN where all repetitions failed.
-    """
-    times = np.asarray(round_trip_s, np.float64)
-    valid = ~np.isnan(times)
-    num = valid.sum(axis=-1)
-    mean = np.where(num > 0, np.where(valid, times, 0).sum(axis=-1) / np.maximum(num, 1), np.nan)
-    return np.asarray(propagation_speed_m_per_s / 2 * (mean - t_off_s), np.float64)
-
-
 def single_sided_range(
     tx1: npt.ArrayLike,
     rx1: npt.ArrayLike,
@@ -123,10 +104,9 @@ def _same_duration(one_s: npt.NDArray[np.float64], other_s: npt.NDArray[np.float
 
 
 def _range(round_trip_s: npt.NDArray[np.float64], options: StampOptions) -> npt.NDArray[np.float64]:
-    """A round trip is far shorter than the wrap: what seems almost a whole wrap is a little less than nothing."""
-    signed = np.mod(round_trip_s + options.wrap_s / 2, options.wrap_s) - options.wrap_s / 2
-    return range_from_round_trips(
-        signed[..., np.newaxis],
-        t_off_s=options.t_off_s,
-        propagation_speed_m_per_s=options.propagation_speed_m_per_s,
-    )
+    """d = c/2 (round-trip time - t_off), Lee et al. 2018.
+
+    A round trip is far shorter than the wrap: what seems almost a whole wrap is a little less than nothing.
+    """
+    signed_s = np.mod(round_trip_s + options.wrap_s / 2, options.wrap_s) - options.wrap_s / 2
+    return np.asarray(options.propagation_speed_m_per_s / 2 * (signed_s - options.t_off_s), np.float64)

@@ -11,7 +11,7 @@ import numpy as np
 from rangesfm.errors import InputError
 from rangesfm.files.tables import read_head
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.errors.quantization import find_quantization_m, quantization_stddev_m
+from rangesfm.ranging.errors.noise_of_log import find_quantization_m, quantization_stddev_m
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers import canonical, ros
 from rangesfm.ranging.readers.canonical import write_ranges_csv
