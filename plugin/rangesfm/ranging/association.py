@@ -13,7 +13,6 @@ from rangesfm.arrays import Array, Mask
 from rangesfm.errors import InputError
 from rangesfm.geometry.trajectory import ROUNDING_S, Trajectory
 from rangesfm.options import AssociationOptions
-from rangesfm.ranging.clock.time_resolution import time_resolution_s
 from rangesfm.ranging.errors.noise import robust_stddev
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
@@ -249,9 +248,7 @@ def _timing_stddev(
     Uniform rounding to a step has the stddev step / sqrt(12), each time its own.
     """
     times, centers = trajectory.timestamps_s, trajectory.centers
-    log_stddev_s, photo_stddev_s = (
-        step / np.sqrt(12) for step in (time_resolution_s(log), trajectory.time_resolution_s)
-    )
+    log_stddev_s, photo_stddev_s = (each.time_resolution_s / np.sqrt(12) for each in (log, trajectory))
     if times is None or len(times) < 2 or not log_stddev_s + photo_stddev_s > 0:
         return np.zeros(len(before))
     gaps = np.diff(times)

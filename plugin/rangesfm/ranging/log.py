@@ -15,6 +15,8 @@ import numpy.typing as npt
 from rangesfm.files.tables import Categories
 
 DEFAULT_TAG_ID = "tag"
+# Two ranges of one radio to another take time: if this share of them has the time of the one before, it was rounded.
+_MIN_REPEATED_SHARE = 0.25
 
 
 class RangeKind(IntEnum):
@@ -122,6 +124,23 @@ class RangeLog:
             else self.timestamp_s
         )
         return np.lexsort((self.range_m, self.peer_index, self.tag_index, when, self.anchor_index))
+
+    @property
+    def time_resolution_s(self) -> float:
+        """The step of the times, of a host's whole seconds or of lines in batches; 0 if none is seen.
+
+        Any step is seen that is longer than the ranges between one tag and one anchor are apart.
+        """
+        times = self.timestamp_s
+        if times is None or len(self) < 2:
+            return 0.0
+        link = self.tag_index * len(self.anchor_ids) + self.anchor_index
+        order = np.lexsort((times, link))
+        steps = np.diff(times[order])[np.diff(link[order]) == 0]
+        if not len(steps) or np.mean(steps == 0) < _MIN_REPEATED_SHARE:
+            return 0.0
+        between = np.diff(np.unique(times))
+        return float(np.median(between)) if len(between) else 0.0
 
     def peer_ranges(self, kind: RangeKind) -> PeerRanges:
         """The ranges between two anchors, distances that do not depend on the camera; or those between two tags."""

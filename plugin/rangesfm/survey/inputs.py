@@ -19,7 +19,6 @@ from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.anchor_file import default_anchor_frame, read_anchors
 from rangesfm.ranging.anchors.site import Site, local_site
-from rangesfm.ranging.clock.time_resolution import time_resolution_s
 from rangesfm.ranging.errors.error_curve import correct_ranges, read_error_curve
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges
@@ -292,7 +291,7 @@ def _notes(log: RangeLog, anchors: Sequence[Anchor], survey: Survey, *, anchors_
         notes.append("the anchor positions are those that the log gives")
     if log.num_no_measurement:
         notes.append(f"{log.num_no_measurement} records of the log say that there was no measurement")
-    if (step_s := time_resolution_s(log)) >= _COARSE_STEP_S:
+    if (step_s := log.time_resolution_s) >= _COARSE_STEP_S:
         notes.append(f"the log's times come in steps of {step_s:.2g} s: at walking pace that is as much in metres")
     return notes
 

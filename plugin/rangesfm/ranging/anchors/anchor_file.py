@@ -38,7 +38,7 @@ def read_anchors(path: str | Path) -> tuple[Anchor, ...]:
     _check_unique(table, anchor_ids)
     positions = _positions(table)
     position_stddevs = _not_negative(table, "position_stddev_m", empty=0.0)
-    biases = table.numbers("range_bias_m", empty=0.0) if "range_bias_m" in table else np.zeros(len(table))
+    biases = table.numbers("range_bias_m", empty=0.0)
     bias_stddevs = _not_negative(table, "range_bias_stddev_m", empty=np.nan)
     return tuple(
         Anchor(
@@ -108,10 +108,7 @@ def _positions(table: Table) -> npt.NDArray[np.float64]:
 
 
 def _not_negative(table: Table, column: str, *, empty: float) -> npt.NDArray[np.float64]:
-    if column not in table:
-        return np.full(len(table), empty)
     expected = "a number of metres that is not negative, or nothing"
     values = table.numbers(column, empty=empty, expected=expected)
-    if np.any(values < 0):
-        raise table.error(int(np.argmax(values < 0)), column, expected)
+    table.refuse(values < 0, column, expected)
     return values

@@ -11,8 +11,7 @@ from scipy.stats import f as f_distribution
 
 from rangesfm.arrays import Array
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.ranging.clock.curve import CostCurve
-from rangesfm.ranging.clock.search import TimedRanges
+from rangesfm.ranging.clock.search import CostCurve, TimedRanges
 from rangesfm.ranging.clock.squares import MIN_RESIDUAL_M, fit_squares
 
 Rows = npt.NDArray[np.int64]

@@ -231,8 +231,7 @@ def _civil_times(table: Table, name: Mapping[str, str], notes: list[str]) -> npt
 def _stddevs(table: Table, column: str, per_metre: float) -> npt.NDArray[np.float64]:
     expected = "a positive number or nothing"
     stddevs = table.numbers(column, empty=np.nan, expected=expected) / per_metre
-    if np.any(stddevs <= 0):
-        raise table.error(int(np.argmax(stddevs <= 0)), column, expected)
+    table.refuse(stddevs <= 0, column, expected)
     return stddevs
 
 
@@ -241,6 +240,5 @@ def _line_of_sight(table: Table, name: Mapping[str, str]) -> npt.NDArray[np.int8
     expected = "1 (line of sight), 0 (none) or nothing"
     los = table.numbers(column, empty=-1.0, expected=expected)
     wrong = ~np.isin(los, (0.0, 1.0)) & (np.array(table.text(column, empty="")) != "")
-    if np.any(wrong):
-        raise table.error(int(np.argmax(wrong)), column, expected)
+    table.refuse(wrong, column, expected)
     return np.where(los < 0, -1, los if "los" in name else 1 - los).astype(np.int8)
