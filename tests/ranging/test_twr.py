@@ -141,7 +141,9 @@ def test_log_of_single_sided_stamps_under_other_names_and_units(tmp_path: Path) 
     options = StampOptions(unit_s=DW1000_TICK_S, propagation_speed_m_per_s=VACUUM_M_PER_S, t_off_s=1e-9)
     stamps = first_four(simulate(options, rate_of_a=1.0, rate_of_b=1.0))
     path = write_stamps(tmp_path / "log.csv", stamps, {"tx1": "sent"})
-    log = read_ranges(path, columns={**COLUMNS, "tx1": "sent"}, stamps=options)
+    log = read_ranges(
+        path, columns={**COLUMNS, "tx1": "sent"}, stamp_unit="ticks", propagation_speed="vacuum", t_off_s=1e-9
+    )
     np.testing.assert_allclose(log.range_m, RANGES_M, CRYSTAL, TENTH_OF_A_MILLIMETRE)
 
 

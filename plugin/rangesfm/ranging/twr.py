@@ -12,10 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.errors import InputError
+from rangesfm.options import LogOptions
 
 VACUUM_M_PER_S = 299_792_458.0
 AIR_M_PER_S = 299_702_547.0  # refractive index 1.0003, as radio firmware assumes
 DW1000_TICK_S = 1 / (499.2e6 * 128)
+_UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "ticks": DW1000_TICK_S}
 _MAX_RATE_DIFFERENCE = 1e-3  # fifty times what crystals of 20 ppm can do
 
 
@@ -35,6 +37,17 @@ class StampOptions:
     wrap_s: float = 2**32 * DW1000_TICK_S
     propagation_speed_m_per_s: float = AIR_M_PER_S
     t_off_s: float = 0.0
+
+    @classmethod
+    def of(cls, options: LogOptions) -> StampOptions:
+        speeds: dict[str | float, float] = {"air": AIR_M_PER_S, "vacuum": VACUUM_M_PER_S}
+        speed = options.propagation_speed
+        return cls(
+            unit_s=_UNITS_S[options.stamp_unit],
+            wrap_s=2**options.stamp_bits * DW1000_TICK_S,
+            propagation_speed_m_per_s=speeds[speed] if speed in speeds else float(speed),
+            t_off_s=options.t_off_s,
+        )
 
     def interval_s(self, later: npt.ArrayLike, earlier: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Seconds from ``earlier`` to ``later`` on one clock, in [0, wrap_s)."""

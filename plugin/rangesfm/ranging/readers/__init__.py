@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from rangesfm.errors import InputError
 from rangesfm.files.tables import read_head
+from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.noise_of_log import find_quantization_m, quantization_stddev_m
 from rangesfm.ranging.log import RangeLog
@@ -20,9 +22,6 @@ from rangesfm.ranging.readers.reader import Reader, ReadOptions
 from rangesfm.ranging.readers.roles import tell_roles
 from rangesfm.ranging.readers.several import files_of_log, join_logs
 from rangesfm.ranging.readers.table import MAPPED, PRESETS, TABLE, table_reader
-from rangesfm.ranging.readers.times import TIMESTAMP_UNITS
-from rangesfm.ranging.readers.units import UNITS_PER_METRE
-from rangesfm.ranging.twr import StampOptions
 
 __all__ = ["find_log_reader", "read_anchors_in_log", "read_ranges", "reader_names", "write_ranges_csv"]
 
@@ -36,33 +35,22 @@ def reader_names() -> tuple[str, ...]:
 
 def read_ranges(
     path: str | Path | Sequence[str | Path],
+    options: LogOptions | None = None,
     *,
-    format: str | None = None,
-    columns: Mapping[str, str] | None = None,
-    timestamp_unit: str | None = None,
-    range_unit: str | None = None,
-    separator: str | None = None,
     anchor_ids: Collection[str] = (),
     tag_ids: Collection[str] = (),
-    ranging_interval_s: float | None = None,
-    stamps: StampOptions | None = None,
+    **said: Any,
 ) -> RangeLog:
     """Read a radio's log.
 
     Args:
         path: a file; or several, a folder of them, or a pattern as ``uwb_*.csv``, one an anchor say.
-        format: one of ``reader_names()``; None: "mapped" with ``columns``, else recognised by content.
-        columns: name in the file (or number, in one without names) of ``timestamp`` (or ``image_name``),
-            ``anchor_id``, ``range`` and, where it has them, ``tag_id``, ``range_stddev``, ``los`` and others of
-            ``columns.QUANTITIES``; a column an anchor: ``range:A1``, or ``range:A1:T0`` with the tag; without
-            ``range``, the time stamps ``tx1``, ``rx1``, .. of two-way ranging, where they have other names than these.
-        timestamp_unit: s, ms, us, ns or iso; None: what the format, the column's name or its values say.
-        range_unit: m, cm or mm; None: what the format, the column's name or its values say.
-        separator: between cells (a blank: any run of blanks); None: told from the rows.
+        options: how to take it.
         anchor_ids, tag_ids: known anchors and tags, which tell them apart where the log does not, and ranges
             between two of a kind from those between a tag and an anchor.
-        ranging_interval_s: time between two rounds, for radios that count rounds where nobody wrote times.
-        stamps: how those time stamps become ranges; None: nanoseconds of a 32-bit DW1000, through air.
+        said: single ones of the options: ``format``, one of ``reader_names()``; ``columns``, the name in the file of
+            each of ``columns.QUANTITIES``, of a column an anchor as ``range:A1``, or ``range:A1:T0`` with the tag; and
+            all others.
 
     Returns:
         All ranges in the order of the log, those that are not positive (no measurement) counted and left out; its
@@ -74,26 +62,10 @@ def read_ranges(
             (its advice says what to type), broken, or without any usable range.
     """
     paths = _paths(path)
-    for what, given, choices in (
-        ("timestamp_unit", timestamp_unit, TIMESTAMP_UNITS),
-        ("range_unit", range_unit, tuple(UNITS_PER_METRE)),
-    ):
-        if given not in (None, *choices):
-            raise InputError(f"{what} is '{given}', expected one of {', '.join(choices)}", paths[0])
-    if ranging_interval_s is not None and not 0 < ranging_interval_s < float("inf"):
-        message = f"ranging_interval_s is {ranging_interval_s}, expected a positive number of seconds"
-        raise InputError(message, paths[0])
-    options = ReadOptions(
-        columns=dict(columns or {}),
-        timestamp_unit=timestamp_unit,
-        range_unit=range_unit,
-        separator=separator,
-        ranging_interval_s=ranging_interval_s,
-        stamps=stamps or StampOptions(),
-        given=[str(one) for one in paths],
-    )
-    chosen = _choose_readers(paths, options, format or ("mapped" if columns else None))
-    logs = [reader.read(file, options) for file, reader in chosen]
+    table = {} if options is None else {name: getattr(options, name) for name in LogOptions.model_fields}
+    reading = ReadOptions(**{**table, **said, "given": tuple(map(str, paths))})
+    chosen = _choose_readers(paths, reading, reading.format or ("mapped" if reading.columns else None))
+    logs = [reader.read(file, reading) for file, reader in chosen]
     source = paths[0] if len(paths) == 1 else paths[0].parent
     log = logs[0] if len(logs) == 1 else join_logs(logs, source)
     log = tell_roles(log, chosen[0][1].sides, known_anchor_ids=anchor_ids, known_tag_ids=tag_ids)

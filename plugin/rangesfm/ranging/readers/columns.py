@@ -179,7 +179,7 @@ def _ids(table: Table, column: str, columns: Columns, empty: str | None) -> Cate
 def _ranges(table: Table, name: Mapping[str, str], columns: Columns, options: ReadOptions) -> npt.NDArray[np.float64]:
     """(n,) in the unit of the file, those of a row after each other; not positive: no measurement."""
     if "range" not in name and not columns.wide:
-        return _ranges_by_stamps(table, name, options.stamps)
+        return _ranges_by_stamps(table, name, StampOptions.of(options))
     unit = " of metres" if options.range_unit in (None, "m") else f" of {options.range_unit}"
     empty, expected = None if columns.is_strict else 0.0, f"a positive number{unit}; 0 means no measurement"
     names = columns.wide or [name["range"]]

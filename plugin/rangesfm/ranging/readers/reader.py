@@ -4,39 +4,23 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 from rangesfm.errors import InputError
+from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.roles import Sides
-from rangesfm.ranging.twr import StampOptions
 
 
-@dataclass(frozen=True)
-class ReadOptions:
-    """What the user says about a log; None and empty: what the format says.
+class ReadOptions(LogOptions):
+    """What the user says about a log."""
 
-    Attributes:
-        columns: name in the file of each quantity (``columns.QUANTITIES``).
-        timestamp_unit: s, ms, us, ns or iso.
-        range_unit: m, cm or mm.
-        separator: between cells; a blank means any run of blanks.
-        ranging_interval_s: time between two rounds, of radios that count them instead of telling times.
-        stamps: how time stamps of two-way ranging become ranges.
-        given: what the user called the log.
-    """
-
-    columns: Mapping[str, str] = field(default_factory=dict)
-    timestamp_unit: str | None = None
-    range_unit: str | None = None
-    separator: str | None = None
-    ranging_interval_s: float | None = None
-    stamps: StampOptions = field(default_factory=StampOptions)
-    given: Sequence[str] = ()
+    given: tuple[str, ...] = ()
+    """What the user calls it."""
 
     def command(self, path: Path, **more: str) -> str:
         """What to type to read the log with these options and some more."""

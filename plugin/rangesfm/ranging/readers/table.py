@@ -83,7 +83,7 @@ def _question(path: Path, options: ReadOptions, layout: Layout | None, guess: Gu
         return InputError(f"not a known log format, and no table; it begins with '{first_line}'", path)
     found = f"found: {len(layout.columns)} columns: {', '.join(described(layout.columns))}"
     told = {**guess.told, **dict.fromkeys(guess.missing, "NAME")}
-    command = replace(options, columns=told).command(path)
+    command = options.changed(columns=told).command(path)
     closest = ", ".join(f"{quantity} = {name}" for quantity, name in guess.told.items()) or "none"
     why = "; ".join([*(f"no column seems to be the {missing}" for missing in guess.missing), *guess.doubts])
     return InputError(

@@ -11,7 +11,6 @@ from rangesfm.errors import InputError
 from rangesfm.ranging.readers.reader import ReadOptions
 
 SECONDS_PER_UNIT = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-TIMESTAMP_UNITS = (*SECONDS_PER_UNIT, "iso")
 ISO_TIME = re.compile(
     r"(\d{4})[-/.](\d\d?)[-/.](\d\d?)[T _](\d\d?:\d\d(?::\d\d(?:[.,]\d{1,18})?)?) ?(Z|UTC|[+-]\d\d(?::?\d\d)?(?!\d))?",
     re.ASCII,
