@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
+from unittest.mock import patch
 
 import numpy as np
 import numpy.typing as npt
@@ -11,16 +13,19 @@ from scipy.spatial.transform import Rotation
 from tests.simulated.path import loop_path
 from tests.studies.scale_coverage import drifting, error_curve
 
+from rangesfm.colmap.reprojection import PointErrors
 from rangesfm.demo.ranges import CameraPath
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.similarity import align_points
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.observations import RangeStatus
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
+from rangesfm.scale.range_equation import RangeProblem, RangeState
+from rangesfm.trust.finished_map import by_similarity, doubts_of_map
 from rangesfm.trust.ranges_on_map import RangesOnMap, ranges_on_map
 from rangesfm.trust.verdict import TrustVerdict, trust_in
 
@@ -57,7 +62,7 @@ SITES = (
         {"A1": (0.3, 0.2, 3.9), "A2": (19.6, 0.4, 1.2), "A3": (19.4, 13.6, 4.2), "A4": (0.2, 13.4, 0.9),
          "A5": (9.8, 0.1, 2.6), "A6": (10.1, 13.8, 0.4)},
         "site",
-        5.0,
+        1.5,
         0.06,
         (0.06, -0.15, -0.04),
     ),
@@ -69,7 +74,7 @@ SITES = (
         ),
         {"N": (2.0, 17.0, 4.5), "E": (19.0, 1.5, 0.6), "S": (-3.0, -15.5, 3.2), "W": (-18.0, 2.0, 1.4)},
         "site",
-        3.0,
+        1.5,
         0.1,
         (0.1, -0.25, 0.02),
     ),
@@ -81,7 +86,7 @@ SITES = (
         ),
         {"B": (4.0, -5.0, 1.0)},
         "unknown",
-        10.0,
+        8.0,
         0.08,
         (0.02, 0.12, -0.06),
     ),
@@ -90,7 +95,10 @@ SITES = (
 
 @dataclass
 class Given:
-    """What a surveyor hands over, right or wrong; times in seconds of the camera's clock."""
+    """What a surveyor hands over, right or wrong, and the truth; times in seconds of the camera's clock.
+
+    ``needs_search``: the truth is no start for the scale's solution.
+    """
 
     trajectory: Trajectory
     anchors_m: dict[str, Array]
@@ -102,8 +110,10 @@ class Given:
     tags_m: Array
     true_anchors_m: dict[str, Array]
     world_from_cam: Array
-    path: CameraPath
+    true_centers_m: Array
+    metres_per_unit: float = METRES_PER_UNIT
     time_offset_s: float = 0.0
+    needs_search: bool = False
 
     @property
     def ids(self) -> list[str]:
@@ -126,7 +136,7 @@ def surveyed(site: Site, seed: int) -> Given:
     anchors = {name: np.array(at) for name, at in site.anchors_m.items()}
     given = Given(
         mapped(path, rng), dict(anchors), site.frame, np.array(site.tag_in_cam_m), times, anchor, np.zeros(len(times)),
-        tags, anchors, world_from_cam, path,
+        tags, anchors, world_from_cam, path.centers(np.arange(path.start_s, path.end_s, 0.5)),
     )  # fmt: skip
     given.range_m = distances(given) + radio_errors(given, site.stddev_m, rng)
     return given
@@ -170,6 +180,7 @@ def radio_errors(given: Given, stddev_m: float, rng: np.random.Generator) -> Arr
 class Run:
     """One survey as it went; None where the scale was refused."""
 
+    given: Given
     estimate: ScaleEstimate | None
     trust: TrustVerdict | None
     on_map: RangesOnMap | None = None
@@ -181,11 +192,31 @@ class Run:
         if self.estimate is None:
             return False
         low, high = self.estimate.interval_95
-        return not low <= METRES_PER_UNIT <= high
+        return not low <= self.given.metres_per_unit <= high
+
+    @property
+    def doubts(self) -> list[str]:
+        """All that speaks against the map, as a survey that is not refined has it."""
+        assert self.estimate is not None
+        assert self.trust is not None
+        no_points = PointErrors(np.zeros(0), np.zeros((0, 3)), np.inf)
+        of_map = doubts_of_map(self.estimate, None, None, no_points, 0.1, noise_is_given=False)
+        of_scale = self.estimate.reasons if self.estimate.verdict != "good" else ()
+        return [*self.trust.reasons, *of_scale, *(doubt.reason for doubt in of_map)]
+
+    @property
+    def place_in_stddevs(self) -> float:
+        """How far the middle of the map is out of place, in its stated stddevs; 0 without a place."""
+        if self.estimate is None or self.estimate.placement is None:
+            return 0.0
+        centers_m = self.estimate.metric_from_sfm.apply(self.given.trajectory.centers)
+        of_map, _ = by_similarity(self.estimate.placement, centers_m)
+        off_m = np.nanmean(centers_m - self.given.true_centers_m, axis=0)
+        return float(np.linalg.norm(off_m) / np.sqrt(np.trace(of_map[4:, 4:])))
 
 
 def run(given: Given, seed: int) -> Run:
-    """The scale stage and the tests after it."""
+    """The scale stage, from near the truth where that is a start, and the tests after it."""
     log = RangeLog.from_arrays(
         np.array(given.ids)[given.anchor], np.maximum(given.range_m, 0.02), timestamp_s=given.time_s
     )
@@ -193,18 +224,24 @@ def run(given: Given, seed: int) -> Run:
     anchors = [Anchor(name, None if given.frame == "unknown" else at) for name, at in given.anchors_m.items()]
     options = ScaleOptions(max_relative_stddev=0.5)
     try:
-        estimate = initialize_scale(
-            observations, given.trajectory, anchors, anchor_frame=given.frame, options=options, seed=seed
-        )
+        with nullcontext() if given.needs_search else patch("rangesfm.scale.solution.site_starts", _near_truth(given)):
+            estimate = initialize_scale(
+                observations, given.trajectory, anchors, anchor_frame=given.frame, options=options, seed=seed
+            )
     except GeometryError as error:
-        return Run(None, None, refusal=str(error))
-    on_map = ranges_on_map(
-        estimate.observations, given.trajectory, estimate.metric_from_sfm, estimate.anchors, estimate.errors,
-        by_status(estimate), frame_is_free=estimate.frame == "site",
-    )  # fmt: skip
-    return Run(estimate, trust_in(on_map, seed=seed), on_map)
+        return Run(given, None, None, refusal=str(error))
+    on_map = ranges_on_map(estimate.problem, estimate.solution, estimate.observations, given.trajectory)
+    return Run(given, estimate, trust_in(on_map, seed=seed), on_map)
 
 
-def by_status(estimate: ScaleEstimate) -> Array:
-    """(n,) robust weights, as far as the statuses tell them."""
-    return np.where(estimate.observations.status <= RangeStatus.DOWN_WEIGHTED, 1.0, 0.0)
+def _near_truth(given: Given) -> Callable[[RangeProblem, int], list[RangeState]]:
+    trajectory = given.trajectory
+    first_camera = (trajectory.centers - trajectory.centers[0]) @ trajectory.world_from_cam[0]
+    is_known = np.isfinite(given.true_centers_m).all(axis=1)
+
+    def starts(problem: RangeProblem, seed: int) -> list[RangeState]:
+        anchors_m = np.where(np.isfinite(problem.anchor_mean_m), problem.anchor_mean_m, 0.0)
+        placed = align_points(first_camera[is_known], given.true_centers_m[is_known])
+        return [RangeState(placed, anchors_m, problem.bias_mean_m.copy())]
+
+    return starts

@@ -1,26 +1,39 @@
 """How often a mistake in a survey is found and rightly named, and how often a clean survey is doubted.
 
-Run: python -m tests.studies.mistakes [--num_seeds 20] [--num_clean 70] [--seed 0] [--surveys hall] [--kinds anchor]
-     [--quick] [--verbose]
+Run: python -m tests.studies.mistakes --out FILE [--num_seeds 20] [--num_clean 67] [--surveys hall] [--kinds anchor]
+     [--room FOLDER --model FOLDER]
+     python -m tests.studies.mistakes --out FILE --report
 
 Three simulated surveys without photos, whose path is the true one with a smooth bend: a hall with six surveyed
-anchors, a yard with four, a drone with one unknown anchor. Errors as of real radios: white, lasting for seconds, of the
-direction, of the distance, and ranges without line of sight. First clean surveys; then each kind of mistake that the
-survey allows, of twice the size that the clean surveys say would be found. Printed for each survey and each kind: in
-how many runs the tests found a mistake, named the right one first (or in the pair that nothing tells apart), gave its
-size within three stddevs, and in how many the scale was called good and lay outside its interval.
+anchors, a yard with four, a drone with one unknown anchor; and the real room, mapped before, with a tenth of its
+ranges. Errors as of real radios: white, lasting for seconds, of the direction, of the distance, and ranges without line
+of sight. Of each seed first a clean survey, then each kind of mistake that the survey allows, of one of several sizes
+in terms of the smallest that the tests of the clean one say would be found. Each run is a line of the file, and is not
+run again where it stands there. Reported for each survey and each kind: in how many runs a mistake was found, the right
+one named first (or in the pair that nothing tells apart), the map called good, and good though its scale lies outside
+its interval or its place is more than three stddevs off.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from tests.studies.erring_surveys import SITES, X_FORWARD, Array, Given, Site, run, surveyed
+from tests.studies.erring_surveys import SITES, X_FORWARD, Array, Given, Run, run, surveyed
+from tests.studies.real_room import real_room
 
 Mistake = Callable[[Given, float, np.random.Generator], None]
+Line = dict[str, Any]
+Lines = dict[tuple[str, str, int], Line]
+CLEAN = "clean"
+# Times the smallest size that is found; twice that is what must be found.
+FACTORS = (2.0, 1.0, 2.0, 5.0)
 
 
 @dataclass(frozen=True)
@@ -29,8 +42,7 @@ class Kind:
 
     Attributes:
         name: of the kind. make: puts it into a survey, of a size.
-        size: fixed; None: twice the smallest that the clean surveys say is found, of the test ``of``.
-        of: name and subject of the test that tells the size.
+        of: name and subject of the test whose smallest detectable size is the unit; None: there is but one size.
         right: names (with subjects where they count) of which one must be named.
     """
 
@@ -38,13 +50,11 @@ class Kind:
     make: Mistake
     right: tuple[str, ...]
     of: tuple[str, str] | None = None
-    size: float = 1.0
 
 
-def kinds(site: Site) -> list[Kind]:
-    """All that this survey allows."""
+def kinds(ids: list[str]) -> list[Kind]:
+    """All that a survey allows with these anchors in their places."""
     made: list[Kind] = []
-    ids = list(site.anchors_m) if site.frame != "unknown" else []
     for k, name in enumerate(ids[:3]):
         for axis, letter in enumerate("xyz"):
             right: tuple[str, ...] = (f"anchor place {name}", f"anchor coordinate {name} {letter}")
@@ -242,98 +252,139 @@ def _swap(first: str, second: str) -> Mistake:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--report", action="store_true", help="tell what the file holds, and run nothing")
     parser.add_argument("--num_seeds", type=int, default=20)
-    parser.add_argument("--num_clean", type=int, default=70, help="of each survey")
-    parser.add_argument("--seed", type=int, default=0, help="of the first survey")
+    parser.add_argument("--num_clean", type=int, default=67, help="of each simulated survey")
+    parser.add_argument("--seed", type=int, default=0, help="the first")
     parser.add_argument("--surveys", default="", help="only those whose name begins so")
     parser.add_argument("--kinds", default="", help="only those whose name has this in it")
-    parser.add_argument("--quick", action="store_true", help="one seed of each kind, five clean surveys")
-    parser.add_argument("--verbose", action="store_true", help="tell of each run that went wrong")
+    parser.add_argument("--room", type=Path, help="folder of the real room's data")
+    parser.add_argument("--model", type=Path, help="folder of the model of its photos")
     args = parser.parse_args()
-    if args.quick:
-        args.num_seeds, args.num_clean = 1, 5
-    total = Tally("all kinds")
-    for site in SITES:
-        if site.name.startswith(args.surveys):
-            smallest = clean_runs(site, args)
-            for kind in kinds(site):
-                if args.kinds in kind.name:
-                    total = total.plus(runs_of(site, kind, smallest, args))
-    print(total)
+    lines = args.out.read_text(encoding="utf-8").splitlines() if args.out.exists() else []
+    done = {(line["survey"], line["kind"], line["seed"]): line for line in map(json.loads, lines)}
+    if args.report:
+        report(list(done.values()))
+        return
+    sites = [(site.name, site.frame, list(site.anchors_m), partial(surveyed, site)) for site in SITES]
+    if args.room:
+        sites = [
+            (
+                "room",
+                "site",
+                list(real_room(args.room, args.model, 0).anchors_m),
+                partial(real_room, args.room, args.model),
+            )
+        ]
+    with args.out.open("a", encoding="utf-8") as out:
+        for seed in range(args.seed, args.seed + max(args.num_seeds, args.num_clean)):
+            for name, frame, ids, make in sites:
+                if name.startswith(args.surveys) and (seed < args.num_clean or seed < args.num_seeds):
+                    for line in runs_of_seed(name, kinds(ids if frame != "unknown" else []), make, seed, args, done):
+                        out.write(json.dumps(line) + "\n")
+                        out.flush()
 
 
-def clean_runs(site: Site, args: argparse.Namespace) -> dict[tuple[str, str], float]:
-    """The median smallest size of each test that is found."""
-    sizes: dict[tuple[str, str], list[float]] = {}
-    doubted = doubtful = wrong = refused = 0
-    for seed in range(args.seed, args.seed + args.num_clean):
-        done = run(surveyed(site, seed), seed)
-        if done.trust is None or done.estimate is None:
-            refused += 1
+def runs_of_seed(
+    survey: str, all_kinds: list[Kind], make: Callable[[int], Given], seed: int, args: argparse.Namespace, done: Lines
+) -> Iterator[Line]:
+    """Those that are not done."""
+    clean = done.get((survey, CLEAN, seed))
+    if clean is None:
+        clean = told(run(make(seed), seed), survey, CLEAN, seed)
+        yield clean
+    for number, kind in enumerate(all_kinds):
+        if args.kinds not in kind.name or (survey, kind.name, seed) in done or seed >= args.num_seeds:
             continue
-        doubted += bool(done.trust.reasons)
-        doubtful += done.estimate.verdict != "good"
-        wrong += done.is_wrong
-        if args.verbose and done.trust.reasons:
-            print(f"   clean {site.name} {seed}: {'; '.join(done.trust.reasons)}")
-        for test in done.trust.tests:
-            sizes.setdefault((test.name, test.subject), []).append(test.smallest_detectable or np.inf)
-    print(
-        f"{site.name}: {args.num_clean} clean: {doubted} doubted by the tests, {doubtful} for another reason, "
-        f"{wrong} outside the interval, {refused} refused",
-        flush=True,
-    )
-    return {key: float(np.median(values)) for key, values in sizes.items()}
+        factor, size = FACTORS[(seed + number) % len(FACTORS)], 1.0
+        if kind.of is not None:
+            smallest = (clean["smallest"] or {}).get(" ".join(kind.of).strip())
+            if smallest is None:
+                continue
+            size = factor * smallest
+        given = make(seed)
+        kind.make(given, size, np.random.default_rng([seed, 7]))
+        given.needs_search = kind.of is None
+        yield told(run(given, seed), survey, kind.name, seed, kind.right, factor if kind.of else None, size)
+
+
+def told(
+    run_: Run, survey: str, kind: str, seed: int, right: tuple[str, ...] = (), factor: float | None = None,
+    size: float | None = None,
+) -> Line:  # fmt: skip
+    """What counts of a run."""
+    line: Line = {"survey": survey, "kind": kind, "seed": seed, "factor": factor, "size": size}
+    if run_.trust is None or run_.estimate is None:
+        return {**line, "refused": run_.refusal, "smallest": None}
+    tests = run_.trust.tests
+    causes = [f"{c.name} {c.subject}".strip() for c in run_.trust.causes]
+    named = [*causes, *(f"{t.name} {t.subject}".strip() for t in tests if t.rejected and t.stddev is None)]
+    effects = [(t.effect_on_scale, f"{t.name} {t.subject}".strip()) for t in tests if t.effect_on_scale is not None]
+    return {
+        **line,
+        "refused": "",
+        "named": named,
+        "is_named": any(name == r or name.startswith(f"{r} ") for name in named for r in right),
+        "found": bool(run_.trust.reasons),
+        "doubts": run_.doubts,
+        "wrong": run_.is_wrong,
+        "place": run_.place_in_stddevs,
+        "half_width": run_.estimate.uncertainty.half_width_95,
+        "log_error": float(np.log(run_.estimate.value / run_.given.metres_per_unit)),
+        "hidden": max(effects, default=None),
+        "smallest": {f"{t.name} {t.subject}".strip(): t.smallest_detectable for t in tests} if kind == CLEAN else None,
+    }
 
 
 @dataclass(frozen=True)
 class Tally:
     """Counts of runs."""
 
-    name: str
-    num: int = 0
-    refused: int = 0
-    found: int = 0
-    named: int = 0
-    good: int = 0
-    wrong_and_good: int = 0
+    num: int
+    refused: int
+    found: int
+    named: int
+    good: int
+    wrong_and_good: int
+    displaced_and_good: int
 
-    def plus(self, other: Tally) -> Tally:
-        sums = {f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self) if f.name != "name"}
-        return replace(self, **sums)
+    @classmethod
+    def of(cls, lines: Sequence[Line]) -> Tally:
+        judged = [line for line in lines if not line["refused"]]
+        good = [line for line in judged if not line["doubts"]]
+        return cls(
+            len(lines),
+            len(lines) - len(judged),
+            sum(line["found"] for line in judged),
+            sum(line["is_named"] for line in judged),
+            len(good),
+            sum(line["wrong"] for line in good),
+            sum(line["place"] > 3 for line in good),
+        )
 
     def __str__(self) -> str:
         return (
-            f"{self.name:40}{self.num:5} runs, {self.refused:4} refused, {self.found:4} found, {self.named:4} named, "
-            f"{self.good:4} good, {self.wrong_and_good:3} of these outside the interval"
+            f"{self.num:5} runs,{self.refused:4} refused,{self.found:5} found,{self.named:5} named,{self.good:5} good, "
+            f"of these{self.wrong_and_good:3} outside the interval,{self.displaced_and_good:3} out of place"
         )
 
 
-def runs_of(site: Site, kind: Kind, smallest: dict[tuple[str, str], float], args: argparse.Namespace) -> Tally:
-    size = kind.size if kind.of is None else 2 * smallest.get(kind.of, np.inf)
-    tally = Tally(f"{site.name}: {kind.name} ({size:.2g})")
-    if not np.isfinite(size):
-        print(f"{tally.name}: nothing can find it", flush=True)
-        return tally
-    for seed in range(args.seed, args.seed + args.num_seeds):
-        given = surveyed(site, seed)
-        kind.make(given, size, np.random.default_rng([seed, 7]))
-        done = run(given, seed)
-        if done.trust is None or done.estimate is None:
-            tally = tally.plus(Tally("", num=1, refused=1))
-            if args.verbose:
-                print(f"   {tally.name} {seed}: refused: {done.refusal}")
-            continue
-        named = {f"{c.name} {c.subject}".strip() for c in done.trust.causes}
-        named |= {f"{t.name} {t.subject}".strip() for t in done.trust.tests if t.rejected and not t.stddev}
-        is_named = any(name == right or name.startswith(f"{right} ") for name in named for right in kind.right)
-        is_good = not done.trust.reasons and done.estimate.verdict == "good"
-        if args.verbose and not is_named:
-            print(f"   {tally.name} {seed}: {'; '.join(done.trust.reasons) or 'nothing found'}")
-        found = bool(done.trust.reasons)
-        tally = tally.plus(Tally("", 1, 0, int(found), int(is_named), int(is_good), int(is_good and done.is_wrong)))
-    print(tally, flush=True)
-    return tally
+def report(lines: list[Line]) -> None:
+    """By kind and survey, by size, and in all."""
+    made = [line for line in lines if line["kind"] != CLEAN]
+    for survey in dict.fromkeys(line["survey"] for line in lines):
+        clean = [line for line in lines if line["kind"] == CLEAN and line["survey"] == survey]
+        widths = [line["half_width"] for line in clean if not line["refused"]]
+        print(f"{survey}: {'clean':34}{Tally.of(clean)}; median half width {100 * np.median(widths):.2f} %")
+        for name in dict.fromkeys(line["kind"] for line in made if line["survey"] == survey):
+            own = [line for line in made if (line["survey"], line["kind"]) == (survey, name)]
+            print(f"{survey}: {name:34}{Tally.of(own)}")
+    for factor in [None, *sorted(set(FACTORS))]:
+        which = "of one size" if factor is None else f"of {factor} times the smallest detectable size"
+        print(f"{which:40}{Tally.of([line for line in made if line['factor'] == factor])}")
+    print(f"{'all mistakes':40}{Tally.of(made)}")
+    print(f"{'all clean':40}{Tally.of([line for line in lines if line['kind'] == CLEAN])}")
 
 
 if __name__ == "__main__":

@@ -67,7 +67,7 @@ def test_baardas_number() -> None:
 
 def test_all_together_alarm_for_nothing_as_seldom_as_they_say(problem: Linearized) -> None:
     rng, num = np.random.default_rng(1), 150
-    factor, tried = np.linalg.cholesky(problem.covariance_m2), hypotheses(problem)
+    factor, tried = np.linalg.cholesky(problem.errors.covariance_m2), hypotheses(problem)
     thresholds = [test.threshold for test in Factorization(problem).test(tried, 0)]
     alarms = 0
     for _ in range(num):

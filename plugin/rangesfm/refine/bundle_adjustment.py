@@ -186,7 +186,7 @@ def _settle_radio(problem: BundleAdjustment) -> None:
     """Solve for what is estimated beside the map alone."""
     metric, ceres_problem = problem.metric, problem.adjuster.problem
     blocks = [pose_of(metric.frame(frame_id)).params for frame_id in metric.reg_frame_ids()]
-    blocks += [rig.sensor_from_rig(sensor).params for rig in metric.rigs.values() for sensor in rig.non_ref_sensors]
+    blocks += [pose.params for rig in metric.rigs.values() for pose in rig.non_ref_sensors.values() if pose is not None]
     blocks += [camera.params for camera in metric.cameras.values()]
     blocks += [point.xyz for point in metric.points3D.values()]
     held = [

@@ -11,6 +11,8 @@ from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.observations import RangeObservations
+from rangesfm.scale.problem import ScaleProblem
+from rangesfm.scale.solution import Solution
 from rangesfm.scale.two_candidate import TwoCandidate
 
 NORMAL_95 = 1.96
@@ -93,6 +95,7 @@ class ScaleEstimate:
         observations: all ranges, with status by their final weight.
         errors: of all n ranges of the log, as weighted; their inflation widens the formal stddev.
         noise_stddev_m: stddev of a range away from all special cases.
+        problem, solution: from which all of this was found.
         placement: (7, 7) covariance of the logarithm of the scale, of a turn (rad) and of a shift (m) of the map about
             where the first camera is, by what the ranges get wrong; None where the frame is the first camera's.
     """
@@ -112,6 +115,8 @@ class ScaleEstimate:
     observations: RangeObservations
     errors: RangeErrors
     noise_stddev_m: float
+    problem: ScaleProblem
+    solution: Solution
     placement: Array | None = None
 
     @property

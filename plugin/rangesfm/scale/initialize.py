@@ -61,9 +61,9 @@ def initialize_scale(
     table = _paper_table(solution)
     rotations = model_from_cam(observations, trajectory, problem)
     learned = learned_errors(problem, solution, observations, rotations)
-    uncertainty = scale_uncertainty(solution, learned)
+    uncertainty = scale_uncertainty(problem, solution, learned)
     per_anchor = scale_per_anchor(solution, observations.log.anchor_ids)
-    covariance = parameter_covariance(solution.fit, solution.problem, learned)
+    covariance = parameter_covariance(solution, learned)
     found = anchor_estimates(solution, observations.log.anchor_ids, covariance)
     tests = cutoff_test(solution)
     judged = judge(problem, solution, uncertainty, per_anchor, found, tests, options)
@@ -93,6 +93,8 @@ def initialize_scale(
         observations=replace(observations, status=status),
         errors=replace(solution.errors, learned=learned).spread(problem.rows, len(observations.log)),
         noise_stddev_m=solution.noise_stddev_m,
+        problem=problem,
+        solution=solution,
         placement=placement_covariance(solution, covariance),
     )
 

@@ -191,5 +191,5 @@ def _given_m(on_map: RangesOnMap) -> Mapping[str, Array]:
 
 def _lever_arms_m(on_map: RangesOnMap) -> Mapping[str, Array]:
     """As given, by the first range of each tag."""
-    arms = np.einsum("nji,nj->ni", on_map.world_from_cam, on_map.problem.tag_from_center)
+    arms = np.einsum("nji,nj->ni", on_map.model_from_cam, on_map.problem.tag_from_center)
     return {on_map.tag_ids[k]: np.median(arms[on_map.tag_index == k], axis=0) for k in np.unique(on_map.tag_index)}

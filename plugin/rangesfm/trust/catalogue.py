@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from rangesfm.arrays import Array, Mask
-from rangesfm.trust.hypothesis import Correction, Effect, Hypothesis, of_anchor_place, of_bias, of_cells
+from rangesfm.trust.hypothesis import Correction, Effect, Hypothesis, of_anchor_place, of_cells
 from rangesfm.trust.linearized import Linearized
 
 _AXES = "xyz"
@@ -19,9 +19,9 @@ _MEASURE_AGAIN = "measure it again, or run with it unknown (leave its coordinate
 
 def anchor_places(problem: Linearized) -> Iterator[Hypothesis]:
     """An anchor is not where its coordinates say."""
-    given_m = problem.on_map.given_m
+    given_m = problem.on_map.problem.anchor_mean_m
     for k, name in enumerate(problem.on_map.anchor_ids):
-        found = of_anchor_place(problem, k, np.eye(3)) if np.any(problem.anchor_index == k) else None
+        found = of_anchor_place(problem, k, np.eye(3)) if np.any(problem.cells.anchor_index == k) else None
         if found is None:
             continue
 
@@ -79,7 +79,7 @@ def anchor_places(problem: Linearized) -> Iterator[Hypothesis]:
 
 def anchor_biases(problem: Linearized) -> Iterator[Hypothesis]:
     """The ranges of one anchor, or of all, are off by a constant, by more than is usual."""
-    heard = np.unique(problem.anchor_index).tolist()
+    heard = np.unique(problem.cells.anchor_index).tolist()
     if len(heard) > 1:
         for k in heard:
             yield _bias(problem, [k], problem.on_map.anchor_ids[k], f"anchor {problem.on_map.anchor_ids[k]}")
@@ -103,7 +103,7 @@ def _bias(problem: Linearized, anchors: list[int], subject: str, whose: str) -> 
         remedy="calibrate the radio's delay (range_bias_m in the anchors' file), or look for what stands in the way",
         correction=correction,
         is_linear=True,
-        effect=of_bias(problem, anchors),
+        effect=of_cells(problem, -np.isin(problem.cells.anchor_index, anchors).astype(np.float64)),
     )
 
 
@@ -125,9 +125,9 @@ def range_shares(problem: Linearized) -> Iterator[Hypothesis]:
         is_linear=True,
         effect=of_cells(problem, by_distance),
     )
-    heard = np.unique(problem.anchor_index)
+    heard = np.unique(problem.cells.anchor_index)
     for k in heard if len(heard) > 1 else []:
-        is_of, of_ranges = problem.anchor_index == k, problem.on_map.problem.anchor_index == k
+        is_of, of_ranges = problem.cells.anchor_index == k, problem.on_map.problem.anchor_index == k
         mean = problem.gradient.distance_m[is_of].mean()
 
         def of_one(size: Array, name: str = problem.on_map.anchor_ids[k]) -> str:
@@ -152,7 +152,7 @@ def range_shares(problem: Linearized) -> Iterator[Hypothesis]:
 
 def anchors_in_another_scale(problem: Linearized) -> Iterator[Hypothesis]:
     """The anchors' coordinates are in a unit that is not quite the metre."""
-    given_m = problem.on_map.given_m
+    given_m = problem.on_map.problem.anchor_mean_m
     known = np.flatnonzero(np.isfinite(given_m).all(axis=1))
     if len(known) < 2:
         return
@@ -184,8 +184,8 @@ def anchors_in_another_scale(problem: Linearized) -> Iterator[Hypothesis]:
 
 def heights_never_measured(problem: Linearized) -> Iterator[Hypothesis]:
     """All anchors are given one height, and do not have it."""
-    given_m, ids = problem.on_map.given_m, problem.on_map.anchor_ids
-    heard = np.unique(problem.anchor_index)
+    given_m, ids = problem.on_map.problem.anchor_mean_m, problem.on_map.anchor_ids
+    heard = np.unique(problem.cells.anchor_index)
     known = heard[np.isfinite(given_m[heard]).all(axis=1)]
     if len(known) < 3 or np.ptp(given_m[known, 2]) > _SAME_HEIGHT_M:
         return
@@ -215,9 +215,9 @@ def heights_never_measured(problem: Linearized) -> Iterator[Hypothesis]:
 
 def lever_arms(problem: Linearized) -> Iterator[Hypothesis]:
     """The tag is elsewhere on the camera."""
-    for k in np.unique(problem.tag_index).tolist():
+    for k in np.unique(problem.cells.tag_index).tolist():
         name = problem.on_map.tag_ids[k] if len(problem.on_map.tag_ids) > 1 else ""
-        columns = np.where((problem.tag_index == k)[:, None], -problem.by_lever_arm, 0.0)
+        columns = np.where((problem.cells.tag_index == k)[:, None], -problem.by_lever_arm, 0.0)
 
         def words(size: Array, name: str = name) -> str:
             of_tag = f" of tag {name}" if name else ""

@@ -19,10 +19,10 @@ def corrected(on_map: RangesOnMap, correction: Correction) -> RangesOnMap:
         mean_m[k] = np.full(3, np.nan) if position is None else position
         anchors_m[k] = anchors_m[k] if position is None else position
     moves = np.array([correction.tag_moves_m.get(tag, np.zeros(3)) for tag in on_map.tag_ids])
-    turned = np.einsum("nij,nj->ni", on_map.world_from_cam, moves[on_map.tag_index])
+    turned = np.einsum("nij,nj->ni", on_map.model_from_cam, moves[on_map.tag_index])
     centers, range_m = problem.centers, problem.range_m
-    if on_map.velocity_m_per_s is not None:
-        centers = centers + on_map.velocity_m_per_s * np.reshape(correction.time_shift_s, (-1, 1))
+    if on_map.velocity is not None:
+        centers = centers + on_map.velocity * np.reshape(correction.time_shift_s, (-1, 1))
     if correction.longer_m is not None:
         range_m = range_m - correction.longer_m
     problem = replace(

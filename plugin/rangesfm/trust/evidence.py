@@ -13,16 +13,16 @@ from rangesfm.trust.table import MistakeTest
 _MOST_NOISE_M, _MOST_LASTING_M = 0.25, 0.25
 # In metres for a metre of distance: a radio on 70 m is noisier than one in a room.
 _NOISE_BY_DISTANCE = 0.005
+_LASTING = ("time", "long_time")
 _LEAST_USED, _MOST_OUTLYING = 0.4, 0.35
 _FEW_OBSTRUCTED = "place the anchors where nothing stands between them and the path"
 
 
 def evidence(problem: Linearized) -> Iterator[MistakeTest]:
     """Of the noise as learnt beside the likeliest mistake, and of each anchor's ranges."""
-    if problem.noise is not None:
-        far = _NOISE_BY_DISTANCE * float(problem.gradient.distance_m.mean())
-        yield _noise("range noise", problem.cells.scatter_m, _MOST_NOISE_M + far, "scatter")
-        yield _noise("lasting errors", problem.noise.stddev_m["lasting"], _MOST_LASTING_M + far, "err for seconds")
+    far = _NOISE_BY_DISTANCE * float(problem.gradient.distance_m.mean())
+    yield _noise("range noise", problem.scatter_m, _MOST_NOISE_M + far, "scatter")
+    yield _noise("lasting errors", _lasting_m(problem), _MOST_LASTING_M + far, "err for seconds")
     index, cells = problem.on_map.problem.anchor_index, problem.cells
     for k in np.unique(index):
         is_of, name = index == k, problem.on_map.anchor_ids[k]
@@ -36,7 +36,7 @@ def evidence(problem: Linearized) -> Iterator[MistakeTest]:
             f"only {round((1 - unused) * num)} of {num} ranges to anchor {name} fit the map",
             "look whether it is the anchor that it is taken for, and where it stands",
         )
-        outlying = float(np.mean(cells.weights[is_of] == 0))
+        outlying = float(np.mean(cells.weight[is_of] < 0.5))
         yield _share(
             "anchor's outliers",
             name,
@@ -45,6 +45,13 @@ def evidence(problem: Linearized) -> Iterator[MistakeTest]:
             f"{100 * outlying:.0f} % of the ranges to anchor {name} are far from those right before and after",
             _FEW_OBSTRUCTED,
         )
+
+
+def _lasting_m(problem: Linearized) -> float:
+    """Root mean square over cells."""
+    lasting = np.isin(problem.errors.names, _LASTING)
+    variances = np.trace(problem.errors.covariances_m2[lasting].sum(axis=0))
+    return float(np.sqrt(variances / len(problem.cells)))
 
 
 def _noise(name: str, stddev_m: float, most_m: float, what: str) -> MistakeTest:

@@ -102,18 +102,11 @@ def of_anchor_place(problem: Linearized, anchor: int, directions: Array) -> Effe
     given = problem.on_map.problem
     if not np.isfinite(given.anchor_mean_m[anchor]).all() or not np.isfinite(given.anchor_stddev_m[anchor]):
         return None
-    column = problem.columns.anchor[anchor]
-    if column < 0:
-        is_of = (problem.anchor_index == anchor)[:, None]
+    if problem.columns.anchor[anchor] < 0:
+        is_of = (problem.cells.anchor_index == anchor)[:, None]
         return of_cells(problem, np.where(is_of, problem.gradient.by_tag @ directions, 0.0))
-    priors = problem.prior_design[:, column : column + 3] * problem.is_anchor_prior[:, None]
-    return Effect(np.zeros((len(problem.residual_m), directions.shape[1])), priors @ directions)
-
-
-def of_bias(problem: Linearized, anchors: list[int]) -> Effect:
-    """That the ranges of some anchors all read too long, by one number."""
-    fixed = [k for k in anchors if problem.columns.bias[k] < 0]
-    free = [problem.columns.bias[k] for k in anchors if problem.columns.bias[k] >= 0]
-    columns = -np.isin(problem.anchor_index, fixed).astype(np.float64)
-    priors = problem.prior_design[:, free].sum(axis=1) * problem.is_bias_prior
-    return Effect(columns[:, None], priors[:, None])
+    has_rows = (problem.columns.anchor >= 0) & np.isfinite(given.anchor_stddev_m)
+    row = 3 * np.count_nonzero(has_rows[:anchor])
+    priors = np.zeros((problem.num_priors, directions.shape[1]))
+    priors[row : row + 3] = directions / given.anchor_stddev_m[anchor]
+    return Effect(np.zeros((len(problem.residual_m), directions.shape[1])), priors)

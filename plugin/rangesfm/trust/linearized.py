@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.ranging.errors.cells import Cells, cells, noisiness
+from rangesfm.ranging.errors.learned import LearnedErrors, learn_errors, usual_errors
+from rangesfm.ranging.errors.noise import MIN_STDDEV_M, robust_stddev
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.scale.range_equation import (
     Columns,
@@ -19,119 +21,162 @@ from rangesfm.scale.range_equation import (
     range_jacobian,
     tag_positions,
 )
-from rangesfm.trust.cells import Cells
-from rangesfm.trust.random_errors import RandomErrors
 from rangesfm.trust.ranges_on_map import RangesOnMap
+
+# The tests learn the errors many times over: fewer cells than an interval has.
+_MAX_NUM_CELLS = 160
+_NUM_NEIGHBOURS = 8
+# In stddevs from the median of its neighbours, of which the noise is at least this: what is further off is an outlier
+# among them. A radio may repeat itself to a centimetre and err by ten from one place to the next.
+_OUTLYING = 3.0
+_LEAST_SCATTER_M = 0.08
+_NO_WEIGHT = 1e-6
 
 
 @dataclass(frozen=True)
 class Linearized:
-    """c cells of ranges and r priors, by p parameters.
+    """c cells of ranges and r priors, by p parameters. What ranges are off by for each anchor's sake is random.
 
     Attributes:
         residual_m: (c,) predicted minus measured. design: (c, p) its derivative.
-        prior_residual, prior_design: (r,) and (r, p), in stddevs.
-        is_anchor_prior, is_bias_prior: (r,) of which of them.
-        covariance_m2: (c, c) of all that is random in the cells.
+        prior_residual, prior_design: (r,) and (r, p), in stddevs; first those of the anchors' places.
         columns: which of the p parameters is what; the first is the logarithm of the scale.
         place: (c, 3, p) derivative of the camera's place in each cell.
-        cells: how ranges form them.
-        anchor_index, tag_index, time_s: (c,).
+        cells: how ranges form them. time_s: (c,) as of the ranges.
         gradient: of the c distances.
         by_lever_arm: (c, 3) derivative of the residual by the tag's place in the camera.
         by_time: (c,) by the clocks' offset; None without clocks.
-        by_log_scale: (c,) by the scale of the path about its middle.
-        on_map: the ranges.
-        noise: what is assumed random.
+        on_map: the ranges. scatter_m: stddev of one among its neighbours.
+        errors: what is assumed random.
     """
 
     residual_m: Array
     design: Array
     prior_residual: Array
     prior_design: Array
-    is_anchor_prior: npt.NDArray[np.bool_]
-    is_bias_prior: npt.NDArray[np.bool_]
-    covariance_m2: Array
     columns: Columns
     place: Array
     cells: Cells
-    anchor_index: npt.NDArray[np.int64]
-    tag_index: npt.NDArray[np.int64]
     time_s: Array
     gradient: RangeGradient
     by_lever_arm: Array
     by_time: Array | None
-    by_log_scale: Array
     on_map: RangesOnMap
-    noise: RandomErrors | None = None
+    scatter_m: float
+    errors: LearnedErrors
 
     @property
     def num_priors(self) -> int:
         return len(self.prior_residual)
 
-    def with_noise(self, noise: RandomErrors) -> Linearized:
-        return replace(self, covariance_m2=noise.covariance_m2, noise=noise)
+    def with_learnt_errors(self, columns: Array, priors: Array) -> Linearized:
+        """With what is left random when (c, k) columns and (r, k) priors explain what they can."""
+        # At the place where nothing speaks against what is known beforehand.
+        back = np.linalg.lstsq(self.prior_design, self.prior_residual, rcond=1e-12)[0]
+        alone = replace(self.cells, of_range=np.arange(len(self.cells)), weight=self.cells.worth)
+        curve_m = self.on_map.curve_stddev_m
+        learnt = learn_errors(
+            alone,
+            off_m=self.design @ back - self.residual_m,
+            design=np.hstack([self.design, columns]),
+            prior_design=np.hstack([self.prior_design, priors]),
+            noise_m=self.scatter_m,
+            curve_stddev_m=None if curve_m is None else self.cells.mean(curve_m),
+            ruled_out=self.on_map.ruled_out,
+        )
+        return replace(self, errors=learnt)
+
+    def with_usual_errors(self) -> Linearized:
+        """As radios and maps have them that scatter like this."""
+        return replace(self, errors=_usual(self.cells, self.on_map, self.scatter_m))
 
 
-def linearized(on_map: RangesOnMap, cells: Cells | None = None) -> Linearized:
-    """At the map's own state, with white noise alone until something is known of the rest.
+def linearized(on_map: RangesOnMap, cells_of_ranges: Cells | None = None, scatter_m: float = 0.0) -> Linearized:
+    """At the map's own state, with the errors that are usual.
 
     Args:
-        cells: None: formed by the residuals.
+        cells_of_ranges, scatter_m: as found before; None: they are found by the residuals, of whatever is not far from
+            its neighbours, however far from the map.
     """
-    problem, state = on_map.problem, on_map.state
+    problem = replace(on_map.problem, bias_stddev_m=np.zeros(on_map.problem.num_anchors))
+    state = replace(on_map.state, bias_m=problem.bias_mean_m)
     columns = columns_of([problem])[0]
-    residual_m = predicted_ranges(problem, state) - problem.range_m
-    if cells is None:
-        cells = Cells.of(residual_m, problem.anchor_index, on_map.time_s)
-    gradient = range_gradient(problem, state)
-    first = np.zeros(cells.num, dtype=np.int64)
-    first[cells.cell_of_range[::-1]] = np.arange(len(residual_m))[::-1]
+    residual_m, gradient = predicted_ranges(problem, state) - problem.range_m, range_gradient(problem, state)
+    if cells_of_ranges is None:
+        cells_of_ranges, scatter_m = _cells(on_map, residual_m, gradient)
+    mean, turned = cells_of_ranges.mean, state.metric_from_model.rotation.T
     arms = tag_positions(problem, state.metric_from_model) - state.metric_from_model.translation
-    middle = problem.centers.mean(axis=0)
     by_time = None
-    if on_map.velocity_m_per_s is not None:
-        by_time = cells.mean(np.sum(gradient.by_tag * on_map.velocity_m_per_s, axis=1))
-    num_anchor_rows, num_bias_rows = _num_prior_rows(on_map, columns)
-    kind = np.arange(len(prior_residuals(problem, columns, state)))
+    if on_map.velocity is not None:
+        velocity_m_per_s = state.metric_from_model.scale * on_map.velocity @ turned
+        by_time = mean(np.sum(gradient.by_tag * velocity_m_per_s, axis=1))
     return Linearized(
-        residual_m=cells.mean(residual_m),
-        design=cells.mean(range_jacobian(problem, columns, state, state)),
+        residual_m=mean(residual_m),
+        design=mean(range_jacobian(problem, columns, state, state)),
         prior_residual=prior_residuals(problem, columns, state),
         prior_design=prior_jacobian(problem, columns, state, state),
-        is_anchor_prior=kind < num_anchor_rows,
-        is_bias_prior=(kind >= num_anchor_rows) & (kind < num_anchor_rows + num_bias_rows),
-        covariance_m2=np.diag(cells.scatter_m**2 / cells.num_ranges),
         columns=columns,
-        place=_place(cells.mean(problem.centers), cells.mean(arms), columns),
-        cells=cells,
-        anchor_index=problem.anchor_index[first],
-        tag_index=on_map.tag_index[first],
-        time_s=cells.mean(on_map.time_s),
-        gradient=RangeGradient(cells.mean(gradient.distance_m), cells.mean(gradient.by_tag)),
-        by_lever_arm=cells.mean(gradient.by_tag_in_cam(on_map.world_from_cam)),
+        place=_place(mean(state.metric_from_model.scale * problem.centers @ turned), mean(arms), columns),
+        cells=cells_of_ranges,
+        time_s=mean(on_map.time_s),
+        gradient=RangeGradient(mean(gradient.distance_m), mean(gradient.by_tag)),
+        by_lever_arm=mean(gradient.by_tag_in_cam(on_map.world_from_cam)),
         by_time=by_time,
-        by_log_scale=cells.mean(gradient.by_log_scale(problem.centers - middle)),
         on_map=on_map,
+        scatter_m=scatter_m,
+        errors=_usual(cells_of_ranges, on_map, scatter_m),
     )
 
 
 def at_state(problem: Linearized, on_map: RangesOnMap) -> Linearized:
-    """The same cells and the same noise, linearised elsewhere, or of corrected ranges."""
-    return replace(linearized(on_map, problem.cells), covariance_m2=problem.covariance_m2, noise=problem.noise)
+    """The same cells and the same errors, linearised elsewhere, or of corrected ranges."""
+    return replace(linearized(on_map, problem.cells, problem.scatter_m), errors=problem.errors)
 
 
-def _num_prior_rows(on_map: RangesOnMap, columns: Columns) -> tuple[int, int]:
-    problem = on_map.problem
-    anchors = np.count_nonzero((columns.anchor >= 0) & np.isfinite(problem.anchor_stddev_m))
-    biases = np.count_nonzero((columns.bias >= 0) & np.isfinite(problem.bias_stddev_m))
-    return 3 * int(anchors), int(biases)
+def _usual(cells_of_ranges: Cells, on_map: RangesOnMap, scatter_m: float) -> LearnedErrors:
+    return usual_errors(
+        cells_of_ranges,
+        curve_stddev_m=on_map.curve_stddev_m,
+        ruled_out=on_map.ruled_out,
+        stddevs={"white": scatter_m},
+    )
 
 
-def _place(centers_m: Array, arms_m: Array, columns: Columns) -> Array:
-    """(c, 3, p) of the places of cameras at (c, 3) from the origin that the scale stretches them about."""
-    place = np.zeros((len(centers_m), 3, columns.num))
-    place[:, :, columns.scale] = centers_m
+def _cells(on_map: RangesOnMap, residual_m: Array, gradient: RangeGradient) -> tuple[Cells, float]:
+    index = on_map.problem.anchor_index
+    order = np.lexsort((on_map.time_s, on_map.tag_index, index))
+    off_m, scatter_m = _off_neighbours(residual_m[order], index[order])
+    is_near = np.empty(len(order), dtype=bool)
+    is_near[order] = np.abs(off_m) <= _OUTLYING * max(scatter_m, _LEAST_SCATTER_M)
+    of_ranges = cells(
+        index,
+        on_map.tag_index,
+        on_map.time_s,
+        gradient.by_tag * gradient.distance_m[:, None],
+        np.swapaxes(on_map.world_from_cam, 1, 2),
+        np.where(is_near, 1.0, _NO_WEIGHT),
+        noisiness(index[order], off_m, on_map.problem.num_anchors),
+        _MAX_NUM_CELLS,
+    )
+    return of_ranges, scatter_m
+
+
+def _off_neighbours(values: Array, anchor_index: Indices) -> tuple[Array, float]:
+    """(n,) from the lower median of a few that follow each other, and the stddev of a value; all in order."""
+    begins: Mask = np.diff(anchor_index, prepend=-1) != 0
+    since = np.arange(len(values)) - np.maximum.accumulate(np.where(begins, np.arange(len(values)), 0))
+    labels = np.cumsum(begins | (since % _NUM_NEIGHBOURS == 0)) - 1
+    counts = np.bincount(labels)
+    by_value = np.lexsort((values, labels))
+    middles = values[by_value][np.cumsum(counts) - counts + (counts - 1) // 2]
+    steps = np.diff(values)[~begins[1:]]
+    return values - middles[labels], max(robust_stddev(steps) / np.sqrt(2), MIN_STDDEV_M)
+
+
+def _place(scaled_m: Array, arms_m: Array, columns: Columns) -> Array:
+    """(c, 3, p) of the places of cameras that the scale stretches to (c, 3), their tags at (c, 3) from the origin."""
+    place = np.zeros((len(scaled_m), 3, columns.num))
+    place[:, :, columns.scale] = scaled_m
     if columns.frame >= 0:
         x, y, z = arms_m.T
         nothing = np.zeros_like(x)

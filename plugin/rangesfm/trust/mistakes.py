@@ -11,10 +11,8 @@ from rangesfm.scale.range_equation import state_after
 from rangesfm.trust.alternatives import ALTERNATIVES, Alternative, Refits
 from rangesfm.trust.catalogue import STANDING
 from rangesfm.trust.corrected import corrected
-from rangesfm.trust.hypothesis import Correction, Hypothesis
+from rangesfm.trust.hypothesis import Correction, Effect, Hypothesis, of_cells
 from rangesfm.trust.linearized import Linearized, at_state, linearized
-from rangesfm.trust.noise_model import learnt_noise, usual_noise
-from rangesfm.trust.random_errors import RandomErrors
 from rangesfm.trust.ranges_on_map import RangesOnMap
 from rangesfm.trust.scanning import SCANNING
 from rangesfm.trust.testing import Factorization, Test, overlap
@@ -77,23 +75,25 @@ def find_mistakes(on_map: RangesOnMap, *, seed: int = 0) -> Findings:
     problem = linearized(on_map)
     standing = _standing(problem)
     hypotheses = standing + [hypothesis for of_kind in SCANNING for hypothesis in of_kind(problem)]
-    problem = problem.with_noise(learnt_noise(problem, standing))
+    problem = _learnt(problem, standing)
     tests = _best_of_each(Factorization(problem).test(hypotheses, seed), problem)
     nominated = [test for test in tests if test.is_rejected and _is_possible(test)]
     is_sure = bool(nominated)
     if not nominated:
-        usual = problem.with_noise(usual_noise(problem))
+        usual = problem.with_usual_errors()
         with_usual = _best_of_each(Factorization(usual).test(hypotheses, seed), usual)
         nominated = [test for test in with_usual if test.is_rejected and _is_possible(test)]
-    if not nominated:
-        return Findings(problem, tuple(tests), ())
-    causes = _causes(problem, nominated, is_sure)
-    if not causes:
-        return Findings(problem, tuple(tests), ())
-    if causes[0].test is not None:
-        problem = problem.with_noise(learnt_noise(problem, [*standing, causes[0].test.hypothesis]))
+    causes = _causes(problem, nominated, is_sure) if nominated else []
+    if causes and causes[0].test is not None:
+        problem = _learnt(problem, [*standing, causes[0].test.hypothesis])
         tests = _best_of_each(Factorization(problem).test(hypotheses, seed), problem)
     return Findings(problem, tuple(tests), tuple(causes))
+
+
+def _learnt(problem: Linearized, explaining: Sequence[Hypothesis]) -> Linearized:
+    """With the errors that are left when some mistakes explain what they can."""
+    effects = Effect.of_all([of_cells(problem, problem.design[:, :0]), *(h.effect for h in explaining)])
+    return problem.with_learnt_errors(effects.columns, effects.priors)
 
 
 def _standing(problem: Linearized) -> list[Hypothesis]:
@@ -102,18 +102,18 @@ def _standing(problem: Linearized) -> list[Hypothesis]:
 
 def _causes(problem: Linearized, nominated: Sequence[Test], is_sure: bool) -> list[Cause]:
     """The likeliest explanation, and those as good; none if even that is no better than chance."""
-    before = learnt_noise(_settled(problem), []).deviance
+    before = Factorization(_learnt(_settled(problem), [])).deviance()
     num = len(problem.residual_m)
     causes = []
     for test in _varied(nominated):
-        again, noise = _settled_test(problem, test.hypothesis)
-        gain = before - noise.deviance
+        again, deviance = _settled_test(problem, test.hypothesis)
+        gain = before - deviance
         if _is_possible(again) and (is_sure or gain > test.threshold):
-            named = replace(_narrowed(problem, again, noise), threshold=test.threshold)
-            causes.append(_cause(named, gain, _penalty(again, num)))
+            causes.append(_cause(replace(again, threshold=test.threshold), gain, _penalty(again, num)))
     causes += _alternatives(problem, before)
     causes.sort(key=lambda cause: -cause.score)
-    return [cause for k, cause in enumerate(causes) if not k or _is_rival(causes[0], cause)][: 1 + _MAX_NUM_RIVALS]
+    likeliest = [cause for k, cause in enumerate(causes) if not k or _is_rival(causes[0], cause)]
+    return [_narrowed(problem, cause, before) for cause in likeliest[: 1 + _MAX_NUM_RIVALS]]
 
 
 def _varied(tests: Sequence[Test]) -> list[Test]:
@@ -128,8 +128,8 @@ def _is_rival(best: Cause, other: Cause) -> bool:
     return best.test is not None and other.test is not None and overlap(best.test, other.test) > _SAME
 
 
-def _settled_test(problem: Linearized, hypothesis: Hypothesis) -> tuple[Test, RandomErrors]:
-    """The test of a hypothesis with the noise that it leaves; of one that is not linear at the state that it leaves."""
+def _settled_test(problem: Linearized, hypothesis: Hypothesis) -> tuple[Test, float]:
+    """The test of a hypothesis and its deviance, with the errors that it leaves and, if not linear, at the state."""
     original, sizes, at = hypothesis, np.zeros(hypothesis.num), problem
     for _ in range(_NUM_SETTLING):
         factorized = Factorization(at)
@@ -147,19 +147,21 @@ def _settled_test(problem: Linearized, hypothesis: Hypothesis) -> tuple[Test, Ra
         standing = _standing(at)
         there = {h.key: h for h in [*standing, *(n for h in standing for n in h.narrower)]}
         hypothesis = there.get(hypothesis.key, hypothesis)
-    noise = learnt_noise(at, [hypothesis])
-    [test] = Factorization(at.with_noise(noise)).test([hypothesis], 0)
-    return replace(test, hypothesis=original, sizes=test.sizes if original.is_linear else sizes + test.sizes), noise
+    factorized = Factorization(_learnt(at, [hypothesis]))
+    [test] = factorized.test([hypothesis], 0)
+    sizes = test.sizes if original.is_linear else sizes + test.sizes
+    return replace(test, hypothesis=original, sizes=sizes), factorized.deviance(test)
 
 
-def _narrowed(problem: Linearized, test: Test, wide: RandomErrors) -> Test:
+def _narrowed(problem: Linearized, cause: Cause, before: float) -> Cause:
     """The one of fewer numbers that does as well, if there is one."""
-    if not test.hypothesis.narrower:
-        return test
-    tried = [_settled_test(problem, h) for h in test.hypothesis.narrower]
-    best, noise = min(tried, key=lambda each: each[1].deviance)
-    num = len(problem.residual_m)
-    return best if noise.deviance + _penalty(best, num) < wide.deviance + _penalty(test, num) else test
+    if cause.test is None or not cause.test.hypothesis.narrower:
+        return cause
+    tried = [_settled_test(problem, h) for h in cause.test.hypothesis.narrower]
+    best, deviance = min(tried, key=lambda each: each[1])
+    test = replace(best, threshold=cause.test.threshold)
+    narrow = _cause(test, before - deviance, _penalty(best, len(problem.residual_m)))
+    return narrow if narrow.score > cause.score else cause
 
 
 def _cause(test: Test, gain: float, penalty: float) -> Cause:
@@ -174,11 +176,12 @@ def _alternatives(problem: Linearized, before: float) -> Iterator[Cause]:
     tried = [each for of_kind in ALTERNATIVES for each in of_kind(on_map)]
     if not tried:
         return
-    refits = Refits(on_map, problem.cells.scatter_m)
+    refits = Refits(on_map, problem.scatter_m)
+    as_given, _ = refits.of(Correction())
     fits = sorted(((*refits.of(each.correction), each) for each in tried), key=lambda fit: fit[0])
-    for _, refitted, each in fits[:_NUM_TRIED]:
+    for _, refitted, each in [fit for fit in fits if fit[0] < as_given][:_NUM_TRIED]:
         moved = _settled(at_state(problem, refitted))
-        gain = before - learnt_noise(moved, []).deviance
+        gain = before - Factorization(_learnt(moved, [])).deviance()
         penalty = 2 * float(np.log(len(tried)))
         if gain > penalty + _AS_LIKELY:
             yield _cause_of(each, gain, penalty)
@@ -186,7 +189,7 @@ def _alternatives(problem: Linearized, before: float) -> Iterator[Cause]:
 
 def _settled(problem: Linearized) -> Linearized:
     """At the likeliest state."""
-    step = Factorization(problem.with_noise(usual_noise(problem))).step()
+    step = Factorization(problem.with_usual_errors()).step()
     state = state_after((problem.columns,), problem.on_map.state, step)
     return at_state(problem, replace(problem.on_map, state=state))
 

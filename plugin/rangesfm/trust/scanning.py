@@ -22,8 +22,8 @@ def anchors_moved(problem: Linearized) -> Iterator[Hypothesis]:
     for k in _heard(problem):
         name = problem.on_map.anchor_ids[k]
         for time in _times(problem, _NUM_MOVES):
-            is_after = (problem.anchor_index == k) & (problem.time_s > time)
-            is_before = (problem.anchor_index == k) & ~is_after
+            is_after = (problem.cells.anchor_index == k) & (problem.time_s > time)
+            is_before = (problem.cells.anchor_index == k) & ~is_after
             if min(is_after.sum(), is_before.sum()) < 3 * _MIN_NUM_CELLS:
                 continue
 
@@ -49,7 +49,7 @@ def steps(problem: Linearized) -> Iterator[Hypothesis]:
     """From some time on ranges read longer, those of one anchor or of all."""
     for k in [*(_heard(problem) if len(_heard(problem)) > 1 else []), None]:
         name = "" if k is None else problem.on_map.anchor_ids[k]
-        is_of = np.ones(len(problem.time_s), dtype=bool) if k is None else problem.anchor_index == k
+        is_of = np.ones(len(problem.time_s), dtype=bool) if k is None else problem.cells.anchor_index == k
         for time in _times(problem, _NUM_STEPS):
             is_after = is_of & (problem.time_s > time)
             if min(is_after.sum(), (is_of & ~is_after).sum()) < _MIN_NUM_CELLS:
@@ -79,7 +79,7 @@ def stretches(problem: Linearized) -> Iterator[Hypothesis]:
     """For a while ranges read longer."""
     for k in [*(_heard(problem) if len(_heard(problem)) > 1 else []), None]:
         name = "" if k is None else problem.on_map.anchor_ids[k]
-        is_of = np.ones(len(problem.time_s), dtype=bool) if k is None else problem.anchor_index == k
+        is_of = np.ones(len(problem.time_s), dtype=bool) if k is None else problem.cells.anchor_index == k
         for start, end in _windows(problem):
             inside = is_of & (problem.time_s >= start) & (problem.time_s < end)
             if inside.sum() < _MIN_NUM_CELLS:
@@ -131,7 +131,7 @@ def clock_jumps(problem: Linearized) -> Iterator[Hypothesis]:
 
 
 def _heard(problem: Linearized) -> list[int]:
-    heard: list[int] = np.unique(problem.anchor_index).tolist()
+    heard: list[int] = np.unique(problem.cells.anchor_index).tolist()
     return heard
 
 

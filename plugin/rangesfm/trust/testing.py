@@ -61,7 +61,7 @@ class Factorization:
 
     def __init__(self, problem: Linearized):
         self.problem = problem
-        self._factor = np.linalg.cholesky(problem.covariance_m2)
+        self._factor = np.linalg.cholesky(problem.errors.covariance_m2)
         self._basis, triangle = np.linalg.qr(self._whitened(problem.design, problem.prior_design))
         scale = np.maximum(np.abs(np.diag(triangle)), 1e-12)
         self._triangle = triangle + np.diag(np.where(np.abs(np.diag(triangle)) < 1e-9, 1e-9, 0.0) * scale)
@@ -78,10 +78,13 @@ class Factorization:
         left: Array = whitened - self._basis @ (self._basis.T @ whitened)
         return left
 
-    @property
-    def misfit(self) -> float:
-        """Sum of squares of the residuals, whitened."""
-        return float(self.residual @ self.residual)
+    def deviance(self, made: Test | None = None) -> float:
+        """-2 times the logarithm of the likelihood, up to a constant, of the errors too; if a mistake was made.
+
+        Two explanations of the same cells, each with the errors that it leaves, are compared by it.
+        """
+        squares = float(self.residual @ self.residual) - (made.statistic if made else 0.0)
+        return squares + 2 * float(np.sum(np.log(np.diag(self._factor)))) + self.problem.errors.unlikeliness
 
     def step(self, made: tuple[Effect, Array] | None = None) -> Array:
         """(p,) from the state to the likeliest one, if a mistake of some size (k,) was made."""

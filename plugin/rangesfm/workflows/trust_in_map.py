@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from rangesfm.geometry.gravity import gravity_of
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.survey.settings import Survey
 from rangesfm.trust.ranges_on_map import RangesOnMap, ranges_on_map
@@ -20,7 +19,7 @@ def tested(survey: Survey, metric: MetricResult, journal: Journal) -> MetricResu
     The scaled map is looked at, refined or not: a refinement bends a map to ranges that are wrong.
     """
     try:
-        trust = trust_in(scaled_ranges(survey, metric), seed=survey.output.seed)
+        trust = trust_in(scaled_ranges(metric), seed=survey.output.seed)
     except np.linalg.LinAlgError as error:
         journal.warn(f"mistakes were not looked for, as the ranges determine too little: {error}")
         return metric
@@ -29,16 +28,7 @@ def tested(survey: Survey, metric: MetricResult, journal: Journal) -> MetricResu
     return replace(metric, trust=trust).doubted(trust.reasons)
 
 
-def scaled_ranges(survey: Survey, metric: MetricResult) -> RangesOnMap:
+def scaled_ranges(metric: MetricResult) -> RangesOnMap:
     """The ranges on the scaled map."""
     estimate = metric.estimate
-    return ranges_on_map(
-        estimate.observations,
-        metric.trajectory,
-        estimate.metric_from_sfm,
-        estimate.anchors,
-        estimate.errors,
-        metric.scaled_weights,
-        frame_is_free=estimate.frame == "site",
-        gravity=gravity_of(survey.scale.up_in_first_camera),
-    )
+    return ranges_on_map(estimate.problem, estimate.solution, estimate.observations, metric.trajectory)

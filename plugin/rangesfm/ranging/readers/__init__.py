@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from rangesfm.errors import InputError
+from rangesfm.files.bags import is_bag_folder
 from rangesfm.files.tables import read_head
 from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
@@ -130,7 +131,7 @@ def _choose_reader(path: Path, options: ReadOptions, format: str | None) -> Read
         if named is None:
             raise InputError(f"no log format is named '{format}', expected one of {', '.join(reader_names())}", path)
         return named
-    if ros.is_bag_folder(path):
+    if is_bag_folder(path):
         return ros.READER
     head = read_head(path)
     if not head.strip():
