@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.files.tables import Categories
 
 DEFAULT_TAG_ID = "tag"
@@ -36,8 +37,8 @@ class PeerRanges(NamedTuple):
         end_ids: k pairs of their ids.
     """
 
-    rows: npt.NDArray[np.int64]
-    ends: npt.NDArray[np.int64]
+    rows: Indices
+    ends: Indices
     end_ids: tuple[tuple[str, str], ...]
 
 
@@ -69,21 +70,21 @@ class RangeLog:
     """
 
     anchor_ids: tuple[str, ...]
-    anchor_index: npt.NDArray[np.int64]
-    range_m: npt.NDArray[np.float64]
-    timestamp_s: npt.NDArray[np.float64] | None
+    anchor_index: Indices
+    range_m: Array
+    timestamp_s: Array | None
     image_name: tuple[str, ...] | None
-    range_stddev_m: npt.NDArray[np.float64]
+    range_stddev_m: Array
     tag_ids: tuple[str, ...]
-    tag_index: npt.NDArray[np.int64]
-    peer_index: npt.NDArray[np.int64]
+    tag_index: Indices
+    peer_index: Indices
     los: npt.NDArray[np.int8]
-    line: npt.NDArray[np.int64]
+    line: Indices
     source: Path | None = None
     format: str = "memory"
     num_no_measurement: int = 0
     notes: tuple[str, ...] = ()
-    shared_stddev_m: npt.NDArray[np.float64] | None = None
+    shared_stddev_m: Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.range_m)
@@ -112,7 +113,7 @@ class RangeLog:
         return kind
 
     @property
-    def own_order(self) -> npt.NDArray[np.int64]:
+    def own_order(self) -> Indices:
         """(n,) the rows by anchor, time, tag and range.
 
         The order in which the log has them has no say in what is made of them then, not by random draws and not by how
@@ -156,7 +157,7 @@ class RangeLog:
         texts = np.array(ids, dtype=object)
         return texts[first].tolist(), texts[second].tolist()
 
-    def _ends(self) -> tuple[list[str], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    def _ends(self) -> tuple[list[str], Indices, Indices]:
         """Ids of all anchors and then all tags, and (n,) and (n,) into them: both ends of each range."""
         num_anchors = len(self.anchor_ids)
         first = np.where(self.tag_index < 0, self.peer_index, num_anchors + self.tag_index)
@@ -171,13 +172,7 @@ class RangeLog:
         is_anchor = np.array([node_id in anchor_ids for node_id in node_of], dtype=bool)
         return self._between(list(node_of), is_anchor, node[first], node[second])
 
-    def _between(
-        self,
-        ids: list[str],
-        is_anchor: npt.NDArray[np.bool_],
-        first: npt.NDArray[np.int64],
-        second: npt.NDArray[np.int64],
-    ) -> RangeLog:
+    def _between(self, ids: list[str], is_anchor: Mask, first: Indices, second: Indices) -> RangeLog:
         """The same ranges between other nodes; those without ranges are forgotten."""
         swapped = is_anchor[first] & ~is_anchor[second]
         first, second = np.where(swapped, second, first), np.where(swapped, first, second)
@@ -198,7 +193,7 @@ class RangeLog:
             peer_index=index[peer],
         )
 
-    def subset(self, rows: npt.NDArray[np.int64] | npt.NDArray[np.bool_]) -> RangeLog:
+    def subset(self, rows: Indices | Mask) -> RangeLog:
         """The same log with some of its ranges; anchors and tags that are left without any are forgotten."""
         rows = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
         columns: dict[str, Any] = {

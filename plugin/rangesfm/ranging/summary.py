@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array, Mask
 from rangesfm.ranging.errors.noise_of_log import estimate_noise_m, find_quantization_m, quantization_stddev_m
 from rangesfm.ranging.log import RangeKind, RangeLog
 
@@ -114,11 +114,11 @@ def _summarize_anchor(log: RangeLog, index: int, quantization_m: float | None) -
     return LinkSummary("tag-anchor", (log.anchor_ids[index],), *_lengths(log.range_m[mine]), gap_s, noise_m)
 
 
-def _lengths(range_m: npt.NDArray[np.float64]) -> tuple[int, float, float, float]:
+def _lengths(range_m: Array) -> tuple[int, float, float, float]:
     return len(range_m), float(range_m.min()), float(np.median(range_m)), float(range_m.max())
 
 
-def _noise(log: RangeLog, mine: npt.NDArray[np.bool_], quantization_m: float | None) -> float | None:
+def _noise(log: RangeLog, mine: Mask, quantization_m: float | None) -> float | None:
     """Of the tag with the most ranges to this anchor: each tag moves by itself."""
     if log.timestamp_s is None:
         return None
@@ -138,7 +138,7 @@ def _num_duplicates(log: RangeLog) -> int:
     return int(np.count_nonzero(same))
 
 
-def _largest_gap(timestamps_s: npt.NDArray[np.float64] | None) -> float | None:
+def _largest_gap(timestamps_s: Array | None) -> float | None:
     if timestamps_s is None or len(timestamps_s) < 2:
         return None
     return float(np.diff(np.sort(timestamps_s)).max())

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.options import LogOptions
 
@@ -49,7 +50,7 @@ class StampOptions:
             t_off_s=options.t_off_s,
         )
 
-    def interval_s(self, later: npt.ArrayLike, earlier: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    def interval_s(self, later: npt.ArrayLike, earlier: npt.ArrayLike) -> Array:
         """Seconds from ``earlier`` to ``later`` on one clock, in [0, wrap_s)."""
         wrap = self.wrap_s / self.unit_s
         interval = np.mod(np.asarray(later, np.float64) - np.asarray(earlier, np.float64), wrap)
@@ -64,7 +65,7 @@ def single_sided_range(
     options: StampOptions,
     *,
     rate_of_a: npt.ArrayLike = 1.0,
-) -> npt.NDArray[np.float64]:
+) -> Array:
     """Range from A's poll (tx1, rx1) and B's answer (tx2, rx2), (n,) metres.
 
     Args:
@@ -82,7 +83,7 @@ def double_sided_range(
     tx3: npt.ArrayLike,
     rx3: npt.ArrayLike,
     options: StampOptions,
-) -> npt.NDArray[np.float64]:
+) -> Array:
     """Range from A's poll, B's answer and a third message, free of the clocks' different rates, (n,) metres.
 
     The third message tells the rates apart, whoever sent it; the stamps themselves show who that was.
@@ -108,7 +109,7 @@ def double_sided_range(
     )
 
 
-def _same_duration(one_s: npt.NDArray[np.float64], other_s: npt.NDArray[np.float64]) -> bool:
+def _same_duration(one_s: Array, other_s: Array) -> bool:
     """Whether most intervals are the same on both clocks, as far as crystals agree."""
     both = np.isfinite(one_s) & np.isfinite(other_s) & (other_s > 0)
     if not np.any(both):
@@ -116,7 +117,7 @@ def _same_duration(one_s: npt.NDArray[np.float64], other_s: npt.NDArray[np.float
     return bool(np.median(np.abs(one_s[both] / other_s[both] - 1)) < _MAX_RATE_DIFFERENCE)
 
 
-def _range(round_trip_s: npt.NDArray[np.float64], options: StampOptions) -> npt.NDArray[np.float64]:
+def _range(round_trip_s: Array, options: StampOptions) -> Array:
     """d = c/2 (round-trip time - t_off), Lee et al. 2018.
 
     A round trip is far shorter than the wrap: what seems almost a whole wrap is a little less than nothing.

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.tables import Table, has_columns, read_table, write_table
 from rangesfm.ranging.anchors.anchor import Anchor
@@ -93,7 +93,7 @@ def _check_unique(table: Table, anchor_ids: list[str]) -> None:
             raise InputError(message, table.path, line)
 
 
-def _positions(table: Table) -> npt.NDArray[np.float64]:
+def _positions(table: Table) -> Array:
     """(n, 3) metres, a row of NaN where all three cells are empty."""
     positions = np.column_stack(
         [table.numbers(name, empty=np.nan, expected="a number of metres") for name in _COORDINATES]
@@ -107,7 +107,7 @@ def _positions(table: Table) -> npt.NDArray[np.float64]:
     return positions
 
 
-def _not_negative(table: Table, column: str, *, empty: float) -> npt.NDArray[np.float64]:
+def _not_negative(table: Table, column: str, *, empty: float) -> Array:
     expected = "a number of metres that is not negative, or nothing"
     values = table.numbers(column, empty=empty, expected=expected)
     table.refuse(values < 0, column, expected)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.ndimage import maximum_filter1d
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.geometry.similarity import rounding_of
 from rangesfm.ranging.clock.path import PathSamples
 from rangesfm.ranging.clock.squares import MIN_RANGE_M, rows_by_anchor
@@ -35,10 +35,10 @@ class TimedRanges(NamedTuple):
 
     times_s: Array
     range_m: Array
-    anchor: npt.NDArray[np.int64]
-    tag: npt.NDArray[np.int64]
+    anchor: Indices
+    tag: Indices
 
-    def take(self, rows: npt.NDArray[np.int64] | npt.NDArray[np.bool_]) -> TimedRanges:
+    def take(self, rows: Indices | Mask) -> TimedRanges:
         return TimedRanges(self.times_s[rows], self.range_m[rows], self.anchor[rows], self.tag[rows])
 
 
@@ -116,7 +116,7 @@ def scan_offsets(ranges: TimedRanges, path: PathSamples, weights: Array | None =
     return OffsetCurve(offsets[order], costs[order], scores[order])
 
 
-def _parts(times: Array, path_span_s: float) -> list[npt.NDArray[np.int64]]:
+def _parts(times: Array, path_span_s: float) -> list[Indices]:
     """The log's rows, cut where its pauses are longer than the path: no offset puts both sides on it.
 
     A clock that starts at zero and is set to the date later costs nothing so.
@@ -179,7 +179,7 @@ class _Correlation:
 def _sums_of_anchor(
     range_m: Array,
     weights: Array,
-    cell: npt.NDArray[np.int64],
+    cell: Indices,
     products: dict[tuple[int, int], npt.NDArray[np.complex128]],
     correlate: _Correlation,
 ) -> Array:

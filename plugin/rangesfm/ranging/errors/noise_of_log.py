@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.ranging.errors.noise import robust_stddev, robust_stddevs
 
 _WINDOW = 11
@@ -23,7 +23,7 @@ _MIN_NUM_ROUNDED = 20
 _ROUNDED_TO_M = 1e-5  # what 32-bit numbers leave of a range of some hundred metres
 
 
-def estimate_noise_m(timestamp_s: npt.NDArray[np.float64], range_m: npt.NDArray[np.float64]) -> float | None:
+def estimate_noise_m(timestamp_s: Array, range_m: Array) -> float | None:
     """Robust stddev of the ranges between one tag and one anchor.
 
     A parabola is fitted robustly to every 11 ranges in a row; the middle one's distance from it, corrected
@@ -51,7 +51,7 @@ def estimate_noise_m(timestamp_s: npt.NDArray[np.float64], range_m: npt.NDArray[
     return noise if np.isfinite(noise) else None
 
 
-def _misses_of_parabola(times: npt.NDArray[np.float64], ranges: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _misses_of_parabola(times: Array, ranges: Array) -> Array:
     """What the middle of each row of (m, 11) ranges is off a robust parabola, as if it had not pulled on it, (m,)."""
     middle = _WINDOW // 2
     centred = times - times[:, middle : middle + 1]
@@ -70,7 +70,7 @@ def _misses_of_parabola(times: npt.NDArray[np.float64], ranges: npt.NDArray[np.f
     return np.asarray(residuals[:, middle] / np.sqrt(np.maximum(1 - pull, _TINY)), np.float64)
 
 
-def find_quantization_m(range_m: npt.NDArray[np.float64]) -> float | None:
+def find_quantization_m(range_m: Array) -> float | None:
     """The step (0.1 or 0.01 m) of which all ranges are multiples; None if of neither, or too few to tell."""
     if len(range_m) < _MIN_NUM_ROUNDED:
         return None

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.tables import Categories, Table, read_table
 from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
@@ -176,7 +177,7 @@ def _ids(table: Table, column: str, columns: Columns, empty: str | None) -> Cate
     return Categories(merged.names, merged.index[ids.index])
 
 
-def _ranges(table: Table, name: Mapping[str, str], columns: Columns, options: ReadOptions) -> npt.NDArray[np.float64]:
+def _ranges(table: Table, name: Mapping[str, str], columns: Columns, options: ReadOptions) -> Array:
     """(n,) in the unit of the file, those of a row after each other; not positive: no measurement."""
     if "range" not in name and not columns.wide:
         return _ranges_by_stamps(table, name, StampOptions.of(options))
@@ -186,7 +187,7 @@ def _ranges(table: Table, name: Mapping[str, str], columns: Columns, options: Re
     return np.column_stack([table.numbers(k, empty=empty, missing=MISSING, expected=expected) for k in names]).ravel()
 
 
-def _ranges_by_stamps(table: Table, name: Mapping[str, str], options: StampOptions) -> npt.NDArray[np.float64]:
+def _ranges_by_stamps(table: Table, name: Mapping[str, str], options: StampOptions) -> Array:
     """Two-way ranging, double-sided where the third message is there; 0 (no measurement) where a stamp is empty."""
     stamps = {
         stamp: table.numbers(name[stamp], empty=np.nan, expected="a time stamp or nothing")
@@ -200,7 +201,7 @@ def _ranges_by_stamps(table: Table, name: Mapping[str, str], options: StampOptio
     return np.nan_to_num(ranges, nan=0.0)
 
 
-def _timestamps(table: Table, name: Mapping[str, str], unit: str | None, notes: list[str]) -> npt.NDArray[np.float64]:
+def _timestamps(table: Table, name: Mapping[str, str], unit: str | None, notes: list[str]) -> Array:
     column = name["timestamp"]
     if unit == "iso" or "date" in name or (unit is None and not table.begins_with_number(column)):
         return _civil_times(table, name, notes)
@@ -211,7 +212,7 @@ def _timestamps(table: Table, name: Mapping[str, str], unit: str | None, notes: 
     return seconds + 1e-9 * table.numbers(name["nanoseconds"]) if "nanoseconds" in name else seconds
 
 
-def _civil_times(table: Table, name: Mapping[str, str], notes: list[str]) -> npt.NDArray[np.float64]:
+def _civil_times(table: Table, name: Mapping[str, str], notes: list[str]) -> Array:
     texts = table.text(name["timestamp"])
     if "date" in name:
         texts = [f"{date} {time}" for date, time in zip(table.text(name["date"]), texts)]
@@ -228,7 +229,7 @@ def _civil_times(table: Table, name: Mapping[str, str], notes: list[str]) -> npt
     return seconds
 
 
-def _stddevs(table: Table, column: str, per_metre: float) -> npt.NDArray[np.float64]:
+def _stddevs(table: Table, column: str, per_metre: float) -> Array:
     expected = "a positive number or nothing"
     stddevs = table.numbers(column, empty=np.nan, expected=expected) / per_metre
     table.refuse(stddevs <= 0, column, expected)

@@ -10,8 +10,8 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.files.tables import read_head
 from rangesfm.ranging.readers.times import ISO_TIME, TIME_OF_DAY
 from rangesfm.ranging.readers.units import words_of
@@ -39,7 +39,7 @@ class Column:
         return words_of(self.name)
 
     @cached_property
-    def numbers(self) -> npt.NDArray[np.float64]:
+    def numbers(self) -> Array:
         """Of the cells that are finite ones."""
         values = np.array([float(cell) for cell in self.cells if _NUMBER.fullmatch(cell)], np.float64)
         return values[np.isfinite(values)]
