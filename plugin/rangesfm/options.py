@@ -168,10 +168,10 @@ class LogOptions(Options):
     """Names of its columns (numbers, where they have none) for timestamp (or image_name), anchor_id, range, tag_id,
     range_stddev, los; range:A1 for a column of one anchor; without range, the time stamps tx1, rx1, tx2, rx2 and
     possibly tx3, rx3 of two-way ranging."""
-    timestamp_unit: str | None = None
-    """One of s, ms, us, ns and iso (default: by format, name or values)."""
-    range_unit: str | None = None
-    """One of m, cm and mm (default: by format, name or values)."""
+    timestamp_unit: Literal["s", "ms", "us", "ns", "iso"] | None = None
+    """Of its times (default: by format, name or values)."""
+    range_unit: Literal["m", "cm", "mm"] | None = None
+    """Of its ranges (default: by format, name or values)."""
     separator: Annotated[
         Annotated[str, Field(min_length=1, max_length=1)] | None, Told(metavar="CHARACTER", expected="one character")
     ] = None

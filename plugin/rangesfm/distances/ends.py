@@ -16,7 +16,7 @@ from rangesfm.distances.tape import CONTROL, Marker, Tape, TapedDistance
 from rangesfm.errors import InputError
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.noise import shared_stddev
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.log import RangeKind, RangeLog
 
 # Marks of one point further from it than this share of the photo's size are of different points.
 _MAX_REPROJECTION = 0.02
@@ -265,12 +265,13 @@ def distances_by_radio(
         bias_m, bias_stddev_m: (num_anchors,) what each anchor's ranges read too long, as far as that is known.
         common_bias_stddev_m: of what all ranges between anchors read too long.
     """
-    ranges = log.anchor_anchor_ranges()
+    ranges = log.peer_ranges(RangeKind.ANCHOR_ANCHOR)
+    range_m, given = log.range_m[ranges.rows], log.range_stddev_m[ranges.rows]
     pairs, index = np.unique(np.sort(ranges.ends, axis=1), axis=0, return_inverse=True)
     index = index.reshape(-1)
     count = np.bincount(index, minlength=len(pairs))
-    noise = np.where(np.isfinite(ranges.range_stddev_m), ranges.range_stddev_m, noise_m)
-    medians = np.array([np.median(ranges.range_m[index == k]) for k in range(len(pairs))])
+    noise = np.where(np.isfinite(given), given, noise_m)
+    medians = np.array([np.median(range_m[index == k]) for k in range(len(pairs))])
     mean_square = np.bincount(index, noise**2, len(pairs)) / count
     shared = np.bincount(index, shared_stddev(log)[ranges.rows], len(pairs)) / count
     first, second = pairs.reshape(-1, 2).T

@@ -138,17 +138,14 @@ def _distances(table: Table) -> tuple[TapedDistance, ...]:
         if kind not in (CONTROL, CHECK):
             raise table.error(row, "kind", f"{CONTROL} or {CHECK}")
     lengths = _positive(table, "distance_m", "a number of metres greater than 0", empty=None)
-    stddevs = np.full(len(table), DEFAULT_STDDEV_M)
-    if "stddev_m" in table:
-        stddevs = _positive(table, "stddev_m", "a number of metres greater than 0, or nothing", empty=DEFAULT_STDDEV_M)
+    stddevs = _positive(table, "stddev_m", "a number of metres greater than 0, or nothing", empty=DEFAULT_STDDEV_M)
     rows = zip(starts, ends, lengths.tolist(), stddevs.tolist(), kinds, table.line.tolist(), strict=True)
     return tuple(TapedDistance((a, b), length, stddev, kind, line) for a, b, length, stddev, kind, line in rows)
 
 
 def _positive(table: Table, column: str, expected: str, *, empty: float | None) -> npt.NDArray[np.float64]:
     values = table.numbers(column, empty=empty, expected=expected)
-    if np.any(values <= 0):
-        raise table.error(int(np.argmax(values <= 0)), column, expected)
+    table.refuse(values <= 0, column, expected)
     return values
 
 

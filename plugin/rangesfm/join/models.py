@@ -16,8 +16,7 @@ from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory, joined_trajectory
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.joined_observations import each_on_one_path, joined_observations
-from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.observations import RangeObservations, each_on_one_path, joined_observations
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.model_placement import ScaledModel, place_models
