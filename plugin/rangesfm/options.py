@@ -290,9 +290,12 @@ class MapperOptions(Options):
 
     method: Annotated[Literal["incremental", "global", "hierarchical"], Told(flag="mapper_method")] = "incremental"
     """COLMAP's mapper: photo by photo; all at once; photo by photo in clusters, which are merged."""
-    matching: Literal["sequential", "exhaustive", "spatial", "auto"] = "auto"
-    """Which photos are matched: neighbours in time, all, neighbours by EXIF position; auto: all up to 60 keyframes,
-    else neighbours in time."""
+    matching: Literal["sequential", "exhaustive", "spatial", "vocabtree", "auto"] = "auto"
+    """Which photos are matched: neighbours in time, all, neighbours by EXIF position, those that look alike; auto: all
+    up to 60 keyframes, else neighbours in time."""
+    vocab_tree_path: Annotated[Path | None, Told(metavar="TREE", role="file")] = None
+    """COLMAP's vocabulary tree, by which photos look alike: for vocabtree matching, and for loop_detection of the
+    pairing of neighbours in time; nothing is downloaded."""
     pairs: Annotated[Path | None, Told(role="file")] = None
     """Text file with the names of two photos a line, a tab between them: these pairs are matched, and no others."""
     mask_path: Annotated[Path | None, Told(role="photos")] = None
@@ -322,6 +325,14 @@ class MapperOptions(Options):
     def num_cores(self) -> int:
         """What ``num_threads`` comes to here."""
         return self.num_threads if self.num_threads > 0 else os.cpu_count() or 1
+
+    @model_validator(mode="after")
+    def _tree_is_there(self) -> MapperOptions:
+        by_tree = self.matching == "vocabtree" or self.pairing.get("loop_detection") is True
+        if by_tree and self.vocab_tree_path is None and "vocab_tree_path" not in self.pairing:
+            message = "[mapper] vocab_tree_path is not given, expected COLMAP's vocabulary tree for this matching"
+            raise OptionError(message, "mapper", "matching" if self.matching == "vocabtree" else "pairing")
+        return self
 
     @model_validator(mode="after")
     def _features_are_from_photos(self) -> MapperOptions:

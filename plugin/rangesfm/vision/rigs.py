@@ -92,7 +92,7 @@ class Rigs:
             return
         with pycolmap.Database.open(database_path) as database, pycolmap.DatabaseTransaction(database):
             try:
-                pycolmap.apply_rig_config(list(self.configs), database, model)
+                pycolmap.apply_rig_config(list(self.configs), database, *([] if model is None else [model]))
             except ValueError as error:
                 reason = " ".join(str(error).partition("Check failed: ")[2].split())
                 raise InputError(f"does not go with the photos ({reason})", self.path) from None
