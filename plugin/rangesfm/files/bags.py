@@ -14,18 +14,18 @@ if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
 SQLITE_HEAD = "SQLite format 3\0"
-_EXTENSIONS = (".bag", ".mcap", ".db3")
+_ROS2 = (".mcap", ".db3")
 _BAG_TABLES = {"topics", "messages"}
 
 
 def is_bag_folder(path: Path) -> bool:
     """Whether this is the folder of a ROS 2 bag."""
-    return (path / "metadata.yaml").is_file()
+    return (path / "metadata.yaml").is_file() and any(any(path.glob(f"*{end}*")) for end in _ROS2)
 
 
 def is_bag(path: Path) -> bool:
     """Whether it is called as a file of a bag, or is the folder of one."""
-    return path.suffix.lower() in _EXTENSIONS or is_bag_folder(path)
+    return path.suffix.lower() in (".bag", *_ROS2) or is_bag_folder(path)
 
 
 @contextmanager

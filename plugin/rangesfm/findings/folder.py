@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from pathlib import Path
 from rangesfm.distances.tape import is_distances_file, is_markers_file
 from rangesfm.errors import InputError
 from rangesfm.files.bags import is_bag, is_bag_folder
+from rangesfm.files.folders import walk
 from rangesfm.files.tables import read_head
 from rangesfm.findings.calibration import Calibration, read_calibrations
 from rangesfm.geometry.reference import is_reference_file
@@ -120,24 +120,20 @@ def _key_of(path: Path) -> str | None:
 
 def _entries(folders: Sequence[Path]) -> Iterator[Path]:
     """Files, bags, models and folders that hold photos; links are followed once."""
-    seen: set[str] = set()
     for top in folders:
         if not top.is_dir():
             raise InputError("is a file, expected a folder" if top.exists() else "no such folder", top)
-        for parent, subfolders, names in os.walk(top, followlinks=True):
-            folder, real = Path(parent), os.path.realpath(parent)
-            is_known = real in seen or not _LEFT_BY_RUNS.isdisjoint(names)
-            seen.add(real)
-            if is_known or is_bag_folder(folder) or _is_model(folder):
-                subfolders.clear()
-                yield from () if is_known else (folder,)
-                continue
-            subfolders[:] = sorted(name for name in subfolders if not name.startswith("."))
-            shown = sorted(name for name in names if not name.startswith("."))
-            photos = {name for name in shown if name.lower().endswith(IMAGE_EXTENSIONS)}
+    for folder, subfolders, names in walk(*folders):
+        if not _LEFT_BY_RUNS.isdisjoint(names):
+            subfolders.clear()
+        elif is_bag_folder(folder) or _is_model(folder):
+            subfolders.clear()
+            yield folder
+        else:
+            photos = {name for name in names if name.lower().endswith(IMAGE_EXTENSIONS)}
             if len(photos) >= MIN_NUM_PHOTOS:
                 yield folder
-            yield from (folder / name for name in shown if name not in photos)
+            yield from (folder / name for name in names if name not in photos)
 
 
 def _is_model(folder: Path) -> bool:

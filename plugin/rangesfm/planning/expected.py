@@ -23,7 +23,12 @@ from rangesfm.scale.initialize import model_from_cam, placement_covariance
 from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import RangeFit, fit_at, range_jacobian, tag_positions
 from rangesfm.scale.solution import Solution, refuse_ambiguity, weighted
-from rangesfm.scale.uncertainty import errors_to_expect, parameter_covariance, parameter_influence, scale_uncertainty
+from rangesfm.scale.uncertainty import (
+    errors_to_expect,
+    expected_scale_uncertainty,
+    parameter_covariance,
+    parameter_influence,
+)
 from rangesfm.scale.verdict import Verdict, judge
 from rangesfm.trust.finished_map import by_similarity
 
@@ -128,8 +133,8 @@ def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expect
     for _ in range(_NUM_NOISE_ROUNDS):
         errors = _as_seen(solution, learned, num_alike)
         solution = _weighed(posed, errors, fit_at(weighted(posed.ranges, errors), state, num_alike))
-    covariance = parameter_covariance(solution.fit, solution.problem, learned) + _undetermined(solution.fit)
-    uncertainty = scale_uncertainty(solution, learned)
+    covariance = parameter_covariance(solution, learned) + _undetermined(solution.fit)
+    uncertainty = expected_scale_uncertainty(solution, learned)
     placement = placement_covariance(solution, covariance)
     return Expected(planned, observations, posed, solution, learned, uncertainty, covariance, placement)
 

@@ -95,7 +95,6 @@ def render_report(content: Content) -> str:
         heading=content.title,
         summary=content.summary,
         checks=quality_checks(content.summary),
-        stddevs=head.stddevs(content.summary.scale),
         tiles=head.tiles(content),
         view=None if scene is None else view_of(scene),
         sections=sections,
@@ -152,6 +151,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters |= {function.__name__: function for function in _FILTERS}
-    environment.globals |= {"keyed": text.keyed, "decimals_for": text.decimals_for, "css": css}
+    environment.globals |= {"keyed": text.keyed, "decimals_for": text.decimals_for}
+    environment.globals |= {"said_once": head.said_once, "css": css}
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
     return environment

@@ -51,7 +51,8 @@ def open_images(path: Path, topic: str | None) -> Source:
     is_stamped = _stamp_s(message) > 0
     clock = "the stamps of their headers" if is_stamped else "when they arrived, as their headers have no stamps"
     what = f"{num_by_topic[topic]} images of {topic}, {size_px[0]} x {size_px[1]} pixels"
-    return Source(what, size_px, duration_s, clock, partial(_frames, path, topic, is_stamped), camera, notes)
+    frames = partial(_frames, path, topic, is_stamped)
+    return Source(what, size_px, duration_s, num_by_topic[topic], clock, frames, camera, notes)
 
 
 def _num_by_topic(bag: AnyReader) -> dict[str, int]:
@@ -68,8 +69,8 @@ def _chosen(num_by_topic: dict[str, int], topic: str | None, path: Path) -> str:
         return str(topic)
     if not num_by_topic:
         raise InputError(f"no images in this bag, expected {_RAW} or {_COMPRESSED} of sensor_msgs", path)
-    which = "several topics" if topic is None else f"no images of {topic}, but"
-    raise InputError(f"{which} of images: {several}; choose by [images] topic, or --image_topic", path)
+    which = "several topics of images" if topic is None else f"no images of {topic}, but of"
+    raise InputError(f"{which}: {several}; choose by [images] topic, or --image_topic", path)
 
 
 def _messages(bag: AnyReader, topic: str) -> Iterator[tuple[str, Any, float]]:

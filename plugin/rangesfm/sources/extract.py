@@ -81,7 +81,7 @@ def take_photos(
     with new_folder(folder) as new:
         times_s, num_bytes = _write(source, new, rate_hz, progress)
         if len(times_s) < _MIN_NUM_PHOTOS:
-            raise InputError(f"{len(times_s)} photos at {rate_hz:g} Hz, expected at least {_MIN_NUM_PHOTOS}", path)
+            raise InputError(f"fewer than {_MIN_NUM_PHOTOS} photos at {rate_hz:g} Hz ([images] rate_hz)", path)
         what = f"the photos are the sharpest of each {1 / rate_hz:.3g} s of {path.name}; their times are {source.clock}"
         found = {"image_names": tuple(times_s), "camera": source.camera, "notes": (what, *source.notes)}
         taken = wanted.model_copy(update=found)
@@ -111,8 +111,7 @@ def _with_intervals(frames: Iterable[Frame], rate_hz: float) -> Iterator[tuple[i
 def _write(source: Source, folder: Path, rate_hz: float, progress: Progress) -> tuple[dict[str, float], int]:
     """Photos and their table; returns the photos' times by name, and how many bytes they take."""
     times_s: dict[str, float] = {}
-    num_expected = math.ceil(source.duration_s * rate_hz)
-    num_bytes = 0
+    num_expected, num_bytes = source.num_photos(rate_hz), 0
     for frame in sharpest(source.frames(), rate_hz):
         name = f"frame_{frame.number:06d}{frame.suffix}"
         frame.write(folder / name)

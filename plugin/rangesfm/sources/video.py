@@ -50,9 +50,16 @@ def open_video(path: Path) -> Source:
             f"those of its frames, the first one at its creation time {created}; that is in whole seconds, and with "
             "some cameras local time, or the end of the video"
         )
-    turned = f", turned by {first.rotation} degrees" if first.rotation else ""
-    what = f"video, {size_px[0]} x {size_px[1]} pixels{turned}, {duration_s:.1f} s"
-    return Source(what, size_px, duration_s, clock, partial(_frames, path, start_s or 0.0))
+    turned = "the photos are turned as players show the video; the lever arm refers to photos so turned"
+    return Source(
+        what=f"video, {size_px[0]} x {size_px[1]} pixels, {duration_s:.1f} s",
+        size_px=size_px,
+        duration_s=duration_s,
+        num_frames=stream.frames,
+        clock=clock,
+        frames=partial(_frames, path, start_s or 0.0),
+        notes=(turned,) if first.rotation else (),
+    )
 
 
 def _frames(path: Path, start_s: float) -> Iterator[Frame]:
@@ -77,7 +84,7 @@ def _reading(path: Path) -> Iterator[InputContainer]:
             "reading a video needs the package av: python -m pip install 'rangesfm[video]'", path
         ) from None
     try:
-        with av.open(path) as video:
+        with av.open(path, metadata_errors="replace") as video:
             if not video.streams.video:
                 raise InputError("there are no pictures in this video", path)
             yield video

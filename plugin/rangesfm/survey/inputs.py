@@ -14,6 +14,7 @@ import numpy.typing as npt
 from rangesfm.distances.tape import Tape, read_tape
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import sha256_of
+from rangesfm.files.folders import walk
 from rangesfm.geometry.reference import Reference, read_reference
 from rangesfm.geometry.trajectory import photos_by_frame
 from rangesfm.options import LogOptions
@@ -309,7 +310,7 @@ def input_hashes(survey: Survey) -> list[dict[str, Any]]:
         if item.role == "photos":
             entries += [_folder(item.path)] if item.path.is_dir() else []
         else:
-            files = sorted(item.path.glob("*.bin")) if item.role == "model" else [item.path]
+            files = sorted(item.path.glob("*.bin" if item.role == "model" else "*")) or [item.path]
             entries += [_file(path) for path in files if path.is_file()]
     return entries
 
@@ -319,7 +320,8 @@ def _file(path: Path) -> dict[str, Any]:
 
 
 def _folder(path: Path) -> dict[str, Any]:
-    sizes = {file.relative_to(path).as_posix(): file.stat().st_size for file in path.rglob("*") if file.is_file()}
+    files = (parent / name for parent, _, names in walk(path) for name in names)
+    sizes = {file.relative_to(path).as_posix(): file.stat().st_size for file in files if file.is_file()}
     listing = "".join(f"{name}\t{size}\n" for name, size in sorted(sizes.items()))
     return {
         "path": str(path),

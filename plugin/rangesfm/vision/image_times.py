@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import is_plain_name
+from rangesfm.files.folders import walk
 from rangesfm.files.tables import Table, has_columns, read_table
 from rangesfm.vision.exif import exif_tags
 
@@ -73,7 +74,7 @@ class ImageTimes:
 
 
 def list_images(folder: str | Path) -> tuple[str, ...]:
-    """Names of all photos in a folder and its subfolders, sorted; hidden files are no photos.
+    """Names of all photos in a folder and its subfolders, links to such among them, sorted; hidden ones are none.
 
     Raises:
         InputError: there is no such folder, or no photo in it, or one whose name no table could hold.
@@ -81,11 +82,12 @@ def list_images(folder: str | Path) -> tuple[str, ...]:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError("is a file, expected a folder of photos" if folder.exists() else "no such folder", folder)
-    names = []
-    for parent, subfolders, files in os.walk(folder):
-        subfolders[:] = [name for name in subfolders if not name.startswith(".")]
-        photos = [name for name in files if name.lower().endswith(IMAGE_EXTENSIONS) and not name.startswith(".")]
-        names += [(Path(parent) / name).relative_to(folder).as_posix() for name in photos]
+    names = [
+        (parent / name).relative_to(folder).as_posix()
+        for parent, _, files in walk(folder)
+        for name in files
+        if name.lower().endswith(IMAGE_EXTENSIONS)
+    ]
     if not names:
         raise InputError(f"no photos ({' '.join(e[1:] for e in IMAGE_EXTENSIONS)}) in this folder", folder)
     for name in names:

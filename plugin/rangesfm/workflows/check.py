@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -106,7 +105,7 @@ def _check_photos(survey: Survey, checked: CheckedSurvey) -> None:
 def _check_source(survey: Survey, path: Path, checked: CheckedSurvey) -> None:
     """What is known of a video or a bag before its photos are taken out."""
     source, rate_hz = open_source(path, survey.images.topic), survey.images.rate_hz
-    num = f"about {math.ceil(source.duration_s * rate_hz)} photos at {rate_hz:g} Hz"
+    num = f"about {source.num_photos(rate_hz)} photos at {rate_hz:g} Hz"
     checked.facts.append(f"photos of {path.name}: {source.what}; {num}, taken out when a run begins")
     checked.facts += [*source.notes]
     checked.assumed.append(f"the photos' times are {source.clock}")
