@@ -108,6 +108,7 @@ def test_a_folder_with_one_bag_of_camera_and_radio_is_a_whole_survey(
     assert written.stdout.splitlines()[-1].startswith("next: rangesfm run")
     rangesfm_command("run", "robot", *flags, "--features", "sift.max_num_features=2000", cwd=tmp_path)
     of_bag, of_photos = (read_result_folder(path).summary for path in (folder / "out", photo_run.output_path))
+    assert {"walk.mcap", "photos"} <= {Path(item["path"]).name for item in of_bag.to_json()["inputs"]}
     assert of_bag.map.num_photos == of_photos.map.num_photos == 14
     assert of_bag.scale.relative_stddev.formal == pytest.approx(of_photos.scale.relative_stddev.formal, rel=0.1)
     bag, photos = of_bag.comparison[-1], of_photos.comparison[-1]
