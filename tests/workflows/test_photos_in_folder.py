@@ -14,6 +14,7 @@ from tests.sources.recorded import Message, camera_info, compressed, raw, write_
 from rangesfm.demo.survey import TIME_OFFSET_S, DemoSurvey
 from rangesfm.errors import InputError
 from rangesfm.geometry.reference import Reference, write_reference
+from rangesfm.options import CameraOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.result.folder import read_result_folder
 from rangesfm.survey.settings import Survey, survey_from_tables
@@ -43,14 +44,15 @@ def test_photos_times_and_camera_take_the_bags_place(survey: Survey) -> None:
     assert len([*folder.glob("*.png")]) == 8
     assert journal.warnings == [
         "the photos are the sharpest of each 0.5 s of walk; their times are the stamps of their headers",
-        "the camera is that of /camera_info",
+        "the camera is that of /camera_info, where none is given",
     ]
     assert with_photos_in_folder(changed, journal) == changed
 
 
 def test_a_camera_that_is_given_stays(survey: Survey) -> None:
-    given = survey.changed({"camera.model": "SIMPLE_RADIAL"})
-    assert with_photos_in_folder(given, Journal(SilentProgress())).camera == given.camera
+    by_folder = CameraOptions(others=(CameraOptions(images="left"),))
+    for given in (survey.changed({"camera.model": "SIMPLE_RADIAL"}), survey.model_copy(update={"camera": by_folder})):
+        assert with_photos_in_folder(given, Journal(SilentProgress())).camera == given.camera
 
 
 def test_other_times_beside_those_of_a_bag_are_refused(survey: Survey) -> None:
