@@ -120,7 +120,8 @@ def with_photos_in_folder(survey: Survey, journal: Journal, *, restart: bool = F
     for note in taken.notes:
         journal.warn(note)
     values: dict[str, Any] = {"images.path": folder, "images.times": folder / TIMES_NAME}
-    if taken.camera is not None and survey.camera.model is None and survey.camera.params is None:
+    given = survey.camera
+    if taken.camera is not None and given.model is None and given.params is None and not given.others:
         values["camera.model"], values["camera.params"] = taken.camera
     return survey.changed(values)
 
