@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from tests.conftest import PhotoRun, WalkedSurvey
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 
 
 def run_process(name: str, *arguments: str, cwd: Path) -> str:
@@ -131,21 +130,3 @@ def test_survey_file_is_one_for_a_folder_with_its_files(path: Path, tmp_path: Pa
 
 
 FILES_OF = {"images": ["times"], "ranges": ["path"], "anchors": ["path"], "report": ["reference"]}
-
-
-def test_survey_of_the_readme_is_one(tmp_path: Path) -> None:
-    (text,) = re.findall(r"```toml\n(.*?)```", README, re.DOTALL)
-    (tmp_path / "survey.toml").write_text(text, encoding="utf-8")
-    for name in ("images.csv", "uwb.csv", "anchors.csv"):
-        (tmp_path / name).touch()
-    survey = read_survey(tmp_path / "survey.toml")
-    assert survey.images.every_nth == 3
-    assert survey.camera.model == "OPENCV"
-    assert survey.ranges.time_offset_s is None
-    assert survey.tag.tag_in_cam_m == (-0.0012, -0.09, -0.0663)
-
-
-def test_readme_shows_every_command() -> None:
-    from rangesfm.cli.arguments import COMMANDS
-
-    assert [command for command in COMMANDS if f"`rangesfm {command}`" not in README] == []

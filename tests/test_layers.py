@@ -18,7 +18,7 @@ LAYERS = (
     "geometry",
     "colmap ceres",
     "ranging",
-    "distances",
+    "distances sources",
     "vision scale export",
     "survey",
     "findings",

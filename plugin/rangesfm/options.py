@@ -7,6 +7,7 @@ commands' flags, their help, the reference of all keys and the settings in ``res
 from __future__ import annotations
 
 import os
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -50,6 +51,10 @@ def _direction(vector: tuple[float, float, float]) -> tuple[float, float, float]
     return vector
 
 
+def _is_of(name: str, pattern: str) -> bool:
+    return fnmatchcase(name, pattern) or name.startswith(f"{pattern.rstrip('/')}/")
+
+
 def _span(times: tuple[float, ...]) -> tuple[float, ...]:
     if times and not (len(times) == 2 and times[0] < times[1]):
         raise ValueError("is no span")
@@ -73,9 +78,21 @@ class ImageOptions(KeyframeOptions):
     """The photos."""
 
     path: Annotated[Path | None, Told(flag="images", metavar="PATH", role="photos")] = None
-    """Folder of the photos; as a flag also the CSV of their times."""
+    """Folder of the photos and of folders of them, a video, or a ROS bag with images; as a flag also the CSV of the
+    photos' times."""
     times: Annotated[Path | None, Told(flag="image_times", role="file")] = None
     """CSV image_name,timestamp_s (default: EXIF, else file names)."""
+    rig_config: Annotated[Path | None, Told(flag="rig_config_path", metavar="JSON", role="file")] = None
+    """COLMAP's rig_config.json, lengths in metres: photos of one rig whose names go on alike after their image_prefix
+    were taken at once, when the reference camera's was. A cam_from_rig is kept while mapping, and the length of its
+    translation is a measured distance, which checks the ranges and is checked by them; cameras without one are placed
+    by a model made without the rig first."""
+    baseline_stddev_m: _Positive = 0.001
+    """Of each known distance of a rig's camera from its reference camera."""
+    rate_hz: Annotated[float, Field(ge=1e-3, le=1e3), Told(flag="image_rate_hz")] = 2.0
+    """Photos a second of a video or a bag: of each such interval the sharpest one."""
+    topic: Annotated[str | None, Told(flag="image_topic")] = None
+    """Of the images, for a bag with several such topics."""
 
 
 class CameraOptions(Options):
@@ -83,6 +100,9 @@ class CameraOptions(Options):
 
     table: ClassVar[str] = "camera"
 
+    images: Annotated[str | None, Told(flag="camera_images", metavar="PATTERN")] = None
+    """Of several [[camera]] tables, which photos each is of: a folder, or a pattern of their names as left*.jpg; one
+    table may do without, for all others."""
     mode: Annotated[Literal["auto", "single", "per_folder", "per_image"], Told(flag="camera_mode")] = "auto"
     """Which photos of one size share a camera: those of the same make, model, serial number and focal length by EXIF
     (auto; without EXIF all), all of them, those of one folder, or none."""
@@ -96,6 +116,21 @@ class CameraOptions(Options):
     refine_intrinsics: bool | None = None
     """Whether mapping and refinement adjust them at all (default: mapping does; the refinement does to given ones, by
     their stddev, and else keeps what it finds, so that it does the same to a model just mapped and one brought)."""
+
+    others: Annotated[tuple[CameraOptions, ...], Told(is_key=False)] = ()
+    """Those of the other tables, each with its pattern; this one is for photos of which none is."""
+
+    @property
+    def tables(self) -> tuple[CameraOptions, ...]:
+        return (self, *self.others)
+
+    def of_photo(self, name: str) -> CameraOptions:
+        """The table that a photo belongs to; OptionError for one that belongs to two."""
+        found = [table for table in self.others if table.images is not None and _is_of(name, table.images)]
+        if len(found) > 1:
+            patterns = " and ".join(f"'{table.images}'" for table in found)
+            raise OptionError(f"[[camera]] images {patterns} are both of the photo {name}, expected one", "camera")
+        return found[0] if found else self
 
     @property
     def mapping_refines_intrinsics(self) -> bool:
@@ -227,7 +262,8 @@ class TagOptions(Options):
     table: ClassVar[str] = "tag"
 
     tag_in_cam_m: Annotated[_LeverArm, Told(flag="tag_in_cam", metavar="[ID:]X,Y,Z")] = (0.0, 0.0, 0.0)
-    """Lever arm: the tag's antenna in the camera frame, metres; of several tags, the flag once for each with its ID."""
+    """Lever arm: the tag's antenna in the camera frame, of a rig its reference camera's, metres; of several tags, the
+    flag once for each with its ID."""
     lever_arms_m: Annotated[dict[str, _LeverArm], Told(flag="tag_in_cam", metavar="ID:X,Y,Z")] = Field(
         default_factory=dict
     )
@@ -259,6 +295,11 @@ class MapperOptions(Options):
     else neighbours in time."""
     pairs: Annotated[Path | None, Told(role="file")] = None
     """Text file with the names of two photos a line, a tab between them: these pairs are matched, and no others."""
+    mask_path: Annotated[Path | None, Told(role="photos")] = None
+    """Folder of masks: for photo a/b.jpg the image a/b.jpg.png of the same size, black where no features are wanted."""
+    database_path: Annotated[Path | None, Told(metavar="DB", role="file")] = None
+    """Database of COLMAP's or hloc's, which is copied: its features, matches and (where [camera] says neither model nor
+    params) cameras are used, and only what it lacks is computed; photos that it does not know are left out."""
     features: dict[str, Any] = Field(default_factory=dict)
     """Passed through to pycolmap's FeatureExtractionOptions."""
     pairing: dict[str, Any] = Field(default_factory=dict)
@@ -281,6 +322,15 @@ class MapperOptions(Options):
     def num_cores(self) -> int:
         """What ``num_threads`` comes to here."""
         return self.num_threads if self.num_threads > 0 else os.cpu_count() or 1
+
+    @model_validator(mode="after")
+    def _features_are_from_photos(self) -> MapperOptions:
+        if self.mask_path is not None and self.database_path is not None:
+            message = (
+                "[mapper] mask_path is given beside database_path, expected one of them: there are features already"
+            )
+            raise OptionError(message, "mapper", "mask_path")
+        return self
 
     @model_validator(mode="before")
     @classmethod

@@ -26,6 +26,7 @@ def test_the_example_is_planned_and_written(tmp_path: Path, capsys: pytest.Captu
     assert "scale: +-" in printed.out
     assert "what would gain most for the place" in printed.out
     content = json.loads((tmp_path / "plan" / "plan.json").read_text())
+    assert "<figure" in (tmp_path / "plan" / "plan.html").read_text()
     assert 0 < content["scale_stddev"] < 0.1
     # All its anchors stand at one height, and the path is flat.
     assert any("mirror image" in reason for reason in content["reasons"])

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from tests.ranging.readers.test_readers_ros import message, write_bag1
 from tests.simulated.phone_survey import write_photos
+from tests.sources.recorded import raw, write_bag
 
 from rangesfm.errors import InputError
 from rangesfm.findings.folder import Found, look_into
@@ -68,7 +70,7 @@ def test_results_of_runs_hidden_files_single_pictures_and_prose_are_no_inputs(tm
 
 
 def test_what_cannot_be_used_is_said(tmp_path: Path) -> None:
-    for name in ("walk.MP4", "walk2.mp4", "IMG_1.HEIC"):
+    for name in ("walk.INSV", "walk2.insv", "IMG_1.HEIC"):
         (tmp_path / name).touch()
     (tmp_path / "sparse").mkdir()
     for name in ("cameras.txt", "images.txt", "points3D.txt"):
@@ -78,7 +80,7 @@ def test_what_cannot_be_used_is_said(tmp_path: Path) -> None:
     model, photos, videos = found.notes
     assert model == f"sparse is a COLMAP model: rangesfm refine --input_path {tmp_path / 'sparse'} begins with it"
     assert photos == "1 of .heic, as IMG_1.HEIC: these are not read: convert them to JPEG"
-    assert videos.startswith("2 of .mp4, as walk.MP4: videos are not read yet")
+    assert videos.startswith("2 of .insv, as walk.INSV: videos of 360 degrees are not read")
 
 
 def test_a_bag_is_a_log_if_it_has_ranges(tmp_path: Path) -> None:
@@ -86,13 +88,22 @@ def test_a_bag_is_a_log_if_it_has_ranges(tmp_path: Path) -> None:
     bag = write_bag1(tmp_path, [(name, message(1, name, range=2.5, from_id=1, to_id=3, covariance=0.04))])
     found = look_into([tmp_path])
     assert paths(found) == {"ranges.path": ["log.bag"]}
-    assert found.notes == ("log.bag is a bag: its ranges are read, images in it are not yet",)
+    assert found.notes == ()
     bag.unlink()
     node = "nlink_parser/msg/LinktrackNode2"
     write_bag1(tmp_path, [(node, message(1, node, role=1, id=1, dis=1.0, fp_rssi=0.0, rx_rssi=0.0))])
     found = look_into([tmp_path])
     assert found.paths == {}
-    assert "no ranges in this bag" in found.notes[1]
+    assert "no ranges in this bag" in found.notes[0]
+
+
+def test_a_bag_with_images_is_photos_and_what_a_run_took_out_of_it_is_not(tmp_path: Path) -> None:
+    stamped = ("/uwb", "uwb_ros/msg/RangeStamped", 1.0, {"range": 2.5, "from_id": 1, "to_id": 3, "covariance": 0.04})
+    image = ("/image", "sensor_msgs/msg/Image", 1.0, raw(np.zeros((2, 2, 1), np.uint8), "mono8"))
+    write_bag(tmp_path / "walk", [stamped, image])
+    write_photos(tmp_path / "out" / "photos", 3)
+    (tmp_path / "out" / "photos" / "photos.json").touch()
+    assert look_into([tmp_path]).paths == {"images.path": [tmp_path / "walk"], "ranges.path": [tmp_path / "walk"]}
 
 
 def test_a_table_that_may_be_a_log_is_told_unless_there_is_one(tmp_path: Path) -> None:

@@ -75,10 +75,10 @@ def test_files_of_one_anchor_each_are_one_log(tmp_path: Path) -> None:
 
 
 def test_a_folder_of_nothing_is_refused_with_what_is_there(tmp_path: Path) -> None:
-    (tmp_path / "walk.mp4").touch()
+    (tmp_path / "walk.insv").touch()
     with pytest.raises(InputError, match="neither photos nor a radio's log") as caught:
         understand([tmp_path], {})
-    assert "videos are not read yet" in caught.value.advice[0]
+    assert "videos of 360 degrees are not read" in caught.value.advice[0]
 
 
 def test_of_several_cameras_that_of_the_photos_size_is_taken(tmp_path: Path) -> None:
@@ -95,6 +95,14 @@ def test_a_camera_of_another_size_is_left_out_but_its_lever_arm_holds(tmp_path: 
     understood = understand([tmp_path], {})
     assert understood.values == {"images.path": tmp_path / "images", "tag.tag_in_cam_m": (0, 0.1, 0)}
     assert "0 of its cameras (192 x 128 pixels) fit the photos: none is taken" in understood.notes[-1]
+
+
+def test_a_video_is_the_photos_also_in_a_folder_of_the_usual_name(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "walk.MOV").touch()
+    write_log(tmp_path / "uwb.csv", 0.0)
+    understood = understand([tmp_path], {})
+    assert understood.values == {"images.path": tmp_path / "images" / "walk.MOV", "ranges.path": tmp_path / "uwb.csv"}
 
 
 def test_what_the_user_says_goes_before_what_is_found(tmp_path: Path) -> None:

@@ -11,7 +11,8 @@ import pytest
 from tests.planning.surveys import COPLANAR_M, FIVE_ANCHORS_M, loop, planned
 
 from rangesfm.planning.expected import expect
-from rangesfm.planning.survey_plan import SurveyPlan, plan_survey, write_plan
+from rangesfm.planning.survey_plan import SurveyPlan, plan_survey
+from rangesfm.report.plan_page import write_plan
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +91,7 @@ def test_plan_json_holds_it_all_and_what_is_open_is_null(tmp_path: Path) -> None
     path = loop(height_amplitude_m=0.0)
     level = replace(path, centers=path.centers * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.6])
     plan = plan_survey(planned(COPLANAR_M, "site", level))
-    content = json.loads(write_plan(plan, tmp_path / "plan").read_text())
+    content = json.loads(write_plan(plan, tmp_path / "plan")[0].read_text())
     assert content["scale_stddev"] == plan.scale_stddev
     assert content["place"]["stddev_m"][2] is None
     assert len(content["advice_for_place"]) == len(plan.advice_for_place)

@@ -92,7 +92,7 @@ def test_the_numbers_are_those_of_the_result(make_result: MakeResult) -> None:
     expected = [
         "0.7421",
         "± 0.0041",
-        "Good",
+        "Scale: good",
         "Eight anchors agree within 1.5 %.",
         "12 ranges were taken before the first photo.",
         f"{summary['ranges']['rms_m']:.3f} m",
@@ -159,9 +159,46 @@ def test_the_place_has_its_verdict_beside_that_of_the_scale(make_result: MakeRes
         "worst_keyframe_stddev_m": 0.21,
     }
     texts = page_of(make_result(changes={"place": place})).texts
-    assert "doubtful" in texts[texts.index("Place in the site") :]
-    assert any("middle ± 0.13" in text for text in texts)
-    assert "Place in the site" not in page_of(make_result("elsewhere", changes={"place": None})).texts
+    begin = texts.index("Place: doubtful")
+    assert begin > texts.index("Scale: good")
+    assert [text for text in texts[begin:] if text in ("0.03", "0.04", "0.12", "Why not.")] == [
+        *("0.03", "0.04", "0.12", "Why not.")
+    ]
+    texts = page_of(make_result("elsewhere", changes={"place": None})).texts
+    assert not any(text.startswith("Place") for text in texts)
+
+
+def test_what_would_help_and_what_speaks_against_both_is_said_once(make_result: MakeResult) -> None:
+    reason = "probably A3 stands elsewhere: measure it again"
+    scale = {
+        "reasons": [reason],
+        "advice": [
+            "calibrate the radio (rangesfm ranges calibrate), or tape",
+            "measure it again",
+            "calibrate the radio: 2 %",
+        ],
+    }
+    place = {
+        "verdict": "doubtful",
+        "reasons": [reason],
+        "stddev_m": [0.0, 0.0, 0.0],
+        "heading_stddev_deg": 0.0,
+        "worst_keyframe_stddev_m": 0.0,
+    }
+    texts = page_of(make_result(changes={"scale": scale, "place": place})).texts
+    assert [text for text in texts if "measure it again" in text or "calibrate" in text.lower()] == [
+        "Probably A3 stands elsewhere: measure it again.",
+        "Calibrate the radio (rangesfm ranges), or tape.",
+    ]
+
+
+def test_what_was_assumed_is_told_in_words(make_result: MakeResult) -> None:
+    folder = make_result()
+    texts = page_of(folder).texts
+    given = json.loads((folder / "result.json").read_text())["scale"]["sensitivity"]
+    assert "1 cm, all ranges" in texts
+    assert f"{given['common_bias_per_cm']:+.3f}".replace("-", "−") == texts[texts.index("1 cm, all ranges") + 1]
+    assert not any("per_cm" in text for text in texts)
 
 
 def test_every_anchor_has_its_panel_and_its_row(make_result: MakeResult) -> None:

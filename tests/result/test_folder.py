@@ -22,7 +22,7 @@ from rangesfm.result.folder import (
 )
 from rangesfm.result.ranges_as_used import RangesAsUsed
 
-README = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "examples" / "results.md").read_text(encoding="utf-8")
 
 
 def files_of(folder: Path) -> set[str]:
@@ -93,8 +93,8 @@ def write_document(folder: Path, **changes: Any) -> Path:
     return folder
 
 
-def test_every_file_of_a_result_stands_in_the_table_of_the_readme() -> None:
-    (table,) = re.findall(r"The output folder holds\n\n(.*?)\n\n", README, re.DOTALL)
+def test_every_file_of_a_result_stands_in_the_table_of_its_page() -> None:
+    (table,) = re.findall(r"^# The result folder\n\n(.*?)\n\n", PAGE, re.DOTALL)
     documented = {name for row in table.splitlines() for name in re.findall(r"`([^`]+)`", row.split("|")[1])}
     assert set(RESULT_FILES) <= documented
 

@@ -58,6 +58,15 @@ class TestListImages:
         with pytest.raises(InputError, match=r"images.csv: is a file, expected a folder"):
             list_images(write_csv(tmp_path, ""))
 
+    def test_finds_photos_of_several_folders_behind_links_once(self, tmp_path: Path) -> None:
+        write_photos(tmp_path / "disk", "a.png")
+        write_photos(tmp_path / "card", "a.png")
+        (tmp_path / "all").mkdir()
+        (tmp_path / "all" / "left").symlink_to(tmp_path / "disk")
+        (tmp_path / "all" / "right").symlink_to(tmp_path / "card")
+        (tmp_path / "disk" / "again").symlink_to(tmp_path / "all")
+        assert list_images(tmp_path / "all") == ("left/a.png", "right/a.png")
+
     def test_says_that_a_folder_has_no_photos(self, tmp_path: Path) -> None:
         (tmp_path / "a.txt").touch()
         with pytest.raises(InputError, match=r"no photos \(jpg jpeg png tif tiff bmp webp\) in this folder"):

@@ -269,7 +269,7 @@ class TestEarlierRun:
     def test_of_unchanged_photos_does_not_read_them_again(
         self, room: Room, output: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("rangesfm.vision.photos.sha256_of", pytest.fail)
+        monkeypatch.setattr("rangesfm.files.atomic.sha256_of", pytest.fail)
         summary = reconstruct(room.folder, room.names, output, camera=room.camera, mapper=MAPPER)
         assert summary.seconds == {}
 

@@ -11,11 +11,11 @@ import numpy.typing as npt
 import pycolmap
 from scipy import linalg
 from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix, diags
-from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Mask
 from rangesfm.ceres import num_columns, tangent_jacobian
+from rangesfm.ceres.factored import SingularError, factor
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import similarity_motions
@@ -26,8 +26,6 @@ from rangesfm.geometry.trajectory import pose_of
 _FREE_MOTION = 1e-9
 # Pivots of the normal equations, their diagonal scaled to 1, below which a direction is not determined.
 _MIN_PIVOT = 1e-13
-# From this share of nonzeros on, a dense inverse is faster than a sparse one.
-_DENSE_FROM = 0.15
 _BLOCKS_AT_ONCE = 64
 # Of the squared extent of a path, across which it is straight.
 _NO_TURN = 1e-10
@@ -154,7 +152,8 @@ class _Columns:
         poses = [pose_of(reconstruction.frame(frame)).params for frame in frames]
         blocks = [("pose", pose) for pose in poses]
         for rig in reconstruction.rigs.values():
-            blocks += [("sensor", rig.sensor_from_rig(sensor).params) for sensor in rig.non_ref_sensors]
+            # Not by sensor_from_rig(), which hands out copies.
+            blocks += [("sensor", pose.params) for pose in rig.non_ref_sensors.values() if pose is not None]
         blocks += [("other", camera.params) for camera in reconstruction.cameras.values()]
         blocks += [("anchor", anchor) for anchor in anchors]
         blocks += [("other", other) for other in others]
@@ -297,9 +296,7 @@ class _Inverse:
         held[linalg.qr(self._free.T, mode="r", pivoting=True)[1][: free.shape[1]]] = 1.0
         scaled = csc_matrix(diags(scale) @ normal @ diags(scale) + diags(held))
         self._scale = scale[:, None]
-        self._solve_scaled = (_dense_solver if scaled.nnz > _DENSE_FROM * len(scale) ** 2 else _sparse_solver)(
-            scaled, columns
-        )
+        self._solve_scaled = _solver(scaled, columns)
 
     def solve(self, right: Array) -> Array:
         """(size, k) for (size, k)."""
@@ -329,29 +326,15 @@ class _Inverse:
         return covariance
 
 
-def _dense_solver(normal: csc_matrix, columns: _Columns) -> Callable[[Array], Array]:
+def _solver(normal: csc_matrix, columns: _Columns) -> Callable[[Array], Array]:
     try:
-        factor = linalg.cho_factor(normal.toarray(), lower=True, overwrite_a=True, check_finite=False)
-    except linalg.LinAlgError as error:
-        column = int(str(error).split("-th")[0]) - 1
-        raise _not_determined(columns, column) from error
-    _check_pivots(np.square(np.diag(factor[0])), np.arange(normal.shape[0]), columns)
-    return lambda right: np.asarray(linalg.cho_solve(factor, right, check_finite=False))
-
-
-def _sparse_solver(normal: csc_matrix, columns: _Columns) -> Callable[[Array], Array]:
-    try:
-        factor = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    except RuntimeError as error:  # exactly singular
-        raise _not_determined(columns, int(np.argmin(normal.diagonal()))) from error
-    _check_pivots(np.abs(factor.U.diagonal()), np.argsort(factor.perm_c), columns)
-    return lambda right: np.asarray(factor.solve(right))
-
-
-def _check_pivots(pivots: Array, columns_of_pivots: npt.NDArray[np.int64], columns: _Columns) -> None:
-    worst = int(np.argmin(pivots))
-    if not pivots[worst] > _MIN_PIVOT:
-        raise _not_determined(columns, int(columns_of_pivots[worst]))
+        factored = factor(normal)
+    except SingularError as error:
+        raise _not_determined(columns, error.column) from error
+    worst = int(np.argmin(factored.pivots))
+    if not factored.pivots[worst] > _MIN_PIVOT:
+        raise _not_determined(columns, worst)
+    return factored.solve
 
 
 def _not_determined(columns: _Columns, column: int) -> GeometryError:

@@ -57,7 +57,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     surveys' files under the same paths. Each should do one survey at a time:
       dask scheduler --host HEAD
       dask worker tcp://HEAD:8786 --nthreads 1 --no-dashboard       # on each machine
-    On Slurm, PBS and the like dask-jobqueue starts them, on Kubernetes dask-kubernetes: see the README.
+    On Slurm, PBS and the like dask-jobqueue starts them, on Kubernetes dask-kubernetes: see examples/many_surveys.md.
 
     Exit status: 0 all done; otherwise the largest of the statuses that rangesfm run would have had.
 

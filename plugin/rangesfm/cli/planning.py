@@ -14,7 +14,7 @@ def add_commands(commands: Commands) -> None:
     plan = commands.add("plan", _plan, "before going out: what a survey will know, and what to change")
     plan.add_argument("plan", nargs="?", metavar="PLAN.toml", help="anchors, path and radio")
     plan.add_argument("--from", dest="result", metavar="RESULT", help="the same for another survey like a finished one")
-    plan.add_argument("--output_path", metavar="FOLDER", help="write plan.json there")
+    plan.add_argument("--output_path", metavar="FOLDER", help="write plan.json and plan.html there")
 
 
 def _plan(args: argparse.Namespace, progress: Progress) -> Outcome:
@@ -29,7 +29,8 @@ def _plan(args: argparse.Namespace, progress: Progress) -> Outcome:
         raise InputError("expected either a plan's file or --from RESULT")
     from rangesfm.planning.placement import place_anchors
     from rangesfm.planning.settings import read_plan
-    from rangesfm.planning.survey_plan import plan_survey, write_plan
+    from rangesfm.planning.survey_plan import plan_survey
+    from rangesfm.report.plan_page import write_plan
 
     if args.plan is not None:
         planned = place_anchors(read_plan(args.plan), progress)
@@ -38,5 +39,5 @@ def _plan(args: argparse.Namespace, progress: Progress) -> Outcome:
 
         planned = plan_of_result(args.result)
     plan = plan_survey(planned)
-    written = [] if args.output_path is None else [str(write_plan(plan, Path(args.output_path)))]
+    written = [] if args.output_path is None else map(str, write_plan(plan, Path(args.output_path)))
     return Outcome([*plan.lines, *written])

@@ -18,7 +18,17 @@ if TYPE_CHECKING:
 
 
 _SCALE_KEYS = (
-    *("images.path", "images.times", "ranges", "anchors", "tag", "mapper.num_threads", "scale"),
+    *(
+        "images.path",
+        "images.times",
+        "images.rig_config",
+        "images.baseline_stddev_m",
+        "ranges",
+        "anchors",
+        "tag",
+        "mapper.num_threads",
+        "scale",
+    ),
     *("export", "report", "output"),
 )
 _DEMO_FOLDER = "rangesfm_demo"
@@ -177,8 +187,10 @@ def _join(args: argparse.Namespace, progress: Progress) -> Outcome:
 def _require_images(survey: Survey) -> None:
     if survey.images.path is None:
         raise InputError("no photos: give [images] path in a survey file, or --images FOLDER")
-    if not os.path.isdir(survey.images.path):
-        raise InputError("no such folder of photos", survey.images.path)
+    from rangesfm.sources.source import is_source
+
+    if not (os.path.isdir(survey.images.path) or (is_source(survey.images.path) and survey.images.path.is_file())):
+        raise InputError("no such folder of photos, video or bag", survey.images.path)
 
 
 def _require_model_and_ranges(survey: Survey) -> None:

@@ -220,4 +220,6 @@ def survey_from_arguments(args: argparse.Namespace, progress: Progress | None = 
 
 
 def _is_table(path: str) -> bool:
-    return os.path.isfile(path) or path.endswith(".csv")
+    from rangesfm.sources.source import is_source
+
+    return path.endswith(".csv") or (os.path.isfile(path) and not is_source(Path(path)))

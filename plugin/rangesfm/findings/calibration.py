@@ -12,21 +12,11 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
+from rangesfm.colmap.opencv_camera import colmap_camera
 from rangesfm.errors import InputError
 from rangesfm.files.tables import read_head
 
 _COLMAP_LINE = re.compile(r"\d+ ([A-Z][A-Z0-9_]+) (\d+) (\d+)((?: [-+.\deE]+)+)", re.ASCII)
-# To OpenCV, and so to Kalibr and ROS, the centre of the first pixel is (0, 0); to COLMAP it is (0.5, 0.5).
-_CORNER_PX = 0.5
-# COLMAP's model and how many parameters it has beside fx, fy, cx, cy.
-_OPENCV_MODELS = {
-    "none": ("PINHOLE", 0),
-    "radtan": ("OPENCV", 4),
-    "plumb_bob": ("OPENCV", 4),
-    "rational_polynomial": ("FULL_OPENCV", 8),
-    "equidistant": ("OPENCV_FISHEYE", 4),
-    "fisheye": ("OPENCV_FISHEYE", 4),
-}
 
 
 @dataclass(frozen=True)
@@ -106,14 +96,7 @@ def _of_kalibr(path: Path, camera: Mapping[str, Any]) -> Calibration:
 
 
 def _of_opencv(path: Path, distortion: str, pinhole: Any, coefficients: Any, size: Any) -> Calibration:
-    if distortion not in _OPENCV_MODELS:
-        raise InputError(f"distortion_model is '{distortion}', expected one of {', '.join(_OPENCV_MODELS)}", path)
-    model, num = _OPENCV_MODELS[distortion]
-    given = [*map(float, coefficients)]
-    if model == "OPENCV" and any(given[num:]):  # a third radial coefficient
-        model, num = "FULL_OPENCV", 8
-    fx, fy, cx, cy = map(float, pinhole)
-    params = (fx, fy, cx + _CORNER_PX, cy + _CORNER_PX, *[*given, *[0.0] * num][:num])
+    model, params = colmap_camera(distortion, pinhole, coefficients, path)
     return Calibration(model, params, (int(size[0]), int(size[1])))
 
 

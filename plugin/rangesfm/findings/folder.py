@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -10,30 +9,30 @@ from pathlib import Path
 
 from rangesfm.distances.tape import is_distances_file, is_markers_file
 from rangesfm.errors import InputError
+from rangesfm.files.bags import is_bag, is_bag_folder
+from rangesfm.files.folders import walk
 from rangesfm.files.tables import read_head
 from rangesfm.findings.calibration import Calibration, read_calibrations
 from rangesfm.geometry.reference import is_reference_file
 from rangesfm.ranging.anchors.anchor_file import is_anchor_file
 from rangesfm.ranging.errors.error_curve import is_error_curve_file
 from rangesfm.ranging.readers import find_log_reader, read_ranges
-from rangesfm.ranging.readers.ros import is_bag_folder
+from rangesfm.sources.bag import has_images
+from rangesfm.sources.extract import RECORD_NAME
+from rangesfm.sources.source import is_video
 from rangesfm.vision.image_times import IMAGE_EXTENSIONS, is_image_times_file
 from rangesfm.vision.photos import MIN_NUM_PHOTOS
 
 PHOTOS, LOG = "images.path", "ranges.path"
 _NOT_READ = {
-    **dict.fromkeys(
-        (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mts", ".insv"),
-        "videos are not read yet: take photos out of them (ffmpeg), with their times",
-    ),
+    ".insv": "videos of 360 degrees are not read: take plain photos out of them, with their times",
     **dict.fromkeys((".heic", ".heif", ".dng", ".cr2", ".nef", ".arw"), "these are not read: convert them to JPEG"),
 }
-_BAG_EXTENSIONS = (".bag", ".mcap", ".db3")
 _TABLE_EXTENSIONS = (".csv", ".tsv", ".txt", ".log", ".dat")
 # Of tables that may be the log, where there is none.
 _MAX_NUM_UNSURE = 3
 # Files of earlier runs are no inputs.
-_LEFT_BY_RUNS = {"result.json", "reconstruct.json"}
+_LEFT_BY_RUNS = {"result.json", "reconstruct.json", RECORD_NAME}
 # By the header row, once it is known that the file is no log.
 _TABLES = {
     "scale.markers": is_markers_file,
@@ -50,7 +49,7 @@ class Found:
     """What may be inputs.
 
     Attributes:
-        paths: folders that hold photos themselves, and files, by dotted key of a survey file.
+        paths: folders that hold photos themselves, videos, and other files, by dotted key of a survey file.
         calibrations: the cameras of each file that has any.
         notes: what is there and cannot be used, a line each.
     """
@@ -80,11 +79,13 @@ def look_into(folders: Sequence[Path]) -> Found:
                     notes.append(f"{path.name} is a COLMAP model: rangesfm refine --input_path {path} begins with it")
                 else:
                     paths[PHOTOS].append(path)
+            elif is_video(path):
+                paths[PHOTOS].append(path)
             elif cameras := read_calibrations(path):
                 calibrations[path] = cameras
             else:
-                if _is_bag(path):
-                    notes.append(f"{path.name} is a bag: its ranges are read, images in it are not yet")
+                if is_bag(path) and has_images(path):
+                    paths[PHOTOS].append(path)
                 if key := _key_of(path):
                     paths[key].append(path)
         except InputError as error:
@@ -97,13 +98,9 @@ def look_into(folders: Sequence[Path]) -> Found:
     return Found(dict(paths), calibrations, (*notes, *([] if LOG in paths else unsure[:_MAX_NUM_UNSURE])))
 
 
-def _is_bag(path: Path) -> bool:
-    return is_bag_folder(path) or path.suffix in _BAG_EXTENSIONS
-
-
 def _key_of(path: Path) -> str | None:
     """The key that takes such a file; None: not known. InputError: it may be a log, and is not understood."""
-    if _is_bag(path):
+    if is_bag(path):
         read_ranges(path)
         return LOG
     head = read_head(path)
@@ -123,24 +120,20 @@ def _key_of(path: Path) -> str | None:
 
 def _entries(folders: Sequence[Path]) -> Iterator[Path]:
     """Files, bags, models and folders that hold photos; links are followed once."""
-    seen: set[str] = set()
     for top in folders:
         if not top.is_dir():
             raise InputError("is a file, expected a folder" if top.exists() else "no such folder", top)
-        for parent, subfolders, names in os.walk(top, followlinks=True):
-            folder, real = Path(parent), os.path.realpath(parent)
-            is_known = real in seen or not _LEFT_BY_RUNS.isdisjoint(names)
-            seen.add(real)
-            if is_known or is_bag_folder(folder) or _is_model(folder):
-                subfolders.clear()
-                yield from () if is_known else (folder,)
-                continue
-            subfolders[:] = sorted(name for name in subfolders if not name.startswith("."))
-            shown = sorted(name for name in names if not name.startswith("."))
-            photos = {name for name in shown if name.lower().endswith(IMAGE_EXTENSIONS)}
+    for folder, subfolders, names in walk(*folders):
+        if not _LEFT_BY_RUNS.isdisjoint(names):
+            subfolders.clear()
+        elif is_bag_folder(folder) or _is_model(folder):
+            subfolders.clear()
+            yield folder
+        else:
+            photos = {name for name in names if name.lower().endswith(IMAGE_EXTENSIONS)}
             if len(photos) >= MIN_NUM_PHOTOS:
                 yield folder
-            yield from (folder / name for name in shown if name not in photos)
+            yield from (folder / name for name in names if name not in photos)
 
 
 def _is_model(folder: Path) -> bool:

@@ -6,6 +6,7 @@ import glob
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
@@ -15,6 +16,7 @@ from rangesfm.errors import InputError
 from rangesfm.findings.calibration import Calibration
 from rangesfm.findings.folder import LOG, PHOTOS, Found, look_into
 from rangesfm.ranging.readers import read_ranges
+from rangesfm.sources.source import is_source, open_source
 from rangesfm.survey.settings import KEYS, Survey, survey_from_tables
 from rangesfm.vision.image_times import list_images
 from rangesfm.vision.photos import usable_photos
@@ -101,6 +103,9 @@ def _tops(paths: Sequence[Path], folders: Sequence[Path]) -> list[Path]:
     """Of folders of photos the highest one inside ``folders`` that has a usual name, as photos for photos/left."""
     tops = []
     for path in paths:
+        if is_source(path):
+            tops.append(path)
+            continue
         inside = [above for above in (path, *path.parents) if any(above.is_relative_to(folder) for folder in folders)]
         tops.append(next((above for above in reversed(inside) if above.name.lower() in _USUAL_NAMES[PHOTOS]), path))
     return list(dict.fromkeys(tops))
@@ -158,6 +163,10 @@ def _of_size(cameras: Sequence[Calibration], size_px: tuple[int, int] | None) ->
 def _size_px(values: Mapping[str, Any]) -> tuple[int, int] | None:
     """The most common size of the photos; None without any."""
     if PHOTOS not in values:
+        return None
+    if is_source(values[PHOTOS]):
+        with suppress(InputError):  # for a check to tell of
+            return open_source(values[PHOTOS], values.get("images.topic")).size_px
         return None
     photos = usable_photos(values[PHOTOS], list_images(values[PHOTOS]))
     return Counter(photos.sizes).most_common(1)[0][0]

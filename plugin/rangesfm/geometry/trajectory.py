@@ -148,6 +148,16 @@ def pose_of(frame: pycolmap.Frame) -> pycolmap.Rigid3d:
     return pose
 
 
+def photos_by_frame(reconstruction: pycolmap.Reconstruction) -> dict[str, tuple[str, ...]]:
+    """Names of the photos of each frame, by the one that stands for them in a trajectory."""
+    return {
+        _reference_image_name(reconstruction, frame): tuple(
+            reconstruction.image(data_id.id).name for data_id in frame.image_ids
+        )
+        for frame in reconstruction.frames.values()
+    }
+
+
 def _reference_image_name(reconstruction: pycolmap.Reconstruction, frame: pycolmap.Frame) -> str:
     """The photo of the rig's reference camera; of a frame that lacks it, the first by name."""
     images = [reconstruction.image(data_id.id) for data_id in frame.image_ids]

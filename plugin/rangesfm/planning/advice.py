@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,7 +33,7 @@ class Advice:
 
     Attributes:
         kind: which sort of change. subject: what it is made to; an anchor's id, or nothing.
-        words: what to do.
+        words: what to do. planned: with the change made.
         scale_stddev: relative. place_stddev_m: of the keyframe known least; inf: open; NaN: no place in a site.
         scale_gain, place_gain: by which share these are less than before; 0 without a place.
     """
@@ -40,14 +41,14 @@ class Advice:
     kind: str
     subject: str
     words: str
+    planned: PlannedSurvey = field(repr=False)
     scale_stddev: float
     place_stddev_m: float
     scale_gain: float
     place_gain: float
 
 
-@dataclass(frozen=True)
-class _Change:
+class _Change(NamedTuple):
     kind: str
     subject: str
     words: str
@@ -88,9 +89,7 @@ def _advice(change: _Change, after: Expected, before: Expected, stated: Expected
     size_m = float(np.linalg.norm(np.ptp(stated.planned.places_m, axis=0)))
     place_ratio = min(place_after_m, size_m) / min(place_before_m, size_m)
     return Advice(
-        change.kind,
-        change.subject,
-        change.words,
+        *change,
         scale_stddev=stated.uncertainty.empirical * scale_ratio,
         place_stddev_m=place_after_m if is_open else stated.worst_keyframe_m * place_ratio,
         scale_gain=1 - scale_ratio,

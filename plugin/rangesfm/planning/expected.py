@@ -8,6 +8,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.options import ScaleOptions
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.errors.cells import MAX_NUM_CELLS
@@ -22,7 +23,12 @@ from rangesfm.scale.initialize import model_from_cam, placement_covariance
 from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import RangeFit, fit_at, range_jacobian, tag_positions
 from rangesfm.scale.solution import Solution, refuse_ambiguity, weighted
-from rangesfm.scale.uncertainty import errors_to_expect, parameter_covariance, parameter_influence, scale_uncertainty
+from rangesfm.scale.uncertainty import (
+    errors_to_expect,
+    expected_scale_uncertainty,
+    parameter_covariance,
+    parameter_influence,
+)
 from rangesfm.scale.verdict import Verdict, judge
 from rangesfm.trust.finished_map import by_similarity
 
@@ -80,9 +86,19 @@ class Expected:
         """(7,) stddevs of the map about its middle, and (n,) of each keyframe's place; inf where they are open."""
         if self.placement is None:
             return None
-        of_map, of_keyframes = by_similarity(self.placement, self.planned.trajectory.centers)
-        keyframes = np.trace(of_keyframes, axis1=1, axis2=2)
-        return _stddevs(np.diag(of_map)), _stddevs(keyframes)
+        centers = self.planned.trajectory.centers
+        return _stddevs(np.diag(by_similarity(self.placement, centers)[0])), self.stddevs_at(centers)
+
+    def stddevs_at(self, places_m: Array) -> Array:
+        """(n,) of (n, 3) places in the map, in the frame of the result: all coordinates together; inf where open.
+
+        Without a place in the site they are as far off as the scale makes them, seen from the first camera.
+        """
+        placement = self.placement
+        if placement is None:
+            placement = np.diag([self.uncertainty.empirical**2, *np.zeros(6)])
+        motions = similarity_motions(places_m - self.planned.trajectory.centers[0])
+        return _stddevs(np.einsum("nij,jk,nik->n", motions, placement, motions))
 
     @property
     def worst_keyframe_m(self) -> float:
@@ -117,8 +133,8 @@ def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expect
     for _ in range(_NUM_NOISE_ROUNDS):
         errors = _as_seen(solution, learned, num_alike)
         solution = _weighed(posed, errors, fit_at(weighted(posed.ranges, errors), state, num_alike))
-    covariance = parameter_covariance(solution.fit, solution.problem, learned) + _undetermined(solution.fit)
-    uncertainty = scale_uncertainty(solution, learned)
+    covariance = parameter_covariance(solution, learned) + _undetermined(solution.fit)
+    uncertainty = expected_scale_uncertainty(solution, learned)
     placement = placement_covariance(solution, covariance)
     return Expected(planned, observations, posed, solution, learned, uncertainty, covariance, placement)
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
 import numpy as np
 
-from rangesfm.files.atomic import make_output_folder, write_text
 from rangesfm.planning.advice import Advice, advise, ranked
 from rangesfm.planning.detectable import detectable_mistakes
 from rangesfm.planning.expected import OPEN, Expected, expect
@@ -29,7 +26,6 @@ class PlannedPlace:
         stddev_m: (3,) of the map's middle, in x, y, z.
         heading_stddev_deg: of its turn about z. tilt_stddev_deg: of z against the plumb line.
         worst_keyframe: which keyframe is known least. worst_keyframe_stddev_m: root of its summed variances.
-        keyframe_stddevs_m: (n,) of each, likewise.
     """
 
     stddev_m: tuple[float, float, float]
@@ -37,7 +33,6 @@ class PlannedPlace:
     tilt_stddev_deg: float
     worst_keyframe: int
     worst_keyframe_stddev_m: float
-    keyframe_stddevs_m: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -82,9 +77,11 @@ class SurveyPlan:
         scale_interval_95: relative, its ends.
         components: what each component of the ranges' errors does to the scale, by name.
         place: None where the frame is the first camera's.
+        keyframe_stddevs_m: (n,) of each keyframe's place in that frame.
         verdict, reasons: on the scale, as the run will judge it; "doubtful" too where it will refuse the place.
         mistakes: what would be found of each, those that do most first.
         advice: changes that would gain something.
+        expected: the estimate that all this is of.
     """
 
     num_ranges: int
@@ -96,10 +93,12 @@ class SurveyPlan:
     scale_interval_95: tuple[float, float]
     components: dict[str, float]
     place: PlannedPlace | None
+    keyframe_stddevs_m: tuple[float, ...]
     verdict: str
     reasons: tuple[str, ...]
     mistakes: tuple[DetectableMistake, ...]
     advice: tuple[Advice, ...]
+    expected: Expected = field(repr=False)
 
     @property
     def advice_for_scale(self) -> list[Advice]:
@@ -118,12 +117,12 @@ class SurveyPlan:
 
     def as_json(self) -> dict[str, Any]:
         """What is infinite or not a number is null; advice in both orders."""
-        content: dict[str, Any] = asdict(self)
+        content: dict[str, Any] = _finite(self)
         del content["advice"]
-        content["advice_for_scale"] = [asdict(advice) for advice in self.advice_for_scale]
-        content["advice_for_place"] = [asdict(advice) for advice in self.advice_for_place]
-        finite: dict[str, Any] = _finite(content)
-        return finite
+        return content | {
+            "advice_for_scale": _finite(self.advice_for_scale),
+            "advice_for_place": _finite(self.advice_for_place),
+        }
 
 
 def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
@@ -145,19 +144,13 @@ def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
         scale_interval_95=(float(np.expm1(-half_width)), float(np.expm1(half_width))),
         components=expected.uncertainty.components,
         place=_place(expected),
+        keyframe_stddevs_m=tuple(expected.stddevs_at(planned.trajectory.centers).tolist()),
         verdict=verdict.verdict if mirror_image is None else "doubtful",
         reasons=verdict.reasons if mirror_image is None else (f"a run will refuse: {mirror_image}", *verdict.reasons),
         mistakes=_mistakes(expected),
         advice=advise(expected),
+        expected=expected,
     )
-
-
-def write_plan(plan: SurveyPlan, folder: Path) -> Path:
-    """Write ``plan.json`` there."""
-    make_output_folder(folder)
-    path = folder / "plan.json"
-    write_text(json.dumps(plan.as_json(), indent=2) + "\n", path)
-    return path
 
 
 def _place(expected: Expected) -> PlannedPlace | None:
@@ -172,7 +165,6 @@ def _place(expected: Expected) -> PlannedPlace | None:
         tilt_stddev_deg=float(np.rad2deg(np.linalg.norm(of_map[1:3]))),
         worst_keyframe=int(np.argmax(of_keyframes)),
         worst_keyframe_stddev_m=float(of_keyframes.max()),
-        keyframe_stddevs_m=tuple(of_keyframes.tolist()),
     )
 
 
@@ -250,6 +242,8 @@ def _degrees(stddev_deg: float) -> str:
 
 
 def _finite(value: Any) -> Any:
+    if is_dataclass(value):
+        value = {part.name: getattr(value, part.name) for part in fields(value) if part.repr}
     if isinstance(value, dict):
         return {name: _finite(part) for name, part in value.items()}
     if isinstance(value, (list, tuple)):

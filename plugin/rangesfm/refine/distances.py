@@ -86,8 +86,8 @@ def add_distances(
         for anchor, block in zip(anchors, anchor_blocks, strict=True)
         if np.isfinite(block).all()
     }
-    _add_taped(bundle, distances, placed)
-    return _add_by_radio(bundle, distances.by_radio, anchor_blocks, errors)
+    origins = _add_taped(bundle, distances, placed)
+    return origins + _add_by_radio(bundle, distances.by_radio, anchor_blocks, errors)
 
 
 @dataclass(frozen=True)
@@ -98,19 +98,20 @@ class _End:
     in_rig_m: Array | None
 
 
-def _add_taped(bundle: BundleAdjustment, distances: MeasuredDistances, anchors: Mapping[str, _End]) -> None:
-    ends = dict(anchors)
+def _add_taped(bundle: BundleAdjustment, distances: MeasuredDistances, anchors: Mapping[str, _End]) -> list[Array]:
+    ends, origins = dict(anchors), []
     for name, point_id in distances.marker_ids.items():
         ends[name] = _End(bundle.metric.point3D(point_id).xyz, None)
         bundle.keep_from_elimination(ends[name].block)
-    if distances.tape.distances:
-        ends |= {name: _camera(bundle.metric, image) for name, image in images_by_name(bundle.metric).items()}
+    images = images_by_name(bundle.metric) if distances.tape.distances else {}
+    ends |= {name: _camera(bundle.metric, image) for name, image in images.items()}
     for taped in distances.tape.distances:
         if not set(taped.ends) <= ends.keys():
             continue
         a, b = (ends[name] for name in taped.ends)
         if a.block is b.block or np.shares_memory(a.block, b.block):
-            continue  # two cameras of one rig, which is as it is
+            a, b = (_in_rig(bundle.metric, images[name]) for name in taped.ends)
+            origins += [end.block for end in (a, b) if end.in_rig_m is None]
         cost = ceres.distance_cost(
             distance_m=taped.distance_m,
             stddev_m=taped.stddev_m / bundle.pixel_stddev,
@@ -118,6 +119,17 @@ def _add_taped(bundle: BundleAdjustment, distances: MeasuredDistances, anchors: 
             b_in_cam_m=b.in_rig_m,
         )
         ceres.add_residual_block(bundle.adjuster, cost, None, [a.block, b.block])
+    for origin in origins:
+        bundle.adjuster.problem.set_parameter_block_constant(origin)
+    return origins
+
+
+def _in_rig(metric: pycolmap.Reconstruction, image: pycolmap.Image) -> _End:
+    """Where a camera sits in its rig: one of which another photo is the other end's."""
+    sensor, rig = image.data_id.sensor_id, metric.rig(metric.frame(image.frame_id).rig_id)
+    # Itself: sensor_from_rig() hands out a copy.
+    pose = None if rig.is_ref_sensor(sensor) else rig.non_ref_sensors[sensor]
+    return _End(np.zeros(3), None) if pose is None else _End(pose.params, np.zeros(3))
 
 
 def _camera(metric: pycolmap.Reconstruction, image: pycolmap.Image) -> _End:

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.ceres.factored import Factored, SingularError, factor
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import rounding_of
@@ -297,12 +297,18 @@ def _prior_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tup
     return np.array(residuals), sparse.coo_array((values, (rows, columns)), shape=shape).tocsr()
 
 
-def _factor(hessian: sparse.csc_array, layout: _Layout, damping: float) -> SuperLU:
+def _factor(hessian: sparse.csc_array, layout: _Layout, damping: float) -> Factored:
+    """With more damping where rounding makes it indefinite, as it does in a map without sense."""
     part = hessian[layout.free][:, layout.free]
     diagonal = part.diagonal()
     # The floor keeps a pose that nothing holds in place.
     damped = part + sparse.diags_array(damping * diagonal + 1e-12 * diagonal.max())
-    return splu(damped.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    try:
+        return factor(damped.tocsc())
+    except SingularError:
+        if damping > _MAX_DAMPING:  # then it is not of numbers
+            raise
+        return _factor(hessian, layout, max(10 * damping, _INITIAL_DAMPING))
 
 
 def _moved(state: GraphState, layout: _Layout, free_step: Array) -> GraphState:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rangesfm.report.text import fixed, sentence
+from markupsafe import Markup
+
+from rangesfm.report.text import count, decimals_for, fixed, keyed, sentence, signed
 from rangesfm.result.entries import ScaleEntry, TimeOffsetEntry
 from rangesfm.result.summary import ResultSummary
 
@@ -22,6 +24,7 @@ class Check:
             (from the first upwards, where larger is better).
         decimals: of the printed numbers.
         larger_is_better: the limits are lower ones.
+        key: of the value in ``result.json``.
         no_matter: why any value is as good here, so that the light is green; None: it matters.
     """
 
@@ -33,6 +36,7 @@ class Check:
     amber_limit: float
     decimals: int
     larger_is_better: bool = False
+    key: str = ""
     no_matter: str | None = None
 
     @property
@@ -49,7 +53,8 @@ class Check:
 
     @property
     def text(self) -> str:
-        return fixed(self.value, self.decimals, self.unit, nothing="not measured")
+        text = fixed(self.value, self.decimals, self.unit, nothing="not measured")
+        return keyed(self.key, self.value, text) if self.key else text
 
     @property
     def limits(self) -> str:
@@ -81,22 +86,40 @@ def quality_checks(summary: ResultSummary) -> tuple[Check, ...]:
     uncertainty = _relative_percent(scale.larger_stddev, scale.value)
     share_used = _relative_percent(ranges.num_used, ranges.num)
     reprojection_px = None if summary.refine is None else summary.refine.reprojection_rms_px
-    of_scale = "The larger of the formal and the empirical standard deviation."
+    of_scale = Markup("One standard deviation: the larger of the formal, {}, and the empirical one, {}.").format(
+        _shown("scale.stddev_formal", scale.stddev_formal), _shown("scale.stddev_empirical", scale.stddev_empirical)
+    )
     of_anchors = "Farthest that the scale from one anchor alone is from the joint one."
-    of_check_ranges = "RMS of ranges that no estimate has seen."
-    of_share = "Share of all ranges in the log that had a say."
-    of_clocks = "Standard deviation of the offset between the camera's and the radio's clock."
+    of_check_ranges = Markup("RMS of {} ranges held out, which no estimate has seen.").format(
+        keyed("check_ranges.num", summary.check_ranges.num, count(summary.check_ranges.num))
+    )
+    of_ranges = Markup("RMS of the ranges used; half of them are within {}.").format(
+        keyed("ranges.median_abs_m", ranges.median_abs_m, fixed(ranges.median_abs_m, 3, "m"))
+    )
+    of_share = Markup("{} of the {} ranges in the log had a say.").format(
+        keyed("ranges.num_used", ranges.num_used, count(ranges.num_used)),
+        keyed("ranges.num", ranges.num, count(ranges.num)),
+    )
+    decimals = min(decimals_for(offset.stddev_s, default=3), 6)
+    of_clocks = Markup("Standard deviation of image time minus range time, {}.").format(
+        keyed("time_offset.value_s", offset.value_s, signed(offset.value_s, decimals, "s"))
+    )
     of_points = "RMS distance of the map's points from where the photos show them."
     no_matter = _why_no_offset_matters(offset)
+    checked_m, clocks_s = summary.check_ranges.rms_m, offset.stddev_s
     return (
         Check("Scale uncertainty", of_scale, uncertainty, "%", 1.0, 5.0, 2),
         Check("Anchor agreement", of_anchors, _anchor_spread_percent(scale), "%", 2.0, 5.0, 2),
-        Check("Check ranges", of_check_ranges, summary.check_ranges.rms_m, "m", 0.20, 0.40, 3),
-        Check("Range residuals", "RMS of the ranges used.", ranges.rms_m, "m", 0.15, 0.30, 3),
+        Check("Check ranges", of_check_ranges, checked_m, "m", 0.20, 0.40, 3, key="check_ranges.rms_m"),
+        Check("Range residuals", of_ranges, ranges.rms_m, "m", 0.15, 0.30, 3, key="ranges.rms_m"),
         Check("Ranges used", of_share, share_used, "%", 70.0, 40.0, 1, larger_is_better=True),
-        Check("Clock offset", of_clocks, offset.stddev_s, "s", 0.02, 0.10, 4, no_matter=no_matter),
-        Check("Reprojection", of_points, reprojection_px, "px", 1.0, 2.0, 2),
+        Check("Clock offset", of_clocks, clocks_s, "s", 0.02, 0.1, 4, key="time_offset.stddev_s", no_matter=no_matter),
+        Check("Reprojection", of_points, reprojection_px, "px", 1.0, 2.0, 2, key="refine.reprojection_rms_px"),
     )
+
+
+def _shown(key: str, value: float | None) -> str:
+    return keyed(key, value, fixed(value, decimals_for(value, default=5)))
 
 
 def _why_no_offset_matters(offset: TimeOffsetEntry) -> str | None:

@@ -21,9 +21,7 @@ from rangesfm.report.plot import (
     figure_of,
     views_of,
 )
-from rangesfm.report.text import count
 
-MAX_NUM_POINTS_DRAWN = 6000
 PICTURE_WIDTH_PX = 900
 
 _SEEN_QUANTILE = 0.02
@@ -35,12 +33,9 @@ def trajectory_views(content: Content) -> Figure | None:
     """The path in plan and in elevation: with the true, with the estimated scale, and refined."""
     if not content.final:
         return None
-    frame, num = content.summary.frame, len(content.points_m)
+    frame = content.summary.frame
     views = tuple(_trajectory_view(content, view) for view in views_of(content.final.centers, frame))
     caption = f"The camera's path in metres, in the {'site' if frame == 'site' else 'first camera'} frame."
-    if num:
-        drawn = count(min(num, MAX_NUM_POINTS_DRAWN))
-        caption += f" {drawn} of the map's {count(num)} points are drawn, those that are near."
     return Figure("trajectory", caption, views, layout="views")
 
 
@@ -88,11 +83,6 @@ def _trajectory_view(content: Content, view: View) -> Panel:
     anchors = content.result.anchor_positions_m
     places = view.seen(np.array(list(anchors.values())).reshape(-1, 3))
     limits = equal_view(np.concatenate([*(line.points for line in lines), places]))
-    if (num := len(content.points_m)) > 0:
-        even = np.random.default_rng(0).choice(num, min(num, MAX_NUM_POINTS_DRAWN), replace=False)
-        points, (low, high) = view.seen(content.points_m[even]), np.transpose(limits[:2])
-        inside = np.all((points > low) & (points < high), axis=1)
-        lines.insert(0, Series("map", "map", points[inside], is_data=False))
     marks = tuple(
         Mark("anchor", "anchor", "triangle", x, y, anchor_id, f"anchor {anchor_id}")
         for anchor_id, (x, y) in zip(anchors, places.tolist())

@@ -32,7 +32,7 @@ def scale_per_anchor(content: Content) -> Figure | None:
     return figure_of(
         "scale_per_anchor",
         "The scale from each anchor alone, and how far it is from the joint one. Line and band: the joint scale "
-        "and one standard deviation. The spread of the anchors is the most honest error bar there is.",
+        "and one standard deviation. What an anchor alone has wrong, its place or its antenna, shows here.",
         "Scale from each anchor alone against the joint scale",
         ("scale m per unit", ""),
         (),

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from markupsafe import Markup
 
 from rangesfm.report import figures_path, figures_ranges, figures_scale, head, tables, text
-from rangesfm.report.chart import ASSETS, page_charts
+from rangesfm.report.chart import ASSETS, css, page_charts
 from rangesfm.report.checks import quality_checks
 from rangesfm.report.content import Content
 from rangesfm.report.plot import Figure
@@ -60,7 +60,7 @@ SECTIONS = (
         (tables.range_statuses, tables.ranges_per_anchor),
     ),
     Section("mistakes", "Mistakes", (), (tables.mistakes,)),
-    Section("anchors", "Anchors", (), (tables.anchors, tables.distances)),
+    Section("anchors", "Anchors", (), (tables.anchors, tables.distances, tables.baselines)),
     Section(
         "run",
         "Run",
@@ -73,7 +73,7 @@ _SCRIPTS = (
     *("data", "stage", "points", "cameras", "anchors", "ranges", "grid", "picking", "measuring", "photo_panel"),
     *("charts", "csv", "main"),
 )
-_FILTERS = (text.count, text.duration, text.fixed, text.plain, text.sentence, text.signed)
+_FILTERS = (text.count, text.duration, text.fixed, text.percent, text.plain, text.sentence, text.signed)
 
 
 def figures_of(content: Content, sections: Iterable[Section] = SECTIONS) -> list[Figure]:
@@ -95,7 +95,6 @@ def render_report(content: Content) -> str:
         heading=content.title,
         summary=content.summary,
         checks=quality_checks(content.summary),
-        stddevs=head.stddevs(content.summary.scale),
         tiles=head.tiles(content),
         view=None if scene is None else view_of(scene),
         sections=sections,
@@ -153,5 +152,6 @@ def _environment() -> Environment:
     )
     environment.filters |= {function.__name__: function for function in _FILTERS}
     environment.globals |= {"keyed": text.keyed, "decimals_for": text.decimals_for}
+    environment.globals |= {"said_once": head.said_once, "css": css}
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
     return environment

@@ -18,6 +18,27 @@ from rangesfm.result.entries import AnchorEntry, median, rms
 
 _Columns = Mapping[str, Callable[[Any], str]]
 _to_4 = partial(fixed, decimals=4)
+_WAYS = ("to the right", "downward", "forward")
+_REFINEMENT = {
+    "kept": "refined map kept",
+    "why_not_kept": "why not kept",
+    "iterations": "iterations",
+    "keyframe_graph_steps": "steps along the path before",
+    "bend_m": "bent by, m",
+    "initial_cost": "cost before",
+    "final_cost": "cost after",
+    "reprojection_rms_px": "reprojection RMS, px",
+    "pixel_stddev": "stddev of an observation, px",
+    "correlation_inflation": "stddevs widened for errors that last, times",
+    "seconds": "time, s",
+    "converged": "converged",
+    "message": "solver's message",
+    "scale_value": "scale after, m per unit",
+    "relative_scale_stddev": "its stddev, relative",
+    "tag_in_cam_m": "lever arm, m",
+    "time_offset_change_s": "clock offset changed by, s",
+    "short_range_error_m": "error of short ranges, m",
+}
 
 
 @dataclass(frozen=True)
@@ -147,6 +168,18 @@ def distances(content: Content) -> Table:
     return Table("Control and check distances", header, rows)
 
 
+def baselines(content: Content) -> Table:
+    """The scale by the known distances between a rig's cameras, beside that by the ranges."""
+    columns = dict.fromkeys(("distance_m", "stddev_m", "scale"), partial(fixed, decimals=4))
+    columns["off_by"] = partial(signed, decimals=4)
+    header = ["cameras", "known m", "stddev m", "scale m per SfM unit", "more than by ranges, share", "agrees"]
+    rows = [
+        [" and ".join(row.photos), *_cells(f"baselines.{i}", row, columns), "yes" if row.agrees else "no"]
+        for i, row in enumerate(content.summary.baselines)
+    ]
+    return Table("Baselines of rigs", header, rows)
+
+
 def intrinsics(content: Content) -> Table:
     """The cameras before and, if there was one, after the refinement."""
     header = ["camera", "parameter", "scaled", "refined", "change"]
@@ -181,7 +214,7 @@ def refinement(content: Content) -> Table:
     """What the solver did."""
     refine = content.summary.refine
     values = {} if refine is None else refine.to_json()
-    rows = [[name.replace("_", " "), keyed(f"refine.{name}", value, plain(value))] for name, value in values.items()]
+    rows = [[_REFINEMENT[name], keyed(f"refine.{name}", value, plain(value))] for name, value in values.items()]
     return Table("Refinement", [], rows, is_narrow=True)
 
 
@@ -195,7 +228,17 @@ def error_budget(content: Content) -> Table:
 
 def sensitivity(content: Content) -> Table:
     """By how much the scale would change."""
-    return Table("How the scale answers to what was assumed", [], _flat(content.summary.scale.to_json()["sensitivity"]))
+    given = content.summary.scale.sensitivity
+    percents = {
+        "1 cm, all ranges": given.common_bias_per_cm,
+        "1 cm, the shorter half of the ranges": given.short_range_per_cm,
+        **{f"1 cm, ranges of anchor {name}": value for name, value in given.anchor_bias_per_cm.items()},
+        "1 % of its length, each range": given.range_slope_per_percent,
+        **{f"1 cm, lever arm {way}": value for way, value in zip(_WAYS, given.lever_arm_per_cm)},
+    }
+    rows = [[what, signed(percent, 3)] for what, percent in percents.items()]
+    title = "By how much the scale would change if it were longer by"
+    return Table(title, ["what is longer than it was taken to be", "scale %"], rows, is_narrow=True)
 
 
 def versions(content: Content) -> Table:

@@ -35,6 +35,17 @@ def count(value: float | None) -> str:
     return NOTHING if number is None else f"{round(number):,}".replace(",", "\u202f")
 
 
+def rough(value: float | None, unit: str) -> str:
+    """In two digits with a unit; "open" for what nothing determines."""
+    number = _known(value)
+    return "open" if number is None else f"{number:.2g}\u00a0{unit}"
+
+
+def percent(share: float) -> str:
+    """A share in two digits."""
+    return rough(100 * share, "%")
+
+
 def decimals_for(stddev: float | None, *, default: int) -> int:
     """Decimals that show two digits of the stddev."""
     if stddev is None or stddev <= 0:

@@ -20,6 +20,7 @@ from rangesfm.ranging.observations import RangeObservations, RangeStatus
 from rangesfm.refine.with_ranges import RefineSummary
 from rangesfm.scale.diagnostics import ScaleDiagnostics, scale_diagnostics
 from rangesfm.scale.estimate import ScaleEstimate
+from rangesfm.trust.baselines import Baseline
 from rangesfm.trust.finished_map import Place
 from rangesfm.trust.verdict import TrustVerdict
 
@@ -46,6 +47,7 @@ class MetricResult:
         place: of the map in the site's frame; None where the frame is the first camera's, or nobody judged it yet.
         models: that were to be joined to what is one model here; empty where there was only one.
         trust: what the tests of mistakes say of the scaled map.
+        baselines: known distances between a rig's cameras, as the unscaled model has them.
     """
 
     trajectory: Trajectory
@@ -61,6 +63,7 @@ class MetricResult:
     place: Place | None = None
     models: tuple[ModelVerdict, ...] = ()
     trust: TrustVerdict | None = None
+    baselines: tuple[Baseline, ...] = ()
 
     @property
     def final(self) -> pycolmap.Reconstruction:

@@ -90,7 +90,7 @@ def solve_scale(posed: ScaleProblem, *, camera_side: str | None, seed: int) -> S
     starts = [fit.state for fit in fits]
     if posed.anchors_are_known and not problem.frame_is_free:
         starts += _consensus_states(problem)
-    solutions = [_with_own_errors(posed, start) for start in _likeliest_each_once(problem, errors, starts)]
+    solutions = [solution_from(posed, start) for start in _likeliest_each_once(problem, errors, starts)]
     solutions.sort(key=lambda solution: _unlikeliness(problem, errors, solution.fit.state))
     on_side(problem, [solutions[0].fit], camera_side)
     refuse_ambiguity(solutions[0], [solution.fit.state for solution in solutions[1:]], camera_side)
@@ -184,8 +184,8 @@ def _differ(problem: RangeProblem, first: RangeState, second: RangeState) -> boo
     return bool(turn > _SAME_ROTATION_DEG or shift > _SAME_SHIFT)
 
 
-def _with_own_errors(posed: ScaleProblem, start: RangeState) -> Solution:
-    """Alternate between the fit and the errors it shows."""
+def solution_from(posed: ScaleProblem, start: RangeState) -> Solution:
+    """Alternate between the fit and the errors it shows, from one start only."""
     given = posed.ranges
 
     def seen(errors: RangeErrors, state: RangeState) -> RangeErrors:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.ranging.errors.cells import MAX_NUM_CELLS, Cells, cells, noisiness
-from rangesfm.ranging.errors.components import GIVEN
-from rangesfm.ranging.errors.learned import LearnedErrors, learn_errors, usual_errors
+from rangesfm.ranging.errors.components import GIVEN, REWEIGHTING
+from rangesfm.ranging.errors.learned import ROUNDING, LearnedErrors, learn_errors, usual_errors
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.estimate import ScaleUncertainty
 from rangesfm.scale.problem import ScaleProblem
@@ -21,6 +21,7 @@ from rangesfm.scale.range_equation import (
     invert_information,
     predicted_ranges,
     prior_jacobian,
+    prior_residuals,
     range_gradient,
     range_jacobian,
 )
@@ -38,21 +39,44 @@ def learned_errors(
     Args:
         model_from_cam: (n, 3, 3) rotation of the camera at each range, into the world of the problem.
     """
-    problem, state, log = solution.problem, solution.fit.state, observations.log
-    unbiased = replace(state, bias_m=problem.bias_mean_m)
-    ones = np.ones(len(problem.range_m))
-    # Biases are among the errors here.
-    only_map = replace(problem, bias_stddev_m=np.zeros(problem.num_anchors), stddev_m=ones, share=None)
-    columns = columns_of([only_map])[0]
-    taken_off = log.shared_stddev_m
+    linear, taken_off = _linear(posed, solution), observations.log.shared_stddev_m
     return learn_errors(
         _cells(posed, solution, observations, model_from_cam),
-        off_m=problem.range_m - predicted_ranges(problem, unbiased),
-        design=range_jacobian(only_map, columns, state, state),
-        prior_design=prior_jacobian(only_map, columns, state, state),
+        off_m=linear.off_m,
+        design=linear.design,
+        prior_design=linear.prior_design,
         noise_m=solution.noise_stddev_m,
         curve_stddev_m=None if taken_off is None else taken_off[posed.rows],
-        ruled_out=ruled_out(problem),
+        ruled_out=ruled_out(solution.problem),
+    )
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """The map alone about a solution, as biases are among the errors here.
+
+    Attributes:
+        off_m: (n,) measured minus predicted without any bias.
+        design: (n, p) by how much each predicted range grows with the unknowns, the logarithm of the scale first.
+        prior_off, prior_design: (r,), (r, p) the same of what is known of these beforehand, in stddevs.
+    """
+
+    off_m: Array
+    design: Array
+    prior_off: Array
+    prior_design: Array
+
+
+def _linear(posed: ScaleProblem, solution: Solution) -> _Linear:
+    given, state = posed.ranges, solution.fit.state
+    unbiased = replace(state, bias_m=given.bias_mean_m)
+    only_map = replace(given, bias_stddev_m=np.zeros(given.num_anchors), stddev_m=np.ones(len(given.range_m)))
+    columns = columns_of([only_map])[0]
+    return _Linear(
+        given.range_m - predicted_ranges(given, unbiased),
+        range_jacobian(only_map, columns, state, state),
+        -prior_residuals(only_map, columns, state),
+        prior_jacobian(only_map, columns, state, state),
     )
 
 
@@ -117,16 +141,43 @@ def times_of_ranges(posed: ScaleProblem, solution: Solution, observations: Range
     return np.concatenate([[0.0], np.cumsum(steps_m)])[of_range] / _WALKING_M_PER_S
 
 
-def scale_uncertainty(solution: Solution, learned: LearnedErrors) -> ScaleUncertainty:
-    """Relative stddevs of the scale."""
+def scale_uncertainty(posed: ScaleProblem, solution: Solution, learned: LearnedErrors) -> ScaleUncertainty:
+    """Relative stddevs of the scale.
+
+    Its robust weights do not make the most of what is learnt of the errors. The best ones do (Gauss-Markov), as far as
+    the errors are what they are taken for, and say how far off the scale is that was found: as far as theirs, give or
+    take the stddev of theirs. Where that leaves more open than the errors' sum, it is no help.
+    """
+    summed = expected_scale_uncertainty(solution, learned)
+    reweighted = replace(summed, components=_reweighted(_linear(posed, solution), learned))
+    return min(summed, reweighted, key=lambda each: each.empirical)
+
+
+def expected_scale_uncertainty(solution: Solution, learned: LearnedErrors) -> ScaleUncertainty:
+    """The same by the errors' sum alone, before anything is measured."""
     components = learned.stddev_of(scale_influence(solution.fit, solution.problem))
-    if (given := _by_what_was_given(solution)) > 0:
-        components[GIVEN] = given
+    if (given := _by_what_was_given(solution)[0, 0]) > 0:
+        components[GIVEN] = float(np.sqrt(given))
     return ScaleUncertainty(formal=solution.fit.log_scale_stddev, components=components)
 
 
-def _by_what_was_given(solution: Solution) -> float:
-    """What taped distances, positions of anchors and the upward direction do to the scale by not being exact.
+def _reweighted(linear: _Linear, learned: LearnedErrors) -> dict[str, float]:
+    """By component, of the scale that the best weights find, and how far that is from the one at hand."""
+    design, off_m = learned.cells.mean(linear.design), learned.cells.mean(linear.off_m)
+    covariance = learned.covariance_m2
+    covariance[np.diag_indices_from(covariance)] += ROUNDING * np.trace(covariance)
+    whitened = np.linalg.solve(covariance, design)
+    inverse = invert_information(design.T @ whitened + linear.prior_design.T @ linear.prior_design)
+    of_cells, of_priors = whitened @ inverse[0], linear.prior_design @ inverse[0]
+    components = learned.stddev_of_cells(of_cells)
+    if (given := float(np.linalg.norm(of_priors))) > 0:
+        components[GIVEN] = given
+    components[REWEIGHTING] = abs(float(of_cells @ off_m + of_priors @ linear.prior_off))
+    return components
+
+
+def _by_what_was_given(solution: Solution) -> Array:
+    """(p, p) what taped distances, positions of anchors and the upward direction do by not being exact.
 
     Biases are among the ranges' errors. All priors weigh as against independent ranges: their stddevs were divided by
     the inflation.
@@ -135,16 +186,15 @@ def _by_what_was_given(solution: Solution) -> float:
     given = fit.prior_information.copy()
     biases = fit.columns[0].bias[fit.columns[0].bias >= 0]
     given[biases] = given[:, biases] = 0.0
-    to_scale = np.linalg.lstsq(fit.information, np.eye(len(fit.information))[0], rcond=1e-12)[0]
-    return float(solution.errors.inflation * np.sqrt(max(to_scale @ given @ to_scale, 0.0)))
-
-
-def parameter_covariance(fit: RangeFit, problem: RangeProblem, learned: LearnedErrors) -> Array:
-    """(p, p) of all that a fit estimates, in the parameters of its columns: what the ranges' errors do to it."""
-    of_cells = parameter_influence(fit, problem, learned)
     inverse = invert_information(fit.information)
-    of_priors = inverse @ fit.prior_information @ inverse
-    covariance: Array = of_cells @ learned.covariance_m2 @ of_cells.T + of_priors
+    covariance: Array = solution.errors.inflation**2 * inverse @ given @ inverse
+    return covariance
+
+
+def parameter_covariance(solution: Solution, learned: LearnedErrors) -> Array:
+    """(p, p) of all that a fit estimates, in the parameters of its columns, by what ranges get wrong and was given."""
+    of_cells = parameter_influence(solution.fit, solution.problem, learned)
+    covariance: Array = of_cells @ learned.covariance_m2 @ of_cells.T + _by_what_was_given(solution)
     return covariance
 
 

@@ -30,9 +30,9 @@ _MAX_ANCHOR_SPREAD = 0.05
 # Components of the ranges' errors that the same measure helps against.
 _KINDS = (
     ("curve", "rough_curve", "slope", "short", "common_bias", "learnt_curve"),
-    ("antenna", "tag_antenna"),
+    ("antenna", "tag_antenna", "view"),
     ("bias",),
-    ("white", "moment", "time", "long_time", "bending"),
+    ("white", "time", "place", "bending", "reweighting"),
 )
 _CALIBRATE = "calibrate the radio at the distances of this survey (rangesfm ranges calibrate)"
 

@@ -14,7 +14,9 @@ import numpy.typing as npt
 from rangesfm.distances.tape import Tape, read_tape
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import sha256_of
+from rangesfm.files.folders import walk
 from rangesfm.geometry.reference import Reference, read_reference
+from rangesfm.geometry.trajectory import photos_by_frame
 from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.anchor_file import default_anchor_frame, read_anchors
@@ -225,10 +227,10 @@ def _anchors_of_log(log: RangeLog) -> tuple[Anchor, ...]:
 
 def times_of_model(survey: Survey, sfm: pycolmap.Reconstruction, model_path: Path) -> ImageTimes:
     """Times of a model's photos; the table may list others, which did not become keyframes."""
+    frames = photos_by_frame(sfm)
     if survey.images.times is not None:
-        return read_image_times_csv(survey.images.times)
-    names = tuple(sorted(image.name for image in sfm.images.values()))
-    return find_image_times(survey.images.path or model_path, names)
+        return read_image_times_csv(survey.images.times, frames=frames)
+    return find_image_times(survey.images.path or model_path, tuple(sorted(frames)))
 
 
 def of_one_tag(log: RangeLog, tag_id: str | None) -> RangeLog:
@@ -308,7 +310,7 @@ def input_hashes(survey: Survey) -> list[dict[str, Any]]:
         if item.role == "photos":
             entries += [_folder(item.path)] if item.path.is_dir() else []
         else:
-            files = sorted(item.path.glob("*.bin")) if item.role == "model" else [item.path]
+            files = sorted(item.path.glob("*.bin" if item.role == "model" else "*")) or [item.path]
             entries += [_file(path) for path in files if path.is_file()]
     return entries
 
@@ -318,7 +320,8 @@ def _file(path: Path) -> dict[str, Any]:
 
 
 def _folder(path: Path) -> dict[str, Any]:
-    sizes = {file.relative_to(path).as_posix(): file.stat().st_size for file in path.rglob("*") if file.is_file()}
+    files = (parent / name for parent, _, names in walk(path) for name in names)
+    sizes = {file.relative_to(path).as_posix(): file.stat().st_size for file in files if file.is_file()}
     listing = "".join(f"{name}\t{size}\n" for name, size in sorted(sizes.items()))
     return {
         "path": str(path),

@@ -76,7 +76,7 @@ def ranges_on_map(
 
 def _velocities(posed: ScaleProblem, observations: RangeObservations, trajectory: Trajectory) -> Array | None:
     times = trajectory.timestamps_s
-    if times is None or len(times) < 2:
+    if times is None or len(times) < 2 or (np.diff(times) <= 0).any():  # two cameras at once have no one way
         return None
     nearest = np.where(observations.weight < 0.5, observations.before, observations.after)[posed.rows]
     velocities = np.gradient(trajectory.centers, times, axis=0)[nearest]

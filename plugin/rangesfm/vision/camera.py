@@ -14,6 +14,7 @@ from rangesfm.errors import InputError, nearest_known
 from rangesfm.options import CameraOptions
 from rangesfm.vision.exif import exif_tags
 from rangesfm.vision.photos import Photos
+from rangesfm.vision.rigs import NO_RIGS, Rigs
 
 _TELLING_TAGS = (0x010F, 0x0110, 0xA431, 0x920A)  # make, model, serial number, focal length
 _MODELS = {name: model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
@@ -23,8 +24,16 @@ def check_camera(options: CameraOptions) -> None:
     """Refuse what is no camera of COLMAP's.
 
     Raises:
-        InputError: an unknown model, parameters without a model, too few or too many or impossible ones.
+        InputError: an unknown model, parameters without a model, too few or too many or impossible ones; a pattern of
+            photos where there is nothing but this one table.
     """
+    if options.images is not None and not options.others:
+        raise InputError(f"[camera] images is '{options.images}', expected none but in several [[camera]] tables")
+    for table in options.tables:
+        _check_table(table)
+
+
+def _check_table(options: CameraOptions) -> None:
     if options.params is None and options.focal_length_stddev_px is not None:
         raise InputError("[camera] has focal_length_stddev_px but no params, expected those that it is of")
     if options.model is None:
@@ -70,18 +79,42 @@ class PhotoCameras:
         return [*cameras, *([] if len(cameras) == 1 else [self.of_photo])]
 
 
-def cameras_of_photos(options: CameraOptions, photos: Photos) -> PhotoCameras:
+def cameras_of_photos(options: CameraOptions, photos: Photos, rigs: Rigs = NO_RIGS) -> PhotoCameras:
     """Which camera took each photo; photos of one camera are of one size.
 
     Args:
         options: as checked by ``check_camera``. Where they leave a camera open, COLMAP takes it from the EXIF data of
             its first photo.
+        rigs: whose cameras are one each, whatever the options say.
 
     Raises:
-        InputError: parameters that belong to photos of another size.
+        InputError: photos of two sizes of one camera of a rig, parameters that belong to photos of another size, a
+            table whose pattern is of no photo. OptionError: a photo that belongs to two tables.
     """
+    table_of = {name: options.of_photo(name) for name in photos.names}
+    cameras: list[pycolmap.Camera] = []
+    place_of: dict[str, int] = {}
+    guessed: list[str] = []
+    for table in options.tables:
+        own = photos.of([name for name in photos.names if table_of[name] is table])
+        if not own.names:
+            _check_pattern(table, photos.names[0])
+            continue
+        found = _of_one_table(table, own, rigs)
+        place_of |= {name: len(cameras) + place for name, place in zip(own.names, found.of_photo, strict=True)}
+        cameras += found.cameras
+        guessed += found.guessed
+    return PhotoCameras(tuple(cameras), tuple(place_of[name] for name in photos.names), tuple(guessed))
+
+
+def _check_pattern(table: CameraOptions, name: str) -> None:
+    if table.images is not None:
+        raise InputError(f"[[camera]] images is '{table.images}', expected some photo's name, as {name}")
+
+
+def _of_one_table(options: CameraOptions, photos: Photos, rigs: Rigs) -> PhotoCameras:
     groups: dict[Any, int] = {}
-    of_photo = [groups.setdefault(key, len(groups)) for key in _keys(options.mode, photos)]
+    of_photo = [groups.setdefault(key, len(groups)) for key in _keys(options.mode, photos, rigs)]
     firsts = [of_photo.index(group) for group in range(len(groups))]
     if options.model is None or options.params is None:
         return PhotoCameras(tuple(_guessed(options.model, photos, first) for first in firsts), tuple(of_photo))
@@ -98,8 +131,21 @@ def cameras_of_photos(options: CameraOptions, photos: Photos) -> PhotoCameras:
     return PhotoCameras(tuple(cameras), tuple(of_photo), tuple(guessed))
 
 
-def _keys(mode: str, photos: Photos) -> list[Any]:
+def _keys(mode: str, photos: Photos, rigs: Rigs) -> list[Any]:
     """The same for photos of one camera."""
+    sizes: dict[str | None, tuple[int, int]] = {}
+    in_rigs = [rigs.camera_of(name) for name in photos.names]
+    for name, size, camera in zip(photos.names, photos.sizes, in_rigs, strict=True):
+        if camera is not None and (first := sizes.setdefault(camera, size)) != size:
+            message = (
+                f"{name} is of {size[0]} x {size[1]} pixels, expected {first[0]} x {first[1]} as others of '{camera}'"
+            )
+            raise InputError(message, rigs.path)
+    keys = _keys_by_mode(mode, photos)
+    return [key if camera is None else (camera, "of a rig") for key, camera in zip(keys, in_rigs, strict=True)]
+
+
+def _keys_by_mode(mode: str, photos: Photos) -> list[Any]:
     if mode == "per_image":
         return list(photos.names)
     if mode == "per_folder":

@@ -74,10 +74,11 @@ def copy_features(source_path: Path, path: Path, image_ids: Sequence[int]) -> No
             target.write_camera(camera, use_camera_id=True)
         for rig in source.read_all_rigs():
             target.write_rig(rig, use_rig_id=True)
-        for image_id in image_ids:
-            image = source.read_image(image_id)
+        images = [source.read_image(image_id) for image_id in image_ids]
+        for frame_id in {image.frame_id: None for image in images}:
+            target.write_frame(source.read_frame(frame_id), use_frame_id=True)
+        for image_id, image in zip(image_ids, images, strict=True):
             image.name = str(image_id)
-            target.write_frame(source.read_frame(image.frame_id), use_frame_id=True)
             target.write_image(image, use_image_id=True)
             target.write_keypoints(image_id, source.read_keypoints(image_id))
             target.write_descriptors(image_id, source.read_descriptors(image_id))

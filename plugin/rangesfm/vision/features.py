@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import pycolmap
@@ -27,16 +28,24 @@ def feature_options(mapper: MapperOptions) -> pycolmap.FeatureExtractionOptions:
 
 
 def extract_features(
-    database_path: Path, photos: Photos, options: pycolmap.FeatureExtractionOptions, progress: Progress
+    database_path: Path,
+    photos: Photos,
+    options: pycolmap.FeatureExtractionOptions,
+    progress: Progress,
+    mask_path: Path | None = None,
 ) -> None:
-    """Find features in the photos of the database that have none yet.
+    """Find features in the photos of the database that have none yet, where their masks are not black.
 
     Raises:
         ReconstructionError: hardly any photo has features.
     """
+    reader = pycolmap.ImageReaderOptions()
+    if mask_path is not None:
+        reader.mask_path = mask_path
     with pycolmap.Database.open(database_path) as database:
+        missing = [name for id_, name in enumerate(photos.names, 1) if not database.exists_keypoints(id_)]
         run_in_background(
-            lambda token: _call_colmap(database_path, photos, options, token),
+            lambda token: _call_colmap(database_path, photos.folder, missing, reader, options, token),
             progress,
             lambda: num_photos_with_features(database),
             len(photos.names),
@@ -58,18 +67,21 @@ def extract_features(
 
 def _call_colmap(
     database_path: Path,
-    photos: Photos,
+    folder: Path,
+    names: Sequence[str],
+    reader: pycolmap.ImageReaderOptions,
     options: pycolmap.FeatureExtractionOptions,
     token: pycolmap.CancellationToken,
 ) -> None:
     """A few photos at a time: COLMAP finishes all photos of a call before it heeds the token."""
     num_threads = options.num_threads if options.num_threads > 0 else os.cpu_count() or 1
     num_at_a_time = _PHOTOS_PER_THREAD * num_threads
-    for start in range(0, len(photos.names), num_at_a_time):
+    for start in range(0, len(names), num_at_a_time):
         pycolmap.extract_features(
             database_path,
-            photos.folder,
-            image_names=photos.names[start : start + num_at_a_time],
+            folder,
+            image_names=names[start : start + num_at_a_time],
+            reader_options=reader,
             extraction_options=options,
             cancellation_token=token,
         )

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import is_plain_name
+from rangesfm.files.folders import walk
 from rangesfm.files.tables import Table, has_columns, read_table
 from rangesfm.vision.exif import exif_tags
 
@@ -73,7 +74,7 @@ class ImageTimes:
 
 
 def list_images(folder: str | Path) -> tuple[str, ...]:
-    """Names of all photos in a folder and its subfolders, sorted; hidden files are no photos.
+    """Names of all photos in a folder and its subfolders, links to such among them, sorted; hidden ones are none.
 
     Raises:
         InputError: there is no such folder, or no photo in it, or one whose name no table could hold.
@@ -81,11 +82,12 @@ def list_images(folder: str | Path) -> tuple[str, ...]:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError("is a file, expected a folder of photos" if folder.exists() else "no such folder", folder)
-    names = []
-    for parent, subfolders, files in os.walk(folder):
-        subfolders[:] = [name for name in subfolders if not name.startswith(".")]
-        photos = [name for name in files if name.lower().endswith(IMAGE_EXTENSIONS) and not name.startswith(".")]
-        names += [(Path(parent) / name).relative_to(folder).as_posix() for name in photos]
+    names = [
+        (parent / name).relative_to(folder).as_posix()
+        for parent, _, files in walk(folder)
+        for name in files
+        if name.lower().endswith(IMAGE_EXTENSIONS)
+    ]
     if not names:
         raise InputError(f"no photos ({' '.join(e[1:] for e in IMAGE_EXTENSIONS)}) in this folder", folder)
     for name in names:
@@ -94,14 +96,22 @@ def list_images(folder: str | Path) -> tuple[str, ...]:
     return tuple(sorted(names))
 
 
-def find_image_times(folder: str | Path, names: Sequence[str], csv_path: str | Path | None = None) -> ImageTimes:
+def find_image_times(
+    folder: str | Path,
+    names: Sequence[str],
+    csv_path: str | Path | None = None,
+    frames: Mapping[str, Sequence[str]] | None = None,
+) -> ImageTimes:
     """Times of the photos ``names`` of ``folder``: the CSV file if given, else EXIF, else the names.
+
+    Args:
+        frames: as of ``read_image_times_csv``, by ``names``.
 
     Raises:
         InputError: none of them gives times, or the CSV file is not right.
     """
     if csv_path is not None:
-        return read_image_times_csv(csv_path, names)
+        return read_image_times_csv(csv_path, names, frames)
     with suppress(InputError):
         return times_from_exif(folder, names)
     with suppress(InputError):
@@ -118,12 +128,16 @@ def is_image_times_file(head: str) -> bool:
     return has_columns(head, _COLUMNS, _ALIASES)
 
 
-def read_image_times_csv(path: str | Path, names: Sequence[str] | None = None) -> ImageTimes:
+def read_image_times_csv(
+    path: str | Path, names: Sequence[str] | None = None, frames: Mapping[str, Sequence[str]] | None = None
+) -> ImageTimes:
     """Read ``image_name,timestamp_s`` (the header may say ``filename`` and ``timestamp`` as well).
 
     Args:
         path: the CSV file; other columns are ignored.
         names: the photos that there are; None: those of the file are not checked.
+        frames: photos taken at once, by the one among ``names`` that stands for them, itself among them; theirs is the
+            time of the first of them that has one.
 
     Raises:
         InputError: with the line: a column missing, a cell that is no time in seconds, a photo
@@ -135,9 +149,11 @@ def read_image_times_csv(path: str | Path, names: Sequence[str] | None = None) -
     image_names, times = table.text("image_name"), table.numbers("timestamp_s", expected="seconds")
     for row in np.flatnonzero(np.abs(times) > _MAX_TIMESTAMP_S).tolist():
         raise table.error(row, "timestamp_s", "seconds")
-    _refuse_repetitions(table, image_names, times.tolist())
+    frames = frames or {}
+    frame_of = {photo: first for first, photos in frames.items() for photo in photos}
+    _refuse_repetitions(table, image_names, times.tolist(), frame_of)
     if names is not None:
-        known = set(names)
+        known = {*names, *frame_of}
         for row, name in enumerate(image_names):
             if name not in known:
                 raise table.error(row, "image_name", f"the name of a photo in the folder, like '{names[0]}'")
@@ -146,7 +162,10 @@ def read_image_times_csv(path: str | Path, names: Sequence[str] | None = None) -
         name: _Stamp(time, _resolution(text))
         for name, time, text in zip(image_names, times.tolist(), texts, strict=True)
     }
-    return _in_time_order(stamps, names or image_names, "csv")
+    stamps = {name: stamp for name, stamp in stamps.items() if name not in frame_of} | {
+        first: stamps[found[0]] for first, photos in frames.items() if (found := [p for p in photos if p in stamps])
+    }
+    return _in_time_order(stamps, names or tuple(stamps), "csv")
 
 
 def times_from_exif(folder: str | Path, names: Sequence[str]) -> ImageTimes:
@@ -206,14 +225,17 @@ def _in_time_order(stamps: Mapping[str, _Stamp], names: Sequence[str], source: s
     )
 
 
-def _refuse_repetitions(table: Table, image_names: Sequence[str], times: Sequence[float]) -> None:
+def _refuse_repetitions(
+    table: Table, image_names: Sequence[str], times: Sequence[float], frame_of: Mapping[str, str]
+) -> None:
     row_of_name: dict[str, int] = {}
     row_of_time: dict[float, int] = {}
     for row, (name, time) in enumerate(zip(image_names, times, strict=True)):
         if (first := row_of_name.setdefault(name, row)) != row:
             message = f"{name} stands in line {table.line[first]} already, expected one row per photo"
             raise InputError(message, table.path, int(table.line[row]))
-        if (first := row_of_time.setdefault(time, row)) != row:
+        first = row_of_time.setdefault(time, row)
+        if first != row and frame_of.get(name, name) != frame_of.get(image_names[first], image_names[first]):
             message = f"{name} has the time of {image_names[first]} in line {table.line[first]}, expected another"
             raise InputError(message, table.path, int(table.line[row]))
 

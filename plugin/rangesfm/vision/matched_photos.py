@@ -16,10 +16,13 @@ from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import Progress
 from rangesfm.vision.camera import PhotoCameras, cameras_of_photos, check_camera
 from rangesfm.vision.features import extract_features, feature_options
+from rangesfm.vision.given_database import GivenDatabase, opened
 from rangesfm.vision.mapping import remove_models
-from rangesfm.vision.matching import match_features, matching_options
+from rangesfm.vision.masks import contents_of_masks
+from rangesfm.vision.matching import MatchingOptions, match_features, matching_options, verify_matches
 from rangesfm.vision.photos import Photos, usable_photos
 from rangesfm.vision.renewed_database import RenewedDatabase, forget_database
+from rangesfm.vision.rigs import Rigs
 from rangesfm.vision.snapshots import remove_snapshots
 from rangesfm.vision.steps import Steps, fingerprint
 
@@ -84,6 +87,7 @@ def match_photos(
     image_names: Sequence[str],
     camera: CameraOptions,
     mapper: MapperOptions,
+    rigs: Rigs,
     seed: int,
     space: Workspace,
     *,
@@ -94,11 +98,33 @@ def match_photos(
     for_features = feature_options(mapper)
     for_matching = matching_options(mapper, len(image_names), seed)
     photos = usable_photos(image_path, image_names)
-    cameras = cameras_of_photos(camera, photos)
+    cameras = cameras_of_photos(camera, photos, rigs)
+    masks = contents_of_masks(mapper.mask_path, photos)
     space.begin(restart=restart)
+    _say_left_out(photos, space.progress)
+    with opened(mapper.database_path, photos, space.output) as given:
+        if given is not None:
+            space.progress.message(given.note)
+            photos = given.photos
+            is_open = all(table.model is None for table in camera.tables)
+            cameras = given.cameras() if is_open else cameras_of_photos(camera, photos, rigs)
+        _say_guessed(cameras, space.progress)
+        return _match(photos, cameras, rigs, given, masks, mapper, for_features, for_matching, space)
+
+
+def _match(
+    photos: Photos,
+    cameras: PhotoCameras,
+    rigs: Rigs,
+    given: GivenDatabase | None,
+    masks: dict[str, str],
+    mapper: MapperOptions,
+    for_features: pycolmap.FeatureExtractionOptions,
+    for_matching: MatchingOptions,
+    space: Workspace,
+) -> MatchedPhotos:
     steps, progress, database = space.steps, space.progress, space.database
-    _say_left_out(photos, progress)
-    _say_guessed(cameras, progress)
+    has_matches = given is not None and given.num_pairs > 0
 
     def prepare_features() -> None:
         space.remove_old_models()
@@ -109,28 +135,32 @@ def match_photos(
         space.remove_old_models()
         renewed.begin_matching()
 
+    def match() -> None:
+        if has_matches:
+            verify_matches(database, photos, for_matching, progress)
+        else:
+            match_features(database, photos, for_matching, space.log, progress)
+
     with space.logged():
         steps.note("photos", photos.contents(steps.notes.get("photos", {})))
         contents = {name: sha256 for name, (_, sha256) in steps.notes["photos"].items()}
-        of_features = fingerprint(pycolmap.__version__, mapper.features)
-        of_matches = fingerprint(of_features, cameras.inputs, for_matching.pairing_inputs, mapper.matcher, seed)
-        renewed = RenewedDatabase(database, photos, contents, cameras, for_matching, of_features, of_matches, steps)
-        inputs = fingerprint(of_features, cameras.inputs, list(contents.items()))
+        sources = [mapper.features, *([masks] if masks else [])] if given is None else given.inputs
+        of_features = fingerprint(pycolmap.__version__, *sources)
+        how = [] if has_matches else [for_matching.pairing_inputs, mapper.matcher, for_matching.seed]
+        of_matches = fingerprint(of_features, cameras.inputs, *how)
+        renewed = RenewedDatabase(
+            database, photos, contents, cameras, rigs, given, for_matching, of_features, of_matches, steps
+        )
+        inputs = fingerprint(of_features, cameras.inputs, list(contents.items()), *rigs.inputs)
         steps.run(
             "features",
             inputs,
             database,
             prepare_features,
-            lambda: extract_features(database, photos, for_features, progress),
+            lambda: extract_features(database, photos, for_features, progress, mapper.mask_path),
         )
         inputs = fingerprint(inputs, of_matches)
-        steps.run(
-            "matching",
-            inputs,
-            database,
-            prepare_matching,
-            lambda: match_features(database, photos, for_matching, space.log, progress),
-        )
+        steps.run("matching", inputs, database, prepare_matching, match)
     return MatchedPhotos(photos, inputs)
 
 

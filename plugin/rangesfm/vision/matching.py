@@ -19,7 +19,8 @@ from rangesfm.files.atomic import scratch_folder
 from rangesfm.options import MapperOptions
 from rangesfm.processes.children import run_children
 from rangesfm.progress import Progress
-from rangesfm.vision.database import is_compared, num_matching_pairs
+from rangesfm.vision.background import run_in_background
+from rangesfm.vision.database import is_compared, num_compared_pairs, num_matching_pairs
 from rangesfm.vision.matching_share import MatchingShare
 from rangesfm.vision.pairs import NamedPairs, Pairing, pairing_options, pairs_to_match
 from rangesfm.vision.photos import Photos
@@ -48,6 +49,10 @@ class MatchingOptions:
     matcher: pycolmap.FeatureMatchingOptions
     verification: pycolmap.TwoViewGeometryOptions
     num_processes: int
+
+    @property
+    def seed(self) -> int:
+        return self.verification.ransac.random_seed
 
     @property
     def is_by_place(self) -> bool:
@@ -103,6 +108,30 @@ def match_features(
         _match_shares(
             shares, database_path, options.num_processes, log, lambda num: progress.update(num_there + num, num_all)
         )
+    _require_matches(database_path, photos)
+
+
+def verify_matches(database_path: Path, photos: Photos, options: MatchingOptions, progress: Progress) -> None:
+    """Look which matches fit one geometry of two views, unless that has been done of all of them.
+
+    Raises:
+        ReconstructionError: those of no two photos do.
+    """
+    with pycolmap.Database.open(database_path) as database:
+        num_pairs = database.num_matched_image_pairs()
+        if num_compared_pairs(database) < num_pairs:
+            run_in_background(
+                lambda token: pycolmap.geometric_verification(
+                    database_path, two_view_geometry_options=options.verification, cancellation_token=token
+                ),
+                progress,
+                lambda: num_compared_pairs(database),
+                num_pairs,
+            )
+    _require_matches(database_path, photos)
+
+
+def _require_matches(database_path: Path, photos: Photos) -> None:
     with pycolmap.Database.open(database_path) as database:
         num_matching = num_matching_pairs(database)
     if num_matching == 0:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from PIL import Image
 
 from rangesfm.errors import ReconstructionError
-from rangesfm.files.atomic import sha256_of
+from rangesfm.files.atomic import state_and_sha256
 
 MIN_NUM_PHOTOS = 2
 
@@ -31,23 +31,20 @@ class Photos:
     sizes: tuple[tuple[int, int], ...]
     left_out: dict[str, str]
 
-    def contents(self, known: Mapping[str, Any]) -> dict[str, tuple[list[int], str]]:
+    def of(self, names: Collection[str]) -> Photos:
+        """Some of them."""
+        wanted = set(names)
+        kept = [(name, size) for name, size in zip(self.names, self.sizes, strict=True) if name in wanted]
+        return replace(self, names=tuple(name for name, _ in kept), sizes=tuple(size for _, size in kept))
+
+    def contents(self, known: Mapping[str, Any]) -> dict[str, tuple[tuple[int, int, int], str]]:
         """State and SHA-256 of each file, by name in the order given: what tells these photos from others.
 
         Args:
             known: what an earlier call returned, perhaps by way of JSON; a file is not read again
                 while its size and its times of change are the same.
         """
-        return {name: _content(self.folder / name, known.get(name)) for name in self.names}
-
-
-def _content(path: Path, known: Any) -> tuple[list[int], str]:
-    found = path.stat()
-    # The second time is the file system's own: it also moves when a program sets the first one back.
-    state = [found.st_size, found.st_mtime_ns, found.st_ctime_ns]
-    if isinstance(known, (list, tuple)) and len(known) == 2 and known[0] == state:
-        return state, str(known[1])
-    return state, sha256_of(path)
+        return {name: state_and_sha256(self.folder / name, known.get(name)) for name in self.names}
 
 
 def usable_photos(folder: Path, names: Sequence[str]) -> Photos:
@@ -56,7 +53,7 @@ def usable_photos(folder: Path, names: Sequence[str]) -> Photos:
     Raises:
         ReconstructionError: fewer than two of them.
     """
-    sizes = {name: _size(folder / name) for name in names}
+    sizes = {name: image_size(folder / name) for name in names}
     usable = {name: size for name, size in sizes.items() if size is not None}
     left_out = {name: "cannot be read as an image" for name in names if name not in usable}
     if len(usable) < MIN_NUM_PHOTOS:
@@ -68,7 +65,8 @@ def usable_photos(folder: Path, names: Sequence[str]) -> Photos:
     return Photos(folder, tuple(usable), tuple(usable.values()), left_out)
 
 
-def _size(path: Path) -> tuple[int, int] | None:
+def image_size(path: Path) -> tuple[int, int] | None:
+    """Width and height, pixels; None of what is no image."""
     try:
         with Image.open(path) as image:
             return int(image.width), int(image.height)

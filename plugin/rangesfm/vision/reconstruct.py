@@ -10,9 +10,11 @@ import pycolmap
 
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import Progress, SilentProgress
-from rangesfm.vision.mapping import map_photos, pipeline_options, read_models
+from rangesfm.vision.mapping import hold_cameras, map_photos, pipeline_options, read_models
 from rangesfm.vision.mapping_loop import GlobalAdjustment
 from rangesfm.vision.matched_photos import Workspace, match_photos
+from rangesfm.vision.rig_places import hold_rigs, place_cameras
+from rangesfm.vision.rigs import NO_RIGS, Rigs
 from rangesfm.vision.steps import fingerprint
 
 
@@ -42,6 +44,7 @@ def reconstruct(
     *,
     camera: CameraOptions,
     mapper: MapperOptions,
+    rigs: Rigs = NO_RIGS,
     seed: int = 0,
     progress: Progress | None = None,
     restart: bool = False,
@@ -61,6 +64,7 @@ def reconstruct(
         image_names: the keyframes, relative to it, in time order.
         output_path: made if it does not exist.
         camera: which photos share one, and what is known of it.
+        rigs: that cameras are on.
         seed: the same one gives the same models.
         restart: take nothing over.
         before_change: called before models of an earlier run are removed or replaced.
@@ -74,11 +78,23 @@ def reconstruct(
     progress = progress or SilentProgress()
     space = Workspace(Path(output_path), progress, before_change)
     options = pipeline_options(camera, mapper, seed)
-    matched = match_photos(Path(image_path), image_names, camera, mapper, seed, space, restart=restart)
-    inputs = [matched.inputs, mapper.method, mapper.pipeline, camera.mapping_refines_intrinsics]
+    matched = match_photos(Path(image_path), image_names, camera, mapper, rigs, seed, space, restart=restart)
+    inputs = [matched.inputs, mapper.method, mapper.pipeline]
+    inputs += [table.mapping_refines_intrinsics for table in camera.tables]
     if adjustment is not None:
         inputs.append(adjustment.inputs)
     with space.logged():
+        if not all(rigs.are_known):
+            space.steps.run(
+                "rigs",
+                fingerprint(*inputs),
+                space.database,
+                lambda: rigs.apply(space.database),
+                lambda: place_cameras(matched.photos, rigs, pipeline_options(camera, mapper, seed), space),
+            )
+        hold_cameras(options, camera, space.database)
+        if "ba_refine_sensor_from_rig" not in mapper.pipeline:
+            hold_rigs(options, rigs, space.database)
         space.steps.run(
             "mapping",
             fingerprint(*inputs),

@@ -21,9 +21,11 @@ from rangesfm.vision.database import (
     write_positions,
 )
 from rangesfm.vision.exif import exif_position
+from rangesfm.vision.given_database import GivenDatabase
 from rangesfm.vision.matching import MatchingOptions
 from rangesfm.vision.pairs import pairs_to_match
 from rangesfm.vision.photos import Photos
+from rangesfm.vision.rigs import Rigs
 from rangesfm.vision.steps import Steps
 
 _NOTE = "database"
@@ -39,7 +41,8 @@ class RenewedDatabase:
         path: of the database.
         photos: in the order of their ids.
         contents: SHA-256 of each photo, by name.
-        cameras: that took them.
+        cameras: that took them. rigs: that the cameras are on.
+        given: the user's database, whose features take the place of all that an earlier run has found.
         matching: how they will be matched.
         feature_inputs: fingerprint of what features depend on beside the photo itself.
         match_inputs: likewise, of matches beside the two photos.
@@ -50,6 +53,8 @@ class RenewedDatabase:
     photos: Photos
     contents: Mapping[str, str]
     cameras: PhotoCameras
+    rigs: Rigs
+    given: GivenDatabase | None
     matching: MatchingOptions
     feature_inputs: str
     match_inputs: str
@@ -61,12 +66,9 @@ class RenewedDatabase:
         forget_database(self.steps)
         with new_file(self.path) as fresh:
             self._create(fresh)
-            try:
-                num_taken = self._take_over(earlier, fresh)
-            except RuntimeError:  # somebody has damaged the earlier one
-                self._create(fresh)
-                num_taken = 0
-            if num_taken:
+            if self.given is not None:
+                self.given.copy_to(fresh)
+            elif num_taken := self._taken_over(earlier, fresh):
                 progress.message(f"features: those of {num_taken} photos are taken over from an earlier run")
             remove_database(self.path)  # also what SQLite keeps beside it, which would be taken for the new one's
         self._write_note()
@@ -80,7 +82,15 @@ class RenewedDatabase:
 
     def _create(self, path: Path) -> None:
         create_database(path, self.photos.names, self.cameras.cameras, self.cameras.of_photo)
+        self.rigs.apply(path)
         write_positions(path, (exif_position(self.photos.folder / name) for name in self.photos.names))
+
+    def _taken_over(self, earlier: Mapping[str, Any], fresh: Path) -> int:
+        try:
+            return self._take_over(earlier, fresh)
+        except RuntimeError:  # somebody has damaged the earlier one
+            self._create(fresh)
+            return 0
 
     def _take_over(self, earlier: Mapping[str, Any], fresh: Path) -> int:
         ids = self._earlier_ids(earlier)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
+import struct
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
 import pycolmap
 
 from rangesfm.colmap.model_files import read_model
@@ -16,8 +15,9 @@ from rangesfm.errors import InputError
 # Writing a model after each photo takes a few percent of the time of mapping up to a few hundred photos, and beyond
 # grows with their number.
 _MAX_NUM_SNAPSHOTS = 200
-# As COLMAP writes the frames of a model, each of one photo.
-_FRAME = np.dtype([("id", "<u4"), ("rig_id", "<u4"), ("pose", "<f8", 7), ("num_photos", "<u4"), ("photo", "<u4", 4)])
+# As COLMAP writes the frames of a model: id, rig and pose, then so many photos.
+_FRAME = struct.Struct("<II7dI")
+_PHOTO_BYTES = 16
 
 
 class Snapshots:
@@ -39,7 +39,7 @@ class Snapshots:
         self._path = path
         self._scratch = scratch
         self._num_models = 0
-        self._poses: npt.NDArray[np.void] | None = None
+        self._poses: dict[int, tuple[float, ...]] | None = None
         scratch.mkdir()
         if options.snapshot_frames_freq <= 0:
             options.snapshot_path = scratch
@@ -59,12 +59,20 @@ class Snapshots:
 
     def _is_just_refined(self, folder: Path) -> bool:
         """All cameras have moved since the last snapshot; the photos next to a new one alone move otherwise."""
-        poses = np.fromfile(folder / "frames.bin", _FRAME, offset=8)
+        poses = _poses(folder / "frames.bin")
         before, self._poses = self._poses, poses
-        if before is None:
-            return False
-        _, old, new = np.intersect1d(before["id"], poses["id"], return_indices=True)
-        return bool((before["pose"][old] != poses["pose"][new]).any(axis=1).all())
+        return before is not None and all(poses[id_] != pose for id_, pose in before.items() if id_ in poses)
+
+
+def _poses(path: Path) -> dict[int, tuple[float, ...]]:
+    """Of each frame of a model, by its id."""
+    data = path.read_bytes()
+    poses, at = {}, 8
+    while at < len(data):
+        frame_id, _, *pose, num_photos = _FRAME.unpack_from(data, at)
+        poses[frame_id] = tuple(pose)
+        at += _FRAME.size + num_photos * _PHOTO_BYTES
+    return poses
 
 
 def newest_snapshot(path: Path) -> Path | None:

@@ -6,17 +6,20 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from rangesfm.errors import RangesfmError
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.log import RangeKind
+from rangesfm.sources.source import is_source, open_source
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.camera import cameras_of_photos, check_camera
 from rangesfm.vision.image_times import ImageTimes, list_images
 from rangesfm.vision.photos import usable_photos
+from rangesfm.vision.rigs import read_rigs
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.photos import checked_keyframes, images_path, read_inputs
 
@@ -59,20 +62,25 @@ class CheckedSurvey:
 
 def check_survey(survey: Survey) -> CheckedSurvey:
     """Read all inputs of a run as the run does, and tell what they are."""
-    checked, journal = CheckedSurvey(), Journal(SilentProgress())
+    checked = CheckedSurvey()
+    journal = Journal(SilentProgress(), warnings=checked.warnings)
     with checked.finding_faults():
         _check_photos(survey, checked)
     with checked.finding_faults():
         inputs = read_inputs(survey, journal)
         _tell_of_radio(survey, inputs, checked)
+        if survey.images.path is not None and is_source(survey.images.path):
+            return checked
         keyframes, times = checked_keyframes(survey, inputs, journal)
         _tell_of_times(survey, inputs, keyframes, times, checked)
-    checked.warnings += journal.warnings
     return checked
 
 
 def _check_photos(survey: Survey, checked: CheckedSurvey) -> None:
     folder = images_path(survey)
+    if is_source(folder):
+        _check_source(survey, folder, checked)
+        return
     photos = usable_photos(folder, list_images(folder))
     sizes = [f"{num} of {width} x {height} pixels" for (width, height), num in Counter(photos.sizes).most_common()]
     more = [f"{len(sizes) - _MAX_NUM_SIZES} sizes more"] if len(sizes) > _MAX_NUM_SIZES else []
@@ -82,16 +90,27 @@ def _check_photos(survey: Survey, checked: CheckedSurvey) -> None:
         checked.warnings.append(f"{len(photos.left_out)} photos are left out, first {name}: {why}")
     with survey.source.naming_lines():
         check_camera(survey.camera)
-        found = cameras_of_photos(survey.camera, photos)
+        found = cameras_of_photos(survey.camera, photos, read_rigs(survey.images.rig_config))
     for number, camera in enumerate(found.cameras[:_MAX_NUM_SIZES]):
         num_photos, focal_length_px = found.of_photo.count(number), camera.mean_focal_length()
         what = f"{camera.model.name} for {num_photos} photos, f {focal_length_px:.0f} pixels"
-        is_guessed = photos.names[found.of_photo.index(number)] in found.guessed
-        if survey.camera.params is not None and not is_guessed:
+        first = photos.names[found.of_photo.index(number)]
+        if survey.camera.of_photo(first).params is not None and first not in found.guessed:
             checked.facts.append(f"camera: {what}, as given")
         else:
             seen = "by EXIF" if camera.has_prior_focal_length else "a guess from the photos' size"
             checked.assumed.append(f"camera {what}, {seen}")
+
+
+def _check_source(survey: Survey, path: Path, checked: CheckedSurvey) -> None:
+    """What is known of a video or a bag before its photos are taken out."""
+    source, rate_hz = open_source(path, survey.images.topic), survey.images.rate_hz
+    num = f"about {source.num_photos(rate_hz)} photos at {rate_hz:g} Hz"
+    checked.facts.append(f"photos of {path.name}: {source.what}; {num}, taken out when a run begins")
+    checked.facts += [*source.notes]
+    checked.assumed.append(f"the photos' times are {source.clock}")
+    with survey.source.naming_lines():
+        check_camera(survey.camera)
 
 
 def _tell_of_radio(survey: Survey, inputs: RangingInputs, checked: CheckedSurvey) -> None:

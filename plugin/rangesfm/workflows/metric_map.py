@@ -12,7 +12,7 @@ import pycolmap
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.colmap.transform import rescale, without_photos
 from rangesfm.distances.ends import LocatedDistances, locate_distances, surveyed_distances
-from rangesfm.distances.tape import Tape
+from rangesfm.distances.tape import CONTROL, Tape, TapedDistance
 from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
@@ -29,9 +29,11 @@ from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
+from rangesfm.trust.baselines import ADVICE, compare_baselines, disagreeing
 from rangesfm.trust.broken_refinement import why_broken
 from rangesfm.trust.finished_map import Doubt, doubts_of_map, place_of_map
 from rangesfm.vision.image_times import ImageTimes
+from rangesfm.vision.rigs import read_rigs
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.trust_in_map import tested
 
@@ -239,7 +241,11 @@ def scale_by_survey(
     weights = estimate.errors.robust_weights(predicted - inputs.log.range_m)
     offset_s = offset.value_s if offset is not None else survey.ranges.time_offset_s
     metric = MetricResult(trajectory, offset, offset_s, estimate, scaled, predicted, weights)
-    return tested(survey, metric.doubted(by_rivals), journal)
+    taped = read_rigs(survey.images.rig_config).baselines(sfm, survey.images.baseline_stddev_m)
+    metric = replace(metric, baselines=compare_baselines(taped, sfm, estimate))
+    for doubt in (disagreements := disagreeing(metric.baselines)):
+        journal.warn(doubt)
+    return tested(survey, metric.doubted(by_rivals).doubted(disagreements, [ADVICE]), journal)
 
 
 def doubts_by_rivals(
@@ -343,8 +349,15 @@ def judge_map(survey: Survey, metric: MetricResult, journal: Journal) -> MetricR
 
 
 def _control(inputs: RangingInputs, metric: MetricResult) -> Tape:
-    """What was taped, and the distances between surveyed anchors where their positions could not be used."""
+    """What was taped, baselines of rigs that the ranges agree with, and the distances between surveyed anchors where
+    their positions could not be used."""
     tape = inputs.tape or Tape()
-    if inputs.anchor_frame != "site" or metric.estimate.frame == "site":
-        return tape
-    return replace(tape, distances=tape.distances + surveyed_distances(inputs.anchors))
+    distances = [*tape.distances]
+    distances += [
+        TapedDistance(known.photos, known.distance_m, known.stddev_m, CONTROL, line=0)
+        for known in metric.baselines
+        if known.agrees
+    ]
+    if inputs.anchor_frame == "site" and metric.estimate.frame != "site":
+        distances += surveyed_distances(inputs.anchors)
+    return replace(tape, distances=tuple(distances))

@@ -20,6 +20,8 @@ from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.clock.estimate import estimate_time_offset
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.result.folder import forget_result, refuse_to_overwrite
+from rangesfm.sources.extract import TIMES_NAME, take_photos
+from rangesfm.sources.source import is_source
 from rangesfm.survey.inputs import RangingInputs, read_ranging_inputs
 from rangesfm.survey.settings import Survey
 from rangesfm.trust.before import notes_before_work, notes_on_model, notes_on_times
@@ -27,6 +29,7 @@ from rangesfm.vision.image_times import ImageTimes, find_image_times, list_image
 from rangesfm.vision.keyframes import select_keyframes
 from rangesfm.vision.mapping_loop import GlobalAdjustment
 from rangesfm.vision.reconstruct import reconstruct
+from rangesfm.vision.rigs import read_rigs
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.metric_map import estimate_scale, path_of_model, ranges_on_path, refine_by_survey
 
@@ -46,12 +49,6 @@ def read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
     for note in (*inputs.notes, *notes_before_work(survey, inputs)):
         journal.warn(note)
     return inputs
-
-
-def checked_inputs(survey: Survey, journal: Journal) -> tuple[RangingInputs, tuple[str, ...], ImageTimes | None]:
-    """Ranges and photos that have to do with each other; the photos' times, where any are needed."""
-    inputs = read_inputs(survey, journal)
-    return inputs, *checked_keyframes(survey, inputs, journal)
 
 
 def checked_keyframes(
@@ -96,20 +93,51 @@ def read_registered(path: Path, journal: Journal) -> pycolmap.Reconstruction:
     return model
 
 
+def with_photos_in_folder(survey: Survey, journal: Journal, *, restart: bool = False) -> Survey:
+    """The survey, with the photos of a video or a bag taken out into the output folder, and with the camera it tells.
+
+    Photos that an earlier run took are used again, unless it is to ``restart``.
+    """
+    path = survey.images.path
+    if path is None or not is_source(path):
+        return survey
+    if survey.images.times is not None:
+        raise InputError("its images have their times: expected no other ones ([images] times)", path)
+    folder = survey.output.path / "photos"
+    with journal.timed("photos"):
+        taken = take_photos(
+            path,
+            folder,
+            rate_hz=survey.images.rate_hz,
+            topic=survey.images.topic,
+            progress=journal.progress,
+            restart=restart,
+        )
+    for note in taken.notes:
+        journal.warn(note)
+    values: dict[str, Any] = {"images.path": folder, "images.times": folder / TIMES_NAME}
+    if taken.camera is not None and survey.camera.model is None and survey.camera.params is None:
+        values["camera.model"], values["camera.params"] = taken.camera
+    return survey.changed(values)
+
+
 def find_keyframes(
     survey: Survey, journal: Journal, *, log_names_photos: bool | None = None
 ) -> tuple[tuple[str, ...], ImageTimes | None]:
     """The photos to reconstruct and their times; without times, where none are needed, in the order of their names.
+
+    Of photos that a rig took at once only the one that stands for them.
 
     Args:
         log_names_photos: then no photo is left out for want of a time; None: there is no log.
     """
     folder = images_path(survey)
     with journal.timed("keyframes"):
-        names = list_images(folder)
+        frames = read_rigs(survey.images.rig_config).frames(list_images(folder))
+        names = tuple(frames)
         image_times = None
         with nullcontext() if survey.images.times or log_names_photos is False else suppress(InputError):
-            image_times = find_image_times(folder, names, survey.images.times)
+            image_times = find_image_times(folder, names, survey.images.times, frames)
         if image_times is None or (log_names_photos and not survey.images.times and image_times.num_left_out):
             return select_keyframes(names, survey.images), None
         keyframes = select_keyframes(image_times, survey.images)
@@ -124,13 +152,16 @@ def map_keyframes(
     adjustment: GlobalAdjustment | None = None,
 ) -> tuple[pycolmap.Reconstruction, ...]:
     """Map the keyframes into ``sparse``; returns ``sparse/0``, ``sparse/1``, ..."""
+    rigs = read_rigs(survey.images.rig_config)
+    frames = rigs.frames(list_images(images_path(survey)))
     with survey.source.naming_lines():
         summary = reconstruct(
             images_path(survey),
-            keyframes,
+            [photo for keyframe in keyframes for photo in frames[keyframe]],
             survey.output.path,
             camera=survey.camera,
             mapper=survey.mapper,
+            rigs=rigs,
             seed=survey.output.seed,
             progress=journal.progress,
             restart=restart,

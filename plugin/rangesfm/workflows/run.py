@@ -33,13 +33,14 @@ from rangesfm.workflows.metric_map import (
 from rangesfm.workflows.photos import (
     AdjustmentWithRanges,
     check_times,
-    checked_inputs,
+    checked_keyframes,
     find_keyframes,
     map_keyframes,
     noted,
     read_inputs,
     read_registered,
     tell_of_times,
+    with_photos_in_folder,
 )
 from rangesfm.workflows.results import RunResult, write_results
 
@@ -47,8 +48,10 @@ from rangesfm.workflows.results import RunResult, write_results
 def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> RunResult:
     """Photos and ranges to a metric model. Steps of the reconstruction that are done are reused."""
     journal = Journal(progress)
-    inputs, keyframes, times = checked_inputs(survey, journal)
+    inputs = read_inputs(survey, journal)
     with sole_writer(survey.output.path):
+        survey = with_photos_in_folder(survey, journal, restart=restart)
+        keyframes, times = checked_keyframes(survey, inputs, journal)
         adjustment = AdjustmentWithRanges(survey, inputs, keyframes[0], times)
         models = map_keyframes(
             survey, keyframes, journal, restart, adjustment if survey.mapper.ranges_in_mapping else None
@@ -63,8 +66,9 @@ def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = Fa
     journal = Journal(progress)
     if survey.mapper.ranges_in_mapping:
         journal.warn("ranges_in_mapping: nothing has been said of ranges here, they take part in a whole run")
-    keyframes, _ = find_keyframes(survey, journal)
     with sole_writer(survey.output.path):
+        survey = with_photos_in_folder(survey, journal, restart=restart)
+        keyframes, _ = find_keyframes(survey, journal)
         sfm = map_keyframes(survey, keyframes, journal, restart)[0]
     path = survey.output.path / "sparse" / "0"
     return [f"unscaled model: {sfm.num_reg_images()} photos, {sfm.num_points3D()} points, in {path}"]
@@ -83,16 +87,18 @@ def scale_model(survey: Survey, *, progress: Progress) -> RunResult:
 def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResult:
     journal = Journal(progress)
     inputs = read_inputs(survey, journal)
-    if survey.model_path is None:
+    model_path = survey.model_path
+    if model_path is None:
         raise InputError("no model: give --input_path MODEL, a COLMAP model as sparse/0")
-    sfm = read_registered(survey.model_path, journal)
+    sfm = read_registered(model_path, journal)
     if refine and not sfm.num_points3D():
-        raise InputError("the model has no 3-D points to refine: a trajectory can only be scaled", survey.model_path)
+        raise InputError("the model has no 3-D points to refine: a trajectory can only be scaled", model_path)
     times = None
-    if inputs.log.image_name is None:
-        times = noted(times_of_model(survey, sfm, survey.model_path), journal)
-        tell_of_times(survey, inputs, times, journal)
     with sole_writer(survey.output.path):
+        survey = with_photos_in_folder(survey, journal)
+        if inputs.log.image_name is None:
+            times = noted(times_of_model(survey, sfm, model_path), journal)
+            tell_of_times(survey, inputs, times, journal)
         return to_metric(survey, inputs, [sfm], times, journal, refine=refine)
 
 

@@ -198,6 +198,7 @@ def test_a_database_of_another_kind_is_named_as_such(
 
 def test_folder_with_broken_metadata_is_refused(tmp_path: Path) -> None:
     (tmp_path / "metadata.yaml").write_text("a: [")
+    (tmp_path / "log_0.mcap").touch()
     with pytest.raises(InputError, match="cannot be read as a ROS bag"):
         read_ranges(tmp_path)
 

@@ -1,22 +1,25 @@
 """What ranges get wrong: the components of their errors, each with what the population of radios lets expect of it.
 
-An error of two cells is covariant as their anchors, places, directions, distances and times are alike. The medians and
-spreads sum up what eight public logs of seven radios with the true path show (the table in ``examples/radios.md``);
-each survey learns its own stddevs on top of them.
+An error of two cells is covariant as their anchors, places, directions, distances and times are alike. Each survey
+learns its own stddevs on top of what the population shows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.errors.cells import Cells
+from rangesfm.ranging.errors.population import population
 
 _SHORT_M = 1.0
-_TIME_S, _LONG_TIME_S = 3.0, 15.0
+_TIME_S = 3.0
+# Of the tag's place, and of 1 minus the cosine between directions in the camera: as echoes and antennas' lobes have it.
+_PLACE_M, _LOBE = 0.5, 0.1
 # In logarithms of distance.
 _SMOOTH, _ROUGH = 1.0, 0.5
 _MIN_DISTANCE_M = 0.05
@@ -62,8 +65,19 @@ def _apart(values: Array) -> Array:
     return np.abs(values[:, None] - values)
 
 
-def _in_time(cells: Cells, length_s: float) -> Array:
-    together: Array = np.exp(-_apart(cells.time_s) / length_s) * _same_link(cells)
+def _in_time(cells: Cells) -> Array:
+    together: Array = np.exp(-_apart(cells.time_s) / _TIME_S) * _same_link(cells)
+    return together
+
+
+def _in_place(cells: Cells) -> Array:
+    places_m = cells.distance_m[:, None] * cells.from_anchor
+    together: Array = np.exp(-cdist(places_m, places_m) / _PLACE_M) * _same_link(cells)
+    return together
+
+
+def _in_view(cells: Cells) -> Array:
+    together: Array = np.exp((cells.in_cam @ cells.in_cam.T - 1) / _LOBE) * _same_link(cells)
     return together
 
 
@@ -120,37 +134,38 @@ def _bending(cells: Cells) -> Array:
     return alike
 
 
-COMPONENTS = (
-    Component("white", 0.05, 1.0, None, True, _white, "noise of single ranges"),
-    Component("moment", 0.03, 1.0, None, True, lambda c: np.eye(len(c)), "errors of moments"),
-    Component("time", 0.04, 0.7, None, True, lambda c: _in_time(c, _TIME_S), "errors that last for seconds"),
-    Component("long_time", 0.03, 0.7, None, True, lambda c: _in_time(c, _LONG_TIME_S), "errors that last longer"),
-    Component("bias", 0.045, 0.5, None, True, lambda c: _same(c.anchor_index), "each anchor's own bias"),
-    Component("common_bias", 0.2, 0.5, 0.04, False, lambda c: np.ones((len(c), len(c))), "the bias of all ranges"),
-    Component("short", 0.2, 0.5, 0.08, False, _short, "short ranges"),
-    Component("curve", 0.04, 0.5, 0.02, False, _smooth, "the radio's error curve"),
-    Component("rough_curve", 0.02, 0.3, 0.01, False, _rough, "unevenness of the error curve"),
-    Component("slope", 0.004, 0.7, 0.003, False, _proportional, "ranges long by a share"),
-    Component(
-        "antenna",
-        0.05,
-        0.7,
-        None,
-        True,
-        _antenna,
-        "anchors' antennas by direction",
-    ),
-    Component(
-        "tag_antenna",
-        0.05,
-        0.7,
-        None,
-        False,
-        _tag_antenna,
-        "the tag's antenna by direction",
-    ),
-    Component("bending", 0.01, 0.8, None, False, _bending, "the map's own bending"),
-)
+def components(expected: Mapping[str, tuple[float, float]]) -> tuple[Component, ...]:
+    """All of them, with median and spread over radios by name."""
+
+    def of(
+        name: str,
+        correlation: Callable[[Cells], Array],
+        words: str,
+        *,
+        is_of_anchor: bool = False,
+        calibrated_median: float | None = None,
+    ) -> Component:
+        median, spread = expected[name]
+        return Component(name, median, spread, calibrated_median, is_of_anchor, correlation, words)
+
+    return (
+        of("white", _white, "noise of single ranges", is_of_anchor=True),
+        of("time", _in_time, "errors that last for seconds", is_of_anchor=True),
+        of("place", _in_place, "errors that belong to a place: echoes", is_of_anchor=True),
+        of("view", _in_view, "lobes of the tag's antenna towards each anchor", is_of_anchor=True),
+        of("bias", lambda c: _same(c.anchor_index), "each anchor's own bias", is_of_anchor=True),
+        of("common_bias", lambda c: np.ones((len(c), len(c))), "the bias of all ranges", calibrated_median=0.04),
+        of("short", _short, "short ranges", calibrated_median=0.08),
+        of("curve", _smooth, "the radio's error curve", calibrated_median=0.02),
+        of("rough_curve", _rough, "unevenness of the error curve", calibrated_median=0.005),
+        of("slope", _proportional, "ranges long by a share", calibrated_median=0.003),
+        of("antenna", _antenna, "anchors' antennas by direction", is_of_anchor=True),
+        of("tag_antenna", _tag_antenna, "the tag's antenna by direction"),
+        of("bending", _bending, "the map's own bending"),
+    )
+
+
+COMPONENTS = components(population())
 
 LEARNT_CURVE = "learnt_curve"
 """What is left of an error curve that has been taken off, as it was learnt with it."""
@@ -159,8 +174,16 @@ GIVEN = "given"
 """No component of the ranges' errors: what is known beforehand of the map and the anchors."""
 
 
+REWEIGHTING = "reweighting"
+"""None either: by how much the best weights for these errors would change the scale."""
+
+
 def component_words(names: Iterable[str]) -> dict[str, str]:
     """What each component is, for people."""
     words = {component.name: component.words for component in COMPONENTS}
-    words |= {LEARNT_CURVE: "the learnt error curve", GIVEN: "tapes, anchors' positions and what else was given"}
+    words |= {
+        LEARNT_CURVE: "the learnt error curve",
+        GIVEN: "tapes, anchors' positions and what else was given",
+        REWEIGHTING: "what the best weights for these errors would change",
+    }
     return {name: words[name] for name in names}

@@ -22,7 +22,7 @@ _TOLERANCE = 1e-6
 # Logarithms of stddevs, beside the median: farther away the likelihood is flat.
 _FARTHEST_BELOW, _FARTHEST_ABOVE = 5.0, 4.0
 # Of the trace of a covariance, which rounding may leave singular.
-_ROUNDING = 1e-12
+ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,10 @@ class LearnedErrors:
 
     def stddev_of(self, influence: Array) -> dict[str, float]:
         """What each component does to a number that moves by (n,) ``influence`` for each metre of a range."""
-        of_cells = self.cells.total(influence)
+        return self.stddev_of_cells(self.cells.total(influence))
+
+    def stddev_of_cells(self, of_cells: Array) -> dict[str, float]:
+        """The same by (c,) influence for each metre of a cell."""
         variances = np.einsum("i,kij,j->k", of_cells, self.covariances_m2, of_cells)
         return dict(zip(self.names, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True))
 
@@ -159,7 +162,7 @@ def _covariance(component: Component, cells: Cells, widening: float) -> Array:
     if component.is_of_anchor:
         covariance = covariance * np.outer(cells.noisiness, cells.noisiness)
     # A map bends no more for a bad radio, and the noise says itself how large it is.
-    return covariance if component.name in ("bending", "white", "moment") else widening**2 * covariance
+    return covariance if component.name in ("bending", "white") else widening**2 * covariance
 
 
 def _known(cells: Cells, curve_stddev_m: Array | None) -> Array:
@@ -196,7 +199,7 @@ class _Likelihood:
     def _negative_with_gradient(self, logs: Array) -> tuple[float, Array]:
         variances = np.exp(2 * logs)
         covariance = np.tensordot(variances, self.of_components, axes=1) + self.known
-        covariance[np.diag_indices_from(covariance)] += _ROUNDING * np.trace(covariance)
+        covariance[np.diag_indices_from(covariance)] += ROUNDING * np.trace(covariance)
         lower = np.linalg.cholesky(covariance)
         inverse = cho_solve((lower, True), np.eye(len(covariance)))
         whitened = inverse @ self.design

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.errors import InputError
+from rangesfm.files.bags import is_bag_folder
 from rangesfm.files.tables import read_head
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.quantization import find_quantization_m, quantization_stddev_m
@@ -142,7 +143,7 @@ def _choose_reader(path: Path, options: ReadOptions, format: str | None) -> Read
         if reader is None:
             raise InputError(f"no log format is named '{format}', expected one of {', '.join(reader_names())}", path)
         return reader
-    if ros.is_bag_folder(path):
+    if is_bag_folder(path):
         return ros.READER
     head = read_head(path)
     if not head.strip():

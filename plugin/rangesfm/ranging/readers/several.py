@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.errors import InputError
+from rangesfm.files.bags import is_bag_folder
 from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.readers import ros
 
 _ID_IN_NAME = re.compile(r"(?:.*[^0-9A-Za-z])?([A-Za-z]{0,2}\d{1,3}|(?=[A-F]*\d)[0-9A-F]{4})", re.ASCII)
 
@@ -25,7 +25,7 @@ def files_of_log(path: Path) -> list[Path]:
     text = str(path)
     if "\0" in text:
         raise InputError("no file has such a name", path)
-    if path.is_dir() and not ros.is_bag_folder(path):
+    if path.is_dir() and not is_bag_folder(path):
         found = [file for file in path.iterdir() if file.is_file() and not file.name.startswith(".")]
     elif glob.has_magic(text) and not path.exists():
         found = [Path(name) for name in glob.glob(text)]

@@ -1,0 +1,189 @@
+"""A plan as one self-contained page, in the report's style: how well the map will be known, what to change."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from rangesfm.arrays import Array, Mask
+from rangesfm.files.atomic import make_output_folder, new_file, write_text
+from rangesfm.planning.advice import Advice
+from rangesfm.planning.survey_plan import DetectableMistake, SurveyPlan
+from rangesfm.ranging.errors.components import component_words
+from rangesfm.report.chart import page_charts
+from rangesfm.report.page import render
+from rangesfm.report.plot import Figure, Limits, Mark, Panel, Pixels, Series, View, equal_view, views_of
+from rangesfm.report.tables import Table
+from rangesfm.report.text import count, duration, fixed, percent, rough
+
+# From well known to hardly, each as visible on a light page as on a dark one.
+_COLORS = ("#2f7ebc", "#2a9d8f", "#6f9a2b", "#c98b12", "#d4512b")
+_OPEN_COLOR = "#a3123a"
+_AREA_OPACITY, _AREA_WIDTH_PX = 70, 160
+_MAX_NUM_MISTAKES = 12
+
+
+def write_plan(plan: SurveyPlan, folder: Path) -> list[Path]:
+    """Write ``plan.json`` and ``plan.html`` there."""
+    make_output_folder(folder)
+    numbers, page = folder / "plan.json", folder / "plan.html"
+    write_text(json.dumps(plan.as_json(), indent=2) + "\n", numbers)
+    with new_file(page) as temporary:
+        temporary.write_text(render_plan(plan), encoding="utf-8", errors="xmlcharrefreplace")
+    return [numbers, page]
+
+
+def render_plan(plan: SurveyPlan) -> str:
+    """The page, which fetches nothing."""
+    figures = [accuracy_views(plan)]
+    title = f"{len(plan.anchors_m)} anchors, {count(len(plan.keyframe_stddevs_m))} keyframes"
+    return render(
+        "plan.html",
+        title=f"{title} – rangesfm plan",
+        heading=f"Plan: {title}",
+        plan=plan,
+        tiles=_tiles(plan),
+        figures=figures,
+        charts=page_charts(figures),
+        advice=[
+            _advice("What would gain most for the scale", plan.advice_for_scale),
+            _advice("What would gain most for the place of the keyframe known least", plan.advice_for_place),
+        ],
+        expected=[_components(plan), _anchors(plan), _mistakes(plan.mistakes)],
+    )
+
+
+def _tiles(plan: SurveyPlan) -> list[tuple[str, str, str]]:
+    place = plan.place
+    of_place = []
+    if place is not None:
+        axes = ", ".join(f"{axis} {rough(stddev_m, 'm')}" for axis, stddev_m in zip("xyz", place.stddev_m, strict=True))
+        of_place = [
+            ("Place", rough(math.hypot(*place.stddev_m), "m"), f"of the map's middle: {axes}"),
+            ("Heading", rough(place.heading_stddev_deg, "°"), f"tilt {rough(place.tilt_stddev_deg, '°')}"),
+        ]
+    worst = int(np.argmax(plan.keyframe_stddevs_m))
+    return [
+        *of_place,
+        ("Keyframe known least", rough(plan.keyframe_stddevs_m[worst], "m"), f"number {worst + 1} on the path"),
+        ("Ranges", count(plan.num_ranges), f"in {duration(plan.duration_s)}"),
+    ]
+
+
+def accuracy_views(plan: SurveyPlan) -> Figure:
+    """The path in plan and in elevation, coloured by how well it will be known, as is what lies around it."""
+    centers = plan.expected.planned.trajectory.centers
+    edges = _edges(plan.expected.stddevs_at(plan.expected.planned.places_m))
+    # Plan and elevation are of the site, z up, whatever frame the result will be in.
+    views = tuple(_view(plan, view, centers, edges) for view in views_of(centers, "site"))
+    whose = "in the site" if plan.place is not None else "against the first camera"
+    caption = (
+        f"How well places will be known {whose} (1 stddev of the three coordinates together): of the keyframes along "
+        "the path, and of what the photos show around it, at the path's mean height and depth."
+    )
+    return Figure("accuracy", caption, views, layout="views")
+
+
+def _view(plan: SurveyPlan, view: View, centers: Array, edges: Array) -> Panel:
+    places = view.seen(np.array(list(plan.anchors_m.values())))
+    line = view.seen(centers)
+    limits = equal_view(np.vstack([line, places]))
+    of_keyframe = np.digitize(plan.keyframe_stddevs_m, edges)
+    names = _names(edges)
+    shown = names if len(edges) in of_keyframe else names[:-1]
+    series = [
+        Series(name, _color(band, len(names)), _stretches(line, of_keyframe == band), "line")
+        for band, name in enumerate(shown)
+    ]
+    marks = tuple(
+        Mark("anchor", "anchor", "triangle", x, y, name, f"anchor {name}")
+        for name, (x, y) in zip(plan.anchors_m, places.tolist(), strict=True)
+    )
+    area = _area(plan, view, centers.mean(axis=0), edges, limits)
+    return view.panel("the path and the anchors", " m", series, limits, marks=marks, picture=area)
+
+
+def _area(plan: SurveyPlan, view: View, middle: Array, edges: Array, limits: Limits) -> Pixels:
+    """(h, w, 4): the colour of a place that a photo shows, by how well it will be known."""
+    (x_low, x_high), (y_low, y_high), size = limits
+    width, height = _AREA_WIDTH_PX, max(round(_AREA_WIDTH_PX * size[1] / size[0]), 1)
+    across, down = np.meshgrid(np.linspace(x_low, x_high, width), np.linspace(y_high, y_low, height))
+    places = np.tile(middle, (width * height, 1))
+    places[:, view.axes] = np.column_stack([across.ravel(), view.sign * down.ravel()])
+    bands = np.digitize(plan.expected.stddevs_at(places), edges)
+    palette = np.array([_rgb(_color(band, len(edges) + 1)) for band in range(len(edges) + 1)], dtype=np.uint8)
+    pixels: Pixels = np.insert(palette[bands], 3, _AREA_OPACITY, axis=1).reshape(height, width, 4)
+    return pixels
+
+
+def _edges(stddevs_m: Array) -> Array:
+    """Ends of bands of about equal ratios, in two digits; the last one is infinite where something is open."""
+    known = stddevs_m[np.isfinite(stddevs_m) & (stddevs_m > 0)]
+    if len(known) == 0:
+        return np.array([np.inf])
+    inner = np.geomspace(known.min(), known.max(), len(_COLORS) + 1)[1:-1]
+    edges = np.unique([float(f"{edge:.2g}") for edge in inner])
+    return np.append(edges, np.inf)
+
+
+def _names(edges: Array) -> list[str]:
+    ends = [rough(edge, "m") for edge in edges[:-1]]
+    if not ends:
+        return ["known alike", "open"]
+    between = [f"{low} to {high}" for low, high in itertools.pairwise(ends)]
+    return [f"below {ends[0]}", *between, f"above {ends[-1]}", "open"]
+
+
+def _color(band: int, num: int) -> str:
+    return _OPEN_COLOR if band == num - 1 else _COLORS[round(band * (len(_COLORS) - 1) / max(num - 2, 1))]
+
+
+def _rgb(color: str) -> tuple[int, ...]:
+    return tuple(bytes.fromhex(color[1:]))
+
+
+def _stretches(line: Array, inside: Mask) -> Array:
+    """The path where it is inside, with the step that leads out of it."""
+    kept = inside | np.append(False, inside[:-1])
+    return np.where(kept[:, None], line, np.nan)
+
+
+def _advice(caption: str, ranked: Sequence[Advice]) -> Table:
+    rows = [
+        [f"{k}. {each.words}", percent(each.scale_stddev), rough(each.place_stddev_m, "m")]
+        for k, each in enumerate(ranked, 1)
+    ]
+    return Table(caption, ["one change", "scale then ±", "that keyframe then"], rows, kind="settings")
+
+
+def _components(plan: SurveyPlan) -> Table:
+    words = component_words(plan.components)
+    largest = sorted(plan.components.items(), key=lambda item: -item[1])
+    rows = [[words[name], percent(part)] for name, part in largest]
+    return Table("What makes the scale uncertain", ["", "of the scale"], rows, is_narrow=True)
+
+
+def _anchors(plan: SurveyPlan) -> Table:
+    rows = [[name, *(fixed(x, 2) for x in place)] for name, place in plan.anchors_m.items()]
+    return Table("Anchors", ["anchor", "x m", "y m", "z m"], rows, is_narrow=True)
+
+
+def _mistakes(mistakes: Sequence[DetectableMistake]) -> Table:
+    rows = [
+        [
+            f"{each.name} {each.subject}".strip(),
+            "never found" if each.smallest_detectable is None else f"{each.smallest_detectable:.2g}",
+            "" if each.unit == "1" else each.unit,
+            "open" if each.effect_on_scale is None else percent(each.effect_on_scale),
+            rough(each.effect_on_place_m, "m"),
+        ]
+        for each in mistakes[:_MAX_NUM_MISTAKES]
+    ]
+    header = ["mistake", "found from", "", "would change the scale by", "places by"]
+    note = "Of each mistake that may be made the smallest that will be found, and the most that one of that size does."
+    return Table("Mistakes just too small to be found", header, rows, note)

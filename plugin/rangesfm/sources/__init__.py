@@ -1,0 +1,1 @@
+"""Photos from what is no folder of photos: videos, and bags with images."""

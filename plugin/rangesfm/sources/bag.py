@@ -1,0 +1,135 @@
+"""The images of a bag: one topic of them, with the stamps of their headers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rangesfm.colmap.opencv_camera import colmap_camera
+from rangesfm.errors import InputError
+from rangesfm.files.bags import open_bag, type_name
+from rangesfm.sources.pixels import image_file, opened, raw_image
+from rangesfm.sources.source import MAX_SIDE_PX, Frame, Source
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+    from rosbags.highlevel import AnyReader
+
+_RAW, _COMPRESSED, _CAMERA = "Image", "CompressedImage", "CameraInfo"
+
+
+def has_images(path: Path) -> bool:
+    """Whether a bag that can be read has any."""
+    with suppress(InputError), open_bag(path) as bag:
+        return bool(_num_by_topic(bag))
+    return False
+
+
+def open_images(path: Path, topic: str | None) -> Source:
+    """What the images of a bag are.
+
+    Args:
+        topic: of them, if there are several such; None: there is one.
+
+    Raises:
+        InputError: the bag cannot be read or has no images, or nothing tells which are meant.
+    """
+    with open_bag(path) as bag:
+        num_by_topic = _num_by_topic(bag)
+        topic = _chosen(num_by_topic, topic, path)
+        first = next(_messages(bag, topic), None)
+        if first is None:
+            raise InputError(f"there is no image of {topic} in this bag", path)
+        kind, message, _ = first
+        image = opened(image_file(message, path)[0], path) if kind == _COMPRESSED else raw_image(message, path)
+        size_px = image.size
+        camera, notes = _camera(bag, topic, kind, size_px, path)
+        duration_s = bag.duration * 1e-9
+    is_stamped = _stamp_s(message) > 0
+    clock = "the stamps of their headers" if is_stamped else "when they arrived, as their headers have no stamps"
+    what = f"{num_by_topic[topic]} images of {topic}, {size_px[0]} x {size_px[1]} pixels"
+    frames = partial(_frames, path, topic, is_stamped)
+    return Source(what, size_px, duration_s, num_by_topic[topic], clock, frames, camera, notes)
+
+
+def _num_by_topic(bag: AnyReader) -> dict[str, int]:
+    """How many images each topic has that has any."""
+    images = {item.topic for item in bag.connections if type_name(item.msgtype) in (_RAW, _COMPRESSED)}
+    return {topic: bag.topics[topic].msgcount for topic in sorted(images)}
+
+
+def _chosen(num_by_topic: dict[str, int], topic: str | None, path: Path) -> str:
+    several = ", ".join(f"{name} ({num})" for name, num in num_by_topic.items())
+    if topic is None and len(num_by_topic) == 1:
+        return next(iter(num_by_topic))
+    if topic in num_by_topic:
+        return str(topic)
+    if not num_by_topic:
+        raise InputError(f"no images in this bag, expected {_RAW} or {_COMPRESSED} of sensor_msgs", path)
+    which = "several topics of images" if topic is None else f"no images of {topic}, but of"
+    raise InputError(f"{which}: {several}; choose by [images] topic, or --image_topic", path)
+
+
+def _messages(bag: AnyReader, topic: str) -> Iterator[tuple[str, Any, float]]:
+    """Type, content and time of arrival of each message of a topic."""
+    connections = [item for item in bag.connections if item.topic == topic]
+    for connection, received_ns, data in bag.messages(connections):
+        yield type_name(connection.msgtype), bag.deserialize(data, connection.msgtype), received_ns * 1e-9
+
+
+def _frames(path: Path, topic: str, is_stamped: bool) -> Iterator[Frame]:
+    with open_bag(path) as bag:
+        for number, (kind, message, received_s) in enumerate(_messages(bag, topic)):
+            time_s = _stamp_s(message) if is_stamped else received_s
+            if kind == _COMPRESSED:
+                content, suffix = image_file(message, path)
+                grey = partial(opened, content, path, reduced_to_px=MAX_SIDE_PX)
+                yield Frame(number, time_s, suffix, grey, partial(_write_file, content))
+            else:
+                yield Frame(number, time_s, ".png", partial(_grey, message, path), partial(_write, message, path))
+
+
+def _camera(
+    bag: AnyReader, topic: str, kind: str, size_px: tuple[int, int], path: Path
+) -> tuple[tuple[str, tuple[float, ...]] | None, tuple[str, ...]]:
+    """COLMAP's model and parameters by the CameraInfo beside a topic, and what is to be said of it."""
+    infos = [item.topic for item in bag.connections if type_name(item.msgtype) == _CAMERA]
+    beside = [topic.rpartition("/")[0]]
+    beside += [beside[0].rpartition("/")[0]] if kind == _COMPRESSED else []  # as of /camera/image_raw/compressed
+    info_topic = next((info for place in beside for info in infos if info.rpartition("/")[0] == place), None)
+    found = None if info_topic is None else next(_messages(bag, info_topic), None)
+    if found is None:
+        return None, ()
+    info = found[1]
+    d, k, p = (getattr(info, name if hasattr(info, name) else name.upper()) for name in "dkp")  # ROS 1 has capitals
+    is_rectified = "rect" in topic.rpartition("/")[2] or "rect" in beside[0].rpartition("/")[2]
+    fx, cx, fy, cy = p[[0, 2, 5, 6]] if is_rectified else k[[0, 2, 4, 5]]
+    if not (fx > 0 and fy > 0):
+        return None, ()  # not calibrated
+    if (info.width, info.height) != size_px:
+        return None, (f"{info_topic} is of {info.width} x {info.height} pixels: not taken as the camera",)
+    distortion = info.distortion_model if not is_rectified and any(d) else "none"
+    try:
+        return colmap_camera(distortion, (fx, fy, cx, cy), d, path), (f"the camera is that of {info_topic}",)
+    except InputError as error:
+        return None, (f"{info_topic} is not taken as the camera: {error}",)
+
+
+def _stamp_s(message: Any) -> float:
+    """0 for a stamp that nobody set."""
+    return float(message.header.stamp.sec + message.header.stamp.nanosec * 1e-9)
+
+
+def _grey(message: Any, path: Path) -> Image:
+    return raw_image(message, path).convert("L")
+
+
+def _write(message: Any, path: Path, photo_path: Path) -> None:
+    raw_image(message, path).save(photo_path, compress_level=1)
+
+
+def _write_file(content: bytes, path: Path) -> None:
+    path.write_bytes(content)

@@ -1,0 +1,130 @@
+"""A database that the user has, of COLMAP's or hloc's: what there is of a survey's photos, and what is still to do."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+
+from rangesfm.colmap.log import colmap_log
+from rangesfm.errors import InputError
+from rangesfm.files.atomic import scratch_folder, sha256_of
+from rangesfm.vision.camera import PhotoCameras
+from rangesfm.vision.photos import MIN_NUM_PHOTOS, Photos
+
+
+@dataclass(frozen=True)
+class GivenDatabase:
+    """A copy of it, which pycolmap may bring up to date.
+
+    Attributes:
+        source: the user's file. path: of the copy.
+        sha256: of the user's file.
+        photos: those of the survey that it has features of.
+        ids: their ids in it, in the order of the photos.
+        num_pairs: pairs of these photos that it has matches of.
+        note: what of it is used, and what of the survey and of it the other lacks.
+    """
+
+    source: Path
+    path: Path
+    sha256: str
+    photos: Photos
+    ids: tuple[int, ...]
+    num_pairs: int
+    note: str
+
+    @property
+    def inputs(self) -> list[Any]:
+        """Plain values that tell its features and matches of these photos from others."""
+        return [self.sha256, self.photos.names]
+
+    def cameras(self) -> PhotoCameras:
+        """As it has them; InputError for one of another size than its photos."""
+        with pycolmap.Database.open(self.path) as database:
+            of_photo = [database.read_image(id_).camera_id for id_ in self.ids]
+            ids = sorted(set(of_photo))
+            cameras = tuple(database.read_camera(id_) for id_ in ids)
+        places = tuple(ids.index(id_) for id_ in of_photo)
+        for name, size, place in zip(self.photos.names, self.photos.sizes, places, strict=True):
+            if (found := (cameras[place].width, cameras[place].height)) != size:
+                raise InputError(
+                    f"{name} is of {found[0]} x {found[1]} pixels there, expected {size[0]} x {size[1]} as its file",
+                    self.source,
+                )
+        return PhotoCameras(cameras, places)
+
+    def copy_to(self, path: Path) -> None:
+        """Features and matches of the photos, into a database in which their ids are 1, 2, ..."""
+        new = {id_: new_id for new_id, id_ in enumerate(self.ids, 1)}
+        with (
+            pycolmap.Database.open(self.path) as source,
+            pycolmap.Database.open(path) as target,
+            pycolmap.DatabaseTransaction(target),
+        ):
+            for id_, new_id in new.items():
+                target.write_keypoints(new_id, source.read_keypoints(id_))
+                if source.exists_descriptors(id_):
+                    target.write_descriptors(new_id, source.read_descriptors(id_))
+            for first, second in _pairs(source, new):
+                pair = new[first], new[second]
+                target.write_matches(*pair, source.read_matches(first, second))
+                if source.exists_two_view_geometry(first, second):
+                    target.write_two_view_geometry(*pair, source.read_two_view_geometry(first, second))
+
+
+@contextmanager
+def opened(path: Path | None, photos: Photos, folder: Path) -> Iterator[GivenDatabase | None]:
+    """The database, if one is given, while its copy is in ``folder``.
+
+    Raises:
+        InputError: it is none, or has features of fewer than two of the photos, or nothing to match them by.
+    """
+    if path is None:
+        yield None
+        return
+    with scratch_folder(folder / "given_database") as scratch:
+        copy = Path(shutil.copyfile(path, scratch / "database.db"))
+        if (log := path.with_name(path.name + "-wal")).is_file():  # what SQLite has not yet written into the file
+            shutil.copyfile(log, copy.with_name(copy.name + "-wal"))
+        yield _read(path, copy, photos)
+
+
+def _read(source: Path, path: Path, photos: Photos) -> GivenDatabase:
+    try:
+        with colmap_log(path.with_name("open.log")):
+            database = pycolmap.Database.open(path)
+    except RuntimeError:
+        raise InputError("is no database of COLMAP's", source) from None
+    with database:
+        of_name = {image.name: image.image_id for image in database.read_all_images()}
+        ids = {
+            name: of_name[name] for name in photos.names if name in of_name and database.exists_keypoints(of_name[name])
+        }
+        if len(ids) < MIN_NUM_PHOTOS:
+            raise InputError(
+                f"has features of {len(ids)} of {len(photos.names)} photos, expected at least {MIN_NUM_PHOTOS}, by"
+                f" their names relative to the folder as {photos.names[0]}",
+                source,
+            )
+        num_pairs = len(_pairs(database, {id_: id_ for id_ in ids.values()}))
+        bare = next((name for name, id_ in ids.items() if not database.exists_descriptors(id_)), None)
+    if not num_pairs and bare is not None:
+        raise InputError(f"has neither matches nor a descriptor of {bare} to match it by, expected either", source)
+    note = f"of {source.name} are taken features of {len(ids)} photos and matches of {num_pairs} pairs"
+    if lacking := [name for name in photos.names if name not in ids]:
+        note += f"; {len(lacking)} photos are not in it and are left out, the first is {lacking[0]}"
+    if others := sorted(of_name.keys() - set(photos.names)):
+        note += f"; {len(others)} of its photos are no keyframes, the first is {others[0]}"
+    return GivenDatabase(source, path, sha256_of(source), photos.of(ids), tuple(ids.values()), num_pairs, note)
+
+
+def _pairs(database: pycolmap.Database, known: Mapping[int, Any]) -> Sequence[tuple[int, int]]:
+    """Those with matches, of photos that are known by their ids."""
+    pairs = (pycolmap.pair_id_to_image_pair(pair_id) for pair_id in database.read_num_matches()[0])
+    return [(first, second) for first, second in pairs if first in known and second in known]

@@ -1,0 +1,178 @@
+"""Rigs of cameras by COLMAP's rig configuration: which photos were taken at once, and where the cameras sit."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from rangesfm.distances.tape import CONTROL, TapedDistance
+from rangesfm.errors import InputError
+
+# Cameras that are nearer to each other share a centre, as those of a panorama do: no length.
+_MIN_BASELINE_M = 1e-4
+_MAX_OFF_UNIT = 1e-3
+
+
+@dataclass(frozen=True)
+class Rigs:
+    """Rigs as configured; none without a configuration.
+
+    Attributes:
+        configs: COLMAP's, in the order of the file; their lengths are in metres.
+        path: of the file.
+    """
+
+    configs: tuple[pycolmap.RigConfig, ...] = ()
+    path: Path | None = None
+
+    @cached_property
+    def _cameras(self) -> list[tuple[int, pycolmap.RigConfigCamera]]:
+        return [(k, camera) for k, config in enumerate(self.configs) for camera in config.cameras]
+
+    @property
+    def inputs(self) -> list[Any]:
+        """Plain values that tell them from others; none for no rigs."""
+        return [str(config.todict()) for config in self.configs]
+
+    @property
+    def are_known(self) -> list[bool]:
+        """Of each rig, whether the configuration says where all of its cameras sit."""
+        return [all(c.ref_sensor or c.cam_from_rig is not None for c in config.cameras) for config in self.configs]
+
+    def camera_of(self, name: str) -> str | None:
+        """What a photo's name begins with, by which its camera is known; None outside the rigs.
+
+        Raises:
+            InputError: the names of two cameras' photos begin so.
+        """
+        found = [camera.image_prefix for _, camera in self._cameras if name.startswith(camera.image_prefix)]
+        if len(found) > 1:
+            message = f"the photo {name} is of '{found[0]}' and of '{found[1]}', expected one image_prefix"
+            raise InputError(message, self.path)
+        return found[0] if found else None
+
+    def frames(self, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+        """Photos that were taken at once, by the one that stands for them: the reference camera's, else the first.
+
+        Raises:
+            InputError: a camera without photos, or a photo of two cameras.
+        """
+        prefixes = {name: self.camera_of(name) for name in names}
+        for _, camera in self._cameras:
+            if camera.image_prefix not in prefixes.values():
+                raise InputError(f"no photo's name begins with image_prefix '{camera.image_prefix}'", self.path)
+        rig_of = {camera.image_prefix: k for k, camera in self._cameras}
+        references = {camera.image_prefix for _, camera in self._cameras if camera.ref_sensor}
+        frames: dict[Any, list[str]] = {}
+        for name, prefix in prefixes.items():
+            key = name if prefix is None else (rig_of[prefix], name.removeprefix(prefix))
+            frames.setdefault(key, []).append(name)
+        ordered = (
+            sorted(photos, key=lambda name: (prefixes[name] not in references, name)) for photos in frames.values()
+        )
+        return {frame[0]: tuple(frame) for frame in ordered}
+
+    def apply(self, database_path: Path, model: pycolmap.Reconstruction | None = None) -> None:
+        """Put the rigs into a database in which each camera of theirs is one.
+
+        Args:
+            model: of the photos without rigs, by which cameras are placed of which the configuration says nothing.
+
+        Raises:
+            InputError: COLMAP cannot make rigs of these photos, for want of some or of others in the model.
+        """
+        if not self.configs:
+            return
+        with pycolmap.Database.open(database_path) as database, pycolmap.DatabaseTransaction(database):
+            try:
+                pycolmap.apply_rig_config(list(self.configs), database, *([] if model is None else [model]))
+            except ValueError as error:
+                reason = " ".join(str(error).partition("Check failed: ")[2].split())
+                raise InputError(f"does not go with the photos ({reason})", self.path) from None
+
+    def ids_of_known(self, database_path: Path) -> set[int]:
+        """Ids in a database of the rigs whose cameras' places are all known: COLMAP enters rigs by their order."""
+        with pycolmap.Database.open(database_path) as database:
+            ids = sorted(rig.rig_id for rig in database.read_all_rigs())
+        return {rig_id for rig_id, is_known in zip(ids, self.are_known, strict=False) if is_known}
+
+    def baselines(self, model: pycolmap.Reconstruction, stddev_m: float) -> tuple[TapedDistance, ...]:
+        """The known distances of each rig's cameras from its reference camera, as if taped between two photos."""
+        found = []
+        for config in self.configs:
+            reference = next(camera.image_prefix for camera in config.cameras if camera.ref_sensor)
+            for camera in config.cameras:
+                length_m = _baseline_m(camera)
+                ends = next(_pairs(model, reference, camera.image_prefix), None) if length_m else None
+                if ends is not None:
+                    found.append(TapedDistance(ends, length_m, stddev_m, CONTROL, line=0))
+        return tuple(found)
+
+    def rescale(self, model: pycolmap.Reconstruction) -> None:
+        """Bring a model made without the rigs to the scale of the cameras whose places are known, if there are any."""
+        ratios = []
+        for config in self.configs:
+            reference = next(camera.image_prefix for camera in config.cameras if camera.ref_sensor)
+            for camera in config.cameras:
+                if length_m := _baseline_m(camera):
+                    pairs = _pairs(model, reference, camera.image_prefix)
+                    ratios += [length_m / length for pair in pairs if (length := _distance(model, pair)) > 0]
+        if ratios:
+            model.transform(pycolmap.Sim3d(float(np.median(ratios)), pycolmap.Rotation3d(), np.zeros(3)))
+
+
+NO_RIGS = Rigs()
+
+
+def read_rigs(path: Path | None) -> Rigs:
+    """COLMAP's ``rig_config.json``; no rigs without a path.
+
+    Raises:
+        InputError: it is none, or places a camera by no rotation.
+    """
+    if path is None:
+        return NO_RIGS
+    try:
+        configs = pycolmap.read_rig_config(path)
+        places = [camera for rig in json.loads(path.read_text(encoding="utf-8")) for camera in rig["cameras"]]
+    except (RuntimeError, ValueError, LookupError, TypeError) as error:
+        reason = " ".join(str(error).split()).removesuffix(".")
+        raise InputError(f"is no rig configuration of COLMAP's ({reason})", path) from None
+    if not configs:
+        raise InputError("holds no rig, expected COLMAP's rig configuration", path)
+    for camera in places:  # COLMAP takes what is not there for whatever there was
+        for key, num in (("cam_from_rig_rotation", 4), ("cam_from_rig_translation", 3)):
+            if len(found := camera.get(key, [0.0] * num)) != num:
+                raise InputError(f"{key} of '{camera['image_prefix']}' has {len(found)} numbers, expected {num}", path)
+        turn = camera.get("cam_from_rig_rotation", [1.0, 0.0, 0.0, 0.0])
+        if not abs(np.linalg.norm(np.array(turn, dtype=float)) - 1) < _MAX_OFF_UNIT:
+            message = f"cam_from_rig_rotation of '{camera['image_prefix']}' is {turn}, expected w, x, y, z of length 1"
+            raise InputError(message, path)
+    return Rigs(tuple(configs), path)
+
+
+def _baseline_m(camera: pycolmap.RigConfigCamera) -> float:
+    """0 where it is not known, or none."""
+    length_m = 0.0 if camera.cam_from_rig is None else float(np.linalg.norm(camera.cam_from_rig.translation))
+    return length_m if length_m >= _MIN_BASELINE_M else 0.0
+
+
+def _pairs(model: pycolmap.Reconstruction, reference: str, other: str) -> Iterator[tuple[str, str]]:
+    """Photos of two cameras that were taken at once and are in a model."""
+    names = sorted(image.name for image in model.images.values() if image.has_pose)
+    there = set(names)
+    for name in names:
+        if name.startswith(reference) and (partner := other + name.removeprefix(reference)) in there:
+            yield name, partner
+
+
+def _distance(model: pycolmap.Reconstruction, names: tuple[str, str]) -> float:
+    centers = [model.find_image_with_name(name).projection_center() for name in names]
+    return float(np.linalg.norm(centers[0] - centers[1]))

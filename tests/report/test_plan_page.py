@@ -1,0 +1,53 @@
+"""The page of a plan says what the plan says, and colours the path by how well it will be known."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.planning.surveys import COPLANAR_M, FIVE_ANCHORS_M, loop, planned
+
+from rangesfm.planning.survey_plan import SurveyPlan, plan_survey
+from rangesfm.report.plan_page import accuracy_views, render_plan
+
+
+@pytest.fixture(scope="module")
+def plan() -> SurveyPlan:
+    return plan_survey(planned(FIVE_ANCHORS_M, "site", loop(30.0, 40)))
+
+
+def test_every_keyframe_has_the_colour_of_its_accuracy(plan: SurveyPlan) -> None:
+    series = accuracy_views(plan).panels[0].series
+    assert sum(np.isfinite(one.points).any() for one in series) > 2
+    for one in series:
+        # "below 0.1 m", "0.1 m to 0.12 m", "above 0.2 m"
+        ends = [float(end) for end in re.findall(r"[\d.]+", one.name)]
+        low, high = {"b": [0.0, *ends], "a": [*ends, np.inf]}.get(one.name[0], ends)
+        for stddev_m, at in zip(plan.keyframe_stddevs_m, one.points, strict=True):
+            assert np.isfinite(at).all() or not low < stddev_m < high
+    assert len({one.color for one in series}) == len(series)
+
+
+def test_the_area_is_known_less_further_out(plan: SurveyPlan) -> None:
+    picture = accuracy_views(plan).panels[0].picture
+    assert picture is not None
+    middle, corner = picture[picture.shape[0] // 2, picture.shape[1] // 2, :3], picture[0, 0, :3]
+    assert middle.tolist() != corner.tolist()
+
+
+def test_the_page_ranks_the_advice_and_fetches_nothing(plan: SurveyPlan) -> None:
+    page = render_plan(plan)
+    first = plan.advice_for_place[0].words.replace("'", "&#39;")
+    assert f"1. {first}" in page
+    assert "default-src &#39;none&#39;" in page
+    assert f"{100 * plan.scale_stddev:.2g}\u00a0%" in page
+
+
+def test_what_is_open_is_called_so() -> None:
+    path = loop(30.0, 40, height_amplitude_m=0.0)
+    level = replace(path, centers=path.centers * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.6])
+    plan = plan_survey(planned(COPLANAR_M, "site", level))
+    assert [series.name for series in accuracy_views(plan).panels[0].series][-1] == "open"
+    assert "open" in render_plan(plan)

@@ -1,0 +1,185 @@
+"""Surveys as they may turn out: a planned one measured with a radio that errs, its map bent, and its scale found.
+
+The errors are drawn as functions of time, distance and direction, each in its own way, not from covariances of cells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+from tests.studies.scale_coverage import error_curve
+
+from rangesfm.distances.ends import LocatedDistances
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.association import associate
+from rangesfm.ranging.errors.components import COMPONENTS
+from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.observations import RangeObservations
+
+Array = npt.NDArray[np.float64]
+Labels = npt.NDArray[np.int64]
+
+METRES_PER_UNIT = 2.3
+MOMENT_S, SHORT_LASTING_S, LONG_LASTING_S = 0.5, 3.0, 15.0
+# Knots of an uneven curve over the logarithm of distance.
+_KNOTS = np.linspace(np.log(0.05), np.log(300.0), 400)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a surveyor brings home."""
+
+    observations: RangeObservations
+    trajectory: Trajectory
+    anchors: tuple[Anchor, ...]
+    distances: LocatedDistances | None
+    metric_from_map: Similarity
+
+
+def radio(
+    *, median_m: float, bulk_m: float, anchors_m: float, short_m: float, with_distance_m: float
+) -> dict[str, float]:
+    """Stddevs of the components of a radio's errors, from a row of the table in ``examples/radios.md``."""
+    shares = {"white": 0.5, "moment": 0.25, "time": 0.4, "long_time": 0.3, "antenna": 0.5, "tag_antenna": 0.5}
+    return {
+        **{name: share * bulk_m for name, share in shares.items()},
+        "bias": anchors_m,
+        "common_bias": abs(median_m),
+        "short": 3 * short_m,
+        "curve": 0.8 * with_distance_m,
+        "rough_curve": 0.3 * with_distance_m,
+    }
+
+
+def stddevs_of(planned: PlannedSurvey) -> dict[str, float]:
+    """Of the components of its ranges' errors: as told, or as radios mostly have them."""
+    is_learnt = planned.curve_stddev_m is not None
+    usual = {
+        c.name: c.calibrated_median if is_learnt and c.calibrated_median is not None else c.median for c in COMPONENTS
+    }
+    return usual | dict(planned.component_stddevs)
+
+
+def measured(planned: PlannedSurvey, seed: int) -> Measured:
+    """One such survey, all of its ranges."""
+    rng = np.random.default_rng(seed)
+    stddevs, true = stddevs_of(planned), planned.trajectory
+    times = _required(true.timestamps_s)
+    ids = [anchor.anchor_id for anchor in planned.anchors]
+    turn = np.arange(planned.num_ranges)
+    at_s = times[0] + (turn + 0.5) / (planned.rate_hz * len(ids))
+    log = RangeLog.from_arrays([ids[k] for k in turn % len(ids)], np.ones(len(turn)), timestamp_s=at_s)
+    places = associate(log, true, planned.tag_in_cam_m)
+    standing_m = np.array([planned.anchors_m[ids.index(name)] for name in log.anchor_ids])
+    errors_m, distance_m = _errors(places, true, standing_m, stddevs, planned.curve_stddev_m, rng)
+    ranges_m = np.maximum(np.nan_to_num(distance_m + errors_m, nan=1.0), 0.02)
+    curve = None if planned.curve_stddev_m is None else np.full(len(log), planned.curve_stddev_m)
+    log = replace(log, range_m=ranges_m, shared_stddev_m=curve)
+    bent = replace(true, centers=true.centers + stddevs["bending"] * _bend(times, rng))
+    turned = Rotation.from_quat(rng.normal(size=4)).as_matrix()
+    map_from_metric = Similarity(1 / METRES_PER_UNIT, turned, rng.normal(size=3))
+    seen = bent.transformed(map_from_metric.scale, map_from_metric.rotation, map_from_metric.translation)
+    return Measured(
+        associate(log, seen, planned.tag_in_cam_m),
+        seen,
+        _told(planned, rng),
+        _taped(planned, rng),
+        map_from_metric.inverse(),
+    )
+
+
+def _required(times: Array | None) -> Array:
+    assert times is not None
+    return times
+
+
+def _errors(
+    places: RangeObservations,
+    true: Trajectory,
+    standing_m: Array,
+    stddevs: dict[str, float],
+    curve_stddev_m: float | None,
+    rng: np.random.Generator,
+) -> tuple[Array, Array]:
+    """(n,) errors and (n,) distances, metres."""
+    index, times = places.log.anchor_index, places.log.timestamp_s
+    assert times is not None
+    from_anchor = places.centers + places.tag_from_center - standing_m[index]
+    distance = np.linalg.norm(from_anchor, axis=1)
+    direction = from_anchor / distance[:, None]
+    nearest = np.where(places.weight < 0.5, places.before, places.after)
+    in_cam = np.einsum("nji,nj->ni", true.world_from_cam[nearest], direction)
+    errors = stddevs["white"] * rng.standard_normal(len(distance)) + stddevs["common_bias"] * rng.standard_normal()
+    errors += stddevs["short"] * rng.standard_normal() * np.exp(-distance)
+    errors += stddevs["slope"] * rng.standard_normal() * distance
+    errors += (stddevs["curve"] * error_curve(distance, rng)) + stddevs["rough_curve"] * _uneven(distance, rng)
+    if curve_stddev_m is not None:
+        errors += curve_stddev_m * error_curve(distance, rng)
+    errors += stddevs["tag_antenna"] * _lobes(in_cam, rng)
+    for k in range(len(standing_m)):
+        rows = np.flatnonzero(index == k)
+        since = times[rows]
+        errors[rows] += stddevs["bias"] * rng.standard_normal() + stddevs["antenna"] * _lobes(direction[rows], rng)
+        errors[rows] += stddevs["time"] * lasting(since, SHORT_LASTING_S, rng)
+        errors[rows] += stddevs["long_time"] * lasting(since, LONG_LASTING_S, rng)
+        moment = np.floor((since - since[0]) / MOMENT_S).astype(np.int64)
+        errors[rows] += stddevs["moment"] * rng.standard_normal(int(moment[-1]) + 1)[moment]
+    return np.asarray(errors), np.asarray(distance)
+
+
+def lasting(times: Array, memory_s: float, rng: np.random.Generator) -> Array:
+    """First-order autoregressive, of stddev 1."""
+    kept = np.exp(-np.diff(times) / memory_s)
+    fresh = np.sqrt(1 - kept**2) * rng.standard_normal(len(kept))
+    values = np.empty(len(times))
+    values[0] = rng.standard_normal()
+    for i, share in enumerate(kept):
+        values[i + 1] = share * values[i] + fresh[i]
+    return values
+
+
+def _lobes(direction: Array, rng: np.random.Generator) -> Array:
+    """(n,) of stddev 1: half of the variance linear, half a quadratic form without a mean."""
+    form = rng.standard_normal((3, 3))
+    quadratic = np.einsum("ni,ij,nj->n", direction, form, direction) - np.trace(form) / 3
+    return np.asarray(direction @ rng.standard_normal(3) / np.sqrt(2) + np.sqrt(3) / 2 * quadratic)
+
+
+def _uneven(distance: Array, rng: np.random.Generator) -> Array:
+    """A random walk over the logarithm of distance that forgets within half an e-fold."""
+    return np.interp(np.log(np.maximum(distance, 0.05)), _KNOTS, lasting(_KNOTS, 0.5, rng))
+
+
+def _bend(times: Array, rng: np.random.Generator) -> Array:
+    """(n, 3) of stddev 1 in each coordinate, smooth within an eighth of the time."""
+    knots = np.linspace(times[0], times[-1], 60)
+    apart = (knots[:, None] - knots) / (np.ptp(times) / 8)
+    lower = np.linalg.cholesky(np.exp(-0.5 * apart**2) + 1e-9 * np.eye(len(knots)))
+    return np.stack([np.interp(times, knots, lower @ rng.standard_normal(len(knots))) for _ in range(3)], axis=1)
+
+
+def _told(planned: PlannedSurvey, rng: np.random.Generator) -> tuple[Anchor, ...]:
+    if planned.anchor_frame == "unknown":
+        return tuple(replace(anchor, position_m=None) for anchor in planned.anchors)
+    path = planned.trajectory
+    first = Similarity(1.0, path.world_from_cam[0], path.centers[0])
+    into = first.inverse() if planned.anchor_frame == "first_camera" else Similarity(1.0, np.eye(3), np.zeros(3))
+    return tuple(
+        replace(anchor, position_m=into.apply(at) + anchor.position_stddev_m * rng.standard_normal(3))
+        for anchor, at in zip(planned.anchors, planned.anchors_m, strict=True)
+    )
+
+
+def _taped(planned: PlannedSurvey, rng: np.random.Generator) -> LocatedDistances | None:
+    if not planned.taped:
+        return None
+    lengths, stddevs = np.array(planned.taped, dtype=np.float64).T
+    nowhere = np.full((len(lengths), 2), -1, dtype=np.int64)
+    found = lengths + stddevs * rng.standard_normal(len(lengths))
+    return LocatedDistances(lengths / METRES_PER_UNIT, nowhere, found, stddevs, np.zeros(len(lengths), dtype=bool))

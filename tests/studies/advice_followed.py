@@ -1,0 +1,81 @@
+"""Whether advice gains what it promises: in ten weak surveys it is followed, and both are measured in simulation.
+
+Run: python -m tests.studies.advice_followed --rows FILE [--num_seeds 100] [--surveys NAME]
+
+Of each survey the first advice for the scale, the first that is no tape, and the first for the place are followed.
+Prints what each promises and what it does: the stddev afterwards as a share of that before, both predicted and as the
+spread of simulated runs has it. Where nothing is known before (open), the stddevs afterwards are compared. FILE keeps
+what is done, as in ``planned_surveys``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from tests.studies.planned_surveys import ROOM, runs_of, spread, straight, survey, up_and_down, walk
+
+from rangesfm.planning.advice import Advice
+from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.planning.survey_plan import SurveyPlan, plan_survey
+
+CEILING = ((6.0, 6.0, 2.8), (-6.0, 6.0, 2.8), (6.0, -6.0, 2.8), (-6.0, -6.0, 2.8))
+ONE_SIDE = ((9.0, -3.0, 2.5), (10.0, 0.5, 0.5), (9.0, 4.0, 1.5))
+NEAR = ((4.5, 0.5, 1.5), (-4.6, 0.5, 1.8), (0.5, 3.8, 1.2), (0.3, -3.7, 2.0))
+
+SURVEYS: dict[str, Callable[[], PlannedSurvey]] = {
+    "coplanar anchors, flat path": lambda: survey(walk(height_amplitude_m=0.05), CEILING, "site", "usual", 3.0),
+    "coplanar anchors": lambda: survey(walk(), CEILING, "site", "room", 3.0),
+    "one known anchor": lambda: survey(walk(semi_axes_m=(2, 1.5)), ROOM[:1], "first_camera", "usual", 8.0),
+    "one unknown anchor": lambda: survey(walk(), ROOM[4:5], "unknown", "slow", 10.0),
+    "straight path": lambda: survey(straight(8.0), ((-2.0, 3.0, 2.5),), "first_camera", "room", 10.0),
+    "short ranges": lambda: survey(walk(), NEAR, "site", "usual", 3.0),
+    "anchors on one side": lambda: survey(up_and_down(), ONE_SIDE, "site", "usual", 4.0),
+    "small loop": lambda: survey(walk(semi_axes_m=(1.2, 1.0)), ROOM[:5], "site", "drone", 3.0),
+    "few ranges": lambda: survey(up_and_down(), ROOM[:4], "site", "trolley", 0.2),
+    "two known anchors": lambda: survey(walk(semi_axes_m=(2, 2)), ROOM[:2], "first_camera", "fast", 6.0),
+}
+
+
+def first_of(plan: SurveyPlan) -> Iterator[tuple[str, Advice]]:
+    """Each with what it is for, "scale" or "place"."""
+    for_scale = plan.advice_for_scale
+    yield from (("scale", advice) for advice in for_scale[:1] if advice.kind == "tape")
+    yield from (("scale", advice) for advice in [advice for advice in for_scale if advice.kind != "tape"][:1])
+    yield from (("place", advice) for advice in plan.advice_for_place[:1])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rows", type=Path, required=True, help="what is done, as JSON lines")
+    parser.add_argument("--num_seeds", type=int, default=100)
+    parser.add_argument("--surveys", default="", help="only those whose name begins so")
+    args = parser.parse_args()
+    print(f"{'survey':30}{'for':>6}{'promised':>20}{'followed':>20}{'ratio':>7}  advice")
+    off = []
+    for name, make in SURVEYS.items():
+        if not name.startswith(args.surveys):
+            continue
+        plan = plan_survey(make())
+        before = runs_of(name, plan.expected.planned, args.rows, args.num_seeds, num_whole=0)
+        for what, advice in first_of(plan):
+            after = runs_of(f"{name}: {advice.words}", advice.planned, args.rows, args.num_seeds, num_whole=0)
+            if what == "scale":
+                promised, was = advice.scale_stddev, plan.scale_stddev
+            else:
+                promised, was = advice.place_stddev_m, plan.expected.worst_keyframe_m
+            found = spread(after, what)
+            is_open = not np.isfinite(was)
+            gains = (promised, found) if is_open else (promised / was, found / spread(before, what))
+            off.append(abs(gains[0] / gains[1] - 1))
+            unit = ("{:14.3f} m" if what == "place" else "{:14.5f}") if is_open else "{:11.2f} of it"
+            told = "".join(f"{unit.format(gain):>20}" for gain in gains)
+            print(f"{name:30}{what:>6}{told}{gains[0] / gains[1]:7.2f}  {advice.words}", flush=True)
+    median = 100 * np.median(off)
+    print(f"{sum(np.array(off) > 0.25)} of {len(off)} off by more than 25 %, {median:.0f} % in the median")
+
+
+if __name__ == "__main__":
+    main()

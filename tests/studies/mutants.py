@@ -1,0 +1,120 @@
+"""Of small mistakes put into the estimation packages, how many their tests notice.
+
+    pip install cosmic-ray
+    python -m tests.studies.mutants --num 60 --seed 0
+
+Draws mutants (another operator, a number one off, a condition turned round, ...) at random from the packages, puts each
+into a copy of the checkout, and runs the tests that mirror its file: its own, then those of its folder, then those of
+the folders that use it. One that all of these pass has survived. Type hints and ``frozen=True`` are left as they are:
+no run depends on them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+PACKAGE = Path("plugin/rangesfm")
+PACKAGES = ("scale", "refine", "ranging/errors", "ranging/anchors", "ranging/clock", "trust", "ceres")
+USED_BY = {"ranging/errors": ("scale", "refine"), "ranging/anchors": ("scale",), "ceres": ("refine",)}
+MAX_SECONDS = 1200
+# Of which all that are found stand in type hints, or change nothing that runs.
+LEFT_OUT = ("BitOr", "RemoveDecorator", "ExceptionReplacer", "BitAnd")
+
+
+class Mutant(NamedTuple):
+    """One change of one file: an operator of Cosmic Ray, and which of the places where it applies."""
+
+    path: Path
+    operator: str
+    occurrence: int
+
+
+def mutants_of(path: Path) -> list[tuple[Mutant, int]]:
+    """All mutants of a file, and the line of each."""
+    from cosmic_ray.ast import ast_nodes, get_ast_from_path
+    from cosmic_ray.plugins import get_operator, operator_names
+
+    nodes = list(ast_nodes(get_ast_from_path(path)))
+    lines = path.read_text().split("\n")
+    found = []
+    for name in operator_names():
+        if any(word in name for word in LEFT_OUT):
+            continue
+        operator: Any = get_operator(name)()
+        places = [start[0] for node in nodes for start, _ in operator.mutation_positions(node)]
+        kept = [(k, line) for k, line in enumerate(places) if "frozen=True" not in lines[line - 1]]
+        found += [(Mutant(path, name, k), line) for k, line in kept]
+    return found
+
+
+def test_commands(path: Path) -> list[list[str]]:
+    """Arguments of pytest, nearest first."""
+    folder = path.parent.relative_to(PACKAGE)
+    tests = Path("tests") / folder
+    own = tests / f"test_{path.stem}.py"
+    commands = [[str(own)]] if own.is_file() else []
+    commands.append([str(tests), f"--ignore={own}"])
+    return commands + [[str(Path("tests") / user)] for user in USED_BY.get(str(folder), ())]
+
+
+def survives(mutant: Mutant, copy: Path) -> tuple[bool, str]:
+    """Whether every test passes, and the change as a diff."""
+    from cosmic_ray.mutating import use_mutation
+    from cosmic_ray.plugins import get_operator
+
+    environment = {**os.environ, "PYTHONPATH": str(copy / "plugin"), "PYTHONDONTWRITEBYTECODE": "1"}
+    with use_mutation(copy / mutant.path, get_operator(mutant.operator)(), mutant.occurrence) as (before, after):
+        old, new = before.split("\n"), (after or before).split("\n")
+        changed = "; ".join(f"{a.strip()} -> {b.strip()}" for a, b in zip(old, new, strict=False) if a != b)
+        for arguments in test_commands(mutant.path):
+            command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *arguments]
+            try:
+                done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, timeout=MAX_SECONDS)
+            except subprocess.TimeoutExpired:
+                return False, changed
+            if done.returncode not in (0, 5):  # 5: no tests there
+                return False, changed
+    return True, changed
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--num", type=int, default=60)
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    files = sorted(path for package in PACKAGES for path in (PACKAGE / package).glob("*.py") if path.stem != "__init__")
+    # Each place once, whatever it may be changed into.
+    choices: dict[tuple[Path, int, str], list[Mutant]] = {}
+    for path in files:
+        for mutant, line in mutants_of(path):
+            choices.setdefault((path, line, mutant.operator.split("_")[0]), []).append(mutant)
+    rng = random.Random(args.seed)
+    places = rng.sample(sorted(choices), args.num)
+    drawn = [(rng.choice(choices[place]), place[1]) for place in places]
+    survivors = 0
+    with tempfile.TemporaryDirectory(prefix="mutants_") as folder:
+        copy = Path(folder)
+        for part in ("plugin", "tests"):
+            shutil.copytree(part, copy / part)
+        shutil.copy("pyproject.toml", copy)
+        for num, (mutant, line) in enumerate(drawn, 1):
+            begun = time.monotonic()
+            survived, changed = survives(mutant, copy)
+            survivors += survived
+            word = "SURVIVED" if survived else "noticed"
+            print(f"{num:3d} {word} {mutant.path}:{line} {changed} ({time.monotonic() - begun:.0f} s)", flush=True)
+    share = f"{100 * survivors / args.num:.0f} %"
+    print(f"{survivors} of {args.num} mutants survived ({share}), drawn from {len(choices)} places, seed {args.seed}")
+
+
+if __name__ == "__main__":
+    main()

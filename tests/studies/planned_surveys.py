@@ -1,0 +1,219 @@
+"""Whether a plan's numbers are those of the survey: predicted stddevs against the spread over simulated runs.
+
+Run: python -m tests.studies.planned_surveys --rows FILE [--num_seeds 100] [--surveys NAME]
+
+Twenty surveys of different kinds, with radios of the table in ``examples/radios.md``, are planned; then each is
+measured and its scale found again and again, every time with other errors of its radio, other slips in surveying the
+anchors and another bend of its map. The first three runs of each are whole scale stages, the others begin at the truth.
+FILE keeps what is done, one line a run: started again, the study goes on there.
+Prints for each survey the predicted stddev of the scale and of the place (of the keyframe known least) over the spread
+of the runs' errors, the median stddev that a run states itself, and how many runs refused.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from tests.simulated.path import lap_path, loop_path, sequence_path
+from tests.simulated.surveys import METRES_PER_UNIT, Measured, measured, radio
+
+from rangesfm.demo.ranges import CameraPath
+from rangesfm.errors import GeometryError
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.options import ScaleOptions
+from rangesfm.planning.expected import Expected, expect
+from rangesfm.planning.paths import path_through
+from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.scale.initialize import initialize_scale
+from rangesfm.scale.problem import ScaleProblem, scale_problem
+from rangesfm.scale.range_equation import RangeState
+from rangesfm.scale.solution import solution_from
+
+Array = npt.NDArray[np.float64]
+Place = tuple[float, float, float]
+
+RADIOS = {
+    "room": radio(median_m=0.01, bulk_m=0.10, anchors_m=0.06, short_m=0.12, with_distance_m=0.05),
+    "slow": radio(median_m=0.10, bulk_m=0.04, anchors_m=0.02, short_m=0.03, with_distance_m=0.05),
+    "fast": radio(median_m=0.20, bulk_m=0.11, anchors_m=0.07, short_m=0.06, with_distance_m=0.10),
+    "drone": radio(median_m=0.25, bulk_m=0.11, anchors_m=0.05, short_m=0.07, with_distance_m=0.02),
+    "drone, open": radio(median_m=0.21, bulk_m=0.06, anchors_m=0.02, short_m=0.02, with_distance_m=0.08),
+    "trolley": radio(median_m=0.17, bulk_m=0.10, anchors_m=0.06, short_m=0.05, with_distance_m=0.02),
+    "mower": radio(median_m=0.50, bulk_m=0.60, anchors_m=0.13, short_m=0.10, with_distance_m=0.30),
+    "usual": {},
+}
+ROOM = ((6.0, 0.5, 2.5), (-6.0, 1.0, 0.4), (0.5, 6.0, 3.0), (1.0, -6.0, 0.2), (5.0, 5.0, 0.3), (-5.0, 4.5, 2.8),
+        (-4.5, -5.0, 0.5), (5.0, -4.5, 2.2))  # fmt: skip
+CORRIDOR = ((-2.0, 3.0, 2.5), (22.0, -3.0, 0.4), (10.0, 3.5, 0.5), (4.0, -3.0, 2.8), (16.0, 3.0, 2.0), (25.0, 3.0, 2.6))
+FIELD = ((60.0, 40.0, 3.0), (-60.0, 40.0, 1.0), (-60.0, -40.0, 4.0), (60.0, -40.0, 0.5))
+YARD = ((17.0, 2.0, 6.0), (-16.0, 3.0, 1.0), (1.0, 16.0, 9.0), (-2.0, -17.0, 2.0))
+TAG_IN_CAM_M = (0.05, -0.1, -0.05)
+
+
+def along(path: CameraPath, photo_rate_hz: float = 2.0) -> Trajectory:
+    times = np.arange(path.start_s, path.end_s, 1 / photo_rate_hz)
+    names = tuple(f"{k:05d}.jpg" for k in range(len(times)))
+    return Trajectory(np.arange(1, len(times) + 1), names, times, path.centers(times), path.world_from_cam(times))
+
+
+def survey(
+    trajectory: Trajectory, anchors_m: tuple[Place, ...], frame: str, of_radio: str, rate_hz: float, **others: Any
+) -> PlannedSurvey:
+    stddevs = RADIOS[of_radio] | others.pop("stddevs", {})
+    told_to_m = others.pop("position_stddev_m", 0.01)
+    anchors = tuple(Anchor(f"A{k}", np.array(at), told_to_m) for k, at in enumerate(anchors_m))
+    return PlannedSurvey(trajectory, anchors, frame, rate_hz, TAG_IN_CAM_M, component_stddevs=stddevs, **others)
+
+
+def walk(**options: Any) -> Trajectory:
+    return along(loop_path(90.0, unsteadiness_m=0.2, **{"seed": 3, **options}))
+
+
+def up_and_down() -> Trajectory:
+    return walk(height_amplitude_m=1.0, num_turns=2.2)
+
+
+def straight(length_m: float = 20.0) -> Trajectory:
+    return path_through([(0.0, 0.0, 1.5), (length_m, 0.4, 1.6)], speed_m_per_s=0.3, photo_rate_hz=2.0)
+
+
+def flight() -> Trajectory:
+    return along(loop_path(100.0, center_m=(0, 0, 6), semi_axes_m=(10, 7), height_amplitude_m=2.5, num_turns=2.1,
+                           unsteadiness_m=1.0, seed=5))  # fmt: skip
+
+
+def lap() -> Trajectory:
+    return along(lap_path(200.0), 1.0)
+
+
+def onward() -> Trajectory:
+    return along(sequence_path(60.0, speed_m_per_s=0.4, seed=2))
+
+
+SURVEYS: dict[str, Callable[[], PlannedSurvey]] = {
+    "room, 8 surveyed": lambda: survey(walk(), ROOM, "site", "room", 2.0),
+    "room, 8 unknown": lambda: survey(walk(), ROOM, "unknown", "fast", 2.0),
+    "room, 6 surveyed, up and down": lambda: survey(up_and_down(), ROOM[:6], "site", "slow", 3.0),
+    "room, 5 known": lambda: survey(walk(), ROOM[:5], "first_camera", "usual", 3.0),
+    "room, 4 surveyed, up and down": lambda: survey(up_and_down(), ROOM[:4], "site", "trolley", 4.0),
+    "room, 3 surveyed": lambda: survey(up_and_down(), ROOM[:3], "site", "usual", 5.0),
+    "room, 2 known": lambda: survey(walk(), ROOM[:2], "first_camera", "room", 5.0),
+    "room, 1 known": lambda: survey(walk(), ROOM[:1], "first_camera", "usual", 10.0),
+    "room, 1 unknown, up and down": lambda: survey(up_and_down(), ROOM[4:5], "unknown", "slow", 10.0),
+    "wide loop, 1 unknown": lambda: survey(walk(semi_axes_m=(8, 6)), ((4.0, 3.0, 3.5),), "unknown", "trolley", 10.0),
+    "room, 4 unknown": lambda: survey(up_and_down(), ROOM[:4], "unknown", "usual", 4.0),
+    "corridor, 4 surveyed": lambda: survey(straight(), CORRIDOR[:4], "site", "room", 4.0),
+    "corridor, 2 known": lambda: survey(straight(), CORRIDOR[:2], "first_camera", "drone", 8.0),
+    "onward, 6 surveyed": lambda: survey(onward(), CORRIDOR, "site", "fast", 3.0),
+    "field, 4 surveyed": lambda: survey(lap(), FIELD, "site", "mower", 2.0, position_stddev_m=0.03),
+    "field, 1 known": lambda: survey(lap(), FIELD[:1], "first_camera", "trolley", 5.0),
+    "flight, 4 surveyed": lambda: survey(flight(), YARD, "site", "drone, open", 4.0, position_stddev_m=0.02),
+    "flight, 1 unknown": lambda: survey(flight(), ((4.0, -5.0, 1.0),), "unknown", "drone", 15.0),
+    "room, 8 surveyed, learnt curve": lambda: survey(up_and_down(), ROOM, "site", "usual", 2.0, curve_stddev_m=0.02),
+    "room, 7 surveyed, bent map": lambda: survey(walk(), ROOM[:7], "site", "slow", 2.0, stddevs={"bending": 0.04}),
+}
+
+
+def one_run(planned: PlannedSurvey, keyframe: int | None, seed: int, *, is_whole: bool) -> dict[str, Any]:
+    """Error of the logarithm of the scale and of one keyframe's place (metres); of a whole run, what it states too."""
+    made = measured(planned, seed)
+    found: dict[str, Any] = {"seed": seed}
+    try:
+        if is_whole:
+            estimate = initialize_scale(
+                made.observations,
+                made.trajectory,
+                made.anchors,
+                anchor_frame=planned.anchor_frame,
+                options=ScaleOptions(max_relative_stddev=0.5),
+                range_model=planned.range_model,
+                distances=made.distances,
+                seed=seed,
+            )
+            metric_from_map, found["stated"] = estimate.metric_from_sfm, estimate.uncertainty.empirical
+        else:
+            posed = scale_problem(made.observations, made.trajectory, made.anchors, planned.anchor_frame,
+                                  planned.range_model, made.distances)  # fmt: skip
+            fit = solution_from(posed, truth(planned, made, posed)).fit
+            metric_from_map = fit.state.metric_from_model @ posed.first_camera_from_sfm
+    except GeometryError as error:
+        return found | {"refused": str(error)}
+    found["scale"] = float(np.log(metric_from_map.scale / METRES_PER_UNIT))
+    if keyframe is not None:
+        at = metric_from_map.apply(made.trajectory.centers[keyframe])
+        found["place"] = (at - planned.trajectory.centers[keyframe]).tolist()
+    return found
+
+
+def truth(planned: PlannedSurvey, made: Measured, posed: ScaleProblem) -> RangeState:
+    """Where a run is started that is not looked for by itself, which takes ten times as long and ends there too."""
+    state = planned.state(posed, made.observations.log.anchor_ids)
+    return replace(state, metric_from_model=replace(state.metric_from_model, scale=METRES_PER_UNIT))
+
+
+def worst_keyframe(expected: Expected) -> int | None:
+    place = expected.place()
+    return None if place is None else int(np.argmax(place[1]))
+
+
+def spread(rows: list[dict[str, Any]], name: str) -> float:
+    """Root mean square of errors; of a place, of their lengths."""
+    squares = [float(np.sum(np.square(row[name]))) for row in rows if name in row]
+    return float(np.sqrt(np.mean(squares))) if squares else float("nan")
+
+
+def runs_of(name: str, planned: PlannedSurvey, file: Path, num_seeds: int, num_whole: int = 3) -> list[dict[str, Any]]:
+    """As kept in the file; those that are missing are made and added to it."""
+    kept = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+    rows = [row for row in kept if row["survey"] == name and row["seed"] < num_seeds]
+    done = {row["seed"] for row in rows}
+    keyframe = worst_keyframe(expect(planned)) if len(done) < num_seeds else None
+    with file.open("a") as lines:
+        for seed in (seed for seed in range(num_seeds) if seed not in done):
+            row = {"survey": name} | one_run(planned, keyframe, seed, is_whole=seed < num_whole)
+            rows.append(row)
+            print(json.dumps(row), file=lines, flush=True)
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rows", type=Path, required=True, help="what is done, as JSON lines")
+    parser.add_argument("--num_seeds", type=int, default=100)
+    parser.add_argument("--surveys", default="", help="only those whose name begins so")
+    args = parser.parse_args()
+    print(
+        f"{'survey':34}{'predicted':>10}{'spread':>9}{'ratio':>7}{'stated':>9}{'place':>10}{'spread':>9}{'ratio':>7}{'refused':>9}"
+    )
+    off = []
+    for name, plan in SURVEYS.items():
+        if not name.startswith(args.surveys):
+            continue
+        planned = plan()
+        expected = expect(planned)
+        rows = runs_of(name, planned, args.rows, args.num_seeds)
+        scale, place_m = expected.uncertainty.empirical, expected.worst_keyframe_m
+        scale_spread, place_spread_m = spread(rows, "scale"), spread(rows, "place")
+        stated = [row["stated"] for row in rows if "stated" in row] or [float("nan")]
+        ratios = [scale / scale_spread, place_m / place_spread_m]
+        off += [abs(ratio - 1) for ratio in ratios if np.isfinite(ratio)]
+        print(
+            f"{name:34}{100 * scale:8.2f} %{100 * scale_spread:7.2f} %{ratios[0]:7.2f}{100 * np.median(stated):7.2f} %"
+            f"{place_m:8.3f} m{place_spread_m:7.3f} m{ratios[1]:7.2f}{sum('refused' in row for row in rows):9}",
+            flush=True,
+        )
+    print(
+        f"off by {100 * np.median(off):.0f} % in the median; {sum(np.array(off) > 0.3)} of {len(off)} by more than 30 %"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,209 @@
+"""README.md and the pages in examples/ are true: commands run, what is shown is printed, links lead somewhere.
+
+What is in a fence says what is done with it, page by page from top to bottom in one folder that holds a small survey:
+
+- ``bash``: each command is run, as it stands;
+- ``sh``: only read by the program's own parser, as it installs something, takes long, or needs what only a user has;
+- ``text``: each line was printed by the block before it;
+- ``csv NAME``: the file of that name, for the blocks after it.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import runpy
+import shlex
+import shutil
+import sys
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import pytest
+from tests.conftest import TAG_IN_CAM_M, TIME_OFFSET_S
+from tests.simulated.path import loop_path
+
+from rangesfm.cli.arguments import COMMANDS, normalize, parse
+from rangesfm.planning.settings import Plan
+from rangesfm.survey.settings import KEYS, read_survey
+
+if TYPE_CHECKING:
+    from tests.conftest import Command, PhotoRun, WalkedSurvey
+
+ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
+PAGES = (README, *sorted((ROOT / "examples").glob("*.md")))
+# Those that begin with a model; the others begin with a survey that has photos, run once.
+WITH_A_MODEL = {
+    "existing_model",
+    "unknown_anchors",
+    "calibration",
+    "checks",
+    "refinement",
+    "several_surveys",
+    "verdicts",
+}
+
+
+class Block(NamedTuple):
+    kind: str
+    name: str
+    text: str
+
+    @property
+    def commands(self) -> list[list[str]]:
+        """Words of each line; a line that ends with a backslash goes on."""
+        lines = self.text.replace("\\\n", " ").splitlines()
+        return [words for line in lines if (words := shlex.split(line, comments=True))]
+
+
+def blocks_of(page: Path) -> list[Block]:
+    found = re.findall(r"^```(\w+) ?(\S*)\n(.*?)^```$", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    return [Block(*parts) for parts in found]
+
+
+MODEL_SURVEY = f"""
+[images]
+times = "images.csv"
+[ranges]
+path = "uwb.csv"
+time_offset = {TIME_OFFSET_S}
+[anchors]
+path = "anchors.csv"
+[tag]
+tag_in_cam_m = {list(TAG_IN_CAM_M)}
+"""
+
+
+@pytest.fixture(scope="module")
+def model_folder(
+    walked_survey: WalkedSurvey, rangesfm_command: Command, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """A model without photos and its survey, the tag's places as a total station has them, and two days' results."""
+    folder = shutil.copytree(walked_survey.folder, tmp_path_factory.mktemp("pages") / "survey")
+    (folder / "survey.toml").write_text(MODEL_SURVEY)
+    shutil.copytree(folder / "sparse", folder / "out" / "sparse")
+    path, times = loop_path(42.0, start_s=99.0, seed=3), np.arange(99.5, 140.5, 0.1)
+    tag_m = path.centers(times) + path.world_from_cam(times) @ np.array(TAG_IN_CAM_M)
+    rows = [",".join(map(repr, row)) for row in np.column_stack([times - TIME_OFFSET_S, tag_m]).tolist()]
+    (folder / "tag.csv").write_text("\n".join(["timestamp_s,x_m,y_m,z_m", *rows]) + "\n")
+    flags = ("survey.toml", "--input_path", "sparse/0", "--output_path", "monday/out", "--no_report")
+    rangesfm_command("refine", *flags, cwd=folder)
+    shutil.copytree(folder / "monday", folder / "tuesday")
+    return folder
+
+
+@pytest.fixture
+def page_folder(page: Path, request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """What a reader of this page has in the folder in which the commands are typed."""
+    if page.stem in WITH_A_MODEL:
+        folder = shutil.copytree(request.getfixturevalue("model_folder"), tmp_path / "survey")
+    else:
+        run: PhotoRun = request.getfixturevalue("photo_run")
+        folder = shutil.copytree(run.survey.folder, tmp_path / "survey")
+        if page == README:
+            shutil.copytree(folder, folder / "my_survey", ignore=shutil.ignore_patterns("out", "survey.toml"))
+    (folder / "examples").symlink_to(ROOT / "examples")
+    return folder
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if "```bash" in page.read_text()], ids=lambda page: page.stem)
+def test_commands_of_a_page_run_as_they_stand(page: Path, page_folder: Path, rangesfm_command: Command) -> None:
+    printed: list[str] = []
+    for block in blocks_of(page):
+        if block.kind == "bash":
+            printed = []
+            for program, *arguments in block.commands:
+                if program == "python":
+                    printed += run_program(arguments, page_folder)
+                else:
+                    assert program == "rangesfm"
+                    printed += rangesfm_command(*arguments, cwd=page_folder).stdout.splitlines()
+        elif block.kind == "text":
+            assert [line for line in block.text.splitlines() if line not in printed] == []
+        elif block.name:
+            (page_folder / block.name).write_text(block.text)
+
+
+def run_program(arguments: list[str], cwd: Path) -> list[str]:
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as out, redirect_stderr(out):
+        patch.chdir(cwd)
+        patch.setattr(sys, "argv", arguments)
+        runpy.run_path(arguments[0], run_name="__main__")
+    return out.getvalue().splitlines()
+
+
+def shown_commands() -> list[list[str]]:
+    """Every call of rangesfm in a fence, without the program's name."""
+    words = (
+        words for page in PAGES for block in blocks_of(page) if block.kind in ("bash", "sh") for words in block.commands
+    )
+    commands = [" ".join(each).split(" && ")[-1].split() if "&&" in each else each for each in words]
+    return [rest for program, *rest in commands if Path(program).name == "rangesfm"]
+
+
+@pytest.mark.parametrize("arguments", shown_commands(), ids=" ".join)
+def test_a_command_that_is_shown_is_one(arguments: list[str]) -> None:
+    assert parse(normalize(arguments)).command in COMMANDS
+
+
+def test_every_command_is_on_a_page() -> None:
+    text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    assert [command for command in COMMANDS if f"rangesfm {command}" not in text] == []
+
+
+def test_the_readme_is_read_in_one_go() -> None:
+    assert len(README.read_text(encoding="utf-8").splitlines()) <= 150
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_lead_to_what_is_there(page: Path) -> None:
+    for target, anchor in re.findall(r"\]\((?!https?:)([^)#]*)(?:#([^)]*))?\)", page.read_text(encoding="utf-8")):
+        linked = page.parent / target if target else page
+        assert linked.is_file(), target
+        if anchor:
+            titles = re.findall(r"^#+ (.*)$", linked.read_text(encoding="utf-8"), re.MULTILINE)
+            assert anchor in {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def test_every_page_is_linked_from_the_readme() -> None:
+    text = README.read_text(encoding="utf-8")
+    linked = {Path(target).name for target in re.findall(r"\(examples/([\w.]+)", text)}
+    assert {page.name for page in PAGES} - linked - {"README.md"} == {"radios.md"}  # which goes with the verdicts
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_keys_in_the_text_exist(page: Path) -> None:
+    of_a_plan = {(table, key) for table, field in Plan.model_fields.items() for key in field.annotation.model_fields}  # type: ignore[union-attr]
+    named = set(re.findall(r"`\[(\w+)\] (\w+)", page.read_text(encoding="utf-8")))
+    assert named - {(key.table, key.name) for key in KEYS} - of_a_plan == set()
+
+
+def test_flags_in_the_text_exist() -> None:
+    with redirect_stdout(io.StringIO()) as helped:
+        for command in COMMANDS:
+            with pytest.raises(SystemExit):
+                parse([*command.split(), "--help"])
+    known = set(re.findall(r"--\w+", helped.getvalue()))
+    text = "".join(
+        re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE) for page in PAGES
+    )
+    named = {flag.replace("-", "_").replace("__", "--", 1) for flag in re.findall(r"(?<=[` ])--\w[\w-]*", text)}
+    assert named - known == OF_OTHER_PROGRAMS
+
+
+OF_OTHER_PROGRAMS = {"--auto_scale_poses", "--center_method", "--data", "--ref_images_path", "--transform_path"}
+
+
+def test_the_survey_file_on_its_page_is_one(tmp_path: Path) -> None:
+    (text,) = (block.text for block in blocks_of(ROOT / "examples" / "survey_file.md") if block.kind == "toml")
+    (tmp_path / "survey.toml").write_text(text, encoding="utf-8")
+    for name in ("images.csv", "uwb.csv", "anchors.csv"):
+        (tmp_path / name).touch()
+    survey = read_survey(tmp_path / "survey.toml")
+    assert survey.images.every_nth == 3
+    assert survey.camera.model == "OPENCV"
+    assert survey.ranges.time_offset_s is None
+    assert survey.tag.tag_in_cam_m == (-0.0012, -0.09, -0.0663)

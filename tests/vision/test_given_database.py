@@ -1,0 +1,115 @@
+"""A database of COLMAP's or hloc's in the place of features and matches."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pycolmap
+import pytest
+from tests.vision.matches import content_of
+
+from rangesfm.errors import InputError
+from rangesfm.files.atomic import sha256_of
+from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.vision.reconstruct import ReconstructionSummary, reconstruct
+
+if TYPE_CHECKING:
+    from tests.vision.conftest import Listener, Room
+
+FEATURES = {"sift": {"max_num_features": 250}}
+
+
+@pytest.fixture(scope="module")
+def earlier(room: Room, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A database of the room, as COLMAP leaves it."""
+    output = tmp_path_factory.mktemp("earlier")
+    reconstruct(room.folder, room.names, output, camera=room.camera, mapper=MapperOptions(features=FEATURES))
+    return output / "database.db"
+
+
+@pytest.fixture
+def given(earlier: Path, tmp_path: Path) -> Path:
+    """A copy of it, to be changed."""
+    return Path(shutil.copy(earlier, tmp_path / "given.db"))
+
+
+def reconstructed(room: Room, given: Path, listener: Listener, **others: Any) -> ReconstructionSummary:
+    mapper = MapperOptions(database_path=given, **others)
+    output = given.with_name("out")
+    return reconstruct(room.folder, room.names, output, camera=CameraOptions(), mapper=mapper, progress=listener)
+
+
+def test_its_features_matches_and_cameras_are_used_and_it_stays_as_it_is(
+    room: Room, given: Path, earlier: Path, listener: Listener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = sha256_of(given)
+    monkeypatch.setattr(pycolmap, "extract_features", None)
+    monkeypatch.setattr(pycolmap, "geometric_verification", None)
+    monkeypatch.setattr("rangesfm.vision.matched_photos.match_features", None)
+    summary = reconstructed(room, given, listener)
+    assert summary.num_registered == len(room.names)
+    assert content_of(given.with_name("out") / "database.db") == content_of(earlier)
+    assert [tuple(camera.params)[1:] for camera in summary.models[0].cameras.values()] == [
+        tuple(room.camera.params or ())[1:]
+    ]
+    assert sha256_of(given) == before
+    assert listener.messages == ["of given.db are taken features of 6 photos and matches of 15 pairs"]
+    reconstructed(room, given, listener)
+    assert [text for text in listener.messages if "earlier run" in text] == [
+        f"{step}: taken over from an earlier run" for step in ("features", "matching", "mapping")
+    ]
+
+
+def test_without_matches_only_those_are_computed(
+    room: Room, given: Path, earlier: Path, listener: Listener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pycolmap.Database.open(given) as database:
+        database.clear_matches()
+        database.clear_two_view_geometries()
+    monkeypatch.setattr(pycolmap, "extract_features", None)
+    reconstructed(room, given, listener)
+    assert content_of(given.with_name("out") / "database.db") == content_of(earlier)
+
+
+def test_of_hloc_without_descriptors_and_two_view_geometries_the_matches_are_verified(
+    room: Room, given: Path, listener: Listener
+) -> None:
+    with pycolmap.Database.open(given) as database:
+        database.clear_descriptors()
+        database.clear_two_view_geometries()
+    assert reconstructed(room, given, listener).num_registered == len(room.names)
+    with pycolmap.Database.open(given) as database:
+        database.clear_matches()
+    with pytest.raises(InputError, match=r"given.db: has neither matches nor a descriptor of photo000.png"):
+        reconstructed(room, given, listener)
+
+
+def test_photos_that_only_one_side_has_are_told_in_one_line(room: Room, given: Path, listener: Listener) -> None:
+    with pycolmap.Database.open(given) as database:
+        image = database.read_image(3)
+        image.name = "elsewhere/photo.png"
+        database.update_image(image)
+    summary = reconstructed(room, given, listener)
+    assert summary.num_registered == len(room.names) - 1
+    assert listener.messages == [
+        "of given.db are taken features of 5 photos and matches of 10 pairs; 1 photos are not in it and are left out,"
+        " the first is photo002.png; 1 of its photos are no keyframes, the first is elsewhere/photo.png"
+    ]
+
+
+def test_one_that_is_none_or_of_other_photos_is_refused(room: Room, given: Path, listener: Listener) -> None:
+    with pycolmap.Database.open(given) as database:
+        camera = database.read_camera(1)
+        camera.width = 300
+        database.update_camera(camera)
+    with pytest.raises(InputError, match=r"photo000.png is of 300 x 192 pixels there, expected 256 x 192 as its file"):
+        reconstructed(room, given, listener)
+    with pycolmap.Database.open(given) as database:
+        database.clear_keypoints()
+    with pytest.raises(InputError, match=r"given.db: has features of 0 of 6 photos, expected at least 2"):
+        reconstructed(room, given, listener)
+    given.write_text("no database")
+    with pytest.raises(InputError, match=r"given.db: is no database of COLMAP's"):
+        reconstructed(room, given, listener)

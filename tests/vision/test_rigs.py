@@ -1,0 +1,150 @@
+"""Rigs of cameras, from their configuration to the mapped model."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from rangesfm.errors import InputError
+from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.vision.image_times import read_image_times_csv
+from rangesfm.vision.reconstruct import reconstruct
+from rangesfm.vision.rigs import read_rigs
+
+NUM_CAMERAS, NUM_FRAMES = 3, 8
+PREFIXES = [f"camera{k:06d}_" for k in range(1, NUM_CAMERAS + 1)]
+NAMES = [f"{prefix}frame{k:06d}.png" for k in range(NUM_FRAMES) for prefix in PREFIXES]
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """Photos of a rig (nothing is to be seen on them), the truth, and a database of matches that knows of no rig."""
+
+    folder: Path
+    truth: pycolmap.Reconstruction
+
+    @property
+    def poses(self) -> list[pycolmap.Rigid3d]:
+        """Of the cameras beside the reference camera."""
+        return poses_of(self.truth)
+
+    def config(self, path: Path, known: Collection[int], **others: Any) -> Path:
+        """A configuration that tells where some of the cameras sit."""
+        cameras: list[dict[str, Any]] = [{"image_prefix": PREFIXES[0], "ref_sensor": True}]
+        for k, pose in enumerate(self.poses, 1):
+            cameras.append({"image_prefix": PREFIXES[k]})
+            if k in known:
+                x, y, z, w = pose.rotation.quat.tolist()
+                cameras[-1]["cam_from_rig_rotation"] = [w, x, y, z]
+                cameras[-1]["cam_from_rig_translation"] = pose.translation.tolist()
+        cameras[-1] |= others
+        path.write_text(json.dumps([{"cameras": cameras}]))
+        return path
+
+
+def poses_of(model: pycolmap.Reconstruction) -> list[pycolmap.Rigid3d]:
+    (rig,) = (rig for rig in model.rigs.values() if rig.non_ref_sensors)
+    poses = [rig.non_ref_sensors[sensor] for sensor in sorted(rig.non_ref_sensors, key=lambda sensor: sensor.id)]
+    return [pose for pose in poses if pose is not None]
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
+    folder = tmp_path_factory.mktemp("rig")
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_cameras_per_rig=NUM_CAMERAS, num_frames_per_rig=NUM_FRAMES, num_points3D=100
+    )
+    options.sensor_from_rig_translation_stddev = options.sensor_from_rig_rotation_stddev = 0.2
+    with pycolmap.Database.open(folder / "given.db") as database:
+        truth = pycolmap.synthesize_dataset(options, database)
+        pycolmap.apply_rig_config([], database)
+    for name in NAMES:
+        Image.new("L", (options.camera_width, options.camera_height)).save(folder / name)
+    return Simulated(folder, truth)
+
+
+def mapped(simulated: Simulated, config: Path) -> pycolmap.Reconstruction:
+    mapper = MapperOptions(database_path=simulated.folder / "given.db")
+    summary = reconstruct(
+        simulated.folder, NAMES, config.with_name("out"), camera=CameraOptions(), mapper=mapper, rigs=read_rigs(config)
+    )
+    model = summary.models[0]
+    assert model.num_reg_images() == len(NAMES)
+    assert model.num_reg_frames() == NUM_FRAMES
+    return model
+
+
+def test_known_places_are_kept_to_the_digit_and_give_the_model_its_scale(simulated: Simulated, tmp_path: Path) -> None:
+    model = mapped(simulated, simulated.config(tmp_path / "rig_config.json", known=(1, 2)))
+    for found, true in zip(poses_of(model), simulated.poses, strict=True):
+        assert np.allclose(found.matrix(), true.matrix(), rtol=0, atol=1e-12)
+    compared = pycolmap.compare_reconstructions(model, simulated.truth)
+    assert compared is not None
+    assert compared["rec2_from_rec1"].scale == pytest.approx(1, rel=1e-3)
+
+
+@pytest.mark.parametrize("known", [(), (1,)])
+def test_unknown_places_are_found_and_go_together_with_those_that_are_known(
+    simulated: Simulated, tmp_path: Path, known: tuple[int, ...]
+) -> None:
+    model = mapped(simulated, simulated.config(tmp_path / "rig_config.json", known))
+    compared = pycolmap.compare_reconstructions(model, simulated.truth)
+    assert compared is not None
+    scale = compared["rec2_from_rec1"].scale
+    for found, true in zip(poses_of(model), simulated.poses, strict=True):
+        assert np.allclose(found.rotation.matrix(), true.rotation.matrix(), rtol=0, atol=1e-3)
+        assert np.allclose(scale * found.translation, true.translation, rtol=0, atol=1e-3)
+    if known:
+        assert scale == pytest.approx(1, rel=1e-3)
+
+
+def test_what_is_known_of_distances_is_told_of_two_photos_in_the_model(simulated: Simulated, tmp_path: Path) -> None:
+    rigs = read_rigs(simulated.config(tmp_path / "rig_config.json", known=(2,)))
+    (taped,) = rigs.baselines(simulated.truth, stddev_m=0.002)
+    assert taped.ends == (f"{PREFIXES[0]}frame000000.png", f"{PREFIXES[2]}frame000000.png")
+    assert taped.distance_m == pytest.approx(np.linalg.norm(simulated.poses[1].translation))
+    assert taped.stddev_m == 0.002
+
+
+def test_photos_of_one_frame_share_the_time_of_the_first_of_them_that_has_one(
+    simulated: Simulated, tmp_path: Path
+) -> None:
+    frames = read_rigs(simulated.config(tmp_path / "rig_config.json", known=())).frames(["other.png", *NAMES])
+    assert len(frames) == NUM_FRAMES + 1
+    assert frames[NAMES[0]] == tuple(NAMES[:NUM_CAMERAS])
+    rows = [f"{name},{row // NUM_CAMERAS}" for row, name in enumerate(NAMES)]
+    (tmp_path / "times.csv").write_text("\n".join(["image_name,timestamp_s", *rows[1:], "other.png,-1"]))
+    times = read_image_times_csv(tmp_path / "times.csv", tuple(frames), frames)
+    assert times.image_names == ("other.png", *NAMES[::NUM_CAMERAS])
+    assert times.timestamps_s.tolist() == [-1, *range(NUM_FRAMES)]
+    (tmp_path / "times.csv").write_text(f"image_name,timestamp_s\n{NAMES[0]},1\n{NAMES[1]},1\nother.png,1\n")
+    with pytest.raises(InputError, match=rf"4: other.png has the time of {NAMES[0]} in line 2"):
+        read_image_times_csv(tmp_path / "times.csv", tuple(frames), frames)
+
+
+@pytest.mark.parametrize(
+    ("others", "message"),
+    [
+        ({"cam_from_rig_rotation": [1, 0, 0]}, "cam_from_rig_rotation of 'camera000003_' has 3 numbers, expected 4"),
+        ({"cam_from_rig_rotation": [2, 0, 0, 0]}, "is .2, 0, 0, 0., expected w, x, y, z of length 1"),
+        ({"ref_sensor": True}, "is no rig configuration of COLMAP's .*only have one reference sensor"),
+        ({"image_prefix": "right/"}, "no photo's name begins with image_prefix 'right/'"),
+        ({"image_prefix": "camera00000"}, "is of 'camera000001_' and of 'camera00000', expected one image_prefix"),
+    ],
+)
+def test_what_is_no_rig_is_one_line(simulated: Simulated, tmp_path: Path, others: dict[str, Any], message: str) -> None:
+    path = simulated.config(tmp_path / "rig_config.json", known=(), **others)
+    with pytest.raises(InputError, match=f"rig_config.json: .*{message}"):
+        read_rigs(path).frames(NAMES)
+    path.write_text("[]")
+    with pytest.raises(InputError, match=r"rig_config.json: holds no rig"):
+        read_rigs(path)

@@ -1,0 +1,117 @@
+"""A stereo rig and a radio, each of which knows the scale."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from rangesfm.colmap.transform import rescale
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.geometry.trajectory import trajectory_from_reconstruction
+from rangesfm.progress import SilentProgress
+from rangesfm.result.summary import ResultSummary
+from rangesfm.survey.settings import Survey, survey_from_tables
+from rangesfm.workflows.run import refine_model
+
+LEFT, RIGHT = "camera000001_", "camera000002_"
+NUM_FRAMES, RANGES_PER_FRAME = 20, 8
+BASELINE_STDDEV_M, RANGE_STDDEV_M = 0.001, 0.05
+TAG_IN_CAM_M = np.array([0.05, -0.2, 0.1])
+ANCHORS_M = {"A1": (-8.0, -7.0, 1.0), "A2": (8.0, -6.0, 4.0), "A3": (7.0, 8.0, -1.0), "A4": (-6.0, 7.0, -4.0)}
+
+
+@dataclass(frozen=True)
+class StereoSurvey:
+    """A model of a stereo rig in the unit that a baseline as configured gives it, and ranges to surveyed anchors.
+
+    Attributes:
+        true_scale: metres per unit of the model.
+    """
+
+    folder: Path
+    true_scale: float
+
+    def refined(self) -> ResultSummary:
+        tables = {
+            "images": {"rig_config": "rig_config.json", "baseline_stddev_m": BASELINE_STDDEV_M},
+            "ranges": {"path": "ranges.csv", "range_stddev_m": RANGE_STDDEV_M},
+            "anchors": {"path": "anchors.csv"},
+            "tag": {"tag_in_cam_m": TAG_IN_CAM_M.tolist()},
+            "output": {"path": "out"},
+            "report": {"enabled": True},
+        }
+        survey: Survey = survey_from_tables(tables, self.folder)
+        survey = survey.model_copy(update={"model_path": self.folder / "sparse"})
+        return refine_model(survey, progress=SilentProgress()).summary
+
+
+def stereo_survey(folder: Path, *, baseline_error: float = 0.0, seed: int = 0) -> StereoSurvey:
+    """Args: baseline_error: what the configuration has too much of it, as a share."""
+    pycolmap.set_random_seed(seed)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_cameras_per_rig=2, num_frames_per_rig=NUM_FRAMES, num_points3D=200
+    )
+    options.sensor_from_rig_translation_stddev, options.sensor_from_rig_rotation_stddev = 0.3, 0.05
+    truth = pycolmap.synthesize_dataset(options)
+    write_ranges(folder, truth, np.random.default_rng(seed))
+    pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=0.5), truth)
+    model = rescale(truth, Similarity(1 + baseline_error, np.eye(3), np.zeros(3)))
+    (folder / "sparse").mkdir()
+    model.write(folder / "sparse")
+    (rig,) = model.rigs.values()
+    (pose,) = rig.non_ref_sensors.values()
+    assert pose is not None
+    x, y, z, w = pose.rotation.quat.tolist()
+    known = {"cam_from_rig_rotation": [w, x, y, z], "cam_from_rig_translation": pose.translation.tolist()}
+    cameras = [{"image_prefix": LEFT, "ref_sensor": True}, {"image_prefix": RIGHT, **known}]
+    (folder / "rig_config.json").write_text(json.dumps([{"cameras": cameras}]))
+    return StereoSurvey(folder, 1 / (1 + baseline_error))
+
+
+def write_ranges(folder: Path, truth: pycolmap.Reconstruction, rng: np.random.Generator) -> None:
+    """Of each frame to each anchor, several, with independent noise; and the anchors."""
+    path = trajectory_from_reconstruction(truth)
+    tags = path.centers + path.world_from_cam @ TAG_IN_CAM_M
+    rows = ["image_name,anchor_id,range_m"]
+    for name, tag in zip(path.image_names, tags, strict=True):
+        for anchor_id, position in ANCHORS_M.items():
+            ranges = np.linalg.norm(tag - position) + rng.normal(0, RANGE_STDDEV_M, RANGES_PER_FRAME)
+            rows += [f"{name},{anchor_id},{range_m:.4f}" for range_m in ranges]
+    (folder / "ranges.csv").write_text("\n".join(rows) + "\n")
+    places = [f"{anchor_id},{x},{y},{z}" for anchor_id, (x, y, z) in ANCHORS_M.items()]
+    (folder / "anchors.csv").write_text("\n".join(["anchor_id,x_m,y_m,z_m", *places]) + "\n")
+
+
+def test_scales_by_ranges_and_by_baseline_agree_and_together_are_surer(tmp_path: Path) -> None:
+    survey = stereo_survey(tmp_path)
+    found = survey.refined()
+    assert found.scale.verdict == "good"
+    assert abs(np.log(found.scale.value / survey.true_scale)) < 3 * found.scale.relative_stddev.formal
+    (baseline,) = found.baselines
+    assert baseline.agrees
+    assert baseline.photos == (f"{LEFT}frame000000.png", f"{RIGHT}frame000000.png")
+    assert baseline.scale == pytest.approx(survey.true_scale)
+    assert found.refine is not None
+    assert found.refine.relative_scale_stddev is not None
+    assert found.refine.scale_value is not None
+    assert abs(np.log(found.refine.scale_value / survey.true_scale)) < 3 * found.refine.relative_scale_stddev
+    assert found.refine.relative_scale_stddev < 0.95 * found.scale.relative_stddev.empirical
+    assert "Baselines of rigs" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_a_baseline_wrong_by_3_percent_is_found_by_the_ranges_and_has_no_say(tmp_path: Path) -> None:
+    survey = stereo_survey(tmp_path, baseline_error=0.03)
+    found = survey.refined()
+    assert found.scale.value == pytest.approx(survey.true_scale, rel=0.005)
+    assert found.refine is not None
+    assert found.refine.scale_value == pytest.approx(survey.true_scale, rel=0.005)
+    (baseline,) = found.baselines
+    assert not baseline.agrees
+    assert baseline.off_by == pytest.approx(0.03, abs=0.005)
+    assert found.scale.verdict == "doubtful"
+    assert found.scale.reasons[0].startswith("the rig's cameras are 0.4304 m apart, which gives a scale of 1 m per SfM")
