@@ -31,12 +31,14 @@ class Told:
         metavar: how its value is shown there; None: by its type.
         expected: what it may be, for messages; None: by its type and bounds.
         role: of a path, what stands there.
+        is_key: whether it stands in a table of the file.
     """
 
     flag: str | None = None
     metavar: str | None = None
     expected: str | None = None
     role: PathRole | None = None
+    is_key: bool = True
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,8 @@ class Options(BaseModel):
         keys = {}
         for name, field in cls.model_fields.items():
             told = next((item for item in field.metadata if isinstance(item, Told)), Told())
+            if not told.is_key:
+                continue
             expected = told.expected or _described(hints[name], _UNITS.get(name.rpartition("_")[2]))
             meaning = " ".join((field.description or "").split()).removesuffix(".")
             meaning += _default(field.get_default(call_default_factory=True))
@@ -104,12 +108,13 @@ class Options(BaseModel):
     @classmethod
     def _error(cls, where: tuple[int | str, ...], values: Mapping[str, Any]) -> OptionError:
         name = str(where[0])
-        if name not in cls.model_fields:
-            nearest = nearest_known(name, cls.model_fields)
+        keys = cls.keys()
+        if name not in keys:
+            nearest = nearest_known(name, keys)
             return OptionError(
                 f"unknown key {shown(name)} in [{cls.table}]; the nearest known one is '{nearest}'", cls.table, name
             )
-        value, expected = values[name], cls.keys()[name].expected
+        value, expected = values[name], keys[name].expected
         if len(where) > 1 and isinstance(value, Mapping) and where[1] in value:
             name, value, expected = f"{name}.{where[1]}", value[where[1]], expected.removeprefix(_TABLE_OF)
         return OptionError(f"[{cls.table}] {printable(name)} is {shown(value)}, expected {expected}", cls.table, name)

@@ -7,6 +7,7 @@ commands' flags, their help, the reference of all keys and the settings in ``res
 from __future__ import annotations
 
 import os
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -48,6 +49,10 @@ def _direction(vector: tuple[float, float, float]) -> tuple[float, float, float]
     if max(map(abs, vector)) < 1e-6:
         raise ValueError("is 0,0,0")
     return vector
+
+
+def _is_of(name: str, pattern: str) -> bool:
+    return fnmatchcase(name, pattern) or name.startswith(f"{pattern.rstrip('/')}/")
 
 
 def _span(times: tuple[float, ...]) -> tuple[float, ...]:
@@ -95,6 +100,9 @@ class CameraOptions(Options):
 
     table: ClassVar[str] = "camera"
 
+    images: Annotated[str | None, Told(flag="camera_images", metavar="PATTERN")] = None
+    """Of several [[camera]] tables, which photos each is of: a folder, or a pattern of their names as left*.jpg; one
+    table may do without, for all others."""
     mode: Annotated[Literal["auto", "single", "per_folder", "per_image"], Told(flag="camera_mode")] = "auto"
     """Which photos of one size share a camera: those of the same make, model, serial number and focal length by EXIF
     (auto; without EXIF all), all of them, those of one folder, or none."""
@@ -108,6 +116,21 @@ class CameraOptions(Options):
     refine_intrinsics: bool | None = None
     """Whether mapping and refinement adjust them at all (default: mapping does; the refinement does to given ones, by
     their stddev, and else keeps what it finds, so that it does the same to a model just mapped and one brought)."""
+
+    others: Annotated[tuple[CameraOptions, ...], Told(is_key=False)] = ()
+    """Those of the other tables, each with its pattern; this one is for photos of which none is."""
+
+    @property
+    def tables(self) -> tuple[CameraOptions, ...]:
+        return (self, *self.others)
+
+    def of_photo(self, name: str) -> CameraOptions:
+        """The table that a photo belongs to; OptionError for one that belongs to two."""
+        found = [table for table in self.others if table.images is not None and _is_of(name, table.images)]
+        if len(found) > 1:
+            patterns = " and ".join(f"'{table.images}'" for table in found)
+            raise OptionError(f"[[camera]] images {patterns} are both of the photo {name}, expected one", "camera")
+        return found[0] if found else self
 
     @property
     def mapping_refines_intrinsics(self) -> bool:

@@ -33,6 +33,7 @@ from rangesfm.scale.verdict import Verdict, judge
 from rangesfm.trust.finished_map import by_similarity
 
 _NUM_NOISE_ROUNDS = 2
+_NUM_COMPARED_RANGES, _NUM_COMPARED_CELLS = 600, 120
 OPEN = 1e3
 """Metres, or radians: a number this uncertain is one that nothing determines."""
 
@@ -112,11 +113,19 @@ def _stddevs(variances: Array) -> Array:
     return np.where(stddevs < OPEN, stddevs, np.inf)
 
 
+def compare(planned: PlannedSurvey) -> Expected | None:
+    """``expect`` in a tenth of the time, good to tell plans apart; None where a run will find too few ranges."""
+    try:
+        return expect(replace(planned, max_num_ranges=_NUM_COMPARED_RANGES), _NUM_COMPARED_CELLS)
+    except GeometryError:
+        return None
+
+
 def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expected:
     """Find the noise that the run will see, and with its weights what it will state.
 
     Args:
-        max_num_cells: in which how ranges err together is computed; as a run has it, or fewer to compare plans.
+        max_num_cells: in which how ranges err together is computed, as a run has it or coarser.
 
     Raises:
         GeometryError: the run will find too few ranges on the path.

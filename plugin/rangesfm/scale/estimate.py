@@ -86,7 +86,7 @@ class ScaleEstimate:
         uncertainty: relative stddevs.
         verdict: "good" or "doubtful" (a refusal is a GeometryError).
         reasons: why, in words.
-        advice: what to do next time, in words.
+        advice: what to do about it, in words; of a finished survey too what would gain most next time.
         cutoff_test: whether the scale moves as short ranges are left out.
         sensitivity: to what the range model may have wrong.
         per_anchor: scale from each anchor alone; anchors that do not determine one are missing.

@@ -51,7 +51,8 @@ def open_images(path: Path, topic: str | None) -> Source:
     is_stamped = _stamp_s(message) > 0
     clock = "the stamps of their headers" if is_stamped else "when they arrived, as their headers have no stamps"
     what = f"{num_by_topic[topic]} images of {topic}, {size_px[0]} x {size_px[1]} pixels"
-    return Source(what, size_px, duration_s, clock, partial(_frames, path, topic, is_stamped), camera, notes)
+    frames = partial(_frames, path, topic, is_stamped)
+    return Source(what, size_px, duration_s, num_by_topic[topic], clock, frames, camera, notes)
 
 
 def _num_by_topic(bag: AnyReader) -> dict[str, int]:

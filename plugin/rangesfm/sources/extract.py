@@ -111,8 +111,7 @@ def _with_intervals(frames: Iterable[Frame], rate_hz: float) -> Iterator[tuple[i
 def _write(source: Source, folder: Path, rate_hz: float, progress: Progress) -> tuple[dict[str, float], int]:
     """Photos and their table; returns the photos' times by name, and how many bytes they take."""
     times_s: dict[str, float] = {}
-    num_expected = math.ceil(source.duration_s * rate_hz)
-    num_bytes = 0
+    num_expected, num_bytes = source.num_photos(rate_hz), 0
     for frame in sharpest(source.frames(), rate_hz):
         name = f"frame_{frame.number:06d}{frame.suffix}"
         frame.write(folder / name)

@@ -55,6 +55,7 @@ def open_video(path: Path) -> Source:
         what=f"video, {size_px[0]} x {size_px[1]} pixels, {duration_s:.1f} s",
         size_px=size_px,
         duration_s=duration_s,
+        num_frames=stream.frames,
         clock=clock,
         frames=partial(_frames, path, start_s or 0.0),
         notes=(turned,) if first.rotation else (),
@@ -83,7 +84,7 @@ def _reading(path: Path) -> Iterator[InputContainer]:
             "reading a video needs the package av: python -m pip install 'rangesfm[video]'", path
         ) from None
     try:
-        with av.open(path) as video:
+        with av.open(path, metadata_errors="replace") as video:
             if not video.streams.video:
                 raise InputError("there are no pictures in this video", path)
             yield video

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -20,6 +19,7 @@ from rangesfm.survey.settings import Survey
 from rangesfm.vision.camera import cameras_of_photos, check_camera
 from rangesfm.vision.image_times import ImageTimes, list_images
 from rangesfm.vision.photos import usable_photos
+from rangesfm.vision.rigs import read_rigs
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.photos import checked_keyframes, images_path, read_inputs
 
@@ -90,12 +90,12 @@ def _check_photos(survey: Survey, checked: CheckedSurvey) -> None:
         checked.warnings.append(f"{len(photos.left_out)} photos are left out, first {name}: {why}")
     with survey.source.naming_lines():
         check_camera(survey.camera)
-        found = cameras_of_photos(survey.camera, photos)
+        found = cameras_of_photos(survey.camera, photos, read_rigs(survey.images.rig_config))
     for number, camera in enumerate(found.cameras[:_MAX_NUM_SIZES]):
         num_photos, focal_length_px = found.of_photo.count(number), camera.mean_focal_length()
         what = f"{camera.model.name} for {num_photos} photos, f {focal_length_px:.0f} pixels"
-        is_guessed = photos.names[found.of_photo.index(number)] in found.guessed
-        if survey.camera.params is not None and not is_guessed:
+        first = photos.names[found.of_photo.index(number)]
+        if survey.camera.of_photo(first).params is not None and first not in found.guessed:
             checked.facts.append(f"camera: {what}, as given")
         else:
             seen = "by EXIF" if camera.has_prior_focal_length else "a guess from the photos' size"
@@ -105,7 +105,7 @@ def _check_photos(survey: Survey, checked: CheckedSurvey) -> None:
 def _check_source(survey: Survey, path: Path, checked: CheckedSurvey) -> None:
     """What is known of a video or a bag before its photos are taken out."""
     source, rate_hz = open_source(path, survey.images.topic), survey.images.rate_hz
-    num = f"about {math.ceil(source.duration_s * rate_hz)} photos at {rate_hz:g} Hz"
+    num = f"about {source.num_photos(rate_hz)} photos at {rate_hz:g} Hz"
     checked.facts.append(f"photos of {path.name}: {source.what}; {num}, taken out when a run begins")
     checked.facts += [*source.notes]
     checked.assumed.append(f"the photos' times are {source.clock}")

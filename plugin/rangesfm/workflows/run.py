@@ -42,6 +42,7 @@ from rangesfm.workflows.photos import (
     tell_of_times,
     with_photos_in_folder,
 )
+from rangesfm.workflows.plan_again import with_advice
 from rangesfm.workflows.results import RunResult, write_results
 
 
@@ -148,4 +149,5 @@ def map_in_metres(
         with journal.stage("refinement"):
             metric = refine_map(survey, inputs, metric, journal)
     # Comparison and results.
-    return write_results(survey, inputs, judge_map(survey, metric, journal), journal)
+    judged = with_advice(judge_map(survey, metric, journal), inputs.tag_in_cam_m)
+    return write_results(survey, inputs, judged, journal)
