@@ -199,14 +199,6 @@ class TestRefused:
         )
         self.refuse(survey, "unknown", "", "two scales fit.*the path lies on a sphere")
 
-    @pytest.mark.parametrize(("tilt", "seed"), [(0.0, 0), (0.0, 1), (0.3, 0)], ids=["parallel", "again", "tilted"])
-    def test_a_flat_path_among_anchors_in_a_plane(self, make_survey: MakeSurvey, tilt: float, seed: int) -> None:
-        """Its mirror image fits; parallel to the anchors' plane, that image is the same map higher or lower."""
-        centers = on_a_loop_at_one_height(make_survey)
-        centers[:, 2] += tilt * centers[:, 0]
-        survey = make_survey(centers_m=centers, anchors_m=FLAT_ANCHORS_M, radio=NOISE, seed=seed)
-        self.refuse(survey, "site", "ABCD", "mirror image")
-
     def test_a_straight_path_in_the_site_frame(self, make_survey: MakeSurvey) -> None:
         """The map can be turned about it."""
         survey = make_survey(centers_m=on_a_line(), tag_in_cam_m=(0, 0, 0), radio=NOISE)

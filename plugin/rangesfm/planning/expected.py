@@ -35,6 +35,8 @@ from rangesfm.trust.finished_map import by_similarity
 
 _NUM_NOISE_ROUNDS = 2
 _NUM_COMPARED_RANGES, _NUM_COMPARED_CELLS = 600, 120
+# Of the largest information: less is none.
+_ROUNDING = 1e-20
 OPEN = 1e3
 """Metres, or radians: a number this uncertain is one that nothing determines."""
 
@@ -155,7 +157,8 @@ def _weighed(posed: ScaleProblem, errors: RangeErrors, fit: RangeFit) -> Solutio
 
 def _undetermined(fit: RangeFit) -> Array:
     """(p, p) variances without limit in the directions that nothing determines, which least squares leave alone."""
-    sizes = np.sqrt(np.maximum(np.diag(fit.information), 1e-200))
+    of_each = np.diag(fit.information)
+    sizes = np.sqrt(np.maximum(of_each, _ROUNDING * of_each.max()))
     values, vectors = np.linalg.eigh(fit.information / np.outer(sizes, sizes))
     nothing = vectors[:, values < 1e-10] / sizes[:, None]
     lengths = np.linalg.norm(nothing, axis=0)

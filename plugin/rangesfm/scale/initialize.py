@@ -26,7 +26,7 @@ from rangesfm.scale.levelled_places import levelled_places
 from rangesfm.scale.problem import ScaleProblem, first_camera_from, scale_problem
 from rangesfm.scale.range_equation import RangeProblem, solve
 from rangesfm.scale.sensitivity import scale_sensitivity
-from rangesfm.scale.solution import Solution, solve_scale
+from rangesfm.scale.solution import OpenPlaceError, Solution, solve_scale
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
 from rangesfm.scale.uncertainty import learned_errors, parameter_covariance, scale_uncertainty
 from rangesfm.scale.verdict import judge, judge_lengths
@@ -56,7 +56,7 @@ def initialize_scale(
 
     Raises:
         InputError: the log has an anchor that is not given.
-        GeometryError: the scale, or the place in the site frame, is not determined.
+        GeometryError: the scale is not determined.
     """
     options, range_model = options or ScaleOptions(), range_model or RangeModelOptions()
     lengths = scale_by_lengths(distances, trajectory.centers)
@@ -67,8 +67,14 @@ def initialize_scale(
     if lengths is not None and distances is not None:
         distances = lengths.beside_ranges(distances)
     gravity = gravity_of(options.up_in_first_camera)
-    problem = scale_problem(observations, trajectory, anchors, anchor_frame, range_model, distances, gravity)
-    solution = solve_scale(problem, camera_side=options.camera_side, seed=seed)
+    given = (observations, trajectory, anchors, anchor_frame, range_model, distances, gravity)
+    problem, open_place = scale_problem(*given), tuple[str, ...]()
+    try:
+        solution = solve_scale(problem, camera_side=options.camera_side, seed=seed)
+    except OpenPlaceError as error:
+        open_place = (f"scale only, in the first camera's frame: {error}",)
+        problem = scale_problem(*given, place_is_open=True)
+        solution = solve_scale(problem, camera_side=None, seed=seed)
     table = _paper_table(solution)
     rotations = model_from_cam(observations, trajectory, problem)
     learned = learned_errors(problem, solution, observations, rotations)
@@ -79,7 +85,7 @@ def initialize_scale(
     found = anchor_estimates(solution, observations.log.anchor_ids, covariance)
     tests = cutoff_test(solution)
     judged = judge(problem, solution, uncertainty, per_anchor, found, tests, options)
-    verdict, reasons = judged.verdict, judged.reasons
+    verdict, reasons = judged.verdict, (*judged.reasons, *open_place)
     if gravity is not None and problem.frame == "first_camera" and anchor_frame == "site":
         reasons = (*reasons, *levelled_places(gravity, anchors, found))
     if options.method == "two-candidate":

@@ -63,6 +63,8 @@ def scale_problem(
     range_model: RangeModelOptions,
     distances: LocatedDistances | None = None,
     gravity: Gravity | None = None,
+    *,
+    place_is_open: bool = False,
 ) -> ScaleProblem:
     """Set up the estimation.
 
@@ -70,6 +72,7 @@ def scale_problem(
         distances: taped ones, with the anchors of the log in its order; those between anchors that the log holds
             are added.
         gravity: as somebody told it.
+        place_is_open: whether the map has no one place in the site: of surveyed anchors only their distances count.
 
     Raises:
         InputError: an anchor of the log has no place in ``anchors``.
@@ -80,6 +83,7 @@ def scale_problem(
     given = np.array([a.position_m is not None for a in in_log], dtype=bool) & (anchor_frame != "unknown")
     rows, heard = _usable_ranges(observations, given)
     known, notes = _usable_positions(in_log, given & heard, anchor_frame, gravity is not None)
+    known &= not place_is_open
     if anchor_frame == "site" and not known.any():
         distances = _with_surveyed(distances, in_log, given & heard)
     # A surveyed anchor whose ranges are all held out keeps its place, to check them against.

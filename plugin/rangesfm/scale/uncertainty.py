@@ -209,8 +209,8 @@ def _by_what_was_given(solution: Solution) -> Array:
     given = fit.prior_information.copy()
     biases = fit.columns[0].bias[fit.columns[0].bias >= 0]
     given[biases] = given[:, biases] = 0.0
-    inverse = invert_information(fit.information)
-    covariance: Array = solution.errors.inflation**2 * inverse @ given @ inverse
+    inverse = np.linalg.lstsq(fit.information, np.eye(len(fit.information)), rcond=1e-12)[0]
+    covariance: Array = solution.errors.inflation**2 * inverse @ given @ inverse.T
     return covariance
 
 
