@@ -355,8 +355,7 @@ def between_cameras(survey: Survey, *, factor: float = 1.0, stddev_m: float = 0.
     pairs = np.array([[0, len(survey.times) // 2], [len(survey.times) // 4, -1]])
     model = np.linalg.norm(np.diff(survey.trajectory.centers[pairs], axis=1)[:, 0], axis=1)
     metric = factor * np.linalg.norm(np.diff(survey.centers_m[pairs], axis=1)[:, 0], axis=1)
-    nobody = np.full((2, 2), -1)
-    return LocatedDistances(model, nobody, metric, np.full(2, stddev_m), np.zeros(2, dtype=bool))
+    return LocatedDistances.of(metric, np.full(2, stddev_m), model_length=model)
 
 
 def between_anchors(survey: Survey, stddev_m: float = 0.005) -> LocatedDistances:
@@ -364,8 +363,7 @@ def between_anchors(survey: Survey, stddev_m: float = 0.005) -> LocatedDistances
     places = np.array(list(survey.anchors_m.values()))
     pairs = np.array([[0, k] for k in range(1, len(places))])
     lengths = np.linalg.norm(places[1:] - places[0], axis=1)
-    k = len(lengths)
-    return LocatedDistances(np.full(k, np.nan), pairs, lengths, np.full(k, stddev_m), np.zeros(k, dtype=bool))
+    return LocatedDistances.of(lengths, np.full(len(lengths), stddev_m), anchor_pair=pairs)
 
 
 def test_control_distances_between_cameras_hold_a_scale_that_long_ranges_would_spoil(make_survey: MakeSurvey) -> None:

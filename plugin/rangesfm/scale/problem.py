@@ -89,7 +89,7 @@ def scale_problem(
     # A surveyed anchor whose ranges are all held out keeps its place, to check them against.
     placed = known | (given & known.any())
     left_out = tuple(a.anchor_id for a, k in zip(in_log, heard | placed, strict=True) if not k)
-    first_camera_from_sfm = _first_camera_from_sfm(trajectory)
+    first_camera_from_sfm = first_camera_from(trajectory)
     noise = range_model.range_stddev_m or START_STDDEV_M
     errors = RangeErrors.begin(observations, rows, range_model)
     ranges = RangeProblem(
@@ -176,7 +176,8 @@ def _usable_ranges(
     return rows, heard
 
 
-def _first_camera_from_sfm(trajectory: Trajectory) -> Similarity:
+def first_camera_from(trajectory: Trajectory) -> Similarity:
+    """Rigid motion from the world of a path to the frame of its first camera."""
     rotation = trajectory.world_from_cam[0].T
     return Similarity(1.0, rotation, -rotation @ trajectory.centers[0])
 
@@ -228,11 +229,9 @@ def _with_surveyed(
     pairs = surveyed_distances([anchor for anchor, k in zip(anchors, given, strict=True) if k])
     if not pairs:
         return distances
-    surveyed = LocatedDistances(
-        model_length=np.full(len(pairs), np.nan),
+    surveyed = LocatedDistances.of(
+        np.array([pair.distance_m for pair in pairs]),
+        np.array([pair.stddev_m for pair in pairs]),
         anchor_pair=np.array([[ids.index(end) for end in pair.ends] for pair in pairs]),
-        distance_m=np.array([pair.distance_m for pair in pairs]),
-        stddev_m=np.array([pair.stddev_m for pair in pairs]),
-        is_check=np.zeros(len(pairs), dtype=bool),
     )
     return surveyed if distances is None else distances.joined(surveyed)

@@ -143,35 +143,61 @@ def times_of_ranges(posed: ScaleProblem, solution: Solution, observations: Range
     return np.concatenate([[0.0], np.cumsum(steps_m)])[of_range] / _WALKING_M_PER_S
 
 
-def scale_uncertainty(posed: ScaleProblem, solution: Solution, learned: LearnedErrors) -> ScaleUncertainty:
+def scale_uncertainty(
+    posed: ScaleProblem, solution: Solution, learned: LearnedErrors, bending_of_lengths: float = 0.0
+) -> ScaleUncertainty:
     """Relative stddevs of the scale.
 
     Its robust weights do not make the most of what is learnt of the errors. The best ones do (Gauss-Markov), as far as
     the errors are what they are taken for, and say how far off the scale is that was found: as far as theirs, give or
     take the stddev of theirs. Where that leaves more open than the errors' sum, it is no help.
+
+    Args:
+        posed: measured lengths in it as uncertain as the map's bending makes them.
+        bending_of_lengths: as of ``expected_scale_uncertainty``.
     """
-    summed, reweighted, change = _by_both_weights(posed, solution, learned)
+    summed, reweighted, change = _by_both_weights(posed, solution, learned, bending_of_lengths)
     reweighted.components[REWEIGHTING] = change
     return min(summed, reweighted, key=lambda each: each.empirical)
 
 
-def expected_scale_uncertainty(posed: ScaleProblem, solution: Solution, learned: LearnedErrors) -> ScaleUncertainty:
-    """The same before anything is measured: what half of the surveys will state at most."""
-    summed, reweighted, _ = _by_both_weights(posed, solution, learned)
+def expected_scale_uncertainty(
+    posed: ScaleProblem, solution: Solution, learned: LearnedErrors, bending_of_lengths: float = 0.0
+) -> ScaleUncertainty:
+    """The same before anything is measured: what half of the surveys will state at most.
+
+    Args:
+        bending_of_lengths: relative, of the scale by measured lengths.
+    """
+    summed, reweighted, _ = _by_both_weights(posed, solution, learned, bending_of_lengths)
+    of_lengths = _say_of_lengths(solution) * bending_of_lengths
+    if of_lengths > 0:
+        reweighted.components[GIVEN] = float(np.hypot(reweighted.components.get(GIVEN, 0.0), of_lengths))
     # The best estimate and its distance from any other are independent.
     variance = summed.empirical**2 - reweighted.empirical**2
     reweighted.components[REWEIGHTING] = float(np.sqrt(_MEDIAN_SQUARE * max(variance, 0.0)))
     return min(summed, reweighted, key=lambda each: each.empirical)
 
 
+def _say_of_lengths(solution: Solution) -> float:
+    """By how much the scale changes, relative to a change of all lengths between points."""
+    distances, fit = solution.problem.distances, solution.fit
+    if distances is None:
+        return 0.0
+    of_points = distances.subset(distances.is_between_points)
+    slopes = fit.state.metric_from_model.scale * of_points.model_length / of_points.stddev_m
+    return float(invert_information(fit.information)[0, 0] * (slopes @ slopes))
+
+
 def _by_both_weights(
-    posed: ScaleProblem, solution: Solution, learned: LearnedErrors
+    posed: ScaleProblem, solution: Solution, learned: LearnedErrors, bending_of_lengths: float
 ) -> tuple[ScaleUncertainty, ScaleUncertainty, float]:
     """Of the scale at hand; of the scale that the best weights find; and how far they are apart."""
     formal, linear = solution.fit.log_scale_stddev, _linear(posed, solution)
     summed = learned.stddev_of(scale_influence(solution.fit, solution.problem))
-    if (given := float(_by_what_was_given(solution)[0, 0])) > 0:
-        summed[GIVEN] = float(np.sqrt(given))
+    given = np.hypot(np.sqrt(_by_what_was_given(solution)[0, 0]), _say_of_lengths(solution) * bending_of_lengths)
+    if given > 0:
+        summed[GIVEN] = float(given)
     design, off_m = learned.cells.mean(linear.design), learned.cells.mean(linear.off_m)
     covariance = learned.covariance_m2
     covariance[np.diag_indices_from(covariance)] += ROUNDING * np.trace(covariance)
@@ -179,8 +205,8 @@ def _by_both_weights(
     inverse = invert_information(design.T @ whitened + linear.prior_design.T @ linear.prior_design)
     of_cells, of_priors = whitened @ inverse[0], linear.prior_design @ inverse[0]
     reweighted = learned.stddev_of_cells(of_cells)
-    if (given := float(np.linalg.norm(of_priors))) > 0:
-        reweighted[GIVEN] = given
+    if (given := np.linalg.norm(of_priors)) > 0:
+        reweighted[GIVEN] = float(given)
     change = abs(float(of_cells @ off_m + of_priors @ linear.prior_off))
     return ScaleUncertainty(formal, summed), ScaleUncertainty(formal, reweighted), change
 
