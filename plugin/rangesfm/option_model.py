@@ -19,7 +19,7 @@ Same = TypeVar("Same", bound="Options")
 PathRole = Literal["file", "log", "photos", "model", "output"]
 _NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "text", Path: "a path", dict: "a table"}
 _TABLE_OF = "a table in which each value is "
-_UNITS = {"m": "metres", "s": "seconds", "deg": "degrees"}
+_UNITS = {"m_per_s": "metres a second", "m": "metres", "s": "seconds", "deg": "degrees"}
 
 
 @dataclass(frozen=True)
@@ -31,12 +31,14 @@ class Told:
         metavar: how its value is shown there; None: by its type.
         expected: what it may be, for messages; None: by its type and bounds.
         role: of a path, what stands there.
+        is_key: whether it stands in a table of the file.
     """
 
     flag: str | None = None
     metavar: str | None = None
     expected: str | None = None
     role: PathRole | None = None
+    is_key: bool = True
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,10 @@ class Options(BaseModel):
         keys = {}
         for name, field in cls.model_fields.items():
             told = next((item for item in field.metadata if isinstance(item, Told)), Told())
-            expected = told.expected or _described(hints[name], _UNITS.get(name.rpartition("_")[2]))
+            if not told.is_key:
+                continue
+            unit = next((unit for end, unit in _UNITS.items() if name.endswith(f"_{end}")), None)
+            expected = told.expected or _described(hints[name], unit)
             meaning = " ".join((field.description or "").split()).removesuffix(".")
             meaning += _default(field.get_default(call_default_factory=True))
             type_ = _without_none(bare[name])
@@ -104,12 +109,13 @@ class Options(BaseModel):
     @classmethod
     def _error(cls, where: tuple[int | str, ...], values: Mapping[str, Any]) -> OptionError:
         name = str(where[0])
-        if name not in cls.model_fields:
-            nearest = nearest_known(name, cls.model_fields)
+        keys = cls.keys()
+        if name not in keys:
+            nearest = nearest_known(name, keys)
             return OptionError(
                 f"unknown key {shown(name)} in [{cls.table}]; the nearest known one is '{nearest}'", cls.table, name
             )
-        value, expected = values[name], cls.keys()[name].expected
+        value, expected = values[name], keys[name].expected
         if len(where) > 1 and isinstance(value, Mapping) and where[1] in value:
             name, value, expected = f"{name}.{where[1]}", value[where[1]], expected.removeprefix(_TABLE_OF)
         return OptionError(f"[{cls.table}] {printable(name)} is {shown(value)}, expected {expected}", cls.table, name)

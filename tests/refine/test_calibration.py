@@ -7,8 +7,9 @@ import pycolmap
 import pytest
 from tests.refine.test_with_ranges import Survey, make_survey
 
-from rangesfm.options import CameraOptions
-from rangesfm.refine.calibration import parameter_stddevs
+from rangesfm.options import CameraOptions, RefineOptions
+from rangesfm.refine.bundle_adjustment import bundle_adjustment
+from rangesfm.refine.calibration import add_calibration, parameter_stddevs
 
 
 @pytest.fixture(scope="module")
@@ -53,3 +54,21 @@ def test_leaves_open_by_which_parameter_it_is_off_at_the_edge_of_the_photo() -> 
     assert found[4:6] == pytest.approx(
         [shift_px / (400 * np.hypot(x, y) * r2), shift_px / (400 * np.hypot(x, y) * r2**2)], rel=1e-4
     )
+
+
+def test_of_several_tables_each_camera_has_its_own_or_none() -> None:
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=3, num_cameras_per_rig=1, num_frames_per_rig=3, num_points3D=50)
+    model = pycolmap.synthesize_dataset(options)
+    model_name, params = model.camera(1).model_name, tuple(model.camera(1).params.tolist())
+    kept = CameraOptions(images="camera000001*", model=model_name, params=params, focal_length_stddev_px=0.0)
+    drawn = CameraOptions(images="camera000002*", model=model_name, params=params, focal_length_stddev_px=5.0)
+    camera = CameraOptions(others=(kept, drawn))
+    bundle = bundle_adjustment(model, camera, RefineOptions(), fixed_frame_id=None, max_num_iterations=1, num_threads=1)
+    problem, before = bundle.adjuster.problem, bundle.adjuster.problem.num_residuals()
+    add_calibration(bundle, camera)
+    assert problem.num_residuals() == before + len(params)
+    found = [
+        problem.has_parameter_block(block) and not problem.is_parameter_block_constant(block)
+        for block in (model.camera(k).params for k in (1, 2, 3))
+    ]
+    assert found == [False, True, False]

@@ -35,7 +35,7 @@ class Film:
         path.write_text("a film")
 
     def open(self, path: Path, topic: str | None) -> Source:
-        return Source("a film", (8, 8), 2.0, "its own", self.watch, ("PINHOLE", (9.0, 9.0, 4.0, 4.0)), ("in black",))
+        return Source("a film", (8, 8), 2.0, 8, "its own", self.watch, ("PINHOLE", (9.0, 9.0, 4.0, 4.0)), ("in black",))
 
     def watch(self) -> Iterator[Frame]:
         self.num_watched += 1

@@ -46,6 +46,7 @@ def test_the_creation_time_is_the_first_frames_and_not_for_sure(created: str, tm
     assert next(source.frames()).time_s == START_S
     assert "2026-05-04 10:00:00+00:00; that is in whole seconds, and with some cameras local time" in source.clock
     assert source.what.startswith("video, 64 x 48 pixels, 1.0")
+    assert (source.num_photos(2.0), source.num_photos(100.0)) == (3, 5)
 
 
 def test_a_creation_time_that_nobody_set_is_none(tmp_path: Path) -> None:

@@ -106,6 +106,32 @@ def test_whole_survey_is_read(folder: Path) -> None:
     )
 
 
+SEVERAL_CAMERAS = """
+[[camera]]
+images = "left"
+model = "PINHOLE"
+[[camera]]
+model = "OPENCV"
+[[camera]]
+images = "right*.png"
+mode = "single"
+"""
+
+
+def test_several_cameras_are_one_for_all_photos_and_others_by_pattern(folder: Path) -> None:
+    camera = read_survey(write(folder, SEVERAL_CAMERAS), {"camera.mode": "per_image"}).camera
+    assert (camera.model, camera.mode, camera.images) == ("OPENCV", "per_image", None)
+    assert [(table.images, table.model, table.mode) for table in camera.others] == [
+        ("left", "PINHOLE", "auto"),
+        ("right*.png", None, "single"),
+    ]
+    assert camera.of_photo("left/1.jpg") is camera.others[0]
+    assert camera.of_photo("leftover/1.jpg") is camera
+    wrong = refusal(write(folder, SEVERAL_CAMERAS.replace('"single"', '"singel"')))
+    assert (wrong.line, str(wrong).count("[camera] mode is 'singel'")) == (9, 1)
+    assert "2 [[camera]] tables have no images" in str(refusal(write(folder, SEVERAL_CAMERAS + "[[camera]]")))
+
+
 def test_mapper_keys_that_are_not_ours_are_the_pipelines(folder: Path) -> None:
     assert read_survey(write(folder, WHOLE)).mapper == MapperOptions(
         matching="sequential",

@@ -10,6 +10,7 @@ import pycolmap
 import pytest
 from PIL import Image
 
+from rangesfm.errors import InputError, OptionError
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.vision.camera import cameras_of_photos
 from rangesfm.vision.photos import Photos, usable_photos
@@ -63,6 +64,42 @@ def test_given_parameters_are_rescaled_with_the_photos_and_guessed_for_those_of_
     assert params[:2] == [[240, 240, 128, 96], [120, 120, 64, 48]]
     assert [camera.has_prior_focal_length for camera in found.cameras] == [True, True, False]
     assert found.guessed == ("b/4.jpg",)
+
+
+def test_of_several_tables_each_is_of_the_photos_in_its_folder_or_of_its_pattern(photos: Photos) -> None:
+    radial = CameraOptions(images="b/*4.jpg", model="SIMPLE_RADIAL")
+    tables = CameraOptions(mode="single", others=(GIVEN.changed(images="a"), radial))
+    found = cameras_of_photos(tables, photos)
+    assert [found.cameras[place].model_name for place in found.of_photo] == [
+        *("PINHOLE", "PINHOLE"),
+        *("SIMPLE_RADIAL", "SIMPLE_RADIAL", "SIMPLE_RADIAL"),
+    ]
+    assert found.cameras[found.of_photo[0]].params.tolist() == [240, 240, 128, 96]
+    assert len(set(found.of_photo[2:])) == 3
+    assert found.guessed == ()
+
+
+@pytest.mark.parametrize(
+    ("pattern", "message"),
+    [
+        ("*1.jpg", r"\[\[camera\]\] images 'a' and '\*1.jpg' are both of the photo a/1.jpg, expected one"),
+        ("c/", r"\[\[camera\]\] images is 'c/', expected some photo's name, as a/0.jpg"),
+    ],
+)
+def test_a_photo_of_two_tables_or_a_table_of_no_photo_is_one_line(photos: Photos, pattern: str, message: str) -> None:
+    tables = CameraOptions(others=(CameraOptions(images="a"), CameraOptions(images=pattern)))
+    with pytest.raises((InputError, OptionError), match=message):
+        cameras_of_photos(tables, photos)
+
+
+def test_mapping_keeps_the_camera_of_one_table_and_refines_that_of_another(room: Room, tmp_path: Path) -> None:
+    known = room.camera.changed(images="photo00[0-2]*", focal_length_stddev_px=0.0)
+    tables = CameraOptions(model="SIMPLE_PINHOLE", others=(known,))
+    mapper = MapperOptions(features={"sift": {"max_num_features": 250}})
+    (model,) = reconstruct(room.folder, room.names, tmp_path, camera=tables, mapper=mapper).models
+    of_photo = {image.name: model.camera(image.camera_id) for image in model.images.values()}
+    assert tuple(of_photo[room.names[0]].params) == room.camera.params
+    assert of_photo[room.names[5]].focal_length == pytest.approx(240, rel=0.03)  # the guess is 307
 
 
 def test_exif_turns_no_pixels_as_it_does_not_for_colmap(tmp_path: Path) -> None:

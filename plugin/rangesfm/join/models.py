@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 
 from rangesfm.colmap.transform import joined_model, rescale
-from rangesfm.distances.ends import distances_within, locate_distances
+from rangesfm.distances.ends import distances_within, locatable, locate_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import Similarity
@@ -153,7 +153,8 @@ def _alone(part: PathOfModel, ranging: Ranging, *, has_first_camera: bool) -> Sc
     anchor_ids = part.observations.log.anchor_ids
     distances = None
     if ranging.tape is not None:
-        distances = locate_distances(distances_within(ranging.tape, part.sfm, anchor_ids), part.sfm, anchor_ids)
+        within = distances_within(locatable(ranging.tape, part.sfm), part.sfm, anchor_ids)
+        distances = locate_distances(within, part.sfm, anchor_ids)
     estimate = initialize_scale(
         part.observations,
         part.trajectory,

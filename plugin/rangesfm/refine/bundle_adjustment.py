@@ -208,7 +208,8 @@ def _bundle_adjuster(
     num_threads: int,
 ) -> pycolmap.CeresBundleAdjuster:
     ba = pycolmap.BundleAdjustmentOptions(print_summary=False)
-    ba.refine_focal_length = ba.refine_extra_params = camera.refinement_refines_intrinsics
+    refines = [table.refinement_refines_intrinsics for table in camera.tables]
+    ba.refine_focal_length = ba.refine_extra_params = any(refines)
     solver = ba.ceres.solver_options
     solver.initial_trust_region_radius = _INITIAL_TRUST_REGION_RADIUS
     solver.function_tolerance = _FUNCTION_TOLERANCE
@@ -226,6 +227,9 @@ def _bundle_adjuster(
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in metric.reg_image_ids():
         config.add_image(image_id)
+        image = metric.image(image_id)
+        if not all(refines) and not camera.of_photo(image.name).refinement_refines_intrinsics:
+            config.set_constant_cam_intrinsics(image.camera_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.UNSPECIFIED)
     if fixed_frame_id is not None:
         config.set_constant_rig_from_world_pose(fixed_frame_id)

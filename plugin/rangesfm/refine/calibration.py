@@ -7,7 +7,7 @@ import pycolmap
 
 from rangesfm import ceres
 from rangesfm.arrays import Array
-from rangesfm.colmap.calibration import calibrated_cameras
+from rangesfm.colmap.calibration import Size, calibrated_cameras
 from rangesfm.options import CameraOptions
 from rangesfm.refine.bundle_adjustment import BundleAdjustment
 
@@ -15,19 +15,24 @@ _STEP = 1e-6
 
 
 def add_calibration(bundle: BundleAdjustment, options: CameraOptions) -> None:
-    """Draw each camera of the given model to the given parameters, where the adjustment refines it at all."""
-    if options.model is None or options.params is None:
-        return
+    """Draw each camera of a given model to its parameters, where the adjustment refines it at all."""
     metric, problem = bundle.metric, bundle.adjuster.problem
-    by_photo = [metric.camera(metric.image(image_id).camera_id) for image_id in metric.reg_image_ids()]
-    known = calibrated_cameras(options.model, options.params, [(camera.width, camera.height) for camera in by_photo])
-    for camera in metric.cameras.values():
-        given = known.get((camera.width, camera.height))
-        if given is None or camera.model != given.model or not problem.has_parameter_block(camera.params):
+    of_camera: dict[int, CameraOptions] = {}
+    sizes: dict[int, list[Size]] = {}  # of each table's photos
+    for image_id in metric.reg_image_ids():
+        image = metric.image(image_id)
+        table = of_camera.setdefault(image.camera_id, options.of_photo(image.name))
+        camera = metric.camera(image.camera_id)
+        sizes.setdefault(id(table), []).append((camera.width, camera.height))
+    for camera_id, table in of_camera.items():
+        camera = metric.camera(camera_id)
+        if table.model is None or table.params is None or not problem.has_parameter_block(camera.params):
             continue
-        if not problem.is_parameter_block_constant(camera.params):
-            stddev = parameter_stddevs(given, options.calibration_stddev_px(given.mean_focal_length()))
-            ceres.add_normal_prior(bundle.adjuster, camera.params, given.params, stddev / bundle.pixel_stddev)
+        given = calibrated_cameras(table.model, table.params, sizes[id(table)]).get((camera.width, camera.height))
+        if given is None or camera.model != given.model or problem.is_parameter_block_constant(camera.params):
+            continue
+        stddev = parameter_stddevs(given, table.calibration_stddev_px(given.mean_focal_length()))
+        ceres.add_normal_prior(bundle.adjuster, camera.params, given.params, stddev / bundle.pixel_stddev)
 
 
 def parameter_stddevs(camera: pycolmap.Camera, focal_length_stddev_px: float) -> Array:

@@ -51,7 +51,8 @@ def open_images(path: Path, topic: str | None) -> Source:
     is_stamped = _stamp_s(message) > 0
     clock = "the stamps of their headers" if is_stamped else "when they arrived, as their headers have no stamps"
     what = f"{num_by_topic[topic]} images of {topic}, {size_px[0]} x {size_px[1]} pixels"
-    return Source(what, size_px, duration_s, clock, partial(_frames, path, topic, is_stamped), camera, notes)
+    frames = partial(_frames, path, topic, is_stamped)
+    return Source(what, size_px, duration_s, num_by_topic[topic], clock, frames, camera, notes)
 
 
 def _num_by_topic(bag: AnyReader) -> dict[str, int]:
@@ -112,7 +113,9 @@ def _camera(
         return None, (f"{info_topic} is of {info.width} x {info.height} pixels: not taken as the camera",)
     distortion = info.distortion_model if not is_rectified and any(d) else "none"
     try:
-        return colmap_camera(distortion, (fx, fy, cx, cy), d, path), (f"the camera is that of {info_topic}",)
+        return colmap_camera(distortion, (fx, fy, cx, cy), d, path), (
+            f"the camera is that of {info_topic}, where none is given",
+        )
     except InputError as error:
         return None, (f"{info_topic} is not taken as the camera: {error}",)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,6 +52,7 @@ class Source:
         what: it is, for people.
         size_px: width and height of its photos.
         duration_s: about.
+        num_frames: that it says it has; 0 where it does not say.
         clock: what its times are, for people.
         camera: COLMAP's model and parameters, where it says them.
         frames: all of them, in their order.
@@ -60,10 +62,16 @@ class Source:
     what: str
     size_px: tuple[int, int]
     duration_s: float
+    num_frames: int
     clock: str
     frames: Callable[[], Iterator[Frame]]
     camera: tuple[str, tuple[float, ...]] | None = None
     notes: tuple[str, ...] = ()
+
+    def num_photos(self, rate_hz: float) -> int:
+        """About how many photos there will be, one in each interval of ``1 / rate_hz`` seconds."""
+        num = math.ceil(self.duration_s * rate_hz)
+        return min(num, self.num_frames) if self.num_frames else num
 
 
 def is_video(path: Path) -> bool:

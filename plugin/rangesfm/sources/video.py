@@ -42,7 +42,7 @@ def open_video(path: Path) -> Source:
         else:
             duration_s = (video.duration or 0) * 1e-6
         start_s = _creation_time_s(video)
-        size_px = _image(first).size
+        size_px, num_frames = _image(first).size, stream.frames
     clock = "seconds from its first frame, as it has no creation time"
     if start_s is not None:
         created = datetime.fromtimestamp(start_s, timezone.utc).isoformat(sep=" ", timespec="seconds")
@@ -55,6 +55,7 @@ def open_video(path: Path) -> Source:
         what=f"video, {size_px[0]} x {size_px[1]} pixels, {duration_s:.1f} s",
         size_px=size_px,
         duration_s=duration_s,
+        num_frames=num_frames,
         clock=clock,
         frames=partial(_frames, path, start_s or 0.0),
         notes=(turned,) if first.rotation else (),
@@ -83,7 +84,7 @@ def _reading(path: Path) -> Iterator[InputContainer]:
             "reading a video needs the package av: python -m pip install 'rangesfm[video]'", path
         ) from None
     try:
-        with av.open(path) as video:
+        with av.open(path, metadata_errors="replace") as video:
             if not video.streams.video:
                 raise InputError("there are no pictures in this video", path)
             yield video

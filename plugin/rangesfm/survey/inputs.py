@@ -41,10 +41,10 @@ _COARSE_STEP_S = 0.1
 
 @dataclass(frozen=True)
 class RangingInputs:
-    """The radio's side of a survey.
+    """What is measured in metres: the radio's side of a survey, and lengths.
 
     Attributes:
-        log: ranges of the wanted tags to the wanted anchors, and those between two of a kind.
+        log: ranges of the wanted tags to the wanted anchors, and those between two of a kind; empty without a radio.
         tag_in_cam_m: (num_tags, 3) lever arms in the order of ``log.tag_ids``; NaN for a tag that ranges with
             tags only.
         anchors: every anchor of the log.
@@ -71,12 +71,16 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     Raises:
         InputError: a file is missing or wrong, or the log has an anchor or tags that nobody explained.
     """
+    survey.require_metres()
     given = read_anchors(survey.anchors.path) if survey.anchors.path is not None else None
     tag_ids = [*survey.tag.lever_arms_m, *([] if survey.tag.tag_id is None else [survey.tag.tag_id])]
-    log = read_log(survey.ranges, [anchor.anchor_id for anchor in given or ()], tag_ids)
-    _check_lengths(log)
-    log = _of_wanted_anchors(_of_wanted_tag(log, survey.tag.tag_id), survey.anchors.use)
-    _check_camera_is_heard(log)
+    if survey.ranges.path is None:
+        log = RangeLog.from_arrays([], [], image_name=[])
+    else:
+        log = read_log(survey.ranges, [anchor.anchor_id for anchor in given or ()], tag_ids)
+        _check_lengths(log)
+        log = _of_wanted_anchors(_of_wanted_tag(log, survey.tag.tag_id), survey.anchors.use)
+        _check_camera_is_heard(log)
     tag_in_cam_m = _lever_arms_of_log(log, survey)
     anchors = _anchors_of_log(log) if given is None else given
     _check_anchors_known(log, anchors, survey)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sys
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -22,6 +23,7 @@ from rangesfm.options import (
     ExportOptions,
     ImageOptions,
     MapperOptions,
+    MarkerOptions,
     OutputOptions,
     RangesOptions,
     RefineOptions,
@@ -68,10 +70,13 @@ class Source:
             raise InputError(str(error), self.path, next(filter(None, lines), None)) from None
 
     def _line_of(self, wanted: str) -> int | None:
-        current = ""
+        current, num_seen = "", Counter[str]()
         for line, text in enumerate(self.text.split("\n"), 1):
             if header := re.match(r"\s*\[\[?([^\[\]]+)\]", text):
                 current = _dotted(header[1])
+                num_seen[current] += 1
+                if num_seen[current] > 1 or wanted.startswith(f"{current} "):  # one of several tables
+                    current += f" {num_seen[current]}"
                 if current == wanted:
                     return line
             elif assignment := re.match(r"\s*([\w.\"' -]+?)\s*=", text):
@@ -124,6 +129,7 @@ class Survey(BaseModel):
     tag: TagOptions = TagOptions()
     mapper: MapperOptions = MapperOptions()
     scale: ScaleAndTapeOptions = ScaleAndTapeOptions()
+    markers: MarkerOptions = MarkerOptions()
     refine: RefineOptions = RefineOptions()
     export: ExportOptions = ExportOptions()
     report: ReportOptions = ReportOptions()
@@ -138,6 +144,21 @@ class Survey(BaseModel):
             table, _, name = dotted_key.partition(".")
             tables[table] = tables.get(table, getattr(self, table)).changed(**{name: value})
         return self.model_copy(update=tables)
+
+    def require_metres(self) -> None:
+        """InputError where nothing says how long a metre is, or how large tags are that are to be looked for."""
+        if self.scale.distances is not None or self.markers.side_m is not None:
+            return
+        if self.markers.dictionary is not None:
+            raise InputError(
+                "[markers] side_m is not given: give the tags' side in metres (--marker_side_m), or taped distances "
+                "between their corners (--distances CSV)"
+            )
+        if self.ranges.path is None:
+            raise InputError(
+                "no ranges and no lengths: give a radio's log (--ranges LOG), taped distances (--distances CSV), or "
+                "the size of printed tags (--marker_side_m)"
+            )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, fit for JSON."""
@@ -216,6 +237,7 @@ def survey_from_tables(
 def _survey(tables: Mapping[str, Any], folder: Path, overrides: Mapping[str, object], source: Source) -> Survey:
     source = replace(source, overridden=tuple(overrides))
     with source.naming_lines():
+        tables, other_cameras = _with_one_camera(tables)
         refuse_unknown_tables(tables, TABLES)
         given: dict[str, dict[Any, Any]] = {name: dict(tables.get(name, {})) for name in TABLES}
         given["output"].setdefault("path", "out")
@@ -227,10 +249,31 @@ def _survey(tables: Mapping[str, Any], folder: Path, overrides: Mapping[str, obj
             table, _, name = dotted_key.partition(".")
             given[table].pop(_INSTEAD_OF.get(dotted_key), None)
             given[table][name] = _absolute(value, Path.cwd()) if dotted_key in _ROLE_OF_PATH else value
+        given["camera"] |= {"others": other_cameras} if other_cameras else {}
         options: dict[str, Any] = {name: model(**given[name]) for name, model in TABLES.items()}
         survey = Survey(**options, source=source)
         _require_files(survey)
     return survey
+
+
+def _with_one_camera(tables: Mapping[str, Any]) -> tuple[Mapping[str, Any], tuple[CameraOptions, ...]]:
+    """Of several [[camera]] tables the one without a pattern, and the others."""
+    cameras = tables.get("camera")
+    if not isinstance(cameras, list):
+        return tables, ()
+    others, rest = [], []
+    for number, table in enumerate(cameras, 1):
+        if "images" not in table:
+            rest.append(table)
+            continue
+        try:
+            others.append(CameraOptions(**table))
+        except OptionError as error:
+            raise OptionError(str(error), f"camera {number}", error.key) from None
+    if len(rest) > 1:
+        message = f"{len(rest)} [[camera]] tables have no images, expected one at most: those of all other photos"
+        raise OptionError(message, "camera")
+    return {**tables, "camera": rest[0] if rest else {}}, tuple(others)
 
 
 def refuse_unknown_tables(tables: Mapping[str, Any], known: Collection[str]) -> None:

@@ -24,8 +24,16 @@ def check_camera(options: CameraOptions) -> None:
     """Refuse what is no camera of COLMAP's.
 
     Raises:
-        InputError: an unknown model, parameters without a model, too few or too many or impossible ones.
+        InputError: an unknown model, parameters without a model, too few or too many or impossible ones; a pattern of
+            photos where there is nothing but this one table.
     """
+    if options.images is not None and not options.others:
+        raise InputError(f"[camera] images is '{options.images}', expected none but in several [[camera]] tables")
+    for table in options.tables:
+        _check_table(table)
+
+
+def _check_table(options: CameraOptions) -> None:
     if options.params is None and options.focal_length_stddev_px is not None:
         raise InputError("[camera] has focal_length_stddev_px but no params, expected those that it is of")
     if options.model is None:
@@ -80,8 +88,31 @@ def cameras_of_photos(options: CameraOptions, photos: Photos, rigs: Rigs = NO_RI
         rigs: whose cameras are one each, whatever the options say.
 
     Raises:
-        InputError: photos of two sizes of one camera of a rig, or parameters that belong to photos of another size.
+        InputError: photos of two sizes of one camera of a rig, parameters that belong to photos of another size, a
+            table whose pattern is of no photo. OptionError: a photo that belongs to two tables.
     """
+    table_of = {name: options.of_photo(name) for name in photos.names}
+    cameras: list[pycolmap.Camera] = []
+    place_of: dict[str, int] = {}
+    guessed: list[str] = []
+    for table in options.tables:
+        own = photos.of([name for name in photos.names if table_of[name] is table])
+        if not own.names:
+            _check_pattern(table, photos.names[0])
+            continue
+        found = _of_one_table(table, own, rigs)
+        place_of |= {name: len(cameras) + place for name, place in zip(own.names, found.of_photo, strict=True)}
+        cameras += found.cameras
+        guessed += found.guessed
+    return PhotoCameras(tuple(cameras), tuple(place_of[name] for name in photos.names), tuple(guessed))
+
+
+def _check_pattern(table: CameraOptions, name: str) -> None:
+    if table.images is not None:
+        raise InputError(f"[[camera]] images is '{table.images}', expected some photo's name, as {name}")
+
+
+def _of_one_table(options: CameraOptions, photos: Photos, rigs: Rigs) -> PhotoCameras:
     groups: dict[Any, int] = {}
     of_photo = [groups.setdefault(key, len(groups)) for key in _keys(options.mode, photos, rigs)]
     firsts = [of_photo.index(group) for group in range(len(groups))]

@@ -48,7 +48,7 @@ def _incremental(camera: CameraOptions, mapper: MapperOptions, seed: int) -> pyc
 
 def _global(camera: CameraOptions, mapper: MapperOptions, seed: int) -> pycolmap.GlobalPipelineOptions:
     options = pycolmap.GlobalPipelineOptions(num_threads=mapper.num_threads, random_seed=seed)
-    if not camera.mapping_refines_intrinsics:
+    if not all(table.mapping_refines_intrinsics for table in camera.tables):
         adjustment = options.mapper.bundle_adjustment
         adjustment.refine_focal_length = adjustment.refine_extra_params = False
     return options
@@ -64,9 +64,24 @@ def _hierarchical(camera: CameraOptions, mapper: MapperOptions, seed: int) -> py
 
 def _set_incremental(options: pycolmap.IncrementalPipelineOptions, camera: CameraOptions, seed: int) -> None:
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
-    if not camera.mapping_refines_intrinsics:
+    if not any(table.mapping_refines_intrinsics for table in camera.tables):
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+
+
+def hold_cameras(
+    options: pycolmap.IncrementalPipelineOptions | WholePipelineOptions, camera: CameraOptions, database_path: Path
+) -> None:
+    """Have the mapping keep the intrinsics of some cameras; the global mapper keeps those of all, or of none."""
+    if isinstance(options, pycolmap.HierarchicalPipelineOptions):
+        options = options.incremental_options
+    refines = {table.mapping_refines_intrinsics for table in camera.tables}
+    if isinstance(options, pycolmap.IncrementalPipelineOptions) and len(refines) > 1:
+        with pycolmap.Database.open(database_path) as database:
+            images = database.read_all_images()
+        options.constant_cameras = {
+            image.camera_id for image in images if not camera.of_photo(image.name).mapping_refines_intrinsics
+        }
 
 
 def map_photos(

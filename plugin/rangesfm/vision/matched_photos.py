@@ -106,7 +106,8 @@ def match_photos(
         if given is not None:
             space.progress.message(given.note)
             photos = given.photos
-            cameras = given.cameras() if camera.model is None else cameras_of_photos(camera, photos, rigs)
+            is_open = all(table.model is None for table in camera.tables)
+            cameras = given.cameras() if is_open else cameras_of_photos(camera, photos, rigs)
         _say_guessed(cameras, space.progress)
         return _match(photos, cameras, rigs, given, masks, mapper, for_features, for_matching, space)
 

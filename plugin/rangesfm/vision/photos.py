@@ -33,7 +33,8 @@ class Photos:
 
     def of(self, names: Collection[str]) -> Photos:
         """Some of them."""
-        kept = [(name, size) for name, size in zip(self.names, self.sizes, strict=True) if name in names]
+        wanted = set(names)
+        kept = [(name, size) for name, size in zip(self.names, self.sizes, strict=True) if name in wanted]
         return replace(self, names=tuple(name for name, _ in kept), sizes=tuple(size for _, size in kept))
 
     def contents(self, known: Mapping[str, Any]) -> dict[str, tuple[tuple[int, int, int], str]]:

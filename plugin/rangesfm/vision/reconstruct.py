@@ -10,7 +10,7 @@ import pycolmap
 
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import Progress, SilentProgress
-from rangesfm.vision.mapping import map_photos, pipeline_options, read_models
+from rangesfm.vision.mapping import hold_cameras, map_photos, pipeline_options, read_models
 from rangesfm.vision.mapping_loop import GlobalAdjustment
 from rangesfm.vision.matched_photos import Workspace, match_photos
 from rangesfm.vision.rig_places import hold_rigs, place_cameras
@@ -79,7 +79,8 @@ def reconstruct(
     space = Workspace(Path(output_path), progress, before_change)
     options = pipeline_options(camera, mapper, seed)
     matched = match_photos(Path(image_path), image_names, camera, mapper, rigs, seed, space, restart=restart)
-    inputs = [matched.inputs, mapper.method, mapper.pipeline, camera.mapping_refines_intrinsics]
+    refines = [table.mapping_refines_intrinsics for table in camera.tables]
+    inputs = [matched.inputs, mapper.method, mapper.pipeline, *refines]
     if adjustment is not None:
         inputs.append(adjustment.inputs)
     with space.logged():
@@ -91,6 +92,7 @@ def reconstruct(
                 lambda: rigs.apply(space.database),
                 lambda: place_cameras(matched.photos, rigs, pipeline_options(camera, mapper, seed), space),
             )
+        hold_cameras(options, camera, space.database)
         if "ba_refine_sensor_from_rig" not in mapper.pipeline:
             hold_rigs(options, rigs, space.database)
         space.steps.run(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -20,6 +19,7 @@ from rangesfm.survey.settings import Survey
 from rangesfm.vision.camera import cameras_of_photos, check_camera
 from rangesfm.vision.image_times import ImageTimes, list_images
 from rangesfm.vision.photos import usable_photos
+from rangesfm.vision.rigs import read_rigs
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.photos import checked_keyframes, images_path, read_inputs
 
@@ -68,7 +68,9 @@ def check_survey(survey: Survey) -> CheckedSurvey:
         _check_photos(survey, checked)
     with checked.finding_faults():
         inputs = read_inputs(survey, journal)
-        _tell_of_radio(survey, inputs, checked)
+        if len(inputs.log):
+            _tell_of_radio(survey, inputs, checked)
+        _tell_of_others(survey, inputs, checked)
         if survey.images.path is not None and is_source(survey.images.path):
             return checked
         keyframes, times = checked_keyframes(survey, inputs, journal)
@@ -90,12 +92,12 @@ def _check_photos(survey: Survey, checked: CheckedSurvey) -> None:
         checked.warnings.append(f"{len(photos.left_out)} photos are left out, first {name}: {why}")
     with survey.source.naming_lines():
         check_camera(survey.camera)
-        found = cameras_of_photos(survey.camera, photos)
+        found = cameras_of_photos(survey.camera, photos, read_rigs(survey.images.rig_config))
     for number, camera in enumerate(found.cameras[:_MAX_NUM_SIZES]):
         num_photos, focal_length_px = found.of_photo.count(number), camera.mean_focal_length()
         what = f"{camera.model.name} for {num_photos} photos, f {focal_length_px:.0f} pixels"
-        is_guessed = photos.names[found.of_photo.index(number)] in found.guessed
-        if survey.camera.params is not None and not is_guessed:
+        first = photos.names[found.of_photo.index(number)]
+        if survey.camera.of_photo(first).params is not None and first not in found.guessed:
             checked.facts.append(f"camera: {what}, as given")
         else:
             seen = "by EXIF" if camera.has_prior_focal_length else "a guess from the photos' size"
@@ -105,7 +107,7 @@ def _check_photos(survey: Survey, checked: CheckedSurvey) -> None:
 def _check_source(survey: Survey, path: Path, checked: CheckedSurvey) -> None:
     """What is known of a video or a bag before its photos are taken out."""
     source, rate_hz = open_source(path, survey.images.topic), survey.images.rate_hz
-    num = f"about {math.ceil(source.duration_s * rate_hz)} photos at {rate_hz:g} Hz"
+    num = f"about {source.num_photos(rate_hz)} photos at {rate_hz:g} Hz"
     checked.facts.append(f"photos of {path.name}: {source.what}; {num}, taken out when a run begins")
     checked.facts += [*source.notes]
     checked.assumed.append(f"the photos' times are {source.clock}")
@@ -134,8 +136,15 @@ def _tell_of_radio(survey: Survey, inputs: RangingInputs, checked: CheckedSurvey
     if {"tag_in_cam_m", "lever_arms_m"} & survey.tag.model_fields_set:
         arms = (f"{', '.join(f'{x:g}' for x in arm)} m" for arm in inputs.tag_in_cam_m.tolist() if not np.isnan(arm[0]))
         checked.facts.append(f"lever arm: the tag is at {'; '.join(arms)} in the camera frame (right, down, forward)")
+
+
+def _tell_of_others(survey: Survey, inputs: RangingInputs, checked: CheckedSurvey) -> None:
     if inputs.tape is not None:
-        checked.facts.append(f"taped distances: {len(inputs.tape.distances)}")
+        only = "" if len(inputs.log) else ", which alone say how long a metre is (no ranges)"
+        checked.facts.append(f"taped distances: {len(inputs.tape.distances)}{only}")
+    if survey.markers.dictionary is not None:
+        side = "" if survey.markers.side_m is None else f" of {survey.markers.side_m:g} m"
+        checked.facts.append(f"tags: those of {survey.markers.dictionary}{side} will be looked for in the photos")
     if inputs.reference is not None:
         name = "" if survey.report.reference is None else f" in {survey.report.reference.name}"
         checked.facts.append(f"reference: {len(inputs.reference)} positions{name}, only to compare with")
@@ -146,7 +155,8 @@ def _tell_of_times(
 ) -> None:
     radio_s = inputs.log.timestamp_s
     if times is None or radio_s is None:
-        checked.facts.append(f"times: none are needed for {len(keyframes)} keyframes, the ranges name their photos")
+        why = "the ranges name their photos" if len(inputs.log) else "there are no ranges"
+        checked.facts.append(f"times: none are needed for {len(keyframes)} keyframes, {why}")
         return
     photos_s, offset_s = times.timestamps_s, survey.ranges.time_offset_s
     checked.facts.append(

@@ -1,13 +1,12 @@
 """What ranges get wrong: the components of their errors, each with what the population of radios lets expect of it.
 
-An error of two cells is covariant as their anchors, places, directions, distances and times are alike. The medians and
-spreads sum up what eight public logs of seven radios with the true path show (the table in ``examples/radios.md``);
-each survey learns its own stddevs on top of them.
+An error of two cells is covariant as their anchors, places, directions, distances and times are alike. Each survey
+learns its own stddevs on top of what the population shows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +14,7 @@ from scipy.spatial.distance import cdist
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.errors.cells import Cells
+from rangesfm.ranging.errors.population import population
 
 _SHORT_M = 1.0
 _TIME_S = 3.0
@@ -134,21 +134,38 @@ def _bending(cells: Cells) -> Array:
     return alike
 
 
-COMPONENTS = (
-    Component("white", 0.05, 1.0, None, True, _white, "noise of single ranges"),
-    Component("time", 0.04, 0.7, None, True, _in_time, "errors that last for seconds"),
-    Component("place", 0.03, 0.7, None, True, _in_place, "errors that belong to a place: echoes"),
-    Component("view", 0.035, 0.7, None, True, _in_view, "lobes of the tag's antenna towards each anchor"),
-    Component("bias", 0.045, 0.5, None, True, lambda c: _same(c.anchor_index), "each anchor's own bias"),
-    Component("common_bias", 0.2, 0.5, 0.04, False, lambda c: np.ones((len(c), len(c))), "the bias of all ranges"),
-    Component("short", 0.2, 0.5, 0.08, False, _short, "short ranges"),
-    Component("curve", 0.04, 0.5, 0.02, False, _smooth, "the radio's error curve"),
-    Component("rough_curve", 0.02, 0.3, 0.01, False, _rough, "unevenness of the error curve"),
-    Component("slope", 0.004, 0.7, 0.003, False, _proportional, "ranges long by a share"),
-    Component("antenna", 0.05, 0.7, None, True, _antenna, "anchors' antennas by direction"),
-    Component("tag_antenna", 0.05, 0.7, None, False, _tag_antenna, "the tag's antenna by direction"),
-    Component("bending", 0.01, 0.8, None, False, _bending, "the map's own bending"),
-)
+def components(expected: Mapping[str, tuple[float, float]]) -> tuple[Component, ...]:
+    """All of them, with median and spread over radios by name."""
+
+    def of(
+        name: str,
+        correlation: Callable[[Cells], Array],
+        words: str,
+        *,
+        is_of_anchor: bool = False,
+        calibrated_median: float | None = None,
+    ) -> Component:
+        median, spread = expected[name]
+        return Component(name, median, spread, calibrated_median, is_of_anchor, correlation, words)
+
+    return (
+        of("white", _white, "noise of single ranges", is_of_anchor=True),
+        of("time", _in_time, "errors that last for seconds", is_of_anchor=True),
+        of("place", _in_place, "errors that belong to a place: echoes", is_of_anchor=True),
+        of("view", _in_view, "lobes of the tag's antenna towards each anchor", is_of_anchor=True),
+        of("bias", lambda c: _same(c.anchor_index), "each anchor's own bias", is_of_anchor=True),
+        of("common_bias", lambda c: np.ones((len(c), len(c))), "the bias of all ranges", calibrated_median=0.04),
+        of("short", _short, "short ranges", calibrated_median=0.08),
+        of("curve", _smooth, "the radio's error curve", calibrated_median=0.02),
+        of("rough_curve", _rough, "unevenness of the error curve", calibrated_median=0.005),
+        of("slope", _proportional, "ranges long by a share", calibrated_median=0.003),
+        of("antenna", _antenna, "anchors' antennas by direction", is_of_anchor=True),
+        of("tag_antenna", _tag_antenna, "the tag's antenna by direction"),
+        of("bending", _bending, "the map's own bending"),
+    )
+
+
+COMPONENTS = components(population())
 
 LEARNT_CURVE = "learnt_curve"
 """What is left of an error curve that has been taken off, as it was learnt with it."""
@@ -168,5 +185,7 @@ def component_words(names: Iterable[str]) -> dict[str, str]:
         LEARNT_CURVE: "the learnt error curve",
         GIVEN: "tapes, anchors' positions and what else was given",
         REWEIGHTING: "what the best weights for these errors would change",
+        "tape": "how the lengths were measured",
+        "marks": "where their ends are in the photos",
     }
     return {name: words[name] for name in names}
