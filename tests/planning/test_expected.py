@@ -107,7 +107,7 @@ def test_what_is_known_of_the_radio_counts() -> None:
     assert better.uncertainty.empirical < 0.9 * usual.uncertainty.empirical
 
 
-def test_a_taped_length_makes_the_scale_no_better_than_itself() -> None:
+def test_a_taped_length_makes_the_scale_no_better_than_itself_and_the_bending_of_the_map() -> None:
     taped = expect(planned(FIVE_ANCHORS_M, "site", taped=((5.0, 0.005),)))
-    assert 0.0005 < taped.uncertainty.components["given"] < 0.001
-    assert 0.0008 < taped.uncertainty.empirical < 0.002
+    assert 0.006 < taped.uncertainty.components["given"] < 0.009  # the map bends more than the tape errs
+    assert 0.006 < taped.uncertainty.empirical < 0.011
