@@ -1,6 +1,6 @@
 """Surveys as they may turn out: a planned one measured with a radio that errs, its map bent, and its scale found.
 
-The errors are drawn as functions of time, distance and direction, each in its own way, not from covariances of cells.
+The errors are drawn for each single range, as functions of time, place, distance and direction.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 from tests.studies.scale_coverage import error_curve
 
@@ -26,7 +27,7 @@ Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
 
 METRES_PER_UNIT = 2.3
-MOMENT_S, SHORT_LASTING_S, LONG_LASTING_S = 0.5, 3.0, 15.0
+LASTING_S, PLACE_M, LOBE = 3.0, 0.5, 0.1
 # Knots of an uneven curve over the logarithm of distance.
 _KNOTS = np.linspace(np.log(0.05), np.log(300.0), 400)
 
@@ -40,21 +41,6 @@ class Measured:
     anchors: tuple[Anchor, ...]
     distances: LocatedDistances | None
     metric_from_map: Similarity
-
-
-def radio(
-    *, median_m: float, bulk_m: float, anchors_m: float, short_m: float, with_distance_m: float
-) -> dict[str, float]:
-    """Stddevs of the components of a radio's errors, from a row of the table in ``examples/radios.md``."""
-    shares = {"white": 0.5, "moment": 0.25, "time": 0.4, "long_time": 0.3, "antenna": 0.5, "tag_antenna": 0.5}
-    return {
-        **{name: share * bulk_m for name, share in shares.items()},
-        "bias": anchors_m,
-        "common_bias": abs(median_m),
-        "short": 3 * short_m,
-        "curve": 0.8 * with_distance_m,
-        "rough_curve": 0.3 * with_distance_m,
-    }
 
 
 def stddevs_of(planned: PlannedSurvey) -> dict[str, float]:
@@ -126,10 +112,9 @@ def _errors(
         rows = np.flatnonzero(index == k)
         since = times[rows]
         errors[rows] += stddevs["bias"] * rng.standard_normal() + stddevs["antenna"] * _lobes(direction[rows], rng)
-        errors[rows] += stddevs["time"] * lasting(since, SHORT_LASTING_S, rng)
-        errors[rows] += stddevs["long_time"] * lasting(since, LONG_LASTING_S, rng)
-        moment = np.floor((since - since[0]) / MOMENT_S).astype(np.int64)
-        errors[rows] += stddevs["moment"] * rng.standard_normal(int(moment[-1]) + 1)[moment]
+        errors[rows] += stddevs["time"] * lasting(since, LASTING_S, rng)
+        errors[rows] += stddevs["place"] * _field(cdist(from_anchor[rows], from_anchor[rows]) / PLACE_M, rng)
+        errors[rows] += stddevs["view"] * _field((1 - in_cam[rows] @ in_cam[rows].T) / LOBE, rng)
     return np.asarray(errors), np.asarray(distance)
 
 
@@ -149,6 +134,12 @@ def _lobes(direction: Array, rng: np.random.Generator) -> Array:
     form = rng.standard_normal((3, 3))
     quadratic = np.einsum("ni,ij,nj->n", direction, form, direction) - np.trace(form) / 3
     return np.asarray(direction @ rng.standard_normal(3) / np.sqrt(2) + np.sqrt(3) / 2 * quadratic)
+
+
+def _field(apart: Array, rng: np.random.Generator) -> Array:
+    """(n,) of stddev 1, alike where little is between them: (n, n) in lengths within which they forget."""
+    lower = np.linalg.cholesky(np.exp(-np.maximum(apart, 0.0)) + 1e-9 * np.eye(len(apart)))
+    return np.asarray(lower @ rng.standard_normal(len(apart)))
 
 
 def _uneven(distance: Array, rng: np.random.Generator) -> Array:
