@@ -1,6 +1,6 @@
 """Surveys as they may turn out: a planned one measured with a radio that errs, its map bent, and its scale found.
 
-The errors are drawn for each single range, as functions of time, place, distance and direction.
+The errors are drawn as functions of time, distance and direction, each in its own way, not from covariances of cells.
 """
 
 from __future__ import annotations
@@ -9,9 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
-from tests.studies.scale_coverage import error_curve
 
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.geometry.similarity import Similarity
@@ -28,6 +26,7 @@ Labels = npt.NDArray[np.int64]
 
 METRES_PER_UNIT = 2.3
 LASTING_S, PLACE_M, LOBE = 3.0, 0.5, 0.1
+NUM_WAVES = 300
 # Knots of an uneven curve over the logarithm of distance.
 _KNOTS = np.linspace(np.log(0.05), np.log(300.0), 400)
 
@@ -113,8 +112,11 @@ def _errors(
         since = times[rows]
         errors[rows] += stddevs["bias"] * rng.standard_normal() + stddevs["antenna"] * _lobes(direction[rows], rng)
         errors[rows] += stddevs["time"] * lasting(since, LASTING_S, rng)
-        errors[rows] += stddevs["place"] * _field(cdist(from_anchor[rows], from_anchor[rows]) / PLACE_M, rng)
-        errors[rows] += stddevs["view"] * _field((1 - in_cam[rows] @ in_cam[rows].T) / LOBE, rng)
+        # Waves of Cauchy and of Gaussian distribution: their sums are alike as exp(-d) and as exp(-d^2 / 2).
+        cauchy = rng.standard_normal((NUM_WAVES, 3)) / np.abs(rng.standard_normal((NUM_WAVES, 1)))
+        errors[rows] += stddevs["place"] * _field(from_anchor[rows] / PLACE_M, cauchy, rng)
+        gaussian = rng.standard_normal((NUM_WAVES, 3))
+        errors[rows] += stddevs["view"] * _field(in_cam[rows] / np.sqrt(LOBE), gaussian, rng)
     return np.asarray(errors), np.asarray(distance)
 
 
@@ -129,6 +131,12 @@ def lasting(times: Array, memory_s: float, rng: np.random.Generator) -> Array:
     return values
 
 
+def _field(at: Array, waves: Array, rng: np.random.Generator) -> Array:
+    """(n,) of stddev 1 at (n, 3), a sum of waves (k, 3) of any phase."""
+    phases = rng.uniform(0, 2 * np.pi, len(waves))
+    return np.asarray(np.sqrt(2 / len(waves)) * np.cos(at @ waves.T + phases).sum(axis=1))
+
+
 def _lobes(direction: Array, rng: np.random.Generator) -> Array:
     """(n,) of stddev 1: half of the variance linear, half a quadratic form without a mean."""
     form = rng.standard_normal((3, 3))
@@ -136,10 +144,12 @@ def _lobes(direction: Array, rng: np.random.Generator) -> Array:
     return np.asarray(direction @ rng.standard_normal(3) / np.sqrt(2) + np.sqrt(3) / 2 * quadratic)
 
 
-def _field(apart: Array, rng: np.random.Generator) -> Array:
-    """(n,) of stddev 1, alike where little is between them: (n, n) in lengths within which they forget."""
-    lower = np.linalg.cholesky(np.exp(-np.maximum(apart, 0.0)) + 1e-9 * np.eye(len(apart)))
-    return np.asarray(lower @ rng.standard_normal(len(apart)))
+def error_curve(distance: Array, rng: np.random.Generator) -> Array:
+    """A draw of a Gaussian process in the logarithm of distance, of stddev 1 and one e-fold's length."""
+    knots = np.linspace(np.log(0.3), np.log(30.0), 40)
+    covariance = np.exp(-0.5 * (knots[:, None] - knots) ** 2) + 1e-9 * np.eye(len(knots))
+    curve = np.linalg.cholesky(covariance) @ rng.standard_normal(len(knots))
+    return np.interp(np.log(distance), knots, curve)
 
 
 def _uneven(distance: Array, rng: np.random.Generator) -> Array:
