@@ -68,6 +68,12 @@ def test_photos_are_matched_as_colmap_matches_them(mapper: MapperOptions, num_ph
     assert changes(options.verification) == {"ransac.random_seed": SEED}
 
 
+@pytest.mark.parametrize("matching", ["vocabtree", "sequential"])
+def test_a_vocabulary_tree_is_the_users(matching: str) -> None:
+    mapper = MapperOptions(vocab_tree_path=Path("tree.bin")).changed(matching=matching)
+    assert changes(matching_options(mapper, 100, SEED).pairing) == {"vocab_tree_path": Path("tree.bin")}
+
+
 SEEDS = {"random_seed": SEED, "mapper.random_seed": SEED, "triangulation.random_seed": SEED}
 AS_GIVEN = {
     "ba_refine_focal_length": False,
@@ -162,6 +168,7 @@ def test_no_other_options_of_colmaps_are_made_and_none_inside_of_others() -> Non
         "SequentialPairingOptions",
         "SpatialPairingOptions",
         "TwoViewGeometryOptions",
+        "VocabTreePairingOptions",
     }, "one that this file does not look at"
 
 

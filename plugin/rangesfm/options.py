@@ -1,4 +1,5 @@
-"""The keys of a survey file: of each its type, bounds, default, meaning and flag, written here and nowhere else.
+"""The keys of a survey file: of each its type, bounds, default, meaning and flag, written here (those of [mapper]
+in ``mapper_options``) and nowhere else.
 
 The stages take these tables, or the part of one that is theirs, as their options. The reader of survey files, the
 commands' flags, their help, the reference of all keys and the settings in ``result.json`` follow from them.
@@ -6,7 +7,6 @@ commands' flags, their help, the reference of all keys and the settings in ``res
 
 from __future__ import annotations
 
-import os
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -14,11 +14,19 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from rangesfm.errors import OptionError
-from rangesfm.option_model import Options, Told, looks_like
+from rangesfm.mapper_options import MapperOptions as MapperOptions
+from rangesfm.option_model import Options, Told
 
 DEFAULT_FORMATS = ("tum", "ply")
 _CALIBRATION_STDDEV = 0.005  # of a focal length, relative: what focus, warmth and another board make of it
-_LIKE_OURS = 0.85  # a [mapper] key this similar to one of ours is a slip; others are pycolmap's
+
+# fmt: off
+TagDictionary = Literal[
+    "APRILTAG_16h5", "APRILTAG_25h9", "APRILTAG_36h10", "APRILTAG_36h11", "ARUCO_MIP_36h12", "ARUCO_ORIGINAL",
+    "4X4_50", "4X4_100", "4X4_250", "4X4_1000", "5X5_50", "5X5_100", "5X5_250", "5X5_1000",
+    "6X6_50", "6X6_100", "6X6_250", "6X6_1000", "7X7_50", "7X7_100", "7X7_250", "7X7_1000",
+]
+# fmt: on
 
 # Bounds keep out what only a slip can mean, and what would be infinite once it is squared or divided by.
 _Count = Annotated[int, Field(ge=1, le=1_000_000)]
@@ -160,10 +168,10 @@ class LogOptions(Options):
     """Names of its columns (numbers, where they have none) for timestamp (or image_name), anchor_id, range, tag_id,
     range_stddev, los; range:A1 for a column of one anchor; without range, the time stamps tx1, rx1, tx2, rx2 and
     possibly tx3, rx3 of two-way ranging."""
-    timestamp_unit: str | None = None
-    """One of s, ms, us, ns and iso (default: by format, name or values)."""
-    range_unit: str | None = None
-    """One of m, cm and mm (default: by format, name or values)."""
+    timestamp_unit: Literal["s", "ms", "us", "ns", "iso"] | None = None
+    """Of its times (default: by format, name or values)."""
+    range_unit: Literal["m", "cm", "mm"] | None = None
+    """Of its ranges (default: by format, name or values)."""
     separator: Annotated[
         Annotated[str, Field(min_length=1, max_length=1)] | None, Told(metavar="CHARACTER", expected="one character")
     ] = None
@@ -283,70 +291,6 @@ class TagOptions(Options):
         return self
 
 
-class MapperOptions(Options):
-    """Photos to unscaled model. Keys that are not here are of pycolmap's options of the mapper, as in pipeline."""
-
-    table: ClassVar[str] = "mapper"
-
-    method: Annotated[Literal["incremental", "global", "hierarchical"], Told(flag="mapper_method")] = "incremental"
-    """COLMAP's mapper: photo by photo; all at once; photo by photo in clusters, which are merged."""
-    matching: Literal["sequential", "exhaustive", "spatial", "auto"] = "auto"
-    """Which photos are matched: neighbours in time, all, neighbours by EXIF position; auto: all up to 60 keyframes,
-    else neighbours in time."""
-    pairs: Annotated[Path | None, Told(role="file")] = None
-    """Text file with the names of two photos a line, a tab between them: these pairs are matched, and no others."""
-    mask_path: Annotated[Path | None, Told(role="photos")] = None
-    """Folder of masks: for photo a/b.jpg the image a/b.jpg.png of the same size, black where no features are wanted."""
-    database_path: Annotated[Path | None, Told(metavar="DB", role="file")] = None
-    """Database of COLMAP's or hloc's, which is copied: its features, matches and (where [camera] says neither model nor
-    params) cameras are used, and only what it lacks is computed; photos that it does not know are left out."""
-    features: dict[str, Any] = Field(default_factory=dict)
-    """Passed through to pycolmap's FeatureExtractionOptions."""
-    pairing: dict[str, Any] = Field(default_factory=dict)
-    """Passed through to pycolmap's pairing options of the chosen matching."""
-    matcher: dict[str, Any] = Field(default_factory=dict)
-    """Passed through to pycolmap's FeatureMatchingOptions."""
-    pipeline: dict[str, Any] = Field(default_factory=dict)
-    """Passed through to pycolmap's IncrementalPipelineOptions; of the other mappers GlobalPipelineOptions and
-    HierarchicalPipelineOptions."""
-    ranges_in_mapping: bool = False
-    """Each global bundle adjustment of the mapping carries the ranges, as soon as they determine the scale; takes much
-    longer, and the refinement at the end mostly comes to the same map."""
-    num_threads: Annotated[
-        Literal[-1] | Annotated[int, Field(ge=1, le=4096)], Told(expected="1 or more up to 4096, or -1 for all cores")
-    ] = -1
-    """-1 for all cores. Matching on the processor takes so many processes with one thread each, as pycolmap 4.2 loses
-    matches with more threads; matcher.num_threads overrides that one."""
-
-    @property
-    def num_cores(self) -> int:
-        """What ``num_threads`` comes to here."""
-        return self.num_threads if self.num_threads > 0 else os.cpu_count() or 1
-
-    @model_validator(mode="after")
-    def _features_are_from_photos(self) -> MapperOptions:
-        if self.mask_path is not None and self.database_path is not None:
-            message = (
-                "[mapper] mask_path is given beside database_path, expected one of them: there are features already"
-            )
-            raise OptionError(message, "mapper", "mask_path")
-        return self
-
-    @model_validator(mode="before")
-    @classmethod
-    def _others_to_pipeline(cls, values: dict[str, Any]) -> dict[str, Any]:
-        """pycolmap knows best what its keys may be; only one much like ours is a slip."""
-        others = {
-            name: value
-            for name, value in values.items()
-            if name not in cls.model_fields and not looks_like(name, cls.model_fields, _LIKE_OURS)
-        }
-        ours = {name: value for name, value in values.items() if name not in others}
-        if others and isinstance(pipeline := ours.get("pipeline", {}), dict):
-            ours["pipeline"] = {**others, **pipeline}
-        return ours
-
-
 class ScaleOptions(Options):
     """How the scale is found."""
 
@@ -385,6 +329,31 @@ class ScaleAndTapeOptions(ScaleOptions):
                 "distances",
                 "scale",
                 "markers",
+            )
+        return self
+
+
+class MarkerOptions(Options):
+    """Printed tags of known size in the photos."""
+
+    table: ClassVar[str] = "markers"
+
+    dictionary: Annotated[TagDictionary | None, Told(flag="marker_dictionary")] = None
+    """Which tags are looked for in the photos, by OpenCV's names: the corners of tag 7 are the markers tag7.0 (upper
+    left, as it is read) to tag7.3, clockwise (default: none are looked for)."""
+    side_m: Annotated[_Positive | None, Told(flag="marker_side_m")] = None
+    """Side of the tags, from black corner to black corner: each that is found is four lengths (default: they are none,
+    but ends of taped distances)."""
+    side_stddev_m: Annotated[_Positive, Told(flag="marker_side_stddev_m")] = 0.0005
+    """Of that; all tags are off by the same."""
+
+    @model_validator(mode="after")
+    def _side_is_of_a_dictionary(self) -> MarkerOptions:
+        if self.side_m is not None and self.dictionary is None:
+            raise OptionError(
+                f"[markers] side_m is {self.side_m:g}, expected a dictionary beside it: which tags are they?",
+                "markers",
+                "side_m",
             )
         return self
 

@@ -51,13 +51,13 @@ def test_the_expected_place_is_as_certain_as_runs_state() -> None:
     assert expected.worst_keyframe_m == pytest.approx(np.median(stated), rel=0.3)
 
 
-def test_ranges_that_stand_for_several_say_what_all_would(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ranges_that_stand_for_several_say_what_all_would() -> None:
     plan = planned(FIVE_ANCHORS_M, "site", rate_hz=20.0)
     thinned = expect(plan)
     assert plan.num_alike > 1
-    monkeypatch.setattr("rangesfm.planning.planned._MAX_NUM_RANGES", 100_000)
-    assert plan.num_alike == 1
-    whole = expect(plan)
+    every = replace(plan, max_num_ranges=100_000)
+    assert every.num_alike == 1
+    whole = expect(every)
     assert len(whole.posed.rows) > 2 * len(thinned.posed.rows)
     assert thinned.uncertainty.empirical == pytest.approx(whole.uncertainty.empirical, rel=0.05)
     assert thinned.worst_keyframe_m == pytest.approx(whole.worst_keyframe_m, rel=0.05)

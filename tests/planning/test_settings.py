@@ -43,6 +43,23 @@ def test_a_trajectory_and_anchors_may_stand_in_files(tmp_path: Path) -> None:
     assert plan.duration_s == pytest.approx(10.0)
 
 
+def test_a_loop_stays_within_its_floor_and_its_heights(tmp_path: Path) -> None:
+    text = "[path]\nloop_inside_m = [[0, 0], [12, 0], [12, 8], [0, 8]]\nheights_m = [1.0, 1.8]\nnum_rounds = 2\n"
+    path = read_plan(written(tmp_path, ANCHORS + text)).trajectory
+    low, high = path.centers.min(axis=0), path.centers.max(axis=0)
+    np.testing.assert_allclose(low, [2, 4 / 3, 1.0], atol=0.1)
+    np.testing.assert_allclose(high, [10, 20 / 3, 1.8], atol=0.1)
+    # Twice round.
+    assert np.linalg.norm(np.diff(path.centers, axis=0), axis=1).sum() == pytest.approx(2 * 2 / 3 * 40, rel=0.1)
+
+
+def test_anchors_may_be_put_on_walls(tmp_path: Path) -> None:
+    text = "[anchors]\nnum_to_place = 4\nwalls_m = [[[0, 0], [12, 0]], [[0, 8], [12, 8]]]\nheights_m = [0.5, 3.0]\n"
+    plan = read_plan(written(tmp_path, text + PATH))
+    assert not plan.is_placed
+    assert set(plan.anchors_m[:, 1]) == {0.0, 8.0}
+
+
 @pytest.mark.parametrize(
     ("text", "found"),
     [
@@ -50,13 +67,16 @@ def test_a_trajectory_and_anchors_may_stand_in_files(tmp_path: Path) -> None:
         (ANCHORS + PATH + "[radio]\nrate = 5\n", r":\d+: unknown key 'rate' in \[radio\]; .* 'rate_hz'"),
         (ANCHORS + PATH + "[radio]\nrate_hz = -1.0\n", "from 0.001 to 10000"),
         (ANCHORS + PATH + "[radio.stddevs]\nantena = 0.1\n", "no component 'antena', expected some of"),
-        (ANCHORS, "none of waypoints, file and model, expected one"),
+        (ANCHORS, "none of waypoints, loop_inside_m, file and model, expected one"),
         (ANCHORS + PATH + 'file = "walk.tum"\n', "waypoints and file"),
         (ANCHORS + "[path]\nwaypoints = [[1, 1, 1]]\n", "go nowhere"),
         (ANCHORS + "[path]\nwaypoints = [[1, 1], [2, 2]]\n", "expected a list of lists of 3 numbers"),
         (PATH, "none of path, places and num_to_place"),
-        ("[anchors]\nnum_to_place = 4\n" + PATH, "num_to_place and region_m go together"),
+        ("[anchors]\nnum_to_place = 4\n" + PATH, "num_to_place is 4 and there are 0 places"),
         ("[anchors]\nnum_to_place = 4\nregion_m = [[0, 0, 0], [5, -1, 3]]\n" + PATH, "the second one in no coordinate"),
+        ("[anchors]\nwalls_m = [[[0, 0], [5, 0]]]\n" + ANCHORS + PATH, "walls_m goes with heights_m"),
+        ("[anchors]\nwalls_m = [[[0, 0], [0, 0]]]\n" + ANCHORS + PATH, "each a list of 2 corners x, y or more"),
+        (ANCHORS + "[path]\nloop_inside_m = [[0, 0], [1, 1]]\n", "a list of 3 corners x, y or more"),
         ("[anchors]\nheights_m = [3.0, 1.0]\n" + ANCHORS + PATH, "the larger one last"),
         ("[anchors]\nplaces = {A = [1, 2]}\n" + PATH, "3 numbers"),
         (ANCHORS + '[path]\nfile = "nothing.tum"\n', "nothing.tum"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from rangesfm.demo.ranges import Radio
 from rangesfm.errors import GeometryError
 from rangesfm.options import ScaleOptions
 from rangesfm.scale.cutoff import scale_drift
-from rangesfm.scale.estimate import CutoffTest, ScaleUncertainty
+from rangesfm.scale.estimate import CutoffTest
 from rangesfm.scale.initialize import initialize_scale
 
 if TYPE_CHECKING:
@@ -37,18 +37,16 @@ def test_far_anchors_and_little_noise_are_good(make_survey: MakeSurvey) -> None:
     assert low < estimate.value < high
 
 
-def test_a_radio_without_error_curve_near_its_anchors_is_to_be_calibrated(make_survey: MakeSurvey) -> None:
+def test_a_radio_without_error_curve_near_its_anchors_is_doubtful(make_survey: MakeSurvey) -> None:
     centers = 0.3 * make_survey().centers_m
     survey = make_survey(centers_m=centers, anchors_m=NEAR_ANCHORS_M, radio=Radio(range_stddev_m=0.02), num_epochs=5)
     estimate = survey.scale("unknown")
     assert estimate.verdict == "doubtful"
-    assert any("calibrate the radio" in advice for advice in estimate.advice)
 
 
-def test_a_straight_path_is_to_be_bent(make_survey: MakeSurvey) -> None:
+def test_a_straight_path_is_said_to_be_straight(make_survey: MakeSurvey) -> None:
     estimate = make_survey(centers_m=on_a_line(), radio=NOISE, num_epochs=3).scale("unknown")
     assert any("straight" in reason for reason in estimate.reasons)
-    assert any("walk a bend or a loop" in advice for advice in estimate.advice)
 
 
 def test_a_flat_path_with_unknown_anchors_is_to_be_raised_and_lowered(make_survey: MakeSurvey) -> None:
@@ -77,7 +75,6 @@ def test_a_straight_path_leaves_the_roll_of_a_map_in_the_site_uncertain(make_sur
     survey = make_survey(centers_m=centers, radio=NOISE, num_epochs=3)
     estimate = survey.scale("site", "ABCDE")
     assert any("rolled about it" in reason for reason in estimate.reasons)
-    assert "walk a bend or a loop instead of a straight line" in estimate.advice
 
 
 def test_an_anchor_that_is_hardly_heard_is_named(make_survey: MakeSurvey) -> None:
@@ -101,45 +98,6 @@ def test_anchors_in_wrong_places_disagree(make_survey: MakeSurvey) -> None:
     )
     assert any("the anchors disagree" in reason for reason in estimate.reasons)
     assert any("check the anchors' positions" in advice for advice in estimate.advice)
-
-
-class TestAdvice:
-    """By the largest part of the uncertainty, each the only large one here."""
-
-    @staticmethod
-    def advice(make_survey: MakeSurvey, frame: str, monkeypatch: pytest.MonkeyPatch, **parts: Any) -> tuple[str, ...]:
-        told = ScaleUncertainty(0.001, {"curve": 0.001, "bias": 0.001, "antenna": 0.001, "time": 0.001} | parts)
-        monkeypatch.setattr("rangesfm.scale.initialize.scale_uncertainty", lambda *_, **__: told)
-        return make_survey(radio=NOISE, num_epochs=3).scale(frame, "ABCDE").advice
-
-    def test_an_error_curve(self, make_survey: MakeSurvey, monkeypatch: pytest.MonkeyPatch) -> None:
-        (advice,) = self.advice(make_survey, "first_camera", monkeypatch, curve=0.04)
-        assert "calibrate the radio" in advice
-        assert "tape a distance" in advice
-
-    def test_calibration_is_named_once(self, make_survey: MakeSurvey, monkeypatch: pytest.MonkeyPatch) -> None:
-        drifted = lambda tests: CutoffTest(2.0, 1.1 * tests[0].scale, 0.01)  # noqa: E731
-        monkeypatch.setattr("rangesfm.scale.verdict.scale_drift", drifted)
-        (advice,) = self.advice(make_survey, "first_camera", monkeypatch, curve=0.04)
-        assert advice.count("calibrate the radio") == 1
-        assert "tape a distance" in advice
-
-    def test_anchors_that_were_surveyed(self, make_survey: MakeSurvey, monkeypatch: pytest.MonkeyPatch) -> None:
-        (advice,) = self.advice(make_survey, "first_camera", monkeypatch, bias=0.04)
-        assert advice.startswith("check the surveyed positions of the anchors")
-
-    def test_anchors_that_were_not(self, make_survey: MakeSurvey, monkeypatch: pytest.MonkeyPatch) -> None:
-        (advice,) = self.advice(make_survey, "unknown", monkeypatch, bias=0.04)
-        assert advice.startswith("survey the anchors")
-
-    def test_antennas(self, make_survey: MakeSurvey, monkeypatch: pytest.MonkeyPatch) -> None:
-        (advice,) = self.advice(make_survey, "first_camera", monkeypatch, antenna=0.04)
-        assert advice.startswith("range to more anchors")
-
-    def test_errors_in_time(self, make_survey: MakeSurvey, monkeypatch: pytest.MonkeyPatch) -> None:
-        assert self.advice(make_survey, "first_camera", monkeypatch, time=0.04) == ("walk a wider or longer loop",)
-        (advice,) = self.advice(make_survey, "unknown", monkeypatch, time=0.04)
-        assert advice == "walk a wider or longer loop, or survey the anchors"
 
 
 def test_a_refusal_says_what_to_do(make_survey: MakeSurvey) -> None:

@@ -8,21 +8,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rangesfm.errors import GeometryError
+from rangesfm.arrays import Array
+from rangesfm.geometry.similarity import NEARLY_STRAIGHT, path_shape
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.planning.expected import Expected, expect
+from rangesfm.planning.expected import Expected, compare
+from rangesfm.planning.placement import spread_places
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
 
-# Ratios hardly change with coarser cells, and of them there are many to compute.
-_NUM_CELLS = 150
 _RAISED_M = (1.0, -1.0, 2.0, -2.0)
 _UP_AND_DOWN_M, _NUM_WAVES = 0.5, 3
 _WIDER = 1.5
 _LEARNT_CURVE_M = 0.02
 _TAPED_M = (5.0, 0.005)
+_SURVEYED_M = 0.02
 # Of the nearest other anchor: nearer, a new one says the same.
 _NEAR_M = 1.0
+_NUM_BEST = 3
+# Of all that are allowed.
+_NUM_PLACES = 8
 # Of a stddev: what changes less is not worth the way.
 _LEAST_GAIN = 0.02
 
@@ -58,10 +62,21 @@ class _Change(NamedTuple):
 def advise(expected: Expected) -> tuple[Advice, ...]:
     """All changes of a plan that gain something, in no order."""
     planned = expected.planned
-    before = expect(planned, _NUM_CELLS)
-    afters = ((change, _expect_or_none(change.planned)) for change in _changes(planned))
-    found = (_advice(change, after, before, expected) for change, after in afters if after is not None)
+    before = compare(planned)
+    afters = ((change, compare(change.planned)) for change in _changes(planned))
+    found = (_advice(change, after, before, expected) for change, after in afters if before and after)
     return tuple(advice for advice in found if max(advice.scale_gain, advice.place_gain) > _LEAST_GAIN)
+
+
+def best_words(advice: Iterable[Advice]) -> tuple[list[str], list[str]]:
+    """What gains most for the scale, and for the place, with what it gains."""
+    advice = list(advice)
+    for_scale = ranked(advice, lambda each: each.scale_gain)[:_NUM_BEST]
+    for_place = ranked(advice, lambda each: each.place_gain)[:_NUM_BEST]
+    return (
+        [f"{each.words}: the scale would be {1 / (1 - each.scale_gain):.2g} times as certain" for each in for_scale],
+        [f"{each.words}: the place would be {1 / (1 - each.place_gain):.2g} times as certain" for each in for_place],
+    )
 
 
 def ranked(advice: Iterable[Advice], gain: Callable[[Advice], float]) -> list[Advice]:
@@ -71,13 +86,6 @@ def ranked(advice: Iterable[Advice], gain: Callable[[Advice], float]) -> list[Ad
     for each in worthwhile:
         best.setdefault((each.kind, each.subject), each)
     return list(best.values())
-
-
-def _expect_or_none(planned: PlannedSurvey) -> Expected | None:
-    try:
-        return expect(planned, _NUM_CELLS)
-    except GeometryError:
-        return None
 
 
 def _advice(change: _Change, after: Expected, before: Expected, stated: Expected) -> Advice:
@@ -99,12 +107,20 @@ def _advice(change: _Change, after: Expected, before: Expected, stated: Expected
 
 def _changes(planned: PlannedSurvey) -> Iterator[_Change]:
     yield from _raised(planned)
+    yield from _moved(planned)
     yield from _with_one_more(planned)
     path = planned.trajectory
+    if planned.anchor_frame == "unknown" and len(planned.anchors) > 2:
+        known = tuple(replace(anchor, position_stddev_m=_SURVEYED_M) for anchor in planned.anchors)
+        survey = f"survey the anchors, to {_SURVEYED_M:g} m"
+        yield _Change("anchor survey", "", survey, replace(planned, anchors=known, anchor_frame="site"))
     if not planned.path_is_level:
         up = f"go up and down on the way, by {_UP_AND_DOWN_M:g} m, {_NUM_WAVES} times"
         yield _Change("up and down", "", up, replace(planned, trajectory=_up_and_down(path)))
-    wide = f"walk a loop {_WIDER:g} times as wide"
+    if path_shape(path.centers).stddevs[1] < NEARLY_STRAIGHT * path_shape(path.centers).stddevs[0]:
+        bent, off_m = _bent(path)
+        yield _Change("bend", "", f"walk a bend, up to {off_m:.2g} m off the line", replace(planned, trajectory=bent))
+    wide = f"walk {_WIDER:g} times as wide"
     yield _Change("wider path", "", wide, replace(planned, trajectory=_wider(path)))
     yield _Change("rate", "", "range twice as often", replace(planned, rate_hz=2 * planned.rate_hz))
     if planned.curve_stddev_m is None:
@@ -128,20 +144,39 @@ def _raised(planned: PlannedSurvey) -> Iterator[_Change]:
                 )
 
 
+def _moved(planned: PlannedSurvey) -> Iterator[_Change]:
+    """To where somebody allowed it."""
+    for k, anchor in enumerate(planned.anchors if planned.allowed_m is not None else ()):
+        for place in _free_places(planned):
+            moved = (*planned.anchors[:k], replace(anchor, position_m=place), *planned.anchors[k + 1 :])
+            words = f"move anchor {anchor.anchor_id} to {_told(place)}"
+            yield _Change("anchor place", anchor.anchor_id, words, replace(planned, anchors=moved))
+
+
 def _with_one_more(planned: PlannedSurvey) -> Iterator[_Change]:
-    """At the corners and sides of the box around all, as high as the others mostly are."""
-    places = planned.places_m
-    low, high = places.min(axis=0), places.max(axis=0)
-    height_m = float(np.median(planned.anchors_m[:, 2]))
     stddev_m = float(np.median([anchor.position_stddev_m for anchor in planned.anchors]))
     taken = {anchor.anchor_id for anchor in planned.anchors}
     name = next(name for name in (f"new{number or ''}" for number in range(len(taken) + 1)) if name not in taken)
-    for x, y in np.ndindex(3, 3):
-        place = np.array([*(low + (high - low) * [x / 2, y / 2, 0.0])[:2], height_m])
-        if (x, y) != (1, 1) and np.linalg.norm(planned.anchors_m - place, axis=1).min() > _NEAR_M:
-            words = f"add an anchor at {place[0]:.3g}, {place[1]:.3g}, {place[2]:.3g}"
-            more = (*planned.anchors, Anchor(name, place, stddev_m))
-            yield _Change("one more anchor", "", words, replace(planned, anchors=more))
+    for place in _free_places(planned):
+        more = (*planned.anchors, Anchor(name, place, stddev_m))
+        words = f"add an anchor at {_told(place)}"
+        yield _Change("one more anchor", "", words, replace(planned, anchors=more))
+
+
+def _free_places(planned: PlannedSurvey) -> list[Array]:
+    """Those allowed that are farthest apart; else round the box around all, as high as the anchors mostly are."""
+    if planned.allowed_m is not None:
+        spread = spread_places(min(_NUM_PLACES, len(planned.allowed_m)), planned.allowed_m)
+    else:
+        low, high = planned.places_m.min(axis=0), planned.places_m.max(axis=0)
+        height_m = float(np.median(planned.anchors_m[:, 2]))
+        grid = [low + (high - low) * [x / 2, y / 2, 0.0] for x, y in np.ndindex(3, 3) if (x, y) != (1, 1)]
+        spread = np.array(grid) * [1.0, 1.0, 0.0] + [0.0, 0.0, height_m]
+    return [place for place in spread if np.linalg.norm(planned.anchors_m - place, axis=1).min() > _NEAR_M]
+
+
+def _told(place: Array) -> str:
+    return ", ".join(f"{x:.3g}" for x in place)
 
 
 def _up_and_down(path: Trajectory) -> Trajectory:
@@ -149,6 +184,17 @@ def _up_and_down(path: Trajectory) -> Trajectory:
     way = np.concatenate([[0.0], np.cumsum(steps)])
     wave = _UP_AND_DOWN_M * np.sin(2 * np.pi * _NUM_WAVES * way / max(float(way[-1]), 1e-9))
     return replace(path, centers=path.centers + wave[:, None] * [0.0, 0.0, 1.0])
+
+
+def _bent(path: Trajectory) -> tuple[Trajectory, float]:
+    """To one side, level, in an arc a quarter as high as it is long."""
+    shape = path_shape(path.centers)
+    along = (path.centers - shape.centroid) @ shape.axes[:, 0]
+    length_m = float(np.ptp(along))
+    across = np.cross([0.0, 0.0, 1.0], shape.axes[:, 0])
+    aside = across / max(float(np.linalg.norm(across)), 1e-9)
+    arc = np.cos(np.pi * (along - (along.max() + along.min()) / 2) / max(length_m, 1e-9))
+    return replace(path, centers=path.centers + length_m / 4 * arc[:, None] * aside), length_m / 4
 
 
 def _wider(path: Trajectory) -> Trajectory:

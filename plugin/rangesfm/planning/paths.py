@@ -1,4 +1,4 @@
-"""Paths that a camera is to go: through waypoints, along a trajectory, or as in a model of an earlier survey."""
+"""Paths that a camera is to go: through waypoints, round a floor, along a trajectory, or as in an earlier model."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
 _MAX_NUM_KEYFRAMES = 20_000
+_LOOP_SHARE = 2 / 3
+_LOOP_STEP_M, _NUM_WAVES = 0.25, 3
 # A camera whose way is this steep looks level all the same.
 _STEEP = 1e-6
 
@@ -41,6 +43,24 @@ def path_through(
     centers = np.column_stack([np.interp(at, way, column) for column in corners.T])
     leg = np.clip(np.searchsorted(way, at, side="right") - 1, 0, len(corners) - 2)
     return _trajectory(times, centers, _looking(np.diff(corners, axis=0)[leg]))
+
+
+def loop_inside(corners_m: Sequence[Sequence[float]], heights_m: tuple[float, float]) -> list[tuple[float, ...]]:
+    """Waypoints round a floor, drawn in towards its middle, three times up and down between two heights.
+
+    Args:
+        corners_m: (2,) each, in turn.
+    """
+    corners = np.array(corners_m, dtype=np.float64)
+    closed = np.vstack([corners, corners[:1]])
+    sides = np.linalg.norm(np.diff(closed, axis=0), axis=1)
+    way = np.append(0.0, np.cumsum(sides))
+    at = np.linspace(0.0, way[-1], max(int(_LOOP_SHARE * way[-1] / _LOOP_STEP_M), 4 * _NUM_WAVES) + 1)
+    outline = np.column_stack([np.interp(at, way, column) for column in closed.T])
+    middle = sides @ (closed[:-1] + closed[1:]) / (2 * max(float(way[-1]), 1e-9))
+    low, high = heights_m
+    heights = (low + high) / 2 + (high - low) / 2 * np.sin(2 * np.pi * _NUM_WAVES * at / max(float(way[-1]), 1e-9))
+    return [tuple(place) for place in np.insert(middle + _LOOP_SHARE * (outline - middle), 2, heights, axis=1).tolist()]
 
 
 def path_from_file(path: Path, photo_rate_hz: float) -> Trajectory:

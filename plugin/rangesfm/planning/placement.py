@@ -1,4 +1,4 @@
-"""Where to put anchors: places exchanged one by one, over a grid, as long as scale and place gain by it."""
+"""Where to put anchors: places exchanged one by one, among those allowed, as long as scale and place gain by it."""
 
 from __future__ import annotations
 
@@ -9,51 +9,74 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
-from rangesfm.planning.expected import expect
+from rangesfm.planning.expected import compare
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.progress import Progress, SilentProgress
 from rangesfm.ranging.anchors.anchor import Anchor
 
-# Along x, y and z of the region.
+# Along x, y and z of a box.
 _GRID = (4, 4, 2)
+# As many along walls, at the lower and the upper height.
+_NUM_ALONG_WALLS = 16
 _MAX_NUM_ROUNDS = 4
 # Of the sum of two logarithms.
 _LEAST_GAIN = 0.01
-# Coarse cells are enough to tell places apart.
-_NUM_CELLS = 100
 
 
-def spread_anchors(num: int, low_m: Sequence[float], high_m: Sequence[float], stddev_m: float) -> tuple[Anchor, ...]:
-    """As far apart as a grid on the region allows: P1, P2, ..., each farthest from those before."""
-    places = _grid(np.array(low_m, dtype=np.float64), np.array(high_m, dtype=np.float64))
+def places_in_box(low_m: Sequence[float], high_m: Sequence[float]) -> Array:
+    """(k, 3) a grid, each place once, of a box that may be flat."""
+    axes = [np.unique(np.linspace(a, b, num)) for a, b, num in zip(low_m, high_m, _GRID, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def places_on_walls(walls_m: Sequence[Sequence[Sequence[float]]], heights_m: tuple[float, float]) -> Array:
+    """(k, 3) evenly along walls, each from corner to corner as seen from above, at two heights."""
+    walls = [np.array(wall, dtype=np.float64) for wall in walls_m]
+    ways = [np.append(0.0, np.cumsum(np.linalg.norm(np.diff(wall, axis=0), axis=1))) for wall in walls]
+    step = sum(way[-1] for way in ways) / _NUM_ALONG_WALLS
+    spots = []
+    for wall, way in zip(walls, ways, strict=True):
+        at = np.linspace(0.0, way[-1], max(round(way[-1] / step), 1) + 1)
+        spots.append(np.column_stack([np.interp(at, way, column) for column in wall.T]))
+    # A wall that comes back to its start ends where it began.
+    distinct = np.unique(np.round(np.vstack(spots), 6), axis=0)
+    return np.vstack([np.insert(distinct, 2, height, axis=1) for height in heights_m])
+
+
+def spread_places(num: int, places: Array) -> Array:
+    """(num, 3) of the places, each as far as possible from those before."""
     chosen = [0]
     while len(chosen) < num:
         distances = np.linalg.norm(places[:, None] - places[chosen], axis=2).min(axis=1)
         chosen.append(int(np.argmax(distances)))
-    return tuple(Anchor(f"P{k + 1}", places[row], stddev_m) for k, row in enumerate(chosen))
+    return places[chosen]
+
+
+def spread_anchors(num: int, places: Array, stddev_m: float) -> tuple[Anchor, ...]:
+    """P1, P2, ... as far apart as the places allow."""
+    return tuple(Anchor(f"P{k}", place, stddev_m) for k, place in enumerate(spread_places(num, places), 1))
 
 
 def place_anchors(planned: PlannedSurvey, progress: Progress | None = None) -> PlannedSurvey:
     """The same survey with its anchors where scale and place are known best, as far as single exchanges get.
 
-    One anchor after the other is tried at every place of a grid on ``region_m`` (Fedorov's exchange); what counts is
-    the product of the scale's stddev and that of the keyframe known least, or of the scale alone without a place.
+    One anchor after the other is tried at every place that is allowed (Fedorov's exchange); what counts is the product
+    of the scale's stddev and that of the keyframe known least, or of the scale alone without a place.
 
     Raises:
         GeometryError: no place of the anchors determines the scale.
     """
     progress = progress or SilentProgress()
-    if planned.region_m is None:
+    if planned.is_placed or planned.allowed_m is None:
         return planned
-    low, high = np.array(planned.region_m, dtype=np.float64)
-    places, best = _grid(low, high), _badness(planned)
+    best = _badness(planned)
     progress.stage("placing anchors")
     num_anchors = len(planned.anchors)
     for turn in range(_MAX_NUM_ROUNDS):
         before = best
         for k in range(num_anchors):
             progress.update(turn * num_anchors + k, _MAX_NUM_ROUNDS * num_anchors)
-            for place in places:
+            for place in planned.allowed_m:
                 if np.linalg.norm(planned.anchors_m - place, axis=1).min() == 0:
                     continue
                 moved = replace(planned.anchors[k], position_m=place)
@@ -64,23 +87,16 @@ def place_anchors(planned: PlannedSurvey, progress: Progress | None = None) -> P
         if best == before:
             break
     if np.isinf(best):
-        raise GeometryError("no place of the anchors in region_m determines the scale, with this path")
+        raise GeometryError("no place that is allowed for the anchors determines the scale, with this path")
     return planned
 
 
 def _badness(planned: PlannedSurvey) -> float:
     """Sum of logarithms; a place that is open is known to the size of the site."""
-    try:
-        expected = expect(planned, _NUM_CELLS)
-    except GeometryError:
+    expected = compare(planned)
+    if expected is None:
         return np.inf
     size_m = float(np.linalg.norm(np.ptp(planned.places_m, axis=0)))
     place_m = expected.worst_keyframe_m
     of_place = 0.0 if np.isnan(place_m) else float(np.log(min(place_m, size_m)))
     return float(np.log(expected.uncertainty.empirical)) + of_place
-
-
-def _grid(low: Array, high: Array) -> Array:
-    """(k, 3), each place once, of a region that may be flat."""
-    axes = [np.unique(np.linspace(a, b, num)) for a, b, num in zip(low, high, _GRID, strict=True)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -19,7 +19,6 @@ from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.problem import ScaleProblem, scale_problem
 from rangesfm.scale.range_equation import RangeState
 
-_MAX_NUM_RANGES = 2000
 # Nobody puts an anchor in line with a path, or into its plane, to a decimetre; and where one that is to be found stands
 # exactly there, the linear problem does not see what is open.
 _OFF_LINE_M = (0.07, 0.07, 0.1)
@@ -41,7 +40,9 @@ class PlannedSurvey:
         taped: distances between points of the map: pairs of a length and its stddev, metres.
         heights_m: between which anchors may stand; None: not below the ground, which is 0 or the lowest of all.
         path_is_level: the camera cannot go up and down, as on a rover.
-        region_m: two corners of a box in which the anchors may stand anywhere; None: they stand where they do.
+        allowed_m: (k, 3) places for anchors; None: nobody said where they may stand.
+        is_placed: whether the anchors stand where they do; else they may be put anywhere that is allowed.
+        max_num_ranges: to compute with; of more, each stands for several.
     """
 
     trajectory: Trajectory
@@ -55,7 +56,9 @@ class PlannedSurvey:
     taped: tuple[tuple[float, float], ...] = ()
     heights_m: tuple[float, float] | None = None
     path_is_level: bool = False
-    region_m: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    allowed_m: Array | None = None
+    is_placed: bool = True
+    max_num_ranges: int = 2000
 
     @property
     def anchors_m(self) -> Array:
@@ -89,7 +92,7 @@ class PlannedSurvey:
     @property
     def num_alike(self) -> int:
         """How many ranges each simulated one stands for."""
-        return -(-self.num_ranges // _MAX_NUM_RANGES) or 1
+        return -(-self.num_ranges // self.max_num_ranges) or 1
 
     @property
     def _site_from_first_camera(self) -> Similarity:
@@ -127,8 +130,7 @@ class PlannedSurvey:
         if not self.taped:
             return None
         lengths, stddevs = np.array(self.taped, dtype=np.float64).T
-        nowhere = np.full((len(lengths), 2), -1, dtype=np.int64)
-        return LocatedDistances(lengths, nowhere, lengths, stddevs, np.zeros(len(lengths), dtype=bool))
+        return LocatedDistances.of(lengths, stddevs, model_length=lengths)
 
     def state(self, posed: ScaleProblem, anchor_ids: tuple[str, ...]) -> RangeState:
         """The truth, in the frame of the problem."""

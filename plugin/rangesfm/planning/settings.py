@@ -8,12 +8,14 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError, OptionError
 from rangesfm.files.atomic import path_of
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.option_model import Options, Told
 from rangesfm.options import RangeModelOptions, TagOptions
-from rangesfm.planning.paths import path_from_file, path_from_model, path_through
-from rangesfm.planning.placement import spread_anchors
+from rangesfm.planning.paths import loop_inside, path_from_file, path_from_model, path_through
+from rangesfm.planning.placement import places_in_box, places_on_walls, spread_anchors
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.anchor_file import read_anchors
@@ -22,6 +24,7 @@ from rangesfm.survey.settings import parse_toml, refuse_unknown_tables
 
 _Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
 _Place = Annotated[tuple[_Coordinate, _Coordinate, _Coordinate], Field(strict=False)]
+_Spot = Annotated[tuple[_Coordinate, _Coordinate], Field(strict=False)]
 _Stddev = Annotated[float, Field(ge=0, le=10)]
 _MAX_NUM_ANCHORS = 64
 _MAX_DURATION_S = 1e5
@@ -33,10 +36,23 @@ def _ascending(heights: tuple[float, float]) -> tuple[float, float]:
     return heights
 
 
+def _going_somewhere(corners: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    if len(set(corners)) < 2:
+        raise ValueError("are one place")
+    return corners
+
+
 def _corners(corners: tuple[tuple[float, ...], tuple[float, ...]]) -> tuple[tuple[float, ...], tuple[float, ...]]:
     if any(low > high for low, high in zip(*corners, strict=True)) or corners[0][:2] == corners[1][:2]:
         raise ValueError("are no box")
     return corners
+
+
+_Heights = Annotated[tuple[_Coordinate, _Coordinate], Field(strict=False), AfterValidator(_ascending)]
+_HEIGHTS = Told(expected="a list of 2 numbers, the larger one last")
+
+
+_Corners = Annotated[tuple[_Spot, ...], Field(strict=False), AfterValidator(_going_somewhere)]
 
 
 class PlannedAnchorOptions(Options):
@@ -55,21 +71,23 @@ class PlannedAnchorOptions(Options):
     position_stddev_m: _Stddev = 0.0
     """How well each coordinate in places will be known."""
     num_to_place: Annotated[int, Field(ge=1, le=_MAX_NUM_ANCHORS)] | None = None
-    """So many anchors are put where they help most, instead of places and path."""
+    """So many anchors are put where they help most in the region or on the walls, instead of places and path."""
     region_m: Annotated[
         Annotated[tuple[_Place, _Place], Field(strict=False), AfterValidator(_corners)] | None,
         Told(expected="two places, the second one in no coordinate smaller"),
     ] = None
-    """Two corners x, y, z of the box in which they may be put."""
-    heights_m: Annotated[
-        Annotated[tuple[_Coordinate, _Coordinate], Field(strict=False), AfterValidator(_ascending)] | None,
-        Told(expected="a list of 2 numbers, the larger one last"),
+    """Two corners x, y, z of the box in which anchors may stand."""
+    walls_m: Annotated[
+        Annotated[tuple[_Corners, ...], Field(strict=False)] | None,
+        Told(expected="a list of walls, each a list of 2 corners x, y or more"),
     ] = None
+    """Walls on which anchors may stand instead, between heights_m: each from corner to corner, as seen from above."""
+    heights_m: Annotated[_Heights | None, _HEIGHTS] = None
     """Between which they may stand (default: not below the ground)."""
 
 
 class PlannedPathOptions(Options):
-    """The camera's path: waypoints, a trajectory, or a model."""
+    """The camera's path: waypoints, a loop, a trajectory, or a model."""
 
     table: ClassVar[str] = "path"
 
@@ -77,10 +95,17 @@ class PlannedPathOptions(Options):
         Annotated[tuple[_Place, ...], Field(strict=False)] | None, Told(expected="a list of lists of 3 numbers")
     ] = None
     """Places x, y, z that the camera passes, in the site; it looks ahead."""
+    loop_inside_m: Annotated[
+        Annotated[tuple[_Spot, ...], Field(strict=False, min_length=3)] | None,
+        Told(expected="a list of 3 corners x, y or more"),
+    ] = None
+    """Corners of a floor instead, within which a loop is walked, two thirds as wide, up and down between heights_m."""
+    heights_m: Annotated[_Heights, _HEIGHTS] = (1.2, 2.0)
+    """Of the camera on that loop."""
     speed_m_per_s: Annotated[float, Field(ge=0.01, le=100)] = 0.8
-    """Along the waypoints."""
+    """Along the waypoints or the loop."""
     num_rounds: Annotated[int, Field(ge=1, le=1000)] = 1
-    """How often the waypoints are walked; from the second round on back to the first."""
+    """How often they are walked; from the second round on back to the first waypoint."""
     file: Annotated[Path | None, Told(role="file")] = None
     """A trajectory instead, TUM or CSV, with rotations."""
     model: Annotated[Path | None, Told(role="model")] = None
@@ -119,7 +144,7 @@ class Plan(BaseModel):
     tag: TagOptions
 
 
-_TABLES: dict[str, type[Options]] = {
+TABLES: dict[str, type[Options]] = {
     "anchors": PlannedAnchorOptions,
     "path": PlannedPathOptions,
     "radio": PlannedRadioOptions,
@@ -137,9 +162,9 @@ def read_plan(path: str | Path) -> PlannedSurvey:
     tables, source = parse_toml(Path(path))
     folder = Path(path).absolute().parent
     with source.naming_lines():
-        refuse_unknown_tables(tables, _TABLES)
+        refuse_unknown_tables(tables, TABLES)
         options: dict[str, Any] = {
-            name: model(**_absolute(tables.get(name, {}), model, folder)) for name, model in _TABLES.items()
+            name: model(**_absolute(tables.get(name, {}), model, folder)) for name, model in TABLES.items()
         }
         plan = Plan(**options)
         return _planned(plan)
@@ -164,21 +189,10 @@ def _planned(plan: Plan) -> PlannedSurvey:
     if unknown := [name for name in radio.stddevs if name not in known]:
         message = f"[radio] stddevs: there is no component {unknown[0]!r}, expected some of {', '.join(known)}"
         raise OptionError(message, "radio", f"stddevs.{unknown[0]}")
-    given = [name for name in ("waypoints", "file", "model") if getattr(path, name) is not None]
-    if len(given) != 1:
-        raise OptionError(
-            f"[path] has {' and '.join(given) or 'none'} of waypoints, file and model, expected one", "path"
-        )
-    if path.waypoints is not None:
-        trajectory = path_through(path.waypoints, path.speed_m_per_s, path.photo_rate_hz, path.num_rounds)
-    elif path.file is not None:
-        trajectory = path_from_file(path.file, path.photo_rate_hz)
-    else:
-        assert path.model is not None
-        trajectory = path_from_model(path.model, path.photo_rate_hz)
+    allowed_m = _allowed(plan.anchors)
     planned = PlannedSurvey(
-        trajectory=trajectory,
-        anchors=_anchors(plan.anchors),
+        trajectory=_path(path),
+        anchors=_anchors(plan.anchors, allowed_m),
         anchor_frame=plan.anchors.frame,
         rate_hz=radio.rate_hz,
         tag_in_cam_m=tag.tag_in_cam_m,
@@ -189,7 +203,8 @@ def _planned(plan: Plan) -> PlannedSurvey:
         component_stddevs=radio.stddevs,
         heights_m=plan.anchors.heights_m,
         path_is_level=path.is_level,
-        region_m=plan.anchors.region_m,
+        allowed_m=allowed_m,
+        is_placed=plan.anchors.num_to_place is None,
     )
     if planned.duration_s > _MAX_DURATION_S:
         message = f"[path] takes {planned.duration_s:.3g} s, expected at most {_MAX_DURATION_S:g}"
@@ -197,15 +212,43 @@ def _planned(plan: Plan) -> PlannedSurvey:
     return planned
 
 
-def _anchors(options: PlannedAnchorOptions) -> tuple[Anchor, ...]:
+def _path(path: PlannedPathOptions) -> Trajectory:
+    names = ("waypoints", "loop_inside_m", "file", "model")
+    given = [name for name in names if getattr(path, name) is not None]
+    if len(given) != 1:
+        found = " and ".join(given) or "none"
+        raise OptionError(f"[path] has {found} of waypoints, loop_inside_m, file and model, expected one", "path")
+    if path.file is not None:
+        return path_from_file(path.file, path.photo_rate_hz)
+    if path.model is not None:
+        return path_from_model(path.model, path.photo_rate_hz)
+    waypoints = path.waypoints or loop_inside(path.loop_inside_m or (), path.heights_m)
+    return path_through(waypoints, path.speed_m_per_s, path.photo_rate_hz, path.num_rounds)
+
+
+def _allowed(options: PlannedAnchorOptions) -> Array | None:
+    """(k, 3) places where anchors may stand."""
+    if options.walls_m is None:
+        return None if options.region_m is None else places_in_box(*options.region_m)
+    if options.region_m is not None or options.heights_m is None:
+        raise OptionError("[anchors] walls_m goes with heights_m and without region_m", "anchors", "walls_m")
+    return places_on_walls(options.walls_m, options.heights_m)
+
+
+def _anchors(options: PlannedAnchorOptions, allowed_m: Array | None) -> tuple[Anchor, ...]:
     given = [name for name in ("path", "places", "num_to_place") if getattr(options, name)]
     if len(given) != 1:
         found = " and ".join(given) or "none"
         raise OptionError(f"[anchors] has {found} of path, places and num_to_place, expected one", "anchors")
-    if (options.num_to_place is None) != (options.region_m is None):
-        raise OptionError("[anchors] num_to_place and region_m go together, expected both or none", "anchors")
-    if options.num_to_place is not None and options.region_m is not None:
-        return spread_anchors(options.num_to_place, *options.region_m, options.position_stddev_m)
+    if options.num_to_place is not None:
+        num_allowed = 0 if allowed_m is None else len(allowed_m)
+        if allowed_m is None or num_allowed < options.num_to_place:
+            message = (
+                f"[anchors] num_to_place is {options.num_to_place} and there are {num_allowed} places to choose from, "
+                "expected a larger region_m or walls_m"
+            )
+            raise OptionError(message, "anchors", "num_to_place")
+        return spread_anchors(options.num_to_place, allowed_m, options.position_stddev_m)
     if options.path is None:
         anchors = tuple(
             Anchor(anchor_id, np.array(place), options.position_stddev_m) for anchor_id, place in options.places.items()

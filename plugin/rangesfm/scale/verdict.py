@@ -13,6 +13,7 @@ from rangesfm.options import ScaleOptions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.scale.cutoff import scale_drift
 from rangesfm.scale.estimate import NORMAL_95, CutoffTest, ScaleUncertainty
+from rangesfm.scale.lengths import LengthScale
 from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import RangeFit
 from rangesfm.scale.solution import WHY_SCALE_IS_OPEN, Solution
@@ -27,13 +28,6 @@ _FEW_RANGES = 50
 _NOTHING_KNOWN = 1.0
 # Scatter of the scales from one anchor each: more than antennas and short stretches of a path make of it.
 _MAX_ANCHOR_SPREAD = 0.05
-# Components of the ranges' errors that the same measure helps against.
-_KINDS = (
-    ("curve", "rough_curve", "slope", "short", "common_bias", "learnt_curve"),
-    ("antenna", "tag_antenna", "view"),
-    ("bias",),
-    ("white", "time", "place", "bending", "reweighting"),
-)
 _CALIBRATE = "calibrate the radio at the distances of this survey (rangesfm ranges calibrate)"
 
 
@@ -44,7 +38,7 @@ class Verdict:
     Attributes:
         verdict: "good" or "doubtful".
         reasons: why.
-        advice: what to do next time.
+        advice: what to do about faults; which change of the survey would gain most, its plan says.
     """
 
     verdict: str
@@ -55,7 +49,7 @@ class Verdict:
 @dataclass(frozen=True)
 class _Doubt:
     reason: str
-    advice: str
+    advice: str = ""
 
 
 def judge(
@@ -73,10 +67,8 @@ def judge(
         GeometryError: refused, as the scale is less certain than ``options.max_relative_stddev``.
     """
     half_width = uncertainty.half_width_95
-    weak = _weakness_doubts(solution, half_width)
-    narrower = weak[0].advice if weak else _what_narrows_it(solution, uncertainty)
     doubts = [
-        *weak,
+        *_weakness_doubts(solution, half_width),
         *(_Doubt(note, "survey three anchors or more that are not on one line") for note in problem.notes),
         *_left_out_doubts(problem.left_out),
         *_path_doubts(solution),
@@ -87,45 +79,39 @@ def judge(
     if drift := _drift(cutoff_tests):
         is_out = abs(drift.scale / cutoff_tests[0].scale - 1) > half_width
         (doubts if is_out else remarks).append(_drift_in_words(drift, cutoff_tests[0]))
+    return _verdict(doubts, remarks, half_width, options)
+
+
+def judge_lengths(lengths: LengthScale, uncertainty: ScaleUncertainty, options: ScaleOptions) -> Verdict:
+    """The same where there is nothing but measured lengths."""
+    another = "measure another length, far from the first and in another direction"
+    doubts = []
+    if len(lengths.rows) == 1:
+        reason = "the scale hangs on one length that nothing checks: a mistake in it is one of the whole map"
+        doubts.append(_Doubt(reason, another))
+    if uncertainty.half_width_95 > DOUBTFUL_ABOVE:
+        doubts.append(_Doubt("the lengths are short beside their stddevs", "measure more lengths, and longer ones"))
+    return _verdict(doubts, [], uncertainty.half_width_95, options)
+
+
+def _verdict(doubts: list[_Doubt], remarks: list[_Doubt], half_width: float, options: ScaleOptions) -> Verdict:
     if half_width > NORMAL_95 * options.max_relative_stddev:
-        why = f"{doubts[0].reason}; " if doubts else ""
+        why = f": {doubts[0].reason}" if doubts else ""
+        advised = (doubt.advice for doubt in doubts if doubt.advice)
         raise GeometryError(
             f"the scale is only known to {100 * half_width / NORMAL_95:.1f} % (1 stddev), "
-            f"more than the {100 * options.max_relative_stddev:g} % allowed (max_relative_stddev): {why}"
-            f"next time: {narrower}"
+            f"more than the {100 * options.max_relative_stddev:g} % allowed (max_relative_stddev){why}; next time: "
+            f"{next(advised, 'plan it first, which says what would narrow it (rangesfm plan)')}"
         )
     summary = f"the scale is known to {100 * half_width:.1f} % (95 % interval)"
     if half_width > DOUBTFUL_ABOVE:
-        doubts.insert(0, _Doubt(f"{summary}, worse than {100 * DOUBTFUL_ABOVE:g} %", narrower))
+        doubts.insert(0, _Doubt(f"{summary}, worse than {100 * DOUBTFUL_ABOVE:g} %"))
     said = [*doubts, *remarks]
-    advice: dict[str, str] = {}
-    for each in said:  # calibration is advised once, whatever else goes with it
-        advice.setdefault(_CALIBRATE if each.advice.startswith(_CALIBRATE) else each.advice, each.advice)
+    advice = tuple(dict.fromkeys(each.advice for each in said if each.advice))
     reasons = tuple(each.reason for each in said)
     if not doubts:
-        return Verdict("good", (summary, *reasons), tuple(advice.values()))
-    return Verdict("doubtful", reasons, tuple(advice.values()))
-
-
-def _what_narrows_it(solution: Solution, uncertainty: ScaleUncertainty) -> str:
-    """Advice by the largest part of the uncertainty."""
-    some_unknown = bool(np.isinf(solution.problem.anchor_stddev_m).any())
-    parts = uncertainty.components
-    of_curve, of_antennas, of_biases, of_time = (
-        float(np.linalg.norm([parts.get(name, 0.0) for name in names])) for names in _KINDS
-    )
-    largest = max(of_curve, of_antennas, of_biases, of_time)
-    if largest == of_curve:
-        return (
-            f"{_CALIBRATE}, or tape a distance between two photos or points; failing both, keep the anchors farther "
-            "from the path"
-        )
-    if largest == of_biases:
-        survey = "survey the anchors" if some_unknown else "check the surveyed positions of the anchors"
-        return f"{survey}, and place them where they see the whole path"
-    if largest == of_antennas:
-        return "range to more anchors, on all sides of the path: a single antenna errs with the direction"
-    return "walk a wider or longer loop, or survey the anchors" if some_unknown else "walk a wider or longer loop"
+        return Verdict("good", (summary, *reasons), advice)
+    return Verdict("doubtful", reasons, advice)
 
 
 def _left_out_doubts(anchor_ids: tuple[str, ...]) -> list[_Doubt]:
@@ -153,12 +139,11 @@ def _weakness_doubts(solution: Solution, half_width: float) -> list[_Doubt]:
 def _path_doubts(solution: Solution) -> list[_Doubt]:
     stddevs = path_shape(solution.problem.centers).stddevs
     if stddevs[1] < NEARLY_STRAIGHT * stddevs[0]:
-        bend = "walk a bend or a loop instead of a straight line"
         if np.isinf(solution.problem.anchor_stddev_m).any():
             reason = "the path is nearly straight: an unknown anchor may stand anywhere on a circle around it"
-            return [_Doubt(reason, f"{bend}, or survey the anchors")]
+            return [_Doubt(reason)]
         if solution.problem.frame_is_free:
-            return [_Doubt("the path is nearly straight: how far the map is rolled about it is uncertain", bend)]
+            return [_Doubt("the path is nearly straight: how far the map is rolled about it is uncertain")]
     return []
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pycolmap
 
 from rangesfm.colmap.passthrough import apply_options
-from rangesfm.errors import ReconstructionError
+from rangesfm.errors import OptionError, ReconstructionError
 from rangesfm.options import MapperOptions
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
@@ -24,7 +24,21 @@ def feature_options(mapper: MapperOptions) -> pycolmap.FeatureExtractionOptions:
     """Raises InputError for keys or values that are not COLMAP's."""
     options = pycolmap.FeatureExtractionOptions(num_threads=mapper.num_threads)
     apply_options(options, mapper.features, "mapper.features")
+    refuse_learned(options.type.name, "mapper.features")
     return options
+
+
+def refuse_learned(name: str, table: str) -> None:
+    """OptionError for learned features, or a learned way to match them, where pycolmap has no networks."""
+    if not name.startswith("SIFT") or name.endswith("LIGHTGLUE"):
+        known = pycolmap.FeatureExtractionOptions().todict()
+        if "aliked" not in known:
+            raise OptionError(
+                f"[{table}] type is '{name}', expected SIFT: pycolmap {pycolmap.__version__} as installed is built"
+                " without ONNX, which runs networks; features of other programs come by database_path",
+                table,
+                "type",
+            )
 
 
 def extract_features(

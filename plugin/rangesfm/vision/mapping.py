@@ -75,7 +75,8 @@ def hold_cameras(
     """Have the mapping keep the intrinsics of some cameras; the global mapper keeps those of all, or of none."""
     if isinstance(options, pycolmap.HierarchicalPipelineOptions):
         options = options.incremental_options
-    if isinstance(options, pycolmap.IncrementalPipelineOptions):
+    refines = {table.mapping_refines_intrinsics for table in camera.tables}
+    if isinstance(options, pycolmap.IncrementalPipelineOptions) and len(refines) > 1:
         with pycolmap.Database.open(database_path) as database:
             images = database.read_all_images()
         options.constant_cameras = {

@@ -21,6 +21,7 @@ from rangesfm.processes.children import run_children
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import is_compared, num_compared_pairs, num_matching_pairs
+from rangesfm.vision.features import refuse_learned
 from rangesfm.vision.matching_share import MatchingShare
 from rangesfm.vision.pairs import NamedPairs, Pairing, pairing_options, pairs_to_match
 from rangesfm.vision.photos import Photos
@@ -57,7 +58,7 @@ class MatchingOptions:
     @property
     def is_by_place(self) -> bool:
         """Whether a pair is one before anything is known of the photos but their order and their names."""
-        if isinstance(self.pairing, pycolmap.SpatialPairingOptions):
+        if isinstance(self.pairing, (pycolmap.SpatialPairingOptions, pycolmap.VocabTreePairingOptions)):
             return False
         return not (isinstance(self.pairing, pycolmap.SequentialPairingOptions) and self.pairing.loop_detection)
 
@@ -81,6 +82,7 @@ def matching_options(mapper: MapperOptions, num_photos: int, seed: int) -> Match
     # Within COLMAP's own: what it asks of two views is not what its RANSAC asks by itself.
     options.verification.ransac.random_seed = seed
     apply_options(options.matcher, mapper.matcher, "mapper.matcher")
+    refuse_learned(options.matcher.type.name, "mapper.matcher")
     return options
 
 

@@ -16,7 +16,12 @@ from rangesfm.vision.photos import Photos
 
 _MAX_NUM_EXHAUSTIVE = 60  # 1770 pairs; beyond, the pairs outgrow the photos
 
-Pairing = pycolmap.ExhaustivePairingOptions | pycolmap.SequentialPairingOptions | pycolmap.SpatialPairingOptions
+Pairing = (
+    pycolmap.ExhaustivePairingOptions
+    | pycolmap.SequentialPairingOptions
+    | pycolmap.SpatialPairingOptions
+    | pycolmap.VocabTreePairingOptions
+)
 NamedPairs = tuple[tuple[str, str], ...]
 
 
@@ -36,8 +41,12 @@ def pairing_options(mapper: MapperOptions, num_photos: int) -> Pairing | NamedPa
         options = pycolmap.SequentialPairingOptions()
     elif way == "spatial":
         options = pycolmap.SpatialPairingOptions()
+    elif way == "vocabtree":
+        options = pycolmap.VocabTreePairingOptions()
     else:
         options = pycolmap.ExhaustivePairingOptions()
+    if mapper.vocab_tree_path is not None and way in ("sequential", "vocabtree"):
+        options.vocab_tree_path = mapper.vocab_tree_path  # type: ignore[union-attr]
     apply_options(options, mapper.pairing, "mapper.pairing")
     return options
 
@@ -79,9 +88,20 @@ def pairs_to_match(database_path: Path, photos: Photos, pairing: Pairing | Named
             pairs = pycolmap.SequentialPairGenerator(pairing, database).all_pairs()
         elif isinstance(pairing, pycolmap.SpatialPairingOptions):
             pairs = pycolmap.SpatialPairGenerator(pairing, database).all_pairs()
+        elif isinstance(pairing, pycolmap.VocabTreePairingOptions):
+            pairs = _alike(pairing, database)
         else:
             pairs = pycolmap.ExhaustivePairGenerator(pairing, database).all_pairs()
-    return sorted({(min(pair), max(pair)) for pair in pairs})
+    # The most alike to a photo is itself.
+    return sorted({(min(pair), max(pair)) for pair in pairs if pair[0] != pair[1]})
+
+
+def _alike(pairing: pycolmap.VocabTreePairingOptions, database: pycolmap.Database) -> list[tuple[int, int]]:
+    try:
+        return pycolmap.VocabTreePairGenerator(pairing, database).all_pairs()
+    except (RuntimeError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"is no vocabulary tree for these features ({reason})", pairing.vocab_tree_path) from None
 
 
 def _pairs_of_names(names: Sequence[str], pairs: NamedPairs) -> list[tuple[int, int]]:

@@ -79,8 +79,8 @@ def reconstruct(
     space = Workspace(Path(output_path), progress, before_change)
     options = pipeline_options(camera, mapper, seed)
     matched = match_photos(Path(image_path), image_names, camera, mapper, rigs, seed, space, restart=restart)
-    inputs = [matched.inputs, mapper.method, mapper.pipeline]
-    inputs += [table.mapping_refines_intrinsics for table in camera.tables]
+    refines = [table.mapping_refines_intrinsics for table in camera.tables]
+    inputs = [matched.inputs, mapper.method, mapper.pipeline, *refines]
     if adjustment is not None:
         inputs.append(adjustment.inputs)
     with space.logged():

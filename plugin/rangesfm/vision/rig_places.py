@@ -52,11 +52,11 @@ def _why_not(rigs: Rigs) -> str:
 
 def hold_rigs(options: PipelineOptions, rigs: Rigs, database_path: Path) -> None:
     """Have the mapping keep the rigs whose configuration says where all of their cameras sit."""
-    known = rigs.ids_of_known(database_path)
     if isinstance(options, pycolmap.GlobalPipelineOptions):
-        if known and all(rigs.are_known):
+        if rigs.configs and all(rigs.are_known):
             options.mapper.refine_sensor_from_rig = options.mapper.bundle_adjustment.refine_sensor_from_rig = False
-    elif isinstance(options, pycolmap.HierarchicalPipelineOptions):
-        options.incremental_options.constant_rigs = known
-    else:
-        options.constant_rigs = known
+        return
+    if isinstance(options, pycolmap.HierarchicalPipelineOptions):
+        options = options.incremental_options
+    if any(rigs.are_known):
+        options.constant_rigs = rigs.ids_of_known(database_path)

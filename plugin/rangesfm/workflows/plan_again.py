@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
-from rangesfm.errors import InputError
+from rangesfm.errors import GeometryError, InputError
 from rangesfm.export.metric_map import up_in_world
 from rangesfm.geometry.gravity import UP_IN_SITE
-from rangesfm.geometry.trajectory import trajectory_from_reconstruction
+from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.planning.advice import advise, best_words
+from rangesfm.planning.expected import expect
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.result.folder import ResultFolder, read_result_folder
+from rangesfm.ranging.observations import RangeStatus
+from rangesfm.result.folder import read_result_folder
+from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.ranges_as_used import RangesAsUsed
+
+# Of photos without times.
+_PHOTO_RATE_HZ = 2.0
 
 
 def plan_of_result(path: str | Path) -> PlannedSurvey:
@@ -25,37 +34,71 @@ def plan_of_result(path: str | Path) -> PlannedSurvey:
     taken over: the radio errs as radios mostly do.
 
     Raises:
-        InputError: no result folder, one without a metric model, without used ranges or without times.
+        InputError: no result folder, one without a metric model or without used ranges.
     """
     folder = read_result_folder(Path(path))
     model, ranges = folder.read_metric_model(), folder.read(RangesAsUsed)
     if model is None or ranges is None or not ranges.is_used.any():
         raise InputError("has no metric model or no used ranges, expected a finished result", path)
-    if folder.timestamps_s is None:
-        raise InputError("its photos have no times, expected a result of photos with times", path)
     trajectory = trajectory_from_reconstruction(model, folder.timestamps_s)
-    is_site = folder.summary.frame == "site"
-    up = up_in_world(trajectory, "auto", is_site=is_site)
-    level = Rotation.align_vectors(UP_IN_SITE[None], up[None])[0].as_matrix()
     used = np.array(ranges.anchor_id, dtype=str)[ranges.is_used]
-    anchors = _anchors(folder, set(used.tolist()), level)
     (arm,) = folder.lever_arms_m(ranges.tag_id[:1])
-    planned = PlannedSurvey(
-        trajectory=trajectory.transformed(1.0, level, np.zeros(3)),
-        anchors=anchors,
-        anchor_frame="site" if is_site else _frame(folder),
-        rate_hz=1.0,
-        tag_in_cam_m=tuple(arm.tolist()),
-    )
-    return planned.ranging(len(used))
-
-
-def _anchors(folder: ResultFolder, heard: set[str], level: Array) -> tuple[Anchor, ...]:
-    found = {name: np.array(at) for name, at in folder.anchor_positions_m.items() if name in heard}
     stddevs = {name: anchor.stddev_m or 0.0 for name, anchor in folder.summary.anchors.items()}
-    return tuple(Anchor(name, level @ at, stddevs[name]) for name, at in found.items())
-
-
-def _frame(folder: ResultFolder) -> str:
+    heard = {name: np.array(at) for name, at in folder.anchor_positions_m.items() if name in set(used.tolist())}
+    anchors = [Anchor(name, at, stddevs[name]) for name, at in heard.items()]
     is_known = any(anchor.surveyed_position_m is not None for anchor in folder.summary.anchors.values())
-    return "first_camera" if is_known else "unknown"
+    return _planned(trajectory, anchors, _frame(folder.summary.frame, is_known=is_known), arm, len(used))
+
+
+def with_advice(metric: MetricResult, tag_in_cam_m: Array) -> MetricResult:
+    """The same told what to change next time, where its scale or its place is doubtful.
+
+    Args:
+        tag_in_cam_m: (num_tags, 3).
+    """
+    doubtful = metric.estimate.verdict == "doubtful", metric.place is not None and metric.place.verdict == "doubtful"
+    observations = metric.observations
+    used = observations.has_place & (observations.status < RangeStatus.OUTLIER)
+    if not any(doubtful) or not used.any():
+        return metric
+    log, estimate = observations.log, metric.estimate
+    heard = {log.anchor_ids[k] for k in np.unique(log.anchor_index[used])}
+    anchors = [
+        Anchor(a.anchor_id, a.position_m, a.position_stddev_m)
+        for a in metric.anchors
+        if a.anchor_id in heard and np.isfinite(a.position_m).all()
+    ]
+    is_known = any(anchor.prior_position_m is not None for anchor in metric.anchors)
+    trajectory = metric.trajectory.as_in(metric.final)
+    arm = tag_in_cam_m[max(int(log.tag_index[used][0]), 0)]
+    try:
+        planned = _planned(trajectory, anchors, _frame(estimate.frame, is_known=is_known), arm, int(used.sum()))
+        expected = expect(planned)
+    except (InputError, GeometryError):  # nothing says what is up, or a run like it would not come about
+        return metric
+    words = [
+        words for wanted, best in zip(doubtful, best_words(advise(expected)), strict=True) if wanted for words in best
+    ]
+    advice = tuple(dict.fromkeys((*estimate.advice, *words)))
+    return replace(metric, estimate=replace(estimate, advice=advice))
+
+
+def _planned(
+    trajectory: Trajectory, anchors: Sequence[Anchor], frame: str, tag_in_cam_m: Array, num_ranges: int
+) -> PlannedSurvey:
+    """Upright, and with times where none are known."""
+    up = up_in_world(trajectory, "auto", is_site=frame == "site")
+    level = Rotation.align_vectors(UP_IN_SITE[None], up[None])[0].as_matrix()
+    times = np.arange(len(trajectory)) / _PHOTO_RATE_HZ if trajectory.timestamps_s is None else trajectory.timestamps_s
+    planned = PlannedSurvey(
+        trajectory=replace(trajectory.transformed(1.0, level, np.zeros(3)), timestamps_s=times),
+        anchors=tuple(Anchor(a.anchor_id, level @ a.position_m, a.position_stddev_m) for a in anchors),
+        anchor_frame=frame,
+        rate_hz=1.0,
+        tag_in_cam_m=tuple(tag_in_cam_m.tolist()),
+    )
+    return planned.ranging(num_ranges)
+
+
+def _frame(frame: str, *, is_known: bool) -> str:
+    return "site" if frame == "site" else "first_camera" if is_known else "unknown"
