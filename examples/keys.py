@@ -1,5 +1,6 @@
-"""Print the reference of all keys of a survey file: python examples/keys.py > examples/keys.md"""
+"""Print the reference of all keys of a survey file and of a plan: python examples/keys.py > examples/keys.md"""
 
+from rangesfm.planning.settings import TABLES as PLAN_TABLES
 from rangesfm.survey.settings import KEYS, TABLES
 
 HEAD = """# Keys of a survey file
@@ -21,6 +22,12 @@ def main() -> None:
             if key.table == table:
                 flag = f"`--{key.flag}`" + (f", `--no_{key.flag}`" if key.type is bool else "")
                 print(f"| `{key.name}` | {flag} | {cell(key.expected)} | {cell(key.meaning)} |")
+        print()
+    print("# Keys of a plan\n\nOf the file that `rangesfm plan` reads; [how to plan a survey](planning.md).\n")
+    for table, options in PLAN_TABLES.items():
+        print(f"## [{table}] of a plan\n\n{options.__doc__}\n\n| key | value | meaning |\n|---|---|---|")
+        for key in options.keys().values():
+            print(f"| `{key.name}` | {cell(key.expected)} | {cell(key.meaning)} |")
         print()
 
 

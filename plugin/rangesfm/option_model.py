@@ -19,7 +19,7 @@ Same = TypeVar("Same", bound="Options")
 PathRole = Literal["file", "log", "photos", "model", "output"]
 _NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "text", Path: "a path", dict: "a table"}
 _TABLE_OF = "a table in which each value is "
-_UNITS = {"m": "metres", "s": "seconds", "deg": "degrees"}
+_UNITS = {"m_per_s": "metres a second", "m": "metres", "s": "seconds", "deg": "degrees"}
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,8 @@ class Options(BaseModel):
             told = next((item for item in field.metadata if isinstance(item, Told)), Told())
             if not told.is_key:
                 continue
-            expected = told.expected or _described(hints[name], _UNITS.get(name.rpartition("_")[2]))
+            unit = next((unit for end, unit in _UNITS.items() if name.endswith(f"_{end}")), None)
+            expected = told.expected or _described(hints[name], unit)
             meaning = " ".join((field.description or "").split()).removesuffix(".")
             meaning += _default(field.get_default(call_default_factory=True))
             type_ = _without_none(bare[name])

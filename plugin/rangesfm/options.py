@@ -20,6 +20,14 @@ from rangesfm.option_model import Options, Told
 DEFAULT_FORMATS = ("tum", "ply")
 _CALIBRATION_STDDEV = 0.005  # of a focal length, relative: what focus, warmth and another board make of it
 
+# fmt: off
+TagDictionary = Literal[
+    "APRILTAG_16h5", "APRILTAG_25h9", "APRILTAG_36h10", "APRILTAG_36h11", "ARUCO_MIP_36h12", "ARUCO_ORIGINAL",
+    "4X4_50", "4X4_100", "4X4_250", "4X4_1000", "5X5_50", "5X5_100", "5X5_250", "5X5_1000",
+    "6X6_50", "6X6_100", "6X6_250", "6X6_1000", "7X7_50", "7X7_100", "7X7_250", "7X7_1000",
+]
+# fmt: on
+
 # Bounds keep out what only a slip can mean, and what would be infinite once it is squared or divided by.
 _Count = Annotated[int, Field(ge=1, le=1_000_000)]
 _Zero = Annotated[float, Field(ge=0, le=0)]
@@ -160,10 +168,10 @@ class LogOptions(Options):
     """Names of its columns (numbers, where they have none) for timestamp (or image_name), anchor_id, range, tag_id,
     range_stddev, los; range:A1 for a column of one anchor; without range, the time stamps tx1, rx1, tx2, rx2 and
     possibly tx3, rx3 of two-way ranging."""
-    timestamp_unit: str | None = None
-    """One of s, ms, us, ns and iso (default: by format, name or values)."""
-    range_unit: str | None = None
-    """One of m, cm and mm (default: by format, name or values)."""
+    timestamp_unit: Literal["s", "ms", "us", "ns", "iso"] | None = None
+    """Of its times (default: by format, name or values)."""
+    range_unit: Literal["m", "cm", "mm"] | None = None
+    """Of its ranges (default: by format, name or values)."""
     separator: Annotated[
         Annotated[str, Field(min_length=1, max_length=1)] | None, Told(metavar="CHARACTER", expected="one character")
     ] = None
@@ -321,6 +329,31 @@ class ScaleAndTapeOptions(ScaleOptions):
                 "distances",
                 "scale",
                 "markers",
+            )
+        return self
+
+
+class MarkerOptions(Options):
+    """Printed tags of known size in the photos."""
+
+    table: ClassVar[str] = "markers"
+
+    dictionary: Annotated[TagDictionary | None, Told(flag="marker_dictionary")] = None
+    """Which tags are looked for in the photos, by OpenCV's names: the corners of tag 7 are the markers tag7.0 (upper
+    left, as it is read) to tag7.3, clockwise (default: none are looked for)."""
+    side_m: Annotated[_Positive | None, Told(flag="marker_side_m")] = None
+    """Side of the tags, from black corner to black corner: each that is found is four lengths (default: they are none,
+    but ends of taped distances)."""
+    side_stddev_m: Annotated[_Positive, Told(flag="marker_side_stddev_m")] = 0.0005
+    """Of that; all tags are off by the same."""
+
+    @model_validator(mode="after")
+    def _side_is_of_a_dictionary(self) -> MarkerOptions:
+        if self.side_m is not None and self.dictionary is None:
+            raise OptionError(
+                f"[markers] side_m is {self.side_m:g}, expected a dictionary beside it: which tags are they?",
+                "markers",
+                "side_m",
             )
         return self
 

@@ -63,10 +63,11 @@ def test_init_says_what_is_missing_and_assumed(folder: Path, capsys: pytest.Capt
     (folder / "uwb.csv").unlink()
     assert main(["init", str(folder)]) == 0
     told = capsys.readouterr().out
-    assert "\nmissing: no ranges: give [ranges] path in a survey file, or --ranges LOG\n" in told
-    assert told.endswith(f"\nnext: write down what is missing, then rangesfm check '{folder}/survey.toml'\n")
+    assert "\nmissing: no ranges and no lengths: give a radio's log (--ranges LOG), taped distances" in told
+    assert "\nnext: write down what is missing (a flag is a key of the same name), then " in told
+    assert told.endswith(f"rangesfm check '{folder}/survey.toml'\n")
     assert main(["check", str(folder)]) == 2
-    assert "\nerror: no ranges: " in capsys.readouterr().out
+    assert "\nerror: no ranges and no lengths: " in capsys.readouterr().out
 
 
 def test_an_ambiguous_folder_is_asked_about_and_nothing_is_written(

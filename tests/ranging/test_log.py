@@ -61,17 +61,15 @@ class TestWithAnchors:
 class TestPeerRanges:
     def test_ranges_between_anchors_are_had_with_both_ends(self) -> None:
         log = log_of(("t", "A"), ("B", "A"), ("t", "B"), ("C", "B")).with_anchors({"A", "B", "C"})
-        ranges = log.anchor_anchor_ranges()
+        ranges = log.peer_ranges(RangeKind.ANCHOR_ANCHOR)
         assert ranges.rows.tolist() == [1, 3]
         assert [set(ids) for ids in ranges.end_ids] == [{"A", "B"}, {"B", "C"}]
         assert [tuple(log.anchor_ids[k] for k in ends) for ends in ranges.ends] == list(ranges.end_ids)
-        assert ranges.range_m.tolist() == [2.0, 4.0]
-        assert ranges.range_stddev_m.tolist() == [0.1, 0.1]
 
     def test_ranges_between_tags_are_had_with_both_ends(self) -> None:
         log = log_of(("t", "A"), ("t", "u")).with_anchors({"A"})
-        assert log.tag_tag_ranges().end_ids == (("t", "u"),)
-        assert len(log.anchor_anchor_ranges().rows) == 0
+        assert log.peer_ranges(RangeKind.TAG_TAG).end_ids == (("t", "u"),)
+        assert len(log.peer_ranges(RangeKind.ANCHOR_ANCHOR).rows) == 0
 
     def test_subset_forgets_nodes_without_ranges_and_keeps_kinds(self) -> None:
         log = log_of(("t", "A"), ("B", "C"), ("t", "u"), ("v", "A")).with_anchors({"A", "B", "C"})

@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rangesfm.ranging.errors.noise_of_log import estimate_noise_m
-from rangesfm.ranging.errors.quantization import find_quantization_m
+from rangesfm.ranging.errors.noise_of_log import estimate_noise_m, find_quantization_m
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.summary import summarize_ranges
 
@@ -25,7 +24,7 @@ def test_summary_counts_ranges_time_and_gaps() -> None:
     assert (summary.start_s, summary.end_s, summary.rate_hz) == (10, 14, 1.0)
     assert summary.largest_gap_s == pytest.approx(2.0)
     first, second = summary.anchors
-    assert (first.anchor_id, first.num, first.min_m, first.median_m, first.max_m) == ("a", 3, 1, 2, 6)
+    assert (first.ids, first.num, first.min_m, first.median_m, first.max_m) == (("a",), 3, 1, 2, 6)
     assert (first.largest_gap_s, second.largest_gap_s) == (3.0, 2.5)
 
 
@@ -60,8 +59,7 @@ def test_ranges_between_two_of_a_kind_are_told_apart_from_those_of_the_camera() 
         ["a", "b", "b", "a", "u"], [1, 2, 3, 5, 9], timestamp_s=range(5), tag_id=["t", "t", "a", "b", "t"]
     ).with_anchors({"a", "b"})
     summary = summarize_ranges(log)
-    assert (summary.num_between_anchors, summary.num_between_tags) == (2, 1)
-    assert [(anchor.anchor_id, anchor.num) for anchor in summary.anchors] == [("a", 1), ("b", 1)]
+    assert [(anchor.ids, anchor.num) for anchor in summary.anchors] == [(("a",), 1), (("b",), 1)]
     between, tags = summary.pairs
     assert (between.kind, set(between.ids), between.num) == ("anchor-anchor", {"a", "b"}, 2)
     assert (between.min_m, between.median_m, between.max_m) == (3, 4, 5)

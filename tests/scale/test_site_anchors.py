@@ -59,8 +59,21 @@ def test_gravity_rules_out_the_mirror_image_of_a_slope_but_not_of_a_level_path(m
     estimate = slope.scale("site", "ABCD", options=ScaleOptions(up_in_first_camera=up_of(slope, off_deg=2.0)))
     np.testing.assert_allclose(estimate.metric_from_sfm.apply(slope.trajectory.centers), slope.centers_m, atol=0.3)
     level = make_survey(centers_m=flat_loop(make_survey), anchors_m=FLAT_ANCHORS_M, radio=NOISE, num_epochs=2)
-    with pytest.raises(GeometryError, match=r"mirror image.*camera_side"):
-        level.scale("site", "ABCD", options=ScaleOptions(up_in_first_camera=up_of(level)))
+    of_scale = level.scale("site", "ABCD", options=ScaleOptions(up_in_first_camera=up_of(level)))
+    assert of_scale.frame == "first_camera"
+    assert any("mirror image" in reason and "camera_side" in reason for reason in of_scale.reasons)
+
+
+@pytest.mark.parametrize(("tilt", "seed"), [(0.0, 0), (0.0, 1), (0.3, 0)], ids=["parallel", "again", "tilted"])
+def test_a_flat_path_among_anchors_in_a_plane_has_a_scale_and_no_place(
+    make_survey: MakeSurvey, tilt: float, seed: int
+) -> None:
+    """Its mirror image fits; parallel to the anchors' plane, that image is the same map higher or lower."""
+    survey = make_survey(centers_m=flat_loop(make_survey, tilt), anchors_m=FLAT_ANCHORS_M, radio=NOISE, seed=seed)
+    estimate = survey.scale("site", "ABCD")
+    assert estimate.frame == "first_camera"
+    assert "scale only, in the first camera's frame: the map and its mirror image" in estimate.reasons[-1]
+    assert abs(survey.relative_error(estimate)) < estimate.uncertainty.half_width_95 < 0.1
 
 
 def test_a_path_that_is_not_flat_contradicts_the_wrong_side(make_survey: MakeSurvey) -> None:

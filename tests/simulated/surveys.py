@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
-from tests.studies.scale_coverage import error_curve
 
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.geometry.similarity import Similarity
@@ -26,7 +25,8 @@ Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
 
 METRES_PER_UNIT = 2.3
-MOMENT_S, SHORT_LASTING_S, LONG_LASTING_S = 0.5, 3.0, 15.0
+LASTING_S, PLACE_M, LOBE = 3.0, 0.5, 0.1
+NUM_WAVES = 300
 # Knots of an uneven curve over the logarithm of distance.
 _KNOTS = np.linspace(np.log(0.05), np.log(300.0), 400)
 
@@ -46,7 +46,7 @@ def radio(
     *, median_m: float, bulk_m: float, anchors_m: float, short_m: float, with_distance_m: float
 ) -> dict[str, float]:
     """Stddevs of the components of a radio's errors, from a row of the table in ``examples/radios.md``."""
-    shares = {"white": 0.5, "moment": 0.25, "time": 0.4, "long_time": 0.3, "antenna": 0.5, "tag_antenna": 0.5}
+    shares = {"white": 0.5, "time": 0.2, "place": 0.3, "view": 0.4, "antenna": 0.5, "tag_antenna": 0.5}
     return {
         **{name: share * bulk_m for name, share in shares.items()},
         "bias": anchors_m,
@@ -126,10 +126,12 @@ def _errors(
         rows = np.flatnonzero(index == k)
         since = times[rows]
         errors[rows] += stddevs["bias"] * rng.standard_normal() + stddevs["antenna"] * _lobes(direction[rows], rng)
-        errors[rows] += stddevs["time"] * lasting(since, SHORT_LASTING_S, rng)
-        errors[rows] += stddevs["long_time"] * lasting(since, LONG_LASTING_S, rng)
-        moment = np.floor((since - since[0]) / MOMENT_S).astype(np.int64)
-        errors[rows] += stddevs["moment"] * rng.standard_normal(int(moment[-1]) + 1)[moment]
+        errors[rows] += stddevs["time"] * lasting(since, LASTING_S, rng)
+        # Waves of Cauchy and of Gaussian distribution: their sums are alike as exp(-d) and as exp(-d^2 / 2).
+        cauchy = rng.standard_normal((NUM_WAVES, 3)) / np.abs(rng.standard_normal((NUM_WAVES, 1)))
+        errors[rows] += stddevs["place"] * _field(from_anchor[rows] / PLACE_M, cauchy, rng)
+        gaussian = rng.standard_normal((NUM_WAVES, 3))
+        errors[rows] += stddevs["view"] * _field(in_cam[rows] / np.sqrt(LOBE), gaussian, rng)
     return np.asarray(errors), np.asarray(distance)
 
 
@@ -144,11 +146,25 @@ def lasting(times: Array, memory_s: float, rng: np.random.Generator) -> Array:
     return values
 
 
+def _field(at: Array, waves: Array, rng: np.random.Generator) -> Array:
+    """(n,) of stddev 1 at (n, 3), a sum of waves (k, 3) of any phase."""
+    phases = rng.uniform(0, 2 * np.pi, len(waves))
+    return np.asarray(np.sqrt(2 / len(waves)) * np.cos(at @ waves.T + phases).sum(axis=1))
+
+
 def _lobes(direction: Array, rng: np.random.Generator) -> Array:
     """(n,) of stddev 1: half of the variance linear, half a quadratic form without a mean."""
     form = rng.standard_normal((3, 3))
     quadratic = np.einsum("ni,ij,nj->n", direction, form, direction) - np.trace(form) / 3
     return np.asarray(direction @ rng.standard_normal(3) / np.sqrt(2) + np.sqrt(3) / 2 * quadratic)
+
+
+def error_curve(distance: Array, rng: np.random.Generator) -> Array:
+    """A draw of a Gaussian process in the logarithm of distance, of stddev 1 and one e-fold's length."""
+    knots = np.linspace(np.log(0.3), np.log(30.0), 40)
+    covariance = np.exp(-0.5 * (knots[:, None] - knots) ** 2) + 1e-9 * np.eye(len(knots))
+    curve = np.linalg.cholesky(covariance) @ rng.standard_normal(len(knots))
+    return np.interp(np.log(distance), knots, curve)
 
 
 def _uneven(distance: Array, rng: np.random.Generator) -> Array:

@@ -153,7 +153,7 @@ def test_the_camera_is_that_of_the_info_beside_the_images(version: int, tmp_path
     ]
     plain = open_bag(tmp_path, messages, topic="/cam/image_raw", version=version)
     assert plain.camera == ("OPENCV", (9.0, 10.0, 4.5, 3.5, 0.1, 0.0, 0.0, 0.0))
-    assert plain.notes == ("the camera is that of /cam/camera_info",)
+    assert plain.notes == ("the camera is that of /cam/camera_info, where none is given",)
     rectified = open_source(next(tmp_path.iterdir()), "/cam/image_rect")
     assert rectified.camera == ("PINHOLE", (4.5, 5.0, 4.5, 3.5))
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 from tests.simulated.path import loop_path
-from tests.studies.scale_coverage import drifting, error_curve
+from tests.simulated.surveys import LASTING_S, error_curve, lasting
 
 from rangesfm.colmap.reprojection import PointErrors
 from rangesfm.demo.ranges import CameraPath
@@ -32,7 +32,8 @@ from rangesfm.trust.verdict import TrustVerdict, trust_in
 Array = npt.NDArray[np.float64]
 
 METRES_PER_UNIT = 2.3
-LASTING_STDDEV_M, DIRECTION_STDDEV_M, CURVE_STDDEV_M, BIAS_STDDEV_M, COMMON_BIAS_STDDEV_M = 0.03, 0.03, 0.03, 0.01, 0.05
+DIRECTION_STDDEV_M, CURVE_STDDEV_M, BIAS_STDDEV_M, COMMON_BIAS_STDDEV_M = 0.03, 0.03, 0.01, 0.05
+LASTING_STDDEV_M = 0.0018
 OBSTRUCTED_SHARE, OBSTRUCTED_MEAN_M = 0.04, 0.7
 BEND_SHARE = 0.002
 # A camera's x right, y down, z forward by a robot's x forward, y left, z up.
@@ -171,7 +172,7 @@ def radio_errors(given: Given, stddev_m: float, rng: np.random.Generator) -> Arr
         direction = (given.tags_m[rows] - at) / distance[rows, None]
         form = rng.normal(0, DIRECTION_STDDEV_M, (3, 3))
         errors[rows] += np.einsum("ni,ij,nj->n", direction, form, direction) + BIAS_STDDEV_M * rng.standard_normal()
-        errors[rows] += LASTING_STDDEV_M * drifting(given.time_s[rows], rng)
+        errors[rows] += LASTING_STDDEV_M * lasting(given.time_s[rows], LASTING_S, rng)
     errors += (rng.random(len(errors)) < OBSTRUCTED_SHARE) * rng.exponential(OBSTRUCTED_MEAN_M, len(errors))
     return np.asarray(errors)
 

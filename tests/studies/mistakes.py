@@ -280,7 +280,7 @@ def main() -> None:
     with args.out.open("a", encoding="utf-8") as out:
         for seed in range(args.seed, args.seed + max(args.num_seeds, args.num_clean)):
             for name, frame, ids, make in sites:
-                if name.startswith(args.surveys) and (seed < args.num_clean or seed < args.num_seeds):
+                if name.startswith(args.surveys):
                     for line in runs_of_seed(name, kinds(ids if frame != "unknown" else []), make, seed, args, done):
                         out.write(json.dumps(line) + "\n")
                         out.flush()
@@ -295,7 +295,7 @@ def runs_of_seed(
         clean = told(run(make(seed), seed), survey, CLEAN, seed)
         yield clean
     for number, kind in enumerate(all_kinds):
-        if args.kinds not in kind.name or (survey, kind.name, seed) in done or seed >= args.num_seeds:
+        if args.kinds not in kind.name or (survey, kind.name, seed) in done or seed >= args.seed + args.num_seeds:
             continue
         factor, size = FACTORS[(seed + number) % len(FACTORS)], 1.0
         if kind.of is not None:

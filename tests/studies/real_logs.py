@@ -1,14 +1,15 @@
 """Error, 95 % interval and verdict of the scale on real logs with truth, in every way of knowing their anchors.
 
 Run: python -m tests.studies.real_logs --data FOLDER [--sets NAME ...] [--no_singles] [--by_photo]
-     [--turned SEED]
+     [--turned SEED] [--leave_radio_out]
 
 The sets are described in real_logs.json: public logs below the folder, of each tag its place in the tracked body, the
 offset of the clocks (time of the truth minus time of the ranges) and the truth's longest gap. The path is the true
 one, at most ten poses a second, divided by a factor that is to be found again. A survey has all anchors surveyed
 (site frame), known in the
 first pose's frame, all unknown, or each alone unknown. With --by_photo ranges name the pose next to them instead of a
-time; with --turned the unscaled path lies in another frame, which should change nothing.
+time; with --turned the unscaled path lies in another frame, which should change nothing; with --leave_radio_out what is
+expected of radios comes from all others than the one at hand.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +35,8 @@ from rangesfm.options import AssociationOptions, ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.association import associate
+from rangesfm.ranging.errors.components import components
+from rangesfm.ranging.errors.population import population
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.ranging.readers import read_ranges
@@ -57,6 +61,7 @@ def main() -> None:
     parser.add_argument("--no_singles", action="store_true")
     parser.add_argument("--by_photo", action="store_true")
     parser.add_argument("--turned", type=int)
+    parser.add_argument("--leave_radio_out", action="store_true")
     args = parser.parse_args()
     sets = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))
     found = []
@@ -64,11 +69,12 @@ def main() -> None:
         log, anchors, reference = read_set(args.data, sets[name])
         path = path_of(reference)
         given = path if args.turned is None else turned(path, args.turned)
+        expected = components(population(without=name if args.leave_radio_out else None))
         for case in cases(log, anchors, path):
             if not (args.no_singles and case.name.startswith("only")):
-                found.append(
-                    one_survey(name, case, placed(log, case, given, sets[name], by_photo=args.by_photo), given)
-                )
+                observations = placed(log, case, given, sets[name], by_photo=args.by_photo)
+                with patch("rangesfm.ranging.errors.learned.COMPONENTS", expected):
+                    found.append(one_survey(name, case, observations, given))
     known = np.array([row for row in found if row is not None])
     if len(known):
         pulls = 1.96 * known[:, 0] / known[:, 1]

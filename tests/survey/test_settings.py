@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from rangesfm.errors import InputError
 from rangesfm.options import MapperOptions, OutputOptions
 from rangesfm.ranging.twr import DW1000_TICK_S, VACUUM_M_PER_S, StampOptions
-from rangesfm.survey.inputs import stamp_options
 from rangesfm.survey.settings import Survey, read_survey, survey_from_tables
 
 WHOLE = """
@@ -197,10 +196,10 @@ def test_time_stamps_are_described_in_the_survey(folder: Path) -> None:
             "ranging_interval_s = 0.1\n",
         )
     ).ranges
-    assert stamp_options(ranges) == StampOptions(DW1000_TICK_S, 2**40 * DW1000_TICK_S, VACUUM_M_PER_S, 1e-8)
+    assert StampOptions.of(ranges) == StampOptions(DW1000_TICK_S, 2**40 * DW1000_TICK_S, VACUUM_M_PER_S, 1e-8)
     assert ranges.ranging_interval_s == 0.1
-    assert stamp_options(read_survey(write(folder, "")).ranges) == StampOptions()
-    speed = stamp_options(read_survey(write(folder, "[ranges]\npropagation_speed = 299.7e6\n")).ranges)
+    assert StampOptions.of(read_survey(write(folder, "")).ranges) == StampOptions()
+    speed = StampOptions.of(read_survey(write(folder, "[ranges]\npropagation_speed = 299.7e6\n")).ranges)
     assert speed.propagation_speed_m_per_s == 299.7e6
 
 

@@ -122,6 +122,12 @@ class TestCsv:
         with pytest.raises(InputError, match=r"images.csv:3: image_name is 'z.jpg', expected the name of a photo"):
             read_image_times_csv(path, ["a.jpg", "b.jpg"])
 
+    def test_leaves_out_photos_that_were_taken_away(self, tmp_path: Path) -> None:
+        path = write_csv(tmp_path, "image_name,timestamp_s\na.jpg,1.5\nz.jpg,2.5\nb.jpg,3.5\n")
+        times = read_image_times_csv(path, ["a.jpg", "b.jpg"])
+        assert (times.image_names, times.timestamps_s.tolist()) == (("a.jpg", "b.jpg"), [1.5, 3.5])
+        assert times.notes == ("1 of the 3 names in images.csv are of no photo in the folder",)
+
 
 class TestExif:
     def test_reads_the_fraction_as_decimals_and_the_zone(self, tmp_path: Path) -> None:

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from rangesfm.errors import GeometryError
-from rangesfm.ranging.clock.curve import CostCurve
 from rangesfm.ranging.clock.estimate import TimeOffset
 from rangesfm.ranging.clock.rivals import Rival
+from rangesfm.ranging.clock.search import CostCurve
 from rangesfm.ranging.log import RangeLog
 from rangesfm.workflows import metric_map
 
@@ -43,7 +43,7 @@ class Scales:
 
 def time_offset(probability: float, rivals: tuple[Rival, ...]) -> TimeOffset:
     curve = CostCurve(np.zeros(0), np.zeros(0))
-    return TimeOffset(VALUE_S, 0.01, curve, 3, True, 1e-3, 1e-5, True, 0.0, None, probability, rivals)
+    return TimeOffset(VALUE_S, 0.01, curve, True, 1e-3, 1e-5, True, 0.0, None, probability, rivals)
 
 
 def test_a_rival_of_nearly_the_same_scale_is_told_with_its_probability_and_its_scale(

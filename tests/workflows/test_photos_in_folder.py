@@ -14,6 +14,7 @@ from tests.sources.recorded import Message, camera_info, compressed, raw, write_
 from rangesfm.demo.survey import TIME_OFFSET_S, DemoSurvey
 from rangesfm.errors import InputError
 from rangesfm.geometry.reference import Reference, write_reference
+from rangesfm.options import CameraOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.result.folder import read_result_folder
 from rangesfm.survey.settings import Survey, survey_from_tables
@@ -43,14 +44,15 @@ def test_photos_times_and_camera_take_the_bags_place(survey: Survey) -> None:
     assert len([*folder.glob("*.png")]) == 8
     assert journal.warnings == [
         "the photos are the sharpest of each 0.5 s of walk; their times are the stamps of their headers",
-        "the camera is that of /camera_info",
+        "the camera is that of /camera_info, where none is given",
     ]
     assert with_photos_in_folder(changed, journal) == changed
 
 
 def test_a_camera_that_is_given_stays(survey: Survey) -> None:
-    given = survey.changed({"camera.model": "SIMPLE_RADIAL"})
-    assert with_photos_in_folder(given, Journal(SilentProgress())).camera == given.camera
+    by_folder = CameraOptions(others=(CameraOptions(images="left"),))
+    for given in (survey.changed({"camera.model": "SIMPLE_RADIAL"}), survey.model_copy(update={"camera": by_folder})):
+        assert with_photos_in_folder(given, Journal(SilentProgress())).camera == given.camera
 
 
 def test_other_times_beside_those_of_a_bag_are_refused(survey: Survey) -> None:
@@ -108,6 +110,7 @@ def test_a_folder_with_one_bag_of_camera_and_radio_is_a_whole_survey(
     assert written.stdout.splitlines()[-1].startswith("next: rangesfm run")
     rangesfm_command("run", "robot", *flags, "--features", "sift.max_num_features=2000", cwd=tmp_path)
     of_bag, of_photos = (read_result_folder(path).summary for path in (folder / "out", photo_run.output_path))
+    assert {"walk.mcap", "photos"} <= {Path(item["path"]).name for item in of_bag.to_json()["inputs"]}
     assert of_bag.map.num_photos == of_photos.map.num_photos == 14
     assert of_bag.scale.relative_stddev.formal == pytest.approx(of_photos.scale.relative_stddev.formal, rel=0.1)
     bag, photos = of_bag.comparison[-1], of_photos.comparison[-1]

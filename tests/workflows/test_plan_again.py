@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from rangesfm.errors import InputError
+from rangesfm.planning.survey_plan import plan_survey
 from rangesfm.workflows.plan_again import plan_of_result
 
 if TYPE_CHECKING:
@@ -37,6 +38,20 @@ def test_the_plan_is_of_the_map_that_the_run_found(
     printed = rangesfm_command("plan", "--from", out, cwd=tmp_path).stdout
     assert "what would gain most for the scale" in printed
     assert ("place: x" in printed) == (anchors[-1] == "site")
+
+
+def test_a_doubtful_survey_is_told_what_its_plan_would_change(
+    walked_survey: WalkedSurvey, rangesfm_command: Command, tmp_path: Path
+) -> None:
+    flags = (*walked_survey.flags, "--anchor_frame", "unknown", "--use_anchors", "A1", "--no_report")
+    printed = rangesfm_command("scale", *flags, "--output_path", tmp_path / "out", cwd=walked_survey.folder).stdout
+    scale = json.loads((tmp_path / "out" / "result.json").read_text())["scale"]
+    assert scale["verdict"] == "doubtful"
+    advised = plan_survey(plan_of_result(tmp_path / "out")).advice_for_scale
+    best = [advice for advice in scale["advice"] if "the scale would be" in advice]
+    assert best
+    assert best[0].startswith(advised[0].words)
+    assert f"next time: {best[0]}" in printed
 
 
 def test_a_folder_that_holds_no_result_is_refused(tmp_path: Path, rangesfm_command: Command) -> None:

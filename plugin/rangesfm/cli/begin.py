@@ -58,7 +58,8 @@ def _init(args: argparse.Namespace, progress: Progress) -> Outcome:
     checked = check_survey(read_survey(path))
     lines = [f"wrote {path}", *told(checked, fault="missing"), *(f"note: {note}" for note in understood.notes)]
     command = shlex.join(["rangesfm", "check" if checked.faults else "run", str(path)])
-    return Outcome([*lines, f"next: {'write down what is missing, then ' if checked.faults else ''}{command}"])
+    missing = "write down what is missing (a flag is a key of the same name), then " if checked.faults else ""
+    return Outcome([*lines, f"next: {missing}{command}"])
 
 
 def _check(args: argparse.Namespace, progress: Progress) -> Outcome:
@@ -79,5 +80,5 @@ def told(checked: CheckedSurvey, *, fault: str) -> list[str]:
     return [
         *checked.understood(),
         *(f"warning: {text}" for text in checked.warnings),
-        *(f"{fault}: {line}" for error in checked.faults for line in (str(error), *error.advice)),
+        *("\n  ".join([f"{fault}: {error}", *error.advice]) for error in checked.faults),
     ]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rangesfm.ranging.anchors.anchor_survey import AnchorPlacement
     from rangesfm.ranging.errors.calibration import Calibration
     from rangesfm.ranging.log import RangeLog
-    from rangesfm.ranging.summary import AnchorSummary, PairSummary, RangeSummary
+    from rangesfm.ranging.summary import LinkSummary, RangeSummary
 
 _Value = TypeVar("_Value")
 
@@ -226,11 +226,13 @@ def _summary(summary: RangeSummary, of_reading: Sequence[str]) -> list[str]:
     from rangesfm.files.tables import align_rows
 
     step_m = summary.quantization_m
+    between = {"anchor": 0, "tag": 0}
+    for pair in summary.pairs:
+        between[pair.kind.split("-")[0]] += pair.num
     notes = {
         f"{summary.num_duplicates} ranges stand in the log twice": summary.num_duplicates,
         f"{summary.num_out_of_order} ranges are earlier than the one before them": summary.num_out_of_order,
-        f"{summary.num_between_anchors} ranges are between two anchors": summary.num_between_anchors,
-        f"{summary.num_between_tags} ranges are between two tags": summary.num_between_tags,
+        **{f"{num} ranges are between two {end}s": num for end, num in between.items()},
         f"all ranges are multiples of {step_m} m: rounded": step_m,
     }
     # The noise only where there are enough ranges to tell it.
@@ -238,7 +240,7 @@ def _summary(summary: RangeSummary, of_reading: Sequence[str]) -> list[str]:
     rows = [["anchor", *_LENGTHS, *(["noise m"] if has_noise else []), "largest gap s"]]
     for anchor in summary.anchors:
         noise = [_number(anchor.noise_stddev_m)] if has_noise else []
-        rows.append([anchor.anchor_id, *_lengths(anchor), *noise, _number(anchor.largest_gap_s)])
+        rows.append([*anchor.ids, *_lengths(anchor), *noise, _number(anchor.largest_gap_s)])
     pairs = [[pair.kind, " - ".join(pair.ids), *_lengths(pair)] for pair in summary.pairs]
     return [
         f"format  {summary.format}",
@@ -267,7 +269,7 @@ def _time(summary: RangeSummary) -> str:
     return span + rate + f", largest gap {_number(summary.largest_gap_s)} s"
 
 
-def _lengths(ranges: AnchorSummary | PairSummary) -> list[str]:
+def _lengths(ranges: LinkSummary) -> list[str]:
     return [str(ranges.num), *map(_number, (ranges.min_m, ranges.median_m, ranges.max_m))]
 
 

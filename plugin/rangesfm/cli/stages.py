@@ -28,6 +28,7 @@ _SCALE_KEYS = (
         "tag",
         "mapper.num_threads",
         "scale",
+        "markers",
     ),
     *("export", "report", "output"),
 )
@@ -83,9 +84,9 @@ def _run(args: argparse.Namespace, progress: Progress) -> Outcome:
             progress.message(fact)
     if survey.model_path is None:
         _require_images(survey)
-        _require_ranges(survey)
+        survey.require_metres()
     else:
-        _require_model_and_ranges(survey)
+        _require_model_and_metres(survey)
     if not args.live:
         return Outcome(_run_or_refine(survey, progress, args.restart).lines)
     from rangesfm.files.atomic import sole_writer
@@ -149,7 +150,7 @@ def _scale(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm scale --input_path sparse/0 --ranges uwb.csv --images images.csv --output_path out
     """
     survey = survey_from_arguments(args)
-    _require_model_and_ranges(survey)
+    _require_model_and_metres(survey)
     from rangesfm.workflows.run import scale_model
 
     return Outcome(scale_model(survey, progress=progress).lines)
@@ -164,7 +165,7 @@ def _refine(args: argparse.Namespace, progress: Progress) -> Outcome:
         --images images.csv --tag_in_cam -0.0012,-0.09,-0.0663 --output_path out
     """
     survey = survey_from_arguments(args)
-    _require_model_and_ranges(survey)
+    _require_model_and_metres(survey)
     from rangesfm.workflows.run import refine_model
 
     return Outcome(refine_model(survey, progress=progress).lines)
@@ -193,14 +194,9 @@ def _require_images(survey: Survey) -> None:
         raise InputError("no such folder of photos, video or bag", survey.images.path)
 
 
-def _require_model_and_ranges(survey: Survey) -> None:
+def _require_model_and_metres(survey: Survey) -> None:
     if survey.model_path is None:
         raise InputError("no model: give --input_path MODEL, the folder of a COLMAP model such as sparse/0")
     if not os.path.isdir(survey.model_path):
         raise InputError("no such folder of a COLMAP model", survey.model_path)
-    _require_ranges(survey)
-
-
-def _require_ranges(survey: Survey) -> None:
-    if survey.ranges.path is None:
-        raise InputError("no ranges: give [ranges] path in a survey file, or --ranges LOG")
+    survey.require_metres()

@@ -12,11 +12,11 @@ import numpy.typing as npt
 import pycolmap
 
 from rangesfm.arrays import Array
-from rangesfm.distances.tape import CHECK, CONTROL, Marker, Tape, TapedDistance
+from rangesfm.distances.tape import CONTROL, Marker, Tape, TapedDistance
 from rangesfm.errors import InputError
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.noise import shared_stddev
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.log import RangeKind, RangeLog
 
 # Marks of one point further from it than this share of the photo's size are of different points.
 _MAX_REPROJECTION = 0.02
@@ -36,6 +36,9 @@ class LocatedDistances:
         anchor_pair: (k, 2) int, the two anchors; -1 between points.
         distance_m, stddev_m: (k,) as measured.
         is_check: (k,) bool, those that have no say.
+        ends: (k, 2, 3) the points, in the model's unit; NaN where nobody said.
+        mark_stddev: (k,) what marks in photos do to the model's length, in its unit.
+        is_printed: (k,) bool, sides of tags, which were printed alike: what one is too long, all are.
     """
 
     model_length: Array
@@ -43,6 +46,37 @@ class LocatedDistances:
     distance_m: Array
     stddev_m: Array
     is_check: npt.NDArray[np.bool_]
+    ends: Array
+    mark_stddev: Array
+    is_printed: npt.NDArray[np.bool_]
+
+    @classmethod
+    def of(
+        cls,
+        distance_m: Array,
+        stddev_m: Array,
+        *,
+        model_length: Array | None = None,
+        anchor_pair: npt.NDArray[np.int64] | None = None,
+    ) -> LocatedDistances:
+        """All control, between points that are anywhere, or between anchors."""
+        k = len(distance_m)
+        nothing = np.zeros(k, dtype=bool)
+        return cls(
+            np.full(k, np.nan) if model_length is None else model_length,
+            np.full((k, 2), -1, dtype=np.int64) if anchor_pair is None else anchor_pair,
+            distance_m,
+            stddev_m,
+            nothing,
+            np.full((k, 2, 3), np.nan),
+            np.zeros(k),
+            nothing,
+        )
+
+    @property
+    def is_between_points(self) -> npt.NDArray[np.bool_]:
+        """(k,)"""
+        return np.asarray(self.anchor_pair[:, 0] < 0)
 
     def __len__(self) -> int:
         return len(self.distance_m)
@@ -75,24 +109,31 @@ def locate_distances(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Seq
             distance from an anchor to what is none, and marks that are too few, seen from one direction only, or not
             of one point.
     """
-    images = images_by_name(model)
-    points = {name: image.projection_center() for name, image in images.items()} | triangulate_markers(tape, model)
-    lengths = np.full(len(tape.distances), np.nan)
+    images, markers = images_by_name(model), triangulate_markers(tape, model)
+    points = {name: image.projection_center() for name, image in images.items()} | markers
+    ends, mark_stddev = np.full((len(tape.distances), 2, 3), np.nan), np.zeros(len(tape.distances))
     pairs = np.full((len(tape.distances), 2), -1, dtype=np.int64)
     for row, taped in enumerate(tape.distances):
         start, end = taped.ends
         if start in points and end in points:
-            lengths[row] = np.linalg.norm(points[start] - points[end])
+            ends[row] = points[start], points[end]
+            marked = [((tape.markers or {})[name], points[name]) for name in taped.ends if name in markers]
+            of_ends = [_mark_covariance(marker, point, images) for marker, point in marked]
+            along = (ends[row, 1] - ends[row, 0]) / max(float(np.linalg.norm(ends[row, 1] - ends[row, 0])), 1e-12)
+            mark_stddev[row] = np.sqrt(sum(along @ covariance @ along for covariance in of_ends))
         elif start in anchor_ids and end in anchor_ids:
             pairs[row] = anchor_ids.index(start), anchor_ids.index(end)
         else:
             raise InputError(_what_is_wrong(taped, points, anchor_ids), tape.distances_path, taped.line)
     return LocatedDistances(
-        lengths,
+        np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1),
         pairs,
         np.array([taped.distance_m for taped in tape.distances], dtype=np.float64),
         np.array([taped.stddev_m for taped in tape.distances], dtype=np.float64),
-        np.array([taped.kind == CHECK for taped in tape.distances], dtype=bool),
+        np.array([taped.kind != CONTROL for taped in tape.distances], dtype=bool),
+        ends,
+        mark_stddev,
+        np.array([taped.is_printed for taped in tape.distances], dtype=bool),
     )
 
 
@@ -166,6 +207,31 @@ def _triangulate(name: str, marker: Marker, images: dict[str, pycolmap.Image], t
     return point
 
 
+def _mark_covariance(marker: Marker, point: Array, images: dict[str, pycolmap.Image]) -> Array:
+    """(3, 3) of a marker's place, by how well it is marked in each photo."""
+    information = np.zeros((3, 3))
+    for view in (images[name] for name in marker.image_names if name in images):
+        step = 1e-4 * float(np.linalg.norm(point - view.projection_center()))
+        moved = [view.project_point(point + by) for by in step * np.vstack([np.eye(3), -np.eye(3)])]
+        if all(at is not None for at in moved):
+            plus, minus = np.array(moved, dtype=np.float64).reshape(2, 3, 2)
+            slopes = (plus - minus) / (2 * step)
+            information += slopes @ slopes.T / marker.stddev_px**2
+    return np.asarray(np.linalg.pinv(information, hermitian=True))
+
+
+def locatable(tape: Tape, model: pycolmap.Reconstruction) -> Tape:
+    """Without the tags of which a corner has no place in the model; what somebody marked is his to correct."""
+    images, lost = images_by_name(model), set[str]()
+    for name, marker in tape.found_markers.items():
+        try:
+            _triangulate(name, marker, images, tape)
+        except InputError:
+            lost.add(name)
+    kept = (taped for taped in tape.distances if not (taped.is_printed and lost.intersection(taped.ends)))
+    return replace(tape, distances=tuple(kept))
+
+
 def _cam_from_world_at(origin: Array, image: pycolmap.Image) -> Array:
     """(3, 4) for a world whose origin is at ``origin``."""
     pose = image.cam_from_world().matrix()
@@ -199,24 +265,20 @@ def distances_by_radio(
         bias_m, bias_stddev_m: (num_anchors,) what each anchor's ranges read too long, as far as that is known.
         common_bias_stddev_m: of what all ranges between anchors read too long.
     """
-    ranges = log.anchor_anchor_ranges()
+    ranges = log.peer_ranges(RangeKind.ANCHOR_ANCHOR)
+    range_m, given = log.range_m[ranges.rows], log.range_stddev_m[ranges.rows]
     pairs, index = np.unique(np.sort(ranges.ends, axis=1), axis=0, return_inverse=True)
     index = index.reshape(-1)
     count = np.bincount(index, minlength=len(pairs))
-    noise = np.where(np.isfinite(ranges.range_stddev_m), ranges.range_stddev_m, noise_m)
-    medians = np.array([np.median(ranges.range_m[index == k]) for k in range(len(pairs))])
+    noise = np.where(np.isfinite(given), given, noise_m)
+    medians = np.array([np.median(range_m[index == k]) for k in range(len(pairs))])
     mean_square = np.bincount(index, noise**2, len(pairs)) / count
     shared = np.bincount(index, shared_stddev(log)[ranges.rows], len(pairs)) / count
     first, second = pairs.reshape(-1, 2).T
     variance = _MEDIAN_OVER_MEAN**2 * mean_square / count + shared**2 + common_bias_stddev_m**2
     variance += bias_stddev_m[first] ** 2 + bias_stddev_m[second] ** 2
-    return LocatedDistances(
-        model_length=np.full(len(pairs), np.nan),
-        anchor_pair=pairs.reshape(-1, 2),
-        distance_m=medians - (bias_m[first] + bias_m[second]) / 2,
-        stddev_m=np.sqrt(variance),
-        is_check=np.zeros(len(pairs), dtype=bool),
-    )
+    corrected_m = medians - (bias_m[first] + bias_m[second]) / 2
+    return LocatedDistances.of(corrected_m, np.sqrt(variance), anchor_pair=pairs.reshape(-1, 2))
 
 
 def surveyed_distances(anchors: Sequence[Anchor]) -> tuple[TapedDistance, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,11 +16,17 @@ from rangesfm.files.records import Number, NumberOrNull, Record, Text
 from rangesfm.files.tables import Table, has_columns, read_table
 
 CONTROL, CHECK = "control", "check"
+# Of one that cannot belong to the map.
+LEFT_OUT = "left out"
 # What a steel tape and a steady hand are good for.
 DEFAULT_STDDEV_M = 0.01
 _DISTANCE_COLUMNS = ("from", "to", "distance_m")
 _PIXELS = ("x_px", "y_px")
 _MARKER_COLUMNS = ("marker", "image_name", *_PIXELS)
+_CLICKED_STDDEV_PX = 1.0
+FOUND_STDDEV_PX = 0.3
+"""Of a corner that a library found."""
+
 # Of stddevs; one honest distance in three hundred is further off.
 _DISAGREES = 3.0
 
@@ -35,6 +41,7 @@ class TapedDistance:
         stddev_m: of the measurement.
         kind: "control" (it holds the scale) or "check" (it is compared with the result).
         line: in the file.
+        is_printed: whether it is the side of a tag that was found in photos.
     """
 
     ends: tuple[str, str]
@@ -42,21 +49,24 @@ class TapedDistance:
     stddev_m: float
     kind: str
     line: int
+    is_printed: bool = False
 
 
 @dataclass(frozen=True)
 class Marker:
-    """A point of the scene, marked by hand in k photos.
+    """A point of the scene, marked in k photos by hand, or found in them.
 
     Attributes:
         image_names: k names.
         pixels: (k, 2) x and y in COLMAP's convention: the centre of the first pixel is (0.5, 0.5).
         lines: (k,) in the file.
+        stddev_px: of each coordinate.
     """
 
     image_names: tuple[str, ...]
     pixels: npt.NDArray[np.float64]
     lines: tuple[int, ...]
+    stddev_px: float = _CLICKED_STDDEV_PX
 
 
 @dataclass(frozen=True)
@@ -77,6 +87,21 @@ class Tape:
     def control(self) -> Tape:
         """The distances that are to be kept to."""
         return replace(self, distances=tuple(taped for taped in self.distances if taped.kind == CONTROL))
+
+    @property
+    def found_markers(self) -> dict[str, Marker]:
+        """Those that nobody marked by hand."""
+        of_all = (self.markers or {}).items()
+        return {name: marker for name, marker in of_all if marker.stddev_px == FOUND_STDDEV_PX}
+
+    def with_tags(self, markers: Mapping[str, Marker], sides: tuple[TapedDistance, ...]) -> Tape:
+        """With what was found in photos as well; names that somebody gave to marks of his own stay his."""
+        return replace(self, distances=self.distances + sides, markers={**markers, **(self.markers or {})})
+
+    def without(self, rows: Collection[int]) -> Tape:
+        """With some of the distances, by their numbers, as left out."""
+        distances = (replace(taped, kind=LEFT_OUT) if k in rows else taped for k, taped in enumerate(self.distances))
+        return replace(self, distances=tuple(distances))
 
 
 def is_distances_file(head: str) -> bool:
@@ -113,17 +138,14 @@ def _distances(table: Table) -> tuple[TapedDistance, ...]:
         if kind not in (CONTROL, CHECK):
             raise table.error(row, "kind", f"{CONTROL} or {CHECK}")
     lengths = _positive(table, "distance_m", "a number of metres greater than 0", empty=None)
-    stddevs = np.full(len(table), DEFAULT_STDDEV_M)
-    if "stddev_m" in table:
-        stddevs = _positive(table, "stddev_m", "a number of metres greater than 0, or nothing", empty=DEFAULT_STDDEV_M)
+    stddevs = _positive(table, "stddev_m", "a number of metres greater than 0, or nothing", empty=DEFAULT_STDDEV_M)
     rows = zip(starts, ends, lengths.tolist(), stddevs.tolist(), kinds, table.line.tolist(), strict=True)
     return tuple(TapedDistance((a, b), length, stddev, kind, line) for a, b, length, stddev, kind, line in rows)
 
 
 def _positive(table: Table, column: str, expected: str, *, empty: float | None) -> npt.NDArray[np.float64]:
     values = table.numbers(column, empty=empty, expected=expected)
-    if np.any(values <= 0):
-        raise table.error(int(np.argmax(values <= 0)), column, expected)
+    table.refuse(values <= 0, column, expected)
     return values
 
 
@@ -172,15 +194,18 @@ def distance_rows(tape: Tape, lengths_m: npt.NDArray[np.float64]) -> list[Distan
     ]
 
 
-def disagreements(rows: Iterable[DistanceRow], relative_scale_stddev: float) -> Iterator[str]:
-    """What to tell of distances that the map misses by more than tape and scale explain.
+def disagreements(rows: Iterable[DistanceRow], relative_scale_stddev: float, bending: float = 0.0) -> Iterator[str]:
+    """What to tell of distances that the map misses by more than tape, scale and bending explain.
 
-    A control distance has held the scale already, so that only the tape's own error excuses it.
+    A control distance has held the scale already, so that the scale's error does not excuse it.
+
+    Args:
+        bending: stddev by which the scale varies from place to place, relative.
     """
     for row in rows:
-        scale_stddev_m = relative_scale_stddev * row.measured_m if row.kind == CHECK else 0.0
-        stddev_m = math.hypot(row.stddev_m, scale_stddev_m)
-        if row.residual_m is not None and abs(row.residual_m) > _DISAGREES * stddev_m:
+        of_scale = relative_scale_stddev if row.kind == CHECK else 0.0
+        stddev_m = math.hypot(row.stddev_m, of_scale * row.measured_m, bending * row.measured_m)
+        if row.kind != LEFT_OUT and row.residual_m is not None and abs(row.residual_m) > _DISAGREES * stddev_m:
             yield (
                 f"{row.kind} distance from {row.from_} to {row.to}: {row.estimated_m:.3f} m in the map, "
                 f"{row.measured_m:.3f} m by tape ({row.residual_m:+.3f} m, expected within "

@@ -116,10 +116,12 @@ class Table:
         """The cells as finite numbers, (n,).
 
         Args:
-            empty: stands for empty cells, which are refused if it is None.
+            empty: stands for empty cells, which are refused if it is None, and for a column that is not there.
             missing: what an empty cell may look like, in small letters.
             expected: what the message calls a good cell.
         """
+        if column not in self and empty is not None:
+            return np.full(len(self), empty)
         cells = self.cells[column]
         values = np.array(list(map(_number, cells)), np.float64) if isinstance(cells, list) else cells
         bad = np.flatnonzero(~np.isfinite(values)).tolist()
@@ -135,6 +137,11 @@ class Table:
         cell = self._raw(column)[row].strip()
         found = "empty" if not cell else cell if _number(cell) is not None else f"'{printable(cell)}'"
         return InputError(f"{column} is {found}, expected {expected}", self.path, int(self.line[row]))
+
+    def refuse(self, wrong: npt.NDArray[np.bool_], column: str, expected: str) -> None:
+        """The error of the first row that is (n,) ``wrong``, if any is."""
+        if wrong.any():
+            raise self.error(int(np.argmax(wrong)), column, expected)
 
     def _raw(self, column: str) -> list[str]:
         cells = self.cells[column]

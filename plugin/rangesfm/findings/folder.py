@@ -76,7 +76,9 @@ def look_into(folders: Sequence[Path]) -> Found:
                 not_read[path.suffix.lower()].append(path)
             elif path.is_dir() and not is_bag_folder(path):
                 if _is_model(path):
-                    notes.append(f"{path.name} is a COLMAP model: rangesfm refine --input_path {path} begins with it")
+                    notes.append(
+                        f"{path} is a COLMAP model, from which rangesfm refine SURVEY.toml --input_path {path} goes on"
+                    )
                 else:
                     paths[PHOTOS].append(path)
             elif is_video(path):

@@ -80,7 +80,7 @@ def understand(folders: Sequence[Path], given: Mapping[str, object]) -> Understo
             notes.append(f"left out, as {chosen.name} is there: {others}")
     if questions:
         raise InputError("more than one survey could be meant", folders[0], advice=questions)
-    if not {PHOTOS, LOG} & values.keys():
+    if not {PHOTOS, LOG, "scale.distances"} & values.keys():
         raise InputError("neither photos nor a radio's log in there", folders[0], advice=notes)
     _add_camera(values, found, notes)
     return Understood(values, tuple(notes))

@@ -9,15 +9,14 @@ import numpy as np
 import pycolmap
 
 from rangesfm.colmap.transform import joined_model, rescale
-from rangesfm.distances.ends import distances_within, locate_distances
+from rangesfm.distances.ends import distances_within, locatable, locate_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory, joined_trajectory
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.joined_observations import each_on_one_path, joined_observations
-from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.observations import RangeObservations, each_on_one_path, joined_observations
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.model_placement import ScaledModel, place_models
@@ -154,7 +153,8 @@ def _alone(part: PathOfModel, ranging: Ranging, *, has_first_camera: bool) -> Sc
     anchor_ids = part.observations.log.anchor_ids
     distances = None
     if ranging.tape is not None:
-        distances = locate_distances(distances_within(ranging.tape, part.sfm, anchor_ids), part.sfm, anchor_ids)
+        within = distances_within(locatable(ranging.tape, part.sfm), part.sfm, anchor_ids)
+        distances = locate_distances(within, part.sfm, anchor_ids)
     estimate = initialize_scale(
         part.observations,
         part.trajectory,

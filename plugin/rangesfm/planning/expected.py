@@ -20,6 +20,7 @@ from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.anchor_plane import mirrored_map
 from rangesfm.scale.estimate import ScaleUncertainty
 from rangesfm.scale.initialize import model_from_cam, placement_covariance
+from rangesfm.scale.lengths import BENDING
 from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import RangeFit, fit_at, range_jacobian, tag_positions
 from rangesfm.scale.solution import Solution, refuse_ambiguity, weighted
@@ -34,6 +35,8 @@ from rangesfm.trust.finished_map import by_similarity
 
 _NUM_NOISE_ROUNDS = 2
 _NUM_COMPARED_RANGES, _NUM_COMPARED_CELLS = 600, 120
+# Of the largest information: less is none.
+_ROUNDING = 1e-20
 OPEN = 1e3
 """Metres, or radians: a number this uncertain is one that nothing determines."""
 
@@ -143,7 +146,7 @@ def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expect
         errors = _as_seen(solution, learned, num_alike)
         solution = _weighed(posed, errors, fit_at(weighted(posed.ranges, errors), state, num_alike))
     covariance = parameter_covariance(solution, learned) + _undetermined(solution.fit)
-    uncertainty = expected_scale_uncertainty(solution, learned)
+    uncertainty = expected_scale_uncertainty(solution, learned, BENDING)
     placement = placement_covariance(solution, covariance)
     return Expected(planned, observations, posed, solution, learned, uncertainty, covariance, placement)
 
@@ -154,7 +157,8 @@ def _weighed(posed: ScaleProblem, errors: RangeErrors, fit: RangeFit) -> Solutio
 
 def _undetermined(fit: RangeFit) -> Array:
     """(p, p) variances without limit in the directions that nothing determines, which least squares leave alone."""
-    sizes = np.sqrt(np.maximum(np.diag(fit.information), 1e-200))
+    of_each = np.diag(fit.information)
+    sizes = np.sqrt(np.maximum(of_each, _ROUNDING * of_each.max()))
     values, vectors = np.linalg.eigh(fit.information / np.outer(sizes, sizes))
     nothing = vectors[:, values < 1e-10] / sizes[:, None]
     lengths = np.linalg.norm(nothing, axis=0)

@@ -130,8 +130,7 @@ class PlannedSurvey:
         if not self.taped:
             return None
         lengths, stddevs = np.array(self.taped, dtype=np.float64).T
-        nowhere = np.full((len(lengths), 2), -1, dtype=np.int64)
-        return LocatedDistances(lengths, nowhere, lengths, stddevs, np.zeros(len(lengths), dtype=bool))
+        return LocatedDistances.of(lengths, stddevs, model_length=lengths)
 
     def state(self, posed: ScaleProblem, anchor_ids: tuple[str, ...]) -> RangeState:
         """The truth, in the frame of the problem."""

@@ -144,7 +144,7 @@ class Plan(BaseModel):
     tag: TagOptions
 
 
-_TABLES: dict[str, type[Options]] = {
+TABLES: dict[str, type[Options]] = {
     "anchors": PlannedAnchorOptions,
     "path": PlannedPathOptions,
     "radio": PlannedRadioOptions,
@@ -162,9 +162,9 @@ def read_plan(path: str | Path) -> PlannedSurvey:
     tables, source = parse_toml(Path(path))
     folder = Path(path).absolute().parent
     with source.naming_lines():
-        refuse_unknown_tables(tables, _TABLES)
+        refuse_unknown_tables(tables, TABLES)
         options: dict[str, Any] = {
-            name: model(**_absolute(tables.get(name, {}), model, folder)) for name, model in _TABLES.items()
+            name: model(**_absolute(tables.get(name, {}), model, folder)) for name, model in TABLES.items()
         }
         plan = Plan(**options)
         return _planned(plan)

@@ -9,11 +9,10 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from rangesfm.arrays import Array, Mask
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
 from rangesfm.geometry.trajectory import ROUNDING_S, Trajectory
 from rangesfm.options import AssociationOptions
-from rangesfm.ranging.clock.time_resolution import time_resolution_s
 from rangesfm.ranging.errors.noise import robust_stddev
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
@@ -106,7 +105,7 @@ def lever_arms(log: RangeLog, tag_in_cam_m: npt.ArrayLike) -> Array:
 
 def _places_by_name(
     image_names: tuple[str, ...], trajectory: Trajectory, status: npt.NDArray[np.int8]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Array]:
+) -> tuple[Indices, Indices, Array]:
     index_of = {name: index for index, name in enumerate(trajectory.image_names)}
     keyframe = np.array([index_of.get(name, -1) for name in image_names], dtype=np.int64)
     status[keyframe < 0] = RangeStatus.UNKNOWN_IMAGE
@@ -115,7 +114,7 @@ def _places_by_name(
 
 def _places_by_time(
     log: RangeLog, times: Array, keyframe_times: Array, options: AssociationOptions, status: npt.NDArray[np.int8]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Array]:
+) -> tuple[Indices, Indices, Array]:
     """Keyframes around each time, and the weight of the later one. Sets ``status`` where there is no place."""
     last = len(keyframe_times) - 1
     after = np.clip(np.searchsorted(keyframe_times, times), min(1, last), last)
@@ -148,12 +147,7 @@ def _keyframe_is_isolated(keyframe_times: Array, options: AssociationOptions) ->
 
 
 def _camera_is_still(
-    log: RangeLog,
-    nearest: npt.NDArray[np.int64],
-    distance: Array,
-    times: Array,
-    candidates: Mask,
-    keyframe_times: Array,
+    log: RangeLog, nearest: Indices, distance: Array, times: Array, candidates: Mask, keyframe_times: Array
 ) -> Mask:
     """(n,) whether ranges this far from an isolated photo were taken where the photo was.
 
@@ -196,8 +190,8 @@ def _observe(
     trajectory: Trajectory,
     tags_in_cam_m: Array,
     status: npt.NDArray[np.int8],
-    before: npt.NDArray[np.int64],
-    after: npt.NDArray[np.int64],
+    before: Indices,
+    after: Indices,
     weight: Array,
     options: AssociationOptions,
 ) -> RangeObservations:
@@ -223,9 +217,7 @@ def _observe(
     return RangeObservations(log, status, before, after, weight, centers, offsets, lever, stddev)
 
 
-def _turned_lever_arms(
-    trajectory: Trajectory, tags_in_cam_m: Array, before: npt.NDArray[np.int64], weight: Array
-) -> Array:
+def _turned_lever_arms(trajectory: Trajectory, tags_in_cam_m: Array, before: Indices, weight: Array) -> Array:
     """(n, 3) lever arms in the world, part of the shortest turn from one keyframe to the next."""
     rotations = trajectory.world_from_cam
     if np.any(weight > 0):
@@ -237,21 +229,14 @@ def _turned_lever_arms(
 
 
 def _timing_stddev(
-    log: RangeLog,
-    trajectory: Trajectory,
-    before: npt.NDArray[np.int64],
-    after: npt.NDArray[np.int64],
-    weight: Array,
-    options: AssociationOptions,
+    log: RangeLog, trajectory: Trajectory, before: Indices, after: Indices, weight: Array, options: AssociationOptions
 ) -> Array:
     """(n,) how far the camera moves, each coordinate, within the rounding of photo and range times.
 
     Uniform rounding to a step has the stddev step / sqrt(12), each time its own.
     """
     times, centers = trajectory.timestamps_s, trajectory.centers
-    log_stddev_s, photo_stddev_s = (
-        step / np.sqrt(12) for step in (time_resolution_s(log), trajectory.time_resolution_s)
-    )
+    log_stddev_s, photo_stddev_s = (each.time_resolution_s / np.sqrt(12) for each in (log, trajectory))
     if times is None or len(times) < 2 or not log_stddev_s + photo_stddev_s > 0:
         return np.zeros(len(before))
     gaps = np.diff(times)
@@ -264,7 +249,7 @@ def _timing_stddev(
 
 
 def _curve_beyond_line(
-    times: Array, centers: Array, before: npt.NDArray[np.int64], weight: Array, options: AssociationOptions
+    times: Array, centers: Array, before: Indices, weight: Array, options: AssociationOptions
 ) -> tuple[Array, Array]:
     """What a cubic spline has beyond the chord at each place, and how far the spline can be trusted."""
     offsets, stddev = np.zeros((len(before), 3)), np.zeros(len(before))

@@ -7,13 +7,17 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.files.tables import Categories
 
 DEFAULT_TAG_ID = "tag"
+# Two ranges of one radio to another take time: if this share of them has the time of the one before, it was rounded.
+_MIN_REPEATED_SHARE = 0.25
 
 
 class RangeKind(IntEnum):
@@ -24,23 +28,18 @@ class RangeKind(IntEnum):
     TAG_TAG = 2
 
 
-@dataclass(frozen=True)
-class PeerRanges:
+class PeerRanges(NamedTuple):
     """k ranges between two anchors, or between two tags.
 
     Attributes:
         rows: (k,) which ranges of the log these are.
         ends: (k, 2) int, the two nodes, into the log's ``anchor_ids`` or ``tag_ids``.
         end_ids: k pairs of their ids.
-        range_m: (k,) metres.
-        range_stddev_m: (k,) metres, NaN where the log does not say.
     """
 
-    rows: npt.NDArray[np.int64]
-    ends: npt.NDArray[np.int64]
+    rows: Indices
+    ends: Indices
     end_ids: tuple[tuple[str, str], ...]
-    range_m: npt.NDArray[np.float64]
-    range_stddev_m: npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -71,21 +70,21 @@ class RangeLog:
     """
 
     anchor_ids: tuple[str, ...]
-    anchor_index: npt.NDArray[np.int64]
-    range_m: npt.NDArray[np.float64]
-    timestamp_s: npt.NDArray[np.float64] | None
+    anchor_index: Indices
+    range_m: Array
+    timestamp_s: Array | None
     image_name: tuple[str, ...] | None
-    range_stddev_m: npt.NDArray[np.float64]
+    range_stddev_m: Array
     tag_ids: tuple[str, ...]
-    tag_index: npt.NDArray[np.int64]
-    peer_index: npt.NDArray[np.int64]
+    tag_index: Indices
+    peer_index: Indices
     los: npt.NDArray[np.int8]
-    line: npt.NDArray[np.int64]
+    line: Indices
     source: Path | None = None
     format: str = "memory"
     num_no_measurement: int = 0
     notes: tuple[str, ...] = ()
-    shared_stddev_m: npt.NDArray[np.float64] | None = None
+    shared_stddev_m: Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.range_m)
@@ -114,7 +113,7 @@ class RangeLog:
         return kind
 
     @property
-    def own_order(self) -> npt.NDArray[np.int64]:
+    def own_order(self) -> Indices:
         """(n,) the rows by anchor, time, tag and range.
 
         The order in which the log has them has no say in what is made of them then, not by random draws and not by how
@@ -127,20 +126,30 @@ class RangeLog:
         )
         return np.lexsort((self.range_m, self.peer_index, self.tag_index, when, self.anchor_index))
 
-    def anchor_anchor_ranges(self) -> PeerRanges:
-        """The ranges between two anchors: distances that do not depend on the camera."""
-        return self._peer_ranges(RangeKind.ANCHOR_ANCHOR, first_node=0)
+    @property
+    def time_resolution_s(self) -> float:
+        """The step of the times, of a host's whole seconds or of lines in batches; 0 if none is seen.
 
-    def tag_tag_ranges(self) -> PeerRanges:
-        """The ranges between two tags."""
-        return self._peer_ranges(RangeKind.TAG_TAG, first_node=len(self.anchor_ids))
+        Any step is seen that is longer than the ranges between one tag and one anchor are apart.
+        """
+        times = self.timestamp_s
+        if times is None or len(self) < 2:
+            return 0.0
+        link = self.tag_index * len(self.anchor_ids) + self.anchor_index
+        order = np.lexsort((times, link))
+        steps = np.diff(times[order])[np.diff(link[order]) == 0]
+        if not len(steps) or np.mean(steps == 0) < _MIN_REPEATED_SHARE:
+            return 0.0
+        between = np.diff(np.unique(times))
+        return float(np.median(between)) if len(between) else 0.0
 
-    def _peer_ranges(self, kind: RangeKind, first_node: int) -> PeerRanges:
+    def peer_ranges(self, kind: RangeKind) -> PeerRanges:
+        """The ranges between two anchors, distances that do not depend on the camera; or those between two tags."""
         rows = np.flatnonzero(self.kind == kind)
         ids, first, second = self._ends()
         ends = np.column_stack([first[rows], second[rows]])
-        end_ids = tuple((ids[one], ids[other]) for one, other in ends.tolist())
-        return PeerRanges(rows, ends - first_node, end_ids, self.range_m[rows], self.range_stddev_m[rows])
+        first_node = 0 if kind == RangeKind.ANCHOR_ANCHOR else len(self.anchor_ids)
+        return PeerRanges(rows, ends - first_node, tuple((ids[one], ids[other]) for one, other in ends.tolist()))
 
     def end_ids(self) -> tuple[list[str], list[str]]:
         """The ids of each range's two ends: n tags (or peers, where there is none) and n anchors (or peers)."""
@@ -148,7 +157,7 @@ class RangeLog:
         texts = np.array(ids, dtype=object)
         return texts[first].tolist(), texts[second].tolist()
 
-    def _ends(self) -> tuple[list[str], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    def _ends(self) -> tuple[list[str], Indices, Indices]:
         """Ids of all anchors and then all tags, and (n,) and (n,) into them: both ends of each range."""
         num_anchors = len(self.anchor_ids)
         first = np.where(self.tag_index < 0, self.peer_index, num_anchors + self.tag_index)
@@ -163,13 +172,7 @@ class RangeLog:
         is_anchor = np.array([node_id in anchor_ids for node_id in node_of], dtype=bool)
         return self._between(list(node_of), is_anchor, node[first], node[second])
 
-    def _between(
-        self,
-        ids: list[str],
-        is_anchor: npt.NDArray[np.bool_],
-        first: npt.NDArray[np.int64],
-        second: npt.NDArray[np.int64],
-    ) -> RangeLog:
+    def _between(self, ids: list[str], is_anchor: Mask, first: Indices, second: Indices) -> RangeLog:
         """The same ranges between other nodes; those without ranges are forgotten."""
         swapped = is_anchor[first] & ~is_anchor[second]
         first, second = np.where(swapped, second, first), np.where(swapped, first, second)
@@ -190,22 +193,15 @@ class RangeLog:
             peer_index=index[peer],
         )
 
-    def subset(self, rows: npt.NDArray[np.int64] | npt.NDArray[np.bool_]) -> RangeLog:
+    def subset(self, rows: Indices | Mask) -> RangeLog:
         """The same log with some of its ranges; anchors and tags that are left without any are forgotten."""
         rows = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
-        chosen = replace(
-            self,
-            anchor_index=self.anchor_index[rows],
-            range_m=self.range_m[rows],
-            timestamp_s=None if self.timestamp_s is None else self.timestamp_s[rows],
-            image_name=None if self.image_name is None else tuple(self.image_name[i] for i in rows),
-            range_stddev_m=self.range_stddev_m[rows],
-            tag_index=self.tag_index[rows],
-            peer_index=self.peer_index[rows],
-            los=self.los[rows],
-            line=self.line[rows],
-            shared_stddev_m=None if self.shared_stddev_m is None else self.shared_stddev_m[rows],
-        )
+        columns: dict[str, Any] = {
+            name: values[rows] for name, values in vars(self).items() if isinstance(values, np.ndarray)
+        }
+        if self.image_name is not None:
+            columns["image_name"] = tuple(self.image_name[row] for row in rows)
+        chosen = replace(self, **columns)
         ids, first, second = chosen._ends()
         return chosen._between(ids, np.arange(len(ids)) < len(self.anchor_ids), first, second)
 
@@ -221,39 +217,31 @@ class RangeLog:
         tag_id: Sequence[str] | Categories | None = None,
         los: npt.ArrayLike | None = None,
         line: npt.ArrayLike | None = None,
-        source: Path | None = None,
-        format: str = "memory",
-        num_no_measurement: int = 0,
-        notes: tuple[str, ...] = (),
-        shared_stddev_m: npt.ArrayLike | None = None,
+        **of_log: Any,
     ) -> RangeLog:
         """Build a log from one value (or one string) per range; optional columns may be left out.
 
         Each range is between the tag and the anchor of its row; ``with_anchors`` tells those between two of a kind.
+
+        Args:
+            of_log: ``source``, ``format``, ``num_no_measurement`` and ``notes``.
         """
-        ranges = np.asarray(range_m, dtype=np.float64)
-        n = len(ranges)
+        n = np.size(range_m)
         anchor = _categories(anchor_id)
-        tag = _categories(tag_id) if tag_id is not None else _only(DEFAULT_TAG_ID, n)
+        tag = _categories([DEFAULT_TAG_ID] * n if tag_id is None else tag_id)
         return cls(
             anchor_ids=anchor.names,
             anchor_index=anchor.index,
-            range_m=ranges,
-            timestamp_s=None if timestamp_s is None else np.asarray(timestamp_s, dtype=np.float64),
+            range_m=np.asarray(range_m, np.float64),
+            timestamp_s=None if timestamp_s is None else np.asarray(timestamp_s, np.float64),
             image_name=None if image_name is None else tuple(image_name),
-            range_stddev_m=np.full(n, np.nan)
-            if range_stddev_m is None
-            else np.asarray(range_stddev_m, dtype=np.float64),
+            range_stddev_m=np.full(n, np.nan) if range_stddev_m is None else np.asarray(range_stddev_m, np.float64),
             tag_ids=tag.names,
             tag_index=tag.index,
             peer_index=np.full(n, -1),
-            los=np.full(n, -1, dtype=np.int8) if los is None else np.asarray(los, dtype=np.int8),
-            line=np.arange(1, n + 1) if line is None else np.asarray(line, dtype=np.int64),
-            source=source,
-            format=format,
-            num_no_measurement=num_no_measurement,
-            notes=notes,
-            shared_stddev_m=None if shared_stddev_m is None else np.asarray(shared_stddev_m, dtype=np.float64),
+            los=np.full(n, -1, np.int8) if los is None else np.asarray(los, np.int8),
+            line=np.arange(1, n + 1) if line is None else np.asarray(line, np.int64),
+            **of_log,
         )
 
 
@@ -267,7 +255,3 @@ def _as_people_count(name: str) -> tuple[list[tuple[str, int, str]], str]:
     """A key that sorts A2 before A10."""
     parts = [(text, digits.lstrip("0")) for text, digits in re.findall("([^0-9]*)([0-9]*)", name)]
     return [(text, len(number), number) for text, number in parts], name
-
-
-def _only(id: str, num: int) -> Categories:
-    return Categories((id,) if num else (), np.zeros(num, np.int64))

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
+from rangesfm.geometry.similarity import Similarity
 from rangesfm.options import CheckOptions
 from rangesfm.ranging.log import RangeLog
 
@@ -57,21 +61,21 @@ class RangeObservations:
 
     log: RangeLog
     status: npt.NDArray[np.int8]
-    before: npt.NDArray[np.int64]
-    after: npt.NDArray[np.int64]
-    weight: npt.NDArray[np.float64]
-    centers: npt.NDArray[np.float64]
-    center_offsets: npt.NDArray[np.float64]
-    tag_from_center: npt.NDArray[np.float64]
-    center_stddev: npt.NDArray[np.float64]
+    before: Indices
+    after: Indices
+    weight: Array
+    centers: Array
+    center_offsets: Array
+    tag_from_center: Array
+    center_stddev: Array
 
     @property
-    def has_place(self) -> npt.NDArray[np.bool_]:
+    def has_place(self) -> Mask:
         """(n,) ranges that estimates may use: on the path, of a wanted anchor, not held out."""
         return np.asarray(self.status <= RangeStatus.OUTLIER)
 
     @property
-    def placed_rows(self) -> npt.NDArray[np.int64]:
+    def placed_rows(self) -> Indices:
         """(k,) rows of those that have a place, in ``log.own_order``."""
         order = self.log.own_order
         return np.asarray(order[self.has_place[order]])
@@ -99,11 +103,11 @@ def hold_out(observations: RangeObservations, checks: CheckOptions, seed: int) -
     return replace(observations, status=status)
 
 
-def _in_time(log: RangeLog, times_s: tuple[float, ...]) -> npt.NDArray[np.bool_]:
+def _in_time(log: RangeLog, times_s: tuple[float, ...]) -> Mask:
     if log.timestamp_s is None:
         raise InputError("check_times_s needs a log with times, this one names photos", log.source)
     first, last = times_s
-    inside: npt.NDArray[np.bool_] = (log.timestamp_s >= first) & (log.timestamp_s <= last)
+    inside: Mask = (log.timestamp_s >= first) & (log.timestamp_s <= last)
     if not inside.any():
         start, end = log.timestamp_s.min(), log.timestamp_s.max()
         # Twelve digits: times may be seconds since 1970.
@@ -117,9 +121,63 @@ DOWN_WEIGHTED_BELOW = 0.5
 OUTLIER_BELOW = 0.1
 
 
-def status_by_weight(weights: npt.NDArray[np.float64]) -> npt.NDArray[np.int8]:
+def status_by_weight(weights: Array) -> npt.NDArray[np.int8]:
     """(n,) status of ranges that took part in an estimate, by their final robust weight in [0, 1]."""
     status = np.full(len(weights), RangeStatus.USED, dtype=np.int8)
     status[weights < DOWN_WEIGHTED_BELOW] = RangeStatus.DOWN_WEIGHTED
     status[weights < OUTLIER_BELOW] = RangeStatus.OUTLIER
     return status
+
+
+def each_on_one_path(parts: Sequence[RangeObservations]) -> list[RangeObservations]:
+    """The same, but a range that has a place on a path has none on those after it."""
+    taken = np.zeros(len(parts[0].log), dtype=bool)
+    exclusive = []
+    for part in parts:
+        status = part.status.copy()
+        status[taken & part.has_place] = RangeStatus.OUTSIDE_PATH
+        taken |= part.has_place
+        exclusive.append(replace(part, status=status))
+    return exclusive
+
+
+def path_of_each(parts: Sequence[RangeObservations]) -> Indices:
+    """(n,) the part in which each range has a place; -1: in none."""
+    number = np.full(len(parts[0].log), -1, dtype=np.int64)
+    for k, part in enumerate(parts):
+        number[(number < 0) & _is_placed(part)] = k
+    return number
+
+
+def joined_observations(
+    parts: Sequence[RangeObservations], joined_from_part: Sequence[Similarity], keyframes: Sequence[Indices]
+) -> RangeObservations:
+    """All ranges on the joined path.
+
+    Args:
+        parts: of one log, each range with a place on one path at most.
+        joined_from_part: world of each path to that of the joined one.
+        keyframes: where the keyframes of each path are in the joined one.
+    """
+    number = path_of_each(parts)
+    joined: dict[str, npt.NDArray[Any]] = {"status": np.min([part.status for part in parts], axis=0)}
+    for k, (part, similarity, keyframe) in enumerate(zip(parts, joined_from_part, keyframes, strict=True)):
+        rows = number == k
+        moved: dict[str, npt.NDArray[Any]] = {
+            "status": part.status,
+            "before": keyframe[part.before],
+            "after": keyframe[part.after],
+            "weight": part.weight,
+            "centers": similarity.apply(part.centers),
+            "center_offsets": similarity.scale * part.center_offsets @ similarity.rotation.T,
+            "tag_from_center": part.tag_from_center @ similarity.rotation.T,
+            "center_stddev": similarity.scale * part.center_stddev,
+        }
+        for name, values in moved.items():
+            joined.setdefault(name, getattr(part, name).copy())[rows] = values[rows]
+    return RangeObservations(parts[0].log, **joined)
+
+
+def _is_placed(part: RangeObservations) -> Mask:
+    """(n,) with a place that counts, be it only as a check."""
+    return np.asarray((part.before >= 0) & (part.has_place | (part.status == RangeStatus.CHECK)))

@@ -6,50 +6,33 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from rangesfm.ranging.errors.noise_of_log import estimate_noise_m
-from rangesfm.ranging.errors.quantization import find_quantization_m, quantization_stddev_m
-from rangesfm.ranging.log import PeerRanges, RangeKind, RangeLog
-
-
-@dataclass(frozen=True)
-class AnchorSummary:
-    """The ranges of tags to one anchor; without times, or with too few ranges, the last two are None.
-
-    Attributes:
-        num: ranges.
-        min_m, median_m, max_m: of them.
-        largest_gap_s: longest time without any.
-        noise_stddev_m: estimated from the log itself, at least that of its rounding.
-    """
-
-    anchor_id: str
-    num: int
-    min_m: float
-    median_m: float
-    max_m: float
-    largest_gap_s: float | None
-    noise_stddev_m: float | None
+from rangesfm.arrays import Array, Mask
+from rangesfm.ranging.errors.noise_of_log import estimate_noise_m, find_quantization_m, quantization_stddev_m
+from rangesfm.ranging.log import RangeKind, RangeLog
 
 
 @dataclass(frozen=True)
-class PairSummary:
-    """The ranges between two anchors, or between two tags.
+class LinkSummary:
+    """The ranges of tags to one anchor, between two anchors, or between two tags.
 
     Attributes:
-        kind: "anchor-anchor" or "tag-tag".
-        ids: both ends.
+        kind: "tag-anchor", "anchor-anchor" or "tag-tag".
+        ids: the anchor, or both ends.
         num: ranges.
         min_m, median_m, max_m: of them.
+        largest_gap_s: longest time without any; None without times or between two of a kind, like the next.
+        noise_stddev_m: estimated from the log itself, at least that of its rounding; None of too few ranges, too.
     """
 
     kind: str
-    ids: tuple[str, str]
+    ids: tuple[str, ...]
     num: int
     min_m: float
     median_m: float
     max_m: float
+    largest_gap_s: float | None = None
+    noise_stddev_m: float | None = None
 
 
 @dataclass(frozen=True)
@@ -61,7 +44,6 @@ class RangeSummary:
         num_no_measurement: records that said that there was none.
         num_duplicates: ranges that stand in the log already: same time, tag, anchor and range.
         num_out_of_order: ranges that are earlier than the one before them.
-        num_between_anchors, num_between_tags: ranges between two of a kind.
         quantization_m: suspected step of all ranges; None if there is none.
         start_s, end_s: first and last time on the radio's clock.
         rate_hz: ranges a second over the whole span.
@@ -75,16 +57,14 @@ class RangeSummary:
     num_no_measurement: int
     num_duplicates: int
     num_out_of_order: int
-    num_between_anchors: int
-    num_between_tags: int
     quantization_m: float | None
     tag_ids: tuple[str, ...]
     start_s: float | None
     end_s: float | None
     rate_hz: float | None
     largest_gap_s: float | None
-    anchors: tuple[AnchorSummary, ...]
-    pairs: tuple[PairSummary, ...]
+    anchors: tuple[LinkSummary, ...]
+    pairs: tuple[LinkSummary, ...]
 
 
 def summarize_ranges(log: RangeLog) -> RangeSummary:
@@ -100,8 +80,6 @@ def summarize_ranges(log: RangeLog) -> RangeSummary:
         num_no_measurement=log.num_no_measurement,
         num_duplicates=_num_duplicates(log),
         num_out_of_order=0 if log.timestamp_s is None else int(np.count_nonzero(np.diff(log.timestamp_s) < 0)),
-        num_between_anchors=int(np.count_nonzero(log.kind == RangeKind.ANCHOR_ANCHOR)),
-        num_between_tags=int(np.count_nonzero(log.kind == RangeKind.TAG_TAG)),
         quantization_m=quantization,
         tag_ids=log.tag_ids,
         start_s=start,
@@ -113,40 +91,34 @@ def summarize_ranges(log: RangeLog) -> RangeSummary:
             for index in np.unique(log.anchor_index[log.kind == RangeKind.TAG_ANCHOR]).tolist()
         ),
         pairs=(
-            *_summarize_pairs("anchor-anchor", log.anchor_anchor_ranges()),
-            *_summarize_pairs("tag-tag", log.tag_tag_ranges()),
+            *_summarize_pairs(log, "anchor-anchor", RangeKind.ANCHOR_ANCHOR),
+            *_summarize_pairs(log, "tag-tag", RangeKind.TAG_TAG),
         ),
     )
 
 
-def _summarize_pairs(kind: str, ranges: PeerRanges) -> Iterator[PairSummary]:
+def _summarize_pairs(log: RangeLog, name: str, kind: RangeKind) -> Iterator[LinkSummary]:
     """Whichever of the two asked."""
+    ranges = log.peer_ranges(kind)
     rows: dict[frozenset[str], list[int]] = {}
     for row, ids in enumerate(ranges.end_ids):
         rows.setdefault(frozenset(ids), []).append(row)
     for mine in rows.values():
-        range_m = ranges.range_m[mine]
-        first, second = ranges.end_ids[mine[0]]
-        yield PairSummary(
-            kind, (first, second), len(mine), float(range_m.min()), float(np.median(range_m)), float(range_m.max())
-        )
+        yield LinkSummary(name, ranges.end_ids[mine[0]], *_lengths(log.range_m[ranges.rows[mine]]))
 
 
-def _summarize_anchor(log: RangeLog, index: int, quantization_m: float | None) -> AnchorSummary:
+def _summarize_anchor(log: RangeLog, index: int, quantization_m: float | None) -> LinkSummary:
     mine = (log.anchor_index == index) & (log.kind == RangeKind.TAG_ANCHOR)
-    ranges = log.range_m[mine]
-    return AnchorSummary(
-        anchor_id=log.anchor_ids[index],
-        num=len(ranges),
-        min_m=float(ranges.min()),
-        median_m=float(np.median(ranges)),
-        max_m=float(ranges.max()),
-        largest_gap_s=_largest_gap(None if log.timestamp_s is None else log.timestamp_s[mine]),
-        noise_stddev_m=_noise(log, mine, quantization_m),
-    )
+    gap_s = _largest_gap(None if log.timestamp_s is None else log.timestamp_s[mine])
+    noise_m = _noise(log, mine, quantization_m)
+    return LinkSummary("tag-anchor", (log.anchor_ids[index],), *_lengths(log.range_m[mine]), gap_s, noise_m)
 
 
-def _noise(log: RangeLog, mine: npt.NDArray[np.bool_], quantization_m: float | None) -> float | None:
+def _lengths(range_m: Array) -> tuple[int, float, float, float]:
+    return len(range_m), float(range_m.min()), float(np.median(range_m)), float(range_m.max())
+
+
+def _noise(log: RangeLog, mine: Mask, quantization_m: float | None) -> float | None:
     """Of the tag with the most ranges to this anchor: each tag moves by itself."""
     if log.timestamp_s is None:
         return None
@@ -166,7 +138,7 @@ def _num_duplicates(log: RangeLog) -> int:
     return int(np.count_nonzero(same))
 
 
-def _largest_gap(timestamps_s: npt.NDArray[np.float64] | None) -> float | None:
+def _largest_gap(timestamps_s: Array | None) -> float | None:
     if timestamps_s is None or len(timestamps_s) < 2:
         return None
     return float(np.diff(np.sort(timestamps_s)).max())

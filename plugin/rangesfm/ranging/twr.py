@@ -11,11 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
+from rangesfm.options import LogOptions
 
 VACUUM_M_PER_S = 299_792_458.0
 AIR_M_PER_S = 299_702_547.0  # refractive index 1.0003, as radio firmware assumes
 DW1000_TICK_S = 1 / (499.2e6 * 128)
+_UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "ticks": DW1000_TICK_S}
 _MAX_RATE_DIFFERENCE = 1e-3  # fifty times what crystals of 20 ppm can do
 
 
@@ -36,30 +39,22 @@ class StampOptions:
     propagation_speed_m_per_s: float = AIR_M_PER_S
     t_off_s: float = 0.0
 
-    def interval_s(self, later: npt.ArrayLike, earlier: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    @classmethod
+    def of(cls, options: LogOptions) -> StampOptions:
+        speeds: dict[str | float, float] = {"air": AIR_M_PER_S, "vacuum": VACUUM_M_PER_S}
+        speed = options.propagation_speed
+        return cls(
+            unit_s=_UNITS_S[options.stamp_unit],
+            wrap_s=2**options.stamp_bits * DW1000_TICK_S,
+            propagation_speed_m_per_s=speeds[speed] if speed in speeds else float(speed),
+            t_off_s=options.t_off_s,
+        )
+
+    def interval_s(self, later: npt.ArrayLike, earlier: npt.ArrayLike) -> Array:
         """Seconds from ``earlier`` to ``later`` on one clock, in [0, wrap_s)."""
         wrap = self.wrap_s / self.unit_s
         interval = np.mod(np.asarray(later, np.float64) - np.asarray(earlier, np.float64), wrap)
         return np.asarray(interval * self.unit_s, np.float64)
-
-
-def range_from_round_trips(
-    round_trip_s: npt.ArrayLike, *, t_off_s: float = 0.0, propagation_speed_m_per_s: float = AIR_M_PER_S
-) -> npt.NDArray[np.float64]:
-    """Range from repeated round trips: d = c/2 (mean round-trip time - t_off), Lee et al. 2018.
-
-    Args:
-        round_trip_s: (..., k) times from sending to receiving the answer, without the responder's known
-            delay; NaN where a repetition failed.
-
-    Returns:
-        (...,) metres; NaN where all repetitions failed.
-    """
-    times = np.asarray(round_trip_s, np.float64)
-    valid = ~np.isnan(times)
-    num = valid.sum(axis=-1)
-    mean = np.where(num > 0, np.where(valid, times, 0).sum(axis=-1) / np.maximum(num, 1), np.nan)
-    return np.asarray(propagation_speed_m_per_s / 2 * (mean - t_off_s), np.float64)
 
 
 def single_sided_range(
@@ -70,7 +65,7 @@ def single_sided_range(
     options: StampOptions,
     *,
     rate_of_a: npt.ArrayLike = 1.0,
-) -> npt.NDArray[np.float64]:
+) -> Array:
     """Range from A's poll (tx1, rx1) and B's answer (tx2, rx2), (n,) metres.
 
     Args:
@@ -88,7 +83,7 @@ def double_sided_range(
     tx3: npt.ArrayLike,
     rx3: npt.ArrayLike,
     options: StampOptions,
-) -> npt.NDArray[np.float64]:
+) -> Array:
     """Range from A's poll, B's answer and a third message, free of the clocks' different rates, (n,) metres.
 
     The third message tells the rates apart, whoever sent it; the stamps themselves show who that was.
@@ -114,7 +109,7 @@ def double_sided_range(
     )
 
 
-def _same_duration(one_s: npt.NDArray[np.float64], other_s: npt.NDArray[np.float64]) -> bool:
+def _same_duration(one_s: Array, other_s: Array) -> bool:
     """Whether most intervals are the same on both clocks, as far as crystals agree."""
     both = np.isfinite(one_s) & np.isfinite(other_s) & (other_s > 0)
     if not np.any(both):
@@ -122,11 +117,10 @@ def _same_duration(one_s: npt.NDArray[np.float64], other_s: npt.NDArray[np.float
     return bool(np.median(np.abs(one_s[both] / other_s[both] - 1)) < _MAX_RATE_DIFFERENCE)
 
 
-def _range(round_trip_s: npt.NDArray[np.float64], options: StampOptions) -> npt.NDArray[np.float64]:
-    """A round trip is far shorter than the wrap: what seems almost a whole wrap is a little less than nothing."""
-    signed = np.mod(round_trip_s + options.wrap_s / 2, options.wrap_s) - options.wrap_s / 2
-    return range_from_round_trips(
-        signed[..., np.newaxis],
-        t_off_s=options.t_off_s,
-        propagation_speed_m_per_s=options.propagation_speed_m_per_s,
-    )
+def _range(round_trip_s: Array, options: StampOptions) -> Array:
+    """d = c/2 (round-trip time - t_off), Lee et al. 2018.
+
+    A round trip is far shorter than the wrap: what seems almost a whole wrap is a little less than nothing.
+    """
+    signed_s = np.mod(round_trip_s + options.wrap_s / 2, options.wrap_s) - options.wrap_s / 2
+    return np.asarray(options.propagation_speed_m_per_s / 2 * (signed_s - options.t_off_s), np.float64)

@@ -84,7 +84,7 @@ class RadioRanges:
         tags = radio.tags_in_cam_m[self.observations.log.tag_index]
         path = self.trajectory.as_in(metric)
         at = replace(self.antennas, tag_in_cam_m=tags, weight=weight).positions(path.centers, path.world_from_cam)
-        from_anchor: Array = at - np.array([a.position_m for a in radio.anchors])[index]
+        from_anchor: Array = at - np.array([a.position_m for a in radio.anchors]).reshape(-1, 3)[index]
         return from_anchor
 
     def predicted_m(self, metric: pycolmap.Reconstruction, radio: RadioEstimate) -> Array:
@@ -149,7 +149,7 @@ class RadioBlocks:
         anchors = zip(before.anchors, self.positions, self.biases, strict=True)
         return RadioEstimate(
             tuple(replace(a, position_m=position, range_bias_m=float(bias[0])) for a, position, bias in anchors),
-            np.array(self.tags_in_cam),
+            np.array(self.tags_in_cam).reshape(-1, 3),
             before.time_shift_s if self.time_shift is None else float(self.time_shift[0]),
             before.short_range_error_m if self.short_range_error is None else float(self.short_range_error[0]),
         )

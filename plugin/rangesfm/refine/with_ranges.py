@@ -175,9 +175,10 @@ def _errors_to_begin_with(problem: RefinementProblem, errors: RangeErrors, metre
 def _between_anchors(
     observations: RangeObservations, anchors: Sequence[AnchorEstimate], errors: RangeErrors
 ) -> LocatedDistances:
+    used_m = errors.stddev_m[observations.has_place]
     return distances_by_radio(
         observations.log,
-        float(np.median(errors.stddev_m[observations.has_place])),
+        float(np.median(used_m)) if len(used_m) else 0.0,
         np.array([anchor.prior_bias_m for anchor in anchors]),
         np.array([anchor.prior_bias_stddev_m for anchor in anchors]),
         common_bias_stddev_m=0.0,
@@ -215,7 +216,7 @@ def _adjust(problem: RefinementProblem, bundle: BundleAdjustment, start: Unbent)
         else:
             bundle = problem.of_photos(before.num_left)
         added = problem.add_to(bundle, errors, before.radio)
-        solution = solve(bundle, _tolerance_m(errors))
+        solution = solve(bundle, _tolerance_m(problem, errors))
         num_left = before.num_left - solution.num_iterations
         return _Round(added.blocks.estimate(before.radio), (*before.solutions, solution), num_left)
 
@@ -231,15 +232,16 @@ def _adjust(problem: RefinementProblem, bundle: BundleAdjustment, start: Unbent)
         max_num_rounds=_MAX_NUM_ROUNDS,
         is_last=is_last,
     )
-    more, is_still = solve_until_still(bundle, last.solutions[-1], _tolerance_m(errors), last.num_left)
+    more, is_still = solve_until_still(bundle, last.solutions[-1], _tolerance_m(problem, errors), last.num_left)
     last = replace(last, radio=added.blocks.estimate(last.radio), solutions=(*last.solutions, *more))
     covariance = _covariance(problem, bundle, added, errors)
     problem.metric.update_point_3d_errors()
     return _summary(problem, start, bundle, last, errors, covariance, is_still=is_still)
 
 
-def _tolerance_m(errors: RangeErrors) -> float:
-    return _MAX_LAST_MOVEMENT * float(np.min(errors.stddev_m))
+def _tolerance_m(problem: RefinementProblem, errors: RangeErrors) -> float:
+    of_lengths = [taped.stddev_m for taped in problem.distances.tape.distances]
+    return _MAX_LAST_MOVEMENT * float(np.min(errors.stddev_m if len(errors.stddev_m) else of_lengths))
 
 
 def _covariance(

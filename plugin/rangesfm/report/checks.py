@@ -107,13 +107,16 @@ def quality_checks(summary: ResultSummary) -> tuple[Check, ...]:
     of_points = "RMS distance of the map's points from where the photos show them."
     no_matter = _why_no_offset_matters(offset)
     checked_m, clocks_s = summary.check_ranges.rms_m, offset.stddev_s
-    return (
-        Check("Scale uncertainty", of_scale, uncertainty, "%", 1.0, 5.0, 2),
+    checks_of_ranges = (
         Check("Anchor agreement", of_anchors, _anchor_spread_percent(scale), "%", 2.0, 5.0, 2),
         Check("Check ranges", of_check_ranges, checked_m, "m", 0.20, 0.40, 3, key="check_ranges.rms_m"),
         Check("Range residuals", of_ranges, ranges.rms_m, "m", 0.15, 0.30, 3, key="ranges.rms_m"),
         Check("Ranges used", of_share, share_used, "%", 70.0, 40.0, 1, larger_is_better=True),
         Check("Clock offset", of_clocks, clocks_s, "s", 0.02, 0.1, 4, key="time_offset.stddev_s", no_matter=no_matter),
+    )
+    return (
+        Check("Scale uncertainty", of_scale, uncertainty, "%", 1.0, 5.0, 2),
+        *(checks_of_ranges if ranges.num else ()),
         Check("Reprojection", of_points, reprojection_px, "px", 1.0, 2.0, 2, key="refine.reprojection_rms_px"),
     )
 

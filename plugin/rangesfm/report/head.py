@@ -31,7 +31,7 @@ def tiles(content: Content) -> list[tuple[str, str, str]]:
     return [
         ("Keyframes", count(None if path is None else len(path)), f"path of {fixed(length_m, 2, 'm')}"),
         ("Map points", count(None if path is None else len(content.points_m)), "seen by two keyframes or more"),
-        ("Anchors", count(len(content.summary.anchors)), _surveyed(content)),
+        *([("Anchors", count(len(content.summary.anchors)), _surveyed(content))] if content.summary.anchors else []),
         ("Time taken", duration(seconds.get("total") or (sum(known) if known else None)), "all stages"),
     ]
 

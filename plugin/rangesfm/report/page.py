@@ -51,7 +51,7 @@ SECTIONS = (
             figures_scale.clock_curve,
             figures_scale.candidates,
         ),
-        (tables.error_budget, tables.two_candidates, tables.sensitivity),
+        (tables.scale_by_kind, tables.error_budget, tables.two_candidates, tables.sensitivity),
     ),
     Section(
         "ranges",

@@ -236,9 +236,19 @@ def sensitivity(content: Content) -> Table:
         "1 % of its length, each range": given.range_slope_per_percent,
         **{f"1 cm, lever arm {way}": value for way, value in zip(_WAYS, given.lever_arm_per_cm)},
     }
-    rows = [[what, signed(percent, 3)] for what, percent in percents.items()]
+    rows = [[what, signed(percent, 3)] for what, percent in percents.items() if content.summary.ranges.num]
     title = "By how much the scale would change if it were longer by"
     return Table(title, ["what is longer than it was taken to be", "scale %"], rows, is_narrow=True)
+
+
+def scale_by_kind(content: Content) -> Table:
+    """The scale by ranges alone and by measured lengths alone."""
+    columns = dict.fromkeys(("value", "stddev"), plain)
+    rows = [
+        [f"{kind} alone", *_cells(f"scale.by_kind.{kind}", entry, columns)]
+        for kind, entry in content.summary.scale.by_kind.items()
+    ]
+    return Table("The scale by what was measured", ["by", "metres per unit", "stddev"], rows, is_narrow=True)
 
 
 def versions(content: Content) -> Table:

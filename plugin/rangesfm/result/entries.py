@@ -62,6 +62,13 @@ class TwoCandidateEntry(Record):
     num_without_root: Count
 
 
+class ScaleByKindEntry(Record):
+    """The scale by "ranges" alone or by "lengths" alone, and its stddev; null where they do not determine it."""
+
+    value: Number
+    stddev: NumberOrNull
+
+
 class ScaleEntry(Record):
     """The scale and how far to trust it, metres per unit of the unscaled model; see ScaleEstimate."""
 
@@ -82,6 +89,7 @@ class ScaleEntry(Record):
         validation_alias=AliasChoices("correlation_inflation", AliasPath("errors", "inflation"))
     )
     two_candidate: TwoCandidateEntry | None
+    by_kind: dict[Text, ScaleByKindEntry] = Field(default_factory=dict)
 
     @property
     def larger_stddev(self) -> float | None:

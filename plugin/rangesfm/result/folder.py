@@ -23,6 +23,7 @@ from rangesfm.result.tables import (
     PhotoTimes,
     ScaleCandidates,
     ScaleConsensus,
+    TagCorners,
     TimeOffsetCurve,
 )
 
@@ -38,6 +39,7 @@ TABLES: tuple[type[TableFile], ...] = (
     ScaleCandidates,
     ScaleConsensus,
     TimeOffsetCurve,
+    TagCorners,
 )
 REPORT_NAME = "report.html"
 DATABASE_NAME = "database.db"

@@ -11,6 +11,7 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
+from rangesfm.distances.tape import Tape
 from rangesfm.geometry.similarity import Similarity, align_most
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.join.models import ModelVerdict
@@ -47,6 +48,7 @@ class MetricResult:
         place: of the map in the site's frame; None where the frame is the first camera's, or nobody judged it yet.
         models: that were to be joined to what is one model here; empty where there was only one.
         trust: what the tests of mistakes say of the scaled map.
+        tape: the measured lengths, those that cannot belong to the map as left out; None: there are none.
         baselines: known distances between a rig's cameras, as the unscaled model has them.
     """
 
@@ -63,6 +65,7 @@ class MetricResult:
     place: Place | None = None
     models: tuple[ModelVerdict, ...] = ()
     trust: TrustVerdict | None = None
+    tape: Tape | None = None
     baselines: tuple[Baseline, ...] = ()
 
     @property

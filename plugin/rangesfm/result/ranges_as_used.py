@@ -53,8 +53,10 @@ class RangesAsUsed(TableFile):
     status: Texts
 
     @classmethod
-    def of(cls, found: MetricResult) -> RangesAsUsed:
+    def of(cls, found: MetricResult) -> RangesAsUsed | None:
         observations, log = found.observations, found.observations.log
+        if not len(log):
+            return None
         unknown = np.full(len(log), np.nan)
         has_say = np.isin(observations.status, (*USED, RangeStatus.OUTLIER))
         labels = {int(status): status.label for status in RangeStatus}

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from rangesfm.distances.tape import DistanceRow
+from rangesfm.distances.tape import CONTROL, DistanceRow
 from rangesfm.files.records import NumberOrNull, Record, Text
 from rangesfm.result.entries import (
     AnchorEntry,
@@ -128,7 +128,12 @@ class ResultSummary(Record):
             )
         rms, median = (_text(value, ".3f") for value in (ranges.rms_m, ranges.median_abs_m))
         residuals = f", rms {rms} m, median {median} m" if ranges.num_used else ""
-        yield f"ranges: {ranges.num_used} of {ranges.num} used{residuals}"
+        if ranges.num:
+            yield f"ranges: {ranges.num_used} of {ranges.num} used{residuals}"
+        if self.distances:
+            held = [abs(row.residual_m) for row in self.distances if row.kind == CONTROL and row.residual_m is not None]
+            worst = f", the map differs from them by {max(held):.3f} m at most" if held else ""
+            yield f"measured lengths: {len(held)} of {len(self.distances)} held the scale{worst}"
         if offset.estimated:
             value, stddev = _text(offset.value_s, "+.3f"), _text(offset.stddev_s, ".3f")
             yield f"time offset: image time = range time {value} s, +- {stddev} s"

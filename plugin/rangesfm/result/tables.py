@@ -64,6 +64,27 @@ class CenterCovariances(TableFile):
 
 
 @dataclass(frozen=True)
+class TagCorners(TableFile):
+    """``markers.csv``: where corners of printed tags were found in photos, in pixels; to be a survey's markers."""
+
+    NAME: ClassVar = "markers.csv"
+    marker: Texts
+    image_name: Texts
+    x_px: Rounded
+    y_px: Rounded
+
+    @classmethod
+    def of(cls, found: MetricResult) -> TagCorners | None:
+        markers = {} if found.tape is None else found.tape.found_markers
+        if not markers:
+            return None
+        names = [name for name, marker in markers.items() for _ in marker.image_names]
+        photos = [name for marker in markers.values() for name in marker.image_names]
+        pixels = np.concatenate([marker.pixels for marker in markers.values()])
+        return cls(tuple(names), tuple(photos), *pixels.T)
+
+
+@dataclass(frozen=True)
 class ScaleCandidates(TableFile):
     """``scale_candidates.csv``: the paper's two candidates of each range that has them, metres per SfM unit."""
 
@@ -74,7 +95,9 @@ class ScaleCandidates(TableFile):
     alpha1: Rounded
 
     @classmethod
-    def of(cls, found: MetricResult) -> ScaleCandidates:
+    def of(cls, found: MetricResult) -> ScaleCandidates | None:
+        if not len(found.observations.log):
+            return None
         rows, log = found.diagnostics.candidate_rows, found.observations.log
         times = np.full(len(rows), np.nan) if log.timestamp_s is None else log.timestamp_s[rows]
         ids = tuple(log.anchor_ids[k] for k in log.anchor_index[rows])
@@ -90,7 +113,9 @@ class ScaleConsensus(TableFile):
     num_agreeing: Annotated[Array, Column(".0f")]
 
     @classmethod
-    def of(cls, found: MetricResult) -> ScaleConsensus:
+    def of(cls, found: MetricResult) -> ScaleConsensus | None:
+        if not len(found.observations.log):
+            return None
         return cls(found.diagnostics.curve_scales, found.diagnostics.num_agreeing.astype(np.float64))
 
 

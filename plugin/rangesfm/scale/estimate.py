@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.observations import RangeObservations
+from rangesfm.scale.lengths import LengthScale
 from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.solution import Solution
 from rangesfm.scale.two_candidate import TwoCandidate
@@ -39,6 +41,18 @@ class ScaleUncertainty:
     def half_width_95(self) -> float:
         """Of the 95 % interval of the scale's logarithm."""
         return NORMAL_95 * self.empirical
+
+
+@dataclass(frozen=True)
+class ScaleByKind:
+    """The scale by ranges alone, or by measured lengths alone, metres per SfM unit.
+
+    Attributes:
+        stddev: by all that they get wrong; inf where they do not determine it.
+    """
+
+    value: float
+    stddev: float
 
 
 @dataclass(frozen=True)
@@ -95,9 +109,11 @@ class ScaleEstimate:
         observations: all ranges, with status by their final weight.
         errors: of all n ranges of the log, as weighted; their inflation widens the formal stddev.
         noise_stddev_m: stddev of a range away from all special cases.
-        problem, solution: from which all of this was found.
+        problem, solution: from which all of this was found; None where there were no ranges.
         placement: (7, 7) covariance of the logarithm of the scale, of a turn (rad) and of a shift (m) of the map about
             where the first camera is, by what the ranges get wrong; None where the frame is the first camera's.
+        lengths: what measured lengths say by themselves; None: there are none between points of the map.
+        by_kind: "ranges" and "lengths", as far as there are any, where lengths took part.
     """
 
     metric_from_sfm: Similarity
@@ -115,9 +131,11 @@ class ScaleEstimate:
     observations: RangeObservations
     errors: RangeErrors
     noise_stddev_m: float
-    problem: ScaleProblem
-    solution: Solution
+    problem: ScaleProblem | None = None
+    solution: Solution | None = None
     placement: Array | None = None
+    lengths: LengthScale | None = None
+    by_kind: Mapping[str, ScaleByKind] = field(default_factory=dict)
 
     @property
     def value(self) -> float:

@@ -11,21 +11,25 @@ from rangesfm.arrays import Array
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.gravity import gravity_of
-from rangesfm.geometry.similarity import Similarity
+from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.errors.learned import LearnedErrors
+from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.observations import RangeObservations, RangeStatus, status_by_weight
 from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
 from rangesfm.scale.cutoff import cutoff_test
-from rangesfm.scale.estimate import ScaleEstimate
+from rangesfm.scale.estimate import ScaleByKind, ScaleEstimate, ScaleSensitivity, ScaleUncertainty
+from rangesfm.scale.lengths import LengthScale, scale_by_lengths
 from rangesfm.scale.levelled_places import levelled_places
-from rangesfm.scale.problem import ScaleProblem, scale_problem
+from rangesfm.scale.problem import ScaleProblem, first_camera_from, scale_problem
+from rangesfm.scale.range_equation import RangeProblem, solve
 from rangesfm.scale.sensitivity import scale_sensitivity
-from rangesfm.scale.solution import Solution, solve_scale
+from rangesfm.scale.solution import OpenPlaceError, Solution, solve_scale
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
 from rangesfm.scale.uncertainty import learned_errors, parameter_covariance, scale_uncertainty
-from rangesfm.scale.verdict import judge
+from rangesfm.scale.verdict import judge, judge_lengths
 
 
 def initialize_scale(
@@ -39,10 +43,10 @@ def initialize_scale(
     distances: LocatedDistances | None = None,
     seed: int = 0,
 ) -> ScaleEstimate:
-    """Estimate scale and frame of an unscaled path from ranges.
+    """Estimate scale and frame of an unscaled path from ranges, from measured lengths, or from both.
 
     Args:
-        observations: ranges on ``trajectory``.
+        observations: ranges on ``trajectory``; none where lengths alone have to do.
         trajectory: the unscaled path.
         anchors: every anchor of the log, with what is known of it.
         anchor_frame: "site" (positions in a site frame: the map is carried there),
@@ -52,22 +56,36 @@ def initialize_scale(
 
     Raises:
         InputError: the log has an anchor that is not given.
-        GeometryError: the scale, or the place in the site frame, is not determined.
+        GeometryError: the scale is not determined.
     """
     options, range_model = options or ScaleOptions(), range_model or RangeModelOptions()
+    lengths = scale_by_lengths(distances, trajectory.centers)
+    if not len(observations.log):
+        if lengths is None:
+            raise GeometryError("the scale is not determined: no measured length has both its ends in the map")
+        return _by_lengths_alone(lengths, observations, trajectory, range_model, options)
+    if lengths is not None and distances is not None:
+        distances = lengths.beside_ranges(distances)
     gravity = gravity_of(options.up_in_first_camera)
-    problem = scale_problem(observations, trajectory, anchors, anchor_frame, range_model, distances, gravity)
-    solution = solve_scale(problem, camera_side=options.camera_side, seed=seed)
+    given = (observations, trajectory, anchors, anchor_frame, range_model, distances, gravity)
+    problem, open_place = scale_problem(*given), tuple[str, ...]()
+    try:
+        solution = solve_scale(problem, camera_side=options.camera_side, seed=seed)
+    except OpenPlaceError as error:
+        open_place = (f"scale only, in the first camera's frame: {error}",)
+        problem = scale_problem(*given, place_is_open=True)
+        solution = solve_scale(problem, camera_side=None, seed=seed)
     table = _paper_table(solution)
     rotations = model_from_cam(observations, trajectory, problem)
     learned = learned_errors(problem, solution, observations, rotations)
-    uncertainty = scale_uncertainty(problem, solution, learned)
+    posed = problem if lengths is None else _bent(problem, lengths)
+    uncertainty = scale_uncertainty(posed, solution, learned, lengths.components["bending"] if lengths else 0.0)
     per_anchor = scale_per_anchor(solution, observations.log.anchor_ids)
     covariance = parameter_covariance(solution, learned)
     found = anchor_estimates(solution, observations.log.anchor_ids, covariance)
     tests = cutoff_test(solution)
     judged = judge(problem, solution, uncertainty, per_anchor, found, tests, options)
-    verdict, reasons = judged.verdict, judged.reasons
+    verdict, reasons = judged.verdict, (*judged.reasons, *open_place)
     if gravity is not None and problem.frame == "first_camera" and anchor_frame == "site":
         reasons = (*reasons, *levelled_places(gravity, anchors, found))
     if options.method == "two-candidate":
@@ -93,10 +111,70 @@ def initialize_scale(
         observations=replace(observations, status=status),
         errors=replace(solution.errors, learned=learned).spread(problem.rows, len(observations.log)),
         noise_stddev_m=solution.noise_stddev_m,
-        problem=problem,
+        problem=posed,
         solution=solution,
         placement=placement_covariance(solution, covariance),
+        lengths=lengths,
+        by_kind={} if lengths is None else {"ranges": _by_ranges(problem, solution, learned), **_by_lengths(lengths)},
     )
+
+
+def _by_lengths_alone(
+    lengths: LengthScale,
+    observations: RangeObservations,
+    trajectory: Trajectory,
+    range_model: RangeModelOptions,
+    options: ScaleOptions,
+) -> ScaleEstimate:
+    """In the first camera's frame, with nothing to say of ranges."""
+    uncertainty = ScaleUncertainty(lengths.relative_stddev, lengths.components)
+    judged = judge_lengths(lengths, uncertainty, options)
+    first_camera_from_sfm = first_camera_from(trajectory)
+    return ScaleEstimate(
+        metric_from_sfm=replace(IDENTITY, scale=lengths.value) @ first_camera_from_sfm,
+        frame="first_camera",
+        method="lengths",
+        uncertainty=uncertainty,
+        verdict=judged.verdict,
+        reasons=judged.reasons,
+        advice=judged.advice,
+        cutoff_test=(),
+        sensitivity=ScaleSensitivity(0.0, 0.0, {}, 0.0, (0.0, 0.0, 0.0)),
+        per_anchor={},
+        two_candidate=None,
+        anchors=(),
+        observations=observations,
+        errors=RangeErrors.begin(observations, observations.placed_rows, range_model),
+        noise_stddev_m=np.nan,
+        lengths=lengths,
+        by_kind=_by_lengths(lengths),
+    )
+
+
+def _bent(problem: ScaleProblem, lengths: LengthScale) -> ScaleProblem:
+    """With the lengths as uncertain as they are: what the map bends is no reason to believe the ranges, in solving."""
+    if problem.ranges.distances is None:
+        return problem
+    distances = lengths.beside_ranges(problem.ranges.distances, with_bending=True)
+    return replace(problem, ranges=replace(problem.ranges, distances=distances))
+
+
+def _by_lengths(lengths: LengthScale) -> dict[str, ScaleByKind]:
+    return {"lengths": ScaleByKind(lengths.value, lengths.value * lengths.relative_stddev)}
+
+
+def _by_ranges(posed: ScaleProblem, solution: Solution, learned: LearnedErrors) -> ScaleByKind:
+    """From the solution on without lengths between points."""
+    posed = replace(posed, ranges=_without_lengths(posed.ranges))
+    problem = _without_lengths(solution.problem)
+    alone = replace(solution, problem=problem, fit=solve(problem, solution.fit.state, loss=solution.errors.loss))
+    value = alone.fit.state.metric_from_model.scale
+    return ScaleByKind(value, value * scale_uncertainty(posed, alone, learned).empirical)
+
+
+def _without_lengths(problem: RangeProblem) -> RangeProblem:
+    distances = problem.distances
+    return problem if distances is None else replace(problem, distances=distances.subset(~distances.is_between_points))
 
 
 def placement_covariance(solution: Solution, covariance: Array) -> Array | None:

@@ -63,6 +63,8 @@ def scale_problem(
     range_model: RangeModelOptions,
     distances: LocatedDistances | None = None,
     gravity: Gravity | None = None,
+    *,
+    place_is_open: bool = False,
 ) -> ScaleProblem:
     """Set up the estimation.
 
@@ -70,6 +72,7 @@ def scale_problem(
         distances: taped ones, with the anchors of the log in its order; those between anchors that the log holds
             are added.
         gravity: as somebody told it.
+        place_is_open: whether the map has no one place in the site: of surveyed anchors only their distances count.
 
     Raises:
         InputError: an anchor of the log has no place in ``anchors``.
@@ -80,12 +83,13 @@ def scale_problem(
     given = np.array([a.position_m is not None for a in in_log], dtype=bool) & (anchor_frame != "unknown")
     rows, heard = _usable_ranges(observations, given)
     known, notes = _usable_positions(in_log, given & heard, anchor_frame, gravity is not None)
+    known &= not place_is_open
     if anchor_frame == "site" and not known.any():
         distances = _with_surveyed(distances, in_log, given & heard)
     # A surveyed anchor whose ranges are all held out keeps its place, to check them against.
     placed = known | (given & known.any())
     left_out = tuple(a.anchor_id for a, k in zip(in_log, heard | placed, strict=True) if not k)
-    first_camera_from_sfm = _first_camera_from_sfm(trajectory)
+    first_camera_from_sfm = first_camera_from(trajectory)
     noise = range_model.range_stddev_m or START_STDDEV_M
     errors = RangeErrors.begin(observations, rows, range_model)
     ranges = RangeProblem(
@@ -172,7 +176,8 @@ def _usable_ranges(
     return rows, heard
 
 
-def _first_camera_from_sfm(trajectory: Trajectory) -> Similarity:
+def first_camera_from(trajectory: Trajectory) -> Similarity:
+    """Rigid motion from the world of a path to the frame of its first camera."""
     rotation = trajectory.world_from_cam[0].T
     return Similarity(1.0, rotation, -rotation @ trajectory.centers[0])
 
@@ -224,11 +229,9 @@ def _with_surveyed(
     pairs = surveyed_distances([anchor for anchor, k in zip(anchors, given, strict=True) if k])
     if not pairs:
         return distances
-    surveyed = LocatedDistances(
-        model_length=np.full(len(pairs), np.nan),
+    surveyed = LocatedDistances.of(
+        np.array([pair.distance_m for pair in pairs]),
+        np.array([pair.stddev_m for pair in pairs]),
         anchor_pair=np.array([[ids.index(end) for end in pair.ends] for pair in pairs]),
-        distance_m=np.array([pair.distance_m for pair in pairs]),
-        stddev_m=np.array([pair.stddev_m for pair in pairs]),
-        is_check=np.zeros(len(pairs), dtype=bool),
     )
     return surveyed if distances is None else distances.joined(surveyed)

@@ -58,6 +58,10 @@ WHY_SCALE_IS_OPEN = {
 """By the kind of the path: what lets another scale fit, and what to do about it."""
 
 
+class OpenPlaceError(GeometryError):
+    """The map fits in another place of the site as well, and has the same scale there."""
+
+
 @dataclass(frozen=True)
 class Solution:
     """A fit whose noise level is its own.
@@ -82,7 +86,7 @@ def solve_scale(posed: ScaleProblem, *, camera_side: str | None, seed: int) -> S
         camera_side: as of the scale options.
 
     Raises:
-        GeometryError: nothing fits, or two different maps do.
+        GeometryError: nothing fits, or two different maps do (OpenPlaceError: of one scale).
     """
     problem, errors = posed.ranges, posed.errors
     camera_side = camera_side if problem.frame_is_free else None
@@ -240,10 +244,7 @@ def refuse_ambiguity(solution: Solution, rivals: Sequence[RangeState], camera_si
             if min(ours, theirs) * extent < solution.noise_stddev_m:
                 raise GeometryError("the scale is not determined: a camera that stands still fits the ranges as well")
             if abs(np.log(ours / theirs)) <= _SAME_LOG_SCALE:
-                raise GeometryError(
-                    f"{_what_is_open(solution.problem)}; the scale alone needs no site frame "
-                    f"(anchor frame unknown; about {ours:.4g} here)"
-                )
+                raise OpenPlaceError(_what_is_open(solution.problem))
             raise GeometryError(
                 f"two scales fit the ranges equally well ({ours:.4g} and {theirs:.4g} m per unit): "
                 f"{'; '.join(WHY_SCALE_IS_OPEN[path_kind(problem.centers)])}"

@@ -141,24 +141,47 @@ def times_of_ranges(posed: ScaleProblem, solution: Solution, observations: Range
     return np.concatenate([[0.0], np.cumsum(steps_m)])[of_range] / _WALKING_M_PER_S
 
 
-def scale_uncertainty(posed: ScaleProblem, solution: Solution, learned: LearnedErrors) -> ScaleUncertainty:
+def scale_uncertainty(
+    posed: ScaleProblem, solution: Solution, learned: LearnedErrors, bending_of_lengths: float = 0.0
+) -> ScaleUncertainty:
     """Relative stddevs of the scale.
 
     Its robust weights do not make the most of what is learnt of the errors. The best ones do (Gauss-Markov), as far as
     the errors are what they are taken for, and say how far off the scale is that was found: as far as theirs, give or
     take the stddev of theirs. Where that leaves more open than the errors' sum, it is no help.
+
+    Args:
+        posed: measured lengths in it as uncertain as the map's bending makes them.
+        bending_of_lengths: as of ``expected_scale_uncertainty``.
     """
-    summed = expected_scale_uncertainty(solution, learned)
+    summed = expected_scale_uncertainty(solution, learned, bending_of_lengths)
     reweighted = replace(summed, components=_reweighted(_linear(posed, solution), learned))
     return min(summed, reweighted, key=lambda each: each.empirical)
 
 
-def expected_scale_uncertainty(solution: Solution, learned: LearnedErrors) -> ScaleUncertainty:
-    """The same by the errors' sum alone, before anything is measured."""
+def expected_scale_uncertainty(
+    solution: Solution, learned: LearnedErrors, bending_of_lengths: float = 0.0
+) -> ScaleUncertainty:
+    """The same by the errors' sum alone, before anything is measured.
+
+    Args:
+        bending_of_lengths: relative, of the scale by measured lengths.
+    """
     components = learned.stddev_of(scale_influence(solution.fit, solution.problem))
-    if (given := _by_what_was_given(solution)[0, 0]) > 0:
-        components[GIVEN] = float(np.sqrt(given))
+    given = np.hypot(np.sqrt(_by_what_was_given(solution)[0, 0]), _say_of_lengths(solution) * bending_of_lengths)
+    if given > 0:
+        components[GIVEN] = float(given)
     return ScaleUncertainty(formal=solution.fit.log_scale_stddev, components=components)
+
+
+def _say_of_lengths(solution: Solution) -> float:
+    """By how much the scale changes, relative to a change of all lengths between points."""
+    distances, fit = solution.problem.distances, solution.fit
+    if distances is None:
+        return 0.0
+    of_points = distances.subset(distances.is_between_points)
+    slopes = fit.state.metric_from_model.scale * of_points.model_length / of_points.stddev_m
+    return float(invert_information(fit.information)[0, 0] * (slopes @ slopes))
 
 
 def _reweighted(linear: _Linear, learned: LearnedErrors) -> dict[str, float]:
@@ -186,8 +209,8 @@ def _by_what_was_given(solution: Solution) -> Array:
     given = fit.prior_information.copy()
     biases = fit.columns[0].bias[fit.columns[0].bias >= 0]
     given[biases] = given[:, biases] = 0.0
-    inverse = invert_information(fit.information)
-    covariance: Array = solution.errors.inflation**2 * inverse @ given @ inverse
+    inverse = np.linalg.lstsq(fit.information, np.eye(len(fit.information)), rcond=1e-12)[0]
+    covariance: Array = solution.errors.inflation**2 * inverse @ given @ inverse.T
     return covariance
 
 

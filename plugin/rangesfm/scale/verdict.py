@@ -13,6 +13,7 @@ from rangesfm.options import ScaleOptions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.scale.cutoff import scale_drift
 from rangesfm.scale.estimate import NORMAL_95, CutoffTest, ScaleUncertainty
+from rangesfm.scale.lengths import LengthScale
 from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import RangeFit
 from rangesfm.scale.solution import WHY_SCALE_IS_OPEN, Solution
@@ -66,9 +67,8 @@ def judge(
         GeometryError: refused, as the scale is less certain than ``options.max_relative_stddev``.
     """
     half_width = uncertainty.half_width_95
-    weak = _weakness_doubts(solution, half_width)
     doubts = [
-        *weak,
+        *_weakness_doubts(solution, half_width),
         *(_Doubt(note, "survey three anchors or more that are not on one line") for note in problem.notes),
         *_left_out_doubts(problem.left_out),
         *_path_doubts(solution),
@@ -79,12 +79,29 @@ def judge(
     if drift := _drift(cutoff_tests):
         is_out = abs(drift.scale / cutoff_tests[0].scale - 1) > half_width
         (doubts if is_out else remarks).append(_drift_in_words(drift, cutoff_tests[0]))
+    return _verdict(doubts, remarks, half_width, options)
+
+
+def judge_lengths(lengths: LengthScale, uncertainty: ScaleUncertainty, options: ScaleOptions) -> Verdict:
+    """The same where there is nothing but measured lengths."""
+    another = "measure another length, far from the first and in another direction"
+    doubts = []
+    if len(lengths.rows) == 1:
+        reason = "the scale hangs on one length that nothing checks: a mistake in it is one of the whole map"
+        doubts.append(_Doubt(reason, another))
+    if uncertainty.half_width_95 > DOUBTFUL_ABOVE:
+        doubts.append(_Doubt("the lengths are short beside their stddevs", "measure more lengths, and longer ones"))
+    return _verdict(doubts, [], uncertainty.half_width_95, options)
+
+
+def _verdict(doubts: list[_Doubt], remarks: list[_Doubt], half_width: float, options: ScaleOptions) -> Verdict:
     if half_width > NORMAL_95 * options.max_relative_stddev:
         why = f": {doubts[0].reason}" if doubts else ""
+        advised = (doubt.advice for doubt in doubts if doubt.advice)
         raise GeometryError(
             f"the scale is only known to {100 * half_width / NORMAL_95:.1f} % (1 stddev), "
             f"more than the {100 * options.max_relative_stddev:g} % allowed (max_relative_stddev){why}; next time: "
-            f"{weak[0].advice if weak else 'plan it first, which says what would narrow it (rangesfm plan)'}"
+            f"{next(advised, 'plan it first, which says what would narrow it (rangesfm plan)')}"
         )
     summary = f"the scale is known to {100 * half_width:.1f} % (95 % interval)"
     if half_width > DOUBTFUL_ABOVE:

@@ -113,7 +113,9 @@ def _camera(
         return None, (f"{info_topic} is of {info.width} x {info.height} pixels: not taken as the camera",)
     distortion = info.distortion_model if not is_rectified and any(d) else "none"
     try:
-        return colmap_camera(distortion, (fx, fy, cx, cy), d, path), (f"the camera is that of {info_topic}",)
+        return colmap_camera(distortion, (fx, fy, cx, cy), d, path), (
+            f"the camera is that of {info_topic}, where none is given",
+        )
     except InputError as error:
         return None, (f"{info_topic} is not taken as the camera: {error}",)
 

@@ -7,9 +7,6 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from itertools import groupby
 from pathlib import Path
-from typing import Annotated
-
-from pydantic import Field
 
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import new_folder, state_and_sha256
@@ -23,7 +20,7 @@ RECORD_NAME = "photos.json"
 """Of a folder of such photos: what they were taken from."""
 _MIN_NUM_PHOTOS = 2
 _ROUNDING = 1e-6  # of an interval
-_Files = dict[str, Annotated[tuple[tuple[int, int, int], str], Field(strict=False)]]
+_Files = dict[str, tuple[tuple[int, int, int], str]]
 
 
 class TakenPhotos(Record):
@@ -44,15 +41,14 @@ class TakenPhotos(Record):
     camera: tuple[str, tuple[float, ...]] | None = None
     notes: tuple[str, ...] = ()
 
-    def are_in(self, folder: Path, earlier: TakenPhotos | None) -> bool:
-        """Whether a folder holds the photos that a run on the same source, which left that record, took."""
-        return (
-            earlier is not None
-            and (self.rate_hz, self.topic) == (earlier.rate_hz, earlier.topic)
-            and {name: sha256 for name, (_, sha256) in self.files.items()}
-            == {name: sha256 for name, (_, sha256) in earlier.files.items()}
-            and all((folder / name).is_file() for name in (TIMES_NAME, *earlier.image_names))
-        )
+    def is_alike(self, other: TakenPhotos) -> bool:
+        """Whether they are the same photos, whatever the source's state."""
+        sha256, others = ({name: content[1] for name, content in one.files.items()} for one in (self, other))
+        return (sha256, self.rate_hz, self.topic) == (others, other.rate_hz, other.topic)
+
+    def are_in(self, folder: Path) -> bool:
+        """Whether nobody took one of them away."""
+        return all((folder / name).is_file() for name in (TIMES_NAME, *self.image_names))
 
 
 def take_photos(
@@ -73,7 +69,7 @@ def take_photos(
     with suppress(InputError):
         earlier = TakenPhotos.read(folder / RECORD_NAME)
     wanted = TakenPhotos(files=_files(path, earlier), rate_hz=rate_hz, topic=topic)
-    if earlier is not None and not restart and wanted.are_in(folder, earlier):
+    if earlier is not None and not restart and wanted.is_alike(earlier) and earlier.are_in(folder):
         progress.message("photos: taken over from an earlier run")
         return earlier
     progress.stage("photos")

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
+from scipy.ndimage import convolve
 
 from rangesfm.errors import InputError
 
@@ -63,17 +64,11 @@ def raw_image(message: Any, path: Path) -> Image.Image:
 
 
 def _luma_and_colours(luma: int, pixels: _Pixels) -> _Pixels:
-    """Of pixels that have a luma each, and a colour together with their neighbour."""
-    colours = pixels[..., 1 - luma]
-    even = colours[:, : colours.shape[1] // 2 * 2]
-    parts = [pixels[..., luma], *(_as_wide(even[:, k::2], colours.shape[1]) for k in (0, 1))]
-    return np.asarray(
-        Image.merge("YCbCr", [Image.fromarray(np.ascontiguousarray(part)) for part in parts]).convert("RGB")
-    )
-
-
-def _as_wide(half: _Pixels, width: int) -> _Pixels:
-    return np.pad(np.repeat(half, 2, axis=1), ((0, 0), (0, width % 2)), mode="edge")
+    """Of an even number of pixels a row, that have a luma each, and a colour together with their neighbour."""
+    colours = pixels[:, : pixels.shape[1] // 2 * 2, 1 - luma]
+    bands = [pixels[:, : colours.shape[1], luma], *(np.repeat(colours[:, k::2], 2, axis=1) for k in (0, 1))]
+    merged = Image.merge("YCbCr", [Image.fromarray(np.ascontiguousarray(band)) for band in bands])
+    return np.asarray(merged.convert("RGB"))
 
 
 def _colours_of_mosaic(red: tuple[int, int], pixels: _Pixels) -> _Pixels:
@@ -84,23 +79,12 @@ def _colours_of_mosaic(red: tuple[int, int], pixels: _Pixels) -> _Pixels:
     """
     has_red, has_blue = (np.zeros(pixels.shape[:2], bool) for _ in range(2))
     has_red[red[0] :: 2, red[1] :: 2] = has_blue[1 - red[0] :: 2, 1 - red[1] :: 2] = True
-    values = pixels[..., 0].astype(np.float32)
-    colours = [
-        np.where(has, values, _weighted_sum(values * has) / _weighted_sum(has.astype(np.float32)))
-        for has in (has_red, ~(has_red | has_blue), has_blue)
-    ]
-    mixed: _Pixels = np.rint(np.stack(colours, axis=-1)).astype(np.uint8)
+    values, mixed = pixels[..., 0].astype(np.float32), np.empty((*has_red.shape, 3), np.uint8)
+    for channel, has in enumerate((has_red, ~(has_red | has_blue), has_blue)):
+        weights = convolve(has.astype(np.float32), _WEIGHTS, mode="constant")
+        mean = convolve(values * has, _WEIGHTS, mode="constant") / weights
+        mixed[..., channel] = np.where(has, values, np.rint(mean))
     return mixed
-
-
-def _weighted_sum(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Of each pixel and its eight neighbours."""
-    height, width = values.shape
-    padded = np.pad(values, 1)
-    total = np.zeros_like(values)
-    for i, j in np.ndindex(3, 3):
-        total += _WEIGHTS[i][j] * padded[i : i + height, j : j + width]
-    return total
 
 
 # By encoding: bytes of a pixel, and how (height, width, bytes) become grey or red, green and blue.

@@ -42,7 +42,7 @@ def open_video(path: Path) -> Source:
         else:
             duration_s = (video.duration or 0) * 1e-6
         start_s = _creation_time_s(video)
-        size_px = _image(first).size
+        size_px, num_frames = _image(first).size, stream.frames
     clock = "seconds from its first frame, as it has no creation time"
     if start_s is not None:
         created = datetime.fromtimestamp(start_s, timezone.utc).isoformat(sep=" ", timespec="seconds")
@@ -55,7 +55,7 @@ def open_video(path: Path) -> Source:
         what=f"video, {size_px[0]} x {size_px[1]} pixels, {duration_s:.1f} s",
         size_px=size_px,
         duration_s=duration_s,
-        num_frames=stream.frames,
+        num_frames=num_frames,
         clock=clock,
         frames=partial(_frames, path, start_s or 0.0),
         notes=(turned,) if first.rotation else (),

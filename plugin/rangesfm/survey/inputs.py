@@ -21,12 +21,9 @@ from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.anchor_file import default_anchor_frame, read_anchors
 from rangesfm.ranging.anchors.site import Site, local_site
-from rangesfm.ranging.clock.time_resolution import time_resolution_s
 from rangesfm.ranging.errors.error_curve import correct_ranges, read_error_curve
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges
-from rangesfm.ranging.readers.time_units import SECONDS_PER_UNIT
-from rangesfm.ranging.twr import AIR_M_PER_S, DW1000_TICK_S, VACUUM_M_PER_S, StampOptions
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes, find_image_times, read_image_times_csv
 
@@ -44,10 +41,10 @@ _COARSE_STEP_S = 0.1
 
 @dataclass(frozen=True)
 class RangingInputs:
-    """The radio's side of a survey.
+    """What is measured in metres: the radio's side of a survey, and lengths.
 
     Attributes:
-        log: ranges of the wanted tags to the wanted anchors, and those between two of a kind.
+        log: ranges of the wanted tags to the wanted anchors, and those between two of a kind; empty without a radio.
         tag_in_cam_m: (num_tags, 3) lever arms in the order of ``log.tag_ids``; NaN for a tag that ranges with
             tags only.
         anchors: every anchor of the log.
@@ -74,12 +71,16 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     Raises:
         InputError: a file is missing or wrong, or the log has an anchor or tags that nobody explained.
     """
+    survey.require_metres()
     given = read_anchors(survey.anchors.path) if survey.anchors.path is not None else None
     tag_ids = [*survey.tag.lever_arms_m, *([] if survey.tag.tag_id is None else [survey.tag.tag_id])]
-    log = read_log(survey.ranges, [anchor.anchor_id for anchor in given or ()], tag_ids)
-    _check_lengths(log)
-    log = _of_wanted_anchors(_of_wanted_tag(log, survey.tag.tag_id), survey.anchors.use)
-    _check_camera_is_heard(log)
+    if survey.ranges.path is None:
+        log = RangeLog.from_arrays([], [], image_name=[])
+    else:
+        log = read_log(survey.ranges, [anchor.anchor_id for anchor in given or ()], tag_ids)
+        _check_lengths(log)
+        log = _of_wanted_anchors(_of_wanted_tag(log, survey.tag.tag_id), survey.anchors.use)
+        _check_camera_is_heard(log)
     tag_in_cam_m = _lever_arms_of_log(log, survey)
     anchors = _anchors_of_log(log) if given is None else given
     _check_anchors_known(log, anchors, survey)
@@ -126,30 +127,7 @@ def read_log(
     """The radio's log as a survey describes it, or other files than it names; see ``read_ranges``."""
     if options.path is None:
         raise InputError("no ranges: give [ranges] path in a survey file, or --ranges LOG")
-    return read_ranges(
-        files or options.path,
-        format=options.format,
-        columns=options.columns or None,
-        timestamp_unit=options.timestamp_unit,
-        range_unit=options.range_unit,
-        separator=options.separator,
-        anchor_ids=anchor_ids,
-        tag_ids=tag_ids,
-        ranging_interval_s=options.ranging_interval_s,
-        stamps=stamp_options(options),
-    )
-
-
-def stamp_options(options: LogOptions) -> StampOptions:
-    """How a survey's time stamps of two-way ranging become ranges."""
-    named: dict[str | float, float] = {"air": AIR_M_PER_S, "vacuum": VACUUM_M_PER_S}
-    speed = options.propagation_speed
-    return StampOptions(
-        unit_s=DW1000_TICK_S if options.stamp_unit == "ticks" else SECONDS_PER_UNIT[options.stamp_unit],
-        wrap_s=2**options.stamp_bits * DW1000_TICK_S,
-        propagation_speed_m_per_s=named[speed] if speed in named else float(speed),
-        t_off_s=options.t_off_s,
-    )
+    return read_ranges(files or options.path, options, anchor_ids=anchor_ids, tag_ids=tag_ids)
 
 
 def _check_camera_is_heard(log: RangeLog) -> None:
@@ -294,7 +272,7 @@ def _notes(log: RangeLog, anchors: Sequence[Anchor], survey: Survey, *, anchors_
         notes.append("the anchor positions are those that the log gives")
     if log.num_no_measurement:
         notes.append(f"{log.num_no_measurement} records of the log say that there was no measurement")
-    if (step_s := time_resolution_s(log)) >= _COARSE_STEP_S:
+    if (step_s := log.time_resolution_s) >= _COARSE_STEP_S:
         notes.append(f"the log's times come in steps of {step_s:.2g} s: at walking pace that is as much in metres")
     return notes
 

@@ -23,6 +23,7 @@ from rangesfm.options import (
     ExportOptions,
     ImageOptions,
     MapperOptions,
+    MarkerOptions,
     OutputOptions,
     RangesOptions,
     RefineOptions,
@@ -128,6 +129,7 @@ class Survey(BaseModel):
     tag: TagOptions = TagOptions()
     mapper: MapperOptions = MapperOptions()
     scale: ScaleAndTapeOptions = ScaleAndTapeOptions()
+    markers: MarkerOptions = MarkerOptions()
     refine: RefineOptions = RefineOptions()
     export: ExportOptions = ExportOptions()
     report: ReportOptions = ReportOptions()
@@ -142,6 +144,21 @@ class Survey(BaseModel):
             table, _, name = dotted_key.partition(".")
             tables[table] = tables.get(table, getattr(self, table)).changed(**{name: value})
         return self.model_copy(update=tables)
+
+    def require_metres(self) -> None:
+        """InputError where nothing says how long a metre is, or how large tags are that are to be looked for."""
+        if self.scale.distances is not None or self.markers.side_m is not None:
+            return
+        if self.markers.dictionary is not None:
+            raise InputError(
+                "[markers] side_m is not given: give the tags' side in metres (--marker_side_m), or taped distances "
+                "between their corners (--distances CSV)"
+            )
+        if self.ranges.path is None:
+            raise InputError(
+                "no ranges and no lengths: give a radio's log (--ranges LOG), taped distances (--distances CSV), or "
+                "the size of printed tags (--marker_side_m)"
+            )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, fit for JSON."""

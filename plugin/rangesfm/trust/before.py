@@ -31,7 +31,7 @@ _MIN_SHARE_OF_TIME = 0.5
 
 def notes_before_work(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
     """Of the radio's side of a survey, in words for its user; nothing where all seems right."""
-    if not {"tag_in_cam_m", "lever_arms_m"} & survey.tag.model_fields_set:
+    if len(inputs.log) and not {"tag_in_cam_m", "lever_arms_m"} & survey.tag.model_fields_set:
         yield (
             "the tag's place on the camera is not given and taken to be the lens itself: ranges are off by as much as "
             "it is away; measure from the lens to the antenna, right, down and forward (--tag_in_cam X,Y,Z)"

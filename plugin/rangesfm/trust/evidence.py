@@ -13,7 +13,7 @@ from rangesfm.trust.table import MistakeTest
 _MOST_NOISE_M, _MOST_LASTING_M = 0.25, 0.25
 # In metres for a metre of distance: a radio on 70 m is noisier than one in a room.
 _NOISE_BY_DISTANCE = 0.005
-_LASTING = ("time", "long_time")
+_LASTING = ("time", "place", "view")
 _LEAST_USED, _MOST_OUTLYING = 0.4, 0.35
 _FEW_OBSTRUCTED = "place the anchors where nothing stands between them and the path"
 

@@ -18,7 +18,7 @@ from rangesfm.trust.scanning import SCANNING
 from rangesfm.trust.testing import Factorization, Test, overlap
 
 # Explanations that are tried with the noise that each of them leaves.
-_NUM_TRIED, _NUM_OF_KIND = 6, 2
+_NUM_TRIED, _NUM_OF_KIND, _NUM_NEARLY = 6, 2, 3
 # Of two that differ by less in twice the logarithm of their likelihood, neither is named alone.
 _AS_LIKELY = 6.0
 _SAME = 0.95
@@ -69,21 +69,17 @@ class Findings:
 def find_mistakes(on_map: RangesOnMap, *, seed: int = 0) -> Findings:
     """Test all hypotheses with the noise that is left when those that stand explain what they can.
 
-    A mistake that does not stand, as a step, may pass for noise instead: it is looked for with the noise that is usual
-    too, and believed if it makes the ranges likelier with the noise that it leaves.
+    A mistake that does not stand, as a step, may have passed for noise instead: where nothing is found, the likeliest
+    are believed that make the ranges likelier with the noise that each of them leaves.
     """
     problem = linearized(on_map)
     standing = _standing(problem)
     hypotheses = standing + [hypothesis for of_kind in SCANNING for hypothesis in of_kind(problem)]
     problem = _learnt(problem, standing)
     tests = _best_of_each(Factorization(problem).test(hypotheses, seed), problem)
-    nominated = [test for test in tests if test.is_rejected and _is_possible(test)]
-    is_sure = bool(nominated)
-    if not nominated:
-        usual = problem.with_usual_errors()
-        with_usual = _best_of_each(Factorization(usual).test(hypotheses, seed), usual)
-        nominated = [test for test in with_usual if test.is_rejected and _is_possible(test)]
-    causes = _causes(problem, nominated, is_sure) if nominated else []
+    possible = [test for test in tests if _is_possible(test)]
+    rejected = [test for test in possible if test.is_rejected]
+    causes = _causes(problem, rejected or possible[:_NUM_NEARLY], is_sure=bool(rejected))
     if causes and causes[0].test is not None:
         problem = _learnt(problem, [*standing, causes[0].test.hypothesis])
         tests = _best_of_each(Factorization(problem).test(hypotheses, seed), problem)
@@ -100,7 +96,7 @@ def _standing(problem: Linearized) -> list[Hypothesis]:
     return [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
 
 
-def _causes(problem: Linearized, nominated: Sequence[Test], is_sure: bool) -> list[Cause]:
+def _causes(problem: Linearized, nominated: Sequence[Test], *, is_sure: bool) -> list[Cause]:
     """The likeliest explanation, and those as good; none if even that is no better than chance."""
     before = Factorization(_learnt(_settled(problem), [])).deviance()
     num = len(problem.residual_m)
@@ -110,6 +106,8 @@ def _causes(problem: Linearized, nominated: Sequence[Test], is_sure: bool) -> li
         gain = before - deviance
         if _is_possible(again) and (is_sure or gain > test.threshold):
             causes.append(_cause(replace(again, threshold=test.threshold), gain, _penalty(again, num)))
+    if not causes and not is_sure:
+        return []
     causes += _alternatives(problem, before)
     causes.sort(key=lambda cause: -cause.score)
     likeliest = [cause for k, cause in enumerate(causes) if not k or _is_rival(causes[0], cause)]

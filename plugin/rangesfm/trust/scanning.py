@@ -7,10 +7,14 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from rangesfm.arrays import Array, Mask
+from rangesfm.scale.range_equation import tag_positions
 from rangesfm.trust.hypothesis import Correction, Hypothesis, of_cells
 from rangesfm.trust.linearized import Linearized
 
-_NUM_STEPS, _NUM_MOVES = 16, 8
+# A step is best found where it was: the ranges between the true time and the one that is tried fit neither way.
+_MAX_NUM_TIMES = 32
+# Of the survey, on either side: what begins later or ends sooner lasts as good as always.
+_LEAST_SHARE = 1 / 12
 # Shares of the survey that a stretch may last.
 _STRETCHES = (1 / 4, 1 / 8, 1 / 16)
 # Of fewer cells on either side nothing can be said.
@@ -19,11 +23,14 @@ _MIN_NUM_CELLS = 3
 
 def anchors_moved(problem: Linearized) -> Iterator[Hypothesis]:
     """An anchor was moved at some time."""
+    on_map = problem.on_map
+    tags_m = tag_positions(on_map.problem, on_map.state.metric_from_model)
     for k in _heard(problem):
-        name = problem.on_map.anchor_ids[k]
-        for time in _times(problem, _NUM_MOVES):
-            is_after = (problem.cells.anchor_index == k) & (problem.time_s > time)
-            is_before = (problem.cells.anchor_index == k) & ~is_after
+        name, at = on_map.anchor_ids[k], on_map.state.anchors_m[k]
+        is_of = problem.cells.anchor_index == k
+        for time in _times(problem.time_s[is_of]):
+            is_after = is_of & (problem.time_s > time)
+            is_before = is_of & ~is_after
             if min(is_after.sum(), is_before.sum()) < 3 * _MIN_NUM_CELLS:
                 continue
 
@@ -33,14 +40,20 @@ def anchors_moved(problem: Linearized) -> Iterator[Hypothesis]:
                     f"({size[0]:+.2f}, {size[1]:+.2f}, {size[2]:+.2f} m in x, y, z)"
                 )
 
+            of_ranges = _of_ranges(problem, k) & (on_map.time_s > time)
+
+            def back(size: Array, of_ranges: Mask = of_ranges, at: Array = at) -> Correction:
+                grown_m = np.linalg.norm(tags_m - at - size, axis=1) - np.linalg.norm(tags_m - at, axis=1)
+                return Correction(longer_m=np.where(of_ranges, grown_m, 0.0))
+
             yield Hypothesis(
                 "anchor moved",
                 name,
                 unit="m",
-                is_linear=True,
                 words=words,
                 remedy="fix anchors so that nobody bumps into them, and use its ranges from before only",
-                correction=_left_out(_of_ranges(problem, k) & (problem.on_map.time_s > time)),
+                correction=back,
+                adoption=_left_out(of_ranges),
                 effect=of_cells(problem, np.where(is_after[:, None], problem.gradient.by_tag, 0.0)),
             )
 
@@ -50,7 +63,7 @@ def steps(problem: Linearized) -> Iterator[Hypothesis]:
     for k in [*(_heard(problem) if len(_heard(problem)) > 1 else []), None]:
         name = "" if k is None else problem.on_map.anchor_ids[k]
         is_of = np.ones(len(problem.time_s), dtype=bool) if k is None else problem.cells.anchor_index == k
-        for time in _times(problem, _NUM_STEPS):
+        for time in _times(problem.time_s[is_of]):
             is_after = is_of & (problem.time_s > time)
             if min(is_after.sum(), (is_of & ~is_after).sum()) < _MIN_NUM_CELLS:
                 continue
@@ -106,7 +119,7 @@ def clock_jumps(problem: Linearized) -> Iterator[Hypothesis]:
     """The clocks' offset jumped at some time."""
     if problem.by_time is None:
         return
-    for time in _times(problem, _NUM_STEPS):
+    for time in _times(problem.time_s):
         after = problem.time_s > time
         if min(after.sum(), (~after).sum()) < _MIN_NUM_CELLS:
             continue
@@ -144,9 +157,12 @@ def _left_out(rows: Mask) -> Callable[[Array], Correction]:
     return lambda _: Correction(left_out=rows)
 
 
-def _times(problem: Linearized, num: int) -> Array:
-    """By the share of cells, so that there is something on either side of each."""
-    return np.quantile(problem.time_s, np.arange(1, num + 1) / (num + 1))
+def _times(time_s: Array) -> Array:
+    """Between cells at (c,) times, away from the ends: between any two, or between as many as are looked at."""
+    ordered = np.sort(time_s)
+    between, aside = (ordered[1:] + ordered[:-1]) / 2, round(_LEAST_SHARE * len(ordered))
+    between = between[aside : len(between) - aside]
+    return np.asarray(between[:: max(-(-len(between) // _MAX_NUM_TIMES), 1)])
 
 
 def _windows(problem: Linearized) -> Iterator[tuple[float, float]]:

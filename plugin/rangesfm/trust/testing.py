@@ -177,7 +177,8 @@ def _thresholds(bases: Sequence[Array], nums: Array, seed: int) -> Array:
     for num in np.unique(nums[nums > 0]):
         smallest = np.minimum(smallest, stats.chi2.sf(statistics[:, nums == num].max(axis=1), num))
     alpha = float(np.quantile(smallest, FALSE_ALARMS))
-    return np.array([stats.chi2.isf(alpha, num) if num else np.inf for num in nums])
+    of_num = {num: stats.chi2.isf(alpha, num) if num else np.inf for num in np.unique(nums).tolist()}
+    return np.array([of_num[num] for num in nums.tolist()])
 
 
 def overlap(first: Test, second: Test) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,6 +30,11 @@ class TrustVerdict:
     reasons: tuple[str, ...]
     causes: tuple[Cause, ...]
     rows: Indices
+
+    def with_more(self, more: TrustVerdict) -> TrustVerdict:
+        """With tests that were made of something else than ranges."""
+        tests = (*more.tests, *self.tests)
+        return replace(self, tests=tests, reasons=(*self.reasons, *more.reasons))
 
 
 def trust_in(on_map: RangesOnMap, *, seed: int = 0) -> TrustVerdict:

@@ -141,7 +141,7 @@ def read_image_times_csv(
 
     Raises:
         InputError: with the line: a column missing, a cell that is no time in seconds, a photo
-            that does not exist, a photo or a time that stands there twice.
+            that does not exist where one of ``names`` has no time, a photo or a time that stands there twice.
     """
     table = read_table(path, _COLUMNS, aliases=_ALIASES, separator=None)
     if not len(table):
@@ -152,20 +152,28 @@ def read_image_times_csv(
     frames = frames or {}
     frame_of = {photo: first for first, photos in frames.items() for photo in photos}
     _refuse_repetitions(table, image_names, times.tolist(), frame_of)
+    known, unknown = set(image_names), list[int]()
     if names is not None:
         known = {*names, *frame_of}
-        for row, name in enumerate(image_names):
-            if name not in known:
-                raise table.error(row, "image_name", f"the name of a photo in the folder, like '{names[0]}'")
+        unknown = [row for row, name in enumerate(image_names) if name not in known]
+        timed = set(image_names)
+        # More names than photos are of photos that were taken away; with a photo left over, one is misspelt.
+        if unknown and not all({name, *frames.get(name, ())} & timed for name in names):
+            raise table.error(unknown[0], "image_name", f"the name of a photo in the folder, like '{names[0]}'")
     texts = table.text("timestamp_s")
     stamps = {
         name: _Stamp(time, _resolution(text))
         for name, time, text in zip(image_names, times.tolist(), texts, strict=True)
+        if name in known
     }
     stamps = {name: stamp for name, stamp in stamps.items() if name not in frame_of} | {
         first: stamps[found[0]] for first, photos in frames.items() if (found := [p for p in photos if p in stamps])
     }
-    return _in_time_order(stamps, names or tuple(stamps), "csv")
+    found = _in_time_order(stamps, names or tuple(stamps), "csv")
+    if not unknown:
+        return found
+    note = f"{len(unknown)} of the {len(image_names)} names in {table.path.name} are of no photo in the folder"
+    return replace(found, notes=(note, *found.notes))
 
 
 def times_from_exif(folder: str | Path, names: Sequence[str]) -> ImageTimes:

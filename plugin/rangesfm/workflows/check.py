@@ -68,7 +68,9 @@ def check_survey(survey: Survey) -> CheckedSurvey:
         _check_photos(survey, checked)
     with checked.finding_faults():
         inputs = read_inputs(survey, journal)
-        _tell_of_radio(survey, inputs, checked)
+        if len(inputs.log):
+            _tell_of_radio(survey, inputs, checked)
+        _tell_of_others(survey, inputs, checked)
         if survey.images.path is not None and is_source(survey.images.path):
             return checked
         keyframes, times = checked_keyframes(survey, inputs, journal)
@@ -134,8 +136,15 @@ def _tell_of_radio(survey: Survey, inputs: RangingInputs, checked: CheckedSurvey
     if {"tag_in_cam_m", "lever_arms_m"} & survey.tag.model_fields_set:
         arms = (f"{', '.join(f'{x:g}' for x in arm)} m" for arm in inputs.tag_in_cam_m.tolist() if not np.isnan(arm[0]))
         checked.facts.append(f"lever arm: the tag is at {'; '.join(arms)} in the camera frame (right, down, forward)")
+
+
+def _tell_of_others(survey: Survey, inputs: RangingInputs, checked: CheckedSurvey) -> None:
     if inputs.tape is not None:
-        checked.facts.append(f"taped distances: {len(inputs.tape.distances)}")
+        only = "" if len(inputs.log) else ", which alone say how long a metre is (no ranges)"
+        checked.facts.append(f"taped distances: {len(inputs.tape.distances)}{only}")
+    if survey.markers.dictionary is not None:
+        side = "" if survey.markers.side_m is None else f" of {survey.markers.side_m:g} m"
+        checked.facts.append(f"tags: those of {survey.markers.dictionary}{side} will be looked for in the photos")
     if inputs.reference is not None:
         name = "" if survey.report.reference is None else f" in {survey.report.reference.name}"
         checked.facts.append(f"reference: {len(inputs.reference)} positions{name}, only to compare with")
@@ -146,7 +155,8 @@ def _tell_of_times(
 ) -> None:
     radio_s = inputs.log.timestamp_s
     if times is None or radio_s is None:
-        checked.facts.append(f"times: none are needed for {len(keyframes)} keyframes, the ranges name their photos")
+        why = "the ranges name their photos" if len(inputs.log) else "there are no ranges"
+        checked.facts.append(f"times: none are needed for {len(keyframes)} keyframes, {why}")
         return
     photos_s, offset_s = times.timestamps_s, survey.ranges.time_offset_s
     checked.facts.append(

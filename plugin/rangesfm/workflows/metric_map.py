@@ -119,7 +119,7 @@ def ranges_on_path(
 ) -> RangeObservations:
     """Ranges on the path; refused where the clocks cannot be right."""
     observations = _on_path(survey, inputs, trajectory, offset_s)
-    if not observations.has_place.any():
+    if len(inputs.log) and not observations.has_place.any():
         raise InputError(
             _why_no_range_has_a_place(observations, trajectory, float(np.mean(offset_s))), survey.ranges.path
         )
@@ -240,7 +240,10 @@ def scale_by_survey(
     )
     weights = estimate.errors.robust_weights(predicted - inputs.log.range_m)
     offset_s = offset.value_s if offset is not None else survey.ranges.time_offset_s
-    metric = MetricResult(trajectory, offset, offset_s, estimate, scaled, predicted, weights)
+    tape = inputs.tape
+    if tape is not None and (lengths := estimate.lengths) is not None:
+        tape = tape.without(lengths.rows[~lengths.is_kept].tolist())
+    metric = MetricResult(trajectory, offset, offset_s, estimate, scaled, predicted, weights, tape=tape)
     taped = read_rigs(survey.images.rig_config).baselines(sfm, survey.images.baseline_stddev_m)
     metric = replace(metric, baselines=compare_baselines(taped, sfm, estimate))
     for doubt in (disagreements := disagreeing(metric.baselines)):
@@ -349,9 +352,9 @@ def judge_map(survey: Survey, metric: MetricResult, journal: Journal) -> MetricR
 
 
 def _control(inputs: RangingInputs, metric: MetricResult) -> Tape:
-    """What was taped, baselines of rigs that the ranges agree with, and the distances between surveyed anchors where
+    """What was taped, baselines of rigs that the scale agrees with, and the distances between surveyed anchors where
     their positions could not be used."""
-    tape = inputs.tape or Tape()
+    tape = metric.tape or Tape()
     distances = [*tape.distances]
     distances += [
         TapedDistance(known.photos, known.distance_m, known.stddev_m, CONTROL, line=0)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from contextlib import nullcontext, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ import pycolmap
 from rangesfm.colmap.model_files import read_model
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.colmap.transform import rescale, take_over
+from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.export import check_formats
 from rangesfm.files.atomic import sha256_of
@@ -30,6 +33,7 @@ from rangesfm.vision.keyframes import select_keyframes
 from rangesfm.vision.mapping_loop import GlobalAdjustment
 from rangesfm.vision.reconstruct import reconstruct
 from rangesfm.vision.rigs import read_rigs
+from rangesfm.vision.tags import find_tags
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.metric_map import estimate_scale, path_of_model, ranges_on_path, refine_by_survey
 
@@ -116,7 +120,8 @@ def with_photos_in_folder(survey: Survey, journal: Journal, *, restart: bool = F
     for note in taken.notes:
         journal.warn(note)
     values: dict[str, Any] = {"images.path": folder, "images.times": folder / TIMES_NAME}
-    if taken.camera is not None and survey.camera.model is None and survey.camera.params is None:
+    given = survey.camera
+    if taken.camera is not None and given.model is None and given.params is None and not given.others:
         values["camera.model"], values["camera.params"] = taken.camera
     return survey.changed(values)
 
@@ -142,6 +147,26 @@ def find_keyframes(
             return select_keyframes(names, survey.images), None
         keyframes = select_keyframes(image_times, survey.images)
         return keyframes, noted(image_times, journal).of(keyframes)
+
+
+def with_tags(survey: Survey, inputs: RangingInputs, names: Sequence[str], journal: Journal) -> RangingInputs:
+    """The inputs with the printed tags in photos, if any are to be looked for."""
+    wanted = survey.markers
+    if wanted.dictionary is None:
+        return inputs
+    folder = images_path(survey)
+    with journal.stage("tags"):
+        found = find_tags(folder, names, wanted.dictionary, journal.progress)
+    if not found.markers:
+        message = (
+            f"no tag of {wanted.dictionary} in {len(names)} photos: is it another dictionary ([markers] dictionary)?"
+        )
+        if not len(inputs.log) and survey.scale.distances is None:
+            raise InputError(message, folder)
+        journal.warn(message)
+    journal.progress.message(f"tags: {len(found.tags)} of {wanted.dictionary} in {found.num_photos} photos")
+    sides = () if wanted.side_m is None else found.sides(wanted.side_m, wanted.side_stddev_m)
+    return replace(inputs, tape=(inputs.tape or Tape()).with_tags(found.markers, sides))
 
 
 def map_keyframes(

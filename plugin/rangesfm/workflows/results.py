@@ -19,6 +19,7 @@ from rangesfm.result.folder import REFERENCE_NAME, replacing_result
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.summary import ResultSummary
 from rangesfm.result.write import write_models_and_tables
+from rangesfm.scale.lengths import BENDING
 from rangesfm.survey.inputs import RangingInputs, input_hashes
 from rangesfm.survey.settings import Survey
 from rangesfm.workflows.journal import Journal
@@ -49,8 +50,8 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
         journal.warn(f"without covariances of the poses there is no {', '.join(sorted(left_out))}")
     if metric.estimate.frame == "site":
         metric = metric.moved(inputs.site.offset_m)
-    distances = _distances(inputs, metric)
-    disagreeing = tuple(disagreements(distances, metric.estimate.uncertainty.empirical))
+    distances = _distances(metric)
+    disagreeing = tuple(disagreements(distances, metric.estimate.uncertainty.empirical, BENDING))
     for note in disagreeing:
         journal.warn(note)
     metric = metric.doubted(disagreeing)
@@ -83,13 +84,13 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
     return RunResult(folder, summary, tuple(lines))
 
 
-def _distances(inputs: RangingInputs, metric: MetricResult) -> list[DistanceRow]:
+def _distances(metric: MetricResult) -> list[DistanceRow]:
     """The table of control and check distances in the final map."""
-    if inputs.tape is None:
+    if metric.tape is None:
         return []
-    located = locate_distances(inputs.tape, metric.final, [anchor.anchor_id for anchor in metric.anchors])
+    located = locate_distances(metric.tape, metric.final, [anchor.anchor_id for anchor in metric.anchors])
     anchors_m = np.array([anchor.position_m for anchor in metric.anchors]).reshape(-1, 3)
-    return distance_rows(inputs.tape, located.lengths_m(1.0, anchors_m))
+    return distance_rows(metric.tape, located.lengths_m(1.0, anchors_m))
 
 
 def _comparison(survey: Survey, inputs: RangingInputs, metric: MetricResult) -> tuple[ComparisonRow, ...]:

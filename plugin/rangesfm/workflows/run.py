@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import pycolmap
 
+from rangesfm.distances.ends import locatable
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import sole_writer
 from rangesfm.join.models import PathOfModel
@@ -41,6 +42,7 @@ from rangesfm.workflows.photos import (
     read_registered,
     tell_of_times,
     with_photos_in_folder,
+    with_tags,
 )
 from rangesfm.workflows.plan_again import with_advice
 from rangesfm.workflows.results import RunResult, write_results
@@ -53,10 +55,10 @@ def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> 
     with sole_writer(survey.output.path):
         survey = with_photos_in_folder(survey, journal, restart=restart)
         keyframes, times = checked_keyframes(survey, inputs, journal)
+        inputs = with_tags(survey, inputs, keyframes, journal)
         adjustment = AdjustmentWithRanges(survey, inputs, keyframes[0], times)
-        models = map_keyframes(
-            survey, keyframes, journal, restart, adjustment if survey.mapper.ranges_in_mapping else None
-        )
+        with_ranges = survey.mapper.ranges_in_mapping and len(inputs.log) > 0
+        models = map_keyframes(survey, keyframes, journal, restart, adjustment if with_ranges else None)
         if note := adjustment.note():
             journal.warn(note)
         return to_metric(survey, inputs, models, times, journal, refine=survey.refine.enabled)
@@ -100,6 +102,7 @@ def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResul
         if inputs.log.image_name is None:
             times = noted(times_of_model(survey, sfm, model_path), journal)
             tell_of_times(survey, inputs, times, journal)
+        inputs = with_tags(survey, inputs, sorted(image.name for image in sfm.images.values()), journal)
         return to_metric(survey, inputs, [sfm], times, journal, refine=refine)
 
 
@@ -141,6 +144,8 @@ def map_in_metres(
     # Scale, and the metric map that follows from it.
     with journal.stage("scale"):
         path, verdicts = join_by_survey(survey, inputs, paths, journal, must_join=must_join)
+        if inputs.tape is not None:
+            inputs = replace(inputs, tape=locatable(inputs.tape, path.sfm))
         metric = replace(scale_by_survey(survey, inputs, path, offset, journal), models=verdicts)
         if survey.scale.adopt:
             inputs, metric = with_likeliest_cause(survey, inputs, path, metric, journal)

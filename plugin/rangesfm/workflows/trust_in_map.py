@@ -8,6 +8,7 @@ import numpy as np
 
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.survey.settings import Survey
+from rangesfm.trust.lengths import trust_in_lengths
 from rangesfm.trust.ranges_on_map import RangesOnMap, ranges_on_map
 from rangesfm.trust.verdict import trust_in
 from rangesfm.workflows.journal import Journal
@@ -18,17 +19,20 @@ def tested(survey: Survey, metric: MetricResult, journal: Journal) -> MetricResu
 
     The scaled map is looked at, refined or not: a refinement bends a map to ranges that are wrong.
     """
+    trust = trust_in_lengths(metric.estimate, metric.tape)
     try:
-        trust = trust_in(scaled_ranges(metric), seed=survey.output.seed)
+        if (on_map := scaled_ranges(metric)) is not None:
+            trust = trust_in(on_map, seed=survey.output.seed).with_more(trust)
     except np.linalg.LinAlgError as error:
         journal.warn(f"mistakes were not looked for, as the ranges determine too little: {error}")
-        return metric
     for reason in trust.reasons:
         journal.warn(reason)
     return replace(metric, trust=trust).doubted(trust.reasons)
 
 
-def scaled_ranges(metric: MetricResult) -> RangesOnMap:
-    """The ranges on the scaled map."""
+def scaled_ranges(metric: MetricResult) -> RangesOnMap | None:
+    """The ranges on the scaled map; None where there are none."""
     estimate = metric.estimate
+    if estimate.problem is None or estimate.solution is None:
+        return None
     return ranges_on_map(estimate.problem, estimate.solution, estimate.observations, metric.trajectory)

@@ -103,7 +103,6 @@ def test_offset_is_found_through_outliers_whatever_the_epochs(num_anchors: int, 
     assert abs(found.value_s - offset_s) < 4 * found.stddev_s < 0.1
     assert found.offset_matters
     assert found.note is None
-    assert 570 < found.num_ranges_on_path < 600
 
 
 def test_estimate_follows_a_shift_of_the_log() -> None:
@@ -170,7 +169,6 @@ def test_bursts_of_two_tags_are_centred_on_their_photos() -> None:
     found = estimate_time_offset(both_tags(first.log, second.log), first.photos, [left, right])
     assert found.value_s == pytest.approx(0.83, abs=0.05)
     assert not found.offset_matters
-    assert found.num_ranges_on_path == 2 * 80 * 20
 
 
 def test_curve_over_all_offsets_is_lowest_at_the_one_found() -> None:
@@ -211,7 +209,6 @@ def test_photos_lost_for_ten_seconds_do_no_harm() -> None:
     kept = times[(times < 20) | (times > 30)]
     found = estimate(walk.log(range_times(0, 60), -4.0), walk.photos(kept))
     assert found.value_s == pytest.approx(-4.0, abs=0.03)
-    assert found.num_ranges_on_path < 510
 
 
 def test_drift_of_200_ppm_is_noticed_and_named_and_followed() -> None:
@@ -319,7 +316,6 @@ def test_bursts_around_still_photos_are_centred_on_them(num_stops: int, first_ph
     assert not found.offset_matters
     # A burst of two seconds can be moved by two seconds either way before it is half-way to the next photo.
     assert found.stddev_s == pytest.approx(4 / np.sqrt(12), abs=0.05)
-    assert found.num_ranges_on_path == 80 * (num_stops - first_photo)
     assert found.note is not None
     assert "stands still" in found.note
     best = found.curve.costs_m == found.curve.costs_m.min()

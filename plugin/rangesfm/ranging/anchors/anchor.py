@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
+from rangesfm.arrays import Array
 
 
 @dataclass(frozen=True)
@@ -21,7 +20,7 @@ class Anchor:
     """
 
     anchor_id: str
-    position_m: npt.NDArray[np.float64] | None = None
+    position_m: Array | None = None
     position_stddev_m: float = 0.0
     range_bias_m: float = 0.0
     range_bias_stddev_m: float | None = None
@@ -42,12 +41,12 @@ class AnchorEstimate:
     """
 
     anchor_id: str
-    position_m: npt.NDArray[np.float64]
+    position_m: Array
     position_stddev_m: float
-    prior_position_m: npt.NDArray[np.float64] | None
+    prior_position_m: Array | None
     prior_position_stddev_m: float
     range_bias_m: float
     prior_bias_m: float
     prior_bias_stddev_m: float
-    mirror_position_m: npt.NDArray[np.float64] | None = None
-    position_covariance_m2: npt.NDArray[np.float64] | None = None
+    mirror_position_m: Array | None = None
+    position_covariance_m2: Array | None = None

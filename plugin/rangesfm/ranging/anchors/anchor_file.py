@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.tables import Table, has_columns, read_table, write_table
 from rangesfm.ranging.anchors.anchor import Anchor
@@ -38,7 +38,7 @@ def read_anchors(path: str | Path) -> tuple[Anchor, ...]:
     _check_unique(table, anchor_ids)
     positions = _positions(table)
     position_stddevs = _not_negative(table, "position_stddev_m", empty=0.0)
-    biases = table.numbers("range_bias_m", empty=0.0) if "range_bias_m" in table else np.zeros(len(table))
+    biases = table.numbers("range_bias_m", empty=0.0)
     bias_stddevs = _not_negative(table, "range_bias_stddev_m", empty=np.nan)
     return tuple(
         Anchor(
@@ -93,7 +93,7 @@ def _check_unique(table: Table, anchor_ids: list[str]) -> None:
             raise InputError(message, table.path, line)
 
 
-def _positions(table: Table) -> npt.NDArray[np.float64]:
+def _positions(table: Table) -> Array:
     """(n, 3) metres, a row of NaN where all three cells are empty."""
     positions = np.column_stack(
         [table.numbers(name, empty=np.nan, expected="a number of metres") for name in _COORDINATES]
@@ -107,11 +107,8 @@ def _positions(table: Table) -> npt.NDArray[np.float64]:
     return positions
 
 
-def _not_negative(table: Table, column: str, *, empty: float) -> npt.NDArray[np.float64]:
-    if column not in table:
-        return np.full(len(table), empty)
+def _not_negative(table: Table, column: str, *, empty: float) -> Array:
     expected = "a number of metres that is not negative, or nothing"
     values = table.numbers(column, empty=empty, expected=expected)
-    if np.any(values < 0):
-        raise table.error(int(np.argmax(values < 0)), column, expected)
+    table.refuse(values < 0, column, expected)
     return values

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.trilateration import (
@@ -48,7 +48,7 @@ class AnchorPlacement:
 
 def trilaterate_anchors(
     log: RangeLog,
-    tag_positions_m: npt.NDArray[np.float64],
+    tag_positions_m: Array,
     *,
     toward: Mapping[str, Sequence[float]] | None = None,
     height_m: Mapping[str, float] | None = None,

@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.anchors.point_fit import PointFit
 from rangesfm.ranging.errors.cells import cells, noisiness
-from rangesfm.ranging.errors.learned import LearnedErrors, learn_errors
+from rangesfm.ranging.errors.learned import learn_errors
 
 # Each anchor's bias is estimated with a prior of its own, and the path is known.
 _NOT_HERE = ("bias", "common_bias", "bending")
@@ -80,14 +80,10 @@ def errors_of_fits(
         curve_stddev_m=curve_stddev_m if is_calibrated else None,
         ruled_out=_NOT_HERE,
     )
-    return _by_anchor(learned, anchor_index, len(fits))
+    covariance = learned.covariance_m2
+    return [FitErrors(learned.of_range[anchor_index == k], covariance) for k in range(len(fits))]
 
 
 def _off(fit: PointFit) -> Array:
     """(n,) measured minus predicted, with the bias that was expected."""
     return -fit.problem.residuals_m(np.append(fit.x[:3], fit.problem.prior_mean[3]))
-
-
-def _by_anchor(learned: LearnedErrors, anchor_index: Indices, num_anchors: int) -> list[FitErrors]:
-    covariance = learned.covariance_m2
-    return [FitErrors(learned.of_range[anchor_index == k], covariance) for k in range(num_anchors)]

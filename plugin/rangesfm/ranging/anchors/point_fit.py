@@ -10,10 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import least_squares
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.similarity import path_shape
 from rangesfm.ranging.anchors.multilateration import multilaterate
 from rangesfm.ranging.errors.inlier_noise import inlier_noise
@@ -55,7 +54,7 @@ class PointProblem:
     prior_mean: Array
     prior: Array
 
-    def subset(self, rows: npt.NDArray[np.int64]) -> PointProblem:
+    def subset(self, rows: Indices) -> PointProblem:
         """The same problem with some of its ranges."""
         names = ("positions_m", "range_m", "stddev_m", "shared_stddev_m")
         return replace(self, **{name: getattr(self, name)[rows] for name in names})

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -183,12 +184,9 @@ def trilaterate(
     tag_positions_m: npt.ArrayLike,
     range_m: npt.ArrayLike,
     *,
-    range_stddev_m: npt.ArrayLike | None = None,
-    shared_stddev_m: npt.ArrayLike | None = None,
-    timestamp_s: npt.ArrayLike | None = None,
-    toward: npt.ArrayLike | None = None,
-    height_m: float | None = None,
     options: TrilaterationOptions | None = None,
+    height_m: float | None = None,
+    **known: npt.ArrayLike | None,
 ) -> Trilateration:
     """Find an anchor from its ranges to known positions of the tag.
 
@@ -197,27 +195,20 @@ def trilaterate(
     no range tells. Where the height is known, the same goes for positions that lie on a line, seen from above.
 
     Args:
-        tag_positions_m, range_m, range_stddev_m, shared_stddev_m, timestamp_s, toward, height_m: as in
-            ``AnchorRanges``.
+        tag_positions_m, range_m, height_m: as in ``AnchorRanges``.
+        known: others of its attributes: ``range_stddev_m``, ``shared_stddev_m``, ``timestamp_s``, ``toward``.
 
     Raises:
         GeometryError: too few ranges, positions on a line or all close together, or else an anchor less
             certain than ``options.max_position_stddev_m``.
     """
 
-    def array(values: npt.ArrayLike | None) -> Array | None:
-        return None if values is None else np.asarray(values, dtype=np.float64)
-
-    ranges = AnchorRanges(
-        np.asarray(tag_positions_m, dtype=np.float64),
-        np.asarray(range_m, dtype=np.float64),
-        range_stddev_m=array(range_stddev_m),
-        shared_stddev_m=array(shared_stddev_m),
-        timestamp_s=array(timestamp_s),
-        toward=array(toward),
-        height_m=height_m,
-    )
-    (found,) = trilaterate_together([ranges], options or TrilaterationOptions())
+    positions, ranges = (np.asarray(values, dtype=np.float64) for values in (tag_positions_m, range_m))
+    arrays: dict[str, Any] = {
+        name: None if values is None else np.asarray(values, dtype=np.float64) for name, values in known.items()
+    }
+    anchor = AnchorRanges(positions, ranges, height_m=height_m, **arrays)
+    (found,) = trilaterate_together([anchor], options or TrilaterationOptions())
     if isinstance(found, GeometryError):
         raise found
     return found

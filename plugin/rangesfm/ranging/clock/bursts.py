@@ -6,16 +6,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.stats import f as f_distribution
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.ranging.clock.curve import CostCurve
-from rangesfm.ranging.clock.search import TimedRanges
+from rangesfm.ranging.clock.search import CostCurve, TimedRanges
 from rangesfm.ranging.clock.squares import MIN_RESIDUAL_M, fit_squares
-
-Rows = npt.NDArray[np.int64]
 
 # Shares of the usual time between photos: a pause this long ends a burst; a photo's burst is this near.
 _PAUSE_SHARE = 0.25
@@ -44,10 +40,10 @@ class Bursts(NamedTuple):
 
     start_s: Array
     end_s: Array
-    num_ranges: Rows
+    num_ranges: Indices
     range_m: Array
-    anchor: Rows
-    tag: Rows
+    anchor: Indices
+    tag: Indices
 
     @property
     def middle_s(self) -> Array:
@@ -67,8 +63,8 @@ class Pairing:
     """
 
     offset_s: float
-    burst: Rows
-    photo: Rows
+    burst: Indices
+    photo: Indices
     variance: float
     num_spare: float
     chance: float
@@ -162,7 +158,7 @@ def _offsets(burst_times: Array, photo_times: Array, reach_s: float) -> list[flo
     return offsets
 
 
-def _fit(bursts: Bursts, trajectory: Trajectory, tags_in_cam_m: Array, burst: Rows, photo: Rows) -> Pairing:
+def _fit(bursts: Bursts, trajectory: Trajectory, tags_in_cam_m: Array, burst: Indices, photo: Indices) -> Pairing:
     assert trajectory.timestamps_s is not None
     pair, link = np.nonzero(np.isfinite(bursts.range_m[burst]))
     anchor = bursts.anchor[link]

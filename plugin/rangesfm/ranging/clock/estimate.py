@@ -14,12 +14,11 @@ from rangesfm.options import AssociationOptions
 from rangesfm.progress import Progress, SilentProgress
 from rangesfm.ranging.association import associate, is_too_long, lever_arms
 from rangesfm.ranging.clock.bursts import Bursts, curve_of, find_bursts, offsets_that_keep, pair_bursts
-from rangesfm.ranging.clock.curve import CostCurve, cost_curve
-from rangesfm.ranging.clock.drift import drift_note, fit_clocks, without_drift
+from rangesfm.ranging.clock.drift import drift_note, fit_clocks
 from rangesfm.ranging.clock.fit import refine_offset
-from rangesfm.ranging.clock.path import PathSamples, moving_path
+from rangesfm.ranging.clock.path import moving_path
 from rangesfm.ranging.clock.rivals import REMEDY, Rival, likely_fits, likely_offsets
-from rangesfm.ranging.clock.search import TimedRanges, ranges_on_path, scan_offsets
+from rangesfm.ranging.clock.search import CostCurve, TimedRanges, ranges_on_path, scan_offsets
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.observations import RangeStatus
 
@@ -31,6 +30,8 @@ _NUM_RANGES_PER_CANDIDATE = 3000
 _NUM_RANGES_OF_FINAL = 40000
 # So many of the ranges in bursts must stay at their photos for the offset not to matter.
 _MIN_SAME_SHARE = 0.95
+# Around the best offset the curve shows all: at least this far, and so many stddevs.
+_FINE_REACH_S, _FINE_REACH_STDDEVS = 1.0, 6.0
 # Photos too far apart for ranges to be interpolated still show the motion: up to this many times their usual gap.
 _MAX_GAPS = 1.5
 
@@ -43,7 +44,6 @@ class TimeOffset:
         value_s: where the clocks drift, at ``reference_s``.
         stddev_s: of the value, with allowance for correlated residuals.
         curve: what all offsets cost, for the report.
-        num_ranges_on_path: ranges that the offset puts where the path is known.
         offset_matters: False where any offset near the value puts the ranges at the same photos.
         drift: what camera time gains on radio time, seconds a second.
         drift_stddev: of the drift; infinite where it was not looked for.
@@ -57,7 +57,6 @@ class TimeOffset:
     value_s: float
     stddev_s: float
     curve: CostCurve
-    num_ranges_on_path: int
     offset_matters: bool
     drift: float
     drift_stddev: float
@@ -153,7 +152,7 @@ def _offset_of_motion(
     progress.update(len(candidates), len(candidates))
     if not any(fit.is_testable for fit in fits):
         raise GeometryError(f"too few ranges along the camera's path to find the time offset by: {REMEDY}")
-    num_on_path = np.array([_num_on_path(ranges, path, fit.offset_s) for fit in fits])
+    num_on_path = np.array([np.count_nonzero(path.knows(ranges.times_s + fit.offset_s)) for fit in fits])
     (best, probability), *rivals = likely_fits(fits, num_on_path, path)
     if not best.explains():
         raise GeometryError(
@@ -167,11 +166,11 @@ def _offset_of_motion(
             f"the motion is too even to tell the time offset (about {final.offset_s:+.2f} s, "
             f"stddev {timing.stddev_s:.2g} s): {REMEDY}"
         )
+    weighed = scan_offsets(final.ranges, path, final.squares.weights)
     return TimeOffset(
         value_s=final.offset_s,
         stddev_s=timing.stddev_s,
-        curve=cost_curve(final, path, timing.stddev_s),
-        num_ranges_on_path=_num_on_path(without_drift(ranges, drift, reference_s), path, final.offset_s),
+        curve=weighed.around(final.offset_s, max(_FINE_REACH_S, _FINE_REACH_STDDEVS * timing.stddev_s)),
         offset_matters=True,
         drift=drift or timing.drift,
         drift_stddev=timing.drift_stddev,
@@ -181,10 +180,6 @@ def _offset_of_motion(
         probability=probability,
         rivals=tuple(Rival(fit.offset_s, probability) for fit, probability in rivals),
     )
-
-
-def _num_on_path(ranges: TimedRanges, path: PathSamples, offset_s: float) -> int:
-    return int(np.count_nonzero(path.knows(ranges.times_s + offset_s)))
 
 
 def _offset_of_bursts(
@@ -211,7 +206,6 @@ def _offset_of_bursts(
         value_s=value_s,
         stddev_s=(latest_s - earliest_s) / np.sqrt(12),
         curve=curve_of(pairings, bursts, trajectory),
-        num_ranges_on_path=num_in_bursts,
         offset_matters=False,
         drift=0.0,
         drift_stddev=np.inf,

@@ -7,11 +7,10 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.stats import norm
 from scipy.stats import t as student
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.clock.path import PathSamples
 from rangesfm.ranging.clock.search import TimedRanges
 from rangesfm.ranging.clock.squares import SquaresFit, fit_squares, residual_stddev, rows_by_anchor
@@ -195,7 +194,7 @@ def _is_determined(own: Array, rates: Array) -> bool:
     return bool(own @ own > _MIN_OWN_RATE**2 * (rates @ rates))
 
 
-def _blocks(times: Array, num_blocks: int) -> npt.NDArray[np.int64]:
+def _blocks(times: Array, num_blocks: int) -> Indices:
     """(n,) number of the block of time each range falls into, without gaps."""
     length_s = max(float(np.ptp(times)) / num_blocks, 1e-9)
     return np.unique(np.minimum((times - times.min()) // length_s, num_blocks - 1), return_inverse=True)[1]

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from rangesfm.arrays import Array, Mask
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import AssociationOptions
 from rangesfm.ranging.association import associate
@@ -46,7 +45,7 @@ class PathSamples:
         before = np.where(inside, place, 0).astype(np.int64)
         return np.asarray(inside & self.is_known[before] & self.is_known[np.minimum(before + 1, len(self) - 1)])
 
-    def tag(self, times_s: Array, tag: npt.NDArray[np.int64], scale: float) -> tuple[Array, Array]:
+    def tag(self, times_s: Array, tag: Indices, scale: float) -> tuple[Array, Array]:
         """Where the antenna of a tag is at known times, and how it moves.
 
         Args:

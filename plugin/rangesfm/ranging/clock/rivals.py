@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Indices
 from rangesfm.errors import GeometryError
 from rangesfm.ranging.clock.fit import OffsetFit
 from rangesfm.ranging.clock.path import PathSamples
@@ -50,9 +50,7 @@ def likely_offsets(offsets_s: Sequence[float], log_likelihoods: Sequence[float])
     return list(zip(likely.tolist(), probabilities.tolist()))
 
 
-def likely_fits(
-    fits: list[OffsetFit], num_on_path: npt.NDArray[np.int64], path: PathSamples
-) -> list[tuple[OffsetFit, float]]:
+def likely_fits(fits: list[OffsetFit], num_on_path: Indices, path: PathSamples) -> list[tuple[OffsetFit, float]]:
     """The fits that cannot be ruled out with their probabilities, the likeliest first.
 
     Args:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.ndimage import maximum_filter1d
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.geometry.similarity import rounding_of
 from rangesfm.ranging.clock.path import PathSamples
 from rangesfm.ranging.clock.squares import MIN_RANGE_M, rows_by_anchor
@@ -25,6 +25,7 @@ _MIN_COVERAGE = 0.5
 # A twentieth of what a walker's motion needs to change; less than that for logs of more than seven hours.
 _STEP_S = 0.05
 _MAX_NUM_STEPS = 1 << 19
+_NUM_COARSE, _MAX_NUM_FINE = 160, 200
 _NUM_COLUMNS = 5
 _PAIRS = [(i, j) for i in range(_NUM_COLUMNS) for j in range(i, _NUM_COLUMNS)]
 
@@ -34,10 +35,10 @@ class TimedRanges(NamedTuple):
 
     times_s: Array
     range_m: Array
-    anchor: npt.NDArray[np.int64]
-    tag: npt.NDArray[np.int64]
+    anchor: Indices
+    tag: Indices
 
-    def take(self, rows: npt.NDArray[np.int64] | npt.NDArray[np.bool_]) -> TimedRanges:
+    def take(self, rows: Indices | Mask) -> TimedRanges:
         return TimedRanges(self.times_s[rows], self.range_m[rows], self.anchor[rows], self.tag[rows])
 
 
@@ -47,19 +48,40 @@ def ranges_on_path(ranges: TimedRanges, path: PathSamples, offset_s: float, max_
 
 
 @dataclass(frozen=True)
-class OffsetCurve:
-    """How well each of m offsets explains the ranges.
+class CostCurve:
+    """What offsets of the clocks cost.
 
     Attributes:
-        offsets_s: (m,) increasing; only those that put a fair share of the ranges on the path.
-        scores: (m,) natural log of how many times smaller the residuals on the path are than
-            the ranges' own variation there; 0 explains nothing.
-        costs_m: (m,) root mean square of the residuals.
+        offsets_s: (m,) increasing: all offsets at which log and photos overlap, closer together
+            near the best one.
+        costs_m: (m,) root mean square of the residuals of the ranges on the path, with the anchors and the scale that
+            suit each offset best; each range weighs as it does at the best offset.
     """
 
     offsets_s: Array
-    scores: Array
     costs_m: Array
+
+
+@dataclass(frozen=True)
+class OffsetCurve(CostCurve):
+    """How well each of m offsets explains the ranges: only those that put a fair share of them on the path.
+
+    Attributes:
+        scores: (m,) natural log of how many times smaller the residuals on the path are than
+            the ranges' own variation there; 0 explains nothing.
+    """
+
+    scores: Array
+
+    def around(self, best_s: float, reach_s: float) -> CostCurve:
+        """To look at: the best offset of each stretch of all, and all those within reach of the best of all."""
+        from_best_s = np.abs(self.offsets_s - best_s)
+        near = np.flatnonzero(from_best_s < reach_s)
+        fine = near[np.argsort(from_best_s[near])[:_MAX_NUM_FINE]]
+        stretches = np.array_split(np.arange(len(from_best_s)), min(_NUM_COARSE, len(from_best_s)))
+        coarse = [rows[np.argmin(self.costs_m[rows])] for rows in stretches]
+        shown = np.unique(np.concatenate([fine, coarse]))
+        return CostCurve(self.offsets_s[shown], self.costs_m[shown])
 
     def peaks(self, separation_s: float, max_num: int) -> list[float]:
         """The offsets whose score is the highest within ``separation_s``, best first."""
@@ -91,10 +113,10 @@ def scan_offsets(ranges: TimedRanges, path: PathSamples, weights: Array | None =
     num_on_path, offsets, scores, costs = (np.concatenate(column) for column in zip(*scanned))
     tried = np.flatnonzero(num_on_path >= max(1.0, _MIN_COVERAGE * most))
     order = tried[np.argsort(offsets[tried], kind="stable")]
-    return OffsetCurve(offsets[order], scores[order], costs[order])
+    return OffsetCurve(offsets[order], costs[order], scores[order])
 
 
-def _parts(times: Array, path_span_s: float) -> list[npt.NDArray[np.int64]]:
+def _parts(times: Array, path_span_s: float) -> list[Indices]:
     """The log's rows, cut where its pauses are longer than the path: no offset puts both sides on it.
 
     A clock that starts at zero and is set to the date later costs nothing so.
@@ -157,7 +179,7 @@ class _Correlation:
 def _sums_of_anchor(
     range_m: Array,
     weights: Array,
-    cell: npt.NDArray[np.int64],
+    cell: Indices,
     products: dict[tuple[int, int], npt.NDArray[np.complex128]],
     correlate: _Correlation,
 ) -> Array:

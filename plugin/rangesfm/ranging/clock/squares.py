@@ -10,12 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.errors.noise import robust_stddev
-
-Rows = npt.NDArray[np.int64]
 
 # Ranges shorter than this say as little of the squared distance as one of this length.
 MIN_RANGE_M = 0.3
@@ -69,7 +66,7 @@ class SquaresFit:
         return np.asarray(left - np.outer(curvature, curvature @ left) / max(float(curvature @ curvature), 1e-300))
 
 
-def fit_squares(points: Array, range_m: Array, anchor: Rows, loss_scale: float = _CAUCHY_LOSS_SCALE) -> SquaresFit:
+def fit_squares(points: Array, range_m: Array, anchor: Indices, loss_scale: float = _CAUCHY_LOSS_SCALE) -> SquaresFit:
     """Iteratively reweighted least squares from equal weights.
 
     Args:
@@ -104,7 +101,7 @@ class _LinearColumns:
         curvature: (n,) the column |p|^2, less what the anchors' own unknowns explain of it.
     """
 
-    def __init__(self, points: Array, row_weights: Array, groups: list[Rows]):
+    def __init__(self, points: Array, row_weights: Array, groups: list[Indices]):
         self._row_weights = row_weights
         self._squared_norm = np.sum(points**2, axis=1)
         self.num_anchors = len(groups)
@@ -151,5 +148,5 @@ def residual_stddev(residuals_m: Array) -> float:
     return max(robust_stddev(residuals_m), MIN_RESIDUAL_M)
 
 
-def rows_by_anchor(anchor: Rows) -> list[Rows]:
+def rows_by_anchor(anchor: Indices) -> list[Indices]:
     return [np.flatnonzero(anchor == number) for number in np.unique(anchor)]

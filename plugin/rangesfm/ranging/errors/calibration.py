@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
+from scipy.linalg import block_diag
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.error_curve import ErrorCurve
@@ -72,7 +72,7 @@ class _Problem:
     design: Array
     error_m: Array
     prior: Array
-    groups: npt.NDArray[np.int64]
+    groups: Indices
 
 
 def calibrate_ranges(log: RangeLog, tags_m: Array, anchors: Sequence[Anchor]) -> Calibration:
@@ -134,14 +134,7 @@ def _knots(distance: Array) -> Array:
     return knots
 
 
-def _problem(
-    log: RangeLog,
-    used: npt.NDArray[np.int64],
-    distance: Array,
-    error: Array,
-    index: npt.NDArray[np.int64],
-    knots: Array,
-) -> _Problem:
+def _problem(log: RangeLog, used: Indices, distance: Array, error: Array, index: Indices, knots: Array) -> _Problem:
     num_anchors = len(log.anchor_ids)
     # Linear in the distance between knots, as the curve is applied.
     hats = np.column_stack([np.interp(distance, knots, unit) for unit in np.eye(len(knots))])
@@ -154,18 +147,11 @@ def _problem(
 
 
 def _prior(knots: Array, num_anchors: int) -> Array:
-    """Rows of stddev 1: bends of the curve as of a slope that walks at random, its ends, and the biases."""
+    """Indices of stddev 1: bends of the curve as of a slope that walks at random, its ends, and the biases."""
     step = np.log(knots[1] / knots[0])
     bends = np.diff(np.eye(len(knots)), 2, axis=0) / (_BEND_STDDEV_M * step**1.5)
     ends = np.eye(len(knots))[[0, -1]] / _LEVEL_STDDEV_M
-    curve = np.vstack([bends, ends])
-    biases = np.eye(num_anchors) / _BIAS_STDDEV_M
-    return np.vstack(
-        [
-            np.hstack([curve, np.zeros((len(curve), num_anchors))]),
-            np.hstack([np.zeros((num_anchors, len(knots))), biases]),
-        ]
-    )
+    return np.asarray(block_diag(np.vstack([bends, ends]), np.eye(num_anchors) / _BIAS_STDDEV_M))
 
 
 def _information(problem: _Problem, weights: Array, stddev: float) -> Array:
@@ -215,7 +201,7 @@ def _fit(problem: _Problem) -> tuple[_Fit, _Scatter]:
     return fitted, seen
 
 
-def _spread_by_anchor(problem: _Problem, index: npt.NDArray[np.int64], num_knots: int) -> Array:
+def _spread_by_anchor(problem: _Problem, index: Indices, num_knots: int) -> Array:
     """(k,) jackknife stddev of the curve over anchors; 0 with too few of them."""
     present = np.unique(index)
     if len(present) < _MIN_ANCHORS_TO_LEAVE_OUT:

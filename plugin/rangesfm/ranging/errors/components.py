@@ -185,5 +185,7 @@ def component_words(names: Iterable[str]) -> dict[str, str]:
         LEARNT_CURVE: "the learnt error curve",
         GIVEN: "tapes, anchors' positions and what else was given",
         REWEIGHTING: "what the best weights for these errors would change",
+        "tape": "how the lengths were measured",
+        "marks": "where their ends are in the photos",
     }
     return {name: words[name] for name in names}

@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.files.tables import Table, has_columns, read_table, write_table
+from rangesfm.files.tables import has_columns, read_table, write_table
 from rangesfm.ranging.log import RangeLog
 
 COLUMNS = ("distance_m", "error_m", "stddev_m", "noise_stddev_m")
@@ -91,15 +90,10 @@ def read_error_curve(path: str | Path) -> ErrorCurve:
         raise InputError(f"has {len(table)} distances, expected two or more", path)
     distance, error = table.numbers("distance_m"), table.numbers("error_m")
     stddev = table.numbers("stddev_m")
-    noise = table.numbers("noise_stddev_m", empty=0.0) if "noise_stddev_m" in table else np.zeros(len(table))
-    _refuse(table, "distance_m", distance <= 0, "more than 0")
-    _refuse(table, "distance_m", np.diff(distance, prepend=0.0) <= 0, "more than the distance before it")
-    _refuse(table, "stddev_m", stddev < 0, "0 or more")
+    noise = table.numbers("noise_stddev_m", empty=0.0)
+    table.refuse(distance <= 0, "distance_m", "more than 0")
+    table.refuse(np.diff(distance, prepend=0.0) <= 0, "distance_m", "more than the distance before it")
+    table.refuse(stddev < 0, "stddev_m", "0 or more")
     too_steep = np.diff(distance + error, prepend=0.0) <= 0
-    _refuse(table, "error_m", too_steep, "one at which a longer distance gives a longer range")
+    table.refuse(too_steep, "error_m", "one at which a longer distance gives a longer range")
     return ErrorCurve(distance, error, stddev, noise)
-
-
-def _refuse(table: Table, column: str, wrong: npt.NDArray[np.bool_], expected: str) -> None:
-    if wrong.any():
-        raise table.error(int(np.argmax(wrong)), column, expected)

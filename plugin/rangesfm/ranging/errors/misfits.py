@@ -23,6 +23,8 @@ def misfits(errors: RangeErrors, residuals_m: Array, time_order: Array) -> tuple
     Args:
         errors, residuals_m: of the k ranges that took part. time_order: (k,) anything that grows with time.
     """
+    if not len(residuals_m):
+        return ()
     reasons = []
     stated = residuals_m / errors.stddev_m
     typical = robust_stddev(stated)

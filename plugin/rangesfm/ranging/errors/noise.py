@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.log import RangeLog
 
 # Radios read up to 0.15 m short below about 2 m, every anchor alike, by an amount that depends
@@ -59,16 +59,16 @@ def bias_whitening(own_stddev_m: Array, common_stddev_m: float) -> Array:
     return whitening
 
 
-def stretch_labels(times_s: Array, length_s: float) -> npt.NDArray[np.int64]:
+def stretch_labels(times_s: Array, length_s: float) -> Indices:
     """(n,) labels of stretches of time, in which errors may go together: at least eight."""
     since = times_s - times_s.min()
     length_s = max(min(length_s, float(since.max()) / _MIN_NUM_STRETCHES), 1e-9)
-    labels: npt.NDArray[np.int64] = np.floor(since / length_s).astype(np.int64)
+    labels: Indices = np.floor(since / length_s).astype(np.int64)
     return labels
 
 
 def correlation_inflation(
-    scaled_residuals: Array, weights: Array, groups: npt.NDArray[np.int64], shares: Array | None = None
+    scaled_residuals: Array, weights: Array, groups: Indices, shares: Array | None = None
 ) -> float:
     """How much larger the stddev of a mean is than independent errors would make it.
 

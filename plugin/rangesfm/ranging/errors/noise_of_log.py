@@ -1,10 +1,15 @@
-"""How noisy ranges are, from the log alone: by how much they miss a smooth curve through their neighbours."""
+"""How noisy ranges are, from the log alone: by how much they miss a smooth curve through their neighbours.
+
+Nor is any range better than its rounding, of radios that report whole centimetres or decimetres.
+"""
 
 from __future__ import annotations
 
-import numpy as np
-import numpy.typing as npt
+import math
 
+import numpy as np
+
+from rangesfm.arrays import Array
 from rangesfm.ranging.errors.noise import robust_stddev, robust_stddevs
 
 _WINDOW = 11
@@ -13,9 +18,12 @@ _MAX_STRETCH = 3.0  # a window so much longer than the typical one has a gap in 
 _CAUCHY_SCALE = 2.4
 _NUM_ITERATIONS = 8
 _TINY = 1e-9
+_STEPS_M = (0.1, 0.01)
+_MIN_NUM_ROUNDED = 20
+_ROUNDED_TO_M = 1e-5  # what 32-bit numbers leave of a range of some hundred metres
 
 
-def estimate_noise_m(timestamp_s: npt.NDArray[np.float64], range_m: npt.NDArray[np.float64]) -> float | None:
+def estimate_noise_m(timestamp_s: Array, range_m: Array) -> float | None:
     """Robust stddev of the ranges between one tag and one anchor.
 
     A parabola is fitted robustly to every 11 ranges in a row; the middle one's distance from it, corrected
@@ -43,7 +51,7 @@ def estimate_noise_m(timestamp_s: npt.NDArray[np.float64], range_m: npt.NDArray[
     return noise if np.isfinite(noise) else None
 
 
-def _misses_of_parabola(times: npt.NDArray[np.float64], ranges: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _misses_of_parabola(times: Array, ranges: Array) -> Array:
     """What the middle of each row of (m, 11) ranges is off a robust parabola, as if it had not pulled on it, (m,)."""
     middle = _WINDOW // 2
     centred = times - times[:, middle : middle + 1]
@@ -60,3 +68,18 @@ def _misses_of_parabola(times: npt.NDArray[np.float64], ranges: npt.NDArray[np.f
     plain = np.einsum("mij,mik->mjk", powers, powers) + _TINY * np.eye(3)
     pull = np.linalg.inv(plain)[:, 0, 0]  # of the middle, where the powers are 1, 0, 0
     return np.asarray(residuals[:, middle] / np.sqrt(np.maximum(1 - pull, _TINY)), np.float64)
+
+
+def find_quantization_m(range_m: Array) -> float | None:
+    """The step (0.1 or 0.01 m) of which all ranges are multiples; None if of neither, or too few to tell."""
+    if len(range_m) < _MIN_NUM_ROUNDED:
+        return None
+    for step in _STEPS_M:
+        if np.all(np.abs(range_m - np.round(range_m / step) * step) < _ROUNDED_TO_M):
+            return step
+    return None
+
+
+def quantization_stddev_m(step_m: float) -> float:
+    """Of the rounding error, which is uniform over one step."""
+    return step_m / math.sqrt(12)

@@ -2,59 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from rangesfm.errors import InputError
 from rangesfm.files.bags import is_bag_folder
 from rangesfm.files.tables import read_head
+from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.errors.quantization import find_quantization_m, quantization_stddev_m
+from rangesfm.ranging.errors.noise_of_log import find_quantization_m, quantization_stddev_m
 from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.readers import ros
+from rangesfm.ranging.readers import canonical, ros
 from rangesfm.ranging.readers.canonical import write_ranges_csv
+from rangesfm.ranging.readers.printed_formats import PRINTED
 from rangesfm.ranging.readers.reader import Reader, ReadOptions
-from rangesfm.ranging.readers.registry import find_reader, reader_names, recognize
 from rangesfm.ranging.readers.roles import tell_roles
 from rangesfm.ranging.readers.several import files_of_log, join_logs
-from rangesfm.ranging.readers.table import TABLE, table_reader
-from rangesfm.ranging.twr import StampOptions
+from rangesfm.ranging.readers.table import MAPPED, PRESETS, TABLE, table_reader
 
 __all__ = ["find_log_reader", "read_anchors_in_log", "read_ranges", "reader_names", "write_ranges_csv"]
+
+_READERS = (ros.READER, canonical.READER, *PRESETS, MAPPED, TABLE, *PRINTED)
+
+
+def reader_names() -> tuple[str, ...]:
+    """All log formats. A new one is a declaration beside this and a name in the tuple above."""
+    return tuple(reader.name for reader in _READERS)
 
 
 def read_ranges(
     path: str | Path | Sequence[str | Path],
+    options: LogOptions | None = None,
     *,
-    format: str | None = None,
-    columns: Mapping[str, str] | None = None,
-    timestamp_unit: str | None = None,
-    range_unit: str | None = None,
-    separator: str | None = None,
     anchor_ids: Collection[str] = (),
     tag_ids: Collection[str] = (),
-    ranging_interval_s: float | None = None,
-    stamps: StampOptions | None = None,
+    **said: Any,
 ) -> RangeLog:
     """Read a radio's log.
 
     Args:
         path: a file; or several, a folder of them, or a pattern as ``uwb_*.csv``, one an anchor say.
-        format: one of ``reader_names()``; None: "mapped" with ``columns``, else recognised by content.
-        columns: name in the file (or number, in one without names) of ``timestamp`` (or ``image_name``),
-            ``anchor_id``, ``range`` and, where it has them, ``tag_id``, ``range_stddev``, ``los`` and others of
-            ``columns.QUANTITIES``; a column an anchor: ``range:A1``, or ``range:A1:T0`` with the tag; without
-            ``range``, the time stamps ``tx1``, ``rx1``, .. of two-way ranging, where they have other names than these.
-        timestamp_unit: s, ms, us, ns or iso; None: what the format, the column's name or its values say.
-        range_unit: m, cm or mm; None: what the format, the column's name or its values say.
-        separator: between cells (a blank: any run of blanks); None: told from the rows.
+        options: how to take it.
         anchor_ids, tag_ids: known anchors and tags, which tell them apart where the log does not, and ranges
             between two of a kind from those between a tag and an anchor.
-        ranging_interval_s: time between two rounds, for radios that count rounds where nobody wrote times.
-        stamps: how those time stamps become ranges; None: nanoseconds of a 32-bit DW1000, through air.
+        said: single ones of the options: ``format``, one of ``reader_names()``; ``columns``, the name in the file of
+            each of ``columns.QUANTITIES``, of a column an anchor as ``range:A1``, or ``range:A1:T0`` with the tag; and
+            all others.
 
     Returns:
         All ranges in the order of the log, those that are not positive (no measurement) counted and left out; its
@@ -65,21 +62,11 @@ def read_ranges(
         InputError: with the line where there is one, for a file that is missing, empty, not understood for sure
             (its advice says what to type), broken, or without any usable range.
     """
-    if ranging_interval_s is not None and not 0 < ranging_interval_s < float("inf"):
-        message = f"ranging_interval_s is {ranging_interval_s}, expected a positive number of seconds"
-        raise InputError(message, path if isinstance(path, (str, Path)) else None)
-    paths = [Path(one) for one in ([path] if isinstance(path, (str, Path)) else path)]
-    options = ReadOptions(
-        columns=dict(columns or {}),
-        timestamp_unit=timestamp_unit,
-        range_unit=range_unit,
-        separator=separator,
-        ranging_interval_s=ranging_interval_s,
-        stamps=stamps or StampOptions(),
-        given=[str(one) for one in paths],
-    )
-    chosen = _choose_readers(paths, options, format or ("mapped" if columns else None))
-    logs = [reader.read(file, options) for file, reader in chosen]
+    paths = _paths(path)
+    table = {} if options is None else {name: getattr(options, name) for name in LogOptions.model_fields}
+    reading = ReadOptions(**{**table, **said, "given": tuple(map(str, paths))})
+    chosen = _choose_readers(paths, reading, reading.format or ("mapped" if reading.columns else None))
+    logs = [reader.read(file, reading) for file, reader in chosen]
     source = paths[0] if len(paths) == 1 else paths[0].parent
     log = logs[0] if len(logs) == 1 else join_logs(logs, source)
     log = tell_roles(log, chosen[0][1].sides, known_anchor_ids=anchor_ids, known_tag_ids=tag_ids)
@@ -99,11 +86,12 @@ def read_anchors_in_log(path: str | Path | Sequence[str | Path], *, format: str 
     Raises:
         InputError: for a file that is missing, empty or of no known format.
     """
-    paths = [Path(one) for one in ([path] if isinstance(path, (str, Path)) else path)]
-    chosen = _choose_readers(paths, ReadOptions(), format)
-    return tuple(
-        anchor for file, reader in chosen if reader.read_anchors is not None for anchor in reader.read_anchors(file)
-    )
+    chosen = _choose_readers(_paths(path), ReadOptions(), format)
+    return tuple(anchor for file, reader in chosen for anchor in reader.read_anchors(file))
+
+
+def _paths(path: str | Path | Sequence[str | Path]) -> list[Path]:
+    return [Path(one) for one in ([path] if isinstance(path, (str, Path)) else path)]
 
 
 def _not_better_than_rounding(log: RangeLog) -> RangeLog:
@@ -139,17 +127,17 @@ def _choose_readers(paths: Sequence[Path], options: ReadOptions, format: str | N
 
 def _choose_reader(path: Path, options: ReadOptions, format: str | None) -> Reader:
     if format is not None and format != TABLE.name:
-        reader = find_reader(format)
-        if reader is None:
+        named = next((reader for reader in _READERS if reader.name == format), None)
+        if named is None:
             raise InputError(f"no log format is named '{format}', expected one of {', '.join(reader_names())}", path)
-        return reader
+        return named
     if is_bag_folder(path):
         return ros.READER
     head = read_head(path)
     if not head.strip():
         raise InputError("the file is empty, expected a log of ranges", path)
-    reader = None if format == TABLE.name else recognize(head)
-    return table_reader(path, options) if reader is None else reader
+    known = () if format == TABLE.name else _READERS
+    return next((reader for reader in known if reader.recognizes(head)), None) or table_reader(path, options)
 
 
 def find_log_reader(path: Path) -> Reader:

@@ -62,7 +62,7 @@ def _read(path: Path, options: ReadOptions) -> RangeLog:
         raise InputError("the canonical CSV has fixed columns in seconds and metres; use format 'mapped'", path)
     names = header_names(read_head(path), options.separator)
     columns = _BY_IMAGE if "image_name" in names and "timestamp_s" not in names else _BY_TIME
-    return read_columns(path, replace(columns, separator=options.separator), options, READER.name)
+    return read_columns(path, columns, options.changed(timestamp_unit=None, range_unit=None), READER.name)
 
 
-READER = Reader("canonical", "CSV with the columns timestamp_s (or image_name), anchor_id, range_m", _recognizes, _read)
+READER = Reader("canonical", _recognizes, _read)

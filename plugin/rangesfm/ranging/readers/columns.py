@@ -11,12 +11,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.tables import Categories, Table, read_table
 from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
-from rangesfm.ranging.readers.layout import MISSING
-from rangesfm.ranging.readers.reader import ReadOptions
-from rangesfm.ranging.readers.time_units import SECONDS_PER_UNIT, TIME_OF_DAY, CivilClock, is_zoned
+from rangesfm.ranging.readers.layout import MISSING, Layout
+from rangesfm.ranging.readers.reader import ReadOptions, no_usable_range
+from rangesfm.ranging.readers.times import SECONDS_PER_UNIT, TIME_OF_DAY, CivilClock, is_zoned
 from rangesfm.ranging.readers.units import UNITS_PER_METRE, UnclearUnitError, range_unit, time_unit
 from rangesfm.ranging.twr import StampOptions, double_sided_range, single_sided_range
 
@@ -40,15 +41,9 @@ class Columns:
         optional: the same for those that it may have.
         wide: names of columns of ranges that each are of one anchor and one tag, with the ids of these.
         anchor_id: of all ranges, where neither a column nor ``wide`` says it.
-        timestamp_unit: one of TIMESTAMP_UNITS; None: by its name and its values.
-        range_unit: one of UNITS_PER_METRE, also of range_stddev; None: by its name and its values.
-        separator: between cells; None: told from the header row.
-        header: names of all columns where the file has no such row, or not as its first; needs the separator.
-        num_skipped: lines before the first row, where ``header`` is given.
-        decimal_comma: numbers have a comma for a point.
+        layout: of the file; None: its first row is its header.
         is_strict: a cell of ranges is a number, and ids are taken to the letter; otherwise it may also be empty (no
             measurement), and 1.000 is the id 1.
-        stamps: how time stamps become ranges, where there is no range.
         notes: how all this was found.
     """
 
@@ -56,14 +51,8 @@ class Columns:
     optional: Mapping[str, str] = field(default_factory=dict)
     wide: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     anchor_id: str | None = None
-    timestamp_unit: str | None = None
-    range_unit: str | None = None
-    separator: str | None = None
-    header: tuple[str, ...] | None = None
-    num_skipped: int = 0
-    decimal_comma: bool = False
+    layout: Layout | None = None
     is_strict: bool = False
-    stamps: StampOptions = field(default_factory=StampOptions)
     notes: tuple[str, ...] = ()
 
 
@@ -71,37 +60,36 @@ def read_columns(path: Path, columns: Columns, options: ReadOptions, format: str
     """Read a log off the named columns.
 
     Args:
-        options: what the user said, for the command that asks for a unit.
+        options: what the user says of units, time stamps and, without a layout, the separator.
         format: name of the reader, for the record.
 
     Raises:
         InputError: with the line, for whatever is not a time, an id or a range; also if no range is left, or if a
             unit may be one or another.
     """
-    named = {**columns.optional, **columns.required}
+    named, layout = {**columns.optional, **columns.required}, columns.layout
     table = read_table(
         path,
         [*columns.required.values(), *columns.wide],
         [*columns.optional.values()],
         text=[named[key] for key in _TEXTS if key in named],
-        separator=columns.separator,
-        header=columns.header,
-        num_skipped=columns.num_skipped,
-        decimal_comma=columns.decimal_comma,
+        separator=layout.separator if layout else options.separator,
+        header=layout.header if layout else None,
+        num_skipped=layout.num_skipped if layout else 0,
+        decimal_comma=layout is not None and layout.decimal_comma,
     )
     name = {key: column for key, column in named.items() if column in table}
     notes = [*columns.notes]
     with _asking("timestamp", path, options):
-        timestamps = _timestamps(table, name, columns.timestamp_unit, notes) if "timestamp" in name else None
+        timestamps = _timestamps(table, name, options.timestamp_unit, notes) if "timestamp" in name else None
     image_name = table.text(name["image_name"]) if timestamps is None else None
     num_ends = max(1, len(columns.wide))
     row = np.repeat(np.arange(len(table)), num_ends)
     anchor, tag = _anchors(table, name, columns), _tags(table, name, columns)
-    ranges = _ranges(table, name, columns)
+    ranges = _ranges(table, name, columns, options)
     measured = ranges > _NOTHING
     if not np.any(measured):
-        said = f"all {len(ranges)} records say that there was no measurement" if len(ranges) else "no records"
-        raise InputError(f"no usable range: {said}", path)
+        raise no_usable_range(len(ranges), path)
     row, ranges, anchor = row[measured], ranges[measured], anchor.subset(measured)
     tag = None if tag is None else tag.subset(measured)
     times = None if timestamps is None else timestamps[row]
@@ -110,7 +98,7 @@ def read_columns(path: Path, columns: Columns, options: ReadOptions, format: str
         with _asking("range", path, options):
             pair = anchor.index if tag is None else anchor.index * len(tag.names) + tag.index
             column = name.get("range") or next(iter(columns.wide))
-            unit = columns.range_unit or _noted(notes, range_unit(column, ranges, times, pair))
+            unit = options.range_unit or _noted(notes, range_unit(column, ranges, times, pair))
     per_metre = UNITS_PER_METRE[unit or "m"]
     stddevs = _stddevs(table, name["range_stddev"], per_metre) if "range_stddev" in name else None
     los = _line_of_sight(table, name) if {"los", "nlos"} & set(name) else None
@@ -189,17 +177,17 @@ def _ids(table: Table, column: str, columns: Columns, empty: str | None) -> Cate
     return Categories(merged.names, merged.index[ids.index])
 
 
-def _ranges(table: Table, name: Mapping[str, str], columns: Columns) -> npt.NDArray[np.float64]:
+def _ranges(table: Table, name: Mapping[str, str], columns: Columns, options: ReadOptions) -> Array:
     """(n,) in the unit of the file, those of a row after each other; not positive: no measurement."""
     if "range" not in name and not columns.wide:
-        return _ranges_by_stamps(table, name, columns)
-    unit = " of metres" if columns.range_unit in (None, "m") else f" of {columns.range_unit}"
+        return _ranges_by_stamps(table, name, StampOptions.of(options))
+    unit = " of metres" if options.range_unit in (None, "m") else f" of {options.range_unit}"
     empty, expected = None if columns.is_strict else 0.0, f"a positive number{unit}; 0 means no measurement"
     names = columns.wide or [name["range"]]
     return np.column_stack([table.numbers(k, empty=empty, missing=MISSING, expected=expected) for k in names]).ravel()
 
 
-def _ranges_by_stamps(table: Table, name: Mapping[str, str], columns: Columns) -> npt.NDArray[np.float64]:
+def _ranges_by_stamps(table: Table, name: Mapping[str, str], options: StampOptions) -> Array:
     """Two-way ranging, double-sided where the third message is there; 0 (no measurement) where a stamp is empty."""
     stamps = {
         stamp: table.numbers(name[stamp], empty=np.nan, expected="a time stamp or nothing")
@@ -207,13 +195,13 @@ def _ranges_by_stamps(table: Table, name: Mapping[str, str], columns: Columns) -
         if stamp in name
     }
     if len(stamps) == len(STAMPS) and len(table) > 0:
-        ranges = double_sided_range(**stamps, options=columns.stamps)
+        ranges = double_sided_range(**stamps, options=options)
     else:
-        ranges = single_sided_range(**{stamp: stamps[stamp] for stamp in STAMPS[:4]}, options=columns.stamps)
+        ranges = single_sided_range(**{stamp: stamps[stamp] for stamp in STAMPS[:4]}, options=options)
     return np.nan_to_num(ranges, nan=0.0)
 
 
-def _timestamps(table: Table, name: Mapping[str, str], unit: str | None, notes: list[str]) -> npt.NDArray[np.float64]:
+def _timestamps(table: Table, name: Mapping[str, str], unit: str | None, notes: list[str]) -> Array:
     column = name["timestamp"]
     if unit == "iso" or "date" in name or (unit is None and not table.begins_with_number(column)):
         return _civil_times(table, name, notes)
@@ -224,7 +212,7 @@ def _timestamps(table: Table, name: Mapping[str, str], unit: str | None, notes: 
     return seconds + 1e-9 * table.numbers(name["nanoseconds"]) if "nanoseconds" in name else seconds
 
 
-def _civil_times(table: Table, name: Mapping[str, str], notes: list[str]) -> npt.NDArray[np.float64]:
+def _civil_times(table: Table, name: Mapping[str, str], notes: list[str]) -> Array:
     texts = table.text(name["timestamp"])
     if "date" in name:
         texts = [f"{date} {time}" for date, time in zip(table.text(name["date"]), texts)]
@@ -241,11 +229,10 @@ def _civil_times(table: Table, name: Mapping[str, str], notes: list[str]) -> npt
     return seconds
 
 
-def _stddevs(table: Table, column: str, per_metre: float) -> npt.NDArray[np.float64]:
+def _stddevs(table: Table, column: str, per_metre: float) -> Array:
     expected = "a positive number or nothing"
     stddevs = table.numbers(column, empty=np.nan, expected=expected) / per_metre
-    if np.any(stddevs <= 0):
-        raise table.error(int(np.argmax(stddevs <= 0)), column, expected)
+    table.refuse(stddevs <= 0, column, expected)
     return stddevs
 
 
@@ -254,6 +241,5 @@ def _line_of_sight(table: Table, name: Mapping[str, str]) -> npt.NDArray[np.int8
     expected = "1 (line of sight), 0 (none) or nothing"
     los = table.numbers(column, empty=-1.0, expected=expected)
     wrong = ~np.isin(los, (0.0, 1.0)) & (np.array(table.text(column, empty="")) != "")
-    if np.any(wrong):
-        raise table.error(int(np.argmax(wrong)), column, expected)
+    table.refuse(wrong, column, expected)
     return np.where(los < 0, -1, los if "los" in name else 1 - los).astype(np.int8)

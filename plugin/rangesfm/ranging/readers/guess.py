@@ -10,8 +10,8 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.ranging.readers.layout import Column, Layout
 from rangesfm.ranging.readers.roles import Sides
 
@@ -367,7 +367,7 @@ def _num_tags(columns: Sequence[Column]) -> int:
     return 1
 
 
-def _are_alike(ranges: npt.NDArray[np.float64]) -> bool:
+def _are_alike(ranges: Array) -> bool:
     """Whether the last axis of (n, anchors, tags) differs little, and less than the one before."""
     spread = np.percentile(np.ptp(ranges, axis=2), 95, axis=0)
     apart = np.median(np.ptp(ranges[:, :, 0], axis=1))

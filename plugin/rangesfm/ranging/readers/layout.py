@@ -10,10 +10,10 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.files.tables import read_head
-from rangesfm.ranging.readers.time_units import ISO_TIME, TIME_OF_DAY
+from rangesfm.ranging.readers.times import ISO_TIME, TIME_OF_DAY
 from rangesfm.ranging.readers.units import words_of
 
 MISSING = ("", "nan", "-nan", "inf", "-inf", "none", "null", "nil", "na", "n/a", "-")
@@ -39,7 +39,7 @@ class Column:
         return words_of(self.name)
 
     @cached_property
-    def numbers(self) -> npt.NDArray[np.float64]:
+    def numbers(self) -> Array:
         """Of the cells that are finite ones."""
         values = np.array([float(cell) for cell in self.cells if _NUMBER.fullmatch(cell)], np.float64)
         return values[np.isfinite(values)]
@@ -70,17 +70,19 @@ class Column:
 
 @dataclass(frozen=True)
 class Layout:
-    """A table as ``read_table`` takes it: see there; ``has_names`` is whether the file names its columns."""
+    """A table as ``read_table`` takes it: see there.
 
-    columns: tuple[Column, ...]
+    Attributes:
+        columns: what the first rows have under each name of the header.
+        has_names: whether the file names its columns.
+    """
+
+    header: tuple[str, ...]
     separator: str
-    num_skipped: int
-    decimal_comma: bool
-    has_names: bool
-
-    @property
-    def header(self) -> tuple[str, ...]:
-        return tuple(column.name for column in self.columns)
+    num_skipped: int = 0
+    decimal_comma: bool = False
+    columns: tuple[Column, ...] = ()
+    has_names: bool = True
 
 
 def find_layout(path: Path, separator: str | None = None) -> Layout | None:
@@ -107,9 +109,9 @@ def find_layout(path: Path, separator: str | None = None) -> Layout | None:
     elif comments := [line for number, line in numbered if number < content[first][0] and line.lstrip()[0] == "#"]:
         cells = _cells(comments[-1].lstrip("# \t"), separator)
         names = cells if len(cells) == num and not any(map(_NUMBER.fullmatch, cells)) else None
-    named = _unique(names or [str(k + 1) for k in range(num)], num)
-    columns = tuple(Column(name, tuple(row[k] for row in body)) for k, name in enumerate(named))
-    return Layout(columns, separator, num_skipped, decimal_comma, names is not None) if body else None
+    header = tuple(_unique(names or [str(k + 1) for k in range(num)], num))
+    columns = tuple(Column(name, tuple(row[k] for row in body)) for k, name in enumerate(header))
+    return Layout(header, separator, num_skipped, decimal_comma, columns, names is not None) if body else None
 
 
 def _split(content: list[tuple[int, str]], separator: str) -> tuple[list[list[str]], str] | None:

@@ -1,18 +1,20 @@
-"""Qorvo DWM3001CDK and QM33 shell: ``SESSION_INFO_NTF`` over several lines, and the older JSON."""
+"""Qorvo DWM3001CDK and QM33 shell: ``SESSION_INFO_NTF: {..}`` over several lines, and the older
+``{"Block":1, "results":[..]}``.
+"""
 
 from __future__ import annotations
 
 import re
 from bisect import bisect_right
+from collections.abc import Iterator
 from pathlib import Path
 
 from rangesfm.errors import InputError
 from rangesfm.files.tables import read_text
 from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.readers.host_time import HostClock
-from rangesfm.ranging.readers.printed import check_only_time_is_described
-from rangesfm.ranging.readers.reader import Reader, ReadOptions
-from rangesfm.ranging.readers.records import Records
+from rangesfm.ranging.readers.printed import LOST
+from rangesfm.ranging.readers.reader import Reader, Reading, ReadOptions, log_of_readings
+from rangesfm.ranging.readers.times import HostClock
 
 _DEFAULT_RANGING_INTERVAL_S = 0.2
 _BEGIN = re.compile(r'SESSION_INFO_NTF:?\s{0,9}\{|\{\s{0,9}"Block"\s{0,9}:', re.ASCII)
@@ -31,10 +33,11 @@ _MEASUREMENT = re.compile(
 
 
 def _read(path: Path, options: ReadOptions) -> RangeLog:
-    check_only_time_is_described(path, options)
-    text = read_text(path, errors="replace")
-    clock = _Clock(path, options)
-    records = Records()
+    options.check_no_table(path)
+    return log_of_readings(_readings(read_text(path, errors="replace"), _Clock(path, options)), path, READER.name)
+
+
+def _readings(text: str, clock: _Clock) -> Iterator[Reading]:
     begins = list(_BEGIN.finditer(text))
     line_starts = [0, *(end.end() for end in re.finditer("\n", text))]
     for begin, stop in zip(begins, [*(begin.start() for begin in begins[1:]), len(text)]):
@@ -43,14 +46,13 @@ def _read(path: Path, options: ReadOptions) -> RangeLog:
         line = bisect_right(line_starts, begin.start())
         timestamp_s = clock.seconds(text[line_starts[line - 1] : begin.start()], body, line)
         measurements = list(_MEASUREMENT.finditer(body))
-        for measurement in measurements:
+        for found in measurements:
             anchor_id, range_cm = (
-                measurement["id"] or measurement["json_id"],
-                measurement["cm"] or measurement["json_cm"],
+                found["id"] or found["json_id"],
+                found["cm"] or found["json_cm"],
             )
-            records.add(timestamp_s, anchor_id, int(range_cm) / 100, line)
-        records.num_no_measurement += max(0, len(_EACH.findall(body)) - len(measurements))
-    return records.to_log(path, READER.name)
+            yield Reading(timestamp_s, anchor_id, int(range_cm) / 100, line)
+        yield from [LOST] * (len(_EACH.findall(body)) - len(measurements))
 
 
 class _Clock:
@@ -83,9 +85,4 @@ class _Clock:
         return count * self._interval_s
 
 
-READER = Reader(
-    "qorvo",
-    'Qorvo shell: SESSION_INFO_NTF: {..}, or {"Block":1, "results":[..]}',
-    recognizes=lambda head: _BEGIN.search(head) is not None,
-    read=_read,
-)
+READER = Reader("qorvo", lambda head: _BEGIN.search(head) is not None, _read)

@@ -1,39 +1,26 @@
-"""What a reader of one log format is."""
+"""What a reader of one log format is, and how the ranges that it finds become a log."""
 
 from __future__ import annotations
 
+import math
 import shlex
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
+from rangesfm.errors import InputError
+from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.roles import Sides
-from rangesfm.ranging.twr import StampOptions
 
 
-@dataclass(frozen=True)
-class ReadOptions:
-    """What the user says about a log; None and empty: what the format says.
+class ReadOptions(LogOptions):
+    """What the user says about a log."""
 
-    Attributes:
-        columns: name in the file of each quantity (``columns.QUANTITIES``).
-        timestamp_unit: s, ms, us, ns or iso.
-        range_unit: m, cm or mm.
-        separator: between cells; a blank means any run of blanks.
-        ranging_interval_s: time between two rounds, of radios that count them instead of telling times.
-        stamps: how time stamps of two-way ranging become ranges.
-        given: what the user called the log.
-    """
-
-    columns: Mapping[str, str] = field(default_factory=dict)
-    timestamp_unit: str | None = None
-    range_unit: str | None = None
-    separator: str | None = None
-    ranging_interval_s: float | None = None
-    stamps: StampOptions = field(default_factory=StampOptions)
-    given: Sequence[str] = ()
+    given: tuple[str, ...] = ()
+    """What the user calls it."""
 
     def command(self, path: Path, **more: str) -> str:
         """What to type to read the log with these options and some more."""
@@ -43,6 +30,12 @@ class ReadOptions:
         typed = [word for flag, value in flags.items() if value for word in (f"--{flag}", value)]
         return shlex.join(["rangesfm", "ranges", *(self.given or [str(path)]), *typed])
 
+    def check_no_table(self, path: Path) -> None:
+        """InputError if the user describes columns where there are none."""
+        if self.columns or self.range_unit is not None or self.separator is not None:
+            message = "the log has a format of its own, without columns, range_unit or separator to be given"
+            raise InputError(message, path)
+
 
 @dataclass(frozen=True)
 class Reader:
@@ -50,16 +43,52 @@ class Reader:
 
     Attributes:
         name: by which the user asks for it.
-        description: for the message that lists the formats.
         recognizes: whether the beginning of a file looks like this format.
         read: the whole file.
-        read_anchors: the anchors whose positions the log tells; None: this format tells none.
+        read_anchors: the anchors whose positions the log tells.
         sides: what the log says of the two ends of a range.
     """
 
     name: str
-    description: str
     recognizes: Callable[[str], bool]
     read: Callable[[Path, ReadOptions], RangeLog]
-    read_anchors: Callable[[Path], tuple[Anchor, ...]] | None = None
+    read_anchors: Callable[[Path], tuple[Anchor, ...]] = lambda path: ()
     sides: Sides = Sides.TOLD
+
+
+class Reading(NamedTuple):
+    """A range as a radio tells it (see RangeLog); one that is not a positive number is no measurement."""
+
+    timestamp_s: float
+    anchor_id: str
+    range_m: float
+    line: int = 0
+    tag_id: str = DEFAULT_TAG_ID
+    range_stddev_m: float = math.nan
+    los: int = -1
+
+
+def log_of_readings(readings: Iterable[Reading], path: Path, format: str) -> RangeLog:
+    """All of it; InputError if no range was found."""
+    readings = list(readings)
+    measured = [reading for reading in readings if 0 < reading.range_m < math.inf]
+    if not measured:
+        raise no_usable_range(len(readings), path)
+    times, anchor_ids, ranges, lines, tag_ids, stddevs, los = zip(*measured)
+    return RangeLog.from_arrays(
+        anchor_ids,
+        ranges,
+        timestamp_s=times,
+        range_stddev_m=[stddev if 0 < stddev < math.inf else math.nan for stddev in stddevs],
+        tag_id=tag_ids,
+        los=los,
+        line=lines,
+        source=path,
+        format=format,
+        num_no_measurement=len(readings) - len(measured),
+    )
+
+
+def no_usable_range(num_records: int, path: Path) -> InputError:
+    said = f"all {num_records} records say that there was no measurement" if num_records else "no records"
+    return InputError(f"no usable range: {said}", path)

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rangesfm.errors import InputError
 from rangesfm.files.bags import SQLITE_HEAD, open_bag, type_name
 from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.readers.printed import check_only_time_is_described
-from rangesfm.ranging.readers.reader import Reader, ReadOptions
-from rangesfm.ranging.readers.records import Records
+from rangesfm.ranging.readers.reader import Reader, Reading, ReadOptions, log_of_readings
 from rangesfm.ranging.readers.roles import Sides
-from rangesfm.ranging.readers.ros_messages import RANGES_IN, MessageRange
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
 _BEGINS = ("#ROSBAG V", SQLITE_HEAD)
 _MCAP = "MCAP0"
+_LED_NO_LINE_OF_SIGHT = 16
 
 
 def _recognizes(head: str) -> bool:
@@ -28,44 +26,79 @@ def _recognizes(head: str) -> bool:
 
 
 def _read(path: Path, options: ReadOptions) -> RangeLog:
-    check_only_time_is_described(path, options)
-    number, ranges = [], []
+    options.check_no_table(path)
     with open_bag(path) as bag:
-        for message_number, found in _ranges(bag, path):
-            number.append(message_number)
-            ranges.append(found)
-    return _to_log(path, number, ranges)
+        return log_of_readings(_readings(bag, path), path, READER.name)
 
 
-def _ranges(bag: AnyReader, path: Path) -> Iterator[tuple[int, MessageRange]]:
-    """The ranges in all messages that hold any, each with the 1-based number of its message."""
-    connections = [connection for connection in bag.connections if type_name(connection.msgtype) in RANGES_IN]
+def _readings(bag: AnyReader, path: Path) -> Iterator[Reading]:
+    """The ranges in all messages that hold any, each with the 1-based number of its message as its line."""
+    connections = [connection for connection in bag.connections if type_name(connection.msgtype) in _RANGES_IN]
     if not connections:
         found = ", ".join(sorted({connection.msgtype for connection in bag.connections})) or "no messages"
-        raise InputError(f"no ranges in this bag; it has {found}, expected one of {', '.join(RANGES_IN)}", path)
+        raise InputError(f"no ranges in this bag; it has {found}, expected one of {', '.join(_RANGES_IN)}", path)
     for number, (connection, received_ns, data) in enumerate(bag.messages(connections), 1):
         message = bag.deserialize(data, connection.msgtype)
         try:
-            found_ranges = list(RANGES_IN[type_name(connection.msgtype)](message))
+            readings = list(_RANGES_IN[type_name(connection.msgtype)](message))
         except AttributeError as error:
             raise InputError(f"a {connection.msgtype} has another definition than expected ({error})", path) from None
-        for found_range in found_ranges:
-            yield number, found_range._replace(time_s=found_range.time_s or received_ns * 1e-9)
+        for reading in readings:
+            yield reading._replace(timestamp_s=reading.timestamp_s or received_ns * 1e-9, line=number)
 
 
-def _to_log(path: Path, number: list[int], ranges: list[MessageRange]) -> RangeLog:
-    records = Records()
-    for message_number, found in zip(number, ranges):
-        records.add(
-            found.time_s or 0.0,
-            found.anchor_id,
-            float(found.range_m),
-            message_number,
-            tag_id=found.tag_id,
-            range_stddev_m=float(found.range_stddev_m or math.nan),
-            los=found.los,
-        )
-    return records.to_log(path, READER.name)
+def _range_stamped(message: Any) -> Iterator[Reading]:
+    yield _stamped(message, message.to_id, message.range, message.from_id, _root(message.covariance))
 
 
-READER = Reader("ros", f"ROS 1 or ROS 2 bag with {', '.join(RANGES_IN)}", _recognizes, _read, sides=Sides.ASKED)
+def _two_way_range_stamped(message: Any) -> Iterator[Reading]:
+    range_m = message.range_corr if message.range_corr > 0 else message.range_raw
+    tag_id, anchor_id = message.UWB_ID1, message.UWB_ID2
+    if _character(message.type_ID1) == "A" and _character(message.type_ID2) != "A":
+        tag_id, anchor_id = anchor_id, tag_id
+    yield _stamped(message, anchor_id, range_m, tag_id, _root(message.R), int(bool(message.LOS)))
+
+
+def _uwb_range(message: Any) -> Iterator[Reading]:
+    los = 0 if _LED_NO_LINE_OF_SIGHT in (message.requester_LED_flag, message.responder_LED_flag) else -1
+    ids = message.responder_id, message.requester_id
+    yield _stamped(message, ids[0], message.distance, ids[1], message.distance_err, los)
+
+
+def _linktrack_nodeframe(message: Any) -> Iterator[Reading]:
+    for node in message.nodes:
+        yield Reading(0.0, str(node.id), float(node.dis), tag_id=str(message.id))
+
+
+def _linktrack_tagframe(message: Any) -> Iterator[Reading]:
+    for slot, range_m in enumerate(message.dis_arr):
+        yield Reading(0.0, str(slot), float(range_m), tag_id=str(message.id))
+
+
+# By the last part of the type's name: any package may define it. A time of 0 is none, that of receiving counts.
+_RANGES_IN: dict[str, Callable[[Any], Iterator[Reading]]] = {
+    "RangeStamped": _range_stamped,
+    "TwoWayRangeStamped": _two_way_range_stamped,
+    "UwbRange": _uwb_range,
+    "LinktrackNodeframe2": _linktrack_nodeframe,
+    "LinktrackNodeframe3": _linktrack_nodeframe,
+    "LinktrackTagframe0": _linktrack_tagframe,
+}
+
+
+def _stamped(message: Any, anchor_id: Any, range_m: Any, tag_id: Any, stddev_m: Any, los: int = -1) -> Reading:
+    """At the time of the header, 0 if nobody set it."""
+    stamp = message.header.stamp
+    time_s = float(stamp.sec + stamp.nanosec * 1e-9)
+    return Reading(time_s, str(anchor_id), float(range_m), 0, str(tag_id), float(stddev_m), los)
+
+
+def _root(variance: float) -> float:
+    return math.sqrt(variance) if variance > 0 else math.nan
+
+
+def _character(value: int | str) -> str:
+    return value if isinstance(value, str) else chr(value)
+
+
+READER = Reader("ros", _recognizes, _read, sides=Sides.ASKED)

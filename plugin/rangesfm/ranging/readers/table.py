@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,24 +14,36 @@ from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers.columns import QUANTITIES, STAMPS, Columns, read_columns
 from rangesfm.ranging.readers.guess import Guess, described, guess_columns
 from rangesfm.ranging.readers.layout import Layout, find_layout
-from rangesfm.ranging.readers.not_ranges import reason_without_ranges
 from rangesfm.ranging.readers.reader import Reader, ReadOptions
 from rangesfm.ranging.readers.roles import Sides
 from rangesfm.ranging.readers.several import anchor_of_file
-from rangesfm.ranging.readers.time_units import TIMESTAMP_UNITS
-from rangesfm.ranging.readers.units import UNITS_PER_METRE
 
 _PRESETS = {
-    "starloc": ("STAR-loc CSV", {"timestamp": "time_s", "range": "range", "tag_id": "from_id", "anchor_id": "to_id"}),
-    "miluv": ("MILUV CSV", {"timestamp": "timestamp", "range": "range", "tag_id": "from_id", "anchor_id": "to_id"}),
-    "uwb_init": ("uwb_init CSV", {"timestamp": "t", "range": "range", "tag_id": "ID_Tag", "anchor_id": "ID_Anchor"}),
-    "inrol": ("INRoL's text", {"timestamp": "timestamp", "range": "r", "anchor_id": "anchor_id"}),
+    "starloc": {"timestamp": "time_s", "range": "range", "tag_id": "from_id", "anchor_id": "to_id"},
+    "miluv": {"timestamp": "timestamp", "range": "range", "tag_id": "from_id", "anchor_id": "to_id"},
+    "uwb_init": {"timestamp": "t", "range": "range", "tag_id": "ID_Tag", "anchor_id": "ID_Anchor"},
+    "inrol": {"timestamp": "timestamp", "range": "r", "anchor_id": "anchor_id"},
 }
-_INROLS_HEADER = ("index", "timestamp", "anchor_id", "r")
+_INROLS_LAYOUT = Layout(("index", "timestamp", "anchor_id", "r"), " ")
 _INROLS_COMMENT = re.compile(
     r"\s{0,99}#[ \t]{0,9}index[ \t]{1,9}timestamp[ \t]{1,9}anchor_id[ \t]{1,9}r[ \t]{0,9}(?:\n|$)"
 )
 _SPAN = re.compile(r"(\D*)(\d{1,4})-(\D*)(\d{1,4})", re.ASCII)
+_POSITIONS_ONLY = (
+    "holds positions that the radio computed and not the ranges they came from; "
+    "record the ranges themselves (DWM1001: the command lec or les instead of lep)"
+)
+_TDOA = (
+    "holds differences of arrival times (TDoA), which are no ranges between a tag and an anchor; "
+    "record two-way ranging instead"
+)
+# Logs of radios that hold no ranges, and what they hold instead.
+_NO_RANGES = (
+    (re.compile(r'\btdoa\b|\btdoa_|"tdoa|\bidA\b.{0,99}\bidB\b', re.ASCII | re.IGNORECASE), _TDOA),
+    (re.compile(r'"tagId".{0,2000}"(?:tagData|coordinates|anchorData)"', re.ASCII | re.DOTALL), _POSITIONS_ONLY),
+    (re.compile(r"(?<![0-9A-Za-z])POS[,\[]-?\d", re.ASCII), _POSITIONS_ONLY),
+    (re.compile(r'"(?:POS|pos|position)"\s*:\s*[{\[]|"est_pos"', re.ASCII), _POSITIONS_ONLY),
+)
 
 
 def table_reader(path: Path, options: ReadOptions) -> Reader:
@@ -44,13 +56,8 @@ def table_reader(path: Path, options: ReadOptions) -> Reader:
     guess = None if layout is None else guess_columns(layout)
     if layout is None or guess is None or guess.missing or guess.doubts:
         raise _question(path, options, layout, guess)
-    columns = replace(
-        _laid_out(layout, options),
-        required={**guess.columns},
-        wide=guess.wide,
-        anchor_id=anchor_of_file(path),
-        notes=tuple(_notes(path, layout, guess)),
-    )
+    notes = tuple(_notes(path, layout, guess))
+    columns = Columns({**guess.columns}, {}, guess.wide, anchor_of_file(path), layout, notes=notes)
     read = partial(read_columns, columns=columns, format=TABLE.name)
     return replace(TABLE, read=lambda path, options: read(path, options=options), sides=guess.sides)
 
@@ -69,14 +76,14 @@ def _notes(path: Path, layout: Layout, guess: Guess) -> Iterable[str]:
 
 def _question(path: Path, options: ReadOptions, layout: Layout | None, guess: Guess | None) -> InputError:
     head = read_head(path)
-    if reason := reason_without_ranges(head):
-        return InputError(f"the log {reason}", path)
+    if instead := next((what for pattern, what in _NO_RANGES if pattern.search(head)), None):
+        return InputError(f"the log {instead}", path)
     if layout is None or guess is None:
         first_line = printable(head.strip().split("\n")[0])
         return InputError(f"not a known log format, and no table; it begins with '{first_line}'", path)
     found = f"found: {len(layout.columns)} columns: {', '.join(described(layout.columns))}"
     told = {**guess.told, **dict.fromkeys(guess.missing, "NAME")}
-    command = replace(options, columns=told).command(path)
+    command = options.changed(columns=told).command(path)
     closest = ", ".join(f"{quantity} = {name}" for quantity, name in guess.told.items()) or "none"
     why = "; ".join([*(f"no column seems to be the {missing}" for missing in guess.missing), *guess.doubts])
     return InputError(
@@ -91,58 +98,36 @@ def _question(path: Path, options: ReadOptions, layout: Layout | None, guess: Gu
     )
 
 
-def _laid_out(layout: Layout, options: ReadOptions) -> Columns:
-    return Columns(
-        required={},
-        timestamp_unit=options.timestamp_unit,
-        range_unit=options.range_unit,
-        separator=layout.separator,
-        header=layout.header,
-        num_skipped=layout.num_skipped,
-        decimal_comma=layout.decimal_comma,
-        stamps=options.stamps,
-    )
-
-
 def _recognizes(format: str, head: str) -> bool:
     if format == "inrol":
         return _INROLS_COMMENT.match(head) is not None
-    return set(_PRESETS[format][1].values()) <= set(header_names(head))
+    return set(_PRESETS[format].values()) <= set(header_names(head))
 
 
 def _read(path: Path, options: ReadOptions, *, format: str) -> RangeLog:
     """By the columns of a preset, and those that the user named."""
-    told = {**_PRESETS.get(format, ("", {}))[1], **options.columns}
-    _check_choice("quantity in columns", (key.partition(":")[0] for key in told), QUANTITIES, path)
-    _check_choice("timestamp_unit", [options.timestamp_unit or "s"], TIMESTAMP_UNITS, path)
-    _check_choice("range_unit", [options.range_unit or "m"], UNITS_PER_METRE, path)
+    told = {**_PRESETS.get(format, {}), **options.columns}
+    for quantity in (key.partition(":")[0] for key in told):
+        if quantity not in QUANTITIES:
+            message = f"quantity in columns is '{quantity}', expected one of {', '.join(QUANTITIES)}"
+            raise InputError(message, path)
     if not {"timestamp", "image_name"} & set(told):
         raise InputError("columns must name range, timestamp (or image_name) and anchor_id where there is one", path)
     wide = _wide(told, path)
     columns = {key: name for key, name in told.items() if not key.startswith("range:")}
     layout = find_layout(path, options.separator) if format == MAPPED.name else None
-    if layout is not None and {*columns.values(), *wide} <= {*layout.header}:
-        described = _laid_out(layout, options)
-    else:
-        described = Columns(
-            {},
-            timestamp_unit=options.timestamp_unit,
-            range_unit=options.range_unit,
-            separator=" " if format == "inrol" else options.separator,
-            header=_INROLS_HEADER if format == "inrol" else None,
-            stamps=options.stamps,
-        )
+    if layout is None or not {*columns.values(), *wide} <= {*layout.header}:
+        layout = _INROLS_LAYOUT if format == "inrol" else None
     third_message = {}
     if "range" not in columns and not wide:
-        names = header_names(read_head(path), options.separator) if described.header is None else described.header
+        names = layout.header if layout else header_names(read_head(path), options.separator)
         stamps = {stamp: columns.get(stamp, stamp) for stamp in STAMPS}
         if not {*(stamps[stamp] for stamp in STAMPS[:4])} <= set(names):
             wanted, found = ", ".join(STAMPS[:4]), printable(", ".join(names))
             raise InputError(f"columns name no column range, nor the time stamps {wanted}; found {found}", path)
         columns = {**{stamp: stamps[stamp] for stamp in STAMPS[:4]}, **columns}
         third_message = {stamp: stamps[stamp] for stamp in STAMPS[4:]}
-    described = replace(described, required=columns, optional=third_message, wide=wide, anchor_id=anchor_of_file(path))
-    return read_columns(path, described, options, format)
+    return read_columns(path, Columns(columns, third_message, wide, anchor_of_file(path), layout), options, format)
 
 
 def _wide(told: Mapping[str, str], path: Path) -> dict[str, tuple[str, str]]:
@@ -168,25 +153,14 @@ def _spanned(text: str) -> list[str]:
     return [f"{span[1]}{number}" for number in range(int(span[2]), int(span[4]) + 1)]
 
 
-def _check_choice(what: str, given: Iterable[str], choices: Collection[str], path: Path) -> None:
-    for value in given:
-        if value not in choices:
-            raise InputError(f"{what} is '{value}', expected one of {', '.join(choices)}", path)
-
-
 PRESETS = tuple(
     Reader(
         name,
-        description,
         partial(_recognizes, name),
         partial(_read, format=name),
         sides=Sides.ASKED if "from_id" in preset.values() else Sides.TOLD,
     )
-    for name, (description, preset) in _PRESETS.items()
+    for name, preset in _PRESETS.items()
 )
-MAPPED = Reader(
-    "mapped", "any CSV or TSV by a mapping of its columns", lambda head: False, partial(_read, format="mapped")
-)
-TABLE = Reader(
-    "table", "any table, by the names and values of its columns", lambda head: False, partial(_read, format="table")
-)
+MAPPED = Reader("mapped", lambda head: False, partial(_read, format="mapped"))
+TABLE = Reader("table", lambda head: False, partial(_read, format="table"))

@@ -5,11 +5,10 @@ from __future__ import annotations
 import re
 
 import numpy as np
-import numpy.typing as npt
 
-from rangesfm.ranging.readers.time_units import SECONDS_PER_UNIT, unit_by_digits
+from rangesfm.arrays import Array, Indices
+from rangesfm.ranging.readers.times import SECONDS_PER_UNIT, unit_by_digits
 
-Array = npt.NDArray[np.float64]
 UNITS_PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 
 _MIN_NUM = 20  # fewer values show nothing
@@ -72,7 +71,7 @@ def time_unit(name: str, times: Array) -> tuple[str, str | None]:
     return can_be[0], f"{name} looks like {can_be[0]} (steps of {step:g}): taken as such"
 
 
-def range_unit(name: str, ranges: Array, times: Array | None, pair: npt.NDArray[np.int64]) -> tuple[str, str | None]:
+def range_unit(name: str, ranges: Array, times: Array | None, pair: Indices) -> tuple[str, str | None]:
     """As ``time_unit``, of positive ranges between some pairs of nodes; ``times`` in seconds."""
     named = _named(name, _LENGTHS)
     if named is not None or len(ranges) < _MIN_NUM:
@@ -93,7 +92,7 @@ def range_unit(name: str, ranges: Array, times: Array | None, pair: npt.NDArray[
     return can_be[0], f"{name} looks like {can_be[0]} ({kind}): taken as such"
 
 
-def _share_of_jumps(ranges_m: Array, times: Array | None, pair: npt.NDArray[np.int64], noise_m: float) -> float:
+def _share_of_jumps(ranges_m: Array, times: Array | None, pair: Indices, noise_m: float) -> float:
     """How many ranges are further from the one before, of their pair, than anybody moves in the time between."""
     if times is None:
         return 0.0

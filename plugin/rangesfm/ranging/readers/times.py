@@ -1,18 +1,22 @@
-"""Times as logs spell them, in seconds."""
+"""Times as logs spell them, in seconds; also those that a logging program writes before what the radio printed."""
 
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import numpy as np
 
+from rangesfm.errors import InputError
+from rangesfm.ranging.readers.reader import ReadOptions
+
 SECONDS_PER_UNIT = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-TIMESTAMP_UNITS = (*SECONDS_PER_UNIT, "iso")
 ISO_TIME = re.compile(
     r"(\d{4})[-/.](\d\d?)[-/.](\d\d?)[T _](\d\d?:\d\d(?::\d\d(?:[.,]\d{1,18})?)?) ?(Z|UTC|[+-]\d\d(?::?\d\d)?(?!\d))?",
     re.ASCII,
 )
 TIME_OF_DAY = re.compile(r"(?<![\d:])([01]?\d|2[0-3]):([0-5]\d):([0-5]\d(?:[.,]\d{1,18})?)(?![\d:])", re.ASCII)
+_NUMBER = re.compile(r"(?<![\w.+-])-?\d{1,19}(?:\.\d{1,18})?(?![\w.-]|:\d)", re.ASCII)
 _DAY_S = 86400.0
 # Of a time since 1970, the digits tell the unit: 1e11 s are three thousand years, 1e11 ms are three.
 _UNIT_ABOVE = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
@@ -64,3 +68,37 @@ class CivilClock:
             self._days += 1
         self._last_of_day_s = seconds
         return self._days * _DAY_S + seconds
+
+
+class HostClock:
+    """Reads the times of one log, each from what stands before a range."""
+
+    def __init__(self, path: Path, options: ReadOptions):
+        self._path = path
+        self._unit = options.timestamp_unit
+        self._civil = CivilClock()
+
+    def find_seconds(self, prefix: str) -> float | None:
+        """The time in ``prefix``: ISO 8601, a time of day, or a number of seconds, ms, us or ns; None without any."""
+        if self._unit in (None, "iso") and (civil := ISO_TIME.search(prefix) or TIME_OF_DAY.search(prefix)):
+            try:
+                return self._civil.seconds(civil[0])
+            except ValueError:
+                return None
+        number = _NUMBER.search(prefix)
+        if number is None or self._unit == "iso":
+            return None
+        value = float(number[0])
+        return value * SECONDS_PER_UNIT[self._unit or unit_by_digits(value) or "s"]
+
+    def seconds(self, prefix: str, line: int) -> float:
+        """As ``find_seconds``, but InputError if there is no time."""
+        seconds = self.find_seconds(prefix)
+        if seconds is None:
+            raise InputError(
+                "no time before the range; the radio prints none, so record the log with the host's time at the "
+                "beginning of each line (seconds, ms, us or ns, or 2026-01-31T12:00:00.000Z)",
+                self._path,
+                line,
+            )
+        return seconds

@@ -1,0 +1,213 @@
+"""The scale by measured lengths alone, and which of them do not go with the others.
+
+A length d between two points of a model, l apart there, errs by its measurement, by the marks of its ends and by the
+map's bending: the scale of a map varies from place to place, smoothly, and a length has its mean along the way. How
+much it varies is learnt from how the lengths disagree, on what maps let expect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.distances.ends import LocatedDistances
+from rangesfm.errors import GeometryError
+from rangesfm.geometry.similarity import path_shape
+
+# By how much the scale of a map varies, and the stddev of the logarithm of that from map to map; within how much of
+# the path's extent it is alike. Of a room mapped from a hand-held camera, lengths of 0.5 to 5 m against the truth.
+BENDING = 0.008
+_BENDING_SPREAD, _ALIKE_WITHIN = 0.6, 0.25
+_NUM_TRIED, _NUM_PLACES, _NUM_ROUNDS = 21, 8, 2
+# Of how many surveys one has an honest length set aside.
+FALSE_ALARMS = 0.02
+_NUM_SUSPECTS = 3
+
+
+@dataclass(frozen=True)
+class LengthScale:
+    """What m lengths between points say of the scale.
+
+    Attributes:
+        value: metres per SfM unit.
+        components: its relative stddevs, by where they come from.
+        rows: (m,) which of the distances they are.
+        is_kept: (m,) those that go with each other; the others have no say.
+        too_long_m, stddev_m: (m,) by how much each is longer than all kept others let expect, and how well that is
+            known; inf: nothing tells.
+        by_metre: (m,) relative change of the scale if one was a metre longer.
+        threshold: of the square of a length's error in stddevs, beyond which it is no chance.
+    """
+
+    value: float
+    components: dict[str, float]
+    rows: Indices
+    is_kept: Mask
+    too_long_m: Array
+    stddev_m: Array
+    by_metre: Array
+    threshold: float
+
+    @property
+    def relative_stddev(self) -> float:
+        return float(np.linalg.norm(list(self.components.values())))
+
+    @property
+    def statistic(self) -> Array:
+        """(m,) squared, in stddevs."""
+        squared: Array = (self.too_long_m / self.stddev_m) ** 2
+        return squared
+
+    def beside_ranges(self, distances: LocatedDistances, *, with_bending: bool = False) -> LocatedDistances:
+        """The distances with all lengths between points as the one that says the same of the scale.
+
+        It weighs by how well it was measured: the bending widens the interval alone, as most of what radios get
+        wrong beyond their noise does.
+        """
+        unit = np.array([1.0])
+        measured = float(np.hypot(self.components["tape"], self.components["marks"]))
+        stddev_m = self.value * (self.relative_stddev if with_bending else measured) * unit
+        one = LocatedDistances.of(self.value * unit, stddev_m, model_length=unit)
+        return one.joined(distances.subset(~distances.is_between_points))
+
+
+def scale_by_lengths(distances: LocatedDistances | None, centers: Array) -> LengthScale | None:
+    """The likeliest scale, lengths that cannot belong to it left out; None where there is no length between points.
+
+    Args:
+        centers: (n, 3) of the path, in the model's unit.
+
+    Raises:
+        GeometryError: the points are in one place.
+    """
+    if distances is None:
+        return None
+    rows = np.flatnonzero(distances.is_between_points & ~distances.is_check)
+    if not len(rows):
+        return None
+    lengths = _Lengths.of(distances, rows, float(np.linalg.norm(path_shape(centers).stddevs)))
+    threshold = _threshold(len(rows))
+    kept = np.ones(len(rows), dtype=bool)
+    ratios = np.log(lengths.metric / lengths.model)
+    while kept.sum() > 2 and (~kept).sum() + 1 < len(rows) / 2:
+        among = np.flatnonzero(kept)
+        far = np.argsort(-np.abs(ratios[among] - np.median(ratios[among])), kind="stable")[:_NUM_SUSPECTS]
+        tests = {k: lengths.errors(kept & (np.arange(len(rows)) != k), k) for k in among[far].tolist()}
+        worst = max(tests, key=lambda k: tests[k][0] ** 2 / tests[k][1] ** 2)
+        if (tests[worst][0] / tests[worst][1]) ** 2 <= threshold:
+            break
+        kept[worst] = False
+    fit = lengths.fit(kept)
+    errors = [lengths.errors(kept, k, fit) for k in range(len(rows))]
+    too_long_m, stddev_m = np.array(errors).T
+    by_metre = np.zeros(len(rows))
+    by_metre[kept] = fit.gains / fit.scale
+    components = {name: float(np.sqrt(fit.gains @ part @ fit.gains)) / fit.scale for name, part in fit.parts.items()}
+    return LengthScale(fit.scale, components, rows, kept, too_long_m, stddev_m, by_metre, threshold)
+
+
+def _threshold(num: int) -> float:
+    """Of a squared Student's t, as the bending is learnt from the other lengths and the spread of maps."""
+    degrees_of_freedom = 1 / (2 * _BENDING_SPREAD**2) + max(num - 2, 0)
+    return float(stats.t.isf(FALSE_ALARMS / (2 * num), degrees_of_freedom) ** 2)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Scale, how much it varies from place to place, covariances of the lengths by cause, (k,) gain of each."""
+
+    scale: float
+    bending: float
+    parts: dict[str, Array]
+    gains: Array
+
+
+@dataclass(frozen=True)
+class _Lengths:
+    """m lengths: in the model, as measured, and the (m, m) covariances of both; that of bending for a share of 1."""
+
+    model: Array
+    metric: Array
+    of_tape_m2: Array
+    of_marks: Array
+    of_bending: Array
+
+    @classmethod
+    def of(cls, distances: LocatedDistances, rows: npt.NDArray[np.int64], extent: float) -> _Lengths:
+        model, stddev_m, printed = distances.model_length[rows], distances.stddev_m[rows], distances.is_printed[rows]
+        if not np.all(model > 1e-9 * extent):
+            raise GeometryError("a measured length has both its ends in one place of the map")
+        alone = ~(printed[:, None] & printed) & ~np.eye(len(rows), dtype=bool)
+        shares = np.linspace(0, 1, _NUM_PLACES)[:, None, None]
+        start, end = np.swapaxes(distances.ends[rows], 0, 1)
+        places = np.swapaxes(start + shares * (end - start), 0, 1).reshape(-1, 3)
+        squared = np.sum((places[:, None] - places) ** 2, axis=2) / (_ALIKE_WITHIN * extent) ** 2
+        alike = np.exp(-0.5 * squared).reshape(len(rows), _NUM_PLACES, len(rows), _NUM_PLACES).mean(axis=(1, 3))
+        # Of lengths that are nobody knows where each has a scale of its own.
+        alike = np.where(np.isfinite(alike), alike, np.eye(len(rows)))
+        return cls(
+            model,
+            distances.distance_m[rows],
+            np.where(alone, 0.0, np.outer(stddev_m, stddev_m)),
+            np.diag(distances.mark_stddev[rows] ** 2),
+            alike * np.outer(model, model),
+        )
+
+    def _parts(self, chosen: Mask, scale: float, bending: float) -> dict[str, Array]:
+        part = np.ix_(chosen, chosen)
+        return {
+            "tape": self.of_tape_m2[part],
+            "marks": scale**2 * self.of_marks[part],
+            "bending": (scale * bending) ** 2 * self.of_bending[part],
+        }
+
+    def fit(self, chosen: Mask) -> _Fit:
+        """Generalised least squares, with the bending by its restricted likelihood: its mean square given the lengths
+        (its most likely size would be too small of few)."""
+        model, metric = self.model[chosen], self.metric[chosen]
+        scale, bending = float(np.median(metric / model)), BENDING
+        logs = np.linspace(-4 * _BENDING_SPREAD, 6 * _BENDING_SPREAD, _NUM_TRIED)
+        for _ in range(_NUM_ROUNDS):
+            of_sizes = [self._parts(chosen, scale, BENDING * np.exp(each)) for each in logs]
+            unlikeliness = np.array([_unlikeliness(_total(p), model, metric) for p in of_sizes])
+            weights = np.exp(-(unlikeliness - unlikeliness.min()) - 0.5 * (logs / _BENDING_SPREAD) ** 2)
+            bending = BENDING * float(np.sqrt(weights @ np.exp(2 * logs) / weights.sum()))
+            parts = self._parts(chosen, scale, bending)
+            by_model = np.linalg.solve(_total(parts), model)
+            gains = by_model / (model @ by_model)
+            scale = float(gains @ metric)
+        return _Fit(scale, bending, parts, gains)
+
+    def errors(self, kept: Mask, k: int, fit: _Fit | None = None) -> tuple[float, float]:
+        """By how much length k is too long for the kept ones, metres, and its stddev (Baarda's test of one).
+
+        Args:
+            fit: of the kept; None: of these, which k is not among.
+        """
+        if (kept & (np.arange(len(kept)) != k)).sum() < 1:
+            return 0.0, np.inf
+        fit = fit or self.fit(kept)
+        chosen = kept | (np.arange(len(kept)) == k)
+        at, model = int(chosen[:k].sum()), self.model[chosen]
+        inverse = np.linalg.inv(_total(self._parts(chosen, fit.scale, fit.bending)))
+        by_model = inverse @ model
+        off = inverse - np.outer(by_model, by_model) / (model @ by_model)
+        return float(off[at] @ self.metric[chosen] / off[at, at]), float(off[at, at] ** -0.5)
+
+
+def _total(parts: Mapping[str, Array]) -> Array:
+    total: Array = np.sum(list(parts.values()), axis=0)
+    return total
+
+
+def _unlikeliness(covariance: Array, model: Array, metric: Array) -> float:
+    """Negative logarithm of the restricted likelihood, up to a constant."""
+    whitened = np.linalg.solve(np.linalg.cholesky(covariance), np.column_stack([model, metric]))
+    (information, right), (_, square) = whitened.T @ whitened
+    determinant = np.linalg.slogdet(covariance)[1]
+    return float(0.5 * (determinant + np.log(information) + square - right**2 / information))

@@ -1,0 +1,70 @@
+"""What each component of the ranges' errors amounts to on real logs, against the true distances.
+
+Run: python -m tests.studies.shown_errors --data FOLDER
+
+Learnt as a survey learns them, but at the true scale and from the same start for all logs: the columns of the table in
+``rangesfm/ranging/errors/population.py``. The logs are those of ``real_logs.json``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+from tests.studies.real_logs import FACTOR, cases, path_of, placed, read_set
+
+from rangesfm.options import RangeModelOptions
+from rangesfm.ranging.errors.components import components
+from rangesfm.ranging.errors.learned import learn_errors
+from rangesfm.scale.initialize import model_from_cam
+from rangesfm.scale.problem import scale_problem
+from rangesfm.scale.range_equation import predicted_ranges
+from rangesfm.scale.solution import solve_scale
+from rangesfm.scale.uncertainty import errors_to_expect
+
+# Medians that the logs' errors suggest at first sight, metres; and how far each log may be from them.
+START = {"white": 0.05, "time": 0.04, "place": 0.03, "view": 0.035, "bias": 0.045, "common_bias": 0.2, "short": 0.2}
+START |= {"curve": 0.04, "rough_curve": 0.02, "slope": 0.004, "antenna": 0.05, "tag_antenna": 0.05, "bending": 0.01}
+SPREAD, OF_WHITE = 0.7, 1.0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True)
+    args = parser.parse_args()
+    sets = json.loads(Path(__file__).with_name("real_logs.json").read_text(encoding="utf-8"))
+    start = components({name: (size, OF_WHITE if name == "white" else SPREAD) for name, size in START.items()})
+    with patch("rangesfm.ranging.errors.learned.COMPONENTS", start):
+        for name, described in sets.items():
+            found = shown(args.data, described)
+            print(f"{name:17}" + "  ".join(f"{part} {stddev:.4f}" for part, stddev in found.items()), flush=True)
+
+
+def shown(data: Path, described: dict[str, object]) -> dict[str, float]:
+    """Stddevs by component."""
+    log, anchors, reference = read_set(data, described)
+    path = path_of(reference)
+    case = next(case for case in cases(log, anchors, path) if case.name == "known")
+    observations = placed(log, case, path, described, by_photo=False)
+    posed = scale_problem(observations, path, case.anchors, case.frame, RangeModelOptions())
+    solution = solve_scale(posed, camera_side=None, seed=0)
+    state = solution.fit.state
+    true = replace(
+        state,
+        metric_from_model=replace(state.metric_from_model, scale=FACTOR),
+        bias_m=posed.ranges.bias_mean_m,
+    )
+    solution = replace(solution, fit=replace(solution.fit, state=true))
+    cells = errors_to_expect(posed, solution, observations, model_from_cam(observations, path, posed), {}).cells
+    off_m = posed.ranges.range_m - predicted_ranges(posed.ranges, true)
+    nothing_open = np.zeros((len(off_m), 1))
+    learned = learn_errors(cells, off_m, nothing_open, np.ones((1, 1)), solution.noise_stddev_m)
+    return dict(zip(learned.names, learned.stddevs.tolist(), strict=True))
+
+
+if __name__ == "__main__":
+    main()
