@@ -141,6 +141,11 @@ def test_a_frame_is_one_keyframe_with_the_time_of_its_photos_and_all_of_them_are
     assert journal.warnings == []
     mapped: list[str] = []
     summary = SimpleNamespace(seconds={}, num_registered=2, num_keyframes=2, models=())
-    monkeypatch.setattr(photos, "reconstruct", lambda folder, chosen, *_, **__: mapped.extend(chosen) or summary)
+
+    def reconstruct(folder: Path, chosen: list[str], *_: object, **__: object) -> SimpleNamespace:
+        mapped.extend(chosen)
+        return summary
+
+    monkeypatch.setattr(photos, "reconstruct", reconstruct)
     map_keyframes(survey, keyframes[1:], journal, restart=False)
     assert mapped == names[2:]
