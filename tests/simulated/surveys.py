@@ -196,6 +196,5 @@ def _taped(planned: PlannedSurvey, rng: np.random.Generator) -> LocatedDistances
     if not planned.taped:
         return None
     lengths, stddevs = np.array(planned.taped, dtype=np.float64).T
-    nowhere = np.full((len(lengths), 2), -1, dtype=np.int64)
     found = lengths + stddevs * rng.standard_normal(len(lengths))
-    return LocatedDistances(lengths / METRES_PER_UNIT, nowhere, found, stddevs, np.zeros(len(lengths), dtype=bool))
+    return LocatedDistances.of(found, stddevs, model_length=lengths / METRES_PER_UNIT)
