@@ -167,7 +167,7 @@ def read_image_times_csv(
         if name in known
     }
     stamps = {name: stamp for name, stamp in stamps.items() if name not in frame_of} | {
-        first: stamps[have[0]] for first, photos in frames.items() if (have := [p for p in photos if p in stamps])
+        first: stamps[own[0]] for first, photos in frames.items() if (own := [p for p in photos if p in stamps])
     }
     ordered = _in_time_order(stamps, names or tuple(stamps), "csv")
     if not unknown:
