@@ -105,7 +105,7 @@ def test_what_is_known_of_the_radio_counts() -> None:
     assert better.uncertainty.empirical < 0.9 * usual.uncertainty.empirical
 
 
-def test_a_taped_length_makes_the_scale_no_better_than_itself() -> None:
+def test_a_taped_length_makes_the_scale_no_better_than_itself_and_the_bending_of_the_map() -> None:
     taped = expect(planned(FIVE_ANCHORS_M, "site", taped=((5.0, 0.005),)))
     # 5 mm of 5 m, and the map's bending between its ends.
     assert 0.5 * BENDING < taped.uncertainty.components["given"] < 1.5 * BENDING

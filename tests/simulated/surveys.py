@@ -42,21 +42,6 @@ class Measured:
     metric_from_map: Similarity
 
 
-def radio(
-    *, median_m: float, bulk_m: float, anchors_m: float, short_m: float, with_distance_m: float
-) -> dict[str, float]:
-    """Stddevs of the components of a radio's errors, from a row of the table in ``examples/radios.md``."""
-    shares = {"white": 0.5, "time": 0.2, "place": 0.3, "view": 0.4, "antenna": 0.5, "tag_antenna": 0.5}
-    return {
-        **{name: share * bulk_m for name, share in shares.items()},
-        "bias": anchors_m,
-        "common_bias": abs(median_m),
-        "short": 3 * short_m,
-        "curve": 0.8 * with_distance_m,
-        "rough_curve": 0.3 * with_distance_m,
-    }
-
-
 def stddevs_of(planned: PlannedSurvey) -> dict[str, float]:
     """Of the components of its ranges' errors: as told, or as radios mostly have them."""
     is_learnt = planned.curve_stddev_m is not None

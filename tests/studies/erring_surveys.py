@@ -201,7 +201,7 @@ class Run:
         assert self.estimate is not None
         assert self.trust is not None
         no_points = PointErrors(np.zeros(0), np.zeros((0, 3)), np.inf)
-        of_map = doubts_of_map(self.estimate, None, None, no_points, 0.1, noise_is_given=False)
+        of_map = doubts_of_map(self.estimate, None, None, no_points, noise_is_given=False)
         of_scale = self.estimate.reasons if self.estimate.verdict != "good" else ()
         return [*self.trust.reasons, *of_scale, *(doubt.reason for doubt in of_map)]
 

@@ -72,7 +72,7 @@ class Expected:
         return judge(self.posed, self.solution, self.uncertainty, {}, (), (), ScaleOptions())
 
     def mirror_image(self) -> str | None:
-        """Why the run will refuse the map's place: its mirror image in the anchors' plane fits as well; None if not."""
+        """Why the run will leave the place open: the mirror image in the anchors' plane fits as well; None if not."""
         problem, fit = self.solution.problem, self.solution.fit
         mirrored = mirrored_map(problem, fit.state) if problem.frame_is_free else None
         if mirrored is None:
