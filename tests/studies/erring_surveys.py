@@ -231,6 +231,8 @@ def run(given: Given, seed: int) -> Run:
             )
     except GeometryError as error:
         return Run(given, None, None, refusal=str(error))
+    assert estimate.problem is not None
+    assert estimate.solution is not None
     on_map = ranges_on_map(estimate.problem, estimate.solution, estimate.observations, given.trajectory)
     return Run(given, estimate, trust_in(on_map, seed=seed), on_map)
 
