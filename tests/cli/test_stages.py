@@ -40,7 +40,8 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calls:
     monkeypatch.setitem(sys.modules, "rangesfm.workflows.run", pipeline)
     (tmp_path / "photos").mkdir()
     (tmp_path / "model").mkdir()
-    (tmp_path / "uwb.csv").touch()
+    for name in ("uwb.csv", "walk.MP4"):
+        (tmp_path / name).touch()
     monkeypatch.chdir(tmp_path)
     return calls
 
@@ -52,6 +53,7 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calls:
         (["run", "--images", "photos", "--ranges", "uwb.csv", "--restart"], "run_survey", {"restart": True}),
         (["run", "--input_path", "model", "--ranges", "uwb.csv"], "refine_model", {}),
         (["reconstruct", "--images", "photos", "--restart"], "reconstruct_survey", {"restart": True}),
+        (["reconstruct", "--images", "walk.MP4"], "reconstruct_survey", {"restart": False}),
         (["scale", "--input-path", "model", "--ranges", "uwb.csv"], "scale_model", {}),
         (["refine", "--input-path", "model", "--ranges", "uwb.csv"], "refine_model", {}),
     ],

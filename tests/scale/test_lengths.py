@@ -46,7 +46,7 @@ def test_the_interval_holds_the_truth_and_honest_lengths_stay(bending: float) ->
         centers = path(rng)
         found = scaled(located(centers, 3, rng, bending), centers)
         off.append(np.log(found.value / SCALE) / found.relative_stddev)
-        num_left_out += np.count_nonzero(~found.is_kept)
+        num_left_out += int(np.count_nonzero(~found.is_kept))
     assert np.mean(np.abs(off) < 1.96) >= 0.9
     assert num_left_out <= 3
 

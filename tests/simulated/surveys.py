@@ -42,21 +42,6 @@ class Measured:
     metric_from_map: Similarity
 
 
-def radio(
-    *, median_m: float, bulk_m: float, anchors_m: float, short_m: float, with_distance_m: float
-) -> dict[str, float]:
-    """Stddevs of the components of a radio's errors, from a row of the table in ``examples/radios.md``."""
-    shares = {"white": 0.5, "time": 0.2, "place": 0.3, "view": 0.4, "antenna": 0.5, "tag_antenna": 0.5}
-    return {
-        **{name: share * bulk_m for name, share in shares.items()},
-        "bias": anchors_m,
-        "common_bias": abs(median_m),
-        "short": 3 * short_m,
-        "curve": 0.8 * with_distance_m,
-        "rough_curve": 0.3 * with_distance_m,
-    }
-
-
 def stddevs_of(planned: PlannedSurvey) -> dict[str, float]:
     """Of the components of its ranges' errors: as told, or as radios mostly have them."""
     is_learnt = planned.curve_stddev_m is not None
@@ -196,6 +181,5 @@ def _taped(planned: PlannedSurvey, rng: np.random.Generator) -> LocatedDistances
     if not planned.taped:
         return None
     lengths, stddevs = np.array(planned.taped, dtype=np.float64).T
-    nowhere = np.full((len(lengths), 2), -1, dtype=np.int64)
     found = lengths + stddevs * rng.standard_normal(len(lengths))
-    return LocatedDistances(lengths / METRES_PER_UNIT, nowhere, found, stddevs, np.zeros(len(lengths), dtype=bool))
+    return LocatedDistances.of(found, stddevs, model_length=lengths / METRES_PER_UNIT)

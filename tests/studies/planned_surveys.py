@@ -2,9 +2,9 @@
 
 Run: python -m tests.studies.planned_surveys --rows FILE [--num_seeds 100] [--surveys NAME]
 
-Twenty surveys of different kinds, with radios of the table in ``examples/radios.md``, are planned; then each is
+Twenty surveys of different kinds, with the radios of eight public logs and with a usual one, are planned; then each is
 measured and its scale found again and again, every time with other errors of its radio, other slips in surveying the
-anchors and another bend of its map. The first three runs of each are whole scale stages, the others begin at the truth.
+anchors and another bend of its map. The first two runs of each are whole scale stages, the others begin at the truth.
 FILE keeps what is done, one line a run: started again, the study goes on there.
 Prints for each survey the predicted stddev of the scale and of the place (of the keyframe known least) over the spread
 of the runs' errors, the median stddev that a run states itself, and how many runs refused.
@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from tests.simulated.path import lap_path, loop_path, sequence_path
-from tests.simulated.surveys import METRES_PER_UNIT, Measured, measured, radio
+from tests.simulated.surveys import METRES_PER_UNIT, Measured, measured
 
 from rangesfm.demo.ranges import CameraPath
 from rangesfm.errors import GeometryError
@@ -32,6 +32,7 @@ from rangesfm.planning.expected import Expected, expect
 from rangesfm.planning.paths import path_through
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.errors.population import stddevs_in
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.problem import ScaleProblem, scale_problem
 from rangesfm.scale.range_equation import RangeState
@@ -41,13 +42,13 @@ Array = npt.NDArray[np.float64]
 Place = tuple[float, float, float]
 
 RADIOS = {
-    "room": radio(median_m=0.01, bulk_m=0.10, anchors_m=0.06, short_m=0.12, with_distance_m=0.05),
-    "slow": radio(median_m=0.10, bulk_m=0.04, anchors_m=0.02, short_m=0.03, with_distance_m=0.05),
-    "fast": radio(median_m=0.20, bulk_m=0.11, anchors_m=0.07, short_m=0.06, with_distance_m=0.10),
-    "drone": radio(median_m=0.25, bulk_m=0.11, anchors_m=0.05, short_m=0.07, with_distance_m=0.02),
-    "drone, open": radio(median_m=0.21, bulk_m=0.06, anchors_m=0.02, short_m=0.02, with_distance_m=0.08),
-    "trolley": radio(median_m=0.17, bulk_m=0.10, anchors_m=0.06, short_m=0.05, with_distance_m=0.02),
-    "mower": radio(median_m=0.50, bulk_m=0.60, anchors_m=0.13, short_m=0.10, with_distance_m=0.30),
+    "room": stddevs_in("room_env1"),
+    "slow": stddevs_in("starloc_s5"),
+    "fast": stddevs_in("starloc_fast_s1"),
+    "drone": stddevs_in("rcv_sequence1"),
+    "drone, open": stddevs_in("rcv_sequence3"),
+    "trolley": stddevs_in("lias_mid"),
+    "mower": stddevs_in("plaza1"),
     "usual": {},
 }
 ROOM = ((6.0, 0.5, 2.5), (-6.0, 1.0, 0.4), (0.5, 6.0, 3.0), (1.0, -6.0, 0.2), (5.0, 5.0, 0.3), (-5.0, 4.5, 2.8),
@@ -170,7 +171,7 @@ def spread(rows: list[dict[str, Any]], name: str) -> float:
     return float(np.sqrt(np.mean(squares))) if squares else float("nan")
 
 
-def runs_of(name: str, planned: PlannedSurvey, file: Path, num_seeds: int, num_whole: int = 3) -> list[dict[str, Any]]:
+def runs_of(name: str, planned: PlannedSurvey, file: Path, num_seeds: int, num_whole: int = 2) -> list[dict[str, Any]]:
     """As kept in the file; those that are missing are made and added to it."""
     kept = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
     rows = [row for row in kept if row["survey"] == name and row["seed"] < num_seeds]

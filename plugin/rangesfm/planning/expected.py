@@ -72,7 +72,7 @@ class Expected:
         return judge(self.posed, self.solution, self.uncertainty, {}, (), (), ScaleOptions())
 
     def mirror_image(self) -> str | None:
-        """Why the run will refuse the map's place: its mirror image in the anchors' plane fits as well; None if not."""
+        """Why the run will leave the place open: the mirror image in the anchors' plane fits as well; None if not."""
         problem, fit = self.solution.problem, self.solution.fit
         mirrored = mirrored_map(problem, fit.state) if problem.frame_is_free else None
         if mirrored is None:
@@ -146,7 +146,7 @@ def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expect
         errors = _as_seen(solution, learned, num_alike)
         solution = _weighed(posed, errors, fit_at(weighted(posed.ranges, errors), state, num_alike))
     covariance = parameter_covariance(solution, learned) + _undetermined(solution.fit)
-    uncertainty = expected_scale_uncertainty(solution, learned, BENDING)
+    uncertainty = expected_scale_uncertainty(posed, solution, learned, BENDING)
     placement = placement_covariance(solution, covariance)
     return Expected(planned, observations, posed, solution, learned, uncertainty, covariance, placement)
 

@@ -20,6 +20,7 @@ from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.errors.components import COMPONENTS
+from rangesfm.ranging.errors.population import LOGS, stddevs_in
 from rangesfm.survey.settings import parse_toml, refuse_unknown_tables
 
 _Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
@@ -123,10 +124,12 @@ class PlannedRadioOptions(RangeModelOptions):
 
     rate_hz: Annotated[float, Field(ge=1e-3, le=1e4)] = 5.0
     """Ranges to each anchor in a second."""
+    like: Literal[LOGS] | None = None  # type: ignore[valid-type]
+    """The radio of a public log, which errs as it does there (default: as radios mostly do)."""
     curve_stddev_m: Annotated[float, Field(ge=1e-4, le=1)] | None = None
     """Of the radio's error curve, where it was learnt (default: it was not)."""
     stddevs: dict[str, Annotated[float, Field(ge=1e-9, le=10)]] = Field(default_factory=dict)
-    """Of components of the ranges' errors by name, as in result.json (default: as radios are known to have them)."""
+    """Of components of the ranges' errors by name, as in result.json (default: as the radio is like)."""
 
 
 class Plan(BaseModel):
@@ -200,7 +203,7 @@ def _planned(plan: Plan) -> PlannedSurvey:
             **{name: getattr(radio, name) for name in RangeModelOptions.model_fields if name in radio.model_fields_set}
         ),
         curve_stddev_m=radio.curve_stddev_m,
-        component_stddevs=radio.stddevs,
+        component_stddevs=({} if radio.like is None else stddevs_in(radio.like)) | radio.stddevs,
         heights_m=plan.anchors.heights_m,
         path_is_level=path.is_level,
         allowed_m=allowed_m,

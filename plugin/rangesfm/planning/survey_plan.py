@@ -78,7 +78,7 @@ class SurveyPlan:
         components: what each component of the ranges' errors does to the scale, by name.
         place: None where the frame is the first camera's.
         keyframe_stddevs_m: (n,) of each keyframe's place in that frame.
-        verdict, reasons: on the scale, as the run will judge it; "doubtful" too where it will refuse the place.
+        verdict, reasons: on the scale, as the run will judge it; "doubtful" too where it will leave the place open.
         mistakes: what would be found of each, those that do most first.
         advice: changes that would gain something.
         expected: the estimate that all this is of.
@@ -132,7 +132,8 @@ def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
         GeometryError: a run will refuse the scale.
     """
     expected = expect(planned)
-    verdict, mirror_image = expected.verdict, expected.mirror_image()
+    verdict = expected.verdict
+    open_place = [why for why in [expected.mirror_image()] if why is not None]
     half_width = expected.uncertainty.half_width_95
     return SurveyPlan(
         num_ranges=planned.num_ranges,
@@ -145,8 +146,8 @@ def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
         components=expected.uncertainty.components,
         place=_place(expected),
         keyframe_stddevs_m=tuple(expected.stddevs_at(planned.trajectory.centers).tolist()),
-        verdict=verdict.verdict if mirror_image is None else "doubtful",
-        reasons=verdict.reasons if mirror_image is None else (f"a run will refuse: {mirror_image}", *verdict.reasons),
+        verdict="doubtful" if open_place else verdict.verdict,
+        reasons=(*(f"a run will give the scale only: {why}" for why in open_place), *verdict.reasons),
         mistakes=_mistakes(expected),
         advice=advise(expected),
         expected=expected,

@@ -23,8 +23,15 @@ antenna     0.063     0.050            0.024      0.024         0.023         0.
 tag_antenna 0.032     0.028            0.021      0.023         0.018         0.046    0.008  0.048
 bending     0.009     0.007            0.005      0.004         0.003         0.003    0.010  0.008
 """
+LOGS = tuple(_SHOWN.split()[1:9])
 # Of the logarithms: eight logs do not show how alike other radios are.
 _LEAST_SPREAD = 0.7
+
+
+def stddevs_in(log: str) -> dict[str, float]:
+    """Of each component, as one of LOGS shows it."""
+    _, _, *components = (line.split() for line in _SHOWN.strip().splitlines())
+    return {name: float(sizes[LOGS.index(log)]) for name, *sizes in components}
 
 
 def population(without: str | None = None) -> dict[str, tuple[float, float]]:
