@@ -38,7 +38,7 @@ def test_far_anchors_and_little_noise_are_good(make_survey: MakeSurvey) -> None:
 
 
 def test_a_radio_without_error_curve_near_its_anchors_is_doubtful(make_survey: MakeSurvey) -> None:
-    centers = 0.3 * make_survey().centers_m
+    centers = 0.2 * make_survey().centers_m
     survey = make_survey(centers_m=centers, anchors_m=NEAR_ANCHORS_M, radio=Radio(range_stddev_m=0.02), num_epochs=5)
     estimate = survey.scale("unknown")
     assert estimate.verdict == "doubtful"

@@ -10,7 +10,7 @@ import pytest
 
 from rangesfm.ranging.errors.cells import MAX_NUM_CELLS, Cells, cells
 from rangesfm.ranging.errors.components import COMPONENTS
-from rangesfm.ranging.errors.learned import LearnedErrors, learn_errors
+from rangesfm.ranging.errors.learned import LearnedErrors, learn_errors, usual_errors
 
 Array = npt.NDArray[np.float64]
 
@@ -62,17 +62,28 @@ def test_errors_ten_times_as_large_as_usual_are_seen_whatever_they_are_taken_for
     drawn = vectors @ (np.sqrt(np.maximum(values, 0)) * np.random.default_rng(1).standard_normal(len(values)))
     off_m = 10 * component.median * drawn + 0.02 * np.random.default_rng(2).standard_normal(len(values))
     learned = learn(walked, off_m)
-    size_m = np.sqrt(np.mean(off_m**2))
-    assert 0.7 < np.sqrt(np.mean(np.diag(learned.covariance_m2))) / size_m < 3.0
+    # About their mean: what all ranges have in common is not seen here.
+    covariance = learned.covariance_m2
+    variance = np.mean(np.diag(covariance)) - np.mean(covariance)
+    assert 0.7 < np.sqrt(variance) / np.std(off_m) < 3.0
 
 
 def test_noise_alone_leaves_the_rest_at_what_radios_let_expect_or_less(walked: Cells) -> None:
     off_m = 0.05 * np.random.default_rng(2).standard_normal(len(walked))
-    found = stddevs(learn(walked, off_m))
-    assert found["white"] == pytest.approx(0.05, rel=0.15)
-    for component in COMPONENTS:
-        if component.name != "white":
-            assert found[component.name] < 1.2 * component.median, component.name
+    found, usual = stddevs(learn(walked, off_m)), stddevs(usual_errors(walked))
+    assert found.pop("white") == pytest.approx(0.05, rel=0.15)
+    for name, stddev in found.items():
+        assert stddev < 1.2 * usual[name], name
+
+
+def test_what_a_survey_does_not_show_counts_with_the_mean_of_its_variance_over_radios(walked: Cells) -> None:
+    slope = next(each for each in COMPONENTS if each.name == "slope")
+    of_radios = slope.median * np.exp(slope.spread * np.random.default_rng(6).standard_normal(200_000))
+    expected = np.sqrt(np.mean(of_radios**2))
+    assert stddevs(usual_errors(walked))["slope"] == pytest.approx(expected, rel=0.02)
+    distance_m = walked.distance_m[walked.of_range]  # a scale that is free takes up all of it
+    scaled_free = learn_errors(walked, np.zeros(len(walked)), distance_m[:, None], NO_MAP, 0.05)
+    assert stddevs(scaled_free)["slope"] == pytest.approx(expected, rel=0.02)
 
 
 def test_a_learnt_curve_counts_as_it_is_stated(walked: Cells) -> None:

@@ -112,7 +112,7 @@ def learn_errors(
         cells.mean(design),
         prior_design,
     )
-    stddevs = np.exp(likelihood.most_likely())
+    stddevs = likelihood.mean_stddevs(likelihood.most_likely())
     covariances = stddevs[:, None, None] ** 2 * likelihood.of_components
     return _of_components(cells, components, stddevs, covariances, None if curve_stddev_m is None else likelihood.known)
 
@@ -124,15 +124,17 @@ def usual_errors(
     ruled_out: Collection[str] = (),
     stddevs: Mapping[str, float] | None = None,
 ) -> LearnedErrors:
-    """What radios let expect before anything is measured: the medians, or what is known better.
+    """What radios let expect before anything is measured: roots of the mean variances, or what is known better.
 
     Args:
         curve_stddev_m, ruled_out: as of ``learn_errors``.
-        stddevs: of some components, by name, in place of their medians.
+        stddevs: of some components, by name, in place of these.
     """
     components = [component for component in COMPONENTS if component.name not in ruled_out]
     is_calibrated = curve_stddev_m is not None
-    sizes = np.array([(stddevs or {}).get(c.name, _median(c, is_calibrated)) for c in components])
+    # Of a lognormal stddev, the root of the mean square.
+    usual = [_median(component, is_calibrated) * np.exp(component.spread**2) for component in components]
+    sizes = np.array([(stddevs or {}).get(c.name, size) for c, size in zip(components, usual, strict=True)])
     covariances = np.array([size**2 * _covariance(c, cells, 1.0) for c, size in zip(components, sizes, strict=True)])
     known = _known(cells, curve_stddev_m) if is_calibrated else None
     return _of_components(cells, components, sizes, covariances, known)
@@ -197,11 +199,44 @@ class _Likelihood:
         return logs
 
     def _negative_with_gradient(self, logs: Array) -> tuple[float, Array]:
-        variances = np.exp(2 * logs)
-        covariance = np.tensordot(variances, self.of_components, axes=1) + self.known
+        lower, inverse = self._factored(logs)
+        whitened, spread, determinant = self._unknowns(inverse)
+        moved = spread @ (whitened.T @ self.off_m)
+        pulls = inverse @ self.off_m - whitened @ moved
+        projector = inverse - whitened @ spread @ whitened.T
+        off_median = (logs - self.log_medians) / self.spreads
+        negative = (
+            np.log(np.diag(lower)).sum()
+            + 0.5 * determinant
+            + 0.5 * float(self.off_m @ pulls)
+            + 0.5 * float(off_median @ off_median)
+        )
+        traces = np.einsum("ij,kij->k", projector, self.of_components)
+        squares = np.einsum("i,kij,j->k", pulls, self.of_components, pulls)
+        return negative, np.exp(2 * logs) * (traces - squares) + off_median / self.spreads
+
+    def mean_stddevs(self, logs: Array) -> Array:
+        """(k,) roots of the mean variances, where these logarithms are the likeliest.
+
+        What a survey does not show is as likely twice as large as half as large, and the larger does more.
+        """
+        _, inverse = self._factored(logs)
+        whitened, spread, _ = self._unknowns(inverse)
+        seen = (inverse - whitened @ spread @ whitened.T) @ self.of_components
+        # Expected information of restricted likelihood (Patterson and Thompson), about logarithms of stddevs.
+        information = 2 * np.einsum("kij,lji->kl", seen, seen, optimize=True) * np.exp(2 * np.add.outer(logs, logs))
+        stddevs: Array = np.exp(logs + np.diag(np.linalg.inv(information + np.diag(self.spreads**-2))))
+        return stddevs
+
+    def _factored(self, logs: Array) -> tuple[Array, Array]:
+        """(c, c) lower factor and inverse of the covariance."""
+        covariance = np.tensordot(np.exp(2 * logs), self.of_components, axes=1) + self.known
         covariance[np.diag_indices_from(covariance)] += ROUNDING * np.trace(covariance)
         lower = np.linalg.cholesky(covariance)
-        inverse = cho_solve((lower, True), np.eye(len(covariance)))
+        return lower, cho_solve((lower, True), np.eye(len(covariance)))
+
+    def _unknowns(self, inverse: Array) -> tuple[Array, Array, float]:
+        """(c, p) whitened design, (p, p) covariance, and the logarithm of the determinant of its inverse."""
         whitened = inverse @ self.design
         information = self.design.T @ whitened + self.prior_design.T @ self.prior_design
         # Directions that nothing determines are as if they were determined a little, always alike.
@@ -209,17 +244,4 @@ class _Likelihood:
         values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
         values = np.maximum(values, 1e-13)
         spread = (vectors / values) @ vectors.T * np.outer(scale, scale)
-        moved = spread @ (whitened.T @ self.off_m)
-        pulls = inverse @ self.off_m - whitened @ moved
-        projector = inverse - whitened @ spread @ whitened.T
-        off_median = (logs - self.log_medians) / self.spreads
-        negative = (
-            np.log(np.diag(lower)).sum()
-            + 0.5 * np.log(values).sum()
-            - np.log(scale).sum()
-            + 0.5 * float(self.off_m @ pulls)
-            + 0.5 * float(off_median @ off_median)
-        )
-        traces = np.einsum("ij,kij->k", projector, self.of_components)
-        squares = np.einsum("i,kij,j->k", pulls, self.of_components, pulls)
-        return negative, variances * (traces - squares) + off_median / self.spreads
+        return whitened, spread, float(np.log(values).sum() - 2 * np.log(scale).sum())

@@ -25,7 +25,7 @@ bending     0.009     0.007            0.005      0.004         0.003         0.
 """
 LOGS = tuple(_SHOWN.split()[1:9])
 # Of the logarithms: eight logs do not show how alike other radios are.
-_LEAST_SPREAD = 0.7
+_LEAST_SPREAD = 0.5
 
 
 def stddevs_in(log: str) -> dict[str, float]:
