@@ -188,7 +188,7 @@ def test_what_would_help_and_what_speaks_against_both_is_said_once(make_result: 
     texts = page_of(make_result(changes={"scale": scale, "place": place})).texts
     assert [text for text in texts if "measure it again" in text or "calibrate" in text.lower()] == [
         "Probably A3 stands elsewhere: measure it again.",
-        "Calibrate the radio (rangesfm ranges), or tape.",
+        "Calibrate the radio (rangesfm ranges calibrate), or tape.",
     ]
 
 

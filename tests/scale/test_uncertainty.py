@@ -20,7 +20,7 @@ Array = npt.NDArray[np.float64]
 
 WITHOUT_BIASES = RangeModelOptions(range_bias_stddev_m=0.0, common_bias_stddev_m=0.0)
 FAR_ANCHORS_M = {"A": (9.0, 2.0, 2.5), "B": (-9.0, 1.0, 0.4), "C": (0.5, 9.0, 3.0), "D": (1.0, -9.0, 0.2)}
-IN_TIME = ("white", "time", "place", "view")
+IN_TIME = ("white", "time", "place", "view", "reweighting")
 
 
 def drifting_errors(survey: Survey, stddev: float, memory_s: float, seed: int) -> Array:
@@ -40,7 +40,7 @@ def drifting_errors(survey: Survey, stddev: float, memory_s: float, seed: int) -
 
 def in_time(uncertainty: ScaleUncertainty) -> float:
     """Of all that differs from moment to moment."""
-    return float(np.linalg.norm([uncertainty.components[name] for name in IN_TIME]))
+    return float(np.linalg.norm([uncertainty.components.get(name, 0.0) for name in IN_TIME]))
 
 
 def test_with_independent_errors_the_formal_stddev_is_the_scatter(make_survey: MakeSurvey) -> None:

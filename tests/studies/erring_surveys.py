@@ -201,7 +201,7 @@ class Run:
         assert self.estimate is not None
         assert self.trust is not None
         no_points = PointErrors(np.zeros(0), np.zeros((0, 3)), np.inf)
-        of_map = doubts_of_map(self.estimate, None, None, no_points, 0.1, noise_is_given=False)
+        of_map = doubts_of_map(self.estimate, None, None, no_points, noise_is_given=False)
         of_scale = self.estimate.reasons if self.estimate.verdict != "good" else ()
         return [*self.trust.reasons, *of_scale, *(doubt.reason for doubt in of_map)]
 
@@ -231,7 +231,8 @@ def run(given: Given, seed: int) -> Run:
             )
     except GeometryError as error:
         return Run(given, None, None, refusal=str(error))
-    assert estimate.problem is not None and estimate.solution is not None
+    assert estimate.problem is not None
+    assert estimate.solution is not None
     on_map = ranges_on_map(estimate.problem, estimate.solution, estimate.observations, given.trajectory)
     return Run(given, estimate, trust_in(on_map, seed=seed), on_map)
 

@@ -44,7 +44,7 @@ def estimate(walked: Survey) -> ScaleEstimate:
 
 
 def doubts(estimate: ScaleEstimate, *, points: PointErrors = GOOD_POINTS, noise_is_given: bool = False) -> list[str]:
-    found = doubts_of_map(estimate, None, None, points, COMMON_BIAS_STDDEV_M, noise_is_given=noise_is_given)
+    found = doubts_of_map(estimate, None, None, points, noise_is_given=noise_is_given)
     assert all(doubt.advice for doubt in found)
     return [doubt.reason for doubt in found]
 
@@ -88,19 +88,6 @@ def test_ranges_off_the_path_are_no_fault_of_their_anchor(estimate: ScaleEstimat
     assert doubts(replace(estimate, observations=replace(observations, status=status))) == []
 
 
-def test_a_bias_beyond_what_was_thought_possible_is_named_and_not_those_beside_it(estimate: ScaleEstimate) -> None:
-    (reason,) = doubts(with_anchor(estimate, 1, range_bias_m=estimate.anchors[0].range_bias_m + 0.11))
-    assert reason.startswith("anchor B's bias is +0.1")
-    assert reason.endswith("1 times what was thought possible")
-    assert doubts(with_anchor(estimate, 1, prior_bias_m=0.0, prior_bias_stddev_m=0.05)) == []
-
-
-def test_a_bias_of_all_anchors_beyond_its_prior_is_said_once(estimate: ScaleEstimate) -> None:
-    longer = tuple(replace(anchor, range_bias_m=anchor.range_bias_m + 0.5) for anchor in estimate.anchors)
-    (reason,) = doubts(replace(estimate, anchors=longer))
-    assert reason.startswith("all anchors' ranges read +0.5")
-
-
 def test_an_anchor_away_from_where_it_was_surveyed_is_named(estimate: ScaleEstimate) -> None:
     place_m = known(estimate.anchors[3].prior_position_m)
     (reason,) = doubts(with_anchor(estimate, 3, position_m=place_m - [0.0, 0.12, 0.01]))
@@ -127,14 +114,13 @@ def test_points_that_are_not_of_the_photos_are_said(estimate: ScaleEstimate) -> 
 def test_a_refined_scale_outside_the_scales_own_interval_is_said(estimate: ScaleEstimate) -> None:
     low, high = estimate.interval_95
     for scale, num in ((0.99 * low, 1), (0.5 * (low + high), 0), (1.01 * high, 1)):
-        found = doubts_of_map(estimate, None, scale, GOOD_POINTS, COMMON_BIAS_STDDEV_M, noise_is_given=False)
+        found = doubts_of_map(estimate, None, scale, GOOD_POINTS, noise_is_given=False)
         assert len(found) == num
 
 
 def test_a_place_is_no_better_than_the_map(walked: Survey, estimate: ScaleEstimate) -> None:
-    found = doubts_of_map(
-        estimate, None, None, PointErrors(np.full(9, 82.0), np.zeros((9, 3)), 4.8), 0.1, noise_is_given=False
-    )
+    points = PointErrors(np.full(9, 82.0), np.zeros((9, 3)), 4.8)
+    found = doubts_of_map(estimate, None, None, points, noise_is_given=False)
     place = known(place_of_map(estimate, None, path_in_site(walked, estimate), found))
     assert (place.verdict, place.reasons) == ("doubtful", (found[0].reason,))
 

@@ -86,3 +86,12 @@ def test_long_ranges_and_small_coordinates_are_named_together() -> None:
     given = surveyed(YARD, SEED)
     given.range_m = 1.06 * given.range_m
     assert {cause.name for cause in trust(given).causes} == {"range share", "anchors' scale"}
+
+
+def test_an_anchor_that_reads_long_is_named_unless_radios_do_so() -> None:
+    given = surveyed(HALL, SEED)
+    of_a1 = given.is_of("A1")
+    given.range_m = given.range_m + 0.8 * of_a1
+    assert [(cause.name, cause.subject) for cause in trust(given).causes] == [("anchor bias", "A1")]
+    given.range_m = given.range_m - 0.74 * of_a1
+    assert trust(given).reasons == ()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,9 @@ from PIL import Image
 
 from rangesfm.errors import InputError
 from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.vision.given_database import opened
 from rangesfm.vision.image_times import read_image_times_csv
+from rangesfm.vision.photos import usable_photos
 from rangesfm.vision.reconstruct import reconstruct
 from rangesfm.vision.rigs import read_rigs
 
@@ -90,6 +93,17 @@ def test_known_places_are_kept_to_the_digit_and_give_the_model_its_scale(simulat
     compared = pycolmap.compare_reconstructions(model, simulated.truth)
     assert compared is not None
     assert compared["rec2_from_rec1"].scale == pytest.approx(1, rel=1e-3)
+
+
+def test_rigs_of_a_given_database_are_told_to_have_no_say(simulated: Simulated, tmp_path: Path) -> None:
+    path = Path(shutil.copy(simulated.folder / "given.db", tmp_path))
+    photos = usable_photos(simulated.folder, NAMES)
+    for known in ((), (1, 2)):
+        if known:
+            read_rigs(simulated.config(tmp_path / "rig_config.json", known)).apply(path)
+        with opened(path, photos, tmp_path) as given:
+            assert given is not None
+            assert ("its rigs are not: what [images] rig_config says of them counts" in given.note) == bool(known)
 
 
 @pytest.mark.parametrize("known", [(), (1,)])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -16,6 +17,9 @@ from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.progress import SilentProgress
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import Survey, survey_from_tables
+from rangesfm.workflows import photos
+from rangesfm.workflows.journal import Journal
+from rangesfm.workflows.photos import find_keyframes, map_keyframes
 from rangesfm.workflows.run import refine_model
 
 LEFT, RIGHT = "camera000001_", "camera000002_"
@@ -115,3 +119,33 @@ def test_a_baseline_wrong_by_3_percent_is_found_by_the_ranges_and_has_no_say(tmp
     assert baseline.off_by == pytest.approx(0.03, abs=0.005)
     assert found.scale.verdict == "doubtful"
     assert found.scale.reasons[0].startswith("the rig's cameras are 0.4304 m apart, which gives a scale of 1 m per SfM")
+
+
+def test_a_frame_is_one_keyframe_with_the_time_of_its_photos_and_all_of_them_are_mapped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = [f"{prefix}frame{k}.png" for k in range(4) for prefix in (LEFT, RIGHT)]
+    (tmp_path / "images").mkdir()
+    for name in names:
+        (tmp_path / "images" / name).touch()
+    rows = [f"{name},{row // 2}.000" for row, name in enumerate(names)]
+    (tmp_path / "images.csv").write_text("\n".join(["image_name,timestamp_s", *rows]))
+    cameras = [{"image_prefix": LEFT, "ref_sensor": True}, {"image_prefix": RIGHT}]
+    (tmp_path / "rig_config.json").write_text(json.dumps([{"cameras": cameras}]))
+    tables = {"images": {"path": "images", "times": "images.csv", "rig_config": "rig_config.json"}}
+    survey, journal = survey_from_tables(tables, tmp_path), Journal(SilentProgress())
+    keyframes, times = find_keyframes(survey, journal)
+    assert keyframes == tuple(names[::2])
+    assert times is not None
+    assert times.by_name() == {name: float(k) for k, name in enumerate(names[::2])}
+    assert journal.warnings == []
+    mapped: list[str] = []
+    summary = SimpleNamespace(seconds={}, num_registered=2, num_keyframes=2, models=())
+
+    def reconstruct(folder: Path, chosen: list[str], *_: object, **__: object) -> SimpleNamespace:
+        mapped.extend(chosen)
+        return summary
+
+    monkeypatch.setattr(photos, "reconstruct", reconstruct)
+    map_keyframes(survey, keyframes[1:], journal, restart=False)
+    assert mapped == names[2:]

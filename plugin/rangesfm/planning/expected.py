@@ -146,7 +146,7 @@ def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expect
         errors = _as_seen(solution, learned, num_alike)
         solution = _weighed(posed, errors, fit_at(weighted(posed.ranges, errors), state, num_alike))
     covariance = parameter_covariance(solution, learned) + _undetermined(solution.fit)
-    uncertainty = expected_scale_uncertainty(solution, learned, BENDING)
+    uncertainty = expected_scale_uncertainty(posed, solution, learned, BENDING)
     placement = placement_covariance(solution, covariance)
     return Expected(planned, observations, posed, solution, learned, uncertainty, covariance, placement)
 

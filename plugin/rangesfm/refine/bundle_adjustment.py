@@ -228,7 +228,7 @@ def _bundle_adjuster(
     for image_id in metric.reg_image_ids():
         config.add_image(image_id)
         image = metric.image(image_id)
-        if not all(refines) and not camera.of_photo(image.name).refinement_refines_intrinsics:
+        if any(refines) and not camera.of_photo(image.name).refinement_refines_intrinsics:
             config.set_constant_cam_intrinsics(image.camera_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.UNSPECIFIED)
     if fixed_frame_id is not None:

@@ -116,7 +116,7 @@ def quality_checks(summary: ResultSummary) -> tuple[Check, ...]:
     )
     return (
         Check("Scale uncertainty", of_scale, uncertainty, "%", 1.0, 5.0, 2),
-        *(checks_of_ranges if ranges.num else ()),
+        *(checks_of_ranges if summary.has_ranges else ()),
         Check("Reprojection", of_points, reprojection_px, "px", 1.0, 2.0, 2, key="refine.reprojection_rms_px"),
     )
 

@@ -236,7 +236,7 @@ def sensitivity(content: Content) -> Table:
         "1 % of its length, each range": given.range_slope_per_percent,
         **{f"1 cm, lever arm {way}": value for way, value in zip(_WAYS, given.lever_arm_per_cm)},
     }
-    rows = [[what, signed(percent, 3)] for what, percent in percents.items() if content.summary.ranges.num]
+    rows = [[what, signed(percent, 3)] for what, percent in percents.items() if content.summary.has_ranges]
     title = "By how much the scale would change if it were longer by"
     return Table(title, ["what is longer than it was taken to be", "scale %"], rows, is_narrow=True)
 

@@ -82,6 +82,11 @@ class ResultSummary(Record):
     seconds: dict[Text, NumberOrNull]
     warnings: tuple[Text, ...]
 
+    @property
+    def has_ranges(self) -> bool:
+        """Whether a radio took part; else the scale is that of measured lengths alone."""
+        return self.scale.method != "lengths"
+
     @classmethod
     def of(cls, found: MetricResult, **others: Any) -> ResultSummary:
         """Of what the stages found, and of ``others``: entries from ``distances`` on, which do not follow from that."""
@@ -128,7 +133,7 @@ class ResultSummary(Record):
             )
         rms, median = (_text(value, ".3f") for value in (ranges.rms_m, ranges.median_abs_m))
         residuals = f", rms {rms} m, median {median} m" if ranges.num_used else ""
-        if ranges.num:
+        if self.has_ranges:
             yield f"ranges: {ranges.num_used} of {ranges.num} used{residuals}"
         if self.distances:
             held = [abs(row.residual_m) for row in self.distances if row.kind == CONTROL and row.residual_m is not None]

@@ -26,7 +26,7 @@ from rangesfm.scale.levelled_places import levelled_places
 from rangesfm.scale.problem import ScaleProblem, first_camera_from, scale_problem
 from rangesfm.scale.range_equation import RangeProblem, solve
 from rangesfm.scale.sensitivity import scale_sensitivity
-from rangesfm.scale.solution import OpenPlaceError, Solution, solve_scale
+from rangesfm.scale.solution import OpenPlaceError, Solution, solution_from, solve_scale
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
 from rangesfm.scale.uncertainty import learned_errors, parameter_covariance, scale_uncertainty
 from rangesfm.scale.verdict import judge, judge_lengths
@@ -74,7 +74,7 @@ def initialize_scale(
     except OpenPlaceError as error:
         open_place = (f"scale only, in the first camera's frame: {error}",)
         problem = scale_problem(*given, place_is_open=True)
-        solution = solve_scale(problem, camera_side=None, seed=seed)
+        solution = solution_from(problem, error.in_first_camera)
     table = _paper_table(solution)
     rotations = model_from_cam(observations, trajectory, problem)
     learned = learned_errors(problem, solution, observations, rotations)

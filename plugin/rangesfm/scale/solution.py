@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError
-from rangesfm.geometry.similarity import NEARLY_STRAIGHT, path_kind, path_shape
+from rangesfm.geometry.similarity import NEARLY_STRAIGHT, Similarity, path_kind, path_shape
 from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors
 from rangesfm.scale.anchor_plane import camera_side_of, mirrored_map, on_side
 from rangesfm.scale.problem import ScaleProblem
@@ -59,7 +59,18 @@ WHY_SCALE_IS_OPEN = {
 
 
 class OpenPlaceError(GeometryError):
-    """The map fits in another place of the site as well, and has the same scale there."""
+    """The map fits in another place of the site as well, and has the same scale there.
+
+    Attributes:
+        in_first_camera: the fit, carried into the first camera's frame.
+    """
+
+    def __init__(self, text: str, fitted: RangeState):
+        super().__init__(text)
+        placed = fitted.metric_from_model
+        from_site = replace(placed, scale=1.0).inverse()
+        alone = Similarity(placed.scale, np.eye(3), np.zeros(3))
+        self.in_first_camera = RangeState(alone, from_site.apply(fitted.anchors_m), fitted.bias_m)
 
 
 @dataclass(frozen=True)
@@ -244,19 +255,20 @@ def refuse_ambiguity(solution: Solution, rivals: Sequence[RangeState], camera_si
             if min(ours, theirs) * extent < solution.noise_stddev_m:
                 raise GeometryError("the scale is not determined: a camera that stands still fits the ranges as well")
             if abs(np.log(ours / theirs)) <= _SAME_LOG_SCALE:
-                raise OpenPlaceError(_what_is_open(solution.problem))
+                raise _another_place(solution)
             raise GeometryError(
                 f"two scales fit the ranges equally well ({ours:.4g} and {theirs:.4g} m per unit): "
                 f"{'; '.join(WHY_SCALE_IS_OPEN[path_kind(problem.centers)])}"
             )
 
 
-def _what_is_open(problem: RangeProblem) -> str:
+def _another_place(solution: Solution) -> GeometryError:
     """Why two maps of the same scale fit in the site frame."""
-    stddevs = path_shape(problem.centers).stddevs
+    stddevs = path_shape(solution.problem.centers).stddevs
     if stddevs[1] < NEARLY_STRAIGHT * stddevs[0]:
-        return "the map fits the ranges turned about the path, which is nearly straight: walk a bend"
-    return (
+        return GeometryError("the map fits the ranges turned about the path, which is nearly straight: walk a bend")
+    return OpenPlaceError(
         "the map and its mirror image in the anchors' plane fit the ranges equally well, as the path is flat too: "
-        "add an anchor at another height, or say on which side of that plane the camera went (camera_side)"
+        "add an anchor at another height, or say on which side of that plane the camera went (camera_side)",
+        solution.fit.state,
     )

@@ -103,6 +103,7 @@ def _bias(problem: Linearized, anchors: list[int], subject: str, whose: str) -> 
         remedy="calibrate the radio's delay (range_bias_m in the anchors' file), or look for what stands in the way",
         correction=correction,
         is_linear=True,
+        is_in_interval=True,
         effect=of_cells(problem, -np.isin(problem.cells.anchor_index, anchors).astype(np.float64)),
     )
 
@@ -123,6 +124,7 @@ def range_shares(problem: Linearized) -> Iterator[Hypothesis]:
         correction=lambda size: Correction(longer_m=distance_m * size[0] / (1 + size[0])),
         most=0.5,
         is_linear=True,
+        is_in_interval=True,
         effect=of_cells(problem, by_distance),
     )
     heard = np.unique(problem.cells.anchor_index)
@@ -146,6 +148,7 @@ def range_shares(problem: Linearized) -> Iterator[Hypothesis]:
             remedy="look at its ranges in the log, and leave it out (use_anchors)",
             correction=left_out,
             is_linear=True,
+            is_in_interval=True,
             effect=of_cells(problem, np.where(is_of, by_distance + mean, 0.0)),
         )
 
@@ -175,6 +178,7 @@ def anchors_in_another_scale(problem: Linearized) -> Iterator[Hypothesis]:
         "anchors' scale",
         "",
         unit="1",
+        is_in_interval=True,
         words=words,
         remedy="check the unit of the anchors' coordinates against a taped distance between two of them",
         correction=correction,

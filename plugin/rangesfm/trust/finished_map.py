@@ -19,7 +19,7 @@ DOUBTFUL_ABOVE = 0.04
 """Half of the 95 % interval from which a place is called doubtful: of the site's size, or of a radian for the heading;
 the scale's own limit, so that no length in the map and no place in it is worse."""
 
-# Prior stddevs that a bias or a coordinate may be off: by chance one in two thousand is.
+# Prior stddevs that a coordinate may be off: by chance one in two thousand is.
 _MAX_STDDEVS = 3.5
 # Noise of UWB radios in the open is 0.02 to 0.3 m.
 _MAX_NOISE_M = 0.4
@@ -62,7 +62,6 @@ def doubts_of_map(
     summary: RefineSummary | None,
     refined_scale: float | None,
     points: PointErrors,
-    common_bias_stddev_m: float,
     *,
     noise_is_given: bool,
 ) -> tuple[Doubt, ...]:
@@ -72,7 +71,6 @@ def doubts_of_map(
         estimate: of the scale.
         summary, refined_scale: of the refinement; None for a map that is only scaled.
         points: of the final model.
-        common_bias_stddev_m: prior of what all anchors' ranges read too long.
         noise_is_given: somebody said how much the ranges scatter.
     """
     stage = estimate if summary is None else summary
@@ -82,7 +80,6 @@ def doubts_of_map(
         *(() if summary is None else _of_solver(summary)),
         *_of_scale(estimate, refined_scale),
         *_of_say(stage.observations),
-        *_of_biases(stage.anchors, common_bias_stddev_m),
         *_of_positions(stage.anchors),
         *_of_noise(stage.observations, noise_m),
     )
@@ -122,31 +119,6 @@ def _of_say(observations: RangeObservations) -> Iterator[Doubt]:
         num, num_used = of_anchor.sum(), (of_anchor & (observations.status < RangeStatus.OUTLIER)).sum()
         if num >= _MIN_RANGES and num_used < _MIN_USED * num:
             yield Doubt(f"anchor {anchor_id}: {num_used} of {num} ranges used", _CHECK_ANCHOR)
-
-
-def _of_biases(anchors: Sequence[AnchorEstimate], common_stddev_m: float) -> Iterator[Doubt]:
-    free = [a for a in anchors if 0 < a.prior_bias_stddev_m < np.inf and np.isfinite(a.position_m).all()]
-    if not free:
-        return
-    off_m = np.array([anchor.range_bias_m - anchor.prior_bias_m for anchor in free])
-    # The median of three or more: a single one that reads long does not drag the others along.
-    common_m = float(np.median(off_m)) if len(off_m) > 2 else _likeliest_common(free, off_m, common_stddev_m)
-    if common_m and abs(common_m) > _MAX_STDDEVS * common_stddev_m:
-        yield Doubt(f"all anchors' ranges read {common_m:+.2f} m{_times(common_m, common_stddev_m)}", _CHECK_RADIO)
-    for anchor, own_m in zip(free, off_m - common_m, strict=True):
-        stddev_m = anchor.prior_bias_stddev_m
-        if abs(own_m) > _MAX_STDDEVS * stddev_m:
-            reason = f"anchor {anchor.anchor_id}'s bias is {own_m:+.2f} m{_times(own_m, stddev_m)}"
-            yield Doubt(reason, f"{_CHECK_ANCHOR}; if this radio's biases are so large, say so (range_bias_stddev_m)")
-
-
-def _likeliest_common(anchors: Sequence[AnchorEstimate], off_m: Array, common_stddev_m: float) -> float:
-    weights = np.array([anchor.prior_bias_stddev_m**-2.0 for anchor in anchors])
-    return float(weights @ off_m / (weights.sum() + common_stddev_m**-2.0)) if common_stddev_m else 0.0
-
-
-def _times(found: float, stddev: float) -> str:
-    return f", {abs(found) / stddev:.2g} times what was thought possible" if stddev else ""
 
 
 def _of_positions(anchors: Sequence[AnchorEstimate]) -> Iterator[Doubt]:

@@ -68,6 +68,7 @@ class Hypothesis:
         most: beyond which an estimate is not believed, in its unit.
         narrower: of fewer numbers, which explain as much if the mistake was of their kind.
         is_linear: whether one step finds its size, however large it is.
+        is_in_interval: whether the scale's interval counts how large it usually is, or it changes what a metre is.
     """
 
     name: str
@@ -81,6 +82,7 @@ class Hypothesis:
     most: float = np.inf
     narrower: tuple[Hypothesis, ...] = ()
     is_linear: bool = False
+    is_in_interval: bool = False
 
     @property
     def num(self) -> int:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rangesfm.arrays import Indices
+from rangesfm.scale.verdict import DOUBTFUL_ABOVE
 from rangesfm.trust.evidence import evidence
 from rangesfm.trust.mistakes import Cause, Findings, find_mistakes
 from rangesfm.trust.ranges_on_map import RangesOnMap
@@ -43,6 +44,7 @@ def trust_in(on_map: RangesOnMap, *, seed: int = 0) -> TrustVerdict:
     shown = list(evidence(found.problem))
     rows = [*_of_causes(found), *(row_of(test) for test in _others(found)), *shown]
     reasons = [*([sentence(found.causes)] if found.causes else []), *(_reason(row) for row in shown if row.rejected)]
+    reasons = reasons or list(_what_could_hide(found))
     return TrustVerdict(tuple(rows), tuple(reasons), found.causes, on_map.rows)
 
 
@@ -54,6 +56,16 @@ def sentence(causes: Sequence[Cause]) -> str:
     either = ", or ".join(cause.words for cause in causes)
     remedies = dict.fromkeys(cause.remedy for cause in causes)
     return f"either {either} ({sure}; the ranges do not tell which): {'; or '.join(remedies)}"
+
+
+def _what_could_hide(found: Findings) -> Iterator[str]:
+    """A mistake that would not have been found and does more than a good scale may be off by."""
+    hidden = [t for t in found.tests if not t.hypothesis.is_in_interval and np.isfinite(t.effect_on_log_scale)]
+    worst = max(hidden, key=lambda test: test.effect_on_log_scale, default=None)
+    if worst is not None and worst.effect_on_log_scale > DOUBTFUL_ABOVE:
+        what = f"{' '.join(worst.hypothesis.key).strip()}, {worst.smallest_detectable:.2g} {worst.hypothesis.unit}"
+        change = f"change the scale by {100 * worst.effect_on_log_scale:.1f} %"
+        yield f"a mistake could stay hidden here ({what}) and {change}: {worst.hypothesis.remedy}"
 
 
 def _reason(row: MistakeTest) -> str:

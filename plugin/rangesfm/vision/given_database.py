@@ -113,6 +113,7 @@ def _read(source: Path, path: Path, photos: Photos) -> GivenDatabase:
                 source,
             )
         num_pairs = len(_pairs(database, {id_: id_ for id_ in ids.values()}))
+        has_rigs = any(rig.non_ref_sensors for rig in database.read_all_rigs())
         bare = next((name for name, id_ in ids.items() if not database.exists_descriptors(id_)), None)
     if not num_pairs and bare is not None:
         raise InputError(f"has neither matches nor a descriptor of {bare} to match it by, expected either", source)
@@ -121,6 +122,8 @@ def _read(source: Path, path: Path, photos: Photos) -> GivenDatabase:
         note += f"; {len(lacking)} photos are not in it and are left out, the first is {lacking[0]}"
     if others := sorted(of_name.keys() - set(photos.names)):
         note += f"; {len(others)} of its photos are no keyframes, the first is {others[0]}"
+    if has_rigs:
+        note += "; its rigs are not: what [images] rig_config says of them counts"
     return GivenDatabase(source, path, sha256_of(source), photos.of(ids), tuple(ids.values()), num_pairs, note)
 
 

@@ -167,13 +167,13 @@ def read_image_times_csv(
         if name in known
     }
     stamps = {name: stamp for name, stamp in stamps.items() if name not in frame_of} | {
-        first: stamps[timed[0]] for first, photos in frames.items() if (timed := [p for p in photos if p in stamps])
+        first: stamps[own[0]] for first, photos in frames.items() if (own := [p for p in photos if p in stamps])
     }
-    found = _in_time_order(stamps, names or tuple(stamps), "csv")
+    ordered = _in_time_order(stamps, names or tuple(stamps), "csv")
     if not unknown:
-        return found
+        return ordered
     note = f"{len(unknown)} of the {len(image_names)} names in {table.path.name} are of no photo in the folder"
-    return replace(found, notes=(note, *found.notes))
+    return replace(ordered, notes=(note, *ordered.notes))
 
 
 def times_from_exif(folder: str | Path, names: Sequence[str]) -> ImageTimes:

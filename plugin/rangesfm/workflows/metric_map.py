@@ -340,7 +340,6 @@ def judge_map(survey: Survey, metric: MetricResult, journal: Journal) -> MetricR
         metric.kept_refinement,
         None if metric.kept_refinement is None else metric.refined_scale,
         point_errors(metric.final),
-        survey.ranges.common_bias_stddev_m,
         noise_is_given=survey.ranges.range_stddev_m is not None or bool(np.isfinite(log.range_stddev_m).any()),
     )
     for doubt in doubts:
