@@ -15,7 +15,8 @@ STRAIGHT = """
 frame = "unknown"
 places = {A = [2, 8, 1.6]}
 [path]
-waypoints = [[0, 0, 1.6], [4, 0, 1.6]]
+waypoints = [[0, 0, 1.6], [2, 0, 1.6]]
+speed_m_per_s = 0.25
 """
 
 
@@ -47,5 +48,5 @@ def test_a_key_that_is_not_known_is_named_with_its_line(tmp_path: Path, capsys: 
     path = tmp_path / "plan.toml"
     path.write_text(STRAIGHT + "speed = 1.0\n")
     assert main(["plan", str(path)]) == 2
-    assert capsys.readouterr().err.startswith(f"rangesfm: error: {path}:7: unknown key 'speed' in [path]")
+    assert capsys.readouterr().err.startswith(f"rangesfm: error: {path}:8: unknown key 'speed' in [path]")
     assert not (tmp_path / "plan").exists()
