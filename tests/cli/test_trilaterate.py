@@ -72,7 +72,8 @@ def test_anchors_are_found_and_written(
     text = capsys.readouterr().out
     for anchor in read_anchors("anchors.csv"):
         assert anchor.position_m is not None
-        assert np.linalg.norm(anchor.position_m - ANCHORS_M[anchor.anchor_id]) < 0.08
+        off_m = float(np.linalg.norm(anchor.position_m - ANCHORS_M[anchor.anchor_id]))
+        assert off_m < min(2 * anchor.position_stddev_m, 0.1)
         assert 0 < anchor.position_stddev_m < 0.2  # what radios get wrong by direction may hide in the place
         assert anchor.range_bias_stddev_m is not None
         assert f"\n{anchor.anchor_id}    " in text

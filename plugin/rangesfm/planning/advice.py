@@ -29,6 +29,8 @@ _NUM_BEST = 3
 _NUM_PLACES = 8
 # Of a stddev: what changes less is not worth the way.
 _LEAST_GAIN = 0.02
+# Of those, after a survey: another 20 % of certainty.
+_WORTH_SAYING = 1 - 1 / 1.2
 
 
 @dataclass(frozen=True)
@@ -68,15 +70,22 @@ def advise(expected: Expected) -> tuple[Advice, ...]:
     return tuple(advice for advice in found if max(advice.scale_gain, advice.place_gain) > _LEAST_GAIN)
 
 
-def best_words(advice: Iterable[Advice]) -> tuple[list[str], list[str]]:
-    """What gains most for the scale, and for the place, with what it gains."""
+def best_words(advice: Iterable[Advice], *, for_scale: bool, for_place: bool) -> list[str]:
+    """The changes that gain most for the scale, then for the place, as far as wanted, with what each gains."""
     advice = list(advice)
-    for_scale = ranked(advice, lambda each: each.scale_gain)[:_NUM_BEST]
-    for_place = ranked(advice, lambda each: each.place_gain)[:_NUM_BEST]
-    return (
-        [f"{each.words}: the scale would be {1 / (1 - each.scale_gain):.2g} times as certain" for each in for_scale],
-        [f"{each.words}: the place would be {1 / (1 - each.place_gain):.2g} times as certain" for each in for_place],
-    )
+    wanted: dict[str, Callable[[Advice], float]] = {}
+    if for_scale:
+        wanted["scale"] = lambda each: each.scale_gain
+    if for_place:
+        wanted["place"] = lambda each: each.place_gain
+    gains: dict[str, list[str]] = {}
+    for what, gain in wanted.items():
+        for each in ranked(advice, gain)[:_NUM_BEST]:
+            if gain(each) > _WORTH_SAYING:
+                gains.setdefault(each.words, []).append(
+                    f"the {what} would be {1 / (1 - gain(each)):.2g} times as certain"
+                )
+    return [f"{words}: {', '.join(gained)}" for words, gained in gains.items()]
 
 
 def ranked(advice: Iterable[Advice], gain: Callable[[Advice], float]) -> list[Advice]:

@@ -76,9 +76,7 @@ def with_advice(metric: MetricResult, tag_in_cam_m: Array) -> MetricResult:
         expected = expect(planned)
     except (InputError, GeometryError):  # nothing says what is up, or a run like it would not come about
         return metric
-    words = [
-        words for wanted, best in zip(doubtful, best_words(advise(expected)), strict=True) if wanted for words in best
-    ]
+    words = best_words(advise(expected), for_scale=doubtful[0], for_place=doubtful[1])
     advice = tuple(dict.fromkeys((*estimate.advice, *words)))
     return replace(metric, estimate=replace(estimate, advice=advice))
 

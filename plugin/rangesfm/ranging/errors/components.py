@@ -18,6 +18,8 @@ from rangesfm.ranging.errors.population import population
 
 _SHORT_M = 1.0
 _TIME_S = 3.0
+# As a warming radio has it.
+_DRIFT_S = 60.0
 # Of the tag's place, and of 1 minus the cosine between directions in the camera: as echoes and antennas' lobes have it.
 _PLACE_M, _LOBE = 0.5, 0.1
 # In logarithms of distance.
@@ -67,6 +69,11 @@ def _apart(values: Array) -> Array:
 
 def _in_time(cells: Cells) -> Array:
     together: Array = np.exp(-_apart(cells.time_s) / _TIME_S) * _same_link(cells)
+    return together
+
+
+def _drifting(cells: Cells) -> Array:
+    together: Array = np.exp(-_apart(cells.time_s) / _DRIFT_S) * _same(cells.tag_index)
     return together
 
 
@@ -151,6 +158,7 @@ def components(expected: Mapping[str, tuple[float, float]]) -> tuple[Component, 
     return (
         of("white", _white, "noise of single ranges", is_of_anchor=True),
         of("time", _in_time, "errors that last for seconds", is_of_anchor=True),
+        of("drift", _drifting, "slow drift of the radio, alike to all anchors"),
         of("place", _in_place, "errors that belong to a place: echoes", is_of_anchor=True),
         of("view", _in_view, "lobes of the tag's antenna towards each anchor", is_of_anchor=True),
         of("bias", lambda c: _same(c.anchor_index), "each anchor's own bias", is_of_anchor=True),

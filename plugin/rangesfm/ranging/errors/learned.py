@@ -232,8 +232,9 @@ class _Likelihood:
         """(c, c) lower factor and inverse of the covariance."""
         covariance = np.tensordot(np.exp(2 * logs), self.of_components, axes=1) + self.known
         covariance[np.diag_indices_from(covariance)] += ROUNDING * np.trace(covariance)
-        lower = np.linalg.cholesky(covariance)
-        return lower, cho_solve((lower, True), np.eye(len(covariance)))
+        lower = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
+        inverse: Array = cho_solve((lower, True), np.eye(len(covariance)))
+        return lower, inverse
 
     def _unknowns(self, inverse: Array) -> tuple[Array, Array, float]:
         """(c, p) whitened design, (p, p) covariance, and the logarithm of the determinant of its inverse."""

@@ -11,6 +11,7 @@ log         room_env1 room_calibration starloc_s5 rcv_sequence1 rcv_sequence3 li
 radio       room      room             starloc    rcv           rcv           lias     plaza  starloc_fast
 white       0.026     0.029            0.043      0.026         0.038         0.080    0.360  0.089
 time        0.020     0.026            0.011      0.006         0.005         0.007    0.003  0.007
+drift       0.015     0.008            0.006       0.007         0.005         0.005    0.002  0.016
 place       0.009     0.027            0.010      0.050         0.047         0.017    0.002  0.010
 view        0.039     0.044            0.024      0.053         0.022         0.009    0.002  0.042
 bias        0.031     0.025            0.029      0.040         0.027         0.046    0.012  0.033
