@@ -81,3 +81,8 @@ def test_the_refinement_of_a_long_path_is_direct() -> None:
         num_threads=1,
     )
     assert problem.adjuster.options.ceres.max_num_images_direct_sparse_cpu_solver == 1010
+
+
+def test_pairs_overlap_in_both_directions() -> None:
+    overlaps = overlaps_of(np.array([[0, 2], [1, 2]]), 3).toarray()
+    np.testing.assert_array_equal(overlaps, [[0, 0, 1], [0, 0, 1], [1, 1, 0]])

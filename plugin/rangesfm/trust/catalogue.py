@@ -14,6 +14,10 @@ _AXES = "xyz"
 _SAME_HEIGHT_M = 1e-3
 # Of an anchor's ranges: where they follow the distance by less, they hardly change at all.
 _STUCK = 0.3
+# Along a camera; of an anchor, beside what is drawn on any sketch of the site.
+_MISMEASURED_M, UNSEEN_MOVE_M = 0.2, 1.0
+# Seconds a second: no quartz drifts by more.
+_BAD_CLOCK = 1e-3
 _MEASURE_AGAIN = "measure it again, or run with it unknown (leave its coordinates in the anchors' file empty)"
 
 
@@ -72,6 +76,7 @@ def anchor_places(problem: Linearized) -> Iterator[Hypothesis]:
             remedy=_MEASURE_AGAIN,
             correction=moved,
             adoption=unknown,
+            unawares=UNSEEN_MOVE_M,
             narrower=tuple(coordinates),
             effect=found,
         )
@@ -221,6 +226,8 @@ def lever_arms(problem: Linearized) -> Iterator[Hypothesis]:
     """The tag is elsewhere on the camera."""
     for k in np.unique(problem.cells.tag_index).tolist():
         name = problem.on_map.tag_ids[k] if len(problem.on_map.tag_ids) > 1 else ""
+        of_tag = problem.on_map.tag_index == k
+        length_m = float(np.median(np.linalg.norm(problem.on_map.problem.tag_from_center[of_tag], axis=1)))
         columns = np.where((problem.cells.tag_index == k)[:, None], -problem.by_lever_arm, 0.0)
 
         def words(size: Array, name: str = name) -> str:
@@ -240,6 +247,7 @@ def lever_arms(problem: Linearized) -> Iterator[Hypothesis]:
             words=words,
             remedy="measure where the tag's antenna sits, x to the right, y down, z forward (--tag_in_cam)",
             correction=correction,
+            unawares=_MISMEASURED_M + 2 * length_m,  # the other way round
             effect=of_cells(problem, columns),
         )
 
@@ -274,6 +282,7 @@ def clocks(problem: Linearized) -> Iterator[Hypothesis]:
         words=drift,
         remedy=remedy,
         correction=lambda size: Correction(time_shift_s=size[0] * of_ranges),
+        unawares=_BAD_CLOCK,
         effect=of_cells(problem, -problem.by_time * since),
     )
 

@@ -66,6 +66,7 @@ class Hypothesis:
         correction: of an estimate, what undoes it.
         adoption: what takes its place where the mistake is adopted; None: the correction itself.
         most: beyond which an estimate is not believed, in its unit.
+        unawares: beyond which nobody makes it without seeing it, in its unit: a larger one need not be feared.
         narrower: of fewer numbers, which explain as much if the mistake was of their kind.
         is_linear: whether one step finds its size, however large it is.
         is_in_interval: whether the scale's interval counts how large it usually is, or it changes what a metre is.
@@ -80,6 +81,7 @@ class Hypothesis:
     correction: Callable[[Array], Correction]
     adoption: Callable[[Array], Correction] | None = None
     most: float = np.inf
+    unawares: float = np.inf
     narrower: tuple[Hypothesis, ...] = ()
     is_linear: bool = False
     is_in_interval: bool = False

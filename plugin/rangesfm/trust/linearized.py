@@ -31,6 +31,9 @@ _NUM_NEIGHBOURS = 8
 _OUTLYING = 3.0
 _LEAST_SCATTER_M = 0.08
 _NO_WEIGHT = 1e-6
+# What the ranges to each anchor, and those to all, drift by in a minute, as hands and bodies move: too slow to be
+# learnt beside a step that is looked for.
+_WANDERING_M, _WANDERING_S = 0.025, 60.0
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,7 @@ class Linearized:
             noise_m=self.scatter_m,
             curve_stddev_m=None if curve_m is None else self.cells.mean(curve_m),
             ruled_out=self.on_map.ruled_out,
+            others_m2=_wandering(self.cells),
         )
         return replace(self, errors=learnt)
 
@@ -139,7 +143,14 @@ def _usual(cells_of_ranges: Cells, on_map: RangesOnMap, scatter_m: float) -> Lea
         curve_stddev_m=on_map.curve_stddev_m,
         ruled_out=on_map.ruled_out,
         stddevs={"white": scatter_m},
+        others_m2=_wandering(cells_of_ranges),
     )
+
+
+def _wandering(cells_of_ranges: Cells) -> dict[str, Array]:
+    index, time_s = cells_of_ranges.anchor_index, cells_of_ranges.time_s
+    together = np.exp(-np.abs(time_s[:, None] - time_s) / _WANDERING_S)
+    return {"wandering": _WANDERING_M**2 * (1.0 + (index[:, None] == index)) * together}
 
 
 def _cells(on_map: RangesOnMap, residual_m: Array, gradient: RangeGradient) -> tuple[Cells, float]:

@@ -104,7 +104,8 @@ def _causes(problem: Linearized, nominated: Sequence[Test], *, is_sure: bool) ->
     for test in _varied(nominated):
         again, deviance = _settled_test(problem, test.hypothesis)
         gain = before - deviance
-        if _is_possible(again) and (is_sure or gain > test.threshold):
+        # What is not linear was tested by its first step, which says little of a large mistake.
+        if _is_possible(again) and ((is_sure and test.hypothesis.is_linear) or gain > test.threshold):
             causes.append(_cause(replace(again, threshold=test.threshold), gain, _penalty(again, num)))
     if not causes and not is_sure:
         return []

@@ -8,6 +8,7 @@ import numpy as np
 
 from rangesfm.arrays import Array, Mask
 from rangesfm.scale.range_equation import tag_positions
+from rangesfm.trust.catalogue import UNSEEN_MOVE_M
 from rangesfm.trust.hypothesis import Correction, Hypothesis, of_cells
 from rangesfm.trust.linearized import Linearized
 
@@ -54,6 +55,7 @@ def anchors_moved(problem: Linearized) -> Iterator[Hypothesis]:
                 remedy="fix anchors so that nobody bumps into them, and use its ranges from before only",
                 correction=back,
                 adoption=_left_out(of_ranges),
+                unawares=UNSEEN_MOVE_M,
                 effect=of_cells(problem, np.where(is_after[:, None], problem.gradient.by_tag, 0.0)),
             )
 

@@ -61,11 +61,17 @@ def sentence(causes: Sequence[Cause]) -> str:
 def _what_could_hide(found: Findings) -> Iterator[str]:
     """A mistake that would not have been found and does more than a good scale may be off by."""
     hidden = [t for t in found.tests if not t.hypothesis.is_in_interval and np.isfinite(t.effect_on_log_scale)]
-    worst = max(hidden, key=lambda test: test.effect_on_log_scale, default=None)
-    if worst is not None and worst.effect_on_log_scale > DOUBTFUL_ABOVE:
-        what = f"{' '.join(worst.hypothesis.key).strip()}, {worst.smallest_detectable:.2g} {worst.hypothesis.unit}"
-        change = f"change the scale by {100 * worst.effect_on_log_scale:.1f} %"
+    worst = max(hidden, key=_hidden_effect, default=None)
+    if worst is not None and _hidden_effect(worst) > DOUBTFUL_ABOVE:
+        size = min(worst.smallest_detectable, worst.hypothesis.unawares)
+        what = f"{' '.join(worst.hypothesis.key).strip()}, {size:.2g} {worst.hypothesis.unit}"
+        change = f"change the scale by {100 * _hidden_effect(worst):.1f} %"
         yield f"a mistake could stay hidden here ({what}) and {change}: {worst.hypothesis.remedy}"
+
+
+def _hidden_effect(test: Test) -> float:
+    """On the logarithm of the scale, of the largest that neither test nor surveyor would see."""
+    return test.effect_on_log_scale * min(1.0, test.hypothesis.unawares / test.smallest_detectable)
 
 
 def _reason(row: MistakeTest) -> str:

@@ -169,6 +169,7 @@ def test_bursts_of_two_tags_are_centred_on_their_photos() -> None:
     found = estimate_time_offset(both_tags(first.log, second.log), first.photos, [left, right])
     assert found.value_s == pytest.approx(0.83, abs=0.05)
     assert not found.offset_matters
+    assert found.drift == 0
 
 
 def test_curve_over_all_offsets_is_lowest_at_the_one_found() -> None:
@@ -314,6 +315,7 @@ def test_bursts_around_still_photos_are_centred_on_them(num_stops: int, first_ph
     found = estimate(survey.log, survey.photos)
     assert found.value_s == pytest.approx(0.83 - 1.6e9, abs=0.05)
     assert not found.offset_matters
+    assert found.drift == 0
     # A burst of two seconds can be moved by two seconds either way before it is half-way to the next photo.
     assert found.stddev_s == pytest.approx(4 / np.sqrt(12), abs=0.05)
     assert found.note is not None

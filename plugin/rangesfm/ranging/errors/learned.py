@@ -88,6 +88,7 @@ def learn_errors(
     noise_m: float,
     curve_stddev_m: Array | None = None,
     ruled_out: Collection[str] = (),
+    others_m2: Mapping[str, Array] | None = None,
 ) -> LearnedErrors:
     """Restricted maximum likelihood (Patterson and Thompson, 1971) with lognormal priors on the stddevs.
 
@@ -98,23 +99,25 @@ def learn_errors(
         noise_m: of single ranges.
         curve_stddev_m: (n,) of a learnt error curve that has been taken off; None if none has.
         ruled_out: components that the user knows not to be there.
+        others_m2: (c, c) covariances of what else there is, by name, of which nothing is to be learnt.
     """
     widening = max(1.0, noise_m / _USUAL_NOISE_M) ** _WIDENING_POWER
     components = [component for component in COMPONENTS if component.name not in ruled_out]
     of_cells = [_covariance(component, cells, widening) for component in components]
     medians = [_median(component, curve_stddev_m is not None) for component in components]
+    known = _known(cells, curve_stddev_m, others_m2)
     likelihood = _Likelihood(
         np.array(of_cells),
         np.log(medians),
         np.array([component.spread for component in components]),
-        _known(cells, curve_stddev_m),
+        np.sum([*known.values(), np.zeros((len(cells), len(cells)))], axis=0),
         cells.mean(off_m),
         cells.mean(design),
         prior_design,
     )
     stddevs = likelihood.mean_stddevs(likelihood.most_likely())
     covariances = stddevs[:, None, None] ** 2 * likelihood.of_components
-    return _of_components(cells, components, stddevs, covariances, None if curve_stddev_m is None else likelihood.known)
+    return _of_components(cells, components, stddevs, covariances, known)
 
 
 def usual_errors(
@@ -123,11 +126,12 @@ def usual_errors(
     curve_stddev_m: Array | None = None,
     ruled_out: Collection[str] = (),
     stddevs: Mapping[str, float] | None = None,
+    others_m2: Mapping[str, Array] | None = None,
 ) -> LearnedErrors:
     """What radios let expect before anything is measured: roots of the mean variances, or what is known better.
 
     Args:
-        curve_stddev_m, ruled_out: as of ``learn_errors``.
+        curve_stddev_m, ruled_out, others_m2: as of ``learn_errors``.
         stddevs: of some components, by name, in place of these.
     """
     components = [component for component in COMPONENTS if component.name not in ruled_out]
@@ -136,20 +140,18 @@ def usual_errors(
     usual = [_median(component, is_calibrated) * np.exp(component.spread**2) for component in components]
     sizes = np.array([(stddevs or {}).get(c.name, size) for c, size in zip(components, usual, strict=True)])
     covariances = np.array([size**2 * _covariance(c, cells, 1.0) for c, size in zip(components, sizes, strict=True)])
-    known = _known(cells, curve_stddev_m) if is_calibrated else None
-    return _of_components(cells, components, sizes, covariances, known)
+    return _of_components(cells, components, sizes, covariances, _known(cells, curve_stddev_m, others_m2))
 
 
 def _of_components(
-    cells: Cells, components: Sequence[Component], stddevs: Array, covariances: Array, known: Array | None
+    cells: Cells, components: Sequence[Component], stddevs: Array, covariances: Array, known: Mapping[str, Array]
 ) -> LearnedErrors:
-    """With what a learnt curve leaves, if there is one."""
-    names = [component.name for component in components]
-    if known is not None:
-        names.append(LEARNT_CURVE)
-        stddevs = np.append(stddevs, 1.0)
-        covariances = np.concatenate([covariances, known[None]])
-    return LearnedErrors(cells, cells.of_range, tuple(names), stddevs, covariances)
+    """With what is known otherwise."""
+    names = (*(component.name for component in components), *known)
+    stddevs = np.append(stddevs, np.ones(len(known)))
+    return LearnedErrors(
+        cells, cells.of_range, names, stddevs, np.concatenate([covariances, *(m[None] for m in known.values())])
+    )
 
 
 def _median(component: Component, is_calibrated: bool) -> float:
@@ -167,13 +169,14 @@ def _covariance(component: Component, cells: Cells, widening: float) -> Array:
     return covariance if component.name in ("bending", "white") else widening**2 * covariance
 
 
-def _known(cells: Cells, curve_stddev_m: Array | None) -> Array:
-    """(c, c) that nothing is to be learnt of."""
-    if curve_stddev_m is None:
-        return np.zeros((len(cells), len(cells)))
-    stddev = cells.mean(curve_stddev_m)
-    smooth = next(component for component in COMPONENTS if component.name == "curve")
-    return np.outer(stddev, stddev) * smooth.correlation(cells)
+def _known(cells: Cells, curve_stddev_m: Array | None, others_m2: Mapping[str, Array] | None) -> dict[str, Array]:
+    """(c, c) covariances that nothing is to be learnt of."""
+    known = dict(others_m2 or {})
+    if curve_stddev_m is not None:
+        stddev = cells.mean(curve_stddev_m)
+        smooth = next(component for component in COMPONENTS if component.name == "curve")
+        known[LEARNT_CURVE] = np.outer(stddev, stddev) * smooth.correlation(cells)
+    return known
 
 
 @dataclass(frozen=True)
