@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from PIL import Image
+from tests.sources.damage import DAMAGES, Damage
 from tests.sources.recorded import PORTRAIT, write_video
 
 from rangesfm.errors import InputError
@@ -82,17 +81,7 @@ def test_missing_package_is_said_with_the_command_that_installs_it(
 
 
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    damage=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=20),
-    kept=st.floats(0.1, 1),
-)
-def test_a_damaged_video_is_read_or_refused(
-    damage: list[tuple[float, int]], kept: float, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+@given(damage=DAMAGES)
+def test_a_damaged_video_is_read_or_refused(damage: Damage, tmp_path_factory: pytest.TempPathFactory) -> None:
     path = write_video(tmp_path_factory.mktemp("video") / "a.mp4", pictures(5), TIMES_S)
-    content = bytearray(path.read_bytes())
-    for position, byte in damage:
-        content[int(position * len(content))] = byte
-    path.write_bytes(content[: int(kept * len(content))])
-    with contextlib.suppress(InputError):
-        assert all(frame.grey().mode == "L" for frame in open_source(path, None).frames())
+    damage.read_or_refused(path)
