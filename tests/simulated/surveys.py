@@ -17,7 +17,7 @@ from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.errors.components import COMPONENTS
+from rangesfm.ranging.errors.learned import usual_stddevs
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeObservations
 
@@ -43,11 +43,8 @@ class Measured:
 
 
 def stddevs_of(planned: PlannedSurvey) -> dict[str, float]:
-    """Of the components of its ranges' errors: as told, or as radios mostly have them."""
-    is_learnt = planned.curve_stddev_m is not None
-    usual = {
-        c.name: c.calibrated_median if is_learnt and c.calibrated_median is not None else c.median for c in COMPONENTS
-    }
+    """Of the components of its ranges' errors: as told, or as radios have them in the mean."""
+    usual = usual_stddevs(is_calibrated=planned.curve_stddev_m is not None)
     return usual | dict(planned.component_stddevs)
 
 
