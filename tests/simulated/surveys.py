@@ -25,7 +25,7 @@ Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
 
 METRES_PER_UNIT = 2.3
-LASTING_S, PLACE_M, LOBE = 3.0, 0.5, 0.1
+LASTING_S, DRIFT_S, PLACE_M, LOBE = 3.0, 60.0, 0.5, 0.1
 NUM_WAVES = 300
 # Knots of an uneven curve over the logarithm of distance.
 _KNOTS = np.linspace(np.log(0.05), np.log(300.0), 400)
@@ -103,7 +103,7 @@ def _errors(
     errors += (stddevs["curve"] * error_curve(distance, rng)) + stddevs["rough_curve"] * _uneven(distance, rng)
     if curve_stddev_m is not None:
         errors += curve_stddev_m * error_curve(distance, rng)
-    errors += stddevs["tag_antenna"] * _lobes(in_cam, rng)
+    errors += stddevs["tag_antenna"] * _lobes(in_cam, rng) + stddevs["drift"] * lasting(times, DRIFT_S, rng)
     for k in range(len(standing_m)):
         rows = np.flatnonzero(index == k)
         since = times[rows]

@@ -1,4 +1,4 @@
-"""Whether a plan knows how far photos let a map bend: predicted stddevs of keyframes against the spread of refined maps.
+"""Whether a plan knows how far photos let a map bend: predicted stddevs of keyframes, and the spread of refined maps.
 
 Run: python -m tests.studies.planned_bends --rows FILE [--num_seeds 40] [--surveys NAME]
 
@@ -40,6 +40,7 @@ from rangesfm.ranging.errors.components import COMPONENTS
 # The simulated camera's.
 _WIDTH_PX, _FOCAL_PX = 960, 750.0
 _FIELD_OF_VIEW_DEG = float(2 * np.rad2deg(np.arctan(_WIDTH_PX / 2 / _FOCAL_PX)))
+
 
 def photos(num_points: int, seen_m: tuple[float, float], max_track_length: int | None, pixels: float) -> PlannedPhotos:
     return PlannedPhotos(

@@ -125,9 +125,10 @@ def _stddevs(variances: Array) -> Array:
 
 
 def compare(planned: PlannedSurvey) -> Expected | None:
-    """``expect`` in a tenth of the time, good to tell plans apart; None where a run will find too few ranges."""
+    """``expect`` in a tenth of the time, good to tell plans apart, of a rigid map; None where a run will find too few
+    ranges."""
     try:
-        return expect(replace(planned, max_num_ranges=_NUM_COMPARED_RANGES), _NUM_COMPARED_CELLS)
+        return expect(replace(planned, photos=None, max_num_ranges=_NUM_COMPARED_RANGES), _NUM_COMPARED_CELLS)
     except GeometryError:
         return None
 
@@ -149,9 +150,10 @@ def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expect
     errors = posed.errors.at(tags, scale * posed.center_stddev)
     solution = _weighed(posed, errors, fit_at(weighted(posed.ranges, errors), state, num_alike))
     rotations = model_from_cam(observations, planned.trajectory, posed)
-    stddevs, made = dict(planned.component_stddevs), _planned_map(planned, posed, observations)
+    made = _planned_map(planned, posed, observations)
+    stddevs = usual_stddevs(is_calibrated=planned.curve_stddev_m is not None) | dict(planned.component_stddevs)
     if made is not None:
-        stddevs["bending"] = np.hypot(stddevs.get("bending", usual_stddevs(is_calibrated=False)["bending"]), made.bend_m(solution))
+        stddevs["bending"] = float(np.hypot(stddevs["bending"], made.bend_m(solution)))
     learned = errors_to_expect(posed, solution, observations, rotations, stddevs, max_num_cells)
     for _ in range(_NUM_NOISE_ROUNDS):
         errors = _as_seen(solution, learned, num_alike)
@@ -164,9 +166,7 @@ def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expect
     return Expected(planned, observations, posed, solution, learned, uncertainty, covariance, placement, bends_m)
 
 
-def _planned_map(
-    planned: PlannedSurvey, posed: ScaleProblem, observations: RangeObservations
-) -> PlannedMap | None:
+def _planned_map(planned: PlannedSurvey, posed: ScaleProblem, observations: RangeObservations) -> PlannedMap | None:
     if planned.photos is None:
         return None
     path = planned.trajectory

@@ -8,13 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import AfterValidator, Field
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.similarity import IDENTITY, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.option_model import Options, Told
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.association import lever_arms
 from rangesfm.ranging.errors.learned import LearnedErrors
@@ -25,6 +28,8 @@ from rangesfm.refine.vision_information import Observations, Poses, VisionInform
 from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.solution import Solution
 
+MAX_NUM_PHOTOS = 2000
+"""More would take minutes, and a coarser path bends alike."""
 # Height of a photo over its width.
 _HEIGHT = 2 / 3
 # So many points of a photo are computed with, each as good as several; and a new one that no other photo sees is drawn
@@ -38,25 +43,35 @@ _NUM_BENT = 60
 _NO_MOTION = 1e-6
 
 
-@dataclass(frozen=True)
-class PlannedPhotos:
-    """What the camera sees, and how well.
+def _ascending(distances: tuple[float, float]) -> tuple[float, float]:
+    if not distances[0] < distances[1]:
+        raise ValueError("are not ascending")
+    return distances
 
-    Attributes:
-        field_of_view_deg: from the left edge of a photo to the right one.
-        seen_m: nearest and farthest distance of what it sees.
-        num_points: of the map in each photo.
-        num_photos_of_point: in a row, at most, in which a point is found.
-        closes_loops: whether it is found again later, from about the same side and distance.
-        feature_stddev: of each coordinate of a feature, share of a photo's width.
-    """
 
-    field_of_view_deg: float
-    seen_m: tuple[float, float]
-    num_points: int
-    num_photos_of_point: int
-    closes_loops: bool
-    feature_stddev: float
+_Distance = Annotated[float, Field(ge=0.01, le=1e4)]
+
+
+class PlannedPhotos(Options):
+    """What the camera sees, and how well; without this table the map is taken to be rigid."""
+
+    table: ClassVar[str] = "photos"
+
+    field_of_view_deg: Annotated[float, Field(ge=5, le=170)] = 65.0
+    """From the left edge of a photo to the right one."""
+    seen_m: Annotated[
+        Annotated[tuple[_Distance, _Distance], Field(strict=False), AfterValidator(_ascending)],
+        Told(expected="a list of 2 distances, the larger one last"),
+    ] = (1.5, 8.0)
+    """Nearest and farthest of what it sees."""
+    num_points: Annotated[int, Field(ge=8, le=100_000)] = 200
+    """Of the map in each photo."""
+    num_photos_of_point: Annotated[int, Field(ge=2, le=1000)] = 8
+    """In a row, at most, in which a point is found."""
+    closes_loops: bool = False
+    """Whether a point is found again later, from about the same side and distance."""
+    feature_stddev: Annotated[float, Field(ge=1e-6, le=0.1)] = 0.0005
+    """Of each coordinate of a feature, as a share of a photo's width."""
 
     @property
     def _half_width(self) -> float:

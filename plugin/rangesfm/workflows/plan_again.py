@@ -22,6 +22,7 @@ from rangesfm.ranging.observations import RangeStatus
 from rangesfm.result.folder import read_result_folder
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.ranges_as_used import RangesAsUsed
+from rangesfm.scale.verdict import CALIBRATE
 
 # Of photos without times.
 _PHOTO_RATE_HZ = 2.0
@@ -30,7 +31,7 @@ _PHOTO_RATE_HZ = 2.0
 def plan_of_result(path: str | Path) -> PlannedSurvey:
     """The same path and anchors, as the run's map has them, and as many ranges as it used.
 
-    What a map in the first camera's frame calls up is what is up in its photos. The radio errs as the run has learnt it.
+    What a map in the first camera's frame calls up is what is up in its photos. The radio errs as the run has learnt.
 
     Raises:
         InputError: no result folder, one without a metric model or without used ranges.
@@ -79,8 +80,9 @@ def with_advice(metric: MetricResult, tag_in_cam_m: Array) -> MetricResult:
     except (InputError, GeometryError):  # nothing says what is up, or a run like it would not come about
         return metric
     words = best_words(advise(expected), for_scale=doubtful[0], for_place=doubtful[1])
-    advice = tuple(dict.fromkeys((*estimate.advice, *words)))
-    return replace(metric, estimate=replace(estimate, advice=advice))
+    is_computed = any(each.startswith(CALIBRATE) for each in words)
+    before = [each for each in estimate.advice if not (is_computed and each.startswith(CALIBRATE))]
+    return replace(metric, estimate=replace(estimate, advice=tuple(dict.fromkeys((*before, *words)))))
 
 
 def _planned(
