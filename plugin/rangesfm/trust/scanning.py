@@ -60,6 +60,39 @@ def anchors_moved(problem: Linearized) -> Iterator[Hypothesis]:
             )
 
 
+def map_breaks(problem: Linearized) -> Iterator[Hypothesis]:
+    """From some time on the map lies elsewhere, as after a wrong match."""
+    on_map = problem.on_map
+    tags_m = tag_positions(on_map.problem, on_map.state.metric_from_model)
+    anchors_m = on_map.state.anchors_m[on_map.problem.anchor_index]
+    for time in _times(problem.time_s):
+        is_after, of_ranges = problem.time_s > time, on_map.time_s > time
+        if min(is_after.sum(), (~is_after).sum()) < 3 * _MIN_NUM_CELLS:
+            continue
+
+        def words(size: Array, when: str = _when(problem, time)) -> str:
+            return (
+                f"the map breaks: {when} it lies about {np.linalg.norm(size):.2f} m from where it should "
+                f"({-size[0]:+.2f}, {-size[1]:+.2f}, {-size[2]:+.2f} m in x, y, z)"
+            )
+
+        def back(size: Array, of_ranges: Mask = of_ranges) -> Correction:
+            grown_m = np.linalg.norm(tags_m + size - anchors_m, axis=1) - np.linalg.norm(tags_m - anchors_m, axis=1)
+            return Correction(longer_m=np.where(of_ranges, grown_m, 0.0))
+
+        yield Hypothesis(
+            "map break",
+            "",
+            unit="m",
+            words=words,
+            remedy="look at the photos there for a false match or too little overlap, and map the parts apart",
+            correction=back,
+            adoption=_left_out(of_ranges),
+            unawares=UNSEEN_MOVE_M,
+            effect=of_cells(problem, np.where(is_after[:, None], -problem.gradient.by_tag, 0.0)),
+        )
+
+
 def steps(problem: Linearized) -> Iterator[Hypothesis]:
     """From some time on ranges read longer, those of one anchor or of all."""
     for k in [*(_heard(problem) if len(_heard(problem)) > 1 else []), None]:
@@ -186,4 +219,10 @@ def _when(problem: Linearized, start: float, end: float | None = None) -> str:
     return f"from {start - begin:.0f} to {end - begin:.0f} {unit} {after}"
 
 
-SCANNING: tuple[Callable[[Linearized], Iterator[Hypothesis]], ...] = (anchors_moved, steps, stretches, clock_jumps)
+SCANNING: tuple[Callable[[Linearized], Iterator[Hypothesis]], ...] = (
+    anchors_moved,
+    map_breaks,
+    steps,
+    stretches,
+    clock_jumps,
+)
