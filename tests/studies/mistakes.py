@@ -10,8 +10,8 @@ ranges. Errors as of real radios: white, lasting for seconds, of the direction, 
 of sight. Of each seed first a clean survey, then each kind of mistake that the survey allows, of one of several sizes
 in terms of the smallest that the tests of the clean one say would be found. Each run is a line of the file, and is not
 run again where it stands there. Reported for each survey and each kind: in how many runs a mistake was found, the right
-one named at all, named first (or in the pair that nothing tells apart), the map called good, and good though its scale lies outside
-its interval or its place is more than three stddevs off.
+one named at all, named first (or in the pair that nothing tells apart), the map called good, and good though its scale
+lies outside its interval or its place is more than three stddevs off.
 """
 
 from __future__ import annotations
@@ -243,7 +243,9 @@ def _clock_jump(given: Given, size: float, rng: np.random.Generator) -> None:
 def _tag_slips(given: Given, size: float, rng: np.random.Generator) -> None:
     """Half way along the camera's z, so that what was measured of it is wrong from then on."""
     after = given.time_s > np.quantile(given.time_s, 0.5)
-    slipped_m = given.tags_m + after[:, None] * (given.world_from_cam @ np.array([0.0, 0.0, rng.choice([-1, 1]) * size]))
+    slipped_m = given.tags_m + after[:, None] * (
+        given.world_from_cam @ np.array([0.0, 0.0, rng.choice([-1, 1]) * size])
+    )
     given.range_m = given.range_m + _grown(given, slipped_m)
 
 
@@ -472,9 +474,9 @@ class Tally:
 
     def __str__(self) -> str:
         return (
-            f"{self.num:5} runs,{self.refused:4} refused,{self.found:5} found,{self.named:5} named,{self.first:5} named first,"
-            f"{self.good:5} good, "
-            f"of these{self.wrong_and_good:3} outside the interval,{self.displaced_and_good:3} out of place"
+            f"{self.num:5} runs,{self.refused:4} refused,{self.found:5} found,{self.named:5} named,"
+            f"{self.first:5} first,{self.good:5} good, of these{self.wrong_and_good:3} outside the interval,"
+            f"{self.displaced_and_good:3} out of place"
         )
 
 
