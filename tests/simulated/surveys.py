@@ -103,7 +103,9 @@ def _errors(
     errors += (stddevs["curve"] * error_curve(distance, rng)) + stddevs["rough_curve"] * _uneven(distance, rng)
     if curve_stddev_m is not None:
         errors += curve_stddev_m * error_curve(distance, rng)
-    errors += stddevs["tag_antenna"] * _lobes(in_cam, rng) + stddevs["drift"] * lasting(times, DRIFT_S, rng)
+    errors += stddevs["drift"] * lasting(times, DRIFT_S, rng)
+    errors += stddevs["tag_antenna"] * _lobes(in_cam, rng)
+    errors += stddevs["off_axis"] * _off_axis(direction, index, rng)
     for k in range(len(standing_m)):
         rows = np.flatnonzero(index == k)
         since = times[rows]
@@ -139,6 +141,14 @@ def _lobes(direction: Array, rng: np.random.Generator) -> Array:
     form = rng.standard_normal((3, 3))
     quadratic = np.einsum("ni,ij,nj->n", direction, form, direction) - np.trace(form) / 3
     return np.asarray(direction @ rng.standard_normal(3) / np.sqrt(2) + np.sqrt(3) / 2 * quadratic)
+
+
+def _off_axis(direction: Array, index: Labels, rng: np.random.Generator) -> Array:
+    """(n,) of stddev 1, smooth in the angle from each anchor's mean direction (radians)."""
+    facing = np.stack([direction[index == k].mean(axis=0) for k in range(index.max() + 1)])
+    facing /= np.linalg.norm(facing, axis=1)[:, None]
+    angle = np.arccos(np.clip(np.sum(direction * facing[index], axis=1), -1.0, 1.0))
+    return _field(angle[:, None], rng.standard_normal((NUM_WAVES, 1)), rng)
 
 
 def error_curve(distance: Array, rng: np.random.Generator) -> Array:
