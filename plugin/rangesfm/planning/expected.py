@@ -52,7 +52,9 @@ class Expected:
         uncertainty: of the scale.
         covariance: (p, p) of all that the fit estimates.
         placement: (7, 7) as of a ScaleEstimate; None without a place in the site.
-        bends_m: (n,) how far each keyframe will be off its place in the map as a whole; 0 of a map that is rigid.
+        by_ranges: (7, 7) the same by the ranges alone, whatever the map bends; of the scale where the frame is the
+            first camera's.
+        bends_m: (n,) what the map's bend adds to the stddev of each keyframe; 0 of a map that is rigid.
     """
 
     planned: PlannedSurvey
@@ -63,6 +65,7 @@ class Expected:
     uncertainty: ScaleUncertainty
     covariance: Array
     placement: Array | None
+    by_ranges: Array
     bends_m: Array
 
     @property
@@ -106,11 +109,8 @@ class Expected:
 
         Without a place in the site they are as far off as the scale makes them, seen from the first camera.
         """
-        placement = self.placement
-        if placement is None:
-            placement = np.diag([self.uncertainty.empirical**2, *np.zeros(6)])
         motions = similarity_motions(places_m - self.planned.trajectory.centers[0])
-        return _stddevs(np.einsum("nij,jk,nik->n", motions, placement, motions))
+        return _stddevs(np.einsum("nij,jk,nik->n", motions, self.by_ranges, motions))
 
     @property
     def worst_keyframe_m(self) -> float:
@@ -158,12 +158,21 @@ def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expect
     for _ in range(_NUM_NOISE_ROUNDS):
         errors = _as_seen(solution, learned, num_alike)
         solution = _weighed(posed, errors, fit_at(weighted(posed.ranges, errors), state, num_alike))
-    covariance = parameter_covariance(solution, learned) + _undetermined(solution.fit)
+    open_m2 = _undetermined(solution.fit)
+    covariance = parameter_covariance(solution, learned) + open_m2
     uncertainty = expected_scale_uncertainty(solution, learned, BENDING)
-    placement = placement_covariance(solution, covariance)
-    nothing = np.zeros(len(planned.trajectory))
-    bends_m = nothing if made is None else made.bends_m(solution, learned, planned.num_alike)
-    return Expected(planned, observations, posed, solution, learned, uncertainty, covariance, placement, bends_m)
+    placement, bends_m = placement_covariance(solution, covariance), np.zeros(len(planned.trajectory))
+    others = learned if made is None else learned.without("bending")
+    by_ranges = placement_covariance(solution, parameter_covariance(solution, others) + open_m2)
+    if by_ranges is None:
+        scale_stddev = expected_scale_uncertainty(solution, others, BENDING).empirical
+        by_ranges = np.diag([scale_stddev**2, *np.zeros(6)])
+    if made is not None:
+        straightened = replace(solution, errors=_as_seen(solution, others, num_alike))
+        bends_m = made.bends_m(straightened, others, planned.num_alike)
+    return Expected(
+        planned, observations, posed, solution, learned, uncertainty, covariance, placement, by_ranges, bends_m
+    )
 
 
 def _planned_map(planned: PlannedSurvey, posed: ScaleProblem, observations: RangeObservations) -> PlannedMap | None:

@@ -32,13 +32,13 @@ MAX_NUM_PHOTOS = 2000
 """More would take minutes, and a coarser path bends alike."""
 # Height of a photo over its width.
 _HEIGHT = 2 / 3
-# So many points of a photo are computed with, each as good as several; and a new one that no other photo sees is drawn
-# again so often.
-_NUM_COMPUTED, _NUM_ROUNDS = 40, 5
-# Seen from farther aside, or at another distance, a point looks different, and is not found again.
+# So many points are computed with, of more each is as good as several; of a photo so many at least. A new one that no
+# other photo sees is drawn again so often.
+_NUM_COMPUTED, _LEAST_COMPUTED, _NUM_ROUNDS = 20_000, 40, 5
+# Seen from farther aside, or at another distance, a point looks different, and later on is not found again.
 _SAME_LOOK, _SAME_SIZE = np.cos(np.deg2rad(30.0)), 2.0
 # Keyframes: between them a bend is smooth.
-_NUM_BENT = 60
+_NUM_BENT = 40
 # Of the largest: about a straight path no turn is seen.
 _NO_MOTION = 1e-6
 
@@ -88,7 +88,7 @@ class PlannedPhotos(Options):
         They are so few that each stands for several, and exact.
         """
         rng = np.random.default_rng(seed)
-        num = min(self.num_points, _NUM_COMPUTED)
+        num = min(self.num_points, max(_NUM_COMPUTED // len(path), _LEAST_COMPUTED))
         wanted = np.full(len(path), num)
         points: list[Array] = []
         seen_by: list[Indices] = []
@@ -121,8 +121,10 @@ class PlannedPhotos(Options):
         with np.errstate(divide="ignore", invalid="ignore"):
             at = np.abs(in_cam[:, :, :2] / depth[:, :, None])
         found = (depth > 0) & (at[:, :, 0] < self._half_width) & (at[:, :, 1] < _HEIGHT * self._half_width)
-        found &= np.einsum("kni,ki->kn", off, off[:, 0]) > _SAME_LOOK * distance * distance[:, :1]
-        found &= np.abs(np.log(distance / distance[:, :1])) < np.log(_SAME_SIZE)
+        looks_alike = np.einsum("kni,ki->kn", off, off[:, 0]) > _SAME_LOOK * distance * distance[:, :1]
+        looks_alike &= np.abs(np.log(distance / distance[:, :1])) < np.log(_SAME_SIZE)
+        is_first_run = np.logical_and.accumulate(found, axis=1)
+        found &= is_first_run | (looks_alike if self.closes_loops else False)
         for row in found:
             yield photos[row & _in_runs(row, self.num_photos_of_point)]
 
@@ -172,21 +174,22 @@ class PlannedMap:
         return float(np.sqrt(np.trace(bent @ by_photos @ bent) / len(by_photos)))
 
     def bends_m(self, solution: Solution, learned: LearnedErrors, num_alike: float) -> Array:
-        """(n,) stddevs of keyframes after the refinement, beside those of the map as a whole.
+        """(n,) stddevs of keyframes after the refinement, beside what the ranges get wrong of the map as a whole.
 
-        The ranges weigh as in a run and err by all that is expected of them: (J^T W J)^-1 J^T W S W J (J^T W J)^-1, as
-        in the run's own covariance.
+        By the run's own covariance, (J^T W J)^-1 J^T W S W J (J^T W J)^-1, with the ranges' errors S: all that the
+        photos get wrong, and of what the ranges do how they bend the map.
 
         Args:
+            solution: with the ranges' errors as a map shows them that bends. learned: of these.
             num_alike: how many ranges each stands for.
         """
         graph = self._graph(solution, num_alike)
         by_photos, by_metre = linear_functions(graph, self._gradients)
         by_cell = np.stack([learned.cells.total(column) for column in by_metre.T], axis=1)
-        by_ranges = by_cell.T @ learned.without("bending").covariance_m2 @ by_cell
+        by_ranges = by_cell.T @ learned.covariance_m2 @ by_cell
         # In the frame of the first camera the map as a whole can only grow.
         bent = _without(self._motions if graph.held_frame is None else self._motions[:, :, :1])
-        variances = np.diag(bent @ (by_photos + by_ranges) @ bent).reshape(-1, 3).sum(axis=1)
+        variances = np.diag(by_photos + bent @ by_ranges @ bent).reshape(-1, 3).sum(axis=1)
         return np.interp(np.arange(len(self.path)), self._some, np.sqrt(np.maximum(variances, 0.0)))
 
     @property
