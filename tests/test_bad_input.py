@@ -149,11 +149,11 @@ def refusal(own_survey: WalkedSurvey, monkeypatch: pytest.MonkeyPatch, capfd: py
         (set_line("reference.csv", 5, "frame_00004.jpg,1,b,2"), r"/reference.csv:5: y_m is 'b', expected a number"),
         (
             write("reference.csv", "image_name,x_m,y_m,z_m\nother.jpg,1,2,3\n"),
-            r"/reference.csv: the reference knows none of the keyframes: its first photo is 'other.jpg'",
+            r"/reference.csv: at a known position: the first that is known is of photo 'other.jpg'",
         ),
         (
             write("reference.csv", "timestamp_s,x_m,y_m,z_m\n1,1,2,3\n2,1,2,3\n"),
-            r"/reference.csv: the reference knows none of the keyframes: its times are 1.000 to 2.000 s",
+            r"/reference.csv: none of the keyframes is at a known position: known are times from 1.000 to 2.000 s",
         ),
         (add_tags, r"/uwb.csv: the log has several tags \(T0, T1\): give each its lever arm"),
         (change_model(lose_a_pose), r"/sparse/0: the pose of frame_00003.jpg is not finite"),
@@ -382,7 +382,7 @@ class TestPhotos:
         ("flags", "said"),
         [
             (("--ranges_time_offset", "999"), r"/uwb.csv: the log's times .* do not overlap the photos'"),
-            (("--reference", "reference.csv"), r"/reference.csv: the reference knows none of the keyframes"),
+            (("--reference", "reference.csv"), r"/reference.csv: none of the keyframes is at a known position"),
             (("--camera_model", "PINHOL"), r"\[camera\] model is 'PINHOL', expected .* the nearest is 'PINHOLE'"),
             (
                 ("--camera_model", "PINHOLE", "--camera_params", "300,160,120"),

@@ -168,8 +168,9 @@ class LogOptions(Options):
     """Names of its columns (numbers, where they have none) for timestamp (or image_name), anchor_id, range, tag_id,
     range_stddev, los; range:A1 for a column of one anchor; without range, the time stamps tx1, rx1, tx2, rx2 and
     possibly tx3, rx3 of two-way ranging."""
-    timestamp_unit: Literal["s", "ms", "us", "ns", "iso"] | None = None
-    """Of its times (default: by format, name or values)."""
+    timestamp_unit: Literal["s", "ms", "us", "ns", "iso", "dmy", "mdy"] | None = None
+    """Of its times; iso: dates and times, dmy and mdy: those whose dates begin with the day or the month (default: by
+    format, name or values)."""
     range_unit: Literal["m", "cm", "mm"] | None = None
     """Of its ranges (default: by format, name or values)."""
     separator: Annotated[

@@ -79,7 +79,7 @@ def test_the_help_promises_the_curve_to_the_commands_that_take_it(capsys: pytest
 
 def test_bad_input_leaves_no_curve(survey: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*COMMAND, "--output_path", "curve.csv", "--time_offset", "1000"]) == 2
-    assert "no range is at a known position" in capsys.readouterr().err
+    assert "none of the ranges is at a known position" in capsys.readouterr().err
     assert main([*COMMAND]) == 2
     assert "--output_path" in capsys.readouterr().err
     assert not Path("curve.csv").exists()

@@ -187,7 +187,7 @@ def _read_positions(path: Path, base: Trajectory) -> NamedModel:
     positions, rotations = reference.positions_at(base)
     known = np.flatnonzero(np.isfinite(positions).all(axis=1))
     if len(known) == 0:
-        raise InputError(reference.why_nothing_is_known(base), path)
+        raise InputError(reference.why_nothing_is_known("keyframes", base.image_names, base.timestamps_s), path)
     trajectory = Trajectory(
         frame_ids=base.frame_ids[known],
         image_names=tuple(base.image_names[i] for i in known),

@@ -96,7 +96,7 @@ def _known_in_frame(
 def _compare_path(name: str, path: Trajectory, reference: Reference, frame: str | None) -> ComparisonRow:
     known, target, _ = _known(path, reference)
     if len(known) == 0:
-        raise InputError(reference.why_nothing_is_known(path))
+        raise InputError(reference.why_nothing_is_known("keyframes", path.image_names, path.timestamps_s))
     source = path.centers[known]
     _, in_frame = _known_in_frame(path, reference, frame)
     is_aligned = len(source) >= MIN_NUM_ALIGNED

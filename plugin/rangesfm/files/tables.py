@@ -265,7 +265,7 @@ def read_text(path: str | Path, *, errors: str = "strict") -> str:
         text = data.decode(_encoding(data), errors)
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        raise InputError(f"not UTF-8 text (byte 0x{data[error.start]:02x})", path, line) from None
+        raise InputError(f"not UTF-8 text (byte 0x{data[error.start]:02x}): save it as UTF-8", path, line) from None
     return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
 
 

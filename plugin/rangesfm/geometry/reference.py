@@ -93,23 +93,26 @@ class Reference:
             rotations[between] = Slerp(known, Rotation.from_matrix(self.world_from_cam))(times[between]).as_matrix()
         return positions, rotations
 
-    def why_nothing_is_known(self, trajectory: Trajectory, max_gap_s: float = 0.05) -> str:
-        """One line for the user whose reference knows no keyframe of the trajectory."""
-        if len(trajectory) == 0 or len(self) == 0:
-            return f"nothing to compare: {len(trajectory)} keyframes, {len(self)} reference poses"
+    def why_nothing_is_known(
+        self, of: str, image_names: Sequence[str] | None, times_s: Array | None, max_gap_s: float = 0.05
+    ) -> str:
+        """One line for the user of whose keyframes or ranges (``of``, with their photos and times) none is at a known
+        position."""
+        why = f"none of the {of} is at a known position: "
+        if len(self) == 0 or not len(image_names or ()) + len([] if times_s is None else times_s):
+            return f"{why}there are {len(self)} of these, or no {of}"
         if self.image_names is not None:
-            return (
-                "the reference knows none of the keyframes: its first photo is "
-                f"'{printable(self.image_names[0])}', the model's '{printable(trajectory.image_names[0])}'"
-            )
+            assert image_names is not None
+            known, first = printable(self.image_names[0]), printable(image_names[0])
+            return f"{why}the first that is known is of photo '{known}', the first of the {of} of '{first}'"
         assert self.timestamps_s is not None
-        assert trajectory.timestamps_s is not None
-        times, spacing = trajectory.timestamps_s, np.diff(self.timestamps_s)
+        assert times_s is not None
+        spacing = np.diff(self.timestamps_s)
         return (
-            "the reference knows none of the keyframes: its times are "
-            f"{self.timestamps_s[0]:.3f} to {self.timestamps_s[-1]:.3f} s, the photos' {times[0]:.3f} to "
-            f"{times[-1]:.3f} s; it is interpolated across at most {max_gap_s:g} s"
-            + (f", its samples are {np.median(spacing):.3f} s apart" if len(spacing) else "")
+            f"{why}known are times from {self.timestamps_s[0]:.3f} to {self.timestamps_s[-1]:.3f} s"
+            + (f", {np.median(spacing):.3f} s apart" if len(spacing) else "")
+            + f", the {of} are from {times_s.min():.3f} to {times_s.max():.3f} s; between known times at most "
+            f"{max_gap_s:g} s apart they are interpolated"
         )
 
     def _at_index(self, index: npt.NDArray[np.int64]) -> tuple[Array, Array | None]:

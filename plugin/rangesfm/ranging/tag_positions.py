@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.arrays import Array
-from rangesfm.errors import InputError, printable
+from rangesfm.errors import InputError
 from rangesfm.geometry.reference import Reference
 from rangesfm.ranging.log import RangeLog
 
@@ -41,7 +41,8 @@ def tag_positions(
             raise InputError("a lever arm needs the rotations qx,qy,qz,qw beside the positions")
         positions = positions + rotations @ lever
     if len(log) and not np.isfinite(positions).any():
-        raise InputError(_why_nothing_is_known(log, path, time_offset_s, max_gap_s), log.source)
+        times_s = None if log.timestamp_s is None else log.timestamp_s + time_offset_s
+        raise InputError(path.why_nothing_is_known("ranges", log.image_name, times_s, max_gap_s), log.source)
     return positions
 
 
@@ -54,17 +55,3 @@ def _poses(log: RangeLog, path: Reference, time_offset_s: float, max_gap_s: floa
         raise InputError("the ranges are by time and the positions by name, expected both alike", log.source)
     assert log.timestamp_s is not None
     return path.poses_at(log.timestamp_s + time_offset_s, max_gap_s)
-
-
-def _why_nothing_is_known(log: RangeLog, path: Reference, time_offset_s: float, max_gap_s: float) -> str:
-    if log.image_name is not None:
-        assert path.image_names is not None
-        first, other = printable(log.image_name[0]), printable(path.image_names[0])
-        return f"no position has the name of a range: the first range is at '{first}', the first position is '{other}'"
-    assert log.timestamp_s is not None
-    assert path.timestamps_s is not None
-    times, known = log.timestamp_s + time_offset_s, path.timestamps_s
-    return (
-        f"no range is at a known position: the ranges are from {times.min():.3f} to {times.max():.3f} s, the positions "
-        f"from {known[0]:.3f} to {known[-1]:.3f} s; between them at most {max_gap_s:g} s are interpolated"
-    )

@@ -127,6 +127,27 @@ def solve_graph(graph: KeyframeGraph, start: GraphState, *, tolerance_m: float) 
     return GraphSolution(state, step_count, _num_absorbed(terms, layout))
 
 
+def linear_functions(graph: KeyframeGraph, gradients: Array) -> tuple[Array, Array]:
+    """How functions of the poses err, by first order at the start.
+
+    Args:
+        gradients: (6 n, k) by turn (in the keyframe's own frame) and shift of each pose.
+
+    Returns:
+        (k, k) covariance by what the photos get wrong alone; and (num_ranges, k) by how much they grow for each metre
+        by which a range is longer. What nothing determines is as if it were determined a little.
+    """
+    layout = _Layout.of(graph)
+    terms = _Terms.at(graph, layout, graph.start())
+    gradient = np.zeros((layout.num, gradients.shape[1]))
+    gradient[: layout.first_anchor] = gradients
+    solved = _factor(terms.hessian, layout, 0.0).solve(gradient[layout.free])
+    by_stddev = terms.whitened[:, layout.free] @ solved
+    by_prior = _prior_rows(graph, layout, graph.start())[1][:, layout.free] @ solved
+    by_metre = (np.sqrt(graph.errors.weight) / graph.errors.stddev_m)[:, None] * by_stddev
+    return gradient[layout.free].T @ solved - by_stddev.T @ by_stddev - by_prior.T @ by_prior, by_metre
+
+
 @dataclass(frozen=True)
 class _Layout:
     """Columns: 6 for each pose (turn in its own frame, shift of its centre), 3 for each anchor, biases, their common.

@@ -69,7 +69,9 @@ def check_times(survey: Survey, inputs: RangingInputs, path: Trajectory) -> None
     """Refuse a reference and ranges that have nothing to do with these photos; where they were does not matter."""
     reference, offset_s = inputs.reference, survey.ranges.time_offset_s
     if reference is not None and not np.isfinite(reference.positions_at(path)[0]).any():
-        raise InputError(reference.why_nothing_is_known(path), survey.report.reference)
+        raise InputError(
+            reference.why_nothing_is_known("keyframes", path.image_names, path.timestamps_s), survey.report.reference
+        )
     if inputs.log.image_name is not None or offset_s is not None:
         ranges_on_path(survey, inputs, path, offset_s or 0.0)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gzip
+import json
 import shlex
 from collections.abc import Callable
 from pathlib import Path
@@ -101,6 +102,27 @@ LONG = {
         "e+0", "e+00"
     ),
     "quoted": lines('"time","anchor","range"', lambda t, a, r: f'"{t:.3f}","{a}","{r:.3f}"'),
+    "day first": lines("when,anchor,range", lambda t, a, r: f"31/01/2026 {clock(t)},{a},{r:.3f}"),
+    "month first, in halves of a day": lines(
+        "time,anchor,range", lambda t, a, r: f"1/31/2026 {clock(t)[1:]} PM,{a},{r:.3f}"
+    ),
+    "day first with points": lines("Datum;Uhrzeit;Anker;Distanz", lambda t, a, r: f"1.2.2026;{clock(t)};{a};{r:.3f}"),
+    "row of units": lines("time,anchor,range\n[ms],[],[cm]", lambda t, a, r: f"{t * 1000:.0f},{a},{r * 100:.1f}"),
+    "ros2 topic echo --csv": lines(
+        None, lambda t, a, r: f"{1700000000 + int(t)},{round(t % 1 * 1e9)},uwb,{r:.4f},{NUM[a]}"
+    ),
+    "rostopic echo": lines(
+        None,
+        lambda t, a, r: (
+            f"header: \n  seq: {round(t * 20)}\n  stamp: \n    secs: {1700000000 + int(t)}\n"
+            f"    nsecs: {round(t % 1 * 1e9)}\n  frame_id: uwb\nrange: {r:.4f}\nto_id: {NUM[a]}\n---"
+        ),
+    ),
+    "JSON": lines(None, lambda t, a, r: json.dumps({"ts": t, "tag": "T", "meas": [{"anchor": a, "dist": r}]})),
+    "JSON array": json.dumps([{"t": t, "id": a, "range": r} for t, a, r in ROWS]),
+    "named values": lines(None, lambda t, a, r: f"2026-01-31 09:{clock(t)[3:]} INFO anchor={a}, range={r:.3f} m"),
+    "words in each row": lines(None, lambda t, a, r: f"{clock(t)} -> {a} dist: {r:.3f} m"),
+    "lost ones in words": lines("time,anchor,range", lambda t, a, r: f"{t:.3f},{a},{r:.3f}") + "15,A0,TIMEOUT\n",
     "PlotJuggler": lines("__time,/uwb/to_id,/uwb/range", lambda t, a, r: f"{t + 1.7e9:.3f},{NUM[a]},{r:.3f}"),
 }
 
@@ -125,6 +147,13 @@ WIDE = {
     ),
     "anchors": wide("Time,Anchor 0,Anchor 1,Anchor 2,Anchor 3", lambda t: f"2026-01-31 9:37:{t:06.3f}"),
     "ros": wide("%time,field.ranges0,field.ranges1,field.ranges2,field.ranges3", lambda t: f"{int((t + 1.7e9) * 1e9)}"),
+    "an anchor in each row": lines(
+        "t,id1,d1,id2,d2",
+        lambda t, a, r: (
+            f"{t:.3f},{a},{r:.3f},{ROWS[round((t - 12) * 20) + 1][1]},{ROWS[round((t - 12) * 20) + 1][2]:.3f}"
+        ),
+        ROWS[::2],
+    ),
     "cm": wide("t_ms,r0_cm,r1_cm,r2_cm,r3_cm", lambda t: f"{t * 1000:.0f}"),
 }
 

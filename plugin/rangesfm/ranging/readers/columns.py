@@ -17,7 +17,16 @@ from rangesfm.files.tables import Categories, Table, read_table
 from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.layout import MISSING, Layout
 from rangesfm.ranging.readers.reader import ReadOptions, no_usable_range
-from rangesfm.ranging.readers.times import SECONDS_PER_UNIT, TIME_OF_DAY, CivilClock, is_zoned
+from rangesfm.ranging.readers.times import (
+    CIVIL_TIME,
+    CIVIL_UNITS,
+    DATE_ORDERS,
+    SECONDS_PER_UNIT,
+    TIME_OF_DAY,
+    CivilClock,
+    date_order,
+    is_zoned,
+)
 from rangesfm.ranging.readers.units import UNITS_PER_METRE, UnclearUnitError, range_unit, time_unit
 from rangesfm.ranging.twr import StampOptions, double_sided_range, single_sided_range
 
@@ -68,11 +77,12 @@ def read_columns(path: Path, columns: Columns, options: ReadOptions, format: str
             unit may be one or another.
     """
     named, layout = {**columns.optional, **columns.required}, columns.layout
-    table = read_table(
+    anchors = [column for anchor_id, _ in columns.wide.values() if (column := column_of_anchor(anchor_id))]
+    table = (layout and layout.table) or read_table(
         path,
-        [*columns.required.values(), *columns.wide],
+        list(dict.fromkeys([*columns.required.values(), *columns.wide, *anchors])),
         [*columns.optional.values()],
-        text=[named[key] for key in _TEXTS if key in named],
+        text=[*(named[key] for key in _TEXTS if key in named), *anchors],
         separator=layout.separator if layout else options.separator,
         header=layout.header if layout else None,
         num_skipped=layout.num_skipped if layout else 0,
@@ -125,7 +135,8 @@ def _asking(quantity: str, path: Path, options: ReadOptions) -> Iterator[None]:
         yield
     except UnclearUnitError as doubt:
         flag = f"{quantity}_unit"
-        message = f"the {quantity} has {doubt}, which may be {' or '.join(doubt.units)}; say which by --{flag}"
+        units = " or ".join(doubt.units)
+        message = f"the {quantity} has {doubt}, which may be {units}; say which by --{flag} (in a survey file: {flag})"
         raise InputError(
             message, path, advice=[options.command(path, **{flag: unit}) for unit in doubt.units]
         ) from None
@@ -139,7 +150,7 @@ def _noted(notes: list[str], unit_and_note: tuple[str, str | None]) -> str:
 
 def _anchors(table: Table, name: Mapping[str, str], columns: Columns) -> Categories:
     if columns.wide:
-        return _repeated([anchor_id for anchor_id, _ in columns.wide.values()], len(table))
+        return _of_wide([anchor_id for anchor_id, _ in columns.wide.values()], table, columns)
     if "anchor_id" not in name:
         return _repeated([columns.anchor_id or ""], len(table))
     return _ids(table, name["anchor_id"], columns, None)
@@ -158,6 +169,25 @@ def _tags(table: Table, name: Mapping[str, str], columns: Columns) -> Categories
     if tag is not None and columns.wide:
         return Categories(tag.names, np.repeat(tag.index, len(columns.wide)))
     return tag
+
+
+def _of_wide(anchor_ids: list[str], table: Table, columns: Columns) -> Categories:
+    """Those of columns of ranges, row after row: the same in each, or what another column says."""
+    if not any(map(column_of_anchor, anchor_ids)):
+        return _repeated(anchor_ids, len(table))
+    each = [
+        _ids(table, said, columns, "") if (said := column_of_anchor(anchor_id)) else _repeated([anchor_id], len(table))
+        for anchor_id in anchor_ids
+    ]
+    names = Categories.of([name for one in each for name in one.names])
+    first = np.cumsum([0, *(len(one.names) for one in each)])
+    index = np.column_stack([names.index[one.index + start] for one, start in zip(each, first)])
+    return Categories(names.names, index.ravel())
+
+
+def column_of_anchor(anchor_id: str) -> str | None:
+    """The name of the column that says the anchor of another, which has "@" and this name in an anchor's place."""
+    return anchor_id[1:] if anchor_id.startswith("@") else None
 
 
 def _repeated(ids: list[str], num_rows: int) -> Categories:
@@ -203,8 +233,8 @@ def _ranges_by_stamps(table: Table, name: Mapping[str, str], options: StampOptio
 
 def _timestamps(table: Table, name: Mapping[str, str], unit: str | None, notes: list[str]) -> Array:
     column = name["timestamp"]
-    if unit == "iso" or "date" in name or (unit is None and not table.begins_with_number(column)):
-        return _civil_times(table, name, notes)
+    if unit in CIVIL_UNITS or "date" in name or (unit is None and not table.begins_with_number(column)):
+        return _civil_times(table, name, unit, notes)
     times = table.numbers(column, expected=f"a time in {unit or 's'}")
     if unit is None:
         unit = _noted(notes, time_unit(column, times))
@@ -212,16 +242,21 @@ def _timestamps(table: Table, name: Mapping[str, str], unit: str | None, notes: 
     return seconds + 1e-9 * table.numbers(name["nanoseconds"]) if "nanoseconds" in name else seconds
 
 
-def _civil_times(table: Table, name: Mapping[str, str], notes: list[str]) -> Array:
+def _civil_times(table: Table, name: Mapping[str, str], unit: str | None, notes: list[str]) -> Array:
     texts = table.text(name["timestamp"])
     if "date" in name:
         texts = [f"{date} {time}" for date, time in zip(table.text(name["date"]), texts)]
-    clock, seconds = CivilClock(), np.empty(len(table))
+    dates = [match[1] for text in texts if (match := CIVIL_TIME.fullmatch(text))]
+    order = unit if unit in DATE_ORDERS else date_order(dates) if dates else "ymd"
+    if order is None:
+        raise UnclearUnitError([*DATE_ORDERS], f"dates as {dates[0]}")
+    clock, seconds = CivilClock(order), np.empty(len(table))
     for row, text in enumerate(texts):
         try:
             seconds[row] = clock.seconds(text)
         except ValueError:
-            raise table.error(row, name["timestamp"], "a time as 2026-01-31T12:00:00.000Z") from None
+            expected = f"a date as {order} and a time" if dates else "a time as 2026-01-31T12:00:00.000Z"
+            raise table.error(row, name["timestamp"], expected) from None
     if texts and TIME_OF_DAY.fullmatch(texts[0]):
         notes.append("times of day without a date: counted from the midnight before the first")
     elif any(text and not is_zoned(text) for text in texts):

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
@@ -20,17 +21,17 @@ def _words(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
-_RANGE = _words("range ranges rng distance distances dist dists dis abstand entfernung distancia 距离")
+_RANGE = _words("range ranges rng distance distances dist dists dis abstand entfernung distanz distancia 距离")
 _RANGE_IN_SHORT = _words("d r")
 # What may stand beside the range, and is none, or is second to it.
 _NO_RANGE = _words(
     "gt true truth ground actual real ref reference expected est estimated error err bias std stddev stdev sigma var "
     "variance cov covariance rate dot vel velocity speed count quality rssi power snr offset x y z min max threshold "
-    "id index idx"
+    "id index idx rtt"
 )
 _SECOND_RANGE = _words("calib calibrated corr corrected filtered filter smoothed smooth mean avg average median last")
 _TIME = _words(
-    "time times timestamp timestamps stamp datetime epoch elapsed clock zeit zeitstempel uhrzeit tiempo 时间"
+    "time times timestamp timestamps timestep stamp datetime epoch elapsed clock zeit zeitstempel uhrzeit tiempo 时间"
 )
 _TIME_IN_SHORT = _words("t ts s sec secs second seconds ms msec millis milliseconds us usec micros ns nanos")
 _NANOSECONDS = _words("nsec nsecs nanosec nanosecs nanosecond nanoseconds")
@@ -42,7 +43,7 @@ _ASKING = _words("requester rqstr req sender initiator init from src source self
 _ANCHOR = _words("anchor anchors anc an beacon landmark station base basestation bs node anker ancla gateway 基站")
 _TAG = _words("tag tags mobile robot rover user wearable 标签")
 _ANTENNA = _words("ant antenna")
-_ANY_ID = _words("id uid nodeid identifier address addr mac device dev serial")
+_ANY_ID = _words("id uid bssid nodeid identifier address addr mac device dev serial")
 _ID = _ANY_ID | _words("ids tid name no num nr number index idx short")
 _ROLES = {
     "antenna": _ANTENNA,
@@ -93,7 +94,7 @@ def guess_columns(layout: Layout) -> Guess:
     """What the columns of a table are."""
     guess = Guess()
     free = [column for column in layout.columns if column.kind != "nothing"]
-    for find in (_find_time, _find_range, _find_nodes) if layout.has_names else ():
+    for find in (_find_time, _find_pairs, _find_range, _find_nodes) if layout.has_names else ():
         free = find(free, guess)
     _find_by_values(free, guess, layout.has_names)
     return guess
@@ -137,7 +138,32 @@ def _time_rank(column: Column) -> tuple[float, int] | None:
     return is_arrival + 0.5 * (not _TIME & {*words}), len({*words} - _TIME - _TIME_IN_SHORT)
 
 
+def _find_pairs(free: list[Column], guess: Guess) -> list[Column]:
+    """An anchor and its range beside it, several times in a row."""
+    pairs = [(node, value) for node, value in pairwise(free) if _names_anchor(node) and _is_range(value)]
+    if len(pairs) < 2 or len({tuple(_without_numbers(column) for column in pair) for pair in pairs}) > 1:
+        return free
+    _take_pairs(pairs, guess)
+    return [column for column in free if all(column not in pair for pair in pairs)]
+
+
+def _take_pairs(pairs: Sequence[tuple[Column, Column]], guess: Guess) -> None:
+    guess.wide = {value.name: (f"@{node.name}", "") for node, value in pairs}
+    guess.notes.append(f"an anchor and its range in {len(pairs)} pairs of columns, as {pairs[0][0].name}")
+
+
+def _names_anchor(column: Column) -> bool:
+    words = {*_without_numbers(column)}
+    return bool(words) and words <= _ANCHOR | _ANY_ID | _ASKED | _ID and (column.kind == "text" or column.is_whole)
+
+
+def _without_numbers(column: Column) -> tuple[str, ...]:
+    return tuple(word for word in column.words if not word.isdigit() and word not in _PLAIN)
+
+
 def _find_range(free: list[Column], guess: Guess) -> list[Column]:
+    if guess.wide:
+        return free
     numbers = [column for column in free if column.kind == "numbers" and not _NO_RANGE & {*column.words}]
     named = [column for column in numbers if _is_range(column)]
     stamps = {
@@ -168,7 +194,9 @@ def _find_range(free: list[Column], guess: Guess) -> list[Column]:
 
 def _is_range(column: Column) -> bool:
     """Whether the name is that of one range; ``d`` and ``r`` only where nothing else is said."""
-    words = {*column.words} - _PLAIN
+    words = {*_without_numbers(column)}
+    if column.kind != "numbers" or _NO_RANGE & words:
+        return False
     return bool(words & _RANGE) or (bool(words) and words <= _RANGE_IN_SHORT | _LENGTH_UNIT)
 
 
@@ -242,6 +270,7 @@ def _find_nodes(free: list[Column], guess: Guess) -> list[Column]:
     ids: dict[str, list[Column]] = defaultdict(list)
     for column in free:
         words = {*column.words} - _PLAIN - {word for word in column.words if word.isdigit()}
+        words -= _RANGE if column.kind == "text" else set()
         role = next(
             (role for role, own in _ROLES.items() if words & own and words <= own | _ID | _ANTENNA | {"node"}), None
         )
@@ -255,7 +284,7 @@ def _find_nodes(free: list[Column], guess: Guess) -> list[Column]:
         anchor, tag = ([nameless[-1]], tag or nameless[:-1][:1])
     guess.sides = Sides.ASKED if anchor and anchor[0] not in ids["anchor"] and tag else Sides.TOLD
     anchor, tag = _by_id_rather_than_index(anchor), _by_id_rather_than_index(tag)
-    if guess.wide and len(anchor) > 1:
+    if guess.wide and max(len(anchor), len(nameless)) > 1:
         guess.doubts.append("the anchor of a column of ranges seems to stand in another column")
     for role, columns in (("anchor_id", anchor), ("tag_id", tag), ("antenna", ids["antenna"][: bool(tag)])):
         if columns and not (guess.wide and role == "anchor_id"):
@@ -263,7 +292,11 @@ def _find_nodes(free: list[Column], guess: Guess) -> list[Column]:
             if len(columns) > 1:
                 guess.doubts.append(f"any of {', '.join(column.name for column in columns)} may be the {role}")
     if not (guess.wide or anchor) and (
-        others := [column for column in free if _is_id(column) and column.num_distinct > 1]
+        others := [
+            column
+            for column in free
+            if _is_id(column) and column.num_distinct > 1 and not (_NO_RANGE - _ANY_ID) & {*column.words}
+        ]
     ):
         guess.columns["anchor_id"] = others[0].name
         guess.doubts.append(f"{others[0].name} may be the anchor")
@@ -286,17 +319,27 @@ def _find_by_values(free: list[Column], guess: Guess, has_names: bool) -> None:
         rising = [column for column in free if column.kind == "times" or _is_rising(column)]
         counters = [column for column in rising if column.is_whole and np.all(np.diff(column.numbers) == 1)]
         rising = [column for column in rising if column not in counters] or rising
-        free = [column for column in free if column not in rising and column not in counters]
+        fractions = [after for time, after in pairwise(free) if time in rising[:1] and _is_nanoseconds(after)]
+        free = [column for column in free if column not in (*rising, *counters, *fractions)]
         if rising:
             guess.columns["timestamp"] = rising[0].name
             guess.doubts += [f"{rising[0].name} may be the time"] * has_names
         else:
             guess.missing.append("timestamp")
+        if rising and rising[0].is_whole and fractions:
+            guess.columns["nanoseconds"] = fractions[0].name
     if guess.wide or {"range", "tx1"} & {*guess.columns}:
+        return
+    pairs = [(node, value) for node, value in pairwise(free) if _is_id(node) and value.kind == "numbers"]
+    pairs = [(node, value) for node, value in pairs if not value.is_whole and _is_positive(value)]
+    if len(pairs) > 1 and 2 * len(pairs) == len(free):
+        _take_pairs(pairs, guess)
+        if len({node.cells[0] for node, _ in pairs}) < len(pairs):
+            guess.doubts.append(f"{', '.join(node.name for node, _ in pairs)} may be the anchors")
         return
     ids = [column for column in free if _is_id(column)]
     reals = [column for column in free if column.kind == "numbers" and column not in ids and _is_positive(column)]
-    reals = [column for column in reals if not _NO_RANGE & {*column.words}]
+    reals = [column for column in reals if not _NO_RANGE & {*column.words} and column.num_distinct > 1] or reals
     if alike := sorted(_groups(reals), key=len):
         reals = [column for column, _ in alike[-1]] if has_names else reals
     # A column of whole numbers beside one of decimals is no range but a count, or a power.
@@ -312,9 +355,17 @@ def _find_by_values(free: list[Column], guess: Guess, has_names: bool) -> None:
         guess.missing.append("range")
 
 
+def _is_nanoseconds(column: Column) -> bool:
+    """Whether it counts up to a second, beside a column that counts those."""
+    return column.is_whole and column.num_distinct > 9 and 1e8 < float(np.max(column.numbers)) < 1e9
+
+
 def _ids_by_values(ids: list[Column], guess: Guess) -> None:
     """Anchors are many and tags few."""
-    tag, anchor = (None, ids[0]) if len(ids) == 1 else sorted(ids[:2], key=lambda column: column.num_distinct)
+    *others, anchor = sorted(ids, key=lambda column: column.num_distinct)
+    tag = others[-1] if others else None
+    if len(others) > 1:
+        guess.doubts.append(f"any of {', '.join(column.name for column in ids)} may be the anchor or the tag")
     guess.columns["anchor_id"] = anchor.name
     if tag is not None:
         guess.columns["tag_id"] = tag.name
@@ -335,6 +386,10 @@ def _is_positive(column: Column) -> bool:
 
 def _is_id(column: Column) -> bool:
     few = column.num_distinct <= min(_MAX_NUM_IDS, max(2, len(column.cells) // 4))
+    if column.num_distinct == 1 and not any(
+        map(str.isdigit, column.cells[0])
+    ):  # a word in each row, as "range:" or "m"
+        return False
     return few and (column.kind == "text" or (column.is_whole and bool(np.all(column.numbers >= 0))))
 
 

@@ -12,11 +12,17 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.files.tables import read_head
-from rangesfm.ranging.readers.times import ISO_TIME, TIME_OF_DAY
+from rangesfm.files.tables import Table, read_head
+from rangesfm.ranging.readers.records import read_records
+from rangesfm.ranging.readers.times import CIVIL_TIME, TIME_OF_DAY
 from rangesfm.ranging.readers.units import words_of
 
-MISSING = ("", "nan", "-nan", "inf", "-inf", "none", "null", "nil", "na", "n/a", "-")
+# fmt: off
+MISSING = (
+    "", "nan", "-nan", "inf", "-inf", "none", "null", "nil", "na", "n/a", "#n/a", "-", "--",
+    "timeout", "error", "err", "fail", "failed", "invalid", "lost",
+)
+# fmt: on
 """What stands in a cell without a number, in small letters."""
 
 _SEPARATORS = "\t;|, "  # a comma may stand in numbers, a blank in times
@@ -24,7 +30,7 @@ _NUM_ROWS = 1000
 _MAX_NUM_WORDS = 20  # lines before the table
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", re.ASCII)
 _DECIMAL_COMMA = re.compile(r"-?\d+,\d+")
-_DATE = re.compile(r"\d{4}-\d\d?-\d\d?", re.ASCII)
+_DATE = re.compile(r"\d{4}([-/.])\d\d?\1\d\d?|\d\d?([-/.])\d\d?\2\d{4}", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -48,7 +54,7 @@ class Column:
     def kind(self) -> str:
         """What the cells are, but for empty ones: numbers, civil times, dates, text or nothing."""
         filled = [cell for cell in self.cells if cell.lower() not in MISSING]
-        patterns = {"numbers": (_NUMBER,), "times": (ISO_TIME, TIME_OF_DAY), "dates": (_DATE,)}
+        patterns = {"numbers": (_NUMBER,), "times": (CIVIL_TIME, TIME_OF_DAY), "dates": (_DATE,)}
         for kind, those in patterns.items():
             if filled and all(any(pattern.fullmatch(cell) for pattern in those) for cell in filled):
                 return kind
@@ -75,6 +81,7 @@ class Layout:
     Attributes:
         columns: what the first rows have under each name of the header.
         has_names: whether the file names its columns.
+        table: all of it, where it is no text in rows.
     """
 
     header: tuple[str, ...]
@@ -83,10 +90,14 @@ class Layout:
     decimal_comma: bool = False
     columns: tuple[Column, ...] = ()
     has_names: bool = True
+    table: Table | None = None
 
 
 def find_layout(path: Path, separator: str | None = None) -> Layout | None:
     """The layout of a file; None if it has no two rows alike."""
+    if table := read_records(path):
+        first_rows = (Column(name, tuple(table.text(name, empty="")[:_NUM_ROWS])) for name in table.columns)
+        return Layout(table.columns, ",", columns=tuple(first_rows), table=table)
     lines = read_head(path).split("\n")
     numbered = [(number, line) for number, line in enumerate(lines[:-1] or lines, 1) if line.strip()]
     content = [(number, line) for number, line in numbered if not line.lstrip().startswith("#")][:_NUM_ROWS]
@@ -103,9 +114,13 @@ def find_layout(path: Path, separator: str | None = None) -> Layout | None:
         rows[first + 1 :] = [[cell.replace(",", ".") for cell in row] for row in rows[first + 1 :]]
     body = [row for row in rows[first:] if len(row) == num]
     names, num_skipped = None, content[first][0] - 1
-    if _is_header(rows[first], body[1:] if len(rows[first]) == num else body):
+    below = body[1:] if len(rows[first]) == num else body
+    if _is_header(rows[first], below) or _is_header(rows[first], below[1:]):
         names, num_skipped = rows[first], content[first][0]
-        body = body[1:] if len(rows[first]) == num else body
+        body = below
+        if len(body) > 1 and len(names) == num and _is_header(body[0], body[1:]):  # their units
+            names, num_skipped = [" ".join(both) for both in zip(names, body[0])], content[first + 1][0]
+            body = body[1:]
     elif comments := [line for number, line in numbered if number < content[first][0] and line.lstrip()[0] == "#"]:
         cells = _cells(comments[-1].lstrip("# \t"), separator)
         names = cells if len(cells) == num and not any(map(_NUMBER.fullmatch, cells)) else None

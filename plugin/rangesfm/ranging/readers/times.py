@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,12 @@ from rangesfm.errors import InputError
 from rangesfm.ranging.readers.reader import ReadOptions
 
 SECONDS_PER_UNIT = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-ISO_TIME = re.compile(
-    r"(\d{4})[-/.](\d\d?)[-/.](\d\d?)[T _](\d\d?:\d\d(?::\d\d(?:[.,]\d{1,18})?)?) ?(Z|UTC|[+-]\d\d(?::?\d\d)?(?!\d))?",
-    re.ASCII,
+DATE_ORDERS = ("dmy", "mdy")
+CIVIL_UNITS = ("iso", *DATE_ORDERS)
+CIVIL_TIME = re.compile(
+    r"((?:\d{4}[-/.]\d\d?[-/.]\d\d?)|(?:\d\d?[-/.]\d\d?[-/.]\d{4}))[T _]"
+    r"(\d\d?):(\d\d(?::\d\d(?:[.,]\d{1,18})?)?)(?: ?([AP])M)? ?(Z|UTC|[+-]\d\d(?::?\d\d)?(?!\d))?",
+    re.ASCII | re.IGNORECASE,
 )
 TIME_OF_DAY = re.compile(r"(?<![\d:])([01]?\d|2[0-3]):([0-5]\d):([0-5]\d(?:[.,]\d{1,18})?)(?![\d:])", re.ASCII)
 _NUMBER = re.compile(r"(?<![\w.+-])-?\d{1,19}(?:\.\d{1,18})?(?![\w.-]|:\d)", re.ASCII)
@@ -27,34 +31,41 @@ def unit_by_digits(value: float) -> str | None:
     return next((unit for above, unit in _UNIT_ABOVE if abs(value) > above), None)
 
 
-def seconds_from_iso(text: str) -> float:
-    """Seconds since 1970 of an ISO 8601 time, or of one nearly so; without a zone it counts as UTC.
+def date_order(dates: Sequence[str]) -> str | None:
+    """How all of some dates must be read: "ymd", "dmy" or "mdy"; None for days and months that may be either."""
+    first, second = (max(int(re.split("[-/.]", date)[k]) for date in dates) for k in (0, 1))
+    if first > 31:
+        return "ymd"
+    return "dmy" if first > 12 or "." in dates[0] else "mdy" if second > 12 else None
 
-    Raises:
-        ValueError: it is none.
-    """
-    match = ISO_TIME.fullmatch(text)
+
+def _seconds_from_civil(text: str, order: str) -> float:
+    """Seconds since 1970 of a date and a time; without a zone it counts as UTC. ValueError if it is none."""
+    match = CIVIL_TIME.fullmatch(text)
     if match is None:
         raise ValueError(text)
-    year, month, day, time, zone = match.groups(default="Z")
-    date = f"{year}-{month:>02}-{day:>02}T{time.replace(',', '.'):0>{len(time) + (time[1] == ':')}}"
-    seconds = float(np.datetime64(date, "us").astype(np.int64)) * 1e-6
-    if zone in ("Z", "UTC"):
+    date, hour, rest, half, zone = match.groups()
+    year, month, day = (field for _, field in sorted(zip(map("ymd".index, order), re.split("[-/.]", date))))
+    hour = int(hour) if half is None else int(hour) % 12 + 12 * (half in "pP")
+    seconds = float(np.datetime64(f"{year}-{month:>02}-{day:>02}T{hour:02}:{rest.replace(',', '.')}", "us").astype(int))
+    seconds *= 1e-6
+    if zone is None or zone.upper() in ("Z", "UTC"):
         return seconds
     hours, minutes = int(zone[1:3]), int(zone[3:].lstrip(":") or 0)
     return seconds - (-1 if zone[0] == "-" else 1) * (hours * 3600.0 + minutes * 60.0)
 
 
 def is_zoned(text: str) -> bool:
-    """Whether an ISO 8601 time says its zone."""
-    match = ISO_TIME.fullmatch(text)
+    """Whether a civil time says its zone."""
+    match = CIVIL_TIME.fullmatch(text)
     return match is not None and match[5] is not None
 
 
 class CivilClock:
     """Reads civil times one after the other; a time of day goes on counting after midnight."""
 
-    def __init__(self) -> None:
+    def __init__(self, order: str = "ymd") -> None:
+        self._order = order
         self._days = 0
         self._last_of_day_s = 0.0
 
@@ -62,7 +73,7 @@ class CivilClock:
         """Seconds since 1970, or of a time of day since the midnight before the first; ValueError if it is neither."""
         of_day = TIME_OF_DAY.fullmatch(text)
         if of_day is None:
-            return seconds_from_iso(text)
+            return _seconds_from_civil(text, self._order)
         seconds = int(of_day[1]) * 3600.0 + int(of_day[2]) * 60.0 + float(of_day[3].replace(",", "."))
         if seconds < self._last_of_day_s - _DAY_S / 2:
             self._days += 1
@@ -76,20 +87,29 @@ class HostClock:
     def __init__(self, path: Path, options: ReadOptions):
         self._path = path
         self._unit = options.timestamp_unit
-        self._civil = CivilClock()
+        self._civil = CivilClock(self._unit if self._unit in DATE_ORDERS else "ymd")
 
     def find_seconds(self, prefix: str) -> float | None:
         """The time in ``prefix``: ISO 8601, a time of day, or a number of seconds, ms, us or ns; None without any."""
-        if self._unit in (None, "iso") and (civil := ISO_TIME.search(prefix) or TIME_OF_DAY.search(prefix)):
+        is_civil = self._unit in CIVIL_UNITS
+        if (is_civil or self._unit is None) and (civil := self._find_civil(prefix)):
             try:
-                return self._civil.seconds(civil[0])
+                return self._civil.seconds(civil)
             except ValueError:
                 return None
         number = _NUMBER.search(prefix)
-        if number is None or self._unit == "iso":
+        if number is None or is_civil:
             return None
         value = float(number[0])
         return value * SECONDS_PER_UNIT[self._unit or unit_by_digits(value) or "s"]
+
+    def _find_civil(self, prefix: str) -> str | None:
+        """A date whose order is not known is left out: the time of day does."""
+        dated = CIVIL_TIME.search(prefix)
+        if dated and (self._unit in DATE_ORDERS or date_order([dated[1]]) == "ymd"):
+            return dated[0]
+        of_day = TIME_OF_DAY.search(prefix)
+        return of_day and of_day[0]
 
     def seconds(self, prefix: str, line: int) -> float:
         """As ``find_seconds``, but InputError if there is no time."""
