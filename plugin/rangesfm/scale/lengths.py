@@ -150,6 +150,8 @@ class _Lengths:
         alike = np.exp(-0.5 * squared).reshape(len(rows), _NUM_PLACES, len(rows), _NUM_PLACES).mean(axis=(1, 3))
         # Of lengths that are nobody knows where each has a scale of its own.
         alike = np.where(np.isfinite(alike), alike, np.eye(len(rows)))
+        bends = ~distances.is_everywhere[rows]
+        alike *= np.outer(bends, bends)
         return cls(
             model,
             distances.distance_m[rows],
