@@ -228,9 +228,8 @@ class _Likelihood:
             + 0.5 * float(self.off_m @ pulls)
             + 0.5 * float(off_median @ off_median)
         )
-        traces = np.einsum("ij,kij->k", projector, self.of_components)
-        squares = np.einsum("i,kij,j->k", pulls, self.of_components, pulls)
-        return negative, np.exp(2 * logs) * (traces - squares) + off_median / self.spreads
+        slopes = self.of_components.reshape(len(logs), -1) @ (projector - np.outer(pulls, pulls)).ravel()
+        return negative, np.exp(2 * logs) * slopes + off_median / self.spreads
 
     def mean_stddevs(self, logs: Array) -> Array:
         """(k,) roots of the mean variances, where these logarithms are the likeliest.
