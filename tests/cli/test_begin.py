@@ -8,13 +8,14 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import pytest
+from tests.conftest import TAG_IN_CAM_M
 from tests.simulated.phone_survey import write_anchors, write_log, write_photos
 
 from rangesfm.cli import main
 from rangesfm.survey.settings import Survey, read_survey
 
 if TYPE_CHECKING:
-    from tests.conftest import Command
+    from tests.conftest import Command, WalkedSurvey
 
 PHONE_START_S = 1777888800.0  # 2026-05-04 10:00:00 UTC
 
@@ -68,6 +69,31 @@ def test_init_says_what_is_missing_and_assumed(folder: Path, capsys: pytest.Capt
     assert told.endswith(f"rangesfm check '{folder}/survey.toml'\n")
     assert main(["check", str(folder)]) == 2
     assert "\nerror: no ranges and no lengths: " in capsys.readouterr().out
+
+
+def test_lengths_do_without_a_radio(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "uwb.csv").unlink()
+    (folder / "anchors.csv").unlink()
+    (folder / "tape.csv").write_text("from,to,distance_m\nIMG_0.jpg,IMG_9.jpg,4.2\ndoor,window,2.5\n")
+    (folder / "marks.csv").write_text("marker,image_name,x_px,y_px\ndoor,IMG_1.jpg,5,6\ndoor,IMG_2.jpg,5,7\n")
+    assert main(["init", str(folder)]) == 0
+    told = capsys.readouterr().out
+    assert "\ntaped distances: 2, which alone say how long a metre is (no ranges)\n" in told
+    assert told.endswith(f"\nnext: rangesfm run '{folder}/survey.toml'\n")
+    survey = read_survey(folder / "survey.toml")
+    assert (survey.scale.distances, survey.scale.markers) == (folder / "tape.csv", folder / "marks.csv")
+
+
+def test_from_a_model_and_a_log_goes_on_what_init_says(
+    own_survey: WalkedSurvey, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(own_survey.folder)
+    Path("reference.csv").unlink()
+    Path("anchors_first_camera.csv").unlink()
+    assert main(["init", ".", "--tag_in_cam", ",".join(map(str, TAG_IN_CAM_M))]) == 0
+    *_, command = capsys.readouterr().out.splitlines()
+    assert command == "next: rangesfm refine survey.toml --input_path sparse/0"
+    assert main(["scale", *command.split()[3:]]) == 0
 
 
 def test_an_ambiguous_folder_is_asked_about_and_nothing_is_written(

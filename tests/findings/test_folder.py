@@ -77,9 +77,8 @@ def test_what_cannot_be_used_is_said(tmp_path: Path) -> None:
         (tmp_path / "sparse" / name).touch()
     found = look_into([tmp_path])
     assert found.paths == {}
-    model, photos, videos = found.notes
-    at = tmp_path / "sparse"
-    assert model == f"{at} is a COLMAP model, from which rangesfm refine SURVEY.toml --input_path {at} goes on"
+    photos, videos = found.notes
+    assert found.models == (tmp_path / "sparse",)
     assert photos == "1 of .heic, as IMG_1.HEIC: these are not read: convert them to JPEG"
     assert videos.startswith("2 of .insv, as walk.INSV: videos of 360 degrees are not read")
 

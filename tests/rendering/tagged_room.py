@@ -36,7 +36,8 @@ def tagged_room(folder: Path, *, with_tags: bool = True) -> SyntheticModel:
         focal_px=_FOCAL_PX,
         seed=3,
     )
-    wall = Surface(_upright(0.0, 0.01, 1.2, 7.0), Texture(np.full((3, 16, 16), 0.25, np.float32)))
+    plaster = np.random.default_rng(5).uniform(0.05, 0.45, (1, 512, 512)).astype(np.float32)
+    wall = Surface(_upright(0.0, 0.01, 1.2, 7.0), Texture(np.repeat(plaster, 3, axis=0)))
     tags = [_tag(k, x_m, z_m) for k, (x_m, z_m) in enumerate([(-0.9, 1.5), (0.1, 0.8), (0.8, 1.5)])]
     scene = Scene([wall, *(tags if with_tags else [])], Sky(np.zeros((4, 4), dtype=np.float32)))
     camera = PhotoCamera(*_SIZE_PX, _FOCAL_PX)

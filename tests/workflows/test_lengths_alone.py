@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,10 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.distance import pdist
 from tests.known import known
-from tests.rendering.tagged_room import DICTIONARY, NUM_PHOTOS, NUM_TAGS, SIDE_M, tagged_room
+from tests.rendering.tagged_room import DICTIONARY, NUM_TAGS, SIDE_M, tagged_room
 from tests.simulated.model import SyntheticModel
 
+from rangesfm.cli import main
 from rangesfm.distances.tape import read_tape
 from rangesfm.errors import InputError
 from rangesfm.progress import SilentProgress
@@ -63,6 +66,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Room:
     return Room(folder, tagged_room(folder / "photos"))
 
 
+NUM_MAPPED = 5
 PAIRS = ((0, 7), (1, 6), (0, 5), (2, 7))
 
 
@@ -105,15 +109,26 @@ def test_of_one_length_the_verdict_says_that_nothing_checks_it(room: Room, tmp_p
     assert summary.tests[0].smallest_detectable is None
 
 
-def test_printed_tags_make_metres_by_themselves(room: Room, tmp_path: Path) -> None:
-    survey = room.survey(tmp_path, markers__dictionary=DICTIONARY, markers__side_m=SIDE_M)
-    summary = refine_model(survey, progress=QUIET).summary
-    room.assert_found(summary, 0.01)
+def test_photos_of_printed_tags_become_a_metric_map_by_init_and_run(room: Room, tmp_path: Path) -> None:
+    names = sorted(room.made.timestamps_s)[:NUM_MAPPED]
+    (tmp_path / "photos").mkdir()
+    for name in names:
+        shutil.copy(room.folder / "photos" / name, tmp_path / "photos")
+    size = ("--marker_dictionary", DICTIONARY, "--marker_side_m", str(SIDE_M))
+    assert main(["init", str(tmp_path), *size]) == 0
+    assert main(["run", str(tmp_path / "survey.toml")]) == 0
+    summary = ResultSummary.read(tmp_path / "out" / "result.json")
+    model = pycolmap.Reconstruction(tmp_path / "out" / "sparse_metric" / "0")
+    found = {image.name: image.projection_center() for image in model.images.values()}
+    assert sorted(found) == names
+    too_long = np.sum(pdist([found[name] for name in names])) / np.sum(pdist(room.made.centers_m[:NUM_MAPPED]))
+    low, high = known(summary.scale.interval_95)
+    assert known(low) < summary.scale.value / too_long < known(high)
+    assert high / low < 1.03
     assert len(summary.distances) == 4 * NUM_TAGS
-    written = survey.output.path / "markers.csv"
-    again = read_tape(room.taped(tmp_path, PAIRS[:1]), written).markers
+    again = read_tape(room.taped(tmp_path, PAIRS[:1]), tmp_path / "out" / "markers.csv").markers
     assert {name: len(marker.image_names) for name, marker in known(again).items()} == {
-        f"tag{tag}.{corner}": NUM_PHOTOS for tag in range(NUM_TAGS) for corner in range(4)
+        f"tag{tag}.{corner}": NUM_MAPPED for tag in range(NUM_TAGS) for corner in range(4)
     }
 
 

@@ -51,11 +51,13 @@ class Found:
     Attributes:
         paths: folders that hold photos themselves, videos, and other files, by dotted key of a survey file.
         calibrations: the cameras of each file that has any.
+        models: COLMAP models.
         notes: what is there and cannot be used, a line each.
     """
 
     paths: dict[str, list[Path]]
     calibrations: dict[Path, tuple[Calibration, ...]]
+    models: tuple[Path, ...]
     notes: tuple[str, ...]
 
 
@@ -67,6 +69,7 @@ def look_into(folders: Sequence[Path]) -> Found:
     """
     paths: dict[str, list[Path]] = defaultdict(list)
     calibrations: dict[Path, tuple[Calibration, ...]] = {}
+    models: list[Path] = []
     notes: list[str] = []
     unsure: list[str] = []
     not_read: dict[str, list[Path]] = defaultdict(list)
@@ -75,12 +78,7 @@ def look_into(folders: Sequence[Path]) -> Found:
             if path.suffix.lower() in _NOT_READ:
                 not_read[path.suffix.lower()].append(path)
             elif path.is_dir() and not is_bag_folder(path):
-                if _is_model(path):
-                    notes.append(
-                        f"{path} is a COLMAP model, from which rangesfm refine SURVEY.toml --input_path {path} goes on"
-                    )
-                else:
-                    paths[PHOTOS].append(path)
+                (models if _is_model(path) else paths[PHOTOS]).append(path)
             elif is_video(path):
                 paths[PHOTOS].append(path)
             elif cameras := read_calibrations(path):
@@ -97,7 +95,9 @@ def look_into(folders: Sequence[Path]) -> Found:
                 notes.append(str(error))
     for suffix, those in not_read.items():
         notes.append(f"{len(those)} of {suffix}, as {those[0].name}: {_NOT_READ[suffix]}")
-    return Found(dict(paths), calibrations, (*notes, *([] if LOG in paths else unsure[:_MAX_NUM_UNSURE])))
+    return Found(
+        dict(paths), calibrations, tuple(models), (*notes, *([] if LOG in paths else unsure[:_MAX_NUM_UNSURE]))
+    )
 
 
 def _key_of(path: Path) -> str | None:

@@ -40,14 +40,17 @@ class Understood:
     Attributes:
         values: by dotted key; paths are absolute.
         notes: what was left out and why, a line each.
+        model: a COLMAP model to begin with, where there are no photos.
     """
 
     values: dict[str, Any]
     notes: tuple[str, ...]
+    model: Path | None = None
 
     def survey(self) -> Survey:
         """All of it as a run takes it; InputError for a value given that is none."""
-        return survey_from_tables({}, Path.cwd(), self.values)
+        survey = survey_from_tables({}, Path.cwd(), self.values)
+        return survey if self.model is None else survey.model_copy(update={"model_path": self.model})
 
 
 def understand(folders: Sequence[Path], given: Mapping[str, object]) -> Understood:
@@ -80,10 +83,16 @@ def understand(folders: Sequence[Path], given: Mapping[str, object]) -> Understo
             notes.append(f"left out, as {chosen.name} is there: {others}")
     if questions:
         raise InputError("more than one survey could be meant", folders[0], advice=questions)
+    model = found.models[0] if found.models and PHOTOS not in values else None
+    notes += [
+        f"{path} is a COLMAP model: rangesfm refine SURVEY --input_path {path} goes on from it"
+        for path in found.models
+        if path != model
+    ]
     if not {PHOTOS, LOG, "scale.distances"} & values.keys():
-        raise InputError("neither photos nor a radio's log in there", folders[0], advice=notes)
+        raise InputError("neither photos nor a radio's log nor lengths in there", folders[0], advice=notes)
     _add_camera(values, found, notes)
-    return Understood(values, tuple(notes))
+    return Understood(values, tuple(notes), model)
 
 
 def _path(value: object) -> Path:

@@ -15,7 +15,7 @@ from rangesfm.errors import RangesfmError
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.log import RangeKind
 from rangesfm.sources.source import is_source, open_source
-from rangesfm.survey.inputs import RangingInputs
+from rangesfm.survey.inputs import RangingInputs, times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.camera import cameras_of_photos, check_camera
 from rangesfm.vision.features import feature_options
@@ -26,7 +26,7 @@ from rangesfm.vision.matching import matching_options
 from rangesfm.vision.photos import Photos, usable_photos
 from rangesfm.vision.rigs import read_rigs
 from rangesfm.workflows.journal import Journal
-from rangesfm.workflows.photos import checked_keyframes, images_path, read_inputs
+from rangesfm.workflows.photos import checked_keyframes, images_path, read_inputs, read_registered
 
 # More than these nobody reads.
 _MAX_NUM_SIZES = 4
@@ -69,17 +69,27 @@ def check_survey(survey: Survey) -> CheckedSurvey:
     """Read all inputs of a run as the run does, and tell what they are."""
     checked = CheckedSurvey()
     journal = Journal(SilentProgress(), warnings=checked.warnings)
+    model = survey.model_path if survey.images.path is None else None
     photos = None
     with checked.finding_faults():
-        photos = _check_photos(survey, checked)
+        if model is None:
+            photos = _check_photos(survey, checked)
     with checked.finding_faults():
         inputs = read_inputs(survey, journal)
+        checked.assumed += inputs.log.notes
+        checked.warnings[:] = [text for text in checked.warnings if text not in inputs.log.notes]
         if len(inputs.log):
             _tell_of_radio(survey, inputs, checked)
         _tell_of_others(survey, inputs, checked)
         if survey.images.path is not None and is_source(survey.images.path):
             return checked
-        keyframes, times = checked_keyframes(survey, inputs, journal)
+        if model is None:
+            keyframes, times = checked_keyframes(survey, inputs, journal)
+        else:
+            sfm = read_registered(model, journal)
+            checked.facts.append(f"model: {sfm.num_reg_images()} photos and {sfm.num_points3D()} points in {model}")
+            keyframes = tuple(image.name for image in sfm.images.values())
+            times = times_of_model(survey, sfm, model) if inputs.log.timestamp_s is not None else None
         _tell_of_times(survey, inputs, keyframes, times, checked)
         if photos is not None:
             _check_mapper(survey, photos.of(keyframes), checked)
