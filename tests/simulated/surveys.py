@@ -20,6 +20,7 @@ from rangesfm.ranging.association import associate
 from rangesfm.ranging.errors.learned import usual_stddevs
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeObservations
+from rangesfm.scale.lengths import BENDING
 
 Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
@@ -189,4 +190,5 @@ def _taped(planned: PlannedSurvey, rng: np.random.Generator) -> LocatedDistances
         return None
     lengths, stddevs = np.array(planned.taped, dtype=np.float64).T
     found = lengths + stddevs * rng.standard_normal(len(lengths))
-    return LocatedDistances.of(found, stddevs, model_length=lengths / METRES_PER_UNIT)
+    bent = lengths * (1 + BENDING * rng.standard_normal(len(lengths)))
+    return LocatedDistances.of(found, stddevs, model_length=bent / METRES_PER_UNIT)

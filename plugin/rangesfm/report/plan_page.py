@@ -24,6 +24,8 @@ from rangesfm.report.text import count, duration, fixed, percent, rough
 # From well known to hardly, each as visible on a light page as on a dark one.
 _COLORS = ("#2f7ebc", "#2a9d8f", "#6f9a2b", "#c98b12", "#d4512b")
 _OPEN_COLOR = "#a3123a"
+# Of the largest stddev: less has one colour.
+_LEAST_SHOWN = 0.1
 _AREA_OPACITY, _AREA_WIDTH_PX = 70, 160
 _MAX_NUM_MISTAKES = 12
 
@@ -126,7 +128,9 @@ def _edges(stddevs_m: Array) -> Array:
     known = stddevs_m[np.isfinite(stddevs_m) & (stddevs_m > 0)]
     if len(known) == 0:
         return np.array([np.inf])
-    inner = np.geomspace(known.min(), known.max(), len(_COLORS) + 1)[1:-1]
+    # The first camera is known exactly where its frame is that of the result.
+    least = max(known.min(), _LEAST_SHOWN * known.max())
+    inner = np.geomspace(least, known.max(), len(_COLORS) + 1)[1:-1]
     edges = np.unique([float(f"{edge:.2g}") for edge in inner])
     return np.append(edges, np.inf)
 
@@ -158,7 +162,10 @@ def _advice(caption: str, ranked: Sequence[Advice]) -> Table:
         [f"{k}. {each.words}", percent(each.scale_stddev), rough(each.place_stddev_m, "m")]
         for k, each in enumerate(ranked, 1)
     ]
-    return Table(caption, ["one change", "scale then ±", "that keyframe then"], rows, kind="settings")
+    columns = ["one change", "scale then ±", "that keyframe then"]
+    if ranked and np.isnan(ranked[0].place_stddev_m):  # in the first camera's frame
+        rows, columns = [row[:2] for row in rows], columns[:2]
+    return Table(caption, columns, rows, kind="settings")
 
 
 def _components(plan: SurveyPlan) -> Table:
