@@ -77,6 +77,9 @@ def with_advice(metric: MetricResult, tag_in_cam_m: Array) -> MetricResult:
     except (InputError, GeometryError):  # nothing says what is up, or a run like it would not come about
         return metric
     words = best_words(advise(expected), for_scale=doubtful[0], for_place=doubtful[1])
+    calibrate = "rangesfm ranges calibrate"
+    if any(calibrate in said for said in estimate.advice):  # the same, with what it would gain
+        words = [said for said in words if calibrate not in said]
     advice = tuple(dict.fromkeys((*estimate.advice, *words)))
     return replace(metric, estimate=replace(estimate, advice=advice))
 
