@@ -23,7 +23,7 @@ LOG = RangeLog.from_arrays(["a", "b", "a"], [1.0, 2.0, 3.0], timestamp_s=[1.7e9,
 def test_every_figure_has_its_pictures_with_something_on_them(make_result: MakeResult) -> None:
     folder = make_result(num_keyframes=60, num_ranges_per_anchor=60, num_points=3000)
     written = write_report_pictures(folder)
-    assert len(written) == 2 * 10
+    assert len(written) == 2 * 11
     assert {path.parent for path in written} == {folder / "figures"}
     for path in written:
         if path.suffix == ".svg":

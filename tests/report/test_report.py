@@ -26,6 +26,7 @@ FIGURES = {
     "path": ["trajectory", "map_points", "local_scale"],
     "scale": ["scale_per_anchor", "scale_consensus", "time_offset_curve", "scale_candidates"],
     "ranges": ["range_residuals", "range_residual_histogram", "absolute_range_errors"],
+    "mistakes": ["mistake_tests"],
 }
 
 
@@ -255,6 +256,20 @@ def test_names_cannot_inject_markup(make_result: MakeResult) -> None:
     (panel,) = figures_in(folder)["scale_per_anchor"]
     assert sum(mark["name"].startswith(f"anchor {evil}") for mark in panel["marks"]) == 1
     assert f"Anchor {evil}" in page.texts
+
+
+def test_a_picture_tells_found_mistakes_from_those_not_found_and_those_that_nothing_finds(
+    make_result: MakeResult,
+) -> None:
+    evidence, could_hide = figures_in(make_result())["mistake_tests"]
+    assert [one["name"] for one in evidence["series"]] == [
+        "found",
+        "would not be found, however large",
+        "not found",
+    ]
+    beyond = [mark["x"] > 1.0 for mark in evidence["marks"]]
+    assert beyond == [True, False, False]
+    assert [mark["x"] for mark in could_hide["marks"]] == [0.42, 20.0, 0.42]
 
 
 def test_a_warning_that_is_a_reason_of_the_verdict_is_shown_once(make_result: MakeResult) -> None:

@@ -17,7 +17,7 @@ from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.errors.components import COMPONENTS
+from rangesfm.ranging.errors.learned import usual_stddevs
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeObservations
 
@@ -25,7 +25,7 @@ Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
 
 METRES_PER_UNIT = 2.3
-LASTING_S, PLACE_M, LOBE = 3.0, 0.5, 0.1
+LASTING_S, DRIFT_S, PLACE_M, LOBE = 3.0, 60.0, 0.5, 0.1
 NUM_WAVES = 300
 # Knots of an uneven curve over the logarithm of distance.
 _KNOTS = np.linspace(np.log(0.05), np.log(300.0), 400)
@@ -43,11 +43,8 @@ class Measured:
 
 
 def stddevs_of(planned: PlannedSurvey) -> dict[str, float]:
-    """Of the components of its ranges' errors: as told, or as radios mostly have them."""
-    is_learnt = planned.curve_stddev_m is not None
-    usual = {
-        c.name: c.calibrated_median if is_learnt and c.calibrated_median is not None else c.median for c in COMPONENTS
-    }
+    """Of the components of its ranges' errors: as told, or as radios have them in the mean."""
+    usual = usual_stddevs(is_calibrated=planned.curve_stddev_m is not None)
     return usual | dict(planned.component_stddevs)
 
 
@@ -106,7 +103,9 @@ def _errors(
     errors += (stddevs["curve"] * error_curve(distance, rng)) + stddevs["rough_curve"] * _uneven(distance, rng)
     if curve_stddev_m is not None:
         errors += curve_stddev_m * error_curve(distance, rng)
+    errors += stddevs["drift"] * lasting(times, DRIFT_S, rng)
     errors += stddevs["tag_antenna"] * _lobes(in_cam, rng)
+    errors += stddevs["off_axis"] * _off_axis(direction, index, rng)
     for k in range(len(standing_m)):
         rows = np.flatnonzero(index == k)
         since = times[rows]
@@ -142,6 +141,14 @@ def _lobes(direction: Array, rng: np.random.Generator) -> Array:
     form = rng.standard_normal((3, 3))
     quadratic = np.einsum("ni,ij,nj->n", direction, form, direction) - np.trace(form) / 3
     return np.asarray(direction @ rng.standard_normal(3) / np.sqrt(2) + np.sqrt(3) / 2 * quadratic)
+
+
+def _off_axis(direction: Array, index: Labels, rng: np.random.Generator) -> Array:
+    """(n,) of stddev 1, smooth in the angle from each anchor's mean direction (radians)."""
+    facing = np.stack([direction[index == k].mean(axis=0) for k in range(index.max() + 1)])
+    facing /= np.linalg.norm(facing, axis=1)[:, None]
+    angle = np.arccos(np.clip(np.sum(direction * facing[index], axis=1), -1.0, 1.0))
+    return _field(angle[:, None], rng.standard_normal((NUM_WAVES, 1)), rng)
 
 
 def error_curve(distance: Array, rng: np.random.Generator) -> Array:

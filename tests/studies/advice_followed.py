@@ -10,12 +10,11 @@ what is done, as in ``planned_surveys``.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import numpy as np
-from tests.studies.planned_surveys import ROOM, runs_of, spread, straight, survey, up_and_down, walk
+from tests.studies.kept_runs import spread, study
+from tests.studies.planned_surveys import ROOM, runs_of, straight, survey, up_and_down, walk
 
 from rangesfm.planning.advice import Advice
 from rangesfm.planning.planned import PlannedSurvey
@@ -48,33 +47,35 @@ def first_of(plan: SurveyPlan) -> Iterator[tuple[str, Advice]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rows", type=Path, required=True, help="what is done, as JSON lines")
-    parser.add_argument("--num_seeds", type=int, default=100)
-    parser.add_argument("--surveys", default="", help="only those whose name begins so")
-    args = parser.parse_args()
-    print(f"{'survey':30}{'for':>6}{'promised':>20}{'followed':>20}{'ratio':>7}  advice")
+    asked = study(__doc__)
+    print(f"{'survey':30}{'for':>6}{'promised':>20}{'followed':>20}{'ratio':>14}  advice")
     off = []
     for name, make in SURVEYS.items():
-        if not name.startswith(args.surveys):
+        if not name.startswith(asked.beginning):
             continue
         plan = plan_survey(make())
-        before = runs_of(name, plan.expected.planned, args.rows, args.num_seeds, num_whole=0)
+        before = runs_of(asked, name, plan.expected.planned, num_whole=0)
         for what, advice in first_of(plan):
-            after = runs_of(f"{name}: {advice.words}", advice.planned, args.rows, args.num_seeds, num_whole=0)
+            after = runs_of(asked, f"{name}: {advice.words}", advice.planned, num_whole=0)
             if what == "scale":
                 promised, was = advice.scale_stddev, plan.scale_stddev
             else:
                 promised, was = advice.place_stddev_m, plan.expected.worst_keyframe_m
-            found = spread(after, what)
+            (found, chance), (found_before, chance_before) = spread(after, what), spread(before, what)
             is_open = not np.isfinite(was)
-            gains = (promised, found) if is_open else (promised / was, found / spread(before, what))
-            off.append(abs(gains[0] / gains[1] - 1))
+            gains = (promised, found) if is_open else (promised / was, found / found_before)
+            ratio = gains[0] / gains[1]
+            by_chance = ratio * (chance if is_open else float(np.hypot(chance, chance_before)))
+            off.append((abs(ratio - 1), by_chance))
             unit = ("{:14.3f} m" if what == "place" else "{:14.5f}") if is_open else "{:11.2f} of it"
             told = "".join(f"{unit.format(gain):>20}" for gain in gains)
-            print(f"{name:30}{what:>6}{told}{gains[0] / gains[1]:7.2f}  {advice.words}", flush=True)
-    median = 100 * np.median(off)
-    print(f"{sum(np.array(off) > 0.25)} of {len(off)} off by more than 25 %, {median:.0f} % in the median")
+            print(f"{name:30}{what:>6}{told}{ratio:7.2f} +-{by_chance:4.2f}  {advice.words}", flush=True)
+    ratios, by_chance = np.array(off).T
+    num_off, num_surely = sum(ratios > 0.25), sum(ratios > 0.25 + 2 * by_chance)
+    print(
+        f"{num_off} of {len(off)} off by more than 25 %, {num_surely} of them by two stddevs of chance more; ", end=""
+    )
+    print(f"{100 * np.median(ratios):.0f} % in the median")
 
 
 if __name__ == "__main__":

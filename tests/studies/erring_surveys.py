@@ -34,9 +34,11 @@ Array = npt.NDArray[np.float64]
 METRES_PER_UNIT = 2.3
 DIRECTION_STDDEV_M, CURVE_STDDEV_M, BIAS_STDDEV_M, COMMON_BIAS_STDDEV_M = 0.03, 0.03, 0.01, 0.05
 LASTING_STDDEV_M = 0.0018
+DRIFT_STDDEV_M, DRIFT_S = 0.01, 60.0
 OBSTRUCTED_SHARE, OBSTRUCTED_MEAN_M = 0.04, 0.7
 BEND_SHARE = 0.002
 # A camera's x right, y down, z forward by a robot's x forward, y left, z up.
+Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 X_FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
 
@@ -174,6 +176,7 @@ def radio_errors(given: Given, stddev_m: float, rng: np.random.Generator) -> Arr
         errors[rows] += np.einsum("ni,ij,nj->n", direction, form, direction) + BIAS_STDDEV_M * rng.standard_normal()
         errors[rows] += LASTING_STDDEV_M * lasting(given.time_s[rows], LASTING_S, rng)
     errors += (rng.random(len(errors)) < OBSTRUCTED_SHARE) * rng.exponential(OBSTRUCTED_MEAN_M, len(errors))
+    errors += DRIFT_STDDEV_M * lasting(given.time_s, DRIFT_S, rng)
     return np.asarray(errors)
 
 

@@ -12,17 +12,15 @@ of the runs' errors, the median stddev that a run states itself, and how many ru
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from tests.simulated.path import lap_path, loop_path, sequence_path
 from tests.simulated.surveys import METRES_PER_UNIT, Measured, measured
+from tests.studies.kept_runs import Row, Study, spread, study
 
 from rangesfm.demo.ranges import CameraPath
 from rangesfm.errors import GeometryError
@@ -123,10 +121,10 @@ SURVEYS: dict[str, Callable[[], PlannedSurvey]] = {
 }
 
 
-def one_run(planned: PlannedSurvey, keyframe: int | None, seed: int, *, is_whole: bool) -> dict[str, Any]:
+def one_run(planned: PlannedSurvey, keyframe: int | None, seed: int, *, is_whole: bool) -> Row:
     """Error of the logarithm of the scale and of one keyframe's place (metres); of a whole run, what it states too."""
     made = measured(planned, seed)
-    found: dict[str, Any] = {"seed": seed}
+    found: Row = {}
     try:
         if is_whole:
             estimate = initialize_scale(
@@ -165,50 +163,33 @@ def worst_keyframe(expected: Expected) -> int | None:
     return None if place is None else int(np.argmax(place[1]))
 
 
-def spread(rows: list[dict[str, Any]], name: str) -> float:
-    """Root mean square of errors; of a place, of their lengths."""
-    squares = [float(np.sum(np.square(row[name]))) for row in rows if name in row]
-    return float(np.sqrt(np.mean(squares))) if squares else float("nan")
-
-
-def runs_of(name: str, planned: PlannedSurvey, file: Path, num_seeds: int, num_whole: int = 2) -> list[dict[str, Any]]:
-    """As kept in the file; those that are missing are made and added to it."""
-    kept = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
-    rows = [row for row in kept if row["survey"] == name and row["seed"] < num_seeds]
-    done = {row["seed"] for row in rows}
-    keyframe = worst_keyframe(expect(planned)) if len(done) < num_seeds else None
-    with file.open("a") as lines:
-        for seed in (seed for seed in range(num_seeds) if seed not in done):
-            row = {"survey": name} | one_run(planned, keyframe, seed, is_whole=seed < num_whole)
-            rows.append(row)
-            print(json.dumps(row), file=lines, flush=True)
-    return rows
+def runs_of(asked: Study, name: str, planned: PlannedSurvey, num_whole: int = 2) -> list[Row]:
+    """Of one survey, the first ones whole."""
+    keyframe = worst_keyframe(expect(planned))
+    return asked.runs_of(name, lambda seed: one_run(planned, keyframe, seed, is_whole=seed < num_whole))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rows", type=Path, required=True, help="what is done, as JSON lines")
-    parser.add_argument("--num_seeds", type=int, default=100)
-    parser.add_argument("--surveys", default="", help="only those whose name begins so")
-    args = parser.parse_args()
+    asked = study(__doc__)
     print(
-        f"{'survey':34}{'predicted':>10}{'spread':>9}{'ratio':>7}{'stated':>9}{'place':>10}{'spread':>9}{'ratio':>7}{'refused':>9}"
+        f"{'survey':34}{'predicted':>10}{'spread':>9}{'ratio':>14}{'stated':>9}{'place':>10}{'spread':>9}{'ratio':>14}{'refused':>9}"
     )
     off = []
     for name, plan in SURVEYS.items():
-        if not name.startswith(args.surveys):
+        if not name.startswith(asked.beginning):
             continue
         planned = plan()
         expected = expect(planned)
-        rows = runs_of(name, planned, args.rows, args.num_seeds)
+        rows = runs_of(asked, name, planned)
         scale, place_m = expected.uncertainty.empirical, expected.worst_keyframe_m
-        scale_spread, place_spread_m = spread(rows, "scale"), spread(rows, "place")
+        (scale_spread, by_chance), (place_spread_m, of_place) = spread(rows, "scale"), spread(rows, "place")
         stated = [row["stated"] for row in rows if "stated" in row] or [float("nan")]
         ratios = [scale / scale_spread, place_m / place_spread_m]
         off += [abs(ratio - 1) for ratio in ratios if np.isfinite(ratio)]
         print(
-            f"{name:34}{100 * scale:8.2f} %{100 * scale_spread:7.2f} %{ratios[0]:7.2f}{100 * np.median(stated):7.2f} %"
-            f"{place_m:8.3f} m{place_spread_m:7.3f} m{ratios[1]:7.2f}{sum('refused' in row for row in rows):9}",
+            f"{name:34}{100 * scale:8.2f} %{100 * scale_spread:7.2f} %{ratios[0]:7.2f} +-{ratios[0] * by_chance:4.2f}"
+            f"{100 * np.median(stated):7.2f} %{place_m:8.3f} m{place_spread_m:7.3f} m{ratios[1]:7.2f} "
+            f"+-{ratios[1] * of_place:4.2f}{sum('refused' in row for row in rows):9}",
             flush=True,
         )
     print(

@@ -1,7 +1,7 @@
 """Error, 95 % interval and verdict of the scale on real logs with truth, in every way of knowing their anchors.
 
 Run: python -m tests.studies.real_logs --data FOLDER [--sets NAME ...] [--no_singles] [--by_photo]
-     [--turned SEED] [--leave_radio_out]
+     [--turned SEED] [--leave_radio_out] [--calibrated]
 
 The sets are described in real_logs.json: public logs below the folder, of each tag its place in the tracked body, the
 offset of the clocks (time of the truth minus time of the ranges) and the truth's longest gap. The path is the true
@@ -9,7 +9,8 @@ one, at most ten poses a second, divided by a factor that is to be found again. 
 (site frame), known in the
 first pose's frame, all unknown, or each alone unknown. With --by_photo ranges name the pose next to them instead of a
 time; with --turned the unscaled path lies in another frame, which should change nothing; with --leave_radio_out what is
-expected of radios comes from all others than the one at hand.
+expected of radios comes from all others than the one at hand; with --calibrated an error curve is taken off that was
+learnt on another log of the same radio, where there is one.
 """
 
 from __future__ import annotations
@@ -35,7 +36,9 @@ from rangesfm.options import AssociationOptions, ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.association import associate
+from rangesfm.ranging.errors.calibration import calibrate_ranges
 from rangesfm.ranging.errors.components import components
+from rangesfm.ranging.errors.error_curve import ErrorCurve, correct_ranges
 from rangesfm.ranging.errors.population import population
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeObservations
@@ -62,11 +65,14 @@ def main() -> None:
     parser.add_argument("--by_photo", action="store_true")
     parser.add_argument("--turned", type=int)
     parser.add_argument("--leave_radio_out", action="store_true")
+    parser.add_argument("--calibrated", action="store_true")
     args = parser.parse_args()
     sets = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))
     found = []
-    for name in args.sets or sets:
+    for name in args.sets or [name for name in sets if not args.calibrated or "same_radio" in sets[name]]:
         log, anchors, reference = read_set(args.data, sets[name])
+        if args.calibrated:
+            log = correct_ranges(log, curve_of(args.data, sets[sets[name]["same_radio"]]))[0]
         path = path_of(reference)
         given = path if args.turned is None else turned(path, args.turned)
         expected = components(population(without=name if args.leave_radio_out else None))
@@ -156,6 +162,14 @@ def at_photos(log: RangeLog, path: Trajectory, offset_s: float) -> tuple[RangeLo
     near = np.abs(times - path.timestamps_s[nearest]) < 0.05
     names = tuple(path.image_names[k] for k in nearest[near])
     return replace(log.subset(near), timestamp_s=None, image_name=names), replace(path, timestamps_s=None), 0.0
+
+
+def curve_of(data: Path, described: dict[str, Any]) -> ErrorCurve:
+    log, anchors, reference = read_set(data, described)
+    path = path_of(reference)
+    observations = placed(log, next(cases(log, anchors, path)), path, described, by_photo=False)
+    tags_m = FACTOR * observations.centers + observations.tag_from_center
+    return calibrate_ranges(observations.log, tags_m, anchors).curve
 
 
 def one_survey(name: str, case: Case, observations: RangeObservations, path: Trajectory) -> tuple[float, float] | None:

@@ -34,6 +34,7 @@ START |= {
     "rough_curve": 0.02,
     "slope": 0.004,
     "antenna": 0.05,
+    "off_axis": 0.05,
     "tag_antenna": 0.05,
     "bending": 0.01,
 }

@@ -96,11 +96,16 @@ def lap_survey(
     )
 
 
-def yard_survey(*, anchor_frame: str = "site", range_stddev_m: float = 0.1) -> Survey:
+def yard_survey(
+    *, anchor_frame: str = "site", range_stddev_m: float = 0.1, max_track_length: int | None = None
+) -> Survey:
     """A walk round a yard, its middle in view: four anchors in the site's frame, else the first of them alone."""
     path = loop_path(40.0, height_amplitude_m=0.8, unsteadiness_m=0.1, seed=3)
     anchors = SITE_ANCHORS_M if anchor_frame == "site" else {"A1": SITE_ANCHORS_M["A1"]}
-    return _survey(path, np.linspace(0.0, 40.0, 60), anchors, anchor_frame, range_stddev_m, num_observations=80)
+    times = np.linspace(0.0, 40.0, 60)
+    return _survey(
+        path, times, anchors, anchor_frame, range_stddev_m, num_observations=80, max_track_length=max_track_length
+    )
 
 
 def _survey(

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pycolmap
 import pytest
+from PIL import Image
 from tests.simulated.phone_survey import write_anchors, write_log, write_photos
 
 from rangesfm.survey.settings import Survey, survey_from_tables
@@ -80,3 +82,25 @@ def test_clocks_that_share_no_time_photos_without_times_and_missing_parts_are_fa
     assert without_photos.facts[0].startswith("ranges: 60 of 1 tag")
     faults = check_survey(survey_from_tables({}, folder)).faults
     assert [str(fault)[:9] for fault in faults] == ["no photos", "no ranges"]
+
+
+def test_masks_a_database_and_options_of_colmap_are_looked_at(folder: Path) -> None:
+    names = [path.name for path in sorted((folder / "images").iterdir())]
+    for name in names:
+        with Image.open(folder / "images" / name) as photo:
+            size = photo.size
+        (folder / "masks").mkdir(exist_ok=True)
+        Image.new("L", size, 255).save(folder / "masks" / f"{name}.png")
+    masked = check_survey(survey_of(folder, mapper__mask_path=folder / "masks"))
+    assert f"masks: of {len(names)} photos" in masked.facts
+    assert masked.faults == []
+    (folder / "masks" / f"{names[3]}.png").unlink()
+    (missing,) = check_survey(survey_of(folder, mapper__mask_path=folder / "masks")).faults
+    assert f"1 of {len(names)} photos have no mask there, the first is {names[3]}" in str(missing)
+    with pycolmap.Database.open(folder / "empty.db"):
+        pass
+    (poor,) = check_survey(survey_of(folder, mapper__database_path=folder / "empty.db")).faults
+    assert f"empty.db: has features of 0 of {len(names)} photos" in str(poor)
+    (unknown,) = check_survey(survey_of(folder, mapper__features={"max_features": 3})).faults
+    assert "max_features" in str(unknown)
+    assert not (folder / "out").exists()

@@ -241,8 +241,12 @@ def _schur_complement(jacobian: csc_matrix, columns: _Columns) -> tuple[csc_matr
     whitener = np.swapaxes(np.linalg.inv(np.linalg.cholesky(blocks)), 1, 2)
     indices = np.arange(num_points)
     whiten = bsr_matrix((whitener, indices, np.arange(num_points + 1)), shape=(3 * num_points, 3 * num_points))
-    coupling = (kept.T @ points) @ whiten
-    return csc_matrix(kept.T @ kept - coupling @ coupling.T), kept_columns
+    coupling = csr_matrix(kept.T @ points)
+    coupling.resize(-(-len(kept_columns) // 6) * 6, points.shape[1])
+    coupling = coupling.tobsr((6, 3)) @ whiten  # blocks of poses and points multiply faster than numbers
+    eliminated = (coupling @ coupling.T).tocsr()
+    eliminated.resize(kept.shape[1], kept.shape[1])
+    return csc_matrix(kept.T @ kept - eliminated), kept_columns
 
 
 def _tied_points(points: csc_matrix) -> Mask:
@@ -259,7 +263,8 @@ def _tied_points(points: csc_matrix) -> Mask:
 def _world_motions(columns: _Columns) -> Array:
     """(num_columns, 7) how small turns, shifts and a change of scale of the world move everything in it."""
     motions = np.zeros((int(columns.starts[-1]), 7))
-    for i, (kind, block) in enumerate(zip(columns.kinds, columns.variable, strict=True)):
+    num = columns.num_kept_blocks
+    for i, (kind, block) in enumerate(zip(columns.kinds[:num], columns.variable[:num], strict=True)):
         rows = motions[columns.span(i)]
         if kind == "pose":
             rotation, translation = _matrix(block), block[4:]
@@ -268,9 +273,10 @@ def _world_motions(columns: _Columns) -> Array:
             rows[3:, 3:] = -rotation @ np.column_stack([np.eye(3), center])
         elif kind == "sensor" and len(rows) == 6:
             rows[3:, 6] = block[4:]
-        elif kind in ("anchor", "point"):
-            rows[:, :3] = -cross_matrices(block)
-            rows[:, 3:] = np.column_stack([np.eye(3), block])
+        elif kind == "anchor":
+            rows[:] = np.roll(similarity_motions(block[None])[0], -1, axis=1)
+    points = np.array(columns.variable[num:]).reshape(-1, 3)
+    motions[columns.num_kept_columns :] = np.roll(similarity_motions(points), -1, axis=2).reshape(-1, 7)
     return motions
 
 

@@ -92,6 +92,7 @@ def tangent_jacobian(problem: Any, blocks: Sequence[npt.NDArray[np.float64]]) ->
     padded = csr_matrix(
         (np.asarray(jacobian.values), np.asarray(jacobian.cols), np.asarray(jacobian.rows)), shape=shape
     )
-    sizes = [problem.parameter_block_tangent_size(block) for block in blocks]
-    wanted = [np.arange(size) < num_columns(problem, block) for size, block in zip(sizes, blocks, strict=True)]
-    return padded[:, np.concatenate(wanted)] if sum(sizes) > sum(map(np.sum, wanted)) else padded
+    sizes = np.array([problem.parameter_block_tangent_size(block) for block in blocks], dtype=np.int64)
+    wanted = np.minimum(sizes, [len(block) for block in blocks])
+    in_block = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    return padded[:, in_block < np.repeat(wanted, sizes)] if (wanted < sizes).any() else padded

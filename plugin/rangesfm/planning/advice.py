@@ -15,6 +15,8 @@ from rangesfm.planning.expected import Expected, compare
 from rangesfm.planning.placement import spread_places
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.errors.components import COMPONENTS
+from rangesfm.scale.verdict import CALIBRATE
 
 _RAISED_M = (1.0, -1.0, 2.0, -2.0)
 _UP_AND_DOWN_M, _NUM_WAVES = 0.5, 3
@@ -62,12 +64,16 @@ class _Change(NamedTuple):
 
 
 def advise(expected: Expected) -> tuple[Advice, ...]:
-    """All changes of a plan that gain something, in no order."""
-    planned = expected.planned
-    before = compare(planned)
-    afters = ((change, compare(change.planned)) for change in _changes(planned))
+    """All changes of a plan that gain something, in no order; a map bends as it did before."""
+    bending = expected.learned.stddev_of_component["bending"]
+    before = _compared(expected.planned, bending)
+    afters = ((change, _compared(change.planned, bending)) for change in _changes(expected.planned))
     found = (_advice(change, after, before, expected) for change, after in afters if before and after)
     return tuple(advice for advice in found if max(advice.scale_gain, advice.place_gain) > _LEAST_GAIN)
+
+
+def _compared(planned: PlannedSurvey, bending: float) -> Expected | None:
+    return compare(replace(planned, component_stddevs={**planned.component_stddevs, "bending": bending}))
 
 
 def best_words(advice: Iterable[Advice], *, for_scale: bool, for_place: bool) -> list[str]:
@@ -105,12 +111,17 @@ def _advice(change: _Change, after: Expected, before: Expected, stated: Expected
     # What is open is still on the site.
     size_m = float(np.linalg.norm(np.ptp(stated.planned.places_m, axis=0)))
     place_ratio = min(place_after_m, size_m) / min(place_before_m, size_m)
+    if not is_open:
+        # What the map bends comes on top of its place as a whole.
+        worst_m, bend_m = stated.worst_keyframe_m, float(stated.bends_m[int(np.argmax(stated.keyframe_stddevs_m))])
+        place_after_m = float(np.hypot(place_ratio * np.sqrt(max(worst_m**2 - bend_m**2, 0.0)), bend_m))
+        place_ratio = place_after_m / worst_m
     return Advice(
         *change,
         scale_stddev=stated.uncertainty.empirical * scale_ratio,
-        place_stddev_m=place_after_m if is_open else stated.worst_keyframe_m * place_ratio,
+        place_stddev_m=place_after_m,
         scale_gain=1 - scale_ratio,
-        place_gain=0.0 if np.isnan(place_after_m) or np.isnan(place_before_m) else 1 - place_ratio,
+        place_gain=0.0 if np.isnan(place_ratio) else 1 - place_ratio,
     )
 
 
@@ -132,12 +143,28 @@ def _changes(planned: PlannedSurvey) -> Iterator[_Change]:
     wide = f"walk {_WIDER:g} times as wide"
     yield _Change("wider path", "", wide, replace(planned, trajectory=_wider(path)))
     yield _Change("rate", "", "range twice as often", replace(planned, rate_hz=2 * planned.rate_hz))
+    if planned.allowed_m is None:
+        yield _Change("wider anchors", "", f"put the anchors {_WIDER:g} times as far out", _with_wider_anchors(planned))
     if planned.curve_stddev_m is None:
-        learn = f"learn the radio's error curve (rangesfm ranges calibrate), to {_LEARNT_CURVE_M:g} m"
-        yield _Change("calibration", "", learn, replace(planned, curve_stddev_m=_LEARNT_CURVE_M))
+        yield _Change("calibration", "", f"{CALIBRATE}, to {_LEARNT_CURVE_M:g} m", _calibrated(planned))
     length_m, stddev_m = _TAPED_M
     tape = f"tape a length of {length_m:g} m to {1000 * stddev_m:g} mm between two points of the map"
     yield _Change("tape", "", tape, replace(planned, taped=(*planned.taped, _TAPED_M)))
+
+
+def _calibrated(planned: PlannedSurvey) -> PlannedSurvey:
+    """What was known of the errors that a calibration takes away is of no use then."""
+    taken = {component.name for component in COMPONENTS if component.calibrated_median is not None}
+    left = {name: stddev for name, stddev in planned.component_stddevs.items() if name not in taken}
+    return replace(planned, curve_stddev_m=_LEARNT_CURVE_M, component_stddevs=left)
+
+
+def _with_wider_anchors(planned: PlannedSurvey) -> PlannedSurvey:
+    """From the middle of the path, at the same heights."""
+    middle = planned.trajectory.centers.mean(axis=0)
+    out = [middle + (at - middle) * [_WIDER, _WIDER, 1.0] for at in planned.anchors_m]
+    moved = [replace(anchor, position_m=at) for anchor, at in zip(planned.anchors, out, strict=True)]
+    return replace(planned, anchors=tuple(moved))
 
 
 def _raised(planned: PlannedSurvey) -> Iterator[_Change]:

@@ -10,9 +10,10 @@ from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.options import ScaleOptions
+from rangesfm.planning.photos import PlannedMap
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.errors.cells import MAX_NUM_CELLS
-from rangesfm.ranging.errors.learned import LearnedErrors
+from rangesfm.ranging.errors.learned import LearnedErrors, usual_stddevs
 from rangesfm.ranging.errors.noise import START_STDDEV_M
 from rangesfm.ranging.errors.place import shares_of_places
 from rangesfm.ranging.errors.range_errors import RangeErrors
@@ -51,6 +52,9 @@ class Expected:
         uncertainty: of the scale.
         covariance: (p, p) of all that the fit estimates.
         placement: (7, 7) as of a ScaleEstimate; None without a place in the site.
+        by_ranges: (7, 7) the same by the ranges alone, whatever the map bends; of the scale where the frame is the
+            first camera's.
+        bends_m: (n,) what the map's bend adds to the stddev of each keyframe; 0 of a map that is rigid.
     """
 
     planned: PlannedSurvey
@@ -61,6 +65,8 @@ class Expected:
     uncertainty: ScaleUncertainty
     covariance: Array
     placement: Array | None
+    by_ranges: Array
+    bends_m: Array
 
     @property
     def verdict(self) -> Verdict:
@@ -91,18 +97,20 @@ class Expected:
         if self.placement is None:
             return None
         centers = self.planned.trajectory.centers
-        return _stddevs(np.diag(by_similarity(self.placement, centers)[0])), self.stddevs_at(centers)
+        return _stddevs(np.diag(by_similarity(self.placement, centers)[0])), self.keyframe_stddevs_m
+
+    @property
+    def keyframe_stddevs_m(self) -> Array:
+        """(n,) of each keyframe's place, as ``stddevs_at``, with the map's bend."""
+        return np.hypot(self.stddevs_at(self.planned.trajectory.centers), self.bends_m)
 
     def stddevs_at(self, places_m: Array) -> Array:
-        """(n,) of (n, 3) places in the map, in the frame of the result: all coordinates together; inf where open.
+        """(n,) of (n, 3) places in the map as a whole, in the result's frame: all coordinates together; inf where open.
 
         Without a place in the site they are as far off as the scale makes them, seen from the first camera.
         """
-        placement = self.placement
-        if placement is None:
-            placement = np.diag([self.uncertainty.empirical**2, *np.zeros(6)])
         motions = similarity_motions(places_m - self.planned.trajectory.centers[0])
-        return _stddevs(np.einsum("nij,jk,nik->n", motions, placement, motions))
+        return _stddevs(np.einsum("nij,jk,nik->n", motions, self.by_ranges, motions))
 
     @property
     def worst_keyframe_m(self) -> float:
@@ -117,9 +125,10 @@ def _stddevs(variances: Array) -> Array:
 
 
 def compare(planned: PlannedSurvey) -> Expected | None:
-    """``expect`` in a tenth of the time, good to tell plans apart; None where a run will find too few ranges."""
+    """``expect`` in a tenth of the time, good to tell plans apart, of a rigid map; None where a run will find too few
+    ranges."""
     try:
-        return expect(replace(planned, max_num_ranges=_NUM_COMPARED_RANGES), _NUM_COMPARED_CELLS)
+        return expect(replace(planned, photos=None, max_num_ranges=_NUM_COMPARED_RANGES), _NUM_COMPARED_CELLS)
     except GeometryError:
         return None
 
@@ -141,14 +150,36 @@ def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expect
     errors = posed.errors.at(tags, scale * posed.center_stddev)
     solution = _weighed(posed, errors, fit_at(weighted(posed.ranges, errors), state, num_alike))
     rotations = model_from_cam(observations, planned.trajectory, posed)
-    learned = errors_to_expect(posed, solution, observations, rotations, planned.component_stddevs, max_num_cells)
+    made = _planned_map(planned, posed, observations)
+    stddevs = usual_stddevs(is_calibrated=planned.curve_stddev_m is not None) | dict(planned.component_stddevs)
+    if made is not None:
+        stddevs["bending"] = float(np.hypot(stddevs["bending"], made.bend_m(solution)))
+    learned = errors_to_expect(posed, solution, observations, rotations, stddevs, max_num_cells)
     for _ in range(_NUM_NOISE_ROUNDS):
         errors = _as_seen(solution, learned, num_alike)
         solution = _weighed(posed, errors, fit_at(weighted(posed.ranges, errors), state, num_alike))
-    covariance = parameter_covariance(solution, learned) + _undetermined(solution.fit)
-    uncertainty = expected_scale_uncertainty(posed, solution, learned, BENDING)
-    placement = placement_covariance(solution, covariance)
-    return Expected(planned, observations, posed, solution, learned, uncertainty, covariance, placement)
+    open_m2 = _undetermined(solution.fit)
+    covariance = parameter_covariance(solution, learned) + open_m2
+    uncertainty = expected_scale_uncertainty(solution, learned, BENDING)
+    placement, bends_m = placement_covariance(solution, covariance), np.zeros(len(planned.trajectory))
+    others = learned if made is None else learned.without("bending")
+    by_ranges = placement_covariance(solution, parameter_covariance(solution, others) + open_m2)
+    if by_ranges is None:
+        scale_stddev = expected_scale_uncertainty(solution, others, BENDING).empirical
+        by_ranges = np.diag([scale_stddev**2, *np.zeros(6)])
+    if made is not None:
+        straightened = replace(solution, errors=_as_seen(solution, others, num_alike))
+        bends_m = made.bends_m(straightened, others, planned.num_alike)
+    return Expected(
+        planned, observations, posed, solution, learned, uncertainty, covariance, placement, by_ranges, bends_m
+    )
+
+
+def _planned_map(planned: PlannedSurvey, posed: ScaleProblem, observations: RangeObservations) -> PlannedMap | None:
+    if planned.photos is None:
+        return None
+    path = planned.trajectory
+    return PlannedMap(path, planned.photos.information(path), posed, observations, planned.tag_in_cam_m)
 
 
 def _weighed(posed: ScaleProblem, errors: RangeErrors, fit: RangeFit) -> Solution:

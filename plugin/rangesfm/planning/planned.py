@@ -12,6 +12,7 @@ from rangesfm.distances.ends import LocatedDistances
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import RangeModelOptions
+from rangesfm.planning.photos import PlannedPhotos
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
@@ -40,6 +41,7 @@ class PlannedSurvey:
         taped: distances between points of the map: pairs of a length and its stddev, metres.
         heights_m: between which anchors may stand; None: not below the ground, which is 0 or the lowest of all.
         path_is_level: the camera cannot go up and down, as on a rover.
+        photos: what the camera will see; None: nobody said, and the map is taken to be rigid.
         allowed_m: (k, 3) places for anchors; None: nobody said where they may stand.
         is_placed: whether the anchors stand where they do; else they may be put anywhere that is allowed.
         max_num_ranges: to compute with; of more, each stands for several.
@@ -54,6 +56,7 @@ class PlannedSurvey:
     curve_stddev_m: float | None = None
     component_stddevs: Mapping[str, float] = field(default_factory=dict)
     taped: tuple[tuple[float, float], ...] = ()
+    photos: PlannedPhotos | None = None
     heights_m: tuple[float, float] | None = None
     path_is_level: bool = False
     allowed_m: Array | None = None

@@ -15,6 +15,7 @@ from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.option_model import Options, Told
 from rangesfm.options import RangeModelOptions, TagOptions
 from rangesfm.planning.paths import loop_inside, path_from_file, path_from_model, path_through
+from rangesfm.planning.photos import MAX_NUM_PHOTOS, PlannedPhotos
 from rangesfm.planning.placement import places_in_box, places_on_walls, spread_anchors
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
@@ -136,7 +137,7 @@ class Plan(BaseModel):
     """A plan's tables.
 
     Attributes:
-        anchors, path, radio, tag: its tables.
+        anchors, path, radio, tag: its tables. photos: None where it has no such table.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -145,6 +146,7 @@ class Plan(BaseModel):
     path: PlannedPathOptions
     radio: PlannedRadioOptions
     tag: TagOptions
+    photos: PlannedPhotos | None
 
 
 TABLES: dict[str, type[Options]] = {
@@ -152,6 +154,7 @@ TABLES: dict[str, type[Options]] = {
     "path": PlannedPathOptions,
     "radio": PlannedRadioOptions,
     "tag": TagOptions,
+    "photos": PlannedPhotos,
 }
 
 
@@ -167,10 +170,11 @@ def read_plan(path: str | Path) -> PlannedSurvey:
     with source.naming_lines():
         refuse_unknown_tables(tables, TABLES)
         options: dict[str, Any] = {
-            name: model(**_absolute(tables.get(name, {}), model, folder)) for name, model in TABLES.items()
+            name: model(**_absolute(tables.get(name, {}), model, folder))
+            for name, model in TABLES.items()
+            if name != "photos" or name in tables
         }
-        plan = Plan(**options)
-        return _planned(plan)
+        return _planned(Plan(**{"photos": None, **options}))
 
 
 def _absolute(table: dict[str, Any], model: type[Options], folder: Path) -> dict[str, Any]:
@@ -204,6 +208,7 @@ def _planned(plan: Plan) -> PlannedSurvey:
         ),
         curve_stddev_m=radio.curve_stddev_m,
         component_stddevs=({} if radio.like is None else stddevs_in(radio.like)) | radio.stddevs,
+        photos=plan.photos,
         heights_m=plan.anchors.heights_m,
         path_is_level=path.is_level,
         allowed_m=allowed_m,
@@ -212,6 +217,9 @@ def _planned(plan: Plan) -> PlannedSurvey:
     if planned.duration_s > _MAX_DURATION_S:
         message = f"[path] takes {planned.duration_s:.3g} s, expected at most {_MAX_DURATION_S:g}"
         raise OptionError(message, "path")
+    if planned.photos is not None and len(planned.trajectory) > MAX_NUM_PHOTOS:
+        message = f"[photos] are {len(planned.trajectory)}, expected at most {MAX_NUM_PHOTOS}: lower photo_rate_hz"
+        raise OptionError(message, "path", "photo_rate_hz")
     return planned
 
 

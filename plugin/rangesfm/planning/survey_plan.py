@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from rangesfm.planning.advice import Advice, advise, ranked
-from rangesfm.planning.detectable import detectable_mistakes
 from rangesfm.planning.expected import OPEN, Expected, expect
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.errors.components import component_words
+from rangesfm.trust.catalogue import STANDING
+from rangesfm.trust.linearized import linearized
+from rangesfm.trust.ranges_on_map import ranges_on_map
 from rangesfm.trust.table import MistakeTest
+from rangesfm.trust.testing import Factorization
+from rangesfm.trust.verdict import row_of
 
 _MAX_NUM_SHOWN = 5
 
@@ -145,7 +149,7 @@ def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
         scale_interval_95=(float(np.expm1(-half_width)), float(np.expm1(half_width))),
         components=expected.uncertainty.components,
         place=_place(expected),
-        keyframe_stddevs_m=tuple(expected.stddevs_at(planned.trajectory.centers).tolist()),
+        keyframe_stddevs_m=tuple(expected.keyframe_stddevs_m.tolist()),
         verdict="doubtful" if open_place else verdict.verdict,
         reasons=(*(f"a run will give the scale only: {why}" for why in open_place), *verdict.reasons),
         mistakes=_mistakes(expected),
@@ -170,7 +174,11 @@ def _place(expected: Expected) -> PlannedPlace | None:
 
 
 def _mistakes(expected: Expected) -> tuple[DetectableMistake, ...]:
-    found = [DetectableMistake.of(test) for test in detectable_mistakes(expected)]
+    """Of every mistake that lasts for the whole survey; that it was made is not tested, as nothing was measured."""
+    on_map = ranges_on_map(expected.posed, expected.solution, expected.observations, expected.planned.trajectory)
+    problem = replace(linearized(on_map, expected.learned.cells), errors=expected.learned)
+    hypotheses = [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
+    found = [DetectableMistake.of(row_of(test)) for test in Factorization(problem).test(hypotheses, seed=0)]
     return tuple(sorted(found, key=lambda each: -_most(each)))
 
 

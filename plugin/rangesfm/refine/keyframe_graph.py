@@ -30,6 +30,8 @@ _INITIAL_DAMPING = 1e-8
 _MAX_DAMPING = 1e6
 # For the number of parameters that the ranges determine: random vectors to estimate a trace with.
 _NUM_PROBES = 12
+# Columns that a range depends on: two poses, an anchor, its bias.
+_IN_ROW = 16
 
 
 @dataclass(frozen=True)
@@ -125,18 +127,42 @@ def solve_graph(graph: KeyframeGraph, start: GraphState, *, tolerance_m: float) 
     return GraphSolution(state, step_count, _num_absorbed(terms, layout))
 
 
+def linear_functions(graph: KeyframeGraph, gradients: Array) -> tuple[Array, Array]:
+    """How functions of the poses err, by first order at the start.
+
+    Args:
+        gradients: (6 n, k) by turn (in the keyframe's own frame) and shift of each pose.
+
+    Returns:
+        (k, k) covariance by what the photos get wrong alone; and (num_ranges, k) by how much they grow for each metre
+        by which a range is longer. What nothing determines is as if it were determined a little.
+    """
+    layout = _Layout.of(graph)
+    terms = _Terms.at(graph, layout, graph.start())
+    gradient = np.zeros((layout.num, gradients.shape[1]))
+    gradient[: layout.first_anchor] = gradients
+    solved = _factor(terms.hessian, layout, 0.0).solve(gradient[layout.free])
+    by_stddev = terms.whitened[:, layout.free] @ solved
+    by_prior = _prior_rows(graph, layout, graph.start())[1][:, layout.free] @ solved
+    by_metre = (np.sqrt(graph.errors.weight) / graph.errors.stddev_m)[:, None] * by_stddev
+    return gradient[layout.free].T @ solved - by_stddev.T @ by_stddev - by_prior.T @ by_prior, by_metre
+
+
 @dataclass(frozen=True)
 class _Layout:
     """Columns: 6 for each pose (turn in its own frame, shift of its centre), 3 for each anchor, biases, their common.
 
     Attributes:
         num: of all. free: which take part.
-        rows: what the rows of the priors are: (prior column, mean, stddev) of single numbers.
+        order, starts: of the ranges, those between the same keyframes to the same anchor together: their derivatives
+            have the same columns.
     """
 
     num_frames: int
     num_anchors: int
     free: Indices
+    order: Indices
+    starts: Indices
 
     @property
     def num(self) -> int:
@@ -162,7 +188,18 @@ class _Layout:
         is_free[6 * n : 6 * n + 3 * m] = np.repeat(anchor_is_free, 3)
         is_free[6 * n + 3 * m : -1] = bias_is_free
         is_free[-1] = graph.errors.common_bias_stddev_m > 0 and bool(bias_is_free.any())
-        return cls(n, m, np.flatnonzero(is_free))
+        ends = np.column_stack([graph.antennas.before, graph.antennas.after, graph.errors.anchor_index])
+        order = np.lexsort(ends.T)
+        starts = np.flatnonzero(np.diff(ends[order], axis=0, prepend=-1).any(axis=1))
+        return cls(n, m, np.flatnonzero(is_free), order, starts)
+
+    def squares(self, rows: sparse.csr_array) -> sparse.coo_array:
+        """J^T J of the derivatives of the ranges, dense among those alike."""
+        values, columns = (array.reshape(-1, _IN_ROW) for array in (rows.data, rows.indices))
+        blocks = np.array([alike.T @ alike for alike in np.split(values[self.order], self.starts[1:])])
+        column = columns[self.order[self.starts]]
+        places = np.broadcast_to(column[:, :, None], blocks.shape), np.broadcast_to(column[:, None], blocks.shape)
+        return sparse.coo_array((blocks.ravel(), tuple(place.ravel() for place in places)), shape=(self.num, self.num))
 
 
 @dataclass(frozen=True)
@@ -190,15 +227,15 @@ class _Terms:
 
         scaled, derivative = _range_rows(graph, layout, state)
         rho, weights, _ = graph.errors.weight * graph.errors.loss.rho(scaled**2)
-        whitened = sparse.diags_array(np.sqrt(weights)) @ derivative
         cost += 0.5 * float(rho.sum())
         gradient = gradient + derivative.T @ (weights * scaled)
+        derivative.data *= np.repeat(np.sqrt(weights), _IN_ROW)
 
         off, prior = _prior_rows(graph, layout, state)
         cost += 0.5 * float(off @ off)
         gradient = gradient + prior.T @ off
-        hessian = hessian + whitened.T @ whitened + prior.T @ prior
-        return cls(cost, gradient, hessian.tocsc(), whitened.tocsr())
+        hessian = hessian + layout.squares(derivative) + prior.T @ prior
+        return cls(cost, gradient, hessian.T, derivative)  # symmetric: its transpose has it by columns
 
 
 def _relative_poses(vision: VisionInformation, poses: Poses) -> tuple[Array, sparse.bsr_array]:
@@ -263,9 +300,8 @@ def _range_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tup
     values += [by.by_anchor, np.ones((len(index), 1))]
     columns += [layout.first_anchor + 3 * index[:, None] + np.arange(3), layout.first_bias + index[:, None]]
     value, column = np.concatenate(values, axis=1) / stddev_m[:, None], np.concatenate(columns, axis=1)
-    rows = np.repeat(np.arange(len(value)), value.shape[1])
-    shape = (len(value), layout.num)
-    return residuals, sparse.coo_array((value.ravel(), (rows, column.ravel())), shape=shape).tocsr()
+    starts = np.arange(0, value.size + 1, _IN_ROW)
+    return residuals, sparse.csr_array((value.ravel(), column.ravel(), starts), shape=(len(value), layout.num))
 
 
 def _prior_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tuple[Array, sparse.csr_array]:

@@ -202,31 +202,25 @@ def vision_information(observations: Observations, poses: Poses) -> VisionInform
     to_rig = root_weight[:, None, None] * np.nan_to_num(derivative) @ observations.cam_from_rig_rotation
     pieces, share = _thinned(_pieces(observations.point))
     n = len(poses)
-    keys, blocks = [], []
+    added: list[tuple[Indices, Array]] = []
     for rows in pieces:
         for batch in np.array_split(rows, max(len(rows) // _BATCH, 1)):
             key, block = _eliminate(batch, observations.frame, in_rig, to_rig, poses)
-            unique, where = np.unique(key, return_inverse=True)
-            adder = sparse.csr_array((np.ones(len(key)), (where, np.arange(len(key)))), shape=(len(unique), len(key)))
-            keys.append(unique)
-            blocks.append(adder @ block.reshape(len(key), 36))
-    key = np.concatenate(keys)
+            added.append(_added(key, block))
+    key, values = _added(*(np.concatenate(parts) for parts in zip(*added, strict=True)))
     reference, first, second = key // n**2, key // n % n, key % n
     pairs, place = np.unique(np.concatenate([reference * n + first, reference * n + second]), return_inverse=True)
-    rows, columns = place[: len(key)], place[len(key) :]
-    values = np.concatenate(blocks).reshape(-1, 6, 6) / share
-    inside = np.arange(6)
-    matrix = sparse.coo_array(
-        (
-            values.ravel(),
-            (
-                np.broadcast_to(6 * rows[:, None, None] + inside[:, None], values.shape).ravel(),
-                np.broadcast_to(6 * columns[:, None, None] + inside, values.shape).ravel(),
-            ),
-        ),
-        shape=(6 * len(pairs), 6 * len(pairs)),
-    )
-    return VisionInformation(poses, pairs // n, pairs % n, matrix.tocsr().tobsr((6, 6)))
+    starts = np.searchsorted(place[: len(key)], np.arange(len(pairs) + 1))
+    size = 6 * len(pairs)
+    matrix = sparse.bsr_array((values / share, place[len(key) :], starts), shape=(size, size))
+    return VisionInformation(poses, pairs // n, pairs % n, matrix)
+
+
+def _added(key: Indices, blocks: Array) -> tuple[Indices, Array]:
+    """The different keys, ascending, and the sum of the (n, 6, 6) blocks of each."""
+    unique, where = np.unique(key, return_inverse=True)
+    adder = sparse.csr_array((np.ones(len(key)), (where, np.arange(len(key)))), shape=(len(unique), len(key)))
+    return unique, (adder @ blocks.reshape(-1, 36)).reshape(-1, 6, 6)
 
 
 def _pieces(point: Indices) -> dict[int, Indices]:

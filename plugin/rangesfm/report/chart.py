@@ -29,7 +29,8 @@ ZOOM: Spec = {
 
 _NUM_PICTURE_COLORS = 128
 _MAP_DOT_PX, _DOT_PX = 1.6, 2.8
-_LEFT_OF_ROWS_PX, _RIGHT_OF_ROWS_PX = 64, 74
+# Least room beside rows; of their labels each letter takes so much.
+_LEFT_OF_ROWS_PX, _RIGHT_OF_ROWS_PX, _LETTER_PX = 64, 74, 6.8
 
 
 def css(color: str) -> str:
@@ -67,7 +68,7 @@ def _page_chart(panel: Panel) -> Spec:
     spec = panel_spec(panel, lambda i: {"name": f"series{i}"})
     encodings = ["x"] if panel.rows else ["x", "y"]
     spec["layer"][0]["params"] = [ZOOM | {"select": ZOOM["select"] | {"encodings": encodings}}]
-    left, right = (_LEFT_OF_ROWS_PX, _RIGHT_OF_ROWS_PX) if panel.rows else (64, 14)
+    left, right = _beside_rows(panel) if panel.rows else (64, 14)
     padding = {"top": 10, "bottom": 38, "left": left, "right": right}
     return {
         "spec": spec | {"autosize": "none", "padding": padding, "background": None, "config": CONFIG},
@@ -166,12 +167,22 @@ def _series(series: Series, data: Spec, y_range: Range) -> Spec:
     return _layer("line", [], color=color, strokeJoin="round", **how) | {"data": data}
 
 
+def _beside_rows(panel: Panel) -> tuple[int, int]:
+    """Pixels to the left and to the right."""
+    left, right = (max(map(len, texts)) for texts in list(zip(*panel.rows))[1:])
+    return (
+        max(_LEFT_OF_ROWS_PX, round(_LETTER_PX * left) + 16),
+        max(_RIGHT_OF_ROWS_PX, round(_LETTER_PX * right) + 16),
+    )
+
+
 def _labels(panel: Panel) -> list[Spec]:
     """Texts left and right of the heights that they belong to; marks, and texts beside them."""
     layers = []
     if panel.rows:
         rows = [{"y": at, "left": left, "right": right} for at, left, right in panel.rows]
-        left, right = (-8, "right", _LEFT_OF_ROWS_PX), ({"expr": "width + 8"}, "left", _RIGHT_OF_ROWS_PX)
+        of_left, of_right = _beside_rows(panel)
+        left, right = (-8, "right", of_left), ({"expr": "width + 8"}, "left", of_right)
         for side, (x, align, limit) in {"left": left, "right": right}.items():
             how = _LABEL | {"clip": False, "align": align, "limit": limit - 8}
             layers.append(_layer("text", rows, {"x": {"value": x}, "text": {"field": side}}, **how))

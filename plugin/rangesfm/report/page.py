@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from markupsafe import Markup
 
-from rangesfm.report import figures_path, figures_ranges, figures_scale, head, tables, text
+from rangesfm.report import figures_mistakes, figures_path, figures_ranges, figures_scale, head, tables, text
 from rangesfm.report.chart import ASSETS, css, page_charts
 from rangesfm.report.checks import quality_checks
 from rangesfm.report.content import Content
@@ -59,7 +59,7 @@ SECTIONS = (
         (figures_ranges.residuals_over_time, figures_ranges.residual_histogram, figures_ranges.absolute_errors),
         (tables.range_statuses, tables.ranges_per_anchor),
     ),
-    Section("mistakes", "Mistakes", (), (tables.mistakes,)),
+    Section("mistakes", "Mistakes", (figures_mistakes.mistakes,), (tables.mistakes,)),
     Section("anchors", "Anchors", (), (tables.anchors, tables.distances, tables.baselines)),
     Section(
         "run",

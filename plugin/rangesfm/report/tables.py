@@ -99,27 +99,19 @@ def mistakes(content: Content) -> Table:
         bar = Markup('<meter min="0" max="1" high="0.5" optimum="0" value="{:.3f}"></meter>').format(filled)
         unfound = "would not be found" if test.smallest_detectable is None else "not found"
         others = f" ({num_others} others like it: less evidence)" if num_others else ""
-        in_percent = test.unit == "1"
-        size = partial(_share, in_percent=in_percent)
-        columns: dict[str, Callable[[Any], str]] = dict.fromkeys(("stddev", "smallest_detectable"), size)
-        columns |= {
-            "effect_on_scale": partial(_share, in_percent=True),
-            "effect_on_place_m": partial(fixed, decimals=3),
-        }
-        cells = _cells(f"tests.{i}", test, columns)
+        names = ("stddev", "smallest_detectable", "effect_on_scale", "effect_on_place_m")
+        cells = _cells(f"tests.{i}", test, dict.fromkeys(names, partial(fixed, decimals=4)))
+        unit = "share" if test.unit == "1" else test.unit
         verdict = "found" if test.rejected else unfound
-        rows.append([f"{test.words}{others}", bar, verdict, *cells[:2], "%" if in_percent else test.unit, *cells[2:]])
+        rows.append([f"{test.words}{others}", bar, verdict, unit, *cells])
     return Table(
         "Mistakes that may have been made",
-        ["if it was made", "evidence", "", "stddev", "smallest found", "unit", "of the scale %", "of places m"],
+        ["if it was made", "evidence", "", "unit", "stddev", "smallest found", "of the scale", "of places m"],
         rows,
         "A bar more than half full is beyond chance. What is not found may still be there, smaller than the smallest "
-        "that is found; the last two columns say what that may do. All that was tested is in result.json.",
+        "that is found; the last two columns say what that may do, to the scale as a share of it. All tests are in "
+        "result.json.",
     )
-
-
-def _share(value: float | None, *, in_percent: bool) -> str:
-    return fixed(100 * value, 2) if in_percent and value is not None else fixed(value, 3)
 
 
 def comparison(content: Content) -> Table:

@@ -77,6 +77,11 @@ class ScaleEntry(Record):
     stddev_empirical: NumberOrNull
     interval_95: IntervalOrNull
     relative_stddev: ScaleUncertainty = Field(validation_alias=AliasChoices("relative_stddev", "uncertainty"))
+    error_stddevs: dict[Text, Number] = Field(
+        default_factory=dict,
+        validation_alias=AliasChoices("error_stddevs", AliasPath("errors", "learned", "stddev_of_component")),
+    )
+    """Of the components of the ranges' errors by name, as learnt: metres (slope: share of the distance)."""
     method: Text
     verdict: Literal["good", "doubtful"]
     reasons: tuple[Text, ...]

@@ -41,6 +41,8 @@ _SAME_ROTATION_DEG = 5.0
 _SAME_SHIFT = 0.05
 # Half of 3 stddevs squared: a rival this close in cost is not ruled out.
 MIN_COST_GAP = 4.5
+# Share of the ranges that a map must explain for another to be its rival.
+_MIN_EXPLAINED = 0.5
 
 WHY_SCALE_IS_OPEN = {
     "straight": ("the path is straight", "walk a bend"),
@@ -241,8 +243,10 @@ def weighted(problem: RangeProblem, errors: RangeErrors) -> RangeProblem:
 
 
 def refuse_ambiguity(solution: Solution, rivals: Sequence[RangeState], camera_side: str | None) -> None:
-    """GeometryError where the map of a rival fits as well."""
+    """GeometryError where the map of a rival fits as well; where none fits, the reason is another (see ``trust``)."""
     problem = solution.problem
+    if np.mean(solution.fit.weights > 0.1) < _MIN_EXPLAINED:
+        return
     for rival in rivals:
         other = solve(solution.problem, rival, loss=solution.errors.loss, tolerance=1e-8)
         is_elsewhere = camera_side is not None and camera_side_of(problem, other.state) not in (camera_side, None)

@@ -29,8 +29,6 @@ from rangesfm.scale.solution import Solution
 
 # Where ranges have no times: a path of so many metres is walked in a second.
 _WALKING_M_PER_S = 1.0
-# Of a normal variable's square, in variances.
-_MEDIAN_SQUARE = 0.455
 
 
 def learned_errors(
@@ -156,27 +154,25 @@ def scale_uncertainty(
         posed: measured lengths in it as uncertain as the map's bending makes them.
         bending_of_lengths: as of ``expected_scale_uncertainty``.
     """
-    summed, reweighted, change = _by_both_weights(posed, solution, learned, bending_of_lengths)
-    reweighted.components[REWEIGHTING] = change
-    return min(summed, reweighted, key=lambda each: each.empirical)
+    summed = expected_scale_uncertainty(solution, learned, bending_of_lengths)
+    return min(summed, _by_best_weights(posed, solution, learned), key=lambda each: each.empirical)
 
 
 def expected_scale_uncertainty(
-    posed: ScaleProblem, solution: Solution, learned: LearnedErrors, bending_of_lengths: float = 0.0
+    solution: Solution, learned: LearnedErrors, bending_of_lengths: float = 0.0
 ) -> ScaleUncertainty:
-    """The same before anything is measured: what half of the surveys will state at most.
+    """What the errors do to the scale by its robust weights: before anything is measured, how far off it will be.
+
+    A survey in which the best weights find much the same scale will state less.
 
     Args:
         bending_of_lengths: relative, of the scale by measured lengths.
     """
-    summed, reweighted, _ = _by_both_weights(posed, solution, learned, bending_of_lengths)
-    of_lengths = _say_of_lengths(solution) * bending_of_lengths
-    if of_lengths > 0:
-        reweighted.components[GIVEN] = float(np.hypot(reweighted.components.get(GIVEN, 0.0), of_lengths))
-    # The best estimate and its distance from any other are independent.
-    variance = summed.empirical**2 - reweighted.empirical**2
-    reweighted.components[REWEIGHTING] = float(np.sqrt(_MEDIAN_SQUARE * max(variance, 0.0)))
-    return min(summed, reweighted, key=lambda each: each.empirical)
+    summed = learned.stddev_of(scale_influence(solution.fit, solution.problem))
+    given = np.hypot(np.sqrt(_by_what_was_given(solution)[0, 0]), _say_of_lengths(solution) * bending_of_lengths)
+    if given > 0:
+        summed[GIVEN] = float(given)
+    return ScaleUncertainty(solution.fit.log_scale_stddev, summed)
 
 
 def _say_of_lengths(solution: Solution) -> float:
@@ -189,15 +185,9 @@ def _say_of_lengths(solution: Solution) -> float:
     return float(invert_information(fit.information)[0, 0] * (slopes @ slopes))
 
 
-def _by_both_weights(
-    posed: ScaleProblem, solution: Solution, learned: LearnedErrors, bending_of_lengths: float
-) -> tuple[ScaleUncertainty, ScaleUncertainty, float]:
-    """Of the scale at hand; of the scale that the best weights find; and how far they are apart."""
-    formal, linear = solution.fit.log_scale_stddev, _linear(posed, solution)
-    summed = learned.stddev_of(scale_influence(solution.fit, solution.problem))
-    given = np.hypot(np.sqrt(_by_what_was_given(solution)[0, 0]), _say_of_lengths(solution) * bending_of_lengths)
-    if given > 0:
-        summed[GIVEN] = float(given)
+def _by_best_weights(posed: ScaleProblem, solution: Solution, learned: LearnedErrors) -> ScaleUncertainty:
+    """Of the scale at hand, by how far it is from the one that the best weights find."""
+    linear = _linear(posed, solution)
     design, off_m = learned.cells.mean(linear.design), learned.cells.mean(linear.off_m)
     covariance = learned.covariance_m2
     covariance[np.diag_indices_from(covariance)] += ROUNDING * np.trace(covariance)
@@ -207,8 +197,8 @@ def _by_both_weights(
     reweighted = learned.stddev_of_cells(of_cells)
     if (given := np.linalg.norm(of_priors)) > 0:
         reweighted[GIVEN] = float(given)
-    change = abs(float(of_cells @ off_m + of_priors @ linear.prior_off))
-    return ScaleUncertainty(formal, summed), ScaleUncertainty(formal, reweighted), change
+    reweighted[REWEIGHTING] = abs(float(of_cells @ off_m + of_priors @ linear.prior_off))
+    return ScaleUncertainty(solution.fit.log_scale_stddev, reweighted)
 
 
 def _by_what_was_given(solution: Solution) -> Array:

@@ -28,7 +28,7 @@ _FEW_RANGES = 50
 _NOTHING_KNOWN = 1.0
 # Scatter of the scales from one anchor each: more than antennas and short stretches of a path make of it.
 _MAX_ANCHOR_SPREAD = 0.05
-_CALIBRATE = "calibrate the radio at the distances of this survey (rangesfm ranges calibrate)"
+CALIBRATE = "calibrate the radio at the distances of this survey (rangesfm ranges calibrate)"
 
 
 @dataclass(frozen=True)
@@ -192,4 +192,4 @@ def _drift_in_words(drift: CutoffTest, with_all: CutoffTest) -> _Doubt:
         f"short ranges disagree with long ones: without those under {drift.min_range_m:g} m the scale would change by "
         f"{100 * (drift.scale / with_all.scale - 1):+.1f} %"
     )
-    return _Doubt(reason, f"{_CALIBRATE}, and keep the anchors farther from the path")
+    return _Doubt(reason, f"{CALIBRATE}, or put the anchors farther from the path")

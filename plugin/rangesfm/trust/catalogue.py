@@ -230,12 +230,13 @@ def lever_arms(problem: Linearized) -> Iterator[Hypothesis]:
         length_m = float(np.median(np.linalg.norm(problem.on_map.problem.tag_from_center[of_tag], axis=1)))
         columns = np.where((problem.cells.tag_index == k)[:, None], -problem.by_lever_arm, 0.0)
 
-        def words(size: Array, name: str = name) -> str:
-            of_tag = f" of tag {name}" if name else ""
-            return (
-                f"the lever arm{of_tag} is off by about {np.linalg.norm(size):.2f} m "
-                f"({size[0]:+.2f}, {size[1]:+.2f}, {size[2]:+.2f} m along the camera's x, y, z)"
-            )
+        def words(size: Array, name: str = name, is_given: bool = length_m > 0) -> str:
+            of_tag, far = f" of tag {name}" if name else "", f"about {np.linalg.norm(size):.2f} m"
+            what = (
+                f"the lever arm{of_tag} is off by {far}" if is_given
+                else f"no lever arm{of_tag} is given, and the tag sits {far} from the lens"
+            )  # fmt: skip
+            return f"{what} ({size[0]:+.2f}, {size[1]:+.2f}, {size[2]:+.2f} m along the camera's x, y, z)"
 
         def correction(size: Array, tag: str = problem.on_map.tag_ids[k]) -> Correction:
             return Correction(tag_moves_m={tag: size})

@@ -31,9 +31,9 @@ _NUM_NEIGHBOURS = 8
 _OUTLYING = 3.0
 _LEAST_SCATTER_M = 0.08
 _NO_WEIGHT = 1e-6
-# What the ranges to each anchor, and those to all, drift by in a minute, as hands and bodies move: too slow to be
-# learnt beside a step that is looked for.
-_WANDERING_M, _WANDERING_S = 0.025, 60.0
+# What the ranges to each anchor, and those to all, drift by in a minute, as hands and bodies move and radios warm. It
+# stands for the component ``drift``, which is not learnt here: a step of all ranges would pass for it.
+_WANDERING_M, _WANDERING_S, _STANDS_FOR = 0.025, 60.0, "drift"
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Linearized:
             prior_design=np.hstack([self.prior_design, priors]),
             noise_m=self.scatter_m,
             curve_stddev_m=None if curve_m is None else self.cells.mean(curve_m),
-            ruled_out=self.on_map.ruled_out,
+            ruled_out=[*self.on_map.ruled_out, _STANDS_FOR],
             others_m2=_wandering(self.cells),
         )
         return replace(self, errors=learnt)
@@ -141,7 +141,7 @@ def _usual(cells_of_ranges: Cells, on_map: RangesOnMap, scatter_m: float) -> Lea
     return usual_errors(
         cells_of_ranges,
         curve_stddev_m=on_map.curve_stddev_m,
-        ruled_out=on_map.ruled_out,
+        ruled_out=[*on_map.ruled_out, _STANDS_FOR],
         stddevs={"white": scatter_m},
         others_m2=_wandering(cells_of_ranges),
     )

@@ -187,10 +187,11 @@ def _alternatives(problem: Linearized, before: float) -> Iterator[Cause]:
 
 
 def _settled(problem: Linearized) -> Linearized:
-    """At the likeliest state."""
-    step = Factorization(problem.with_usual_errors()).step()
-    state = state_after((problem.columns,), problem.on_map.state, step)
-    return at_state(problem, replace(problem.on_map, state=state))
+    """At the likeliest state, if a step of the linearised problem leads there: from far away it does not."""
+    here = Factorization(problem.with_usual_errors())
+    state = state_after((problem.columns,), problem.on_map.state, here.step())
+    there = at_state(problem, replace(problem.on_map, state=state))
+    return min(problem, there, key=lambda each: Factorization(each.with_usual_errors()).deviance())
 
 
 def _cause_of(each: Alternative, gain: float, penalty: float) -> Cause:

@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from rangesfm.arrays import Array, Mask
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.scale.range_equation import tag_positions
 from rangesfm.trust.catalogue import UNSEEN_MOVE_M
 from rangesfm.trust.hypothesis import Correction, Hypothesis, of_cells
 from rangesfm.trust.linearized import Linearized
 
 # A step is best found where it was: the ranges between the true time and the one that is tried fit neither way.
-_MAX_NUM_TIMES = 32
+_NUM_TIMES = 32
 # Of the survey, on either side: what begins later or ends sooner lasts as good as always.
 _LEAST_SHARE = 1 / 12
 # Shares of the survey that a stretch may last.
@@ -28,12 +28,7 @@ def anchors_moved(problem: Linearized) -> Iterator[Hypothesis]:
     tags_m = tag_positions(on_map.problem, on_map.state.metric_from_model)
     for k in _heard(problem):
         name, at = on_map.anchor_ids[k], on_map.state.anchors_m[k]
-        is_of = problem.cells.anchor_index == k
-        for time in _times(problem.time_s[is_of]):
-            is_after = is_of & (problem.time_s > time)
-            is_before = is_of & ~is_after
-            if min(is_after.sum(), is_before.sum()) < 3 * _MIN_NUM_CELLS:
-                continue
+        for time, after in _changes(problem, k, 3 * _MIN_NUM_CELLS):
 
             def words(size: Array, name: str = name, when: str = _when(problem, time)) -> str:
                 return (
@@ -56,19 +51,46 @@ def anchors_moved(problem: Linearized) -> Iterator[Hypothesis]:
                 correction=back,
                 adoption=_left_out(of_ranges),
                 unawares=UNSEEN_MOVE_M,
-                effect=of_cells(problem, np.where(is_after[:, None], problem.gradient.by_tag, 0.0)),
+                effect=of_cells(problem, after[:, None] * problem.gradient.by_tag),
             )
+
+
+def map_breaks(problem: Linearized) -> Iterator[Hypothesis]:
+    """From some time on the map lies elsewhere, as after a wrong match."""
+    on_map = problem.on_map
+    tags_m = tag_positions(on_map.problem, on_map.state.metric_from_model)
+    anchors_m = on_map.state.anchors_m[on_map.problem.anchor_index]
+    for time, after in _changes(problem, None, 3 * _MIN_NUM_CELLS):
+        of_ranges = on_map.time_s > time
+
+        def words(size: Array, when: str = _when(problem, time)) -> str:
+            return (
+                f"the map breaks: {when} it lies about {np.linalg.norm(size):.2f} m from where it should "
+                f"({-size[0]:+.2f}, {-size[1]:+.2f}, {-size[2]:+.2f} m in x, y, z)"
+            )
+
+        def back(size: Array, of_ranges: Mask = of_ranges) -> Correction:
+            grown_m = np.linalg.norm(tags_m + size - anchors_m, axis=1) - np.linalg.norm(tags_m - anchors_m, axis=1)
+            return Correction(longer_m=np.where(of_ranges, grown_m, 0.0))
+
+        yield Hypothesis(
+            "map break",
+            "",
+            unit="m",
+            words=words,
+            remedy="look at the photos there for a false match or too little overlap, and map the parts apart",
+            correction=back,
+            adoption=_left_out(of_ranges),
+            unawares=UNSEEN_MOVE_M,
+            effect=of_cells(problem, -after[:, None] * problem.gradient.by_tag),
+        )
 
 
 def steps(problem: Linearized) -> Iterator[Hypothesis]:
     """From some time on ranges read longer, those of one anchor or of all."""
     for k in [*(_heard(problem) if len(_heard(problem)) > 1 else []), None]:
         name = "" if k is None else problem.on_map.anchor_ids[k]
-        is_of = np.ones(len(problem.time_s), dtype=bool) if k is None else problem.cells.anchor_index == k
-        for time in _times(problem.time_s[is_of]):
-            is_after = is_of & (problem.time_s > time)
-            if min(is_after.sum(), (is_of & ~is_after).sum()) < _MIN_NUM_CELLS:
-                continue
+        for time, after in _changes(problem, k, _MIN_NUM_CELLS):
             of_ranges = _of_ranges(problem, k) & (problem.on_map.time_s > time)
 
             def words(size: Array, name: str = name, when: str = _when(problem, time)) -> str:
@@ -86,20 +108,19 @@ def steps(problem: Linearized) -> Iterator[Hypothesis]:
                 words=words,
                 remedy="see what changed then: a tag that slipped, a restarted radio, a door or a vehicle in between",
                 correction=correction,
-                effect=of_cells(problem, -is_after.astype(np.float64)),
+                effect=of_cells(problem, -after),
             )
 
 
 def stretches(problem: Linearized) -> Iterator[Hypothesis]:
     """For a while ranges read longer."""
+    windows, times = list(_windows(problem)), problem.on_map.time_s
     for k in [*(_heard(problem) if len(_heard(problem)) > 1 else []), None]:
         name = "" if k is None else problem.on_map.anchor_ids[k]
-        is_of = np.ones(len(problem.time_s), dtype=bool) if k is None else problem.cells.anchor_index == k
-        for start, end in _windows(problem):
-            inside = is_of & (problem.time_s >= start) & (problem.time_s < end)
+        for start, end, share in windows:
+            inside = np.where(_is_of(problem.cells.anchor_index, k), share, 0.0)
             if inside.sum() < _MIN_NUM_CELLS:
                 continue
-            times = problem.on_map.time_s
 
             def words(size: Array, name: str = name, when: str = _when(problem, start, end)) -> str:
                 to = f" to anchor {name}" if name else ""
@@ -112,8 +133,8 @@ def stretches(problem: Linearized) -> Iterator[Hypothesis]:
                 is_linear=True,
                 words=words,
                 remedy="look for what stood in the line of sight, and leave that stretch out",
-                correction=_left_out(_of_ranges(problem, k) & (times >= start) & (times < end)),
-                effect=of_cells(problem, -inside.astype(np.float64)),
+                correction=_left_out(_of_ranges(problem, k) & (times > start) & (times <= end)),
+                effect=of_cells(problem, -inside),
             )
 
 
@@ -121,10 +142,7 @@ def clock_jumps(problem: Linearized) -> Iterator[Hypothesis]:
     """The clocks' offset jumped at some time."""
     if problem.by_time is None:
         return
-    for time in _times(problem.time_s):
-        after = problem.time_s > time
-        if min(after.sum(), (~after).sum()) < _MIN_NUM_CELLS:
-            continue
+    for time, after in _changes(problem, None, _MIN_NUM_CELLS):
         of_ranges = problem.on_map.time_s > time
 
         def words(size: Array, when: str = _when(problem, time)) -> str:
@@ -141,7 +159,7 @@ def clock_jumps(problem: Linearized) -> Iterator[Hypothesis]:
             words=words,
             remedy="see whether a logger was restarted then, and run the two parts as surveys of their own",
             correction=correction,
-            effect=of_cells(problem, np.where(after, -problem.by_time, 0.0)),
+            effect=of_cells(problem, -after * problem.by_time),
         )
 
 
@@ -151,28 +169,47 @@ def _heard(problem: Linearized) -> list[int]:
 
 
 def _of_ranges(problem: Linearized, anchor: int | None) -> Mask:
-    index = problem.on_map.problem.anchor_index
-    return np.ones(len(index), dtype=bool) if anchor is None else np.asarray(index == anchor)
+    return _is_of(problem.on_map.problem.anchor_index, anchor)
+
+
+def _is_of(anchor_index: Indices, anchor: int | None) -> Mask:
+    """Of one anchor, or of all."""
+    return np.ones(len(anchor_index), dtype=bool) if anchor is None else np.asarray(anchor_index == anchor)
 
 
 def _left_out(rows: Mask) -> Callable[[Array], Correction]:
     return lambda _: Correction(left_out=rows)
 
 
-def _times(time_s: Array) -> Array:
-    """Between cells at (c,) times, away from the ends: between any two, or between as many as are looked at."""
-    ordered = np.sort(time_s)
-    between, aside = (ordered[1:] + ordered[:-1]) / 2, round(_LEAST_SHARE * len(ordered))
-    between = between[aside : len(between) - aside]
-    return np.asarray(between[:: max(-(-len(between) // _MAX_NUM_TIMES), 1)])
+def _changes(problem: Linearized, anchor: int | None, least: int) -> Iterator[tuple[float, Array]]:
+    """Times away from the ends, with (c,) shares of the cells of an anchor, or of all, that are from later; as many
+    cells as that at least on either side."""
+    ends = _LEAST_SHARE, 1 - _LEAST_SHARE
+    times = np.unique(np.quantile(problem.on_map.time_s[_of_ranges(problem, anchor)], np.linspace(*ends, _NUM_TIMES)))
+    is_of = _is_of(problem.cells.anchor_index, anchor)
+    for time, share in zip(times.tolist(), _shares_after(problem, times), strict=True):
+        after = np.where(is_of, share, 0.0)
+        if min(after.sum(), is_of.sum() - after.sum()) >= least:
+            yield time, after
 
 
-def _windows(problem: Linearized) -> Iterator[tuple[float, float]]:
+def _windows(problem: Linearized) -> Iterator[tuple[float, float, Array]]:
+    """Begin and end, and (c,) shares of the cells that are from in between."""
     for share in _STRETCHES:
         starts = np.arange(0.0, 1.0 - share + 1e-9, share / 2)
         for start in starts:
-            first, last = np.quantile(problem.time_s, [start, min(start + share, 1.0)])
-            yield float(first), float(last)
+            times = np.quantile(problem.on_map.time_s, [start, min(start + share, 1.0)])
+            after = _shares_after(problem, times)
+            yield float(times[0]), float(times[1]), after[0] - after[1]
+
+
+def _shares_after(problem: Linearized, times: Array) -> Array:
+    """(t, c) of the ranges of each cell, as they are averaged, those that are from later than (t,) rising times."""
+    cells, num = problem.cells, len(times) + 1
+    of_span = cells.of_range * num + np.searchsorted(times, problem.on_map.time_s)
+    worth = np.bincount(of_span, cells.weight, len(cells) * num).reshape(len(cells), num)
+    later: Array = np.cumsum(worth[:, :0:-1], axis=1)[:, ::-1].T / cells.worth
+    return later
 
 
 def _when(problem: Linearized, start: float, end: float | None = None) -> str:
@@ -186,4 +223,10 @@ def _when(problem: Linearized, start: float, end: float | None = None) -> str:
     return f"from {start - begin:.0f} to {end - begin:.0f} {unit} {after}"
 
 
-SCANNING: tuple[Callable[[Linearized], Iterator[Hypothesis]], ...] = (anchors_moved, steps, stretches, clock_jumps)
+SCANNING: tuple[Callable[[Linearized], Iterator[Hypothesis]], ...] = (
+    anchors_moved,
+    map_breaks,
+    steps,
+    stretches,
+    clock_jumps,
+)

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -17,8 +18,12 @@ from rangesfm.sources.source import is_source, open_source
 from rangesfm.survey.inputs import RangingInputs, times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.camera import cameras_of_photos, check_camera
+from rangesfm.vision.features import feature_options
+from rangesfm.vision.given_database import opened
 from rangesfm.vision.image_times import ImageTimes, list_images
-from rangesfm.vision.photos import usable_photos
+from rangesfm.vision.masks import contents_of_masks
+from rangesfm.vision.matching import matching_options
+from rangesfm.vision.photos import Photos, usable_photos
 from rangesfm.vision.rigs import read_rigs
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.photos import checked_keyframes, images_path, read_inputs, read_registered
@@ -65,9 +70,10 @@ def check_survey(survey: Survey) -> CheckedSurvey:
     checked = CheckedSurvey()
     journal = Journal(SilentProgress(), warnings=checked.warnings)
     model = survey.model_path if survey.images.path is None else None
+    photos = None
     with checked.finding_faults():
         if model is None:
-            _check_photos(survey, checked)
+            photos = _check_photos(survey, checked)
     with checked.finding_faults():
         inputs = read_inputs(survey, journal)
         checked.assumed += inputs.log.notes
@@ -85,14 +91,17 @@ def check_survey(survey: Survey) -> CheckedSurvey:
             keyframes = tuple(image.name for image in sfm.images.values())
             times = times_of_model(survey, sfm, model) if inputs.log.timestamp_s is not None else None
         _tell_of_times(survey, inputs, keyframes, times, checked)
+        if photos is not None:
+            _check_mapper(survey, photos.of(keyframes), checked)
     return checked
 
 
-def _check_photos(survey: Survey, checked: CheckedSurvey) -> None:
+def _check_photos(survey: Survey, checked: CheckedSurvey) -> Photos | None:
+    """The photos; None where they are still in a video or a bag."""
     folder = images_path(survey)
     if is_source(folder):
         _check_source(survey, folder, checked)
-        return
+        return None
     photos = usable_photos(folder, list_images(folder))
     sizes = [f"{num} of {width} x {height} pixels" for (width, height), num in Counter(photos.sizes).most_common()]
     more = [f"{len(sizes) - _MAX_NUM_SIZES} sizes more"] if len(sizes) > _MAX_NUM_SIZES else []
@@ -112,6 +121,19 @@ def _check_photos(survey: Survey, checked: CheckedSurvey) -> None:
         else:
             seen = "by EXIF" if camera.has_prior_focal_length else "a guess from the photos' size"
             checked.assumed.append(f"camera {what}, {seen}")
+    return photos
+
+
+def _check_mapper(survey: Survey, photos: Photos, checked: CheckedSurvey) -> None:
+    mapper = survey.mapper
+    with survey.source.naming_lines():
+        feature_options(mapper)
+        matching_options(mapper, len(photos.names), survey.output.seed)
+    if masks := contents_of_masks(mapper.mask_path, photos):
+        checked.facts.append(f"masks: of {len(masks)} photos")
+    with TemporaryDirectory() as scratch, opened(mapper.database_path, photos, Path(scratch)) as given:
+        if given is not None:
+            checked.facts.append(f"database: {given.note}")
 
 
 def _check_source(survey: Survey, path: Path, checked: CheckedSurvey) -> None:

@@ -35,11 +35,12 @@ from rangesfm.trust.finished_map import Doubt, doubts_of_map, place_of_map
 from rangesfm.vision.image_times import ImageTimes
 from rangesfm.vision.rigs import read_rigs
 from rangesfm.workflows.journal import Journal
-from rangesfm.workflows.trust_in_map import tested
+from rangesfm.workflows.trust_in_map import named_causes, tested
 
 # Scales of two clock offsets further apart than this are no answer, unless one of the offsets is nearly certain.
 _MAX_SPREAD = 0.03
 _NEARLY_CERTAIN = 0.95
+_ANY_STDDEV = 1e3
 
 
 def path_of_model(model: pycolmap.Reconstruction, times: ImageTimes | None) -> Trajectory:
@@ -223,7 +224,10 @@ def scale_by_survey(
     distances = None
     if inputs.tape is not None:
         distances = locate_distances(inputs.tape, sfm, observations.log.anchor_ids)
-    estimate = estimate_scale(survey, inputs, observations, trajectory, inputs.anchor_frame, distances)
+    try:
+        estimate = estimate_scale(survey, inputs, observations, trajectory, inputs.anchor_frame, distances)
+    except GeometryError as error:
+        raise _with_cause(error, survey, inputs, observations, trajectory, distances) from None
     by_rivals = (
         () if offset is None else doubts_by_rivals(survey, inputs, trajectory, distances, offset, estimate.value)
     )
@@ -249,6 +253,24 @@ def scale_by_survey(
     for doubt in (disagreements := disagreeing(metric.baselines)):
         journal.warn(doubt)
     return tested(survey, metric.doubted(by_rivals).doubted(disagreements, [ADVICE]), journal)
+
+
+def _with_cause(
+    error: GeometryError,
+    survey: Survey,
+    inputs: RangingInputs,
+    observations: RangeObservations,
+    trajectory: Trajectory,
+    distances: LocatedDistances | None,
+) -> GeometryError:
+    """A refusal with the mistake that the ranges show on the map all the same, if they show one."""
+    lenient = survey.model_copy(update={"scale": survey.scale.changed(max_relative_stddev=_ANY_STDDEV)})
+    try:
+        estimate = estimate_scale(lenient, inputs, observations, trajectory, inputs.anchor_frame, distances)
+    except GeometryError:
+        return error
+    causes = named_causes(estimate, trajectory, survey.output.seed)
+    return GeometryError(f"{error}; {causes}") if causes else error
 
 
 def doubts_by_rivals(

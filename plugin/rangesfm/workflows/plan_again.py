@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +22,7 @@ from rangesfm.ranging.observations import RangeStatus
 from rangesfm.result.folder import read_result_folder
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.ranges_as_used import RangesAsUsed
+from rangesfm.scale.verdict import CALIBRATE
 
 # Of photos without times.
 _PHOTO_RATE_HZ = 2.0
@@ -30,8 +31,7 @@ _PHOTO_RATE_HZ = 2.0
 def plan_of_result(path: str | Path) -> PlannedSurvey:
     """The same path and anchors, as the run's map has them, and as many ranges as it used.
 
-    What a map in the first camera's frame calls up is what is up in its photos. What the run learnt of its radio is not
-    taken over: the radio errs as radios mostly do.
+    What a map in the first camera's frame calls up is what is up in its photos. The radio errs as the run has learnt.
 
     Raises:
         InputError: no result folder, one without a metric model or without used ranges.
@@ -47,7 +47,8 @@ def plan_of_result(path: str | Path) -> PlannedSurvey:
     heard = {name: np.array(at) for name, at in folder.anchor_positions_m.items() if name in set(used.tolist())}
     anchors = [Anchor(name, at, stddevs[name]) for name, at in heard.items()]
     is_known = any(anchor.surveyed_position_m is not None for anchor in folder.summary.anchors.values())
-    return _planned(trajectory, anchors, _frame(folder.summary.frame, is_known=is_known), arm, len(used))
+    frame, stddevs_m = _frame(folder.summary.frame, is_known=is_known), folder.summary.scale.error_stddevs
+    return _planned(trajectory, anchors, frame, arm, len(used), stddevs_m)
 
 
 def with_advice(metric: MetricResult, tag_in_cam_m: Array) -> MetricResult:
@@ -72,20 +73,25 @@ def with_advice(metric: MetricResult, tag_in_cam_m: Array) -> MetricResult:
     trajectory = metric.trajectory.as_in(metric.final)
     arm = tag_in_cam_m[max(int(log.tag_index[used][0]), 0)]
     try:
-        planned = _planned(trajectory, anchors, _frame(estimate.frame, is_known=is_known), arm, int(used.sum()))
+        frame, learned = _frame(estimate.frame, is_known=is_known), estimate.errors.learned
+        stddevs = {} if learned is None else learned.stddev_of_component
+        planned = _planned(trajectory, anchors, frame, arm, int(used.sum()), stddevs)
         expected = expect(planned)
     except (InputError, GeometryError):  # nothing says what is up, or a run like it would not come about
         return metric
     words = best_words(advise(expected), for_scale=doubtful[0], for_place=doubtful[1])
-    calibrate = "rangesfm ranges calibrate"
-    if any(calibrate in said for said in estimate.advice):  # the same, with what it would gain
-        words = [said for said in words if calibrate not in said]
-    advice = tuple(dict.fromkeys((*estimate.advice, *words)))
-    return replace(metric, estimate=replace(estimate, advice=advice))
+    is_computed = any(each.startswith(CALIBRATE) for each in words)
+    before = [each for each in estimate.advice if not (is_computed and each.startswith(CALIBRATE))]
+    return replace(metric, estimate=replace(estimate, advice=tuple(dict.fromkeys((*before, *words)))))
 
 
 def _planned(
-    trajectory: Trajectory, anchors: Sequence[Anchor], frame: str, tag_in_cam_m: Array, num_ranges: int
+    trajectory: Trajectory,
+    anchors: Sequence[Anchor],
+    frame: str,
+    tag_in_cam_m: Array,
+    num_ranges: int,
+    component_stddevs: Mapping[str, float],
 ) -> PlannedSurvey:
     """Upright, and with times where none are known."""
     up = up_in_world(trajectory, "auto", is_site=frame == "site")
@@ -97,6 +103,7 @@ def _planned(
         anchor_frame=frame,
         rate_hz=1.0,
         tag_in_cam_m=tuple(tag_in_cam_m.tolist()),
+        component_stddevs=component_stddevs,
     )
     return planned.ranging(num_ranges)
 

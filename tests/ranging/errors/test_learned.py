@@ -55,7 +55,7 @@ def test_every_component_is_a_covariance(component, walked: Cells) -> None:  # t
     assert np.linalg.eigvalsh(correlation).min() > -1e-9 * len(walked)
 
 
-@pytest.mark.parametrize("name", ["antenna", "bending", "time", "place", "view", "bias"])
+@pytest.mark.parametrize("name", ["antenna", "off_axis", "bending", "time", "place", "view", "bias"])
 def test_errors_ten_times_as_large_as_usual_are_seen_whatever_they_are_taken_for(name: str, walked: Cells) -> None:
     component = next(each for each in COMPONENTS if each.name == name)
     values, vectors = np.linalg.eigh(component.correlation(walked))
@@ -66,6 +66,15 @@ def test_errors_ten_times_as_large_as_usual_are_seen_whatever_they_are_taken_for
     covariance = learned.covariance_m2
     variance = np.mean(np.diag(covariance)) - np.mean(covariance)
     assert 0.7 < np.sqrt(variance) / np.std(off_m) < 3.0
+
+
+def test_anchors_that_are_all_late_towards_where_they_do_not_face_are_seen_to_be_alike(walked: Cells) -> None:
+    facing = np.stack([walked.from_anchor[walked.anchor_index == k].mean(axis=0) for k in range(NUM_ANCHORS)])
+    facing /= np.linalg.norm(facing, axis=1)[:, None]
+    angle = np.arccos(np.clip(np.sum(walked.from_anchor * facing[walked.anchor_index], axis=1), -1, 1))
+    found = stddevs(learn(walked, 0.3 * angle + 0.02 * np.random.default_rng(2).standard_normal(len(walked))))
+    assert found["off_axis"] > 2 * found["antenna"]
+    assert found["off_axis"] > 2 * found["tag_antenna"]
 
 
 def test_noise_alone_leaves_the_rest_at_what_radios_let_expect_or_less(walked: Cells) -> None:

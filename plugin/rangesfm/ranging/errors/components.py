@@ -22,6 +22,8 @@ _TIME_S = 3.0
 _DRIFT_S = 60.0
 # Of the tag's place, and of 1 minus the cosine between directions in the camera: as echoes and antennas' lobes have it.
 _PLACE_M, _LOBE = 0.5, 0.1
+# Radians away from the way an anchor faces.
+_OFF_AXIS_RAD = 1.0
 # In logarithms of distance.
 _SMOOTH, _ROUGH = 1.0, 0.5
 _MIN_DISTANCE_M = 0.05
@@ -135,6 +137,16 @@ def _tag_antenna(cells: Cells) -> Array:
     return _same(cells.tag_index) * alike_by_direction(cells.in_cam)
 
 
+def _off_axis(cells: Cells) -> Array:
+    """Anchors face the path: of one make, they are late alike towards where they do not face."""
+    same = _same(cells.anchor_index)
+    facing = same @ cells.from_anchor
+    cosine = np.sum(cells.from_anchor * facing, axis=1) / np.maximum(np.linalg.norm(facing, axis=1), 1e-9)
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    alike: Array = np.exp(-0.5 * (_apart(angle) / _OFF_AXIS_RAD) ** 2)
+    return alike
+
+
 def _bending(cells: Cells) -> Array:
     length_s = max(_BEND * float(np.ptp(cells.time_s)), 1e-9)
     alike: Array = (cells.from_anchor @ cells.from_anchor.T) * np.exp(-_apart(cells.time_s) / length_s)
@@ -168,6 +180,7 @@ def components(expected: Mapping[str, tuple[float, float]]) -> tuple[Component, 
         of("rough_curve", _rough, "unevenness of the error curve", calibrated_median=0.005),
         of("slope", _proportional, "ranges long by a share", calibrated_median=0.003),
         of("antenna", _antenna, "anchors' antennas by direction", is_of_anchor=True),
+        of("off_axis", _off_axis, "anchors' antennas, alike, away from the path's middle"),
         of("tag_antenna", _tag_antenna, "the tag's antenna by direction"),
         of("bending", _bending, "the map's own bending"),
     )

@@ -49,6 +49,11 @@ class LearnedErrors:
         return together
 
     @property
+    def stddev_of_component(self) -> dict[str, float]:
+        """By name."""
+        return dict(zip(self.names, self.stddevs.tolist(), strict=True))
+
+    @property
     def unlikeliness(self) -> float:
         """What radios let expect has against these stddevs, as -2 times a logarithm."""
         known = {component.name: component for component in COMPONENTS}
@@ -59,6 +64,12 @@ class LearnedErrors:
             if name in known
         ]
         return float(np.sum(np.square(off)))
+
+    def without(self, name: str) -> LearnedErrors:
+        """But for one component."""
+        kept = [row for row, each in enumerate(self.names) if each != name]
+        names = tuple(self.names[row] for row in kept)
+        return replace(self, names=names, stddevs=self.stddevs[kept], covariances_m2=self.covariances_m2[kept])
 
     def subset(self, rows: Indices) -> LearnedErrors:
         """Of some of the ranges."""
@@ -135,12 +146,15 @@ def usual_errors(
         stddevs: of some components, by name, in place of these.
     """
     components = [component for component in COMPONENTS if component.name not in ruled_out]
-    is_calibrated = curve_stddev_m is not None
-    # Of a lognormal stddev, the root of the mean square.
-    usual = [_median(component, is_calibrated) * np.exp(component.spread**2) for component in components]
-    sizes = np.array([(stddevs or {}).get(c.name, size) for c, size in zip(components, usual, strict=True)])
+    known = usual_stddevs(is_calibrated=curve_stddev_m is not None) | dict(stddevs or {})
+    sizes = np.array([known[component.name] for component in components])
     covariances = np.array([size**2 * _covariance(c, cells, 1.0) for c, size in zip(components, sizes, strict=True)])
     return _of_components(cells, components, sizes, covariances, _known(cells, curve_stddev_m, others_m2))
+
+
+def usual_stddevs(*, is_calibrated: bool) -> dict[str, float]:
+    """Of all components by name: roots of the mean variances over radios (of a lognormal stddev)."""
+    return {c.name: float(_median(c, is_calibrated) * np.exp(c.spread**2)) for c in COMPONENTS}
 
 
 def _of_components(

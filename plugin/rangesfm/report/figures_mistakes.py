@@ -1,0 +1,120 @@
+"""Figure of the tests of mistakes: which were found, which were not, and what those that were not may do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from rangesfm.report.content import Content
+from rangesfm.report.plot import Figure, Mark, Panel, Series
+from rangesfm.report.text import percent, rough, signed
+from rangesfm.result.entries import MistakeEntry
+
+MAX_NUM_ROWS = 16
+_BEYOND_CHANCE = 1.0
+# Ends of the axes; what lies beyond is drawn at the edge.
+_MOST_EVIDENCE, _MOST_EFFECT_PERCENT = 3.0, 20.0
+_ROW_HEIGHT_PX = 22.0
+_COLORS = {"found": "before", "not found": "after", "would not be found, however large": "rejected"}
+
+
+def mistakes(content: Content) -> Figure | None:
+    """Of those that were found, then of those that may do most: the evidence, and what could have stayed hidden."""
+    tests = sorted(content.summary.tests, key=lambda test: (not test.rejected, -_effect_percent(test)))
+    shown = [test for test in tests if test.rejected or _effect_percent(test) > 0][:MAX_NUM_ROWS]
+    if not shown:
+        return None
+    evidence = _panel(
+        "Evidence",
+        "For each mistake how far the ranges speak for it, and where chance ends",
+        "test value over its threshold (roots)",
+        shown,
+        _evidence,
+        [_size(test) for test in shown],
+        _MOST_EVIDENCE,
+        line=("beyond chance", _BEYOND_CHANCE),
+    )
+    low, high = content.summary.scale.interval_95 or (1.0, 1.0)
+    could_hide = _panel(
+        "What could hide",
+        "For each mistake how much one that is just not found may change the scale",
+        "change of the scale %",
+        shown,
+        _effect_percent,
+        [_smallest(test) for test in shown],
+        _MOST_EFFECT_PERCENT,
+        band=("half of the scale's interval", 0.0, 50 * math.log(high / low)),
+    )
+    caption = (
+        "What was tested for. Left: how far the ranges speak for each mistake, with its size as they have it; right of "
+        "the line it is no chance. Right: the smallest that would have been found, and the most that one of that size "
+        "does to the scale. What lies beyond an axis is drawn at its edge; the table has all."
+    )
+    return Figure("mistake_tests", caption, (evidence, could_hide), layout="views")
+
+
+def _panel(
+    title: str,
+    description: str,
+    label: str,
+    tests: Sequence[MistakeEntry],
+    value_of: Callable[[MistakeEntry], float],
+    right: Sequence[str],
+    most: float,
+    *,
+    line: tuple[str, float] | None = None,
+    band: tuple[str, float, float] | None = None,
+) -> Panel:
+    values = [value_of(test) for test in tests]
+    end = min(1.15 * max(1.0, *values), most)
+    series, marks, rows = [], [], []
+    for row, (test, value, told) in enumerate(zip(tests, values, right, strict=True)):
+        kind, to = _kind(test), min(value, end)
+        series.append(Series(kind, _COLORS[kind], np.array([[0.0, row], [to, row]]), "line"))
+        marks.append(Mark(kind, _COLORS[kind], "disc", to, row, "", test.words))
+        rows.append((float(row), f"{test.name} {test.subject}".strip(), told))
+    return Panel(
+        title,
+        description,
+        (label, ""),
+        tuple(series),
+        marks=tuple(marks),
+        x_range=(0.0, end),
+        y_range=(len(tests) - 0.5, -0.5),
+        size=(200.0, _ROW_HEIGHT_PX * len(tests) + 10),
+        rows=tuple(rows),
+        line=line,
+        band=band,
+    )
+
+
+def _kind(test: MistakeEntry) -> str:
+    found, unfound, never = _COLORS
+    if test.rejected:
+        return found
+    return unfound if test.smallest_detectable is not None else never
+
+
+def _evidence(test: MistakeEntry) -> float:
+    return math.sqrt(max(test.statistic, 0.0) / test.threshold) if test.threshold > 0 else 0.0
+
+
+def _effect_percent(test: MistakeEntry) -> float:
+    """Without end where nothing could find it; 0 of one whose effect nobody computed."""
+    if test.effect_on_scale is not None:
+        return 100 * test.effect_on_scale
+    return 0.0 if test.rejected or test.smallest_detectable is not None else math.inf
+
+
+def _size(test: MistakeEntry) -> str:
+    if test.size is None:
+        return ""
+    return signed(100 * test.size, 1, "%") if test.unit == "1" else signed(test.size, 2, test.unit)
+
+
+def _smallest(test: MistakeEntry) -> str:
+    if test.smallest_detectable is None:
+        return "never found"
+    return percent(test.smallest_detectable) if test.unit == "1" else rough(test.smallest_detectable, test.unit)

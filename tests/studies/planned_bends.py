@@ -1,0 +1,132 @@
+"""Whether a plan knows how far photos let a map bend: predicted stddevs of keyframes, and the spread of refined maps.
+
+Run: python -m tests.studies.planned_bends --rows FILE [--num_seeds 40] [--surveys NAME]
+
+Simulated features of known noise are mapped, scaled and refined with ranges by the stages themselves. Prints for each
+survey the predicted stddev of keyframes (root mean square over the path) as of a map that is rigid and as its photos
+let expect, the spread of the refined keyframes about the truth with its stddev by chance, and the map's bend alone:
+predicted, and as the maps have it before any range is used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from tests.studies.kept_runs import Row, spread, study
+from tests.studies.simulated_survey import (
+    RANGE_MODEL,
+    TAG_IN_CAM_M,
+    Survey,
+    drawn_biases,
+    lap_survey,
+    mapped,
+    range_log,
+    run_stages,
+    unit_pixel_errors,
+    yard_survey,
+)
+
+from rangesfm.geometry.similarity import align_points, rmse
+from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.planning.expected import Expected, expect
+from rangesfm.planning.photos import PlannedPhotos
+from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.errors.components import COMPONENTS
+
+# The simulated camera's.
+_WIDTH_PX, _FOCAL_PX = 960, 750.0
+_FIELD_OF_VIEW_DEG = float(2 * np.rad2deg(np.arctan(_WIDTH_PX / 2 / _FOCAL_PX)))
+
+
+def photos(num_points: int, seen_m: tuple[float, float], max_track_length: int | None, pixels: float) -> PlannedPhotos:
+    return PlannedPhotos(
+        field_of_view_deg=_FIELD_OF_VIEW_DEG,
+        seen_m=seen_m,
+        num_points=num_points,
+        num_photos_of_point=max_track_length or 1000,
+        closes_loops=max_track_length is None,
+        feature_stddev=pixels / _WIDTH_PX,
+    )
+
+
+def lap(num_observations: int) -> Survey:
+    """A quarter of one, of 150 keyframes."""
+    return lap_survey(num_observations=num_observations, anchor_m=(10.0, 5.0, 4.0), num_keyframes=150)
+
+
+IN_YARD, ON_LAP = (2.0, 20.0), (6.0, 40.0)
+SURVEYS: dict[str, tuple[Callable[[], Survey], PlannedPhotos, float]] = {
+    "yard, closed loop": (yard_survey, photos(80, IN_YARD, None, 1.0), 1.0),
+    "yard, open": (partial(yard_survey, max_track_length=8), photos(80, IN_YARD, 8, 1.0), 1.0),
+    "yard, open, one known anchor": (
+        partial(yard_survey, anchor_frame="first_camera", max_track_length=8),
+        photos(80, IN_YARD, 8, 1.0),
+        1.0,
+    ),
+    "lap, open, sharp": (partial(lap, 100), photos(100, ON_LAP, 8, 0.5), 0.5),
+    "lap, open, blurred": (partial(lap, 60), photos(60, ON_LAP, 8, 1.0), 1.0),
+}
+
+
+def planned(survey: Survey, seen: PlannedPhotos) -> PlannedSurvey:
+    model = survey.model
+    # One range of each anchor at each photo, however far apart these are.
+    times = np.arange(len(model.timestamps_s)) / 2
+    path = Trajectory(np.arange(len(times)), tuple(model.timestamps_s), times, model.centers_m, model.world_from_cam)
+    nothing = {component.name: 1e-6 for component in COMPONENTS}
+    return PlannedSurvey(
+        path,
+        tuple(Anchor(name, at) for name, at in survey.anchors_m.items()),
+        survey.anchor_frame,
+        2.0,
+        (float(TAG_IN_CAM_M[0]), float(TAG_IN_CAM_M[1]), float(TAG_IN_CAM_M[2])),
+        RANGE_MODEL,
+        component_stddevs=nothing
+        | {
+            "white": survey.range_stddev_m,
+            "bias": RANGE_MODEL.range_bias_stddev_m,
+            "common_bias": RANGE_MODEL.common_bias_stddev_m,
+        },
+        photos=seen,
+    )
+
+
+def one_run(survey: Survey, pixel_stddev: float, seed: int) -> Row:
+    """Root mean square errors of keyframes, refined, and before that away from the best similarity."""
+    sfm = mapped(survey, pixel_stddev * unit_pixel_errors(survey, seed))
+    log = range_log(survey, seed, biases_m=drawn_biases(survey, seed))
+    truth = survey.model.centers_m
+    free = trajectory_from_reconstruction(sfm, survey.model.timestamps_s).centers
+    done = run_stages(survey, sfm, log)
+    return {"refined": rmse(done.refined.centers - truth), "bend": rmse(align_points(free, truth).apply(free) - truth)}
+
+
+def rms(stddevs: Expected) -> float:
+    return float(np.sqrt(np.mean(stddevs.keyframe_stddevs_m**2)))
+
+
+def main() -> None:
+    asked = study(__doc__)
+    print(f"{'survey':30}{'rigid':>9}{'planned':>10}{'spread':>9}{'ratio':>16}{'bend':>10}{'spread':>9}{'ratio':>16}")
+    for name, (make, seen, pixel_stddev) in SURVEYS.items():
+        if not name.startswith(asked.beginning):
+            continue
+        survey = make()
+        plan = planned(survey, seen)
+        rigid, expected = expect(replace(plan, photos=None)), expect(plan)
+        rows = asked.runs_of(name, partial(one_run, survey, pixel_stddev))
+        told = [f"{name:30}{rms(rigid):7.3f} m"]
+        free_m = 3**0.5 * expected.learned.stddev_of_component["bending"]
+        for predicted, of in ((rms(expected), "refined"), (free_m, "bend")):
+            found, chance = spread(rows, of)
+            ratio = predicted / found
+            told.append(f"{predicted:8.3f} m{found:7.3f} m{ratio:8.2f} +-{ratio * chance:4.2f}")
+        print("".join(told), flush=True)
+
+
+if __name__ == "__main__":
+    main()
