@@ -17,7 +17,6 @@ from rangesfm.report.text import count, duration, fixed, keyed, plain, signed
 from rangesfm.result.entries import AnchorEntry, median, rms
 
 _Columns = Mapping[str, Callable[[Any], str]]
-_to_4 = partial(fixed, decimals=4)
 _WAYS = ("to the right", "downward", "forward")
 _REFINEMENT = {
     "kept": "refined map kept",
@@ -85,23 +84,33 @@ def ranges_per_anchor(content: Content) -> Table:
 
 
 def mistakes(content: Content) -> Table:
-    """Of each mistake that may have been made, whether it was found; a bar that is half full is at the threshold."""
-    columns: dict[str, Callable[[Any], str]] = {"size": partial(signed, decimals=3)}
-    columns |= dict.fromkeys(("stddev", "smallest_detectable", "effect_on_scale", "effect_on_place_m"), _to_4)
-    rows = []
-    for i, test in enumerate(content.summary.tests):
+    """Of each mistake that may have been made, whether it was found; a bar that is half full is at the threshold.
+
+    Of a kind that was not found, as with each of the anchors, the likeliest stands for all.
+    """
+    tests, rows = content.summary.tests, []
+    likeliest: set[str] = set()
+    for i, test in enumerate(tests):
+        if not test.rejected and test.name in likeliest:
+            continue
+        likeliest |= set() if test.rejected else {test.name}
+        num_others = 0 if test.rejected else sum(other.name == test.name and not other.rejected for other in tests) - 1
         filled = min(test.statistic / (2 * test.threshold), 1.0) if test.threshold else 0.0
         bar = Markup('<meter min="0" max="1" high="0.5" optimum="0" value="{:.3f}"></meter>').format(filled)
         unfound = "would not be found" if test.smallest_detectable is None else "not found"
-        name = f"{test.name} {test.subject}".strip()
+        others = f" ({num_others} others like it: less evidence)" if num_others else ""
+        names = ("stddev", "smallest_detectable", "effect_on_scale", "effect_on_place_m")
+        cells = _cells(f"tests.{i}", test, dict.fromkeys(names, partial(fixed, decimals=4)))
+        unit = "share" if test.unit == "1" else test.unit
         verdict = "found" if test.rejected else unfound
-        rows.append([name, bar, verdict, test.unit, *_cells(f"tests.{i}", test, columns)])
+        rows.append([f"{test.words}{others}", bar, verdict, unit, *cells])
     return Table(
         "Mistakes that may have been made",
-        ["mistake", "evidence", "", "unit", "size", "stddev", "smallest found", "of the scale", "of places m"],
+        ["if it was made", "evidence", "", "unit", "stddev", "smallest found", "of the scale", "of places m"],
         rows,
         "A bar more than half full is beyond chance. What is not found may still be there, smaller than the smallest "
-        "that is found; the last two columns say what that may do, to the scale as a share of it.",
+        "that is found; the last two columns say what that may do, to the scale as a share of it. All tests are in "
+        "result.json.",
     )
 
 
@@ -202,7 +211,11 @@ def refinement(content: Content) -> Table:
     """What the solver did."""
     refine = content.summary.refine
     values = {} if refine is None else refine.to_json()
-    rows = [[_REFINEMENT[name], keyed(f"refine.{name}", value, plain(value))] for name, value in values.items()]
+    rows = [
+        [_REFINEMENT[name], keyed(f"refine.{name}", value, plain(value))]
+        for name, value in values.items()
+        if value not in (None, "", {})
+    ]
     return Table("Refinement", [], rows, is_narrow=True)
 
 

@@ -81,6 +81,8 @@ def plain(value: Any) -> str:
         return f"{value:.6g}".replace("-", "−", 1) if value < 0 else f"{value:.6g}"
     if isinstance(value, list):
         return ", ".join(map(plain, value)) or NOTHING
+    if isinstance(value, dict):
+        return "; ".join(f"{key}: {plain(inner)}" for key, inner in value.items()) or NOTHING
     return str(value)
 
 

@@ -36,6 +36,7 @@ QUANTITIES = (
     *("los", "nlos", *STAMPS),
 )
 
+_MAX_TIME_S = 1e11  # three thousand years
 _NOTHING = 1e-12  # in any unit
 _TEXTS = ("image_name", "date", "anchor_id", "tag_id", "antenna")
 
@@ -239,6 +240,7 @@ def _timestamps(table: Table, name: Mapping[str, str], unit: str | None, notes: 
     if unit is None:
         unit = _noted(notes, time_unit(column, times))
     seconds = times * SECONDS_PER_UNIT[unit]
+    table.refuse(np.abs(seconds) > _MAX_TIME_S, column, f"a time in {unit}")
     return seconds + 1e-9 * table.numbers(name["nanoseconds"]) if "nanoseconds" in name else seconds
 
 
