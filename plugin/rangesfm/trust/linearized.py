@@ -31,9 +31,11 @@ _NUM_NEIGHBOURS = 8
 _OUTLYING = 3.0
 _LEAST_SCATTER_M = 0.08
 _NO_WEIGHT = 1e-6
-# What the ranges to each anchor, and those to all, drift by in a minute, as hands and bodies move and radios warm. It
-# stands for the component ``drift``, which is not learnt here: a step of all ranges would pass for it.
-_WANDERING_M, _WANDERING_S, _STANDS_FOR = 0.025, 60.0, "drift"
+# What the ranges to each anchor, and those to all, drift by in a minute, as hands and bodies move, however little a
+# survey shows of the radio's own drift: too slow to be told from a step that is looked for.
+_WANDERING_M, _WANDERING_S = 0.025, 60.0
+# In spreads over radios: what errs by more than that is no radio but a mistake, which shall not pass for noise.
+_MOST_UNUSUAL = 3.0
 
 
 @dataclass(frozen=True)
@@ -85,8 +87,9 @@ class Linearized:
             prior_design=np.hstack([self.prior_design, priors]),
             noise_m=self.scatter_m,
             curve_stddev_m=None if curve_m is None else self.cells.mean(curve_m),
-            ruled_out=[*self.on_map.ruled_out, _STANDS_FOR],
+            ruled_out=self.on_map.ruled_out,
             others_m2=_wandering(self.cells),
+            most_unusual=_MOST_UNUSUAL,
         )
         return replace(self, errors=learnt)
 
@@ -141,7 +144,7 @@ def _usual(cells_of_ranges: Cells, on_map: RangesOnMap, scatter_m: float) -> Lea
     return usual_errors(
         cells_of_ranges,
         curve_stddev_m=on_map.curve_stddev_m,
-        ruled_out=[*on_map.ruled_out, _STANDS_FOR],
+        ruled_out=on_map.ruled_out,
         stddevs={"white": scatter_m},
         others_m2=_wandering(cells_of_ranges),
     )

@@ -100,6 +100,7 @@ def learn_errors(
     curve_stddev_m: Array | None = None,
     ruled_out: Collection[str] = (),
     others_m2: Mapping[str, Array] | None = None,
+    most_unusual: float = np.inf,
 ) -> LearnedErrors:
     """Restricted maximum likelihood (Patterson and Thompson, 1971) with lognormal priors on the stddevs.
 
@@ -111,6 +112,7 @@ def learn_errors(
         curve_stddev_m: (n,) of a learnt error curve that has been taken off; None if none has.
         ruled_out: components that the user knows not to be there.
         others_m2: (c, c) covariances of what else there is, by name, of which nothing is to be learnt.
+        most_unusual: how far above its median any stddev may be, in spreads over radios.
     """
     widening = max(1.0, noise_m / _USUAL_NOISE_M) ** _WIDENING_POWER
     components = [component for component in COMPONENTS if component.name not in ruled_out]
@@ -126,7 +128,7 @@ def learn_errors(
         cells.mean(design),
         prior_design,
     )
-    stddevs = likelihood.mean_stddevs(likelihood.most_likely())
+    stddevs = likelihood.mean_stddevs(likelihood.most_likely(most_unusual))
     covariances = stddevs[:, None, None] ** 2 * likelihood.of_components
     return _of_components(cells, components, stddevs, covariances, known)
 
@@ -205,9 +207,10 @@ class _Likelihood:
     design: Array
     prior_design: Array
 
-    def most_likely(self) -> Array:
+    def most_likely(self, most_unusual: float) -> Array:
         """(k,)"""
-        bounds = [(median - _FARTHEST_BELOW, median + _FARTHEST_ABOVE) for median in self.log_medians]
+        above = np.minimum(most_unusual * self.spreads, _FARTHEST_ABOVE)
+        bounds = np.column_stack([self.log_medians - _FARTHEST_BELOW, self.log_medians + above])
         options = {"maxiter": _MAX_NUM_ITERATIONS, "ftol": _TOLERANCE}
         found = minimize(
             self._negative_with_gradient, self.log_medians, jac=True, method="L-BFGS-B", bounds=bounds, options=options
