@@ -15,6 +15,7 @@ _SCALE = {
         "formal": 0.003,
         "components": {"time": 0.004, "curve": 0.009},
     },
+    "error_stddevs": {"time": 0.02, "curve": 0.04},
     "method": "robust",
     "verdict": "good",
     "reasons": ["the scale is known to 2 % (95 % interval)"],

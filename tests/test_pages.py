@@ -26,7 +26,7 @@ from tests.conftest import TAG_IN_CAM_M, TIME_OFFSET_S
 from tests.simulated.path import loop_path
 
 from rangesfm.cli.arguments import COMMANDS, normalize, parse
-from rangesfm.planning.settings import Plan
+from rangesfm.planning.settings import TABLES as PLAN_TABLES
 from rangesfm.survey.settings import KEYS, read_survey
 
 if TYPE_CHECKING:
@@ -176,7 +176,7 @@ def test_every_page_is_linked_from_the_readme() -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_keys_in_the_text_exist(page: Path) -> None:
-    of_a_plan = {(table, key) for table, field in Plan.model_fields.items() for key in field.annotation.model_fields}  # type: ignore[union-attr]
+    of_a_plan = {(table, key) for table, model in PLAN_TABLES.items() for key in model.model_fields}
     named = set(re.findall(r"`\[(\w+)\] (\w+)", page.read_text(encoding="utf-8")))
     assert named - {(key.table, key.name) for key in KEYS} - of_a_plan == set()
 

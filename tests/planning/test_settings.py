@@ -96,3 +96,12 @@ def test_an_anchor_without_a_place_is_no_plan(tmp_path: Path) -> None:
     (tmp_path / "anchors.csv").write_text("anchor_id,x_m,y_m,z_m\nA,0,0,2\nB,,,\n")
     with pytest.raises(InputError, match="anchor B has no position"):
         read_plan(written(tmp_path, '[anchors]\npath = "anchors.csv"\n' + PATH))
+
+
+def test_photos_count_only_where_their_table_stands(tmp_path: Path) -> None:
+    assert read_plan(written(tmp_path, ANCHORS + PATH)).photos is None
+    photos = read_plan(written(tmp_path, ANCHORS + PATH + "[photos]\nseen_m = [1, 30.5]\n")).photos
+    assert photos is not None
+    assert photos.seen_m == (1.0, 30.5)
+    with pytest.raises(InputError, match="larger one last"):
+        read_plan(written(tmp_path, ANCHORS + PATH + "[photos]\nseen_m = [8, 2]\n"))

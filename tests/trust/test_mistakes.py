@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.studies.erring_surveys import SITES, Given, run, surveyed
+from tests.studies.mistakes import kinds
 
 from rangesfm.trust.verdict import TrustVerdict
 
@@ -83,6 +84,14 @@ def test_two_labels_that_were_swapped_are_named() -> None:
     np.testing.assert_array_equal(found.causes[0].correction.anchors_m["E"], anchors["E"])
 
 
+def test_labels_that_are_one_line_off_are_named() -> None:
+    given = surveyed(HALL, SEED)
+    at = list(given.anchors_m.values())
+    given.anchors_m = dict(zip(given.anchors_m, [*at[1:], at[0]], strict=True))
+    given.needs_search = True
+    assert trust(given).causes[0].name == "lines shifted"
+
+
 def test_long_ranges_and_small_coordinates_are_named_together() -> None:
     given = surveyed(YARD, SEED)
     given.range_m = 1.06 * given.range_m
@@ -97,3 +106,21 @@ def test_an_anchor_that_reads_long_is_named_unless_radios_do_so() -> None:
     assert (likeliest.name, likeliest.subject) == ("anchor bias", "A1")
     given.range_m = given.range_m - 0.74 * of_a1
     assert trust(given).reasons == ()
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "name"),
+    [
+        ("all step", 0.4, "step"),
+        ("map breaks", 0.6, "map break"),
+        ("tag slips", 0.6, "tag slipped"),
+        ("surveyor in between", 0.25, "behind the camera"),
+        ("anchors in feet", 1.0, "anchors' unit"),
+    ],
+)
+def test_a_mistake_is_the_likeliest_cause(kind: str, size: float, name: str) -> None:
+    given = surveyed(YARD, SEED)
+    (mistake,) = [each for each in kinds(given.ids) if each.name == kind]
+    mistake.make(given, size, np.random.default_rng(SEED))
+    given.needs_search = mistake.of is None
+    assert trust(given).causes[0].name == name

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from rangesfm.errors import InputError
+from rangesfm.planning.expected import expect
 from rangesfm.planning.survey_plan import plan_survey
+from rangesfm.scale.verdict import CALIBRATE
 from rangesfm.workflows.plan_again import plan_of_result
 
 if TYPE_CHECKING:
@@ -35,6 +37,10 @@ def test_the_plan_is_of_the_map_that_the_run_found(
     assert planned.num_ranges == pytest.approx(result["ranges"]["num_used"], rel=0.01)
     # The camera was held upright, at a height that changes by some decimetres on a loop of metres.
     assert np.ptp(planned.trajectory.centers[:, 2]) < 0.5 * np.ptp(planned.trajectory.centers[:, 0])
+    # Of the radio as the run has learnt it, and so no more certain than that by much, nor less.
+    assert planned.component_stddevs == result["scale"]["error_stddevs"]
+    stated = result["scale"]["stddev_empirical"] / result["scale"]["value"]
+    assert expect(planned).uncertainty.empirical == pytest.approx(stated, rel=0.3)
     printed = rangesfm_command("plan", "--from", out, cwd=tmp_path).stdout
     assert "what would gain most for the scale" in printed
     assert ("place: x" in printed) == (anchors[-1] == "site")
@@ -52,6 +58,7 @@ def test_a_doubtful_survey_is_told_what_its_plan_would_change(
     best = [advice for advice in scale["advice"] if "the scale would be" in advice]
     assert best
     assert best[0].startswith(advised[0].words)
+    assert sum(advice.startswith(CALIBRATE) for advice in scale["advice"]) <= 1
     assert f"next time: {best[0]}" in printed
 
 

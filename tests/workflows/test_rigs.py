@@ -6,6 +6,7 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -40,15 +41,16 @@ class StereoSurvey:
     folder: Path
     true_scale: float
 
-    def refined(self) -> ResultSummary:
-        tables = {
+    def refined(self, *, with_radio: bool = True) -> ResultSummary:
+        tables: dict[str, dict[str, Any]] = {
             "images": {"rig_config": "rig_config.json", "baseline_stddev_m": BASELINE_STDDEV_M},
             "ranges": {"path": "ranges.csv", "range_stddev_m": RANGE_STDDEV_M},
             "anchors": {"path": "anchors.csv"},
             "tag": {"tag_in_cam_m": TAG_IN_CAM_M.tolist()},
             "output": {"path": "out"},
-            "report": {"enabled": True},
         }
+        if not with_radio:
+            del tables["ranges"], tables["anchors"], tables["tag"]
         survey: Survey = survey_from_tables(tables, self.folder)
         survey = survey.model_copy(update={"model_path": self.folder / "sparse"})
         return refine_model(survey, progress=SilentProgress()).summary
@@ -96,29 +98,35 @@ def test_scales_by_ranges_and_by_baseline_agree_and_together_are_surer(tmp_path:
     found = survey.refined()
     assert found.scale.verdict == "good"
     assert abs(np.log(found.scale.value / survey.true_scale)) < 3 * found.scale.relative_stddev.formal
-    (baseline,) = found.baselines
-    assert baseline.agrees
-    assert baseline.photos == (f"{LEFT}frame000000.png", f"{RIGHT}frame000000.png")
-    assert baseline.scale == pytest.approx(survey.true_scale)
+    (length,) = found.distances
+    assert (length.from_, length.to) == (f"{LEFT}frame000000.png", f"{RIGHT}frame000000.png")
+    by_kind = found.scale.by_kind
+    assert by_kind["lengths"].value == pytest.approx(survey.true_scale)
+    assert by_kind["ranges"].value == pytest.approx(survey.true_scale, rel=0.02)
+    assert not any(test.rejected for test in found.tests)
     assert found.refine is not None
     assert found.refine.relative_scale_stddev is not None
     assert found.refine.scale_value is not None
     assert abs(np.log(found.refine.scale_value / survey.true_scale)) < 3 * found.refine.relative_scale_stddev
-    assert found.refine.relative_scale_stddev < 0.95 * found.scale.relative_stddev.empirical
-    assert "Baselines of rigs" in (tmp_path / "out" / "report.html").read_text()
+    assert (found.scale.stddev_empirical or np.inf) < 0.5 * (by_kind["ranges"].stddev or 0.0)
 
 
-def test_a_baseline_wrong_by_3_percent_is_found_by_the_ranges_and_has_no_say(tmp_path: Path) -> None:
-    survey = stereo_survey(tmp_path, baseline_error=0.03)
-    found = survey.refined()
-    assert found.scale.value == pytest.approx(survey.true_scale, rel=0.005)
-    assert found.refine is not None
-    assert found.refine.scale_value == pytest.approx(survey.true_scale, rel=0.005)
-    (baseline,) = found.baselines
-    assert not baseline.agrees
-    assert baseline.off_by == pytest.approx(0.03, abs=0.005)
+def test_a_baseline_wrong_by_3_percent_is_found_by_the_ranges_and_said(tmp_path: Path) -> None:
+    found = stereo_survey(tmp_path, baseline_error=0.03).refined()
+    (test,) = [test for test in found.tests if test.name == "lengths against ranges"]
+    assert test.rejected
+    assert test.size == pytest.approx(0.03, abs=0.005)
     assert found.scale.verdict == "doubtful"
-    assert found.scale.reasons[0].startswith("the rig's cameras are 0.4304 m apart, which gives a scale of 1 m per SfM")
+    assert any("by the measured lengths the map is" in reason for reason in found.scale.reasons)
+
+
+def test_a_stereo_rig_gives_metres_without_a_radio(tmp_path: Path) -> None:
+    survey = stereo_survey(tmp_path)
+    found = survey.refined(with_radio=False)
+    assert found.scale.value == pytest.approx(survey.true_scale, rel=1e-6)
+    low, high = found.scale.interval_95 or (0.0, 0.0)
+    assert low < survey.true_scale < high
+    assert "one length that nothing checks" in " ".join(found.scale.reasons)
 
 
 def test_a_frame_is_one_keyframe_with_the_time_of_its_photos_and_all_of_them_are_mapped(

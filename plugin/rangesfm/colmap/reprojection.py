@@ -58,7 +58,7 @@ def photo_errors_px(model: pycolmap.Reconstruction) -> dict[str, float]:
     medians = {}
     for image_id in sorted(model.reg_image_ids()):
         image = model.image(image_id)
-        seen = [point for point in image.points2D if point.has_point3D()]
+        seen = image.get_observation_points2D()
         if not seen:
             continue
         in_cam = image.cam_from_world() * np.array([model.point3D(point.point3D_id).xyz for point in seen])

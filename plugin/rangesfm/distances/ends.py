@@ -39,6 +39,7 @@ class LocatedDistances:
         ends: (k, 2, 3) the points, in the model's unit; NaN where nobody said.
         mark_stddev: (k,) what marks in photos do to the model's length, in its unit.
         is_printed: (k,) bool, sides of tags, which were printed alike: what one is too long, all are.
+        is_everywhere: (k,) bool, in the map all along, so that it is no matter how that bends.
     """
 
     model_length: Array
@@ -49,6 +50,7 @@ class LocatedDistances:
     ends: Array
     mark_stddev: Array
     is_printed: npt.NDArray[np.bool_]
+    is_everywhere: npt.NDArray[np.bool_]
 
     @classmethod
     def of(
@@ -70,6 +72,7 @@ class LocatedDistances:
             nothing,
             np.full((k, 2, 3), np.nan),
             np.zeros(k),
+            nothing,
             nothing,
         )
 
@@ -134,6 +137,7 @@ def locate_distances(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Seq
         ends,
         mark_stddev,
         np.array([taped.is_printed for taped in tape.distances], dtype=bool),
+        np.array([taped.is_everywhere for taped in tape.distances], dtype=bool),
     )
 
 

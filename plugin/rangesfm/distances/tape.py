@@ -42,6 +42,7 @@ class TapedDistance:
         kind: "control" (it holds the scale) or "check" (it is compared with the result).
         line: in the file.
         is_printed: whether it is the side of a tag that was found in photos.
+        is_everywhere: whether the map has it all along, as that between the cameras of a rig.
     """
 
     ends: tuple[str, str]
@@ -50,6 +51,7 @@ class TapedDistance:
     kind: str
     line: int
     is_printed: bool = False
+    is_everywhere: bool = False
 
 
 @dataclass(frozen=True)
@@ -94,9 +96,9 @@ class Tape:
         of_all = (self.markers or {}).items()
         return {name: marker for name, marker in of_all if marker.stddev_px == FOUND_STDDEV_PX}
 
-    def with_tags(self, markers: Mapping[str, Marker], sides: tuple[TapedDistance, ...]) -> Tape:
-        """With what was found in photos as well; names that somebody gave to marks of his own stay his."""
-        return replace(self, distances=self.distances + sides, markers={**markers, **(self.markers or {})})
+    def with_more(self, distances: tuple[TapedDistance, ...], markers: Mapping[str, Marker] | None = None) -> Tape:
+        """With others, and with marks found in photos; names that somebody gave to marks of his own stay his."""
+        return replace(self, distances=self.distances + distances, markers={**(markers or {}), **(self.markers or {})})
 
     def without(self, rows: Collection[int]) -> Tape:
         """With some of the distances, by their numbers, as left out."""

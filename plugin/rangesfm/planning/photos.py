@@ -195,7 +195,8 @@ class PlannedMap:
     @property
     def _some(self) -> Indices:
         """Of the k keyframes that are computed."""
-        return np.unique(np.linspace(0, len(self.path) - 1, _NUM_BENT).round().astype(np.int64))
+        some: Indices = np.unique(np.linspace(0, len(self.path) - 1, _NUM_BENT).round().astype(np.int64))
+        return some
 
     @property
     def _motions(self) -> Array:

@@ -27,7 +27,7 @@ class RangeGradient:
     @classmethod
     def of(cls, from_anchor_m: Array) -> RangeGradient:
         """Of vectors (n, 3) from anchor to tag."""
-        distance = np.linalg.norm(from_anchor_m, axis=1)
+        distance = np.sqrt(np.einsum("ni,ni->n", from_anchor_m, from_anchor_m))
         return cls(distance, from_anchor_m / np.maximum(distance, _TINY_DISTANCE_M)[:, None])
 
     @property
@@ -37,7 +37,7 @@ class RangeGradient:
 
     def by_log_scale(self, scaled_m: Array) -> Array:
         """(n,) by the logarithm of a scale, of which (n, 3) is what it has scaled of the tags' places."""
-        slopes: Array = np.sum(self.by_tag * scaled_m, axis=1)
+        slopes: Array = np.einsum("ni,ni->n", self.by_tag, scaled_m)
         return slopes
 
     def by_turn_of_world(self, arms_m: Array) -> Array:

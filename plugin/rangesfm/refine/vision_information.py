@@ -128,7 +128,7 @@ def model_observations(metric: pycolmap.Reconstruction, frame_ids: Indices) -> O
     columns: list[tuple[npt.NDArray[Any], ...]] = []
     for image_id in metric.reg_image_ids():
         image = metric.image(image_id)
-        seen = [(p.point3D_id, p.xy) for p in image.points2D if p.has_point3D()]
+        seen = [(point.point3D_id, point.xy) for point in image.get_observation_points2D()]
         if image.frame_id not in index_of_frame or not seen:
             continue
         camera = metric.camera(image.camera_id)

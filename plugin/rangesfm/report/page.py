@@ -60,7 +60,7 @@ SECTIONS = (
         (tables.range_statuses, tables.ranges_per_anchor),
     ),
     Section("mistakes", "Mistakes", (figures_mistakes.mistakes,), (tables.mistakes,)),
-    Section("anchors", "Anchors", (), (tables.anchors, tables.distances, tables.baselines)),
+    Section("anchors", "Anchors", (), (tables.anchors, tables.distances)),
     Section(
         "run",
         "Run",

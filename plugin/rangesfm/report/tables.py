@@ -168,18 +168,6 @@ def distances(content: Content) -> Table:
     return Table("Control and check distances", header, rows)
 
 
-def baselines(content: Content) -> Table:
-    """The scale by the known distances between a rig's cameras, beside that by the ranges."""
-    columns = dict.fromkeys(("distance_m", "stddev_m", "scale"), partial(fixed, decimals=4))
-    columns["off_by"] = partial(signed, decimals=4)
-    header = ["cameras", "known m", "stddev m", "scale m per SfM unit", "more than by ranges, share", "agrees"]
-    rows = [
-        [" and ".join(row.photos), *_cells(f"baselines.{i}", row, columns), "yes" if row.agrees else "no"]
-        for i, row in enumerate(content.summary.baselines)
-    ]
-    return Table("Baselines of rigs", header, rows)
-
-
 def intrinsics(content: Content) -> Table:
     """The cameras before and, if there was one, after the refinement."""
     header = ["camera", "parameter", "scaled", "refined", "change"]

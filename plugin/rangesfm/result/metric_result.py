@@ -21,7 +21,6 @@ from rangesfm.ranging.observations import RangeObservations, RangeStatus
 from rangesfm.refine.with_ranges import RefineSummary
 from rangesfm.scale.diagnostics import ScaleDiagnostics, scale_diagnostics
 from rangesfm.scale.estimate import ScaleEstimate
-from rangesfm.trust.baselines import Baseline
 from rangesfm.trust.finished_map import Place
 from rangesfm.trust.verdict import TrustVerdict
 
@@ -49,7 +48,6 @@ class MetricResult:
         models: that were to be joined to what is one model here; empty where there was only one.
         trust: what the tests of mistakes say of the scaled map.
         tape: the measured lengths, those that cannot belong to the map as left out; None: there are none.
-        baselines: known distances between a rig's cameras, as the unscaled model has them.
     """
 
     trajectory: Trajectory
@@ -66,7 +64,6 @@ class MetricResult:
     models: tuple[ModelVerdict, ...] = ()
     trust: TrustVerdict | None = None
     tape: Tape | None = None
-    baselines: tuple[Baseline, ...] = ()
 
     @property
     def final(self) -> pycolmap.Reconstruction:

@@ -34,7 +34,6 @@ from rangesfm.result.entries import (
 )
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.scale.estimate import ScaleSensitivity
-from rangesfm.trust.baselines import Baseline
 
 # Percents of the scale for a centimetre that the summary mentions.
 _NOTABLE_PERCENT = 0.5
@@ -51,7 +50,7 @@ class ResultSummary(Record):
         refine: null without a refinement.
         models: that were to be joined to what is one model here; empty where there was only one.
         tests: of mistakes that may have been made, those that were found first.
-        distances: that were taped. baselines: known distances between a rig's cameras.
+        distances: that were taped, or are known between a rig's cameras.
         comparison: only there where a reference was given.
         georeference: null if the anchors did not say.
         versions: of the software, by name.
@@ -73,7 +72,6 @@ class ResultSummary(Record):
     models: tuple[ModelEntry, ...]
     tests: tuple[MistakeEntry, ...] = ()
     distances: tuple[DistanceRow, ...]
-    baselines: tuple[Baseline, ...] = ()
     comparison: tuple[ComparisonRow, ...] = ()
     georeference: GeoreferenceEntry | None
     versions: dict[Text, Text]
@@ -103,7 +101,6 @@ class ResultSummary(Record):
             check_ranges=CheckRangesEntry.of(found),
             refine=RefineEntry.of(found),
             tests=tuple(MistakeEntry.model_validate(test) for test in (found.trust.tests if found.trust else ())),
-            baselines=found.baselines,
             models=tuple(ModelEntry.of(model, estimate.metric_from_sfm) for model in found.models),
             **others,
         )
@@ -119,8 +116,6 @@ class ResultSummary(Record):
             # What speaks against both has just been said.
             reasons = [reason for reason in self.place.reasons if reason not in scale.reasons]
             yield f"place: {self.place.verdict}{': ' if reasons else ''}{'; '.join(reasons)}"
-        for baseline in self.baselines:
-            yield f"rig: {baseline} ({'as it should be' if baseline.agrees else 'too much'})"
         for advice in scale.advice:
             yield f"next time: {advice}"
         yield from _notable(scale.sensitivity)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
+from scipy import special
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.distances.ends import LocatedDistances
@@ -114,7 +114,7 @@ def scale_by_lengths(distances: LocatedDistances | None, centers: Array) -> Leng
 def _threshold(num: int) -> float:
     """Of a squared Student's t, as the bending is learnt from the other lengths and the spread of maps."""
     degrees_of_freedom = 1 / (2 * _BENDING_SPREAD**2) + max(num - 2, 0)
-    return float(stats.t.isf(FALSE_ALARMS / (2 * num), degrees_of_freedom) ** 2)
+    return float(special.stdtrit(degrees_of_freedom, FALSE_ALARMS / (2 * num)) ** 2)
 
 
 @dataclass(frozen=True)
@@ -150,6 +150,8 @@ class _Lengths:
         alike = np.exp(-0.5 * squared).reshape(len(rows), _NUM_PLACES, len(rows), _NUM_PLACES).mean(axis=(1, 3))
         # Of lengths that are nobody knows where each has a scale of its own.
         alike = np.where(np.isfinite(alike), alike, np.eye(len(rows)))
+        bends = ~distances.is_everywhere[rows]
+        alike *= np.outer(bends, bends)
         return cls(
             model,
             distances.distance_m[rows],

@@ -215,8 +215,7 @@ def range_gradient(problem: RangeProblem, state: RangeState) -> RangeGradient:
 
 def predicted_ranges(problem: RangeProblem, state: RangeState) -> Array:
     """(n,) metres."""
-    difference = tag_positions(problem, state.metric_from_model) - state.anchors_m[problem.anchor_index]
-    predicted: Array = np.linalg.norm(difference, axis=1) + state.bias_m[problem.anchor_index]
+    predicted: Array = range_gradient(problem, state).distance_m + state.bias_m[problem.anchor_index]
     return predicted
 
 
@@ -376,8 +375,8 @@ def range_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, s
     jacobian[:, columns.scale] = by.by_log_scale(grown)
     if columns.frame >= 0:
         arms = grown + problem.tag_from_center @ similarity.rotation.T
-        turn = by.by_turn_of_world(arms) @ _left_of_step(start, state)
-        jacobian[:, columns.frame : columns.frame + 6] = np.hstack([turn, by.by_tag])
+        jacobian[:, columns.frame : columns.frame + 3] = by.by_turn_of_world(arms) @ _left_of_step(start, state)
+        jacobian[:, columns.frame + 3 : columns.frame + 6] = by.by_tag
     rows = np.flatnonzero(columns.anchor[index] >= 0)
     jacobian[rows[:, None], columns.anchor[index[rows], None] + np.arange(3)] = by.by_anchor[rows]
     rows = np.flatnonzero(columns.bias[index] >= 0)

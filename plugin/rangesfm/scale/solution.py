@@ -41,8 +41,8 @@ _SAME_ROTATION_DEG = 5.0
 _SAME_SHIFT = 0.05
 # Half of 3 stddevs squared: a rival this close in cost is not ruled out.
 MIN_COST_GAP = 4.5
-# Share of the ranges that a map must explain for another to be its rival.
-_MIN_EXPLAINED = 0.5
+# Share of the ranges that a map must explain for another to be its rival; it is doubted where it explains less.
+_MIN_EXPLAINED = 0.7
 
 WHY_SCALE_IS_OPEN = {
     "straight": ("the path is straight", "walk a bend"),

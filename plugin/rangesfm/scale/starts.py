@@ -248,21 +248,21 @@ def _translations(problem: RangeProblem, scale: float, rotations: Array) -> tupl
     path = scale * problem.centers + problem.tag_from_center
     anchors = problem.anchor_mean_m[problem.anchor_index]
     ranges = problem.range_m - problem.bias_mean_m[problem.anchor_index]
-    q = anchors[None] - path @ np.swapaxes(rotations, 1, 2)
-    design = np.concatenate([-2 * q, np.ones((*q.shape[:2], 1))], axis=2)
-    squared = ranges**2 - np.sum(q**2, axis=2)
-    weights = 1 / np.maximum(2 * ranges, 1e-3) * np.ones_like(squared)
+    q = anchors.T - rotations @ path.T  # (rotations, 3, ranges)
+    squared = ranges**2 - np.einsum("rin,rin->rn", q, q)
+    design = np.concatenate([-2 * q, np.ones_like(squared)[:, None]], axis=1)
+    weights = 1 / np.maximum(2 * ranges, 1e-3)
     robust = np.ones_like(squared)
     ridge = 1e-9 * np.eye(4)
     for _ in range(4):
-        weighted = design * (weights**2 * robust)[..., None]
-        normal = np.swapaxes(weighted, 1, 2) @ design
-        right = (np.swapaxes(weighted, 1, 2) @ squared[..., None])[..., 0]
+        weighted = design * (weights**2 * robust)[:, None]
+        normal = weighted @ np.swapaxes(design, 1, 2)
         normal = normal + ridge * np.trace(normal, axis1=1, axis2=2)[:, None, None]
-        solution = np.linalg.solve(normal, right[..., None])[..., 0]
-        residuals = weights * ((design @ solution[..., None])[..., 0] - squared)
+        solution = np.linalg.solve(normal, weighted @ squared[..., None])
+        residuals = weights * ((np.swapaxes(solution, 1, 2) @ design)[:, 0] - squared)
         robust = 1 / (1 + (residuals / (2 * robust_stddevs(residuals))) ** 2)
     translation = solution[:, :3]
-    distance = np.linalg.norm(q - translation[:, None], axis=2)
-    off = np.abs(distance - ranges)
-    return translation, np.mean(np.minimum(off, 3 * np.median(off, axis=1, keepdims=True)), axis=1)
+    from_path = q - translation
+    off = np.abs(np.sqrt(np.einsum("rin,rin->rn", from_path, from_path)) - ranges)
+    costs = np.mean(np.minimum(off, 3 * np.median(off, axis=1, keepdims=True)), axis=1)
+    return translation[..., 0], costs

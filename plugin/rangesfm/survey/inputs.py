@@ -26,6 +26,7 @@ from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes, find_image_times, read_image_times_csv
+from rangesfm.vision.rigs import read_rigs
 
 if TYPE_CHECKING:
     import pycolmap
@@ -72,6 +73,7 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
         InputError: a file is missing or wrong, or the log has an anchor or tags that nobody explained.
     """
     survey.require_metres()
+    _check_rigs_are_metric(survey)
     given = read_anchors(survey.anchors.path) if survey.anchors.path is not None else None
     tag_ids = [*survey.tag.lever_arms_m, *([] if survey.tag.tag_id is None else [survey.tag.tag_id])]
     if survey.ranges.path is None:
@@ -99,6 +101,17 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     reference = None if survey.report.reference is None else read_reference(survey.report.reference)
     notes = (*_notes(log, anchors, survey, anchors_are_of_log=given is None), *curve_notes)
     return RangingInputs(log, tag_in_cam_m, anchors, frame, site, tape, reference, notes)
+
+
+def _check_rigs_are_metric(survey: Survey) -> None:
+    """InputError where nothing but a rig could say how long a metre is, and it does not."""
+    is_measured = survey.scale.distances or survey.markers.side_m or survey.ranges.path
+    if is_measured is None and not read_rigs(survey.images.rig_config).are_metric:
+        raise InputError(
+            "says of no camera how far it is from the rig's first, and there are no ranges and no lengths: expected "
+            "cam_from_rig_translation in metres, or a radio's log (--ranges LOG)",
+            survey.images.rig_config,
+        )
 
 
 def _check_held_out(survey: Survey, anchors: Sequence[Anchor], frame: str) -> None:

@@ -154,10 +154,10 @@ class Survey(BaseModel):
                 "[markers] side_m is not given: give the tags' side in metres (--marker_side_m), or taped distances "
                 "between their corners (--distances CSV)"
             )
-        if self.ranges.path is None:
+        if self.ranges.path is None and self.images.rig_config is None:
             raise InputError(
-                "no ranges and no lengths: give a radio's log (--ranges LOG), taped distances (--distances CSV), or "
-                "the size of printed tags (--marker_side_m)"
+                "no ranges and no lengths: give a radio's log (--ranges LOG), taped distances (--distances CSV), "
+                "the size of printed tags (--marker_side_m), or where a rig's cameras sit (--rig_config_path JSON)"
             )
 
     def to_dict(self) -> dict[str, Any]:

@@ -20,6 +20,8 @@ from rangesfm.trust.ranges_on_map import RangesOnMap
 
 _NUM_PER_ANCHOR, _NUM_EVALUATIONS = 25, 12
 _FOOT_M = 0.3048
+_IN_FEET = "the anchors' coordinates are in feet"
+_RANGES_IN_FEET = "the ranges are in feet, or the anchors' coordinates were converted from feet and are no feet"
 _SCALE_FACTORS = np.geomspace(1 / 4, 4, 13).tolist()
 _AXES_OF_ANCHORS = {
     "x and y are swapped": np.eye(3)[[1, 0, 2]],
@@ -66,6 +68,20 @@ def labels_swapped(on_map: RangesOnMap) -> Iterator[Alternative]:
         )
 
 
+def lines_shifted(on_map: RangesOnMap) -> Iterator[Alternative]:
+    """The anchors' labels and coordinates, off by a line."""
+    given = _given_m(on_map)
+    for by in (1, -1) if len(given) > 2 else ():
+        at = list(given.values())
+        yield Alternative(
+            "lines shifted",
+            "",
+            "each anchor has the coordinates of the one in the next line of the anchors' file",
+            "compare the labels on the devices with the anchors' file",
+            Correction(anchors_m=dict(zip(given, at[by:] + at[:by], strict=True))),
+        )
+
+
 def other_axes(on_map: RangesOnMap) -> Iterator[Alternative]:
     """Of the anchors' coordinates."""
     given = _given_m(on_map)
@@ -82,14 +98,14 @@ def other_axes(on_map: RangesOnMap) -> Iterator[Alternative]:
 def other_units(on_map: RangesOnMap) -> Iterator[Alternative]:
     """Feet."""
     given = _given_m(on_map)
-    for words, metres in (("feet", _FOOT_M), ("metres, though converted as if from feet", 1 / _FOOT_M)):
+    for words, metres in ((_IN_FEET, _FOOT_M), (_RANGES_IN_FEET, 1 / _FOOT_M)):
         if len(given) < 2:
             return
         middle = np.mean(list(given.values()), axis=0)
         yield Alternative(
             "anchors' unit",
             "",
-            f"the anchors' coordinates are in {words}",
+            words,
             "check the unit of the anchors' file against a taped distance between two of them",
             Correction(anchors_m={name: middle + metres * (at - middle) for name, at in given.items()}),
         )
@@ -112,6 +128,7 @@ def other_lever_arms(on_map: RangesOnMap) -> Iterator[Alternative]:
 
 ALTERNATIVES: tuple[Callable[[RangesOnMap], Iterator[Alternative]], ...] = (
     labels_swapped,
+    lines_shifted,
     other_axes,
     other_units,
     other_lever_arms,

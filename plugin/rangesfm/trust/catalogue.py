@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from rangesfm.arrays import Array, Mask
+from rangesfm.scale.range_equation import tag_positions
 from rangesfm.trust.hypothesis import Correction, Effect, Hypothesis, of_anchor_place, of_cells
 from rangesfm.trust.linearized import Linearized
 
@@ -15,7 +16,7 @@ _SAME_HEIGHT_M = 1e-3
 # Of an anchor's ranges: where they follow the distance by less, they hardly change at all.
 _STUCK = 0.3
 # Along a camera; of an anchor, beside what is drawn on any sketch of the site.
-_MISMEASURED_M, UNSEEN_MOVE_M = 0.2, 1.0
+MISMEASURED_M, UNSEEN_MOVE_M = 0.2, 1.0
 # Seconds a second: no quartz drifts by more.
 _BAD_CLOCK = 1e-3
 _MEASURE_AGAIN = "measure it again, or run with it unknown (leave its coordinates in the anchors' file empty)"
@@ -248,9 +249,31 @@ def lever_arms(problem: Linearized) -> Iterator[Hypothesis]:
             words=words,
             remedy="measure where the tag's antenna sits, x to the right, y down, z forward (--tag_in_cam)",
             correction=correction,
-            unawares=_MISMEASURED_M + 2 * length_m,  # the other way round
+            unawares=MISMEASURED_M + 2 * length_m,  # the other way round
             effect=of_cells(problem, columns),
         )
+
+
+def people_in_between(problem: Linearized) -> Iterator[Hypothesis]:
+    """Whoever carries the camera stands between the tag and the anchors behind."""
+    given, state = problem.on_map.problem, problem.on_map.state
+    from_anchor_m = tag_positions(given, state.metric_from_model) - state.anchors_m[given.anchor_index]
+    is_behind = np.sum(from_anchor_m * problem.on_map.world_from_cam[:, :, 2], axis=1) > 0
+
+    def words(size: Array) -> str:
+        return f"the ranges to anchors behind the camera read about {abs(size[0]):.2f} m too {_long(size[0])}"
+
+    yield Hypothesis(
+        "behind the camera",
+        "",
+        unit="m",
+        words=words,
+        remedy="carry the tag above the head, or see what stands behind it",
+        correction=lambda size: Correction(longer_m=np.where(is_behind, size[0], 0.0)),
+        is_linear=True,
+        unawares=MISMEASURED_M,
+        effect=of_cells(problem, -problem.cells.mean(is_behind.astype(np.float64))),
+    )
 
 
 def clocks(problem: Linearized) -> Iterator[Hypothesis]:
@@ -299,6 +322,7 @@ STANDING: tuple[Callable[[Linearized], Iterator[Hypothesis]], ...] = (
     anchors_in_another_scale,
     heights_never_measured,
     lever_arms,
+    people_in_between,
     clocks,
 )
 """Mistakes that last for the whole survey."""

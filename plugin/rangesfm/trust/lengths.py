@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from rangesfm.distances.tape import Tape, TapedDistance
 from rangesfm.scale.estimate import ScaleEstimate
@@ -85,7 +85,7 @@ def _against_ranges(estimate: ScaleEstimate) -> Iterator[MistakeTest]:
         name="lengths against ranges",
         subject="",
         statistic=(apart / stddev) ** 2 if np.isfinite(stddev) else 0.0,
-        threshold=float(stats.chi2.isf(FALSE_ALARMS, 1)),
+        threshold=float(special.chdtri(1, FALSE_ALARMS)),
         size=apart,
         stddev=finite(stddev),
         unit="1",

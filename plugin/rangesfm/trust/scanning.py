@@ -8,7 +8,7 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.scale.range_equation import tag_positions
-from rangesfm.trust.catalogue import UNSEEN_MOVE_M
+from rangesfm.trust.catalogue import MISMEASURED_M, UNSEEN_MOVE_M
 from rangesfm.trust.hypothesis import Correction, Hypothesis, of_cells
 from rangesfm.trust.linearized import Linearized
 
@@ -83,6 +83,39 @@ def map_breaks(problem: Linearized) -> Iterator[Hypothesis]:
             adoption=_left_out(of_ranges),
             unawares=UNSEEN_MOVE_M,
             effect=of_cells(problem, -after[:, None] * problem.gradient.by_tag),
+        )
+
+
+def tags_slipped(problem: Linearized) -> Iterator[Hypothesis]:
+    """From some time on the tag sits elsewhere on the camera."""
+    on_map = problem.on_map
+    turned = np.swapaxes(on_map.world_from_cam, 1, 2)
+    tags_m = tag_positions(on_map.problem, on_map.state.metric_from_model)
+    from_anchor_m = tags_m - on_map.state.anchors_m[on_map.problem.anchor_index]
+    for time, after in _changes(problem, None, 3 * _MIN_NUM_CELLS):
+        of_ranges = on_map.time_s > time
+
+        def words(size: Array, when: str = _when(problem, time)) -> str:
+            return (
+                f"the tag slipped: {when} it sits about {np.linalg.norm(size):.2f} m elsewhere on the camera "
+                f"({size[0]:+.2f}, {size[1]:+.2f}, {size[2]:+.2f} m along the camera's x, y, z)"
+            )
+
+        def back(size: Array, of_ranges: Mask = of_ranges) -> Correction:
+            moved_m = from_anchor_m + size @ turned
+            grown_m = np.linalg.norm(moved_m, axis=1) - np.linalg.norm(from_anchor_m, axis=1)
+            return Correction(longer_m=np.where(of_ranges, grown_m, 0.0))
+
+        yield Hypothesis(
+            "tag slipped",
+            "",
+            unit="m",
+            words=words,
+            remedy="fix the tag to the camera, and run the two parts as surveys of their own",
+            correction=back,
+            adoption=_left_out(of_ranges),
+            unawares=MISMEASURED_M,
+            effect=of_cells(problem, -after[:, None] * problem.by_lever_arm),
         )
 
 
@@ -226,6 +259,7 @@ def _when(problem: Linearized, start: float, end: float | None = None) -> str:
 SCANNING: tuple[Callable[[Linearized], Iterator[Hypothesis]], ...] = (
     anchors_moved,
     map_breaks,
+    tags_slipped,
     steps,
     stretches,
     clock_jumps,

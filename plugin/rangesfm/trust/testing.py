@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special
 from scipy.linalg import solve_triangular
 
 from rangesfm.arrays import Array
@@ -141,11 +141,11 @@ class Factorization:
 def noncentrality(num: int) -> float:
     """By which a mistake of so many numbers must raise the statistic to be found (Baarda's lambda_0)."""
     if num not in _NONCENTRALITY:
-        critical = stats.chi2.isf(_ALPHA, num)
+        critical = special.chdtri(num, _ALPHA)
         low, high = 0.0, 1000.0
         for _ in range(60):
             middle = 0.5 * (low + high)
-            low, high = (middle, high) if stats.ncx2.sf(critical, num, middle) < 1 - _BETA else (low, middle)
+            low, high = (middle, high) if special.chndtr(critical, num, middle) > _BETA else (low, middle)
         _NONCENTRALITY[num] = high
     return _NONCENTRALITY[num]
 
@@ -175,9 +175,9 @@ def _thresholds(bases: Sequence[Array], nums: Array, seed: int) -> Array:
     statistics = np.where(nums > 0, statistics[:, :-1], 0.0)
     smallest = np.ones(_NUM_DRAWS)
     for num in np.unique(nums[nums > 0]):
-        smallest = np.minimum(smallest, stats.chi2.sf(statistics[:, nums == num].max(axis=1), num))
+        smallest = np.minimum(smallest, special.chdtrc(num, statistics[:, nums == num].max(axis=1)))
     alpha = float(np.quantile(smallest, FALSE_ALARMS))
-    of_num = {num: stats.chi2.isf(alpha, num) if num else np.inf for num in np.unique(nums).tolist()}
+    of_num = {num: special.chdtri(num, alpha) if num else np.inf for num in np.unique(nums).tolist()}
     return np.array([of_num[num] for num in nums.tolist()])
 
 

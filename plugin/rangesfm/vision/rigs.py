@@ -46,6 +46,11 @@ class Rigs:
         """Of each rig, whether the configuration says where all of its cameras sit."""
         return [all(c.ref_sensor or c.cam_from_rig is not None for c in config.cameras) for config in self.configs]
 
+    @property
+    def are_metric(self) -> bool:
+        """Whether the configuration says of any two cameras how far apart they are."""
+        return any(_baseline_m(camera) for _, camera in self._cameras)
+
     def camera_of(self, name: str) -> str | None:
         """What a photo's name begins with, by which its camera is known; None outside the rigs.
 
@@ -112,7 +117,7 @@ class Rigs:
                 length_m = _baseline_m(camera)
                 ends = next(_pairs(model, reference, camera.image_prefix), None) if length_m else None
                 if ends is not None:
-                    found.append(TapedDistance(ends, length_m, stddev_m, CONTROL, line=0))
+                    found.append(TapedDistance(ends, length_m, stddev_m, CONTROL, line=0, is_everywhere=True))
         return tuple(found)
 
     def rescale(self, model: pycolmap.Reconstruction) -> None:

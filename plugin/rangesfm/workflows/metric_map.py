@@ -12,7 +12,7 @@ import pycolmap
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.colmap.transform import rescale, without_photos
 from rangesfm.distances.ends import LocatedDistances, locate_distances, surveyed_distances
-from rangesfm.distances.tape import CONTROL, Tape, TapedDistance
+from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
@@ -29,11 +29,9 @@ from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
-from rangesfm.trust.baselines import ADVICE, compare_baselines, disagreeing
 from rangesfm.trust.broken_refinement import why_broken
 from rangesfm.trust.finished_map import Doubt, doubts_of_map, place_of_map
 from rangesfm.vision.image_times import ImageTimes
-from rangesfm.vision.rigs import read_rigs
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.trust_in_map import named_causes, tested
 
@@ -248,11 +246,7 @@ def scale_by_survey(
     if tape is not None and (lengths := estimate.lengths) is not None:
         tape = tape.without(lengths.rows[~lengths.is_kept].tolist())
     metric = MetricResult(trajectory, offset, offset_s, estimate, scaled, predicted, weights, tape=tape)
-    taped = read_rigs(survey.images.rig_config).baselines(sfm, survey.images.baseline_stddev_m)
-    metric = replace(metric, baselines=compare_baselines(taped, sfm, estimate))
-    for doubt in (disagreements := disagreeing(metric.baselines)):
-        journal.warn(doubt)
-    return tested(survey, metric.doubted(by_rivals).doubted(disagreements, [ADVICE]), journal)
+    return tested(survey, metric.doubted(by_rivals), journal)
 
 
 def _with_cause(
@@ -373,15 +367,8 @@ def judge_map(survey: Survey, metric: MetricResult, journal: Journal) -> MetricR
 
 
 def _control(inputs: RangingInputs, metric: MetricResult) -> Tape:
-    """What was taped, baselines of rigs that the scale agrees with, and the distances between surveyed anchors where
-    their positions could not be used."""
+    """What was measured, and the distances between surveyed anchors where their positions could not be used."""
     tape = metric.tape or Tape()
-    distances = [*tape.distances]
-    distances += [
-        TapedDistance(known.photos, known.distance_m, known.stddev_m, CONTROL, line=0)
-        for known in metric.baselines
-        if known.agrees
-    ]
     if inputs.anchor_frame == "site" and metric.estimate.frame != "site":
-        distances += surveyed_distances(inputs.anchors)
-    return replace(tape, distances=tuple(distances))
+        tape = tape.with_more(surveyed_distances(inputs.anchors))
+    return tape

@@ -168,7 +168,7 @@ def with_tags(survey: Survey, inputs: RangingInputs, names: Sequence[str], journ
         journal.warn(message)
     journal.progress.message(f"tags: {len(found.tags)} of {wanted.dictionary} in {found.num_photos} photos")
     sides = () if wanted.side_m is None else found.sides(wanted.side_m, wanted.side_stddev_m)
-    return replace(inputs, tape=(inputs.tape or Tape()).with_tags(found.markers, sides))
+    return replace(inputs, tape=(inputs.tape or Tape()).with_more(sides, found.markers))
 
 
 def map_keyframes(

@@ -12,6 +12,7 @@ from dataclasses import replace
 import pycolmap
 
 from rangesfm.distances.ends import locatable
+from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import sole_writer
 from rangesfm.join.models import PathOfModel
@@ -20,6 +21,7 @@ from rangesfm.ranging.clock.estimate import TimeOffset
 from rangesfm.survey.inputs import RangingInputs, times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes
+from rangesfm.vision.rigs import read_rigs
 from rangesfm.workflows.adoption import with_likeliest_cause
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.metric_map import (
@@ -144,8 +146,10 @@ def map_in_metres(
     # Scale, and the metric map that follows from it.
     with journal.stage("scale"):
         path, verdicts = join_by_survey(survey, inputs, paths, journal, must_join=must_join)
-        if inputs.tape is not None:
-            inputs = replace(inputs, tape=locatable(inputs.tape, path.sfm))
+        tape = (inputs.tape or Tape()).with_more(
+            read_rigs(survey.images.rig_config).baselines(path.sfm, survey.images.baseline_stddev_m)
+        )
+        inputs = replace(inputs, tape=locatable(tape, path.sfm) if tape.distances else None)
         metric = replace(scale_by_survey(survey, inputs, path, offset, journal), models=verdicts)
         if survey.scale.adopt:
             inputs, metric = with_likeliest_cause(survey, inputs, path, metric, journal)

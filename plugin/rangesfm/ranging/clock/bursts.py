@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy import special
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.trajectory import Trajectory
@@ -176,5 +176,5 @@ def _fit(bursts: Bursts, trajectory: Trajectory, tags_in_cam_m: Array, burst: In
     num_varying = max(len(range_m) - int(np.count_nonzero(num_of_anchor)), 1)
     variation = float(np.sum((range_m - means[anchor]) ** 2)) / num_varying
     offset_s = float(np.median(trajectory.timestamps_s[photo] - bursts.middle_s[burst]))
-    chance = float(f_distribution.sf(variation / variance, num_varying, num_spare))
+    chance = float(special.fdtrc(num_varying, num_spare, variation / variance))
     return Pairing(offset_s, burst, photo, variance, num_spare, chance)

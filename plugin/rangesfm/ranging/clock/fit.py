@@ -7,8 +7,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import norm
-from scipy.stats import t as student
+from scipy import special
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.clock.path import PathSamples
@@ -170,7 +169,8 @@ def fit_at_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, scale
     deviations = ranges.range_m.copy()
     for rows in rows_by_anchor(ranges.anchor):
         deviations[rows] -= np.median(deviations[rows])
-    num_cells = np.unique(np.stack([np.floor(ranges.times_s / _CELL_S), ranges.anchor]), axis=1).shape[1]
+    cells = np.floor(ranges.times_s / _CELL_S).astype(np.int64) * (ranges.anchor.max(initial=0) + 1) + ranges.anchor
+    num_cells = len(np.unique(cells))
     num_spare = num_cells - squares.num_unknowns - 1
     residuals = squares.residuals_m * np.sqrt(num_cells / max(num_spare, 0.5))
     rates = np.einsum("ni,ni->n", squares.gradient, velocities)
@@ -228,6 +228,6 @@ def _jackknife_variances(own: Array, residuals: Array, squares: SquaresFit, time
         if np.linalg.eigvalsh(left)[0] < _MIN_LEFT_CURVATURE:
             return np.full(own.shape[1], np.inf)
         changes[number] = np.linalg.solve(left, gradients[rows].sum(axis=0))[-own.shape[1] :]
-    quantile = float(student.ppf(0.975, num - 1) / norm.ppf(0.975)) if num > 1 else np.inf
+    quantile = float(special.stdtrit(num - 1, 0.975) / special.ndtri(0.975)) if num > 1 else np.inf
     variances = (num - 1) / num * np.sum((changes / np.linalg.norm(own, axis=0)) ** 2, axis=0)
     return np.asarray(quantile**2 * variances)

@@ -78,13 +78,13 @@ def fit_squares(points: Array, range_m: Array, anchor: Indices, loss_scale: floa
     middle = points.mean(axis=0)
     unit = max(float(np.sqrt(np.mean((points - middle) ** 2))), 1e-300)
     points = (points - middle) / unit
-    groups = rows_by_anchor(anchor)
+    design, groups = np.column_stack([points, np.ones(len(points))]), rows_by_anchor(anchor)
     # Dividing by the derivative of rho^2 turns residuals back into metres.
     metres = 1 / (2 * np.maximum(range_m, MIN_RANGE_M))
     residuals_m = np.zeros(len(points))
     for _ in range(_NUM_REWEIGHTINGS + 1):
         weights = 1 / (1 + (residuals_m / (loss_scale * residual_stddev(residuals_m))) ** 2)
-        columns = _LinearColumns(points, metres * np.sqrt(weights), groups)
+        columns = _LinearColumns(design, metres * np.sqrt(weights), groups)
         alpha_squared, coefficients, residuals = columns.solve(range_m**2)
         residuals_m = residuals / np.sqrt(weights)
     is_curved = alpha_squared * np.linalg.norm(columns.curvature) > _MIN_CURVATURE_STDDEVS * np.std(residuals)
@@ -101,14 +101,15 @@ class _LinearColumns:
         curvature: (n,) the column |p|^2, less what the anchors' own unknowns explain of it.
     """
 
-    def __init__(self, points: Array, row_weights: Array, groups: list[Indices]):
+    def __init__(self, design: Array, row_weights: Array, groups: list[Indices]):
         self._row_weights = row_weights
-        self._squared_norm = np.sum(points**2, axis=1)
+        self._squared_norm = np.sum(design[:, :3] ** 2, axis=1)
         self.num_anchors = len(groups)
         self._factors = []
-        for rows in groups:
-            own = row_weights[rows, None] * np.column_stack([points[rows], np.ones(len(rows))])
-            squared_lengths, directions = np.linalg.eigh(own.T @ own)
+        weighted = row_weights[:, None] * design
+        of_groups = [weighted[rows] for rows in groups]
+        decomposed = np.linalg.eigh([own.T @ own for own in of_groups])
+        for rows, own, squared_lengths, directions in zip(groups, of_groups, *decomposed, strict=True):
             # A flat or straight path leaves columns that only round-off fills.
             kept = squared_lengths > 1e-10 * squared_lengths[-1]
             solution = directions[:, kept] / np.sqrt(squared_lengths[kept])

@@ -1,0 +1,66 @@
+"""What photos know of a planned path makes its map stiff, and its keyframes certain, as far as it goes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.planning.surveys import FIVE_ANCHORS_M, loop, planned
+
+from rangesfm.planning.expected import Expected, expect
+from rangesfm.planning.photos import PlannedPhotos
+
+OPEN = PlannedPhotos(num_points=60, feature_stddev=0.001)
+
+
+def seen_by(photos: PlannedPhotos, frame: str = "site") -> Expected:
+    num_anchors = 5 if frame == "site" else 1
+    return expect(replace(planned(FIVE_ANCHORS_M[:num_anchors], frame, loop(30.0, 60)), photos=photos))
+
+
+def free_bend_m(expected: Expected) -> float:
+    return expected.learned.stddev_of_component["bending"]
+
+
+def test_every_point_is_in_the_picture_of_the_photos_that_find_it() -> None:
+    path = loop(30.0, 60)
+    rays = OPEN.observations(path)
+    half_width = np.tan(np.deg2rad(OPEN.field_of_view_deg / 2))
+    assert np.abs(rays.ray[:, 0]).max() < half_width
+    assert np.bincount(rays.point).min() >= 2
+    # As many as wanted in nearly every photo.
+    assert np.median(np.bincount(rays.frame, minlength=60)) == OPEN.num_points
+    in_a_row = np.diff(rays.frame)[np.diff(rays.point) == 0]
+    assert set(in_a_row.tolist()) == {1}
+    assert np.bincount(rays.point).max() == OPEN.num_photos_of_point
+
+
+def test_a_loop_that_is_closed_bends_less() -> None:
+    blurred = OPEN.changed(feature_stddev=0.01)
+    assert free_bend_m(seen_by(blurred.changed(closes_loops=True))) < 0.7 * free_bend_m(seen_by(blurred))
+
+
+def test_the_bend_grows_with_the_noise_of_features_and_with_fewer_points() -> None:
+    sharp, blurred = seen_by(OPEN.changed(feature_stddev=0.01)), seen_by(OPEN.changed(feature_stddev=0.02))
+    assert free_bend_m(blurred) == pytest.approx(2 * free_bend_m(sharp), rel=0.05)
+    assert free_bend_m(seen_by(OPEN.changed(feature_stddev=0.01, num_points=15))) > 1.5 * free_bend_m(sharp)
+
+
+def test_ranges_straighten_a_map_that_bends() -> None:
+    expected = seen_by(OPEN.changed(feature_stddev=0.02))
+    free_m = np.sqrt(3) * free_bend_m(expected)
+    assert 0.02 < float(np.sqrt(np.mean(expected.bends_m**2))) < 0.7 * free_m
+
+
+def test_the_first_camera_stays_where_it_is_and_the_path_drifts_away_from_it() -> None:
+    bends_m = seen_by(OPEN.changed(feature_stddev=0.01), "first_camera").bends_m
+    assert bends_m[0] < 1e-6
+    assert bends_m[10] < bends_m[25]
+
+
+def test_photos_as_sharp_as_can_be_are_a_rigid_map() -> None:
+    expected = seen_by(OPEN.changed(feature_stddev=1e-5))
+    rigid = expect(replace(expected.planned, photos=None))
+    assert expected.uncertainty.empirical == pytest.approx(rigid.uncertainty.empirical, rel=1e-3)
+    np.testing.assert_allclose(expected.keyframe_stddevs_m, rigid.keyframe_stddevs_m, rtol=0.1)
