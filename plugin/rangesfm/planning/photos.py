@@ -190,8 +190,7 @@ class PlannedMap:
         # In the frame of the first camera the map as a whole can only grow.
         bent = _without(self._motions if graph.held_frame is None else self._motions[:, :, :1])
         variances = np.diag(by_photos + bent @ by_ranges @ bent).reshape(-1, 3).sum(axis=1)
-        stddevs_m: Array = np.interp(np.arange(len(self.path)), self._some, np.sqrt(np.maximum(variances, 0.0)))
-        return stddevs_m
+        return np.asarray(np.interp(np.arange(len(self.path)), self._some, np.sqrt(np.maximum(variances, 0.0))))
 
     @property
     def _some(self) -> Indices:
