@@ -238,9 +238,9 @@ class RangeModelOptions(Options):
 
     range_stddev_m: _Positive | None = None
     """Noise of a range (default: estimated from the residuals)."""
-    range_bias_stddev_m: _Uncertainty = 0.03
-    """Prior of each anchor's own constant bias, mean 0: what most radios show; a freer one soaks up errors that depend
-    on direction, and shifts the map instead."""
+    range_bias_stddev_m: _Uncertainty = 0.01
+    """Prior of each anchor's own constant bias, mean 0; small on purpose: a freer bias soaks up errors that depend on
+    direction, and shifts the map instead."""
     common_bias_stddev_m: _Uncertainty = 0.1
     """Prior of the bias that all anchors share (the tag's delay), mean 0."""
 

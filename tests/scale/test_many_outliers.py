@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tests.studies import scale_breakdown
 
-NUM_SEEDS = 12
+NUM_SEEDS = 8
 
 
 @pytest.mark.parametrize(

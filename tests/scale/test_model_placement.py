@@ -31,7 +31,7 @@ def lingering_model(make_survey: MakeSurvey, seed: int = 0) -> ScaledModel:
 def test_a_model_weighs_the_same_alone_and_in_a_join(make_survey: MakeSurvey) -> None:
     model = lingering_model(make_survey)
     estimate, errors = model.estimate, model.estimate.errors
-    assert errors.inflation > 1.2
+    assert errors.inflation > 1.3
     assert np.nanmax(errors.share) > 2 * np.nanmin(errors.share)
     places = {anchor.anchor_id: anchor.position_m for anchor in estimate.anchors}
     joined = model_placement._Group([model], None).solve([estimate.metric_from_sfm], places)
