@@ -194,7 +194,7 @@ def test_flags_in_the_text_exist() -> None:
     assert named - known == OF_OTHER_PROGRAMS | OF_STUDIES
 
 
-OF_OTHER_PROGRAMS = {"--auto_scale_poses", "--center_method", "--ref_images_path", "--transform_path"}
+OF_OTHER_PROGRAMS = {"--auto_scale_poses", "--center_method", "--csv", "--ref_images_path", "--transform_path"}
 OF_STUDIES = {"--data", "--leave_radio_out"}
 
 
