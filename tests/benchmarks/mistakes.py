@@ -53,7 +53,7 @@ def write_survey(folder: Path, num_keyframes: int, num_ranges: int) -> tuple[Sur
     """The model, the photos' times and the anchors; the survey, and the log that is to be written yet."""
     end_s = PHOTO_INTERVAL_S * num_keyframes
     path = loop_path(end_s, center_m=(10, 7, 1.7), semi_axes_m=(7, 4.5), height_amplitude_m=0.4, num_turns=5)
-    times = PHOTO_INTERVAL_S * np.arange(num_keyframes)
+    times = np.linspace(0.0, end_s - PHOTO_INTERVAL_S, num_keyframes)
     made = synthetic_model(
         times,
         path.centers(times),
