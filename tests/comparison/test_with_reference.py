@@ -168,8 +168,14 @@ def test_a_camera_that_stands_still_has_no_scale() -> None:
 @pytest.mark.parametrize(
     ("reference", "message"),
     [
-        (Reference(np.zeros((1, 3)), image_names=("other.jpg",)), "is of photo 'other.jpg', the first of the keyframes of '000.jpg'"),
-        (Reference(np.zeros((2, 3)), timestamps_s=np.array([90.0, 90.5])), r"90\.000 to 90\.500 s, .* from 0\.000 to 29\.000 s"),
+        (
+            Reference(np.zeros((1, 3)), image_names=("other.jpg",)),
+            "is of photo 'other.jpg', the first of the keyframes of '000.jpg'",
+        ),
+        (
+            Reference(np.zeros((2, 3)), timestamps_s=np.array([90.0, 90.5])),
+            r"90\.000 to 90\.500 s, .* from 0\.000 to 29\.000 s",
+        ),
     ],
 )
 def test_a_reference_of_something_else_is_refused(reference: Reference, message: str) -> None:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tests.report.in_browser.conftest import Browser, Pixels
 
 MakeResult = Callable[..., Path]
-# Plan and elevation twice, local scale, four of scale and clock, two of mistakes, eight anchors, histogram, true errors.
+# Plan and elevation twice, local scale, four of scale and clock, two of mistakes, eight anchors, histogram, errors.
 NUM_CHARTS = 21
 WIDTHS_PX = (320, 390, 768, 1280)
 EVIL = "</script><script>document.title = 'broken out'</script>"
