@@ -15,7 +15,7 @@ from tests.simulated.path import loop_path
 
 from rangesfm.survey.inputs import RangingInputs, read_ranging_inputs
 from rangesfm.survey.settings import Survey
-from rangesfm.trust.before import notes_before_work, notes_on_model, notes_on_times
+from rangesfm.trust.before import notes_before_work, notes_on_gaps, notes_on_model, notes_on_times
 
 if TYPE_CHECKING:
     from tests.conftest import WalkedSurvey
@@ -114,6 +114,13 @@ def test_times_an_hour_apart_by_clocks_that_know_the_date_are_told() -> None:
 def test_ranges_that_last_a_fraction_of_the_walk_are_told() -> None:
     (note,) = notes_on_times(1e-3 * WALK_S, WALK_S)
     assert note.startswith("the ranges last 0.12 s, the photos 120 s")
+
+
+def test_keyframes_too_far_apart_for_the_ranges_between_them_are_told_and_one_pause_is_not() -> None:
+    assert not list(notes_on_gaps(np.append(np.arange(10.0), 11.5), 2.0))
+    assert not list(notes_on_gaps(np.array([3.0]), 2.0))
+    (note,) = notes_on_gaps(np.array([0.0, 1.0, 3.1, 5.2, 7.3]), 2.0)
+    assert "for 86 % of the time keyframes are more than 2 s apart (in the median 2.1 s)" in note
 
 
 @pytest.fixture

@@ -27,6 +27,7 @@ _STUCK_SHARE, _MOVING_SHARE, _MIN_RANGES = 0.5, 0.2, 20
 _SINCE_1970_S = 1e9
 _LONG_GAP_S = 60.0
 _MIN_SHARE_OF_TIME = 0.5
+_MAX_SHARE_BETWEEN_FAR_PHOTOS = 0.3
 
 
 def notes_before_work(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
@@ -107,6 +108,22 @@ def notes_on_times(radio_s: Array, photos_s: Array) -> Iterator[str]:
         yield (
             f"by their clocks, ranges and photos are {gap_s / 3600:.2g} h apart: another time zone, or another walk; "
             "the offset is searched for, check what is found"
+        )
+
+
+def notes_on_gaps(photos_s: Array, max_gap_s: float) -> Iterator[str]:
+    """Of keyframes too far apart for the ranges between them.
+
+    Args:
+        photos_s: times, ascending.
+        max_gap_s: farther apart, ranges between two have no place.
+    """
+    gaps_s = np.diff(photos_s)
+    if len(gaps_s) and (share := gaps_s[gaps_s > max_gap_s].sum() / gaps_s.sum()) > _MAX_SHARE_BETWEEN_FAR_PHOTOS:
+        yield (
+            f"for {100 * share:.0f} % of the time keyframes are more than {max_gap_s:g} s apart (in the median "
+            f"{np.median(gaps_s):.3g} s): ranges between those are left out; use more of the photos, or allow more by "
+            "--max_interpolation_gap_s if the camera moved slowly"
         )
 
 

@@ -27,7 +27,7 @@ from rangesfm.sources.extract import TIMES_NAME, take_photos
 from rangesfm.sources.source import is_source
 from rangesfm.survey.inputs import RangingInputs, read_ranging_inputs
 from rangesfm.survey.settings import Survey
-from rangesfm.trust.before import notes_before_work, notes_on_model, notes_on_times
+from rangesfm.trust.before import notes_before_work, notes_on_gaps, notes_on_model, notes_on_times
 from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images
 from rangesfm.vision.keyframes import select_keyframes
 from rangesfm.vision.mapping_loop import GlobalAdjustment
@@ -39,7 +39,6 @@ from rangesfm.workflows.metric_map import estimate_scale, path_of_model, ranges_
 
 # Fewer have no shape by which ranges could tell a scale.
 _MIN_NUM_KEYFRAMES = 5
-_MAX_SHARE_WITHOUT_POSES = 0.3
 # By which factor the path must have grown for the clocks' offset to be looked for again.
 _GROWTH = 1.5
 
@@ -81,17 +80,10 @@ def tell_of_times(survey: Survey, inputs: RangingInputs, times: ImageTimes | Non
     """What is odd about the photos' times, and about two clocks whose offset nobody gave."""
     if times is None or inputs.log.timestamp_s is None:
         return
-    gaps_s, max_s = np.diff(times.timestamps_s), survey.ranges.max_interpolation_gap_s
-    share = float(gaps_s[gaps_s > max_s].sum() / gaps_s.sum()) if len(gaps_s) else 0.0
-    if share > _MAX_SHARE_WITHOUT_POSES:
-        journal.warn(
-            f"for {100 * share:.0f} % of the time keyframes are more than {max_s:g} s apart (in the median "
-            f"{np.median(gaps_s):.3g} s): ranges between those are left out; use more of the photos, or allow more by "
-            "--max_interpolation_gap_s if the camera moved slowly"
-        )
-    for note in (
-        notes_on_times(inputs.log.timestamp_s, times.timestamps_s) if survey.ranges.time_offset_s is None else ()
-    ):
+    notes = [*notes_on_gaps(times.timestamps_s, survey.ranges.max_interpolation_gap_s)]
+    if survey.ranges.time_offset_s is None:
+        notes += notes_on_times(inputs.log.timestamp_s, times.timestamps_s)
+    for note in notes:
         journal.warn(note)
 
 
