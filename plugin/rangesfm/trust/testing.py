@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy import special
@@ -138,19 +139,15 @@ class Factorization:
         )
 
 
+@cache
 def noncentrality(num: int) -> float:
     """By which a mistake of so many numbers must raise the statistic to be found (Baarda's lambda_0)."""
-    if num not in _NONCENTRALITY:
-        critical = special.chdtri(num, _ALPHA)
-        low, high = 0.0, 1000.0
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if special.chndtr(critical, num, middle) > _BETA else (low, middle)
-        _NONCENTRALITY[num] = high
-    return _NONCENTRALITY[num]
-
-
-_NONCENTRALITY: dict[int, float] = {}
+    critical = special.chdtri(num, _ALPHA)
+    low, high = 0.0, 1000.0
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if special.chndtr(critical, num, middle) > _BETA else (low, middle)
+    return high
 
 
 def _basis_of(left: Array, whitened: Array) -> Array:
