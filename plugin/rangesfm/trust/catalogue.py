@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from rangesfm.arrays import Array, Mask
-from rangesfm.scale.range_equation import tag_positions
 from rangesfm.trust.hypothesis import Correction, Effect, Hypothesis, of_anchor_place, of_cells
 from rangesfm.trust.linearized import Linearized
 
@@ -256,9 +255,8 @@ def lever_arms(problem: Linearized) -> Iterator[Hypothesis]:
 
 def people_in_between(problem: Linearized) -> Iterator[Hypothesis]:
     """Whoever carries the camera stands between the tag and the anchors behind."""
-    given, state = problem.on_map.problem, problem.on_map.state
-    from_anchor_m = tag_positions(given, state.metric_from_model) - state.anchors_m[given.anchor_index]
-    is_behind = np.sum(from_anchor_m * problem.on_map.world_from_cam[:, :, 2], axis=1) > 0
+    on_map = problem.on_map
+    is_behind = np.sum(on_map.from_anchor_m * on_map.world_from_cam[:, :, 2], axis=1) > 0
 
     def words(size: Array) -> str:
         return f"the ranges to anchors behind the camera read about {abs(size[0]):.2f} m too {_long(size[0])}"

@@ -11,7 +11,7 @@ from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.initialize import model_from_cam
 from rangesfm.scale.problem import ScaleProblem
-from rangesfm.scale.range_equation import RangeProblem, RangeState
+from rangesfm.scale.range_equation import RangeProblem, RangeState, tag_positions
 from rangesfm.scale.solution import Solution
 from rangesfm.scale.uncertainty import ruled_out, times_of_ranges
 
@@ -51,6 +51,12 @@ class RangesOnMap:
         """(n, 3, 3) in the metric world."""
         turned: Array = self.state.metric_from_model.rotation @ self.model_from_cam
         return turned
+
+    @property
+    def from_anchor_m(self) -> Array:
+        """(n, 3) from each range's anchor to its tag, in the metric world."""
+        tags_m = tag_positions(self.problem, self.state.metric_from_model)
+        return np.asarray(tags_m - self.state.anchors_m[self.problem.anchor_index])
 
 
 def ranges_on_map(

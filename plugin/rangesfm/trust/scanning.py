@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.scale.range_equation import tag_positions
 from rangesfm.trust.catalogue import MISMEASURED_M, UNSEEN_MOVE_M
 from rangesfm.trust.hypothesis import Correction, Hypothesis, of_cells
 from rangesfm.trust.linearized import Linearized
@@ -24,99 +24,82 @@ _MIN_NUM_CELLS = 3
 
 def anchors_moved(problem: Linearized) -> Iterator[Hypothesis]:
     """An anchor was moved at some time."""
-    on_map = problem.on_map
-    tags_m = tag_positions(on_map.problem, on_map.state.metric_from_model)
     for k in _heard(problem):
-        name, at = on_map.anchor_ids[k], on_map.state.anchors_m[k]
-        for time, after in _changes(problem, k, 3 * _MIN_NUM_CELLS):
+        name = problem.on_map.anchor_ids[k]
 
-            def words(size: Array, name: str = name, when: str = _when(problem, time)) -> str:
-                return (
-                    f"anchor {name} was moved by about {np.linalg.norm(size):.2f} m {when} "
-                    f"({size[0]:+.2f}, {size[1]:+.2f}, {size[2]:+.2f} m in x, y, z)"
-                )
+        def words(when: str, size: Array, name: str = name) -> str:
+            return f"anchor {name} was moved by about {np.linalg.norm(size):.2f} m {when} ({_in_axes(size)} in x, y, z)"
 
-            of_ranges = _of_ranges(problem, k) & (on_map.time_s > time)
-
-            def back(size: Array, of_ranges: Mask = of_ranges, at: Array = at) -> Correction:
-                grown_m = np.linalg.norm(tags_m - at - size, axis=1) - np.linalg.norm(tags_m - at, axis=1)
-                return Correction(longer_m=np.where(of_ranges, grown_m, 0.0))
-
-            yield Hypothesis(
-                "anchor moved",
-                name,
-                unit="m",
-                words=words,
-                remedy="fix anchors so that nobody bumps into them, and use its ranges from before only",
-                correction=back,
-                adoption=_left_out(of_ranges),
-                unawares=UNSEEN_MOVE_M,
-                effect=of_cells(problem, after[:, None] * problem.gradient.by_tag),
-            )
+        remedy = "fix anchors so that nobody bumps into them, and use its ranges from before only"
+        yield from _elsewhere(
+            problem, k, "anchor moved", words, remedy, UNSEEN_MOVE_M, -np.eye(3), -problem.gradient.by_tag
+        )
 
 
 def map_breaks(problem: Linearized) -> Iterator[Hypothesis]:
     """From some time on the map lies elsewhere, as after a wrong match."""
-    on_map = problem.on_map
-    tags_m = tag_positions(on_map.problem, on_map.state.metric_from_model)
-    anchors_m = on_map.state.anchors_m[on_map.problem.anchor_index]
-    for time, after in _changes(problem, None, 3 * _MIN_NUM_CELLS):
-        of_ranges = on_map.time_s > time
 
-        def words(size: Array, when: str = _when(problem, time)) -> str:
-            return (
-                f"the map breaks: {when} it lies about {np.linalg.norm(size):.2f} m from where it should "
-                f"({-size[0]:+.2f}, {-size[1]:+.2f}, {-size[2]:+.2f} m in x, y, z)"
-            )
+    def words(when: str, size: Array) -> str:
+        far = f"about {np.linalg.norm(size):.2f} m from where it should"
+        return f"the map breaks: {when} it lies {far} ({_in_axes(-size)} in x, y, z)"
 
-        def back(size: Array, of_ranges: Mask = of_ranges) -> Correction:
-            grown_m = np.linalg.norm(tags_m + size - anchors_m, axis=1) - np.linalg.norm(tags_m - anchors_m, axis=1)
-            return Correction(longer_m=np.where(of_ranges, grown_m, 0.0))
-
-        yield Hypothesis(
-            "map break",
-            "",
-            unit="m",
-            words=words,
-            remedy="look at the photos there for a false match or too little overlap, and map the parts apart",
-            correction=back,
-            adoption=_left_out(of_ranges),
-            unawares=UNSEEN_MOVE_M,
-            effect=of_cells(problem, -after[:, None] * problem.gradient.by_tag),
-        )
+    remedy = "look at the photos there for a false match or too little overlap, and map the parts apart"
+    yield from _elsewhere(problem, None, "map break", words, remedy, UNSEEN_MOVE_M, np.eye(3), problem.gradient.by_tag)
 
 
 def tags_slipped(problem: Linearized) -> Iterator[Hypothesis]:
     """From some time on the tag sits elsewhere on the camera."""
-    on_map = problem.on_map
-    turned = np.swapaxes(on_map.world_from_cam, 1, 2)
-    tags_m = tag_positions(on_map.problem, on_map.state.metric_from_model)
-    from_anchor_m = tags_m - on_map.state.anchors_m[on_map.problem.anchor_index]
-    for time, after in _changes(problem, None, 3 * _MIN_NUM_CELLS):
-        of_ranges = on_map.time_s > time
 
-        def words(size: Array, when: str = _when(problem, time)) -> str:
-            return (
-                f"the tag slipped: {when} it sits about {np.linalg.norm(size):.2f} m elsewhere on the camera "
-                f"({size[0]:+.2f}, {size[1]:+.2f}, {size[2]:+.2f} m along the camera's x, y, z)"
-            )
+    def words(when: str, size: Array) -> str:
+        far = f"about {np.linalg.norm(size):.2f} m elsewhere on the camera"
+        return f"the tag slipped: {when} it sits {far} ({_in_axes(size)} along the camera's x, y, z)"
+
+    remedy = "fix the tag to the camera, and run the two parts as surveys of their own"
+    yield from _elsewhere(
+        problem, None, "tag slipped", words, remedy, MISMEASURED_M, problem.on_map.world_from_cam, problem.by_lever_arm
+    )
+
+
+def _elsewhere(
+    problem: Linearized,
+    anchor: int | None,
+    name: str,
+    words: Callable[[str, Array], str],
+    remedy: str,
+    unawares: float,
+    axes: Array,
+    by_shift: Array,
+) -> Iterator[Hypothesis]:
+    """From some time on tags are elsewhere, as seen from an anchor, or from all.
+
+    Args:
+        words: of when, and of a shift.
+        axes: (3, 3), or (n, 3, 3) for each range: along which they are shifted.
+        by_shift: (c, 3) by how much the predicted ranges grow along these.
+    """
+    from_anchor_m, times = problem.on_map.from_anchor_m, problem.on_map.time_s
+    for time, after in _changes(problem, anchor, 3 * _MIN_NUM_CELLS):
+        of_ranges = _of_ranges(problem, anchor) & (times > time)
 
         def back(size: Array, of_ranges: Mask = of_ranges) -> Correction:
-            moved_m = from_anchor_m + size @ turned
-            grown_m = np.linalg.norm(moved_m, axis=1) - np.linalg.norm(from_anchor_m, axis=1)
+            grown_m = np.linalg.norm(from_anchor_m + axes @ size, axis=1) - np.linalg.norm(from_anchor_m, axis=1)
             return Correction(longer_m=np.where(of_ranges, grown_m, 0.0))
 
         yield Hypothesis(
-            "tag slipped",
-            "",
+            name,
+            "" if anchor is None else problem.on_map.anchor_ids[anchor],
             unit="m",
-            words=words,
-            remedy="fix the tag to the camera, and run the two parts as surveys of their own",
+            words=partial(words, _when(problem, time)),
+            remedy=remedy,
             correction=back,
             adoption=_left_out(of_ranges),
-            unawares=MISMEASURED_M,
-            effect=of_cells(problem, -after[:, None] * problem.by_lever_arm),
+            unawares=unawares,
+            effect=of_cells(problem, -after[:, None] * by_shift),
         )
+
+
+def _in_axes(shift: Array) -> str:
+    return f"{shift[0]:+.2f}, {shift[1]:+.2f}, {shift[2]:+.2f} m"
 
 
 def steps(problem: Linearized) -> Iterator[Hypothesis]:
