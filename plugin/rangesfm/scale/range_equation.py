@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -73,6 +74,17 @@ class RangeProblem:
     @property
     def num_anchors(self) -> int:
         return len(self.anchor_stddev_m)
+
+    @cached_property
+    def uncertain(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Anchors, and biases, of which something is known, but not exactly."""
+        anchors, biases = (np.flatnonzero((s > 0) & np.isfinite(s)) for s in (self.anchor_stddev_m, self.bias_stddev_m))
+        return anchors, biases
+
+    @cached_property
+    def bias_whitening(self) -> Array:
+        """As ``noise.bias_whitening``, of the uncertain biases; asked for at every step of a solve."""
+        return bias_whitening(self.bias_stddev_m[self.uncertain[1]], self.common_bias_stddev_m)
 
     def subset(self, rows: npt.NDArray[np.int64]) -> RangeProblem:
         """The same problem with some of its ranges."""
@@ -390,17 +402,11 @@ def _left_of_step(start: RangeState, state: RangeState) -> Array:
     return left_jacobian(Rotation.from_matrix(state.metric_from_model.rotation @ start.metric_from_model.rotation.T))
 
 
-def _prior_rows(problem: RangeProblem, columns: Columns) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    anchors = np.flatnonzero((columns.anchor >= 0) & np.isfinite(problem.anchor_stddev_m))
-    biases = np.flatnonzero((columns.bias >= 0) & np.isfinite(problem.bias_stddev_m))
-    return anchors, biases
-
-
 def prior_residuals(problem: RangeProblem, columns: Columns, state: RangeState) -> Array:
     """(r,) of anchors, biases, distances and gravity, in stddevs."""
-    anchors, biases = _prior_rows(problem, columns)
+    anchors, biases = problem.uncertain
     off_anchor = (state.anchors_m - problem.anchor_mean_m)[anchors] / problem.anchor_stddev_m[anchors, None]
-    off_bias = _bias_whitening(problem, biases) @ (state.bias_m - problem.bias_mean_m)[biases]
+    off_bias = problem.bias_whitening @ (state.bias_m - problem.bias_mean_m)[biases]
     priors = [off_anchor.ravel(), off_bias]
     if problem.distances is not None:
         priors.append(distance_residuals(problem.distances, state.metric_from_model.scale, state.anchors_m))
@@ -417,12 +423,12 @@ def prior_cost(problem: RangeProblem, state: RangeState) -> float:
 
 def prior_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, state: RangeState) -> Array:
     """(r, p) of the same."""
-    anchors, biases = _prior_rows(problem, columns)
+    anchors, biases = problem.uncertain
     jacobian = np.zeros((3 * len(anchors) + len(biases), columns.num))
     for row, k in enumerate(anchors):
         for axis in range(3):
             jacobian[3 * row + axis, columns.anchor[k] + axis] = 1 / problem.anchor_stddev_m[k]
-    jacobian[3 * len(anchors) :, columns.bias[biases]] = _bias_whitening(problem, biases)
+    jacobian[3 * len(anchors) :, columns.bias[biases]] = problem.bias_whitening
     blocks, similarity = [jacobian], state.metric_from_model
     if problem.distances is not None:
         blocks.append(
@@ -434,10 +440,6 @@ def prior_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, s
         block[:, columns.frame : columns.frame + 3] = turn
         blocks.append(block)
     return np.concatenate(blocks)
-
-
-def _bias_whitening(problem: RangeProblem, biases: npt.NDArray[np.int64]) -> Array:
-    return bias_whitening(problem.bias_stddev_m[biases], problem.common_bias_stddev_m)
 
 
 def invert_information(information: Array) -> Array:
