@@ -132,23 +132,21 @@ def map_incrementally(
     counter = _Counter(begun)
     if begun is not None:
         progress.message(f"mapping: goes on from {counter.num_in_next_model} photos of an earlier run")
-    # COLMAP writes models as it goes, in the order in which it began them.
     with scratch_folder(models_path.with_name("mapping")) as folder:
-        snapshots = Snapshots(snapshots_path, folder / "snapshots", options, len(photos.names))
+        snapshots = Snapshots(snapshots_path, folder)
 
         def begin_model() -> None:
             counter.begin_model()
             snapshots.begin_model()
 
-        def add_photo() -> None:
+        def add_photo(model: pycolmap.Reconstruction) -> None:
             counter.add_photo()
-            snapshots.add_photo()
+            snapshots.add_photo(model)
 
-        models = run_in_background(
+        return run_in_background(
             lambda token: incremental_mapping(
                 database_path,
                 photos.folder,
-                folder,
                 options=options,
                 adjustment=adjustment,
                 input_path=begun or "",
@@ -160,7 +158,6 @@ def map_incrementally(
             lambda: counter.num_registered,
             len(photos.names),
         )
-    return list(models.values())
 
 
 def write_models(models: Iterable[pycolmap.Reconstruction], models_path: Path) -> None:
