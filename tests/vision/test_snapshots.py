@@ -132,7 +132,6 @@ def test_a_snapshot_between_two_refinements_of_the_whole_is_not_kept(undisturbed
     model = pycolmap.Reconstruction(undisturbed.output / "sparse" / "0")
     (tmp_path / "scratch").mkdir()
     snapshots = Snapshots(tmp_path / "kept", tmp_path / "scratch")
-    snapshots.begin_model()
     rng = np.random.default_rng(0)
     seen: set[str] = set()
 
@@ -162,9 +161,6 @@ def test_a_snapshot_between_two_refinements_of_the_whole_is_not_kept(undisturbed
     newest = newest_snapshot(tmp_path / "kept")
     assert newest is not None
     assert newest.name == max(seen)
-    snapshots.begin_model()
-    move(NUM_PHOTOS)
-    assert not keeps_after_photo()
 
 
 def test_snapshots_of_the_user_are_left_alone(mapping: Mapping, tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ class Snapshots:
     COLMAP refines all of the model each time that it has grown by a tenth, and counts from there. A mapping that goes
     on from a model counts anew, so that only a model just refined gives what an undisturbed mapping does.
 
-    Further models are begun when the first is done; snapshots of them are not kept.
+    Further models are begun when the first is done; there are no snapshots of them.
 
     Args:
         path: folder of the newest snapshot, made when there is one.
@@ -29,16 +29,11 @@ class Snapshots:
     def __init__(self, path: Path, scratch: Path):
         self._path = path
         self._scratch = scratch
-        self._num_models = 0
         self._poses: dict[int, bytes] = {}
 
-    def begin_model(self) -> None:
-        """To be called when COLMAP has begun a model, or gone on with one."""
-        self._num_models += 1
-
     def add_photo(self, model: pycolmap.Reconstruction) -> None:
-        """To be called when COLMAP has added a photo."""
-        if self._num_models == 1 and self._is_just_refined(model):
+        """To be called when COLMAP has added a photo to the first model."""
+        if self._is_just_refined(model):
             folder = self._scratch / f"{time.time_ns() // 1_000_000:013d}"
             folder.mkdir()
             model.write_binary(folder)
