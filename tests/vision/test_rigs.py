@@ -76,7 +76,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
 
 
 def mapped(simulated: Simulated, config: Path, method: str = "incremental") -> pycolmap.Reconstruction:
-    mapper = MapperOptions(database_path=simulated.folder / "given.db", method=method)
+    mapper = MapperOptions(database_path=simulated.folder / "given.db").changed(method=method)
     summary = reconstruct(
         simulated.folder, NAMES, config.with_name("out"), camera=CameraOptions(), mapper=mapper, rigs=read_rigs(config)
     )

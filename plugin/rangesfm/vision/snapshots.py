@@ -11,6 +11,7 @@ import pycolmap
 
 from rangesfm.colmap.model_files import read_model
 from rangesfm.errors import InputError
+from rangesfm.geometry.trajectory import pose_of
 
 
 class Snapshots:
@@ -41,7 +42,7 @@ class Snapshots:
 
     def _is_just_refined(self, model: pycolmap.Reconstruction) -> bool:
         """All cameras have moved since the last photo; the photos next to a new one alone move otherwise."""
-        poses = {id_: model.frame(id_).rig_from_world.params.tobytes() for id_ in model.reg_frame_ids()}
+        poses = {id_: pose_of(model.frame(id_)).params.tobytes() for id_ in model.reg_frame_ids()}
         before, self._poses = self._poses, poses
         return bool(before) and all(poses[id_] != pose for id_, pose in before.items() if id_ in poses)
 
