@@ -1,22 +1,32 @@
 """Photos to a model, stage by stage, beside the same calls of pycolmap with all its threads.
 
-python -m tests.benchmarks.reconstruction PHOTOS [--every_nth 3] [--num_threads 2] [--num_rounds 3] [--seed 0]
+python -m tests.benchmarks.reconstruction PHOTOS[:EVERY_NTH] ... [--num_threads 2] [--num_rounds 3] [--seed 0]
     [--camera_model OPENCV --camera_params 377,432,...]
 
-The photos of a folder in the order of their names, matched sequentially. Rounds of both take turns; printed are medians
-of the seconds by the clock, their ratio within each round (median, smallest and largest), and the machine's load. Last,
-matching by one process beside matching by ``--num_threads`` of them, on the same features, and whether the matches are
-the same, row for row.
+as ``DATA/room_env1/images:3 DATA/fountain/images plugin/rangesfm/demo/photos``. Of each folder, the photos in the order
+of their names, matched sequentially. Rounds of both take turns; printed are medians of the seconds by the clock and by
+all processors together (user and system, processes that were started included; less disturbed by whatever else the
+machine does), their ratios within each round (median, smallest and largest), and the machine's load. "all" is the whole
+call, from reading the photos to reading the models.
+
+Last, matching alone by one process that is kept on one core, by one that is not, by ``--num_threads`` of them and by
+twice as many, on the same features; how many cores each keeps busy; and whether the matches are the same, row for row.
+A process matches in one thread and verifies in another, so that on two cores it is not much slower than two processes;
+how processes scale is told by the one on one core.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import resource
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from statistics import median
 
@@ -33,18 +43,48 @@ from rangesfm.vision.photos import usable_photos
 from rangesfm.vision.reconstruct import reconstruct
 
 STAGES = ("features", "matching", "mapping")
-Seconds = dict[str, float]
 
 
-def seconds_of(work: Callable[[], object]) -> float:
-    begin = time.perf_counter()
+@dataclass(frozen=True)
+class Effort:
+    """Seconds by the clock and by all processors together."""
+
+    clock_s: float
+    processor_s: float
+
+    @classmethod
+    def so_far(cls) -> Effort:
+        used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+        return cls(time.perf_counter(), sum(part.ru_utime + part.ru_stime for part in used))
+
+    def __sub__(self, other: Effort) -> Effort:
+        return Effort(self.clock_s - other.clock_s, self.processor_s - other.processor_s)
+
+    @property
+    def num_busy_cores(self) -> float:
+        return self.processor_s / self.clock_s
+
+
+def effort_of(work: Callable[[], object]) -> Effort:
+    begin = Effort.so_far()
     work()
-    return time.perf_counter() - begin
+    return Effort.so_far() - begin
+
+
+class StageEfforts(SilentProgress):
+    """Takes the time whenever a stage begins."""
+
+    def __init__(self) -> None:
+        self.marks: list[Effort] = []
+
+    def stage(self, name: str) -> None:
+        assert name == STAGES[len(self.marks)]
+        self.marks.append(Effort.so_far())
 
 
 def by_pycolmap(
     photos: Path, names: Sequence[str], output: Path, camera: CameraOptions, num: int, seed: int
-) -> Seconds:
+) -> list[Effort]:
     """Its own calls, with the seed and the camera given."""
     database = output / "database.db"
     reader = pycolmap.ImageReaderOptions()
@@ -71,75 +111,115 @@ def by_pycolmap(
         "mapping": lambda: pycolmap.incremental_mapping(database, photos, output, mapping),
     }
     with colmap_log(output / "mapper.log"):
-        return {stage: seconds_of(call) for stage, call in calls.items()}
+        efforts = [effort_of(calls[stage]) for stage in STAGES]
+    return [*efforts, Effort(sum(e.clock_s for e in efforts), sum(e.processor_s for e in efforts))]
 
 
 def by_rangesfm(
     photos: Path, names: Sequence[str], output: Path, camera: CameraOptions, num: int, seed: int
-) -> Seconds:
+) -> list[Effort]:
     mapper = MapperOptions(matching="sequential", num_threads=num)
-    return reconstruct(photos, names, output, camera=camera, mapper=mapper, seed=seed).seconds
+    stages, begin = StageEfforts(), Effort.so_far()
+    reconstruct(photos, names, output, camera=camera, mapper=mapper, seed=seed, progress=stages)
+    marks = [begin, *stages.marks[1:], Effort.so_far()]  # what comes before the features is counted as theirs
+    return [*(end - start for start, end in pairwise(marks)), marks[-1] - begin]
 
 
-def match_anew(photos: Path, names: Sequence[str], database: Path, num_processes: int, seed: int) -> float:
-    """Seconds of matching alone."""
+def match_anew(photos: Path, names: Sequence[str], database: Path, num_processes: int, seed: int) -> Effort:
+    """Of matching alone."""
     clear_matches(database)
     options = matching_options(MapperOptions(matching="sequential", num_threads=num_processes), len(names), seed)
     usable, log = usable_photos(photos, names), database.with_name("mapper.log")
     with colmap_log(log):
-        return seconds_of(lambda: match_features(database, usable, options, log, SilentProgress()))
+        return effort_of(lambda: match_features(database, usable, options, log, SilentProgress()))
 
 
-def row(what: str, ours: Sequence[float], theirs: Sequence[float]) -> str:
-    ratios = [a / b for a, b in zip(ours, theirs, strict=True)]
-    spread = f"{median(ratios):6.2f}   {min(ratios):.2f} to {max(ratios):.2f}"
-    return f"{what:22} {median(theirs):9.1f} s {median(ours):9.1f} s {spread}"
+@contextmanager
+def on_cores(num: int) -> Iterator[None]:
+    """Keep this thread, and the processes that it starts, on so many cores."""
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, sorted(cores)[:num])
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, cores)
+
+
+def ratio(over: Sequence[float], under: Sequence[float]) -> str:
+    ratios = [a / b for a, b in zip(over, under, strict=True)]
+    return f"{median(ratios):5.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
 
 
 def load() -> str:
     return f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
 
 
+def compare_stages(theirs: Sequence[Sequence[Effort]], ours: Sequence[Sequence[Effort]]) -> None:
+    print(f"{'':10}{'pycolmap':>19}{'rangesfm':>19}   ratio, clock          ratio, processors   ({load()})")
+    for k, what in enumerate((*STAGES, "all")):
+        line, ratios = f"{what:10}", []
+        for of in (theirs, ours):
+            clock_s, processor_s = [e[k].clock_s for e in of], [e[k].processor_s for e in of]
+            line += f"{median(clock_s):8.1f} s /{median(processor_s):7.1f} s"
+            ratios.append((clock_s, processor_s))
+        (clock, processor), (our_clock, our_processor) = ratios
+        print(f"{line}   {ratio(our_clock, clock)}   {ratio(our_processor, processor)}", flush=True)
+
+
+def compare_processes(
+    photos: Path, names: Sequence[str], features: Path, num_threads: int, num_rounds: int, seed: int
+) -> None:
+    all_cores = len(os.sched_getaffinity(0))
+    ways = [(1, 1), (1, all_cores), (num_threads, all_cores), (2 * num_threads, all_cores)]
+    databases = [Path(shutil.copy(features, features.with_name(f"{k}.db"))) for k in range(len(ways))]
+    efforts: list[list[Effort]] = [[] for _ in ways]
+    for _ in range(num_rounds):
+        for of_way, database, (num_processes, num_cores) in zip(efforts, databases, ways, strict=True):
+            with on_cores(num_cores):
+                of_way.append(match_anew(photos, names, database, num_processes, seed))
+    print(f"{'matching alone':32}{'clock':>9} {'processors':>10} {'busy':>5}   times as fast as the first ({load()})")
+    first = [effort.clock_s for effort in efforts[0]]
+    for (num_processes, num_cores), of_way in zip(ways, efforts, strict=True):
+        clock_s, processor_s, busy = (
+            median(getattr(effort, of) for effort in of_way) for of in ("clock_s", "processor_s", "num_busy_cores")
+        )
+        line = f"processes: {num_processes}, on cores: {num_cores:<9} {clock_s:8.1f}s {processor_s:9.1f}s {busy:5.2f}"
+        print(f"{line}   {ratio(first, [effort.clock_s for effort in of_way])}", flush=True)
+    several, one = ([effort.clock_s for effort in efforts[k]] for k in (2, 1))
+    contents = [content_of(database) for database in databases]
+    print(
+        f"{num_threads} processes beside one, all cores for both: {ratio(one, several)} times as fast; matches"
+        f" {'the same' if all(content == contents[0] for content in contents) else 'NOT THE SAME'}"
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("photos", type=Path)
-    parser.add_argument("--every_nth", type=int, default=3)
+    parser.add_argument("photos", nargs="+", help="a folder, perhaps with :N for every Nth of its photos")
     parser.add_argument("--num_threads", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--num_rounds", type=int, default=3)
     parser.add_argument("--camera_model")
     parser.add_argument("--camera_params", type=lambda text: tuple(map(float, text.split(","))))
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    names = list_images(arguments.photos)[:: arguments.every_nth]
     camera = CameraOptions(model=arguments.camera_model, params=arguments.camera_params)
-    print(f"{len(names)} photos, {arguments.num_threads} threads, {load()}", flush=True)
-    found: dict[str, list[Seconds]] = {"pycolmap": [], "rangesfm": []}
-    with tempfile.TemporaryDirectory() as folder:
-        for number in range(arguments.num_rounds):
-            for name, run in (("pycolmap", by_pycolmap), ("rangesfm", by_rangesfm)):
-                output = Path(folder) / f"{name}{number}"
-                output.mkdir()
-                found[name].append(run(arguments.photos, names, output, camera, arguments.num_threads, arguments.seed))
-        print(f"{'':22} {'pycolmap':>11} {'rangesfm':>11}  ratio   in the rounds ({load()})")
-        theirs, ours = ([[*seconds.values(), sum(seconds.values())] for seconds in rounds] for rounds in found.values())
-        for k, what in enumerate((*STAGES, "all")):
-            print(row(what, [s[k] for s in ours], [s[k] for s in theirs]), flush=True)
-        databases = [Path(folder) / f"{way}.db" for way in ("one", "several")]
-        seconds: list[list[float]] = [[], []]
-        for database in databases:
-            shutil.copy(Path(folder) / "rangesfm0" / "database.db", database)
-        for _ in range(arguments.num_rounds):
-            for place, num_processes in enumerate((1, arguments.num_threads)):
-                seconds[place].append(
-                    match_anew(arguments.photos, names, databases[place], num_processes, arguments.seed)
-                )
-        is_same = content_of(databases[0]) == content_of(databases[1])
-        gains = [one / several for one, several in zip(*seconds, strict=True)]
-        print(
-            f"matching by {arguments.num_threads} processes: {median(gains):.2f} times as fast as by one"
-            f" ({min(gains):.2f} to {max(gains):.2f}; {median(seconds[0]):.1f} and {median(seconds[1]):.1f} s), matches"
-            f" {'the same' if is_same else 'NOT THE SAME'}; {load()}"
-        )
+    num, seed = arguments.num_threads, arguments.seed
+    for given in arguments.photos:
+        folder, _, every_nth = given.partition(":")
+        photos = Path(folder)
+        names = list_images(photos)[:: int(every_nth or 1)]
+        print(f"\n{photos}: {len(names)} photos, {num} threads, {load()}", flush=True)
+        theirs: list[list[Effort]] = []
+        ours: list[list[Effort]] = []
+        with tempfile.TemporaryDirectory() as scratch:
+            for number in range(arguments.num_rounds):
+                for found, run in ((theirs, by_pycolmap), (ours, by_rangesfm)):
+                    output = Path(scratch) / f"{run.__name__}{number}"
+                    output.mkdir()
+                    found.append(run(photos, names, output, camera, num, seed))
+            compare_stages(theirs, ours)
+            features = Path(scratch) / "by_rangesfm0" / "database.db"
+            compare_processes(photos, names, features, num, arguments.num_rounds, seed)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -72,12 +71,8 @@ def mapped(
     adjust: Callable[[pycolmap.Reconstruction], bool] | None,
     **arguments: Any,
 ) -> list[pycolmap.Reconstruction]:
-    output = database.with_name("models")
-    shutil.rmtree(output, ignore_errors=True)
-    output.mkdir()
     adjustment = None if adjust is None else Adjustment(adjust)
-    models = incremental_mapping(database, database.parent, output, options=options, adjustment=adjustment, **arguments)
-    return list(models.values())
+    return incremental_mapping(database, database.parent, options=options, adjustment=adjustment, **arguments)
 
 
 @pytest.fixture(params=["colmaps loop", "own loop"])
@@ -166,7 +161,7 @@ def test_cancelled_mapping_ends_with_the_photo_at_hand(
 ) -> None:
     token, registered = pycolmap.CancellationToken(), list[str]()
 
-    def cancel_the_second_time() -> None:
+    def cancel_the_second_time(model: pycolmap.Reconstruction) -> None:
         registered.append("")
         if len(registered) == 2:
             token.cancel()
@@ -181,7 +176,7 @@ def test_a_mapping_ends_when_its_time_is_over(
     adjust: Callable[[pycolmap.Reconstruction], bool] | None,
 ) -> None:
     options.max_runtime_seconds = 1
-    (model,) = mapped(database, options, adjust, next_image_callback=lambda: time.sleep(0.6))
+    (model,) = mapped(database, options, adjust, next_image_callback=lambda model: time.sleep(0.6))
     assert 2 <= model.num_reg_images() <= 4
     assert all(point.error >= 0 for point in model.points3D.values())
 
@@ -199,7 +194,7 @@ def test_a_mapping_goes_on_from_a_snapshot_of_its_own(
         options,
         lambda model: False,
         input_path=sorted(tmp_path.iterdir())[1],
-        next_image_callback=lambda: registered.append(""),
+        next_image_callback=lambda model: registered.append(""),
     )
     assert len(registered) == 4
     assert set(continued.reg_image_ids()) == set(whole.reg_image_ids())

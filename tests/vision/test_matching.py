@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -113,7 +113,19 @@ def test_shares_are_of_bounded_size_hold_each_pair_once_and_are_of_few_photos(nu
     shares = list(matching._shared_out(pairs, num_processes))
     assert Counter(pair for share in shares for pair in share) == Counter(pairs)
     assert max(map(len, shares)) <= matching._MAX_NUM_PAIRS
-    assert max(len({photo for pair in share for photo in pair}) for share in shares) < 300
+    assert max(num_photos(share) for share in shares) < 300
+
+
+def test_processes_that_match_neighbours_share_few_photos() -> None:
+    """Each indexes the features of all its photos anew."""
+    pairs = [(first, first + step) for first in range(1, 101) for step in range(1, 11)]
+    shares = list(matching._shared_out(pairs, 2))
+    assert len(shares) == 2
+    assert sum(num_photos(share) for share in shares) < 1.2 * num_photos(pairs)
+
+
+def num_photos(pairs: Sequence[tuple[int, int]]) -> int:
+    return len({photo for pair in pairs for photo in pair})
 
 
 def test_a_process_that_fails_is_told_of_and_ends_the_others(

@@ -75,8 +75,8 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
     return Simulated(folder, truth)
 
 
-def mapped(simulated: Simulated, config: Path) -> pycolmap.Reconstruction:
-    mapper = MapperOptions(database_path=simulated.folder / "given.db")
+def mapped(simulated: Simulated, config: Path, method: str = "incremental") -> pycolmap.Reconstruction:
+    mapper = MapperOptions(database_path=simulated.folder / "given.db").changed(method=method)
     summary = reconstruct(
         simulated.folder, NAMES, config.with_name("out"), camera=CameraOptions(), mapper=mapper, rigs=read_rigs(config)
     )
@@ -86,10 +86,13 @@ def mapped(simulated: Simulated, config: Path) -> pycolmap.Reconstruction:
     return model
 
 
-def test_known_places_are_kept_to_the_digit_and_give_the_model_its_scale(simulated: Simulated, tmp_path: Path) -> None:
-    model = mapped(simulated, simulated.config(tmp_path / "rig_config.json", known=(1, 2)))
+@pytest.mark.parametrize(("method", "max_off"), [("incremental", 1e-12), ("hierarchical", 1e-12), ("global", 1e-5)])
+def test_known_places_are_kept_to_the_digit_but_by_the_global_mapper_and_give_the_model_its_scale(
+    simulated: Simulated, tmp_path: Path, method: str, max_off: float
+) -> None:
+    model = mapped(simulated, simulated.config(tmp_path / "rig_config.json", known=(1, 2)), method)
     for found, true in zip(poses_of(model), simulated.poses, strict=True):
-        assert np.allclose(found.matrix(), true.matrix(), rtol=0, atol=1e-12)
+        assert np.allclose(found.matrix(), true.matrix(), rtol=0, atol=max_off)
     compared = pycolmap.compare_reconstructions(model, simulated.truth)
     assert compared is not None
     assert compared["rec2_from_rec1"].scale == pytest.approx(1, rel=1e-3)
@@ -106,11 +109,13 @@ def test_rigs_of_a_given_database_are_told_to_have_no_say(simulated: Simulated, 
             assert ("its rigs are not: what [images] rig_config says of them counts" in given.note) == bool(known)
 
 
-@pytest.mark.parametrize("known", [(), (1,)])
+@pytest.mark.parametrize(
+    ("known", "method"), [((), "incremental"), ((1,), "incremental"), ((1,), "global"), ((1,), "hierarchical")]
+)
 def test_unknown_places_are_found_and_go_together_with_those_that_are_known(
-    simulated: Simulated, tmp_path: Path, known: tuple[int, ...]
+    simulated: Simulated, tmp_path: Path, known: tuple[int, ...], method: str
 ) -> None:
-    model = mapped(simulated, simulated.config(tmp_path / "rig_config.json", known))
+    model = mapped(simulated, simulated.config(tmp_path / "rig_config.json", known), method)
     compared = pycolmap.compare_reconstructions(model, simulated.truth)
     assert compared is not None
     scale = compared["rec2_from_rec1"].scale

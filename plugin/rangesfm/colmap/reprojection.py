@@ -56,12 +56,13 @@ def point_errors(model: pycolmap.Reconstruction) -> PointErrors:
 def photo_errors_px(model: pycolmap.Reconstruction) -> dict[str, float]:
     """Median reprojection error of each registered photo that sees points, by name; infinite where most lie behind."""
     medians = {}
+    xyz = {point_id: point.xyz for point_id, point in model.points3D.items()}
     for image_id in sorted(model.reg_image_ids()):
         image = model.image(image_id)
         seen = image.get_observation_points2D()
         if not seen:
             continue
-        in_cam = image.cam_from_world() * np.array([model.point3D(point.point3D_id).xyz for point in seen])
+        in_cam = image.cam_from_world() * np.array([xyz[point.point3D_id] for point in seen])
         pixels = np.asarray(model.camera(image.camera_id).img_from_cam(in_cam), dtype=np.float64)
         off_px = np.linalg.norm(pixels - np.array([point.xy for point in seen]), axis=1)
         medians[image.name] = float(np.median(np.where((in_cam[:, 2] > 0) & np.isfinite(off_px), off_px, np.inf)))

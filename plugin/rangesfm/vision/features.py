@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from rangesfm.vision.database import num_photos_with_features
 from rangesfm.vision.photos import MIN_NUM_PHOTOS, Photos
 
 _MIN_NUM_FEATURES = 50  # COLMAP starts from pairs with 100 matches and adds photos that see 30 known points
-_PHOTOS_PER_THREAD = 2
+_CALL_S = 4.0
 
 
 def feature_options(mapper: MapperOptions) -> pycolmap.FeatureExtractionOptions:
@@ -87,10 +88,11 @@ def _call_colmap(
     options: pycolmap.FeatureExtractionOptions,
     token: pycolmap.CancellationToken,
 ) -> None:
-    """A few photos at a time: COLMAP finishes all photos of a call before it heeds the token."""
-    num_threads = options.num_threads if options.num_threads > 0 else os.cpu_count() or 1
-    num_at_a_time = _PHOTOS_PER_THREAD * num_threads
-    for start in range(0, len(names), num_at_a_time):
+    """Some seconds' photos at a time: COLMAP finishes all photos of a call before it heeds the token."""
+    num_at_a_time = num_threads = options.num_threads if options.num_threads > 0 else os.cpu_count() or 1
+    start = 0
+    while start < len(names):
+        begin_s = time.monotonic()
         pycolmap.extract_features(
             database_path,
             folder,
@@ -99,3 +101,6 @@ def _call_colmap(
             extraction_options=options,
             cancellation_token=token,
         )
+        start += num_at_a_time
+        num_in_time = num_at_a_time * _CALL_S / (time.monotonic() - begin_s)
+        num_at_a_time = max(num_threads, int(num_in_time))

@@ -129,26 +129,26 @@ def map_incrementally(
 ) -> list[pycolmap.Reconstruction]:
     """All models that COLMAP's incremental mapper makes; there may be none. Raises ReconstructionError if it fails."""
     begun = newest_snapshot(snapshots_path)
-    counter = _Counter(begun)
+    num_begun = 0
     if begun is not None:
-        progress.message(f"mapping: goes on from {counter.num_in_next_model} photos of an earlier run")
-    # COLMAP writes models as it goes, in the order in which it began them.
+        num_begun = pycolmap.Reconstruction(begun).num_reg_images()
+        progress.message(f"mapping: goes on from {num_begun} photos of an earlier run")
+    num_registered: list[int] = []  # by model; a photo may be in more than one
     with scratch_folder(models_path.with_name("mapping")) as folder:
-        snapshots = Snapshots(snapshots_path, folder / "snapshots", options, len(photos.names))
+        snapshots = Snapshots(snapshots_path, folder)
 
         def begin_model() -> None:
-            counter.begin_model()
-            snapshots.begin_model()
+            num_registered.append(0 if num_registered else num_begun)
 
-        def add_photo() -> None:
-            counter.add_photo()
-            snapshots.add_photo()
+        def add_photo(model: pycolmap.Reconstruction) -> None:
+            num_registered[-1] = model.num_reg_images()
+            if len(num_registered) == 1:
+                snapshots.add_photo(model)
 
-        models = run_in_background(
+        return run_in_background(
             lambda token: incremental_mapping(
                 database_path,
                 photos.folder,
-                folder,
                 options=options,
                 adjustment=adjustment,
                 input_path=begun or "",
@@ -157,10 +157,9 @@ def map_incrementally(
                 cancellation_token=token,
             ),
             progress,
-            lambda: counter.num_registered,
+            lambda: sum(num_registered),
             len(photos.names),
         )
-    return list(models.values())
 
 
 def write_models(models: Iterable[pycolmap.Reconstruction], models_path: Path) -> None:
@@ -179,18 +178,3 @@ def read_models(models_path: Path) -> tuple[pycolmap.Reconstruction, ...]:
 
 def remove_models(models_path: Path) -> None:
     shutil.rmtree(models_path, ignore_errors=True)
-
-
-class _Counter:
-    """Photos registered so far; in more than one model they count more than once."""
-
-    def __init__(self, begun: Path | None):
-        self.num_registered = 0
-        self.num_in_next_model = 2 if begun is None else pycolmap.Reconstruction(begun).num_reg_images()
-
-    def begin_model(self) -> None:
-        self.num_registered += self.num_in_next_model
-        self.num_in_next_model = 2
-
-    def add_photo(self) -> None:
-        self.num_registered += 1

@@ -42,22 +42,22 @@ class _StoppedError(Exception):
 def incremental_mapping(
     database_path: Path,
     image_path: Path,
-    output_path: Path,
     *,
     options: pycolmap.IncrementalPipelineOptions,
     adjustment: GlobalAdjustment | None = None,
     input_path: Path | str = "",
     initial_image_pair_callback: Callable[[], None] = lambda: None,
-    next_image_callback: Callable[[], None] = lambda: None,
+    next_image_callback: Callable[[pycolmap.Reconstruction], None] = lambda model: None,
     cancellation_token: pycolmap.CancellationToken | None = None,
-) -> dict[int, pycolmap.Reconstruction]:
-    """All models, in the order in which they were begun; also written to ``output_path``, as COLMAP does.
+) -> list[pycolmap.Reconstruction]:
+    """All models, in the order in which they were begun.
 
     Python's lock is held but for the callbacks: COLMAP's parts do not release it.
 
     Args:
         adjustment: takes the place of COLMAP's global bundle adjustment.
         input_path: a model to go on from.
+        next_image_callback: given the model that the photo was added to.
         cancellation_token: ends the mapping with the photo at hand, as the time does that the options allow.
     """
     options.image_path = image_path
@@ -75,13 +75,14 @@ def incremental_mapping(
 
     for when, callback in {
         pycolmap.IncrementalPipelineCallback.INITIAL_IMAGE_PAIR_REG_CALLBACK: initial_image_pair_callback,
-        pycolmap.IncrementalPipelineCallback.NEXT_IMAGE_REG_CALLBACK: next_image_callback,
+        pycolmap.IncrementalPipelineCallback.NEXT_IMAGE_REG_CALLBACK: lambda: next_image_callback(
+            manager.get(manager.size() - 1)
+        ),
     }.items():
         pipeline.add_callback(when, partial(call, callback))
     if pipeline.database_cache.num_images():
         _map_with_relaxed_demands(pipeline, adjustment)
-    manager.write(output_path)
-    return {index: manager.get(index) for index in range(manager.size())}
+    return [manager.get(index) for index in range(manager.size())]
 
 
 def _map_with_relaxed_demands(pipeline: pycolmap.IncrementalPipeline, adjustment: GlobalAdjustment | None) -> None:

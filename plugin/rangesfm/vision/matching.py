@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -177,4 +178,5 @@ def _shared_out(pairs: Sequence[tuple[int, int]], num_processes: int) -> Iterato
     num_at_once = max(1, min(num_processes, len(pairs) // _MIN_NUM_PAIRS))
     for start in range(0, len(tiles), num_at_once * _MAX_NUM_PAIRS):
         together = tiles[start : start + num_at_once * _MAX_NUM_PAIRS]
-        yield from (together[k::num_at_once] for k in range(num_at_once))
+        cuts = [len(together) * k // num_at_once for k in range(num_at_once + 1)]
+        yield from (together[begin:end] for begin, end in pairwise(cuts))

@@ -18,8 +18,8 @@ from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import copy_features, copy_matches, num_compared_pairs
 
-# Pairs after which COLMAP writes down what it has found; it keeps as many photos in memory.
-BLOCK_SIZE = 64
+# Features that COLMAP keeps in memory, each of some 700 bytes with its index; what it forgets it indexes anew.
+_MAX_NUM_FEATURES = 400_000
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,10 @@ class MatchingShare:
     def match(self, progress: Progress) -> int:
         """Returns how many pairs have been compared."""
         pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path, pairing.block_size = self.folder / "pairs.txt", BLOCK_SIZE
+        pairing.match_list_path = self.folder / "pairs.txt"
         with colmap_log(self.log), pycolmap.Database.open(self.database) as database:
+            # Pairs after which COLMAP writes down what it has found; it keeps as many photos in memory.
+            pairing.block_size = max(1, _MAX_NUM_FEATURES * database.num_images() // (1 + database.num_descriptors()))
             run_in_background(
                 lambda token: pycolmap.match_image_pairs(
                     self.database, self.matcher, pairing, self.verification, cancellation_token=token

@@ -51,12 +51,12 @@ def _why_not(rigs: Rigs) -> str:
 
 
 def hold_rigs(options: PipelineOptions, rigs: Rigs, database_path: Path) -> None:
-    """Have the mapping keep the rigs whose configuration says where all of their cameras sit."""
-    if isinstance(options, pycolmap.GlobalPipelineOptions):
-        if rigs.configs and all(rigs.are_known):
-            options.mapper.refine_sensor_from_rig = options.mapper.bundle_adjustment.refine_sensor_from_rig = False
-        return
+    """Have the mapping keep the rigs whose configuration says where all of their cameras sit.
+
+    The global mapper begins with what is known and refines it: with rigs held, COLMAP 4.2's global positioning ends in
+    a map without sense, of perfect matches too.
+    """
     if isinstance(options, pycolmap.HierarchicalPipelineOptions):
         options = options.incremental_options
-    if any(rigs.are_known):
+    if isinstance(options, pycolmap.IncrementalPipelineOptions) and any(rigs.are_known):
         options.constant_rigs = rigs.ids_of_known(database_path)

@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import os
 import shutil
-import struct
+import time
 from pathlib import Path
 
 import pycolmap
 
 from rangesfm.colmap.model_files import read_model
 from rangesfm.errors import InputError
-
-# Writing a model after each photo takes a few percent of the time of mapping up to a few hundred photos, and beyond
-# grows with their number.
-_MAX_NUM_SNAPSHOTS = 200
-# As COLMAP writes the frames of a model: id, rig and pose, then so many photos.
-_FRAME = struct.Struct("<II7dI")
-_PHOTO_BYTES = 16
+from rangesfm.geometry.trajectory import pose_of
 
 
 class Snapshots:
@@ -26,53 +20,31 @@ class Snapshots:
     COLMAP refines all of the model each time that it has grown by a tenth, and counts from there. A mapping that goes
     on from a model counts anew, so that only a model just refined gives what an undisturbed mapping does.
 
-    Further models are begun when the first is done; snapshots of them are not kept.
+    Further models are begun when the first is done; there are no snapshots of them.
 
     Args:
         path: folder of the newest snapshot, made when there is one.
-        scratch: folder for COLMAP to write to; made here.
-        options: of the mapping, which are told so. Snapshots that the user asked for go where the user wants them, and
-            none are kept.
+        scratch: folder beside it, where one is written.
     """
 
-    def __init__(self, path: Path, scratch: Path, options: pycolmap.IncrementalPipelineOptions, num_photos: int):
+    def __init__(self, path: Path, scratch: Path):
         self._path = path
         self._scratch = scratch
-        self._num_models = 0
-        self._poses: dict[int, tuple[float, ...]] | None = None
-        scratch.mkdir()
-        if options.snapshot_frames_freq <= 0:
-            options.snapshot_path = scratch
-            options.snapshot_frames_freq = max(1, num_photos // _MAX_NUM_SNAPSHOTS)
+        self._poses: dict[int, bytes] = {}
 
-    def begin_model(self) -> None:
-        """To be called when COLMAP has begun a model, or gone on with one."""
-        self._num_models += 1
+    def add_photo(self, model: pycolmap.Reconstruction) -> None:
+        """To be called when COLMAP has added a photo to the first model."""
+        if self._is_just_refined(model):
+            folder = self._scratch / f"{time.time_ns() // 1_000_000:013d}"
+            folder.mkdir()
+            model.write_binary(folder)
+            _keep(folder, self._path)
 
-    def add_photo(self) -> None:
-        """To be called when COLMAP has added a photo, and so is not writing a snapshot."""
-        for folder in sorted(self._scratch.iterdir()):
-            if self._num_models == 1 and self._is_just_refined(folder):
-                _keep(folder, self._path)
-            else:
-                shutil.rmtree(folder)
-
-    def _is_just_refined(self, folder: Path) -> bool:
-        """All cameras have moved since the last snapshot; the photos next to a new one alone move otherwise."""
-        poses = _poses(folder / "frames.bin")
+    def _is_just_refined(self, model: pycolmap.Reconstruction) -> bool:
+        """All cameras have moved since the last photo; the photos next to a new one alone move otherwise."""
+        poses = {id_: pose_of(model.frame(id_)).params.tobytes() for id_ in model.reg_frame_ids()}
         before, self._poses = self._poses, poses
-        return before is not None and all(poses[id_] != pose for id_, pose in before.items() if id_ in poses)
-
-
-def _poses(path: Path) -> dict[int, tuple[float, ...]]:
-    """Of each frame of a model, by its id."""
-    data = path.read_bytes()
-    poses, at = {}, 8
-    while at < len(data):
-        frame_id, _, *pose, num_photos = _FRAME.unpack_from(data, at)
-        poses[frame_id] = tuple(pose)
-        at += _FRAME.size + num_photos * _PHOTO_BYTES
-    return poses
+        return bool(before) and all(poses[id_] != pose for id_, pose in before.items() if id_ in poses)
 
 
 def newest_snapshot(path: Path) -> Path | None:
