@@ -45,6 +45,8 @@ def test_input_is_never_overwritten(name: str, tmp_path: Path) -> None:
 
 def test_results_do_not_stand_in_a_model_nor_a_model_in_results(tmp_path: Path) -> None:
     for model, output in (("0", "0"), ("0", "0/out"), ("out/sparse_metric/0/copy", "out")):
+        (tmp_path / model).mkdir(parents=True, exist_ok=True)
+        (tmp_path / model / "cameras.bin").touch()
         with pytest.raises(InputError, match="expected another output path"):
             refuse_to_overwrite([InputPath("", "model", tmp_path / model)], tmp_path / output)
     refuse_to_overwrite([InputPath("", "photos", tmp_path / "photos")], tmp_path / "photos" / "out")

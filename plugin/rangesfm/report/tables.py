@@ -261,7 +261,7 @@ def versions(content: Content) -> Table:
 def settings(content: Content) -> Table:
     """The survey as the run had it, in the words of its keys."""
     given = content.summary.settings.to_json()
-    known = [item for item in KEYS if item.name in (given.get(item.table) or {})]
+    known = [item for item in KEYS if (given.get(item.table) or {}).get(item.name) not in (None, [], {})]
     rows = [[item.meaning, plain(given[item.table][item.name]), f"[{item.table}] {item.name}"] for item in known]
     return Table("Settings", ["what it is", "value", "key of the survey file"], rows, kind="settings")
 

@@ -59,7 +59,8 @@ def refuse_to_overwrite(inputs: Iterable[InputPath], folder: Path) -> None:
         path = item.path.resolve()
         if not written.isdisjoint((path, *path.parents)):
             raise InputError("the results would overwrite this input, expected another output path", item.path)
-        if path == folder.resolve() or (item.role == "model" and path in folder.resolve().parents):
+        is_model = item.role == "model" and any(path.glob("cameras.*"))
+        if path.is_dir() and (path == folder.resolve() or (is_model and path in folder.resolve().parents)):
             raise InputError("the results would stand in this input, expected another output path", item.path)
 
 
