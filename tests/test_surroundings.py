@@ -141,9 +141,12 @@ def test_what_colmap_logs_goes_neither_to_the_terminal_nor_to_files_of_its_own(t
     assert not list(tmp_path.iterdir())
 
 
-def test_full_device_for_a_file_is_one_line(command: Callable[..., subprocess.CompletedProcess[bytes]]) -> None:
+@pytest.mark.parametrize("argv", [("ranges", "uwb.csv"), ("--help",), ("--version",)])
+def test_full_device_for_a_file_is_one_line(
+    argv: tuple[str, ...], command: Callable[..., subprocess.CompletedProcess[bytes]]
+) -> None:
     with open("/dev/full", "wb") as full:
-        done = command("ranges", "uwb.csv", stdout=full)
+        done = command(*argv, stdout=full)
     assert done.returncode == 4
     assert done.stderr == b"rangesfm: error: standard output: No space left on device\n"
 

@@ -88,6 +88,8 @@ class ImageOptions(KeyframeOptions):
     path: Annotated[Path | None, Told(flag="images", metavar="PATH", role="photos")] = None
     """Folder of the photos and of folders of them, a video, or a ROS bag with images; as a flag also the CSV of the
     photos' times."""
+    model: Annotated[Path | None, Told(flag="input_path", metavar="MODEL", role="model")] = None
+    """Folder of a COLMAP model, as sparse/0, to go on from: then no photos are needed."""
     times: Annotated[Path | None, Told(flag="image_times", role="file")] = None
     """CSV image_name,timestamp_s (default: EXIF, else file names)."""
     rig_config: Annotated[Path | None, Told(flag="rig_config_path", metavar="JSON", role="file")] = None
@@ -168,10 +170,10 @@ class LogOptions(Options):
     """Names of its columns (numbers, where they have none) for timestamp (or image_name), anchor_id, range, tag_id,
     range_stddev, los; range:A1 for a column of one anchor; without range, the time stamps tx1, rx1, tx2, rx2 and
     possibly tx3, rx3 of two-way ranging."""
-    timestamp_unit: Literal["s", "ms", "us", "ns", "iso", "dmy", "mdy"] | None = None
-    """Of its times; iso: dates and times, dmy and mdy: those whose dates begin with the day or the month (default: by
-    format, name or values)."""
-    range_unit: Literal["m", "cm", "mm"] | None = None
+    timestamp_unit: Literal["s", "ms", "us", "ns", "min", "h", "d", "iso", "dmy", "mdy"] | None = None
+    """Of its times; d: days, also as Excel and MATLAB count them; iso: dates and times, dmy and mdy: those whose dates
+    begin with the day or the month (default: by format, name or values)."""
+    range_unit: Literal["m", "cm", "mm", "ft"] | None = None
     """Of its ranges (default: by format, name or values)."""
     separator: Annotated[
         Annotated[str, Field(min_length=1, max_length=1)] | None, Told(metavar="CHARACTER", expected="one character")

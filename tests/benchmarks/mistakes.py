@@ -68,8 +68,9 @@ def write_survey(folder: Path, num_keyframes: int, num_ranges: int) -> tuple[Sur
     (folder / "images.csv").write_text("image_name,timestamp_s\n" + "".join(lines))
     radio = Radio(rate_hz=num_ranges / len(HALL.anchors_m) / end_s, range_stddev_m=0.05)
     log = simulate_ranges(path, HALL.anchors_m, TAG_IN_CAM_M, radio).log
-    survey = Survey(model_path=folder / "sparse").changed(
+    survey = Survey().changed(
         {
+            "images.model": folder / "sparse",
             "images.times": folder / "images.csv",
             "ranges.path": folder / "uwb.csv",
             "ranges.time_offset": 0.0,

@@ -66,7 +66,7 @@ def test_images_are_a_folder_of_photos_or_a_file_of_times(tmp_path: Path, monkey
     assert (survey.images.path, survey.images.times) == (tmp_path / "photos", tmp_path / "images.csv")
     survey = survey_of("refine", "--input_path", "sparse/0", "--images", "images.csv")
     assert (survey.images.path, survey.images.times) == (None, tmp_path / "images.csv")
-    assert survey.model_path == tmp_path / "sparse" / "0"
+    assert survey.images.model == tmp_path / "sparse" / "0"
     with pytest.raises(InputError, match=r"there is no file .*none\.csv"):
         survey_of("refine", "--images", "none.csv")
 

@@ -92,8 +92,11 @@ def test_from_a_model_and_a_log_goes_on_what_init_says(
     Path("anchors_first_camera.csv").unlink()
     assert main(["init", ".", "--tag_in_cam", ",".join(map(str, TAG_IN_CAM_M))]) == 0
     *_, command = capsys.readouterr().out.splitlines()
-    assert command == "next: rangesfm refine survey.toml --input_path sparse/0"
-    assert main(["scale", *command.split()[3:]]) == 0
+    assert command == "next: rangesfm run survey.toml"
+    assert read_survey("survey.toml").images.model == own_survey.folder / "sparse" / "0"
+    assert main(["check", "survey.toml"]) == 0
+    assert "\nmodel: " in f"\n{capsys.readouterr().out}"
+    assert main(["scale", "survey.toml"]) == 0
 
 
 def test_an_ambiguous_folder_is_asked_about_and_nothing_is_written(

@@ -56,6 +56,7 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calls:
         (["reconstruct", "--images", "walk.MP4"], "reconstruct_survey", {"restart": False}),
         (["scale", "--input-path", "model", "--ranges", "uwb.csv"], "scale_model", {}),
         (["refine", "--input-path", "model", "--ranges", "uwb.csv"], "refine_model", {}),
+        (["run", "--input-path", "model", "--ranges", "uwb.csv", "--no_refine"], "scale_model", {}),
     ],
 )
 def test_command_runs_its_stage_and_prints_the_summary(
@@ -64,7 +65,7 @@ def test_command_runs_its_stage_and_prints_the_summary(
     assert main(argv) == 0
     ((name, survey, given),) = calls.made
     assert (name, given) == (stage, options)
-    assert (survey.images.path is None) != (survey.model_path is None)
+    assert (survey.images.path is None) != (survey.images.model is None)
     captured = capsys.readouterr()
     assert captured.out.splitlines() == [f"{stage} is done", "scale 2.5"]
     assert captured.err == "working\n"

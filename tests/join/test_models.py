@@ -210,7 +210,7 @@ def finished(exact: Halves, tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / day).mkdir()
         part.sfm.write(folder / day)
         survey = exact.write(folder).changed({"output.path": folder / day / "out"})
-        survey = survey.model_copy(update={"model_path": folder / day})
+        survey = survey.changed({"images.model": folder / day})
         scale_model(survey, progress=SilentProgress())
     return folder
 

@@ -107,7 +107,8 @@ def test_the_numbers_are_those_of_the_result(make_result: MakeResult) -> None:
         "+1.094",
         "−0.051",
         "0.0214",
-        "refine.range_loss_scale",
+        "[refine] range_loss_scale",
+        "Residual in stddevs from which a range is down-weighted (Geman-McClure) (default: 3.46)",
         "4.2.1",
     ]
     assert [text for text in expected if text not in texts] == []

@@ -21,6 +21,7 @@ from rangesfm.result.folder import (
     replacing_result,
 )
 from rangesfm.result.ranges_as_used import RangesAsUsed
+from rangesfm.survey.settings import InputPath
 
 PAGE = (Path(__file__).parents[2] / "examples" / "results.md").read_text(encoding="utf-8")
 
@@ -36,9 +37,19 @@ def test_input_is_never_overwritten(name: str, tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "out", target_is_directory=True)
     for path in (tmp_path / "out" / name, tmp_path / "out" / "." / name, tmp_path / "link" / name):
         with pytest.raises(InputError, match="the results would overwrite this input") as caught:
-            refuse_to_overwrite([None, path], tmp_path / "out")
+            refuse_to_overwrite([InputPath("", "file", path)], tmp_path / "out")
         assert caught.value.path == path
-    refuse_to_overwrite([None, tmp_path / name, tmp_path / "out" / "sparse" / "0"], tmp_path / "out")
+    beside = [InputPath("", "file", tmp_path / name), InputPath("", "model", tmp_path / "out" / "sparse" / "0")]
+    refuse_to_overwrite(beside, tmp_path / "out")
+
+
+def test_results_do_not_stand_in_a_model_nor_a_model_in_results(tmp_path: Path) -> None:
+    for model, output in (("0", "0"), ("0", "0/out"), ("out/sparse_metric/0/copy", "out")):
+        (tmp_path / model).mkdir(parents=True, exist_ok=True)
+        (tmp_path / model / "cameras.bin").touch()
+        with pytest.raises(InputError, match="expected another output path"):
+            refuse_to_overwrite([InputPath("", "model", tmp_path / model)], tmp_path / output)
+    refuse_to_overwrite([InputPath("", "photos", tmp_path / "photos")], tmp_path / "photos" / "out")
 
 
 class TestForgetting:

@@ -152,7 +152,7 @@ def print_row(survey: Survey, sfm: pycolmap.Reconstruction) -> None:
         raise InputError("no true positions: give [report] reference in the survey file")
     times = times_of_model(survey, sfm, path)
     unscaled = compare({"unscaled": trajectory_from_reconstruction(sfm, times.by_name())}, reference, frame=None)
-    cut = survey.model_copy(update={"model_path": path.absolute()}).changed(
+    cut = survey.changed({"images.model": path.absolute()}).changed(
         {"output.path": survey.output.path / "result", "refine.covariance": False, "report.enabled": False}
     )
     result = refine_model(cut, progress=SilentProgress()).summary

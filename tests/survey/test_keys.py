@@ -151,7 +151,7 @@ def test_every_path_that_is_read_is_in_one_list(tmp_path: Path) -> None:
     files = [item for item in KEYS if item.role == "file"]
     assert {item.name for item in files} >= {"path", "times", "error_curve", "distances", "markers", "reference"}
     assert all(item.role for item in KEYS if item.type is Path)
-    survey = Survey(model_path=tmp_path / "sparse").changed({item.dotted: tmp_path / item.dotted for item in files})
-    survey = survey.changed({"images.path": tmp_path / "photos", "output.path": tmp_path / "out"})
+    read = {**{item.dotted: item.dotted for item in files}, "images.model": "sparse", "images.path": "photos"}
+    survey = Survey().changed({key: tmp_path / name for key, name in {**read, "output.path": "out"}.items()})
     listed = {item.path.name: item.role for item in survey.input_paths()}
     assert listed == {"sparse": "model", "photos": "photos", **{item.dotted: "file" for item in files}}

@@ -63,8 +63,9 @@ def leave_as_it_is(model: pycolmap.Reconstruction) -> None:
 @pytest.fixture
 def survey(own_survey: WalkedSurvey) -> Survey:
     folder = own_survey.folder
-    return Survey(model_path=folder / "sparse" / "0").changed(
+    return Survey().changed(
         {
+            "images.model": folder / "sparse" / "0",
             "images.times": folder / "images.csv",
             "ranges.path": folder / "uwb.csv",
             "ranges.time_offset": 2.0,
@@ -78,7 +79,7 @@ def survey(own_survey: WalkedSurvey) -> Survey:
 
 
 def spoilt(survey: Survey, spoil: Spoil) -> Survey:
-    path = known(survey.model_path)
+    path = known(survey.images.model)
     model = read_model(path)
     spoil(model)
     model.write(path)

@@ -40,7 +40,7 @@ class Room:
 
     def survey(self, where: Path, **values: object) -> Survey:
         given = {key.replace("__", "."): value for key, value in values.items()}
-        survey = Survey(model_path=self.folder / "sparse")
+        survey = Survey().changed({"images.model": self.folder / "sparse"})
         return survey.changed({"images.path": self.folder / "photos", "output.path": where / "out", **given})
 
     def taped(self, where: Path, pairs: Sequence[tuple[int, int]], *wrong_m: float) -> Path:
@@ -181,8 +181,9 @@ def test_ranges_and_lengths_check_each_other(walked_survey: WalkedSurvey, tmp_pa
     model = pycolmap.Reconstruction(folder / "sparse" / "0")
     images = sorted(model.images.values(), key=lambda image: image.name)
     first, middle = images[0], images[len(images) // 2]
-    base = Survey(model_path=folder / "sparse" / "0").changed(
+    base = Survey().changed(
         {
+            "images.model": folder / "sparse" / "0",
             "images.times": folder / "images.csv",
             "ranges.path": folder / "uwb.csv",
             "ranges.time_offset": 2.0,

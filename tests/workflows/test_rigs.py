@@ -52,7 +52,7 @@ class StereoSurvey:
         if not with_radio:
             del tables["ranges"], tables["anchors"], tables["tag"]
         survey: Survey = survey_from_tables(tables, self.folder)
-        survey = survey.model_copy(update={"model_path": self.folder / "sparse"})
+        survey = survey.changed({"images.model": self.folder / "sparse"})
         return refine_model(survey, progress=SilentProgress()).summary
 
 

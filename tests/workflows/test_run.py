@@ -56,8 +56,9 @@ def survey(walked_survey: WalkedSurvey, tmp_path: Path) -> Survey:
 def survey_of(walked_survey: WalkedSurvey, where: Path) -> Survey:
     """The walked survey with anchors in the site frame, the clocks' offset known."""
     folder = walked_survey.folder
-    return Survey(model_path=folder / "sparse" / "0").changed(
+    return Survey().changed(
         {
+            "images.model": folder / "sparse" / "0",
             "images.times": folder / "images.csv",
             "ranges.path": folder / "uwb.csv",
             "ranges.time_offset": 2.0,
@@ -223,8 +224,9 @@ class TestSeveralTags:
         (tmp_path / "uwb.csv").write_text("\n".join(rows))
         anchors = [f"{name},{x},{y},{z}" for name, (x, y, z) in ANCHORS_M.items()]
         (tmp_path / "anchors.csv").write_text("\n".join(["anchor_id,x_m,y_m,z_m", *anchors]))
-        return Survey(model_path=tmp_path / "sparse").changed(
+        return Survey().changed(
             {
+                "images.model": tmp_path / "sparse",
                 "ranges.path": tmp_path / "uwb.csv",
                 "anchors.path": tmp_path / "anchors.csv",
                 "tag.lever_arms_m": LEVER_ARMS_M,

@@ -31,7 +31,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="backslashreplace")
     try:
         _require_working_folder()
-        args = parse(normalize(sys.argv[1:] if argv is None else argv))
+        try:
+            args = parse(normalize(sys.argv[1:] if argv is None else argv))
+        except SystemExit as ended:  # --help, which is printed, and --version, which is not
+            _print([ended.code] if isinstance(ended.code, str) else [])
+            return 0
         if args.command != "doctor":  # which says more
             from rangesfm.installed_versions import check_versions
 
@@ -41,8 +45,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             outcome: Outcome = args.execute(args, progress)
         _print(outcome.lines)
         return outcome.status
-    except SystemExit as ended:  # --help and --version
-        return int(ended.code or 0)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it exits
         return _BROKEN_PIPE
@@ -62,9 +64,9 @@ def _require_working_folder() -> None:
 
 
 def _print(texts: Sequence[str]) -> None:
-    """Texts of one or several lines, as a table is."""
+    """Texts of one or several lines, as a table is, behind whatever else was printed."""
     try:
-        print("\n".join(one_line(line) for text in texts for line in text.split("\n")), flush=True)
+        print("".join(f"{one_line(line)}\n" for text in texts for line in text.split("\n")), end="", flush=True)
     except BrokenPipeError:
         raise
     except OSError as error:

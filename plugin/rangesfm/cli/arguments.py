@@ -110,7 +110,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
 
     Raises:
         InputError: an unknown command or option, naming the nearest known one, or a bad value.
-        SystemExit: after ``--help`` and ``--version``.
+        SystemExit: after ``--help``; for ``--version`` with what is to be printed.
     """
     parser = Parser(
         prog="rangesfm",
@@ -153,5 +153,4 @@ class _PrintVersion(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         from importlib.metadata import version
 
-        print("rangesfm", version("rangesfm"))
-        parser.exit()
+        raise SystemExit(f"rangesfm {version('rangesfm')}")

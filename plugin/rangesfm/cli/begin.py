@@ -51,21 +51,20 @@ def _init(args: argparse.Namespace, progress: Progress) -> Outcome:
     if os.path.lexists(path):
         raise InputError("is there already and is left as it is; --output_path PATH writes another", path)
     understood = understand(folders, overrides_from_arguments(args))
-    model = understood.survey().model_path  # refuses values that are none, before anything is written
+    understood.survey()  # refuses values that are none, before anything is written
     folder = path.absolute().parent
     folder.mkdir(parents=True, exist_ok=True)
     write_text(survey_text({**understood.values, "output.path": folder / "out"}, folder), path)
-    checked = check_survey(read_survey(path).model_copy(update={"model_path": model}))
+    checked = check_survey(read_survey(path))
     lines = [f"wrote {path}", *told(checked, fault="missing"), *(f"note: {note}" for note in understood.notes)]
-    words = ["run", str(path)] if model is None else ["refine", str(path), "--input_path", os.path.relpath(model)]
-    command = shlex.join(["rangesfm", *(["check", str(path)] if checked.faults and model is None else words)])
+    command = shlex.join(["rangesfm", "check" if checked.faults else "run", str(path)])
     missing = "write down what is missing (a flag is a key of the same name), then " if checked.faults else ""
     return Outcome([*lines, f"next: {missing}{command}"])
 
 
 def _check(args: argparse.Namespace, progress: Progress) -> Outcome:
-    """Read all that a run would read and say what it is, what is assumed and what is wrong: photos, times, ranges,
-    anchors, camera, reference. Takes seconds and writes nothing.
+    """Read all that a run would read and say what it is, what is assumed and what is wrong: photos or model, times,
+    ranges, anchors, camera, reference. Takes seconds and writes nothing.
 
     example:
       rangesfm check survey.toml

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 _SCALE_KEYS = (
     *(
         "images.path",
+        "images.model",
         "images.times",
         "images.rig_config",
         "images.baseline_stddev_m",
@@ -42,7 +43,7 @@ _JOIN_KEYS = (
 
 def add_commands(commands: Commands) -> None:
     run = commands.add("run", _run, "photos and ranges to a metric model: the whole pipeline")
-    add_survey_arguments(run, has_model=True)
+    add_survey_arguments(run)
     add_restart_argument(run)
     run.add_argument("--live", action="store_true", help="keep live.html, a page to watch, in the output folder")
     demo = commands.add("demo", _demo, "make a small survey and run the pipeline on it: no data needed")
@@ -56,12 +57,12 @@ def add_commands(commands: Commands) -> None:
     demo.add_argument("--num_threads", type=int, metavar="N", help="-1 for all cores")
     add_restart_argument(demo)
     reconstruct = commands.add("reconstruct", _reconstruct, "photos to an unscaled COLMAP model")
-    add_survey_arguments(reconstruct, "images", "camera", "mapper", "output")
+    add_survey_arguments(reconstruct, "images", "camera", "mapper", "output", without=("images.model",))
     add_restart_argument(reconstruct)
     scale = commands.add("scale", _scale, "COLMAP model and ranges to the scale, with uncertainty and verdict")
-    add_survey_arguments(scale, *_SCALE_KEYS, has_model=True)
+    add_survey_arguments(scale, *_SCALE_KEYS)
     refine = commands.add("refine", _refine, "COLMAP model and ranges to a refined metric model")
-    add_survey_arguments(refine, *_SCALE_KEYS, "camera.refine_intrinsics", "refine", has_model=True)
+    add_survey_arguments(refine, *_SCALE_KEYS, "camera.refine_intrinsics", "refine")
     join = commands.add(
         "join", _join, "several surveys of one site to one metric map, through the anchors that they share"
     )
@@ -82,7 +83,7 @@ def _run(args: argparse.Namespace, progress: Progress) -> Outcome:
 
         for fact in check_survey(survey).understood():
             progress.message(fact)
-    if survey.model_path is None:
+    if survey.images.model is None:
         _require_images(survey)
         survey.require_metres()
     else:
@@ -100,11 +101,11 @@ def _run(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _run_or_refine(survey: Survey, progress: Progress, restart: bool) -> RunResult:
-    from rangesfm.workflows.run import refine_model, run_survey
+    from rangesfm.workflows.run import refine_model, run_survey, scale_model
 
-    if survey.model_path is None:
+    if survey.images.model is None:
         return run_survey(survey, progress=progress, restart=restart)
-    return refine_model(survey, progress=progress)
+    return (refine_model if survey.refine.enabled else scale_model)(survey, progress=progress)
 
 
 def _demo(args: argparse.Namespace, progress: Progress) -> Outcome:
@@ -186,17 +187,14 @@ def _join(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _require_images(survey: Survey) -> None:
-    if survey.images.path is None:
-        raise InputError("no photos: give [images] path in a survey file, or --images FOLDER")
     from rangesfm.sources.source import is_source
 
-    if not (os.path.isdir(survey.images.path) or (is_source(survey.images.path) and survey.images.path.is_file())):
-        raise InputError("no such folder of photos, video or bag", survey.images.path)
+    path = survey.photos_path
+    if not (os.path.isdir(path) or (is_source(path) and path.is_file())):
+        raise InputError("no such folder of photos, video or bag", path)
 
 
 def _require_model_and_metres(survey: Survey) -> None:
-    if survey.model_path is None:
-        raise InputError("no model: give --input_path MODEL, the folder of a COLMAP model such as sparse/0")
-    if not os.path.isdir(survey.model_path):
-        raise InputError("no such folder of a COLMAP model", survey.model_path)
+    if not os.path.isdir(survey.given_model_path):
+        raise InputError("no such folder of a COLMAP model", survey.given_model_path)
     survey.require_metres()

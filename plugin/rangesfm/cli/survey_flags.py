@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 _WORDS = {"m": "METRES", "s": "SECONDS"}
 
 
-def add_survey_arguments(parser: Parser, *keys: str, has_model: bool = False) -> None:
-    """The survey file, perhaps an existing model, and flags for the file's keys, as ``add_flags`` has them."""
+def add_survey_arguments(parser: Parser, *keys: str, without: tuple[str, ...] = ()) -> None:
+    """The survey file, and flags for its keys, as ``add_flags`` has them."""
     parser.add_argument(
         "survey",
         nargs="?",
@@ -32,9 +32,7 @@ def add_survey_arguments(parser: Parser, *keys: str, has_model: bool = False) ->
     parser.add_argument(
         "--base_path", metavar="FOLDER", help="what the file's paths are relative to (default: its folder)"
     )
-    if has_model:
-        parser.add_argument("--input_path", metavar="MODEL", help="existing COLMAP model, as sparse/0")
-    add_flags(parser, *keys)
+    add_flags(parser, *keys, without=without)
 
 
 def add_restart_argument(parser: Parser) -> None:
@@ -204,19 +202,16 @@ def survey_from_arguments(args: argparse.Namespace, progress: Progress | None = 
     path = None if getattr(args, "survey", None) is None else Path(args.survey)
     path = path / NAME if path is not None and (path / NAME).is_file() else path
     if path is None:
-        survey = survey_from_tables({}, Path.cwd(), overrides)
-    elif path.is_dir():
+        return survey_from_tables({}, Path.cwd(), overrides)
+    if path.is_dir():
         from rangesfm.findings.understood import understand
 
         understood = understand([path], {"output.path": path.absolute() / "out", **overrides})
         if progress is not None:
             for note in understood.notes:
                 progress.message(note)
-        survey = understood.survey()
-    else:
-        survey = read_survey(path, overrides, args.base_path)
-    model = getattr(args, "input_path", None)
-    return survey if model is None else survey.model_copy(update={"model_path": Path.cwd() / model})
+        return understood.survey()
+    return read_survey(path, overrides, args.base_path)
 
 
 def _is_table(path: str) -> bool:

@@ -15,6 +15,7 @@ import zlib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -78,6 +79,13 @@ class Table:
 
     def __len__(self) -> int:
         return len(self.line)
+
+    def where(self, chosen: Sequence[bool]) -> Table:
+        """Some of the rows, of a table of texts."""
+        if all(chosen):
+            return self
+        cells = {name: [*compress(texts, chosen)] for name, texts in self.cells.items()}
+        return Table(self.path, self.columns, self.line[np.array(chosen)], cells)
 
     def __contains__(self, column: str) -> bool:
         return column in self.cells
@@ -159,9 +167,6 @@ def read_table(
     text: Sequence[str] = (),
     aliases: Mapping[str, str] | None = None,
     separator: str | None = ",",
-    header: Sequence[str] | None = None,
-    num_skipped: int = 0,
-    decimal_comma: bool = False,
 ) -> Table:
     """Read the named columns of a file; others are ignored.
 
@@ -171,17 +176,13 @@ def read_table(
         text: those of them that are not numbers. Any column can be had as either; this way it is fast.
         aliases: other names by which a file may call them, ``{name in the file: name}``.
         separator: one character; a blank means any run of blanks; None: told from the header row.
-        header: names of all columns, of a file that has no header row, or one that is a comment; needs the separator.
-        num_skipped: lines before the first row, where ``header`` is given.
-        decimal_comma: numbers have a comma for a point; no comma is a separator then.
 
     Raises:
         InputError: the file is missing, empty or not text, lacks a column, or has a row with too
             few or too many cells.
     """
     path = Path(path)
-    content = read_text(path)
-    header_row, header_line, body = _split_header(content)
+    header_row, header_line, body = _split_header(read_text(path))
     if not header_row:
         raise InputError(f"the file is empty, expected a header row with {_listed(required)}", path)
     if separator is None:
@@ -189,24 +190,14 @@ def read_table(
     if len(separator) != 1 or separator in '"\r\n\0#':
         raise InputError(f"separator is {separator!r}, expected one character", path)
     known, aliases = (*required, *optional), aliases or {}
-    if header is None:
-        found = [cell.strip() for cell in _split_row(header_row, separator, path, header_line)]
-        names = [name if name in known else aliases.get(name, name) for name in found]
-        _check_has_header(names, required, optional, path, header_line)
-    else:
-        names, header_line, body = list(header), num_skipped, "".join(content.split("\n", num_skipped)[num_skipped:])
+    found = [cell.strip() for cell in _split_row(header_row, separator, path, header_line)]
+    names = [name if name in known else aliases.get(name, name) for name in found]
+    _check_has_header(names, required, optional, path, header_line)
     _check_names(names, required, optional, path, header_line)
-    body = body.replace(",", ".") if decimal_comma else body
     wanted = {name: names.index(name) for name in known if name in names}
     reread = partial(_table_of_texts, path, names, wanted, header_line, body, separator)
     rows = None
-    if (
-        body
-        and not body.isspace()
-        and not decimal_comma
-        and separator != " "
-        and not any(character in body for character in '"#')
-    ):
+    if body and not body.isspace() and separator != " " and not any(character in body for character in '"#'):
         # Of the columns that nobody asked for only their number matters.
         types = ["U1" if name not in wanted else "O" if name in text else "f8" for name in names]
         rows = _plain_rows(path, header_line, types, separator)

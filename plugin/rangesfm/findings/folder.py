@@ -10,7 +10,7 @@ from pathlib import Path
 from rangesfm.distances.tape import is_distances_file, is_markers_file
 from rangesfm.errors import InputError
 from rangesfm.files.bags import is_bag, is_bag_folder
-from rangesfm.files.folders import walk
+from rangesfm.files.folders import LEFT_BY_RUNS, walk
 from rangesfm.files.tables import read_head
 from rangesfm.findings.calibration import Calibration, read_calibrations
 from rangesfm.geometry.reference import is_reference_file
@@ -18,12 +18,11 @@ from rangesfm.ranging.anchors.anchor_file import is_anchor_file
 from rangesfm.ranging.errors.error_curve import is_error_curve_file
 from rangesfm.ranging.readers import find_log_reader, read_ranges
 from rangesfm.sources.bag import has_images
-from rangesfm.sources.extract import RECORD_NAME
 from rangesfm.sources.source import is_video
 from rangesfm.vision.image_times import IMAGE_EXTENSIONS, is_image_times_file
 from rangesfm.vision.photos import MIN_NUM_PHOTOS
 
-PHOTOS, LOG = "images.path", "ranges.path"
+PHOTOS, MODEL, LOG = "images.path", "images.model", "ranges.path"
 _NOT_READ = {
     ".insv": "videos of 360 degrees are not read: take plain photos out of them, with their times",
     **dict.fromkeys((".heic", ".heif", ".dng", ".cr2", ".nef", ".arw"), "these are not read: convert them to JPEG"),
@@ -31,8 +30,6 @@ _NOT_READ = {
 _TABLE_EXTENSIONS = (".csv", ".tsv", ".txt", ".log", ".dat")
 # Of tables that may be the log, where there is none.
 _MAX_NUM_UNSURE = 3
-# Files of earlier runs are no inputs.
-_LEFT_BY_RUNS = {"result.json", "reconstruct.json", RECORD_NAME}
 # By the header row, once it is known that the file is no log.
 _TABLES = {
     "scale.markers": is_markers_file,
@@ -126,7 +123,7 @@ def _entries(folders: Sequence[Path]) -> Iterator[Path]:
         if not top.is_dir():
             raise InputError("is a file, expected a folder" if top.exists() else "no such folder", top)
     for folder, subfolders, names in walk(*folders):
-        if not _LEFT_BY_RUNS.isdisjoint(names):
+        if not LEFT_BY_RUNS.isdisjoint(names):
             subfolders.clear()
         elif is_bag_folder(folder) or _is_model(folder):
             subfolders.clear()

@@ -14,7 +14,7 @@ from typing import Any
 
 from rangesfm.errors import InputError
 from rangesfm.findings.calibration import Calibration
-from rangesfm.findings.folder import LOG, PHOTOS, Found, look_into
+from rangesfm.findings.folder import LOG, MODEL, PHOTOS, Found, look_into
 from rangesfm.ranging.readers import read_ranges
 from rangesfm.sources.source import is_source, open_source
 from rangesfm.survey.settings import KEYS, Survey, survey_from_tables
@@ -40,17 +40,14 @@ class Understood:
     Attributes:
         values: by dotted key; paths are absolute.
         notes: what was left out and why, a line each.
-        model: a COLMAP model to begin with, where there are no photos.
     """
 
     values: dict[str, Any]
     notes: tuple[str, ...]
-    model: Path | None = None
 
     def survey(self) -> Survey:
         """All of it as a run takes it; InputError for a value given that is none."""
-        survey = survey_from_tables({}, Path.cwd(), self.values)
-        return survey if self.model is None else survey.model_copy(update={"model_path": self.model})
+        return survey_from_tables({}, Path.cwd(), self.values)
 
 
 def understand(folders: Sequence[Path], given: Mapping[str, object]) -> Understood:
@@ -83,16 +80,17 @@ def understand(folders: Sequence[Path], given: Mapping[str, object]) -> Understo
             notes.append(f"left out, as {chosen.name} is there: {others}")
     if questions:
         raise InputError("more than one survey could be meant", folders[0], advice=questions)
-    model = found.models[0] if found.models and PHOTOS not in values else None
+    if found.models and PHOTOS not in values:
+        values.setdefault(MODEL, found.models[0])
     notes += [
         f"{path} is a COLMAP model: rangesfm refine SURVEY --input_path {path} goes on from it"
         for path in found.models
-        if path != model
+        if path != values.get(MODEL)
     ]
     if not {PHOTOS, LOG, "scale.distances"} & values.keys():
         raise InputError("neither photos nor a radio's log nor lengths in there", folders[0], advice=notes)
     _add_camera(values, found, notes)
-    return Understood(values, tuple(notes), model)
+    return Understood(values, tuple(notes))
 
 
 def _path(value: object) -> Path:
@@ -154,7 +152,7 @@ def _add_camera(values: dict[str, Any], found: Found, notes: list[str]) -> None:
     if len(arms) == 1 and not values.keys() & {*_LEVER_ARMS}:
         values["tag.tag_in_cam_m"] = arms[0]
         notes.append(f"the lever arm is that of {path.name}")
-    if {"camera.model", "camera.params"} & values.keys():
+    if {"camera.model", "camera.params", MODEL} & values.keys():  # a model has its own
         return
     fitting = _of_size(cameras, _size_px(values))
     if len(fitting) == 1:

@@ -135,13 +135,26 @@ class RangeLog:
         times = self.timestamp_s
         if times is None or len(self) < 2:
             return 0.0
-        link = self.tag_index * len(self.anchor_ids) + self.anchor_index
+        link = self._link
         order = np.lexsort((times, link))
         steps = np.diff(times[order])[np.diff(link[order]) == 0]
         if not len(steps) or np.mean(steps == 0) < _MIN_REPEATED_SHARE:
             return 0.0
         between = np.diff(np.unique(times))
         return float(np.median(between)) if len(between) else 0.0
+
+    @property
+    def num_restarts(self) -> int:
+        """How often the times between one tag and one anchor jump back by a quarter of the whole log."""
+        if self.timestamp_s is None or len(self) < 2:
+            return 0
+        order = np.argsort(self._link, kind="stable")
+        steps = np.diff(self.timestamp_s[order])[np.diff(self._link[order]) == 0]
+        return int(np.count_nonzero(steps < -0.25 * np.ptp(self.timestamp_s)))
+
+    @property
+    def _link(self) -> Indices:
+        return self.tag_index * len(self.anchor_ids) + self.anchor_index
 
     def peer_ranges(self, kind: RangeKind) -> PeerRanges:
         """The ranges between two anchors, distances that do not depend on the camera; or those between two tags."""

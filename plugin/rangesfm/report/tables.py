@@ -15,6 +15,7 @@ from rangesfm.ranging.errors.components import component_words
 from rangesfm.report.content import Content, in_natural_order
 from rangesfm.report.text import count, duration, fixed, keyed, plain, signed
 from rangesfm.result.entries import AnchorEntry, median, rms
+from rangesfm.survey.settings import KEYS
 
 _Columns = Mapping[str, Callable[[Any], str]]
 _WAYS = ("to the right", "downward", "forward")
@@ -254,21 +255,15 @@ def scale_by_kind(content: Content) -> Table:
 
 def versions(content: Content) -> Table:
     """Of the software."""
-    return Table("Versions", [], _flat(content.summary.versions), is_narrow=True)
+    return Table("Versions", [], [*map(list, content.summary.versions.items())], is_narrow=True)
 
 
 def settings(content: Content) -> Table:
-    """The survey as the run had it."""
-    return Table("Settings", [], _flat(content.summary.settings.to_json()), kind="settings")
-
-
-def _flat(values: Mapping[str, Any], within: str = "") -> list[list[str]]:
-    """Rows of key and value of a nested object, keys joined by dots."""
-    rows = []
-    for key, value in values.items():
-        is_object = value and isinstance(value, dict)
-        rows += _flat(value, f"{within}{key}.") if is_object else [[f"{within}{key}", plain(value)]]
-    return rows
+    """The survey as the run had it, in the words of its keys."""
+    given = content.summary.settings.to_json()
+    known = [item for item in KEYS if (given.get(item.table) or {}).get(item.name) not in (None, [], {})]
+    rows = [[item.meaning, plain(given[item.table][item.name]), f"[{item.table}] {item.name}"] for item in known]
+    return Table("Settings", ["what it is", "value", "key of the survey file"], rows, kind="settings")
 
 
 def _cells(key: str, entry: object, columns: _Columns) -> list[str]:

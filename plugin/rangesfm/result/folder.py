@@ -26,6 +26,7 @@ from rangesfm.result.tables import (
     TagCorners,
     TimeOffsetCurve,
 )
+from rangesfm.survey.settings import InputPath
 
 if TYPE_CHECKING:
     import pycolmap
@@ -51,12 +52,16 @@ _UNFINISHED = ".result.unfinished"
 _WRITTEN = (*RESULT_FILES, "trajectory.tum", "points.ply", "sparse_scaled/0", "sparse_metric/0")
 
 
-def refuse_to_overwrite(inputs: Iterable[Path | None], folder: Path) -> None:
-    """Raise InputError for an input that stands where a result will be written."""
+def refuse_to_overwrite(inputs: Iterable[InputPath], folder: Path) -> None:
+    """Raise InputError for an input that stands where a result will be written, or that results would stand in."""
     written = {(folder / name).resolve() for name in _WRITTEN}
-    for path in inputs:
-        if path is not None and path.resolve() in written:
-            raise InputError("the results would overwrite this input, expected another output path", path)
+    for item in inputs:
+        path = item.path.resolve()
+        if not written.isdisjoint((path, *path.parents)):
+            raise InputError("the results would overwrite this input, expected another output path", item.path)
+        is_model = item.role == "model" and any(path.glob("cameras.*"))
+        if path.is_dir() and (path == folder.resolve() or (is_model and path in folder.resolve().parents)):
+            raise InputError("the results would stand in this input, expected another output path", item.path)
 
 
 def forget_result(folder: Path) -> None:

@@ -285,6 +285,10 @@ def _notes(log: RangeLog, anchors: Sequence[Anchor], survey: Survey, *, anchors_
         notes.append("the anchor positions are those that the log gives")
     if log.num_no_measurement:
         notes.append(f"{log.num_no_measurement} records of the log say that there was no measurement")
+    if num := log.num_restarts:
+        notes.append(
+            f"the log's times go back {num} times by a quarter of the whole or more: did its clock begin anew?"
+        )
     if (step_s := log.time_resolution_s) >= _COARSE_STEP_S:
         notes.append(f"the log's times come in steps of {step_s:.2g} s: at walking pace that is as much in metres")
     return notes

@@ -116,7 +116,6 @@ class Survey(BaseModel):
     """Inputs, options and output of one run, by the tables of a survey file. Paths are absolute.
 
     Attributes:
-        model_path: an existing COLMAP model, for those who start from one; not a key of the file.
         source: the survey file, for messages; no setting.
     """
 
@@ -134,7 +133,6 @@ class Survey(BaseModel):
     export: ExportOptions = ExportOptions()
     report: ReportOptions = ReportOptions()
     output: OutputOptions = OutputOptions()
-    model_path: Path | None = None
     source: Source = Field(default=Source(), exclude=True, repr=False)
 
     def changed(self, values: Mapping[str, Any]) -> Survey:
@@ -144,6 +142,23 @@ class Survey(BaseModel):
             table, _, name = dotted_key.partition(".")
             tables[table] = tables.get(table, getattr(self, table)).changed(**{name: value})
         return self.model_copy(update=tables)
+
+    @property
+    def photos_path(self) -> Path:
+        """Of the folder, video or bag; InputError if none is given."""
+        if self.images.path is None:
+            raise InputError(
+                "no photos: give [images] path in a survey file, or --images FOLDER; a COLMAP model does as well "
+                "([images] model, --input_path MODEL)"
+            )
+        return self.images.path
+
+    @property
+    def given_model_path(self) -> Path:
+        """Of the model to go on from; InputError if none is given."""
+        if self.images.model is None:
+            raise InputError("no model: give [images] model in a survey file, or --input_path MODEL, as sparse/0")
+        return self.images.model
 
     def require_metres(self) -> None:
         """InputError where nothing says how long a metre is, or how large tags are that are to be looked for."""
@@ -177,8 +192,6 @@ class Survey(BaseModel):
                 )
             elif path is not None and role != "output":
                 yield InputPath(dotted_key, role, path)
-        if self.model_path is not None:
-            yield InputPath("model_path", "model", self.model_path)
 
 
 @dataclass(frozen=True)

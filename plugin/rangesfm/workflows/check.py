@@ -26,7 +26,7 @@ from rangesfm.vision.matching import matching_options
 from rangesfm.vision.photos import Photos, usable_photos
 from rangesfm.vision.rigs import read_rigs
 from rangesfm.workflows.journal import Journal
-from rangesfm.workflows.photos import checked_keyframes, images_path, read_inputs, read_registered
+from rangesfm.workflows.photos import checked_keyframes, read_inputs, read_registered
 
 # More than these nobody reads.
 _MAX_NUM_SIZES = 4
@@ -69,7 +69,7 @@ def check_survey(survey: Survey) -> CheckedSurvey:
     """Read all inputs of a run as the run does, and tell what they are."""
     checked = CheckedSurvey()
     journal = Journal(SilentProgress(), warnings=checked.warnings)
-    model = survey.model_path if survey.images.path is None else None
+    model = survey.images.model
     photos = None
     with checked.finding_faults():
         if model is None:
@@ -98,7 +98,7 @@ def check_survey(survey: Survey) -> CheckedSurvey:
 
 def _check_photos(survey: Survey, checked: CheckedSurvey) -> Photos | None:
     """The photos; None where they are still in a video or a bag."""
-    folder = images_path(survey)
+    folder = survey.photos_path
     if is_source(folder):
         _check_source(survey, folder, checked)
         return None

@@ -48,7 +48,7 @@ def read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
     check_formats(survey.export.formats)
     with survey.source.naming_lines():
         apply_options(pycolmap.BundleAdjustmentOptions(), survey.refine.bundle_adjustment, "refine.bundle_adjustment")
-    refuse_to_overwrite((item.path for item in survey.input_paths()), survey.output.path)
+    refuse_to_overwrite(survey.input_paths(), survey.output.path)
     inputs = read_ranging_inputs(survey)
     for note in (*inputs.notes, *notes_before_work(survey, inputs)):
         journal.warn(note)
@@ -142,7 +142,7 @@ def find_keyframes(
     Args:
         log_names_photos: then no photo is left out for want of a time; None: there is no log.
     """
-    folder = images_path(survey)
+    folder = survey.photos_path
     with journal.timed("keyframes"):
         frames = read_rigs(survey.images.rig_config).frames(list_images(folder))
         names = tuple(frames)
@@ -160,7 +160,7 @@ def with_tags(survey: Survey, inputs: RangingInputs, names: Sequence[str], journ
     wanted = survey.markers
     if wanted.dictionary is None:
         return inputs
-    folder = images_path(survey)
+    folder = survey.photos_path
     with journal.stage("tags"):
         found = find_tags(folder, names, wanted.dictionary, journal.progress)
     if not found.markers:
@@ -184,10 +184,10 @@ def map_keyframes(
 ) -> tuple[pycolmap.Reconstruction, ...]:
     """Map the keyframes into ``sparse``; returns ``sparse/0``, ``sparse/1``, ..."""
     rigs = read_rigs(survey.images.rig_config)
-    frames = rigs.frames(list_images(images_path(survey)))
+    frames = rigs.frames(list_images(survey.photos_path))
     with survey.source.naming_lines():
         summary = reconstruct(
-            images_path(survey),
+            survey.photos_path,
             [photo for keyframe in keyframes for photo in frames[keyframe]],
             survey.output.path,
             camera=survey.camera,
@@ -204,13 +204,6 @@ def map_keyframes(
         which = "the model" if len(summary.models) == 1 else f"the largest of {len(summary.models)} models"
         journal.warn(f"{summary.num_registered} of {summary.num_keyframes} keyframes are in {which}")
     return summary.models
-
-
-def images_path(survey: Survey) -> Path:
-    """The folder of a survey's photos; InputError if none is given."""
-    if survey.images.path is None:
-        raise InputError("no photos: give [images] path in a survey file, or --images FOLDER")
-    return survey.images.path
 
 
 def noted(image_times: ImageTimes, journal: Journal) -> ImageTimes:

@@ -92,17 +92,14 @@ def scale_model(survey: Survey, *, progress: Progress) -> RunResult:
 def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResult:
     journal = Journal(progress)
     inputs = read_inputs(survey, journal)
-    model_path = survey.model_path
-    if model_path is None:
-        raise InputError("no model: give --input_path MODEL, a COLMAP model as sparse/0")
-    sfm = read_registered(model_path, journal)
+    sfm = read_registered(survey.given_model_path, journal)
     if refine and not sfm.num_points3D():
-        raise InputError("the model has no 3-D points to refine: a trajectory can only be scaled", model_path)
+        raise InputError("the model has no 3-D points to refine: a trajectory can only be scaled", survey.images.model)
     times = None
     with sole_writer(survey.output.path):
         survey = with_photos_in_folder(survey, journal)
         if inputs.log.image_name is None:
-            times = noted(times_of_model(survey, sfm, model_path), journal)
+            times = noted(times_of_model(survey, sfm, survey.given_model_path), journal)
             tell_of_times(survey, inputs, times, journal)
         inputs = with_tags(survey, inputs, sorted(image.name for image in sfm.images.values()), journal)
         return to_metric(survey, inputs, [sfm], times, journal, refine=refine)

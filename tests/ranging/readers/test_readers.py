@@ -273,10 +273,12 @@ def test_inrols_text_is_recognised_by_its_comment(tmp_path: Path) -> None:
     np.testing.assert_array_equal(log.line, [2, 3, 4, 5])
 
 
-def test_line_of_inrols_text_that_was_cut_off_is_refused_with_its_number(tmp_path: Path) -> None:
-    error = refusal(write(tmp_path, INROL[:-16]))
-    assert error.line == 5
-    assert "has 3 cells" in str(error)
+def test_line_of_inrols_text_that_was_cut_off_is_left_out_and_a_wrong_one_refused_with_its_number(
+    tmp_path: Path,
+) -> None:
+    log = read_ranges(write(tmp_path, INROL[:-16]))
+    assert len(log) == 3
+    assert log.notes == ("lines that are no rows of the table are left out: 1, first line 5",)
     error = refusal(write(tmp_path, INROL.replace("1.7469", "1.7x469")))
     assert error.line == 3
     assert "r is '1.7x46998299780'" in str(error)

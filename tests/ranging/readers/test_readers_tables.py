@@ -67,6 +67,7 @@ def check_times(log: RangeLog, rows: list[Row] = ROWS, tolerance_s: float = 1.1e
     np.testing.assert_allclose(found, np.array([time_s for time_s, *_ in rows]) - rows[0][0], atol=tolerance_s)
 
 
+PLAIN = lines("time,anchor,range", lambda t, a, r: f"{t:.3f},{a},{r:.3f}")
 LONG = {
     "hobby": lines("timestamp,tag_id,anchor_id,range,quality", lambda t, a, r: f"{t:.3f},7,{a},{r:.3f},93"),
     "short names": lines("t,node,d", lambda t, a, r: f"{t:.3f},{a},{r:.3f}"),
@@ -123,6 +124,25 @@ LONG = {
     "named values": lines(None, lambda t, a, r: f"2026-01-31 09:{clock(t)[3:]} INFO anchor={a}, range={r:.3f} m"),
     "words in each row": lines(None, lambda t, a, r: f"{clock(t)} -> {a} dist: {r:.3f} m"),
     "lost ones in words": lines("time,anchor,range", lambda t, a, r: f"{t:.3f},{a},{r:.3f}") + "15,A0,TIMEOUT\n",
+    "JSON with lists of other things": lines(
+        None,
+        lambda t, a, r: json.dumps(
+            {"t": t, "id": 0, "nodes": [{"id": NUM[a], "dis": r}], "imu": [{"x": 0.1}, {"x": 0.2}], "q": [[1], [2]]}
+        ),
+    ),
+    "units in the cells": lines("time,anchor,range", lambda t, a, r: f"{t * 1000:.0f} ms,{a},{r * 100:.1f}cm"),
+    "header twice, and a line cut off": PLAIN.replace("12.500", "time,anchor,range\n12.4\n12.500"),
+    "comments of MATLAB": lines(
+        "% made by hand\n% time anchor range", lambda t, a, r: f"{t:.3f} {a} {r:.3f}" + "\n% half" * (t == 13)
+    ),
+    "comments of C": "// made by hand\n" + PLAIN + "// end\n",
+    "months in words": lines("Time;anchor;range", lambda t, a, r: f"31-Jan-2026 {clock(t)};{a};{r:.3f}"),
+    "dates of digits alone": lines(
+        "time,anchor,range", lambda t, a, r: f"20260131{clock(t + 39590).translate({58: None, 46: None})},{a},{r:.3f}"
+    ),
+    "days of Excel": lines("Time,anchor,range", lambda t, a, r: f"{46023 + t / 86400:.10f},{a},{r:.3f}"),
+    "days of MATLAB": lines("datenum,anchor,range", lambda t, a, r: f"{739983 + t / 86400:.10f},{a},{r:.3f}"),
+    "minutes and feet": lines("time_min,anchor,range (feet)", lambda t, a, r: f"{t / 60:.7f},{a},{r / 0.3048:.4f}"),
     "PlotJuggler": lines("__time,/uwb/to_id,/uwb/range", lambda t, a, r: f"{t + 1.7e9:.3f},{NUM[a]},{r:.3f}"),
 }
 
@@ -154,6 +174,25 @@ WIDE = {
         ),
         ROWS[::2],
     ),
+    "lists side by side": lines(
+        None,
+        lambda t, a, r: json.dumps(
+            {
+                "t": t,
+                "anchors": [a, ROWS[round((t - 12) * 20) + 1][1]],
+                "distances": [r, ROWS[round((t - 12) * 20) + 1][2]],
+            }
+        ),
+        ROWS[::2],
+    ),
+    "names that come again": lines(
+        None,
+        lambda t, a, r: (
+            f"t={t:.3f} anchor={a} range={r:.3f} anchor={ROWS[round((t - 12) * 20) + 1][1]} "
+            f"range={ROWS[round((t - 12) * 20) + 1][2]:.3f}"
+        ),
+        ROWS[::2],
+    ),
     "cm": wide("t_ms,r0_cm,r1_cm,r2_cm,r3_cm", lambda t: f"{t * 1000:.0f}"),
 }
 
@@ -168,6 +207,38 @@ def test_column_an_anchor_is_understood(tmp_path: Path, kind: str) -> None:
     order = [log.anchor_ids[k] for k in log.anchor_index[:4]]
     assert order in (["b0", "b1", "b2", "b3"], [*"0123"], [*ANCHORS], ["44AE", "06A5", "CBB0", "4F9B"])
     assert log.tag_ids == ("tag",)
+
+
+def test_lists_in_messages_of_rostopic_are_a_row_each(tmp_path: Path) -> None:
+    content = "".join(
+        f"header:\n  stamp:\n    sec: {1700000000 + k}\n    nanosec: 5\n  frame_id: uwb\nranges:\n"
+        + "".join(f"- anchor_id: {anchor}\n  range: {2.5 + anchor}\n  raw: [1.0, 2.0]\n" for anchor in (7, 8))
+        + "tag_id: 3\n---\n"
+        for k in range(30)
+    )
+    log = read_ranges(write(tmp_path, content))
+    assert (len(log), log.anchor_ids, log.tag_ids) == (60, ("7", "8"), ("3",))
+    np.testing.assert_array_equal(log.range_m[:2], [9.5, 10.5])
+
+
+@pytest.mark.parametrize("nothing", ["65535", "4294967.295", "9999"])
+def test_a_value_far_above_all_others_that_comes_again_is_no_measurement(tmp_path: Path, nothing: str) -> None:
+    log = read_ranges(write(tmp_path, PLAIN + f"15,A0,{nothing}\n16,A0,{nothing}\n17,A0,{nothing}\n"))
+    assert (len(log), log.num_no_measurement) == (len(ROWS), 3)
+    assert any("3 times, far above all other ranges: taken for no measurement" in note for note in log.notes)
+
+
+def test_pairs_of_columns_without_names_among_others_are_asked_with_a_command_that_reads_them(tmp_path: Path) -> None:
+    rows = [
+        f"{12 + k / 10:.1f},6,1.5{k % 7},2.3{k % 5},1,{3 + k % 9 / 10},2,{4 + k % 7 / 10},3,{5 + k % 5 / 10}"
+        for k in range(40)
+    ]
+    path = write(tmp_path, "\n".join(rows))
+    with pytest.raises(InputError) as caught:
+        read_ranges(path)
+    columns = caught.value.advice[-1].partition("--columns ")[2].strip("'")
+    log = read_ranges(path, columns=dict(pair.split("=") for pair in columns.split(",")))
+    assert (len(log), log.anchor_ids) == (120, ("1", "2", "3"))
 
 
 def test_two_tags_with_a_column_for_each_anchor(tmp_path: Path) -> None:

@@ -91,7 +91,10 @@ def read_anchors_in_log(path: str | Path | Sequence[str | Path], *, format: str 
 
 
 def _paths(path: str | Path | Sequence[str | Path]) -> list[Path]:
-    return [Path(one) for one in ([path] if isinstance(path, (str, Path)) else path)]
+    paths = [path] if isinstance(path, (str, Path)) else [*path]
+    if "" in paths:
+        raise InputError("a log's name is empty, expected a file")
+    return [*map(Path, paths)]
 
 
 def _not_better_than_rounding(log: RangeLog) -> RangeLog:
@@ -137,7 +140,11 @@ def _choose_reader(path: Path, options: ReadOptions, format: str | None) -> Read
     if not head.strip():
         raise InputError("the file is empty, expected a log of ranges", path)
     known = () if format == TABLE.name else _READERS
-    return next((reader for reader in known if reader.recognizes(head)), None) or table_reader(path, options)
+    if reader := next((reader for reader in known if reader.recognizes(head)), None):
+        return reader
+    if "\0" in head:
+        raise InputError("is neither text nor a bag: unpack it, or save it as UTF-8 text", path)
+    return table_reader(path, options)
 
 
 def find_log_reader(path: Path) -> Reader:

@@ -16,7 +16,7 @@ from rangesfm.errors import InputError
 from rangesfm.files.tables import Categories, Table, read_table
 from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.layout import MISSING, Layout
-from rangesfm.ranging.readers.reader import ReadOptions, no_usable_range
+from rangesfm.ranging.readers.reader import ReadOptions, far_above_all, no_usable_range, told_far
 from rangesfm.ranging.readers.times import (
     CIVIL_TIME,
     CIVIL_UNITS,
@@ -27,7 +27,7 @@ from rangesfm.ranging.readers.times import (
     date_order,
     is_zoned,
 )
-from rangesfm.ranging.readers.units import UNITS_PER_METRE, UnclearUnitError, range_unit, time_unit
+from rangesfm.ranging.readers.units import UNITS_PER_METRE, UnclearUnitError, days_before_1970, range_unit, time_unit
 from rangesfm.ranging.twr import StampOptions, double_sided_range, single_sided_range
 
 STAMPS = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
@@ -79,26 +79,28 @@ def read_columns(path: Path, columns: Columns, options: ReadOptions, format: str
     """
     named, layout = {**columns.optional, **columns.required}, columns.layout
     anchors = [column for anchor_id, _ in columns.wide.values() if (column := column_of_anchor(anchor_id))]
-    table = (layout and layout.table) or read_table(
-        path,
-        list(dict.fromkeys([*columns.required.values(), *columns.wide, *anchors])),
-        [*columns.optional.values()],
-        text=[*(named[key] for key in _TEXTS if key in named), *anchors],
-        separator=layout.separator if layout else options.separator,
-        header=layout.header if layout else None,
-        num_skipped=layout.num_skipped if layout else 0,
-        decimal_comma=layout is not None and layout.decimal_comma,
-    )
-    name = {key: column for key, column in named.items() if column in table}
     notes = [*columns.notes]
+    if layout is None:
+        required = dict.fromkeys([*columns.required.values(), *columns.wide, *anchors])
+        texts = [*(named[key] for key in _TEXTS if key in named), *anchors]
+        table = read_table(path, [*required], [*columns.optional.values()], text=texts, separator=options.separator)
+    else:
+        table, more = layout.read()
+        notes += more
+        if layout.are_records and "range" in named:  # others are not of ranges
+            table = table.where([cell != "" for cell in table.text(named["range"], empty="")])
+    name = {key: column for key, column in named.items() if column in table}
+    units = layout.units if layout else {}
     with _asking("timestamp", path, options):
-        timestamps = _timestamps(table, name, options.timestamp_unit, notes) if "timestamp" in name else None
+        timestamps = _timestamps(table, name, units, options.timestamp_unit, notes) if "timestamp" in name else None
     image_name = table.text(name["image_name"]) if timestamps is None else None
     num_ends = max(1, len(columns.wide))
     row = np.repeat(np.arange(len(table)), num_ends)
     anchor, tag = _anchors(table, name, columns), _tags(table, name, columns)
     ranges = _ranges(table, name, columns, options)
-    measured = ranges > _NOTHING
+    far = far_above_all(ranges)
+    measured = (ranges > _NOTHING) & (ranges < far)
+    notes += [] if np.isinf(far) else [told_far(int(np.sum(ranges == far)), far)]
     if not np.any(measured):
         raise no_usable_range(len(ranges), path)
     row, ranges, anchor = row[measured], ranges[measured], anchor.subset(measured)
@@ -109,6 +111,7 @@ def read_columns(path: Path, columns: Columns, options: ReadOptions, format: str
         with _asking("range", path, options):
             pair = anchor.index if tag is None else anchor.index * len(tag.names) + tag.index
             column = name.get("range") or next(iter(columns.wide))
+            column = f"{column} {units.get(column, '')}".strip()
             unit = options.range_unit or _noted(notes, range_unit(column, ranges, times, pair))
     per_metre = UNITS_PER_METRE[unit or "m"]
     stddevs = _stddevs(table, name["range_stddev"], per_metre) if "range_stddev" in name else None
@@ -232,14 +235,16 @@ def _ranges_by_stamps(table: Table, name: Mapping[str, str], options: StampOptio
     return np.nan_to_num(ranges, nan=0.0)
 
 
-def _timestamps(table: Table, name: Mapping[str, str], unit: str | None, notes: list[str]) -> Array:
+def _timestamps(
+    table: Table, name: Mapping[str, str], units: Mapping[str, str], unit: str | None, notes: list[str]
+) -> Array:
     column = name["timestamp"]
     if unit in CIVIL_UNITS or "date" in name or (unit is None and not table.begins_with_number(column)):
         return _civil_times(table, name, unit, notes)
     times = table.numbers(column, expected=f"a time in {unit or 's'}")
     if unit is None:
-        unit = _noted(notes, time_unit(column, times))
-    seconds = times * SECONDS_PER_UNIT[unit]
+        unit = _noted(notes, time_unit(f"{column} {units.get(column, '')}".strip(), times))
+    seconds = (times - (days_before_1970(times) if unit == "d" else 0.0)) * SECONDS_PER_UNIT[unit]
     table.refuse(np.abs(seconds) > _MAX_TIME_S, column, f"a time in {unit}")
     return seconds + 1e-9 * table.numbers(name["nanoseconds"]) if "nanoseconds" in name else seconds
 

@@ -8,52 +8,36 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import count, pairwise, product, takewhile
 
 import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.ranging.readers.layout import Column, Layout
 from rangesfm.ranging.readers.roles import Sides
-
-
-def _words(text: str) -> frozenset[str]:
-    return frozenset(text.split())
-
-
-_RANGE = _words("range ranges rng distance distances dist dists dis abstand entfernung distanz distancia 距离")
-_RANGE_IN_SHORT = _words("d r")
-# What may stand beside the range, and is none, or is second to it.
-_NO_RANGE = _words(
-    "gt true truth ground actual real ref reference expected est estimated error err bias std stddev stdev sigma var "
-    "variance cov covariance rate dot vel velocity speed count quality rssi power snr offset x y z min max threshold "
-    "id index idx rtt"
+from rangesfm.ranging.readers.vocabulary import (
+    ANCHOR,
+    ANTENNA,
+    ANY_ID,
+    ASKED,
+    ID,
+    IN_WIDE,
+    LENGTH_UNIT,
+    NANOSECONDS,
+    NO_RANGE,
+    NO_TIME,
+    PLAIN,
+    RANGE,
+    RANGE_IN_SHORT,
+    ROLES,
+    SECOND_RANGE,
+    SECOND_TIME,
+    TAG,
+    TIME,
+    TIME_IN_SHORT,
+    words_of,
 )
-_SECOND_RANGE = _words("calib calibrated corr corrected filtered filter smoothed smooth mean avg average median last")
-_TIME = _words(
-    "time times timestamp timestamps timestep stamp datetime epoch elapsed clock zeit zeitstempel uhrzeit tiempo 时间"
-)
-_TIME_IN_SHORT = _words("t ts s sec secs second seconds ms msec millis milliseconds us usec micros ns nanos")
-_NANOSECONDS = _words("nsec nsecs nanosec nanosecs nanosecond nanoseconds")
-_NO_TIME = _words("flight of delta dt diff duration latency tx rx offset since zone out le")
-_SECOND_TIME = _words("device wearable sensor boot local received record rosbag bag")
-_LENGTH_UNIT = _words("m cm mm meter meters metre metres")
-_ASKED = _words("responder rspdr resp rsp receiver to dest dst destination target peer remote neighbor neighbour")
-_ASKING = _words("requester rqstr req sender initiator init from src source self")
-_ANCHOR = _words("anchor anchors anc an beacon landmark station base basestation bs node anker ancla gateway 基站")
-_TAG = _words("tag tags mobile robot rover user wearable 标签")
-_ANTENNA = _words("ant antenna")
-_ANY_ID = _words("id uid bssid nodeid identifier address addr mac device dev serial")
-_ID = _ANY_ID | _words("ids tid name no num nr number index idx short")
-_ROLES = {
-    "antenna": _ANTENNA,
-    "anchor": _ANCHOR,
-    "tag": _TAG,
-    "asked": _ASKED,
-    "asking": _ASKING,
-    "any": _ANY_ID,
-}
-_PLAIN = _words("uwb field msg data header twr tof ranging meas measured measurement value vector arr array list")
+
 _MAX_NUM_IDS = 64
 _SAME_SPOT_M = 1.5  # tags on one rig are not further apart, nor does their range to an anchor differ by more
 
@@ -112,7 +96,7 @@ def _find_time(free: list[Column], guess: Guess) -> list[Column]:
     guess.columns["timestamp"] = time.name
     parts = {column.name: column for column in free}
     dates = [column for column in free if column.kind == "dates"]
-    fractions = [column for column in free if _NANOSECONDS & {*column.words} and column.is_whole]
+    fractions = [column for column in free if NANOSECONDS & {*column.words} and column.is_whole]
     if time.kind == "times" and dates and ":" in time.cells[0][:3]:
         guess.columns["date"] = dates[0].name
     elif time.is_whole and fractions and float(np.median(time.numbers)) < 1e11:
@@ -125,22 +109,26 @@ def _find_time(free: list[Column], guess: Guess) -> list[Column]:
 
 def _time_rank(column: Column) -> tuple[float, int] | None:
     """Smaller for a better column of times; None for none."""
-    words = [word for word in column.words if word not in _PLAIN]
-    if column.kind not in ("numbers", "times") or _NO_TIME & {*words} or _NANOSECONDS & {*words}:
+    words = [word for word in column.words if word not in PLAIN]
+    if column.kind not in ("numbers", "times") or NO_TIME & {*words} or NANOSECONDS & {*words}:
         return None
-    is_in_short = bool(words) and {*words} <= _TIME_IN_SHORT
-    is_named = bool(_TIME & {*words}) or is_in_short or column.kind == "times"
+    is_in_short = bool(words) and {*words} <= TIME_IN_SHORT
+    is_named = bool(TIME & {*words}) or is_in_short or column.kind == "times"
     stands_still = len(column.numbers) > 2 and bool(np.all(column.numbers == column.numbers[0]))
     if not is_named or stands_still:
         return None
     # rostopic's %time and its like are when a message arrived; the stamp in it is when it was measured.
-    is_arrival = column.name.startswith(("%", "__")) or bool(_SECOND_TIME & {*words})
-    return is_arrival + 0.5 * (not _TIME & {*words}), len({*words} - _TIME - _TIME_IN_SHORT)
+    is_arrival = column.name.startswith(("%", "__")) or bool(SECOND_TIME & {*words})
+    return is_arrival + 0.5 * (not TIME & {*words}), len({*words} - TIME - TIME_IN_SHORT)
 
 
 def _find_pairs(free: list[Column], guess: Guess) -> list[Column]:
-    """An anchor and its range beside it, several times in a row."""
-    pairs = [(node, value) for node, value in pairwise(free) if _names_anchor(node) and _is_range(value)]
+    """Anchors and their ranges, several times: of one number, or beside each other."""
+    nodes = {_numbers(column): column for column in free if _names_anchor(column)}
+    values = [column for column in free if _is_range(column)]
+    pairs = [(nodes[number], value) for value in values if (number := _numbers(value)) in nodes]
+    if len(pairs) < len(values) or len({node.name for node, _ in pairs}) < len(pairs):
+        pairs = [(node, value) for node, value in pairwise(free) if _names_anchor(node) and _is_range(value)]
     if len(pairs) < 2 or len({tuple(_without_numbers(column) for column in pair) for pair in pairs}) > 1:
         return free
     _take_pairs(pairs, guess)
@@ -154,26 +142,30 @@ def _take_pairs(pairs: Sequence[tuple[Column, Column]], guess: Guess) -> None:
 
 def _names_anchor(column: Column) -> bool:
     words = {*_without_numbers(column)}
-    return bool(words) and words <= _ANCHOR | _ANY_ID | _ASKED | _ID and (column.kind == "text" or column.is_whole)
+    return bool(words) and words <= ANCHOR | ANY_ID | ASKED | ID and (column.kind == "text" or column.is_whole)
+
+
+def _numbers(column: Column) -> tuple[str, ...]:
+    return tuple(word for word in column.words if word.isdigit())
 
 
 def _without_numbers(column: Column) -> tuple[str, ...]:
-    return tuple(word for word in column.words if not word.isdigit() and word not in _PLAIN)
+    return tuple(word for word in column.words if not word.isdigit() and word not in PLAIN)
 
 
 def _find_range(free: list[Column], guess: Guess) -> list[Column]:
     if guess.wide:
         return free
-    numbers = [column for column in free if column.kind == "numbers" and not _NO_RANGE & {*column.words}]
+    numbers = [column for column in free if column.kind == "numbers" and not NO_RANGE & {*column.words}]
     named = [column for column in numbers if _is_range(column)]
     stamps = {
         word: column.name for column in free for word in (column.name.lower(),) if word in ("tx1", "rx1", "tx2", "rx2")
     }
     groups = [group for group in _groups(numbers) if all(map(_may_be_wide, group))]
     in_groups = {column.name for group in groups for column, _ in group}
-    groups = [group for group in groups if not _SECOND_RANGE & {*group[0][0].words}] or groups
+    groups = [group for group in groups if not SECOND_RANGE & {*group[0][0].words}] or groups
     single = [column for column in named if column.name not in in_groups]
-    first = [column for column in single if not _SECOND_RANGE & {*column.words}] or single
+    first = [column for column in single if not SECOND_RANGE & {*column.words}] or single
     if len(first) == 1:
         guess.columns["range"] = first[0].name
         if others := [column.name for column in single if column not in first]:
@@ -195,9 +187,9 @@ def _find_range(free: list[Column], guess: Guess) -> list[Column]:
 def _is_range(column: Column) -> bool:
     """Whether the name is that of one range; ``d`` and ``r`` only where nothing else is said."""
     words = {*_without_numbers(column)}
-    if column.kind != "numbers" or _NO_RANGE & words:
+    if column.kind != "numbers" or NO_RANGE & words:
         return False
-    return bool(words & _RANGE) or (bool(words) and words <= _RANGE_IN_SHORT | _LENGTH_UNIT)
+    return bool(words & RANGE) or (bool(words) and words <= RANGE_IN_SHORT | LENGTH_UNIT)
 
 
 def _groups(columns: Sequence[Column]) -> list[list[tuple[Column, list[int]]]]:
@@ -217,29 +209,18 @@ def _groups(columns: Sequence[Column]) -> list[list[tuple[Column, list[int]]]]:
 
 def _is_letter(word: str, k: int, words: list[str]) -> bool:
     """Whether a single letter at the end is an id, as in dist_A."""
-    return len(word) == 1 and k == len(words) - 1 > 0 and bool(_RANGE & {*words}) and word not in _LENGTH_UNIT
+    return len(word) == 1 and k == len(words) - 1 > 0 and bool(RANGE & {*words}) and word not in LENGTH_UNIT
 
 
 def _may_be_wide(member: tuple[Column, list[int]]) -> bool:
     column, ids = member
-    others = {word for k, word in enumerate(column.words) if k not in ids} - _PLAIN
-    known = (
-        _RANGE
-        | _RANGE_IN_SHORT
-        | _ANCHOR
-        | _TAG
-        | _LENGTH_UNIT
-        | _ASKED
-        | _ASKING
-        | _SECOND_RANGE
-        | {"a", "b", "t", "raw"}
-    )
-    return others <= known and bool(others & (_RANGE | _RANGE_IN_SHORT | _ANCHOR | {"a", "b"}))
+    others = {word for k, word in enumerate(column.words) if k not in ids} - PLAIN
+    return others <= IN_WIDE and bool(others & (RANGE | RANGE_IN_SHORT | ANCHOR | {"a", "b"}))
 
 
 def _take_wide(group: list[tuple[Column, list[int]]], guess: Guess) -> None:
     for column, ids in group:
-        tags = [k for k in ids if k and column.words[k - 1] in _TAG | {"t"} and len(ids) > 1]
+        tags = [k for k in ids if k and column.words[k - 1] in TAG | {"t"} and len(ids) > 1]
         anchors = [k for k in ids if k not in tags]
         guess.wide[column.name] = (
             "_".join(_id_at(column.words, k, column.name) for k in anchors),
@@ -252,14 +233,14 @@ def _take_wide(group: list[tuple[Column, list[int]]], guess: Guess) -> None:
     if any(len(ids) - bool(guess.wide[column.name][1]) > 1 for column, ids in group):
         guess.doubts.append("the names of the columns hold two ids, and do not say which is the anchor's")
     elif not any(tag for _, tag in guess.wide.values()) and not words & (
-        _RANGE | _RANGE_IN_SHORT | (_ANCHOR - {"an", "bs", "node", "base"})
+        RANGE | RANGE_IN_SHORT | (ANCHOR - {"an", "bs", "node", "base"})
     ):
         guess.doubts.append("the names of the columns do not say that they are ranges")
 
 
 def _id_at(words: list[str], k: int, name: str) -> str:
     """The id, with the one or two letters that stand before it (A0), as the file spells it."""
-    before = words[k - 1] if k and len(words[k - 1]) <= 2 and words[k - 1] not in _RANGE_IN_SHORT else ""
+    before = words[k - 1] if k and len(words[k - 1]) <= 2 and words[k - 1] not in RANGE_IN_SHORT else ""
     text = before + words[k]
     at = name.lower().find(text)
     return name[at : at + len(text)] if at >= 0 else words[k]
@@ -268,11 +249,13 @@ def _id_at(words: list[str], k: int, name: str) -> str:
 def _find_nodes(free: list[Column], guess: Guess) -> list[Column]:
     """The columns of ids: by their names, or two of ids alone."""
     ids: dict[str, list[Column]] = defaultdict(list)
+    # What stands in the same record as the range tells its anchor, what stands around it the tag.
+    within = guess.columns.get("range", "").rpartition(".")[0] + "."
     for column in free:
-        words = {*column.words} - _PLAIN - {word for word in column.words if word.isdigit()}
-        words -= _RANGE if column.kind == "text" else set()
+        words = {word for word in words_of(column.name.removeprefix(within)) if not word.isdigit()} - PLAIN
+        words -= RANGE if column.kind == "text" else set()
         role = next(
-            (role for role, own in _ROLES.items() if words & own and words <= own | _ID | _ANTENNA | {"node"}), None
+            (role for role, own in ROLES.items() if words & own and words <= own | ID | ANTENNA | {"node"}), None
         )
         if role is not None and column.kind in ("numbers", "text") and (column.kind == "text" or column.is_whole):
             ids[role].append(column)
@@ -281,7 +264,8 @@ def _find_nodes(free: list[Column], guess: Guess) -> list[Column]:
     if guess.wide:
         tag = tag or nameless[:1]
     elif not anchor and nameless:
-        anchor, tag = ([nameless[-1]], tag or nameless[:-1][:1])
+        anchor = [column for column in nameless if column.name.startswith(within)] or nameless[-1:]
+        tag = tag or [column for column in nameless if column not in anchor][:1]
     guess.sides = Sides.ASKED if anchor and anchor[0] not in ids["anchor"] and tag else Sides.TOLD
     anchor, tag = _by_id_rather_than_index(anchor), _by_id_rather_than_index(tag)
     if guess.wide and max(len(anchor), len(nameless)) > 1:
@@ -295,7 +279,7 @@ def _find_nodes(free: list[Column], guess: Guess) -> list[Column]:
         others := [
             column
             for column in free
-            if _is_id(column) and column.num_distinct > 1 and not (_NO_RANGE - _ANY_ID) & {*column.words}
+            if _is_id(column) and column.num_distinct > 1 and not (NO_RANGE - ANY_ID) & {*column.words}
         ]
     ):
         guess.columns["anchor_id"] = others[0].name
@@ -330,16 +314,15 @@ def _find_by_values(free: list[Column], guess: Guess, has_names: bool) -> None:
             guess.columns["nanoseconds"] = fractions[0].name
     if guess.wide or {"range", "tx1"} & {*guess.columns}:
         return
-    pairs = [(node, value) for node, value in pairwise(free) if _is_id(node) and value.kind == "numbers"]
-    pairs = [(node, value) for node, value in pairs if not value.is_whole and _is_positive(value)]
-    if len(pairs) > 1 and 2 * len(pairs) == len(free):
+    pairs = _pairs_by_values(free)
+    if len(pairs) > 1:
         _take_pairs(pairs, guess)
-        if len({node.cells[0] for node, _ in pairs}) < len(pairs):
+        if 2 * len(pairs) < len(free) or len({node.cells[0] for node, _ in pairs}) < len(pairs):
             guess.doubts.append(f"{', '.join(node.name for node, _ in pairs)} may be the anchors")
         return
     ids = [column for column in free if _is_id(column)]
     reals = [column for column in free if column.kind == "numbers" and column not in ids and _is_positive(column)]
-    reals = [column for column in reals if not _NO_RANGE & {*column.words} and column.num_distinct > 1] or reals
+    reals = [column for column in reals if not NO_RANGE & {*column.words} and column.num_distinct > 1] or reals
     if alike := sorted(_groups(reals), key=len):
         reals = [column for column, _ in alike[-1]] if has_names else reals
     # A column of whole numbers beside one of decimals is no range but a count, or a power.
@@ -353,6 +336,19 @@ def _find_by_values(free: list[Column], guess: Guess, has_names: bool) -> None:
         _wide_by_values(reals, guess)
     else:
         guess.missing.append("range")
+
+
+def _pairs_by_values(free: Sequence[Column]) -> list[tuple[Column, Column]]:
+    """The columns of ids with decimals beside them, as many as are equally far from each other."""
+    at = [k for k, (node, value) in enumerate(pairwise(free)) if _is_id(node) and _is_real(value)]
+    run: list[int] = []
+    for first, step in product(at, {*np.diff(at).tolist()}):
+        run = max(run, list(takewhile(at.__contains__, count(first, step))), key=len)
+    return [(free[k], free[k + 1]) for k in run]
+
+
+def _is_real(column: Column) -> bool:
+    return column.kind == "numbers" and not column.is_whole and _is_positive(column)
 
 
 def _is_nanoseconds(column: Column) -> bool:

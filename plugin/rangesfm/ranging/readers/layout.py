@@ -1,21 +1,23 @@
-"""How a table of text is laid out, by its first rows: separator, header row or none, decimal commas."""
+"""How a table of text is laid out, by its first rows: separator, header row or none, and how cells are spelt."""
 
 from __future__ import annotations
 
 import csv
 import re
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.files.tables import Table, read_head
+from rangesfm.errors import InputError
+from rangesfm.files.tables import Table, read_head, read_text
 from rangesfm.ranging.readers.records import read_records
-from rangesfm.ranging.readers.times import CIVIL_TIME, TIME_OF_DAY
-from rangesfm.ranging.readers.units import words_of
+from rangesfm.ranging.readers.times import CIVIL_TIME, TIME_OF_DAY, spelt_date
+from rangesfm.ranging.readers.vocabulary import LENGTHS, TIMES, words_of
 
 # fmt: off
 MISSING = (
@@ -28,21 +30,31 @@ MISSING = (
 _SEPARATORS = "\t;|, "  # a comma may stand in numbers, a blank in times
 _NUM_ROWS = 1000
 _MAX_NUM_WORDS = 20  # lines before the table
+_MAX_SHARE_OF_WORDS = 0.02  # and in it
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", re.ASCII)
-_DECIMAL_COMMA = re.compile(r"-?\d+,\d+")
+_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?", re.ASCII)
+_WITH_UNIT = re.compile(rf"({_NUMBER.pattern}) ?([A-Za-z]+)", re.ASCII)
 _DATE = re.compile(r"\d{4}([-/.])\d\d?\1\d\d?|\d\d?([-/.])\d\d?\2\d{4}", re.ASCII)
+_UNITS = {*TIMES, *LENGTHS, "dbm"} - {"d", "h"}  # 1d may be an id
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column by its name and its first cells."""
+    """A column by its name and its first cells.
+
+    Attributes:
+        unit: that stands behind each of its numbers, "" for none.
+        cure: of a cell as the file has it to one as others have it.
+    """
 
     name: str
     cells: tuple[str, ...]
+    unit: str = ""
+    cure: Callable[[str], str] | None = None
 
     @cached_property
     def words(self) -> list[str]:
-        return words_of(self.name)
+        return words_of(f"{self.name} {self.unit}")
 
     @cached_property
     def numbers(self) -> Array:
@@ -51,14 +63,17 @@ class Column:
         return values[np.isfinite(values)]
 
     @cached_property
+    def filled(self) -> list[str]:
+        return [cell for cell in self.cells if cell.lower() not in MISSING]
+
+    @cached_property
     def kind(self) -> str:
         """What the cells are, but for empty ones: numbers, civil times, dates, text or nothing."""
-        filled = [cell for cell in self.cells if cell.lower() not in MISSING]
         patterns = {"numbers": (_NUMBER,), "times": (CIVIL_TIME, TIME_OF_DAY), "dates": (_DATE,)}
         for kind, those in patterns.items():
-            if filled and all(any(pattern.fullmatch(cell) for pattern in those) for cell in filled):
+            if self.filled and all(any(pattern.fullmatch(cell) for pattern in those) for cell in self.filled):
                 return kind
-        return "text" if filled else "nothing"
+        return "text" if self.filled else "nothing"
 
     @cached_property
     def is_whole(self) -> bool:
@@ -68,39 +83,89 @@ class Column:
     def num_distinct(self) -> int:
         return len(set(self.cells))
 
+    def cured(self) -> Column:
+        """With numbers and dates as others spell them: points for decimal commas, no units, 2026-01-31."""
+        cure: Callable[[str], str]
+        unit = ""
+        if self.filled and all(map(spelt_date, self.filled)):
+            cure = _with_spelt_date
+        elif any(map(_DECIMAL_COMMA.fullmatch, self.filled)):
+            cure = _with_point
+        else:
+            units = {match[2] if (match := _WITH_UNIT.fullmatch(cell)) else "" for cell in self.filled}
+            unit = units.pop() if len(units) == 1 else ""
+            if unit.lower() not in _UNITS:
+                return self
+            cure = _without(unit)
+        return replace(self, cells=tuple(map(cure, self.cells)), unit=unit, cure=cure)
+
     def __str__(self) -> str:
         if self.kind == "numbers" and len(self.numbers):
             return f"{self.name} ({self.numbers.min():.10g} to {self.numbers.max():.10g})"
         return f"{self.name} ({self.kind}{'' if self.kind == 'nothing' else f', {self.cells[0]!r}'})"
 
 
+def _with_spelt_date(cell: str) -> str:
+    return spelt_date(cell) or cell
+
+
+def _with_point(cell: str) -> str:
+    return cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell
+
+
+def _without(unit: str) -> Callable[[str], str]:
+    ending = re.compile(rf"({_NUMBER.pattern}) ?{unit}", re.ASCII)
+    return lambda cell: match[1] if (match := ending.fullmatch(cell)) else cell
+
+
 @dataclass(frozen=True)
 class Layout:
-    """A table as ``read_table`` takes it: see there.
+    """A table of text.
 
     Attributes:
-        columns: what the first rows have under each name of the header.
+        columns: what the first rows have under each name.
         has_names: whether the file names its columns.
-        table: all of it, where it is no text in rows.
+        read_cells: all rows as they stand in the file, and what is to be said of them.
+        are_records: whether a row may say nothing at all of a column.
     """
 
-    header: tuple[str, ...]
-    separator: str
-    num_skipped: int = 0
-    decimal_comma: bool = False
-    columns: tuple[Column, ...] = ()
-    has_names: bool = True
-    table: Table | None = None
+    columns: tuple[Column, ...]
+    has_names: bool
+    read_cells: Callable[[], tuple[Table, list[str]]]
+    are_records: bool = False
+
+    @property
+    def header(self) -> tuple[str, ...]:
+        return tuple(column.name for column in self.columns)
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Behind the numbers of each column."""
+        return {column.name: column.unit for column in self.columns}
+
+    def read(self) -> tuple[Table, list[str]]:
+        """All rows, and what is to be said of them; InputError where too many lines are none."""
+        table, notes = self.read_cells()
+        cures = {column.name: column.cure for column in self.columns if column.cure}
+        cured = {name: [*map(cure, table.text(name, empty=""))] for name, cure in cures.items()}
+        notes += ["numbers have decimal commas"] if _with_point in cures.values() else []
+        return replace(table, cells={**table.cells, **cured}), notes
+
+
+def layout_without_header(path: Path, header: Sequence[str], separator: str) -> Layout:
+    """Of a file that is known to have these columns."""
+    columns = tuple(Column(name, ()) for name in header)
+    return Layout(columns, True, lambda: _read_rows(path, header, separator, 0, ()))
 
 
 def find_layout(path: Path, separator: str | None = None) -> Layout | None:
     """The layout of a file; None if it has no two rows alike."""
     if table := read_records(path):
         first_rows = (Column(name, tuple(table.text(name, empty="")[:_NUM_ROWS])) for name in table.columns)
-        return Layout(table.columns, ",", columns=tuple(first_rows), table=table)
+        return Layout(tuple(column.cured() for column in first_rows), True, lambda: (table, []), True)
     lines = read_head(path).split("\n")
     numbered = [(number, line) for number, line in enumerate(lines[:-1] or lines, 1) if line.strip()]
-    content = [(number, line) for number, line in numbered if not line.lstrip().startswith("#")][:_NUM_ROWS]
+    content = [(number, line) for number, line in numbered if not _is_comment(line)][:_NUM_ROWS]
     split = next(filter(None, (_split(content, one) for one in separator or _SEPARATORS)), None)
     if split is None:
         return None
@@ -109,24 +174,50 @@ def find_layout(path: Path, separator: str | None = None) -> Layout | None:
     first = next(k for k, row in enumerate(rows) if len(row) == num)
     if first and len(rows[first - 1]) == num - 1 and not any(row[-1] for row in rows[first:] if len(row) == num):
         first -= 1  # only the rows end in a separator
-    decimal_comma = separator != "," and any(map(_DECIMAL_COMMA.fullmatch, rows[-1]))
-    if decimal_comma:
-        rows[first + 1 :] = [[cell.replace(",", ".") for cell in row] for row in rows[first + 1 :]]
     body = [row for row in rows[first:] if len(row) == num]
     names, num_skipped = None, content[first][0] - 1
     below = body[1:] if len(rows[first]) == num else body
-    if _is_header(rows[first], below) or _is_header(rows[first], below[1:]):
-        names, num_skipped = rows[first], content[first][0]
-        body = below
+    again = [row for row in below if row != rows[first]]  # the header row once more: somebody joined files
+    if _is_header(rows[first], again) or _is_header(rows[first], again[1:]):
+        names, num_skipped, body = rows[first], content[first][0], again
         if len(body) > 1 and len(names) == num and _is_header(body[0], body[1:]):  # their units
             names, num_skipped = [" ".join(both) for both in zip(names, body[0])], content[first + 1][0]
             body = body[1:]
-    elif comments := [line for number, line in numbered if number < content[first][0] and line.lstrip()[0] == "#"]:
-        cells = _cells(comments[-1].lstrip("# \t"), separator)
+    elif comments := [line for number, line in numbered if number < content[first][0] and _is_comment(line)]:
+        cells = _cells(comments[-1].lstrip("#%/ \t"), separator)
         names = cells if len(cells) == num and not any(map(_NUMBER.fullmatch, cells)) else None
+    if not body:
+        return None
     header = tuple(_unique(names or [str(k + 1) for k in range(num)], num))
-    columns = tuple(Column(name, tuple(row[k] for row in body)) for k, name in enumerate(header))
-    return Layout(header, separator, num_skipped, decimal_comma, columns, names is not None) if body else None
+    columns = (Column(name, tuple(row[k] for row in body)) for k, name in enumerate(header))
+    header_row = rows[first] if num_skipped >= content[first][0] else ()
+    return Layout(
+        tuple(column if separator == "," and "," in "".join(column.cells) else column.cured() for column in columns),
+        names is not None,
+        lambda: _read_rows(path, header, separator, num_skipped, header_row),
+    )
+
+
+def _read_rows(
+    path: Path, header: Sequence[str], separator: str, num_skipped: int, names: Sequence[str]
+) -> tuple[Table, list[str]]:
+    """All rows; a few lines that are none (words, one that was cut off, the header again) are left out and told."""
+    numbered = enumerate(read_text(path).split("\n")[num_skipped:], num_skipped + 1)
+    content = [(line, _cells(text, separator)) for line, text in numbered if text.strip() and not _is_comment(text)]
+    rows = [(line, row) for line, row in content if len(row) == len(header) and row != names]
+    odd = [(line, row) for line, row in content if len(row) != len(header)]
+    if len(odd) > 1 + _MAX_SHARE_OF_WORDS * len(content):
+        line, row = odd[0]
+        raise InputError(f"has {len(row)} cell{'s' * (len(row) != 1)}, the header row has {len(header)}", path, line)
+    lost = f"lines that are no rows of the table are left out: {len(odd)}, first line {odd[0][0]}" if odd else ""
+    columns = list(zip(*(row for _, row in rows))) or [()] * len(header)
+    cells = {name: [*column] for name, column in zip(header, columns)}
+    return Table(path, tuple(header), np.array([line for line, _ in rows], np.int64), cells), [lost] if lost else []
+
+
+def _is_comment(line: str) -> bool:
+    """As Python, MATLAB and C have them; rostopic's ``%time`` is a name."""
+    return line.lstrip().startswith(("#", "% ", "%%", "//"))
 
 
 def _split(content: list[tuple[int, str]], separator: str) -> tuple[list[list[str]], str] | None:
@@ -141,6 +232,8 @@ def _split(content: list[tuple[int, str]], separator: str) -> tuple[list[list[st
 def _cells(line: str, separator: str) -> list[str]:
     if separator == " ":
         return line.split()
+    if '"' not in line:
+        return [cell.strip() for cell in line.split(separator)]
     try:
         return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
     except csv.Error:
@@ -149,9 +242,9 @@ def _cells(line: str, separator: str) -> list[str]:
 
 def _is_header(row: list[str], rows: list[list[str]]) -> bool:
     """Whether a row has words where those below it have numbers or times."""
-    below = [Column("", tuple(cells)) for cells in zip(*rows)]
+    below = [Column("", tuple(cells)).cured() for cells in zip(*rows)]
     return any(
-        column.kind in ("numbers", "times") and cell and Column("", (cell,)).kind == "text"
+        column.kind in ("numbers", "times") and cell and Column("", (cell,)).cured().kind == "text"
         for cell, column in zip(row, below)
     ) or (not rows and all(Column("", (cell,)).kind == "text" for cell in row))
 

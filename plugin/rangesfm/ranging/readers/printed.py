@@ -17,8 +17,8 @@ import numpy as np
 
 from rangesfm.files.tables import read_text
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
-from rangesfm.ranging.readers.reader import Reader, Reading, ReadOptions, log_of_readings
+from rangesfm.ranging.log import DEFAULT_TAG_ID
+from rangesfm.ranging.readers.reader import Reader, Reading, ReadOptions, reader_of_readings
 from rangesfm.ranging.readers.roles import Sides
 from rangesfm.ranging.readers.times import HostClock
 
@@ -45,7 +45,6 @@ class _Phrases:
         ranges: of such a phrase, its time in seconds and its line.
     """
 
-    name: str
     begin: re.Pattern[str]
     each: re.Pattern[str]
     whole: re.Pattern[str]
@@ -54,11 +53,8 @@ class _Phrases:
     def begins(self, head: str) -> bool:
         return self.begin.search(head) is not None
 
-    def read(self, path: Path, options: ReadOptions) -> RangeLog:
-        options.check_no_table(path)
-        return log_of_readings(self._readings(path, HostClock(path, options)), path, self.name)
-
-    def _readings(self, path: Path, clock: HostClock) -> Iterator[Reading]:
+    def readings(self, path: Path, options: ReadOptions) -> Iterator[Reading]:
+        clock = HostClock(path, options)
         has_time = "time" in self.whole.groupindex
         for line, text in _numbered_lines(path):
             num_begun = len(self.each.findall(text))
@@ -92,8 +88,8 @@ def printed_reader(
 ) -> Reader:
     """The reader of lines with such phrases, given as patterns of ASCII."""
     compiled = partial(re.compile, flags=re.ASCII | re.MULTILINE)
-    phrases = _Phrases(name, compiled(begin), compiled(each), compiled(whole), ranges)
-    return Reader(name, phrases.begins, phrases.read, phrases.read_anchors, sides)
+    phrases = _Phrases(compiled(begin), compiled(each), compiled(whole), ranges)
+    return reader_of_readings(name, phrases.begins, phrases.readings, phrases.read_anchors, sides)
 
 
 def _numbered_lines(path: Path) -> Iterator[tuple[int, str]]:

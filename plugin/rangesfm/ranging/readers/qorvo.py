@@ -11,9 +11,8 @@ from pathlib import Path
 
 from rangesfm.errors import InputError
 from rangesfm.files.tables import read_text
-from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers.printed import LOST
-from rangesfm.ranging.readers.reader import Reader, Reading, ReadOptions, log_of_readings
+from rangesfm.ranging.readers.reader import Reading, ReadOptions, reader_of_readings
 from rangesfm.ranging.readers.times import HostClock
 
 _DEFAULT_RANGING_INTERVAL_S = 0.2
@@ -32,12 +31,8 @@ _MEASUREMENT = re.compile(
 )
 
 
-def _read(path: Path, options: ReadOptions) -> RangeLog:
-    options.check_no_table(path)
-    return log_of_readings(_readings(read_text(path, errors="replace"), _Clock(path, options)), path, READER.name)
-
-
-def _readings(text: str, clock: _Clock) -> Iterator[Reading]:
+def _readings(path: Path, options: ReadOptions) -> Iterator[Reading]:
+    text, clock = read_text(path, errors="replace"), _Clock(path, options)
     begins = list(_BEGIN.finditer(text))
     line_starts = [0, *(end.end() for end in re.finditer("\n", text))]
     for begin, stop in zip(begins, [*(begin.start() for begin in begins[1:]), len(text)]):
@@ -85,4 +80,4 @@ class _Clock:
         return count * self._interval_s
 
 
-READER = Reader("qorvo", lambda head: _BEGIN.search(head) is not None, _read)
+READER = reader_of_readings("qorvo", lambda head: _BEGIN.search(head) is not None, _readings)

@@ -9,11 +9,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.roles import Sides
+
+# A value that stands for no measurement: so often, so many times the largest range, where so many show what is usual.
+_MIN_NUM_FAR, _FAR, _MIN_NUM = 3, 4.0, 20
 
 
 class ReadOptions(LogOptions):
@@ -29,12 +35,6 @@ class ReadOptions(LogOptions):
         flags = {**said, "separator": self.separator, **more}
         typed = [word for flag, value in flags.items() if value for word in (f"--{flag}", value)]
         return shlex.join(["rangesfm", "ranges", *(self.given or [str(path)]), *typed])
-
-    def check_no_table(self, path: Path) -> None:
-        """InputError if the user describes columns where there are none."""
-        if self.columns or self.range_unit is not None or self.separator is not None:
-            message = "the log has a format of its own, without columns, range_unit or separator to be given"
-            raise InputError(message, path)
 
 
 @dataclass(frozen=True)
@@ -68,10 +68,24 @@ class Reading(NamedTuple):
     los: int = -1
 
 
+def far_above_all(ranges: Array) -> float:
+    """The value that stands for no measurement, as 65535: the largest one, far above all others and often; else inf."""
+    positive = ranges[(ranges > 0) & (ranges < math.inf)]
+    largest = float(np.max(positive, initial=0.0))
+    others = positive[positive < largest]
+    is_often = len(positive) - len(others) >= _MIN_NUM_FAR
+    return largest if is_often and len(others) >= _MIN_NUM and largest > _FAR * others.max() else math.inf
+
+
+def told_far(num: int, value: float) -> str:
+    return f"{value:.10g} stands there {num} times, far above all other ranges: taken for no measurement"
+
+
 def log_of_readings(readings: Iterable[Reading], path: Path, format: str) -> RangeLog:
     """All of it; InputError if no range was found."""
     readings = list(readings)
-    measured = [reading for reading in readings if 0 < reading.range_m < math.inf]
+    far = far_above_all(np.array([reading.range_m for reading in readings]))
+    measured = [reading for reading in readings if 0 < reading.range_m < far]
     if not measured:
         raise no_usable_range(len(readings), path)
     times, anchor_ids, ranges, lines, tag_ids, stddevs, los = zip(*measured)
@@ -86,7 +100,26 @@ def log_of_readings(readings: Iterable[Reading], path: Path, format: str) -> Ran
         source=path,
         format=format,
         num_no_measurement=len(readings) - len(measured),
+        notes=() if math.isinf(far) else (told_far(sum(reading.range_m == far for reading in readings), far),),
     )
+
+
+def reader_of_readings(
+    name: str,
+    recognizes: Callable[[str], bool],
+    readings: Callable[[Path, ReadOptions], Iterable[Reading]],
+    read_anchors: Callable[[Path], tuple[Anchor, ...]] = lambda path: (),
+    sides: Sides = Sides.TOLD,
+) -> Reader:
+    """Of a format of its own, which has no columns to be described."""
+
+    def read(path: Path, options: ReadOptions) -> RangeLog:
+        if options.columns or options.range_unit is not None or options.separator is not None:
+            message = "the log has a format of its own, without columns, range_unit or separator to be given"
+            raise InputError(message, path)
+        return log_of_readings(readings(path, options), path, name)
+
+    return Reader(name, recognizes, read, read_anchors, sides)
 
 
 def no_usable_range(num_records: int, path: Path) -> InputError:

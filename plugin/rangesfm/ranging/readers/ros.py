@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from rangesfm.errors import InputError
 from rangesfm.files.bags import SQLITE_HEAD, open_bag, type_name
-from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.readers.reader import Reader, Reading, ReadOptions, log_of_readings
+from rangesfm.ranging.readers.reader import Reading, ReadOptions, reader_of_readings
 from rangesfm.ranging.readers.roles import Sides
 
 if TYPE_CHECKING:
@@ -25,13 +24,12 @@ def _recognizes(head: str) -> bool:
     return head.startswith(_BEGINS) or head[1:6] == _MCAP
 
 
-def _read(path: Path, options: ReadOptions) -> RangeLog:
-    options.check_no_table(path)
+def _readings(path: Path, options: ReadOptions) -> Iterator[Reading]:
     with open_bag(path) as bag:
-        return log_of_readings(_readings(bag, path), path, READER.name)
+        yield from _in_bag(bag, path)
 
 
-def _readings(bag: AnyReader, path: Path) -> Iterator[Reading]:
+def _in_bag(bag: AnyReader, path: Path) -> Iterator[Reading]:
     """The ranges in all messages that hold any, each with the 1-based number of its message as its line."""
     connections = [connection for connection in bag.connections if type_name(connection.msgtype) in _RANGES_IN]
     if not connections:
@@ -101,4 +99,4 @@ def _character(value: int | str) -> str:
     return value if isinstance(value, str) else chr(value)
 
 
-READER = Reader("ros", _recognizes, _read, sides=Sides.ASKED)
+READER = reader_of_readings("ros", _recognizes, _readings, sides=Sides.ASKED)

@@ -13,7 +13,7 @@ from rangesfm.files.tables import header_names, read_head
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers.columns import QUANTITIES, STAMPS, Columns, read_columns
 from rangesfm.ranging.readers.guess import Guess, described, guess_columns
-from rangesfm.ranging.readers.layout import Layout, find_layout
+from rangesfm.ranging.readers.layout import Layout, find_layout, layout_without_header
 from rangesfm.ranging.readers.reader import Reader, ReadOptions
 from rangesfm.ranging.readers.roles import Sides
 from rangesfm.ranging.readers.several import anchor_of_file
@@ -24,7 +24,7 @@ _PRESETS = {
     "uwb_init": {"timestamp": "t", "range": "range", "tag_id": "ID_Tag", "anchor_id": "ID_Anchor"},
     "inrol": {"timestamp": "timestamp", "range": "r", "anchor_id": "anchor_id"},
 }
-_INROLS_LAYOUT = Layout(("index", "timestamp", "anchor_id", "r"), " ")
+_INROLS_COLUMNS = ("index", "timestamp", "anchor_id", "r")
 _INROLS_COMMENT = re.compile(
     r"\s{0,99}#[ \t]{0,9}index[ \t]{1,9}timestamp[ \t]{1,9}anchor_id[ \t]{1,9}r[ \t]{0,9}(?:\n|$)"
 )
@@ -68,8 +68,6 @@ def _notes(path: Path, layout: Layout, guess: Guess) -> Iterable[str]:
         "" if layout.has_names else " (by their numbers and values: the table has no names)"
     )
     yield from guess.notes
-    if layout.decimal_comma:
-        yield "numbers have decimal commas"
     if "anchor_id" not in guess.columns and not guess.wide:
         yield f"no column says which anchor it was: it is called '{anchor_of_file(path)}', as the file"
 
@@ -116,8 +114,10 @@ def _read(path: Path, options: ReadOptions, *, format: str) -> RangeLog:
     wide = _wide(told, path)
     columns = {key: name for key, name in told.items() if not key.startswith("range:")}
     layout = find_layout(path, options.separator) if format == MAPPED.name else None
-    if layout is None or not {*columns.values(), *wide} <= {*layout.header}:
-        layout = _INROLS_LAYOUT if format == "inrol" else None
+    if format == "inrol":
+        layout = layout_without_header(path, _INROLS_COLUMNS, " ")
+    elif layout is not None and not {*columns.values(), *wide} <= {*layout.header}:
+        layout = None
     third_message = {}
     if "range" not in columns and not wide:
         names = layout.header if layout else header_names(read_head(path), options.separator)

@@ -11,7 +11,7 @@ import numpy as np
 from rangesfm.errors import InputError
 from rangesfm.ranging.readers.reader import ReadOptions
 
-SECONDS_PER_UNIT = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+SECONDS_PER_UNIT = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0}
 DATE_ORDERS = ("dmy", "mdy")
 CIVIL_UNITS = ("iso", *DATE_ORDERS)
 CIVIL_TIME = re.compile(
@@ -20,6 +20,15 @@ CIVIL_TIME = re.compile(
     re.ASCII | re.IGNORECASE,
 )
 TIME_OF_DAY = re.compile(r"(?<![\d:])([01]?\d|2[0-3]):([0-5]\d):([0-5]\d(?:[.,]\d{1,18})?)(?![\d:])", re.ASCII)
+_COMPACT = re.compile(  # 20260131T120000.5Z, 20260131120000500
+    r"((?:19|20)\d\d)(0[1-9]|1[0-2])([0-2]\d|3[01])[T_ -]?"
+    r"([01]\d|2[0-3])([0-5]\d)([0-5]\d)(?:[.,]?(\d{1,9}))?(Z?)",
+    re.ASCII,
+)
+_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+_WITH_MONTH = re.compile(
+    rf"(\d\d?)[- ]({'|'.join(_MONTHS)})[a-z]{{0,6}}[- ](\d{{4}})(?=$|[T _])", re.ASCII | re.IGNORECASE
+)
 _NUMBER = re.compile(r"(?<![\w.+-])-?\d{1,19}(?:\.\d{1,18})?(?![\w.-]|:\d)", re.ASCII)
 _DAY_S = 86400.0
 # Of a time since 1970, the digits tell the unit: 1e11 s are three thousand years, 1e11 ms are three.
@@ -29,6 +38,16 @@ _UNIT_ABOVE = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 def unit_by_digits(value: float) -> str | None:
     """The unit that a number has if it is a time since 1970; None for one too small to be in ms, us or ns."""
     return next((unit for above, unit in _UNIT_ABOVE if abs(value) > above), None)
+
+
+def spelt_date(text: str) -> str | None:
+    """A date of digits alone, or with its month in words, as 2026-01-31; None for any other text."""
+    if compact := _COMPACT.fullmatch(text):
+        year, month, day, hour, minute, second, fraction, zone = compact.groups()
+        return f"{year}-{month}-{day}T{hour}:{minute}:{second}.{fraction or 0}{zone}"
+    if named := _WITH_MONTH.match(text):
+        return f"{named[3]}-{_MONTHS.index(named[2].lower()) + 1:02}-{named[1]:>02}{text[named.end() :]}"
+    return None
 
 
 def date_order(dates: Sequence[str]) -> str | None:

@@ -2,30 +2,21 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.readers.times import SECONDS_PER_UNIT, unit_by_digits
+from rangesfm.ranging.readers.vocabulary import LENGTHS, TIMES, words_of
 
-UNITS_PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
+UNITS_PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0, "ft": 1 / 0.3048}
 
 _MIN_NUM = 20  # fewer values show nothing
-_TIMES = {
-    "s": "s sec secs second seconds",
-    "ms": "ms msec msecs millis millisec milliseconds millisecond",
-    "us": "us usec usecs micros microseconds",
-    "ns": "ns nsec nsecs nanos nanoseconds",
-}
-_LENGTHS = {
-    "m": "m meter meters metre metres",
-    "cm": "cm centimeter centimeters centimetre centimetres",
-    "mm": "mm millimeter millimeters millimetre millimetres",
-}
 _SECONDS_SINCE_1970 = (1e9, 4e9)
 # From one time of a log to the next: a log that is faster, were it in another unit than seconds, is none.
 _FASTEST_S, _SLOWEST_S = {"s": 0.0, "ms": 2e-3, "us": 2e-3, "ns": 2e-3}, 5.0
+# On the average no radio is faster: its times are minutes, hours, or days as those of Excel and MATLAB.
+_FASTEST_ON_AVERAGE_S = 1e-4
+_DAYS_OF_1970 = {(3e4, 6e4): 25569.0, (7e5, 8e5): 719529.0}
 _FASTEST_M_PER_S = 30.0
 _LARGEST_M = {"m": 1000.0, "cm": 300.0, "mm": 300.0}
 _NOISE_M = {"m": 3.0, "cm": 0.6, "mm": 0.6}
@@ -42,19 +33,9 @@ class UnclearUnitError(Exception):
         self.units = units
 
 
-def words_of(name: str) -> list[str]:
-    """The words of a column's name in small letters, digits apart; an id in hexadecimal digits is one."""
-    words: list[str] = []
-    for part in re.findall(r"[^\W_]+", name):
-        is_id = re.fullmatch("(?:0[xX])?[0-9A-F]{4,16}", part) and not part.isdigit()
-        pattern = r"\d+|[^\W\d][^\W\dA-Z]*|[A-Z]+"
-        words += [part] if is_id else re.findall(rf"[A-Z]{{2,}}(?![^\W\dA-Z])|{pattern}", part)
-    return [word.lower() for word in words]
-
-
 def time_unit(name: str, times: Array) -> tuple[str, str | None]:
     """The unit of a column of numbers, and what to say of it where the name does not; or UnclearUnitError."""
-    named, distinct = _named(name, _TIMES), np.unique(times)
+    named, distinct = _named(name, TIMES), np.unique(times)
     by_digits = unit_by_digits(float(np.median(times))) if len(times) else None
     step = float(np.median(np.diff(distinct))) if len(distinct) > 1 else 0.0
     is_so = by_digits is not None and step * SECONDS_PER_UNIT[by_digits] <= _SLOWEST_S
@@ -63,24 +44,37 @@ def time_unit(name: str, times: Array) -> tuple[str, str | None]:
         return by_digits, f"{name} has as many digits as {by_digits} since 1970: taken as {by_digits}"
     if named is not None or len(distinct) < _MIN_NUM:
         return named or "s", None
-    can_be = [unit for unit, size in SECONDS_PER_UNIT.items() if _FASTEST_S[unit] <= step * size <= _SLOWEST_S]
+    mean_step = float(distinct[-1] - distinct[0]) / len(times)
+    if mean_step < _FASTEST_ON_AVERAGE_S:
+        slow = [unit for unit in ("min", "h", "d") if mean_step * SECONDS_PER_UNIT[unit] <= _SLOWEST_S]
+        if not days_before_1970(distinct):
+            raise UnclearUnitError(slow, f"steps of {mean_step:.2g} between its numbers")
+        return "d", f"{name} looks like days (steps of {mean_step:.2g}): taken as such"
+    can_be = [unit for unit, least in _FASTEST_S.items() if least <= step * SECONDS_PER_UNIT[unit] <= _SLOWEST_S]
     if can_be == ["s"] or _SECONDS_SINCE_1970[0] <= distinct[0] < _SECONDS_SINCE_1970[1]:
         return "s", None
     if len(can_be) != 1:
-        raise UnclearUnitError(can_be or [*SECONDS_PER_UNIT], f"steps of {step:g} between its numbers")
+        raise UnclearUnitError(can_be or [*_FASTEST_S], f"steps of {step:g} between its numbers")
     return can_be[0], f"{name} looks like {can_be[0]} (steps of {step:g}): taken as such"
+
+
+def days_before_1970(days: Array) -> float:
+    """What to take off days as Excel and MATLAB count them; 0 if they began at another time."""
+    middle = float(np.median(days)) if len(days) else 0.0
+    return next((first for (low, high), first in _DAYS_OF_1970.items() if low < middle < high), 0.0)
 
 
 def range_unit(name: str, ranges: Array, times: Array | None, pair: Indices) -> tuple[str, str | None]:
     """As ``time_unit``, of positive ranges between some pairs of nodes; ``times`` in seconds."""
-    named = _named(name, _LENGTHS)
+    named = _named(name, LENGTHS)
     if named is not None or len(ranges) < _MIN_NUM:
         return named or "m", None
     most, are_whole = float(np.percentile(ranges, 95)), bool(np.all(ranges == np.round(ranges)))
     can_be = [
         unit
         for unit, per_metre in UNITS_PER_METRE.items()
-        if (not are_whole if unit == "m" else most / per_metre >= (_NEAR_M if are_whole else _NEAR_WITH_DECIMALS_M))
+        if unit in _LARGEST_M
+        and (not are_whole if unit == "m" else most / per_metre >= (_NEAR_M if are_whole else _NEAR_WITH_DECIMALS_M))
         and most / per_metre <= _LARGEST_M[unit]
         and _share_of_jumps(ranges / per_metre, times, pair, _NOISE_M[unit]) <= _MAX_SHARE_OF_JUMPS
     ]
@@ -88,7 +82,7 @@ def range_unit(name: str, ranges: Array, times: Array | None, pair: Indices) -> 
         return "m", None
     kind = f"{'whole' if are_whole else 'decimal'} numbers, most of them up to {most:g}"
     if len(can_be) != 1:
-        raise UnclearUnitError(can_be or [*UNITS_PER_METRE], kind)
+        raise UnclearUnitError(can_be or [*_LARGEST_M], kind)
     return can_be[0], f"{name} looks like {can_be[0]} ({kind}): taken as such"
 
 
@@ -102,7 +96,6 @@ def _share_of_jumps(ranges_m: Array, times: Array | None, pair: Indices, noise_m
     return float(np.mean(moved > noise_m + _FASTEST_M_PER_S * seconds)) if len(moved) else 0.0
 
 
-def _named(name: str, words_by_unit: dict[str, str]) -> str | None:
+def _named(name: str, units: dict[str, str]) -> str | None:
     """The unit that the words of a name hold, the last one if there are several."""
-    units = {word: unit for unit, words in words_by_unit.items() for word in words.split()}
     return next((units[word] for word in reversed(words_of(name)) if word in units), None)

@@ -1,0 +1,81 @@
+"""The words by which columns, times and lengths are called, in the languages of those who log."""
+
+from __future__ import annotations
+
+import re
+
+
+def _unit_by_word(words_by_unit: dict[str, str]) -> dict[str, str]:
+    return {word: unit for unit, words in words_by_unit.items() for word in words.split()}
+
+
+TIMES = _unit_by_word(
+    {
+        "s": "s sec secs second seconds",
+        "ms": "ms msec msecs millis millisec milliseconds millisecond",
+        "us": "us usec usecs micros microseconds",
+        "ns": "ns nsec nsecs nanos nanoseconds",
+        "min": "min mins minute minutes",
+        "h": "h hr hrs hour hours",
+        "d": "d day days datenum",
+    }
+)
+LENGTHS = _unit_by_word(
+    {
+        "m": "m meter meters metre metres",
+        "cm": "cm centimeter centimeters centimetre centimetres",
+        "mm": "mm millimeter millimeters millimetre millimetres",
+        "ft": "ft foot feet",
+    }
+)
+"""The unit that each word stands for."""
+
+
+def words_of(name: str) -> list[str]:
+    """The words of a column's name in small letters, digits apart; an id in hexadecimal digits is one."""
+    words: list[str] = []
+    for part in re.findall(r"[^\W_]+", name):
+        is_id = re.fullmatch("(?:0[xX])?[0-9A-F]{4,16}", part) and not part.isdigit()
+        pattern = r"\d+|[^\W\d][^\W\dA-Z]*|[A-Z]+"
+        words += [part] if is_id else re.findall(rf"[A-Z]{{2,}}(?![^\W\dA-Z])|{pattern}", part)
+    return [word.lower() for word in words]
+
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+RANGE = _words("range ranges rng distance distances dist dists dis abstand entfernung distanz distancia 距离")
+RANGE_IN_SHORT = _words("d r")
+# What may stand beside the range, and is none, or is second to it.
+NO_RANGE = _words(
+    "gt true truth ground actual real ref reference expected est estimated error err bias std stddev stdev sigma var "
+    "variance cov covariance rate dot vel velocity speed count quality rssi power snr offset x y z min max threshold "
+    "id index idx rtt"
+)
+SECOND_RANGE = _words("calib calibrated corr corrected filtered filter smoothed smooth mean avg average median last")
+TIME = _words(
+    "time times timestamp timestamps timestep stamp datetime epoch elapsed clock zeit zeitstempel uhrzeit tiempo 时间"
+)
+TIME_IN_SHORT = frozenset({"t", "ts", *TIMES} - {"d", "h"})
+NANOSECONDS = _words("nsec nsecs nanosec nanosecs nanosecond nanoseconds")
+NO_TIME = _words("flight of delta dt diff duration latency tx rx offset since zone out le")
+SECOND_TIME = _words("device wearable sensor boot local received record rosbag bag")
+LENGTH_UNIT = frozenset(LENGTHS)
+ASKED = _words("responder rspdr resp rsp receiver to dest dst destination target peer remote neighbor neighbour")
+ASKING = _words("requester rqstr req sender initiator init from src source self")
+ANCHOR = _words("anchor anchors anc an beacon landmark station base basestation bs node anker ancla gateway 基站")
+TAG = _words("tag tags mobile robot rover user wearable 标签")
+ANTENNA = _words("ant antenna")
+ANY_ID = _words("id uid bssid nodeid identifier address addr mac device dev serial")
+ID = ANY_ID | _words("ids tid name no num nr number index idx short")
+ROLES = {
+    "antenna": ANTENNA,
+    "anchor": ANCHOR,
+    "tag": TAG,
+    "asked": ASKED,
+    "asking": ASKING,
+    "any": ANY_ID,
+}
+IN_WIDE = RANGE | RANGE_IN_SHORT | ANCHOR | TAG | LENGTH_UNIT | ASKED | ASKING | SECOND_RANGE | {"a", "b", "t", "raw"}
+PLAIN = _words("uwb field msg data header twr tof ranging meas measured measurement value vector arr array list")
