@@ -217,7 +217,7 @@ def _by_what_was_given(solution: Solution) -> Array:
     given = fit.prior_information.copy()
     biases = fit.columns[0].bias[fit.columns[0].bias >= 0]
     given[biases] = given[:, biases] = 0.0
-    inverse = np.linalg.lstsq(fit.information, np.eye(len(fit.information)), rcond=1e-12)[0]
+    inverse = _inverse(fit)
     covariance: Array = solution.errors.inflation**2 * inverse @ given @ inverse.T
     return covariance
 
@@ -231,12 +231,16 @@ def parameter_covariance(solution: Solution, learned: LearnedErrors) -> Array:
 
 def parameter_influence(fit: RangeFit, problem: RangeProblem, learned: LearnedErrors) -> Array:
     """(p, c) change of all that a fit estimates for each metre by which the ranges of a cell are longer."""
-    influence = np.linalg.lstsq(fit.information, fit.gradients.T, rcond=1e-12)[0] / problem.stddev_m
-    return np.stack([learned.cells.total(row) for row in influence])
+    of_cells = [learned.cells.total(column / problem.stddev_m) for column in fit.gradients.T]
+    return _inverse(fit) @ np.stack(of_cells)
 
 
 def scale_influence(fit: RangeFit, problem: RangeProblem) -> Array:
     """(n,) relative change of the scale for each metre by which a range is longer."""
-    to_scale = np.linalg.lstsq(fit.information, np.eye(len(fit.information))[0], rcond=1e-12)[0]
-    influence: Array = fit.gradients @ to_scale / problem.stddev_m
+    influence: Array = fit.gradients @ _inverse(fit)[0] / problem.stddev_m
     return influence
+
+
+def _inverse(fit: RangeFit) -> Array:
+    """(p, p) of the information, where what nothing determines stays as it is."""
+    return np.linalg.pinv(fit.information, rcond=1e-12, hermitian=True)
