@@ -243,4 +243,4 @@ def scale_influence(fit: RangeFit, problem: RangeProblem) -> Array:
 
 def _inverse(fit: RangeFit) -> Array:
     """(p, p) of the information, where what nothing determines stays as it is."""
-    return np.linalg.pinv(fit.information, rcond=1e-12, hermitian=True)
+    return np.asarray(np.linalg.pinv(fit.information, rcond=1e-12, hermitian=True), dtype=np.float64)
