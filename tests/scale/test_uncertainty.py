@@ -12,6 +12,7 @@ import pytest
 from rangesfm.demo.ranges import Radio
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.scale.estimate import ScaleUncertainty
+from rangesfm.scale.uncertainty import expected_scale_uncertainty, scale_uncertainty
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey
@@ -116,3 +117,20 @@ def test_a_map_that_bends_is_not_known_as_well_as_one_that_does_not(make_survey:
     assert stddevs[1]["bending"] > 5 * stddevs[0]["bending"]
     assert wrong.uncertainty.half_width_95 > 1.5 * true.uncertainty.half_width_95
     assert abs(bent.relative_error(wrong)) < wrong.uncertainty.half_width_95
+
+
+def test_best_weights_that_disagree_by_more_than_chance_widen_no_further(make_survey: MakeSurvey) -> None:
+    found = make_survey(radio=Radio(range_stddev_m=0.05)).scale("first_camera", "ABCDE")
+    assert found.errors.learned is not None
+    assert found.problem is not None
+    assert found.solution is not None
+    learned = found.errors.learned
+    for share in (1.0, 1e-6):
+        told = replace(learned, covariances_m2=share * learned.covariances_m2)
+        summed = expected_scale_uncertainty(found.solution, told).components
+        stated = scale_uncertainty(found.problem, found.solution, told).components
+        best = np.array([stated[name] for name in stated if name != "reweighting"])
+        chance = np.sqrt(np.sum(np.square(list(summed.values()))) - np.sum(best**2))
+        assert stated["reweighting"] < 1.345 * chance
+    # Of errors a thousandth as large nothing that the best weights say is chance any more.
+    assert stated["reweighting"] > 0.5 * chance

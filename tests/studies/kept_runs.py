@@ -1,4 +1,4 @@
-"""Studies of plans that keep each simulated run as a line of a file: started again, they go on there."""
+"""Studies that keep each simulated run as a line of a file: started again, they go on there."""
 
 from __future__ import annotations
 

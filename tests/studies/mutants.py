@@ -1,7 +1,7 @@
 """Of small mistakes put into the estimation packages, how many their tests notice.
 
     pip install cosmic-ray
-    python -m tests.studies.mutants --num 60 --seed 0
+    python -m tests.studies.mutants --num 60 --seed 0 [--first 31]
 
 Draws mutants (another operator, a number one off, a condition turned round, ...) at random from the packages, puts each
 into a copy of the checkout, and runs the tests that mirror its file: its own, then those of its folder, then those of
@@ -26,8 +26,8 @@ PACKAGE = Path("plugin/rangesfm")
 PACKAGES = ("scale", "refine", "ranging/errors", "ranging/anchors", "ranging/clock", "trust", "ceres")
 USED_BY = {"ranging/errors": ("scale", "refine"), "ranging/anchors": ("scale",), "ceres": ("refine",)}
 MAX_SECONDS = 1200
-# Of which all that are found stand in type hints, or change nothing that runs.
-LEFT_OUT = ("BitOr", "RemoveDecorator", "ExceptionReplacer", "BitAnd")
+# Of which all that are found stand in type hints, or change nothing that runs; those of variables want names.
+LEFT_OUT = ("BitOr", "RemoveDecorator", "ExceptionReplacer", "BitAnd", "Variable")
 
 
 class Mutant(NamedTuple):
@@ -90,6 +90,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--num", type=int, default=60)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--first", type=int, default=1, help="of those drawn, to go on where a run was cut")
     args = parser.parse_args()
     files = sorted(path for package in PACKAGES for path in (PACKAGE / package).glob("*.py") if path.stem != "__init__")
     # Each place once, whatever it may be changed into.
@@ -100,20 +101,20 @@ def main() -> None:
     rng = random.Random(args.seed)
     places = rng.sample(sorted(choices), args.num)
     drawn = [(rng.choice(choices[place]), place[1]) for place in places]
-    survivors = 0
+    survivors, left = 0, list(enumerate(drawn, 1))[args.first - 1 :]
     with tempfile.TemporaryDirectory(prefix="mutants_") as folder:
         copy = Path(folder)
         for part in ("plugin", "tests"):
             shutil.copytree(part, copy / part)
         shutil.copy("pyproject.toml", copy)
-        for num, (mutant, line) in enumerate(drawn, 1):
+        for num, (mutant, line) in left:
             begun = time.monotonic()
             survived, changed = survives(mutant, copy)
             survivors += survived
             word = "SURVIVED" if survived else "noticed"
             print(f"{num:3d} {word} {mutant.path}:{line} {changed} ({time.monotonic() - begun:.0f} s)", flush=True)
-    share = f"{100 * survivors / args.num:.0f} %"
-    print(f"{survivors} of {args.num} mutants survived ({share}), drawn from {len(choices)} places, seed {args.seed}")
+    share = f"{100 * survivors / len(left):.0f} %"
+    print(f"{survivors} of {len(left)} mutants survived ({share}), drawn from {len(choices)} places, seed {args.seed}")
 
 
 if __name__ == "__main__":

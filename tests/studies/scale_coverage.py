@@ -1,10 +1,12 @@
 """How often the 95 % interval of the scale covers the truth, on simulated surveys with errors as real radios have them.
 
-Run: python -m tests.studies.scale_coverage [--num_seeds 100] [--seed 0] [--cases one] [--by_photo]
+Run: python -m tests.studies.scale_coverage --rows FILE [--num_seeds 300] [--surveys "one known"]
+
+Started again with the same file it goes on where it was stopped.
 
 Each survey has a radio of its own, drawn from the population (``rangesfm.ranging.errors.population``), and with it
 errors that are drawn as functions of time, place, distance and direction, and a bend of its map. In the calibrated
-cases the error curve is known to 0.01 m. With --by_photo ranges name the photo next to them instead of a time. Prints
+cases the error curve is known to 0.01 m; in those by photo ranges name the photo next to them instead of a time. Prints
 for each case of anchors the share of intervals that cover the true scale with its standard error, the median half
 width, the median and the largest error, the part of the errors' mean square that the stated stddev explains (1: all),
 and how many surveys were refused.
@@ -12,13 +14,13 @@ and how many surveys were refused.
 
 from __future__ import annotations
 
-import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from tests.simulated.path import loop_path
 from tests.simulated.surveys import METRES_PER_UNIT, measured
+from tests.studies.kept_runs import Row, study
 from tests.studies.planned_surveys import along
 from tests.studies.real_logs import at_photos
 
@@ -49,15 +51,16 @@ LEARNT_STDDEV_M = 0.01
 
 @dataclass(frozen=True)
 class Case:
-    """Which anchors are heard, the frame in which they are given, and whether the radio's error curve was learnt."""
+    """Anchors that are heard, the frame they are given in, whether an error curve was learnt, and what ranges name."""
 
     name: str
     heard: str
     frame: str
     is_calibrated: bool = False
+    by_photo: bool = False
 
 
-CASES = (
+BY_TIME = (
     Case("one known", "A", "first_camera"),
     Case("one unknown", "A", "unknown"),
     Case("one known, calibrated", "A", "first_camera", is_calibrated=True),
@@ -67,35 +70,32 @@ CASES = (
     Case("eight surveyed, calibrated", "ABCDEFGH", "site", is_calibrated=True),
     Case("eight unknown, calibrated", "ABCDEFGH", "unknown", is_calibrated=True),
 )
+CASES = (*BY_TIME, *(replace(case, name=f"photos, {case.name}", by_photo=True) for case in BY_TIME))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--num_seeds", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=0, help="of the first survey")
-    parser.add_argument("--cases", default="", help="only those whose name begins so")
-    parser.add_argument("--by_photo", action="store_true")
-    args = parser.parse_args()
-    seeds = range(args.seed, args.seed + args.num_seeds)
-    print(f"{'case':28}{'covered':>14}{'half width':>12}{'median err':>12}{'worst':>8}{'explained':>11}{'refused':>9}")
+    asked = study(__doc__)
+    print(f"{'case':36}{'covered':>14}{'half width':>12}{'median err':>12}{'worst':>8}{'explained':>11}{'refused':>9}")
     for case in CASES:
-        if case.name.startswith(args.cases):
-            rows = [one_survey(case, seed, by_photo=args.by_photo) for seed in seeds]
-            print(f"{case.name:28}{summary([row for row in rows if row])}{sum(not row for row in rows):9}", flush=True)
+        if case.name.startswith(asked.beginning):
+            rows = asked.runs_of(case.name, lambda seed, case=case: one_survey(case, seed))  # type: ignore[misc]
+            found = [row for row in rows if "error" in row]
+            print(f"{case.name:36}{summary(found)}{len(rows) - len(found):9}", flush=True)
 
 
-def summary(rows: list[tuple[float, float, float]]) -> str:
-    """Of half widths of intervals, absolute errors and stddevs, all relative."""
-    widths, errors, stddevs = np.array(rows).T
-    covered = float(np.mean(errors <= widths))
+def summary(rows: list[Row]) -> str:
+    """Of surveys that were not refused."""
+    widths, errors, stddevs = (np.array([row[name] for row in rows]) for name in ("half_width", "error", "stddev"))
+    covered = float(np.mean(np.abs(errors) <= widths))
     return (
         f"{100 * covered:7.1f} +-{100 * np.sqrt(0.95 * 0.05 / len(rows)):3.1f} %{100 * np.median(widths):10.2f} %"
-        f"{100 * np.median(errors):10.2f} %{100 * errors.max():6.2f} %{np.mean(stddevs**2) / np.mean(errors**2):11.2f}"
+        f"{100 * np.median(np.abs(errors)):10.2f} %{100 * np.abs(errors).max():6.2f} %"
+        f"{np.mean(stddevs**2) / np.mean(errors**2):11.2f}"
     )
 
 
-def one_survey(case: Case, seed: int, *, by_photo: bool) -> tuple[float, float, float] | None:
-    """Half width of the interval, absolute error and stated stddev of the scale's logarithm; None if refused."""
+def one_survey(case: Case, seed: int) -> Row:
+    """Error of the scale's logarithm, half width of its interval and stated stddev; nothing if refused."""
     planned = PlannedSurvey(
         along(loop_path(DURATION_S, unsteadiness_m=0.3, seed=seed), KEYFRAME_RATE_HZ),
         tuple(Anchor(name, np.array(ANCHORS_M[name])) for name in case.heard),
@@ -107,7 +107,7 @@ def one_survey(case: Case, seed: int, *, by_photo: bool) -> tuple[float, float, 
     )
     made = measured(planned, seed)
     observations, trajectory = made.observations, made.trajectory
-    if by_photo:
+    if case.by_photo:
         log, trajectory, _ = at_photos(observations.log, trajectory, 0.0)
         observations = associate(log, trajectory, TAG_IN_CAM_M)
     options = ScaleOptions(max_relative_stddev=0.2)
@@ -116,9 +116,12 @@ def one_survey(case: Case, seed: int, *, by_photo: bool) -> tuple[float, float, 
             observations, trajectory, made.anchors, anchor_frame=case.frame, options=options, seed=seed
         )
     except GeometryError:
-        return None
-    error = abs(float(np.log(found.value / METRES_PER_UNIT)))
-    return found.uncertainty.half_width_95, error, found.uncertainty.empirical
+        return {}
+    return {
+        "error": float(np.log(found.value / METRES_PER_UNIT)),
+        "half_width": found.uncertainty.half_width_95,
+        "stddev": found.uncertainty.empirical,
+    }
 
 
 def drawn_radio(seed: int, *, is_calibrated: bool) -> dict[str, float]:

@@ -6,13 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.special import chndtrix
 
 from rangesfm.arrays import Array
 from rangesfm.ranging.errors.cells import MAX_NUM_CELLS, Cells, cells, noisiness
 from rangesfm.ranging.errors.components import GIVEN, REWEIGHTING
 from rangesfm.ranging.errors.learned import ROUNDING, LearnedErrors, learn_errors, usual_errors
 from rangesfm.ranging.observations import RangeObservations
-from rangesfm.scale.estimate import ScaleUncertainty
+from rangesfm.scale.estimate import NORMAL_95, ScaleUncertainty
 from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import (
     RangeFit,
@@ -29,6 +31,8 @@ from rangesfm.scale.solution import Solution
 
 # Where ranges have no times: a path of so many metres is walked in a second.
 _WALKING_M_PER_S = 1.0
+# In stddevs, as Huber's.
+_MAX_CHANCE = 1.345
 
 
 def learned_errors(
@@ -146,16 +150,34 @@ def scale_uncertainty(
 ) -> ScaleUncertainty:
     """Relative stddevs of the scale.
 
-    Its robust weights do not make the most of what is learnt of the errors. The best ones do (Gauss-Markov), as far as
-    the errors are what they are taken for, and say how far off the scale is that was found: as far as theirs, give or
-    take the stddev of theirs. Where that leaves more open than the errors' sum, it is no help.
+    Its robust weights do not make the most of what is learnt of the errors. The best ones do (Gauss-Markov): the truth
+    is where they find it, give or take their stddev, and so it lies about the scale at hand within a quantile of a
+    folded normal distribution. That holds as far as the errors are what they are taken for. By how much the best
+    weights change the scale says whether they are (Hausman, "Specification tests in econometrics", 1978): its variance
+    is that by which theirs is less. What is more than chance of it speaks against them, not against the scale.
 
     Args:
         posed: measured lengths in it as uncertain as the map's bending makes them.
         bending_of_lengths: as of ``expected_scale_uncertainty``.
     """
-    summed = expected_scale_uncertainty(solution, learned, bending_of_lengths)
-    return min(summed, _by_best_weights(posed, solution, learned), key=lambda each: each.empirical)
+    linear = _linear(posed, solution)
+    design, off_m = learned.cells.mean(linear.design), learned.cells.mean(linear.off_m)
+    covariance = learned.covariance_m2
+    covariance[np.diag_indices_from(covariance)] += ROUNDING * np.trace(covariance)
+    whitened = cho_solve(cho_factor(covariance), design)
+    inverse = invert_information(design.T @ whitened + linear.prior_design.T @ linear.prior_design)
+    of_cells, of_priors = whitened @ inverse[0], linear.prior_design @ inverse[0]
+    components = learned.stddev_of_cells(of_cells)
+    if (given := float(np.linalg.norm(of_priors))) > 0:
+        components[GIVEN] = given
+    summed = expected_scale_uncertainty(solution, learned, bending_of_lengths).components
+    best, of_sum = (float(np.linalg.norm(list(each.values()))) for each in (components, summed))
+    chance = np.sqrt(max(of_sum**2 - best**2, 0.0))
+    change = min(abs(float(of_cells @ off_m + of_priors @ linear.prior_off)), _MAX_CHANCE * chance)
+    # The square of a normal variable of another mean is noncentral chi-square.
+    half_width = best * np.sqrt(chndtrix(0.95, 1, (change / best) ** 2))
+    components[REWEIGHTING] = float(np.sqrt(max((half_width / NORMAL_95) ** 2 - best**2, 0.0)))
+    return ScaleUncertainty(solution.fit.log_scale_stddev, components)
 
 
 def expected_scale_uncertainty(
@@ -185,22 +207,6 @@ def _say_of_lengths(solution: Solution) -> float:
     return float(invert_information(fit.information)[0, 0] * (slopes @ slopes))
 
 
-def _by_best_weights(posed: ScaleProblem, solution: Solution, learned: LearnedErrors) -> ScaleUncertainty:
-    """Of the scale at hand, by how far it is from the one that the best weights find."""
-    linear = _linear(posed, solution)
-    design, off_m = learned.cells.mean(linear.design), learned.cells.mean(linear.off_m)
-    covariance = learned.covariance_m2
-    covariance[np.diag_indices_from(covariance)] += ROUNDING * np.trace(covariance)
-    whitened = np.linalg.solve(covariance, design)
-    inverse = invert_information(design.T @ whitened + linear.prior_design.T @ linear.prior_design)
-    of_cells, of_priors = whitened @ inverse[0], linear.prior_design @ inverse[0]
-    reweighted = learned.stddev_of_cells(of_cells)
-    if (given := np.linalg.norm(of_priors)) > 0:
-        reweighted[GIVEN] = float(given)
-    reweighted[REWEIGHTING] = abs(float(of_cells @ off_m + of_priors @ linear.prior_off))
-    return ScaleUncertainty(solution.fit.log_scale_stddev, reweighted)
-
-
 def _by_what_was_given(solution: Solution) -> Array:
     """(p, p) what taped distances, positions of anchors and the upward direction do by not being exact.
 
@@ -211,7 +217,7 @@ def _by_what_was_given(solution: Solution) -> Array:
     given = fit.prior_information.copy()
     biases = fit.columns[0].bias[fit.columns[0].bias >= 0]
     given[biases] = given[:, biases] = 0.0
-    inverse = np.linalg.lstsq(fit.information, np.eye(len(fit.information)), rcond=1e-12)[0]
+    inverse = _inverse(fit)
     covariance: Array = solution.errors.inflation**2 * inverse @ given @ inverse.T
     return covariance
 
@@ -225,12 +231,16 @@ def parameter_covariance(solution: Solution, learned: LearnedErrors) -> Array:
 
 def parameter_influence(fit: RangeFit, problem: RangeProblem, learned: LearnedErrors) -> Array:
     """(p, c) change of all that a fit estimates for each metre by which the ranges of a cell are longer."""
-    influence = np.linalg.lstsq(fit.information, fit.gradients.T, rcond=1e-12)[0] / problem.stddev_m
-    return np.stack([learned.cells.total(row) for row in influence])
+    of_cells = [learned.cells.total(column / problem.stddev_m) for column in fit.gradients.T]
+    return _inverse(fit) @ np.stack(of_cells)
 
 
 def scale_influence(fit: RangeFit, problem: RangeProblem) -> Array:
     """(n,) relative change of the scale for each metre by which a range is longer."""
-    to_scale = np.linalg.lstsq(fit.information, np.eye(len(fit.information))[0], rcond=1e-12)[0]
-    influence: Array = fit.gradients @ to_scale / problem.stddev_m
+    influence: Array = fit.gradients @ _inverse(fit)[0] / problem.stddev_m
     return influence
+
+
+def _inverse(fit: RangeFit) -> Array:
+    """(p, p) of the information, where what nothing determines stays as it is."""
+    return np.asarray(np.linalg.pinv(fit.information, rcond=1e-12, hermitian=True), dtype=np.float64)
