@@ -64,7 +64,7 @@ def test_the_matches_are_the_same_row_for_row_whatever_the_number_of_processes(
     photos: Photos, tmp_path: Path, listener: Listener
 ) -> None:
     found = []
-    for num_processes in (1, 2, 4):
+    for num_processes in (1, 3):
         (tmp_path / str(num_processes)).mkdir()
         database = Path(shutil.copy(photos.folder / "database.db", tmp_path / str(num_processes)))
         listener.stage(str(num_processes))
@@ -73,7 +73,7 @@ def test_the_matches_are_the_same_row_for_row_whatever_the_number_of_processes(
         assert listener.updates[str(num_processes)][-1] == (NUM_PAIRS, NUM_PAIRS)
         assert sorted(os.listdir(database.parent)) == ["database.db", "mapper.log"]
     assert len([pair for pair in found[0] if isinstance(pair[0], int)]) == NUM_PAIRS
-    assert found[1:] == [found[0]] * 2
+    assert found[1] == found[0]
 
 
 @pytest.mark.usefixtures("small_shares")

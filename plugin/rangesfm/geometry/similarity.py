@@ -136,9 +136,9 @@ class PathShape:
     """Principal extents of a set of points.
 
     Attributes:
-        centroid: (3,).
-        axes: (3, 3), columns are the principal directions, longest first; ``oriented``.
-        stddevs: (3,) along them, in the unit of the points.
+        centroid: (..., 3).
+        axes: (..., 3, 3), columns are the principal directions, longest first; ``oriented``.
+        stddevs: (..., 3) along them, in the unit of the points.
     """
 
     centroid: Array
@@ -147,18 +147,18 @@ class PathShape:
 
 
 def path_shape(points: Array) -> PathShape:
-    """Principal directions of (n, 3) points."""
-    centroid = points.mean(axis=0)
-    _, singular_values, vt = np.linalg.svd(points - centroid, full_matrices=len(points) < 3)
-    stddevs = np.zeros(3)
-    stddevs[: len(singular_values)] = singular_values / np.sqrt(len(points))
-    return PathShape(centroid, oriented(vt.T), stddevs)
+    """Principal directions of (..., n, 3) points."""
+    centroid, num = points.mean(axis=-2), points.shape[-2]
+    _, singular_values, vt = np.linalg.svd(points - centroid[..., None, :], full_matrices=num < 3)
+    stddevs = np.zeros_like(centroid)
+    stddevs[..., : singular_values.shape[-1]] = singular_values / np.sqrt(num)
+    return PathShape(centroid, oriented(vt.swapaxes(-1, -2)), stddevs)
 
 
 def oriented(axes: Array) -> Array:
-    """Columns (3, k), each turned so that its last coordinate of some size is positive: no decomposition tells."""
-    last = 2 - np.argmax(np.abs(axes[::-1]) > _OF_SOME_SIZE, axis=0)
-    turned: Array = axes * np.sign(np.take_along_axis(axes, last[None], axis=0))
+    """Columns (..., 3, k), each turned so that its last coordinate of some size is positive: no decomposition tells."""
+    last = 2 - np.argmax(np.abs(axes[..., ::-1, :]) > _OF_SOME_SIZE, axis=-2, keepdims=True)
+    turned: Array = axes * np.sign(np.take_along_axis(axes, last, axis=-2))
     return turned
 
 

@@ -84,13 +84,10 @@ def unknown_anchor_starts(problem: RangeProblem) -> list[RangeState]:
     """Starts where nothing is known of the anchors: a sweep over the scale, each anchor solved linearly."""
     small = spread_subset(problem, _MAX_RANGES_PER_ANCHOR)
     scales = scale_candidates(problem)
-    costs, states = [], []
-    for scale in scales:
-        anchors, cost = _multilaterate_all(small, scale)
-        costs.append(cost)
-        states.append(RangeState(Similarity(scale, np.eye(3), np.zeros(3)), anchors, problem.bias_mean_m.copy()))
-    best = dict.fromkeys(i for kind in np.array(costs).T for i in _lowest_minima(kind))
-    return [choose_sides(small, states[i])[0] for i in best]
+    anchors, costs = _multilaterate_all(small, scales)
+    best = dict.fromkeys(i for kind in costs for i in _lowest_minima(kind))
+    placed = [Similarity(scale, np.eye(3), np.zeros(3)) for scale in scales]
+    return [choose_sides(small, RangeState(placed[i], anchors[i], problem.bias_mean_m.copy()))[0] for i in best]
 
 
 def _lowest_minima(costs: Array) -> list[int]:
@@ -222,24 +219,22 @@ def _at_scale(problem: RangeProblem, scale: float) -> RangeState:
     )
 
 
-def _multilaterate_all(problem: RangeProblem, scale: float) -> tuple[Array, tuple[float, float]]:
-    """Each anchor from the tag's positions at a given scale; and the mean of the robust residuals, two ways.
+def _multilaterate_all(problem: RangeProblem, scales: Array) -> tuple[Array, Array]:
+    """(s, m, 3) each anchor from the tag's positions at given scales; (2, s) the mean of robust residuals, two ways.
 
     Those of the linear equation tell more where an anchor is badly placed; those of the distances where the path lies
     on a sphere, which leaves the linear equation free to fit at any scale.
     """
-    anchors, linear, distances = np.zeros((problem.num_anchors, 3)), 0.0, 0.0
-    tags = scale * problem.centers + problem.tag_from_center
+    anchors, costs = np.zeros((len(scales), problem.num_anchors, 3)), np.zeros((2, len(scales)))
     unit = _residual_unit(problem)
-    for k in range(problem.num_anchors):
-        rows = problem.anchor_index == k
-        if rows.any():
-            ranges = problem.range_m[rows] - problem.bias_mean_m[k]
-            anchors[k], residuals = multilaterate(tags[rows], ranges)
-            linear += float(np.sum(np.log1p((residuals / unit) ** 2)))
-            off = np.linalg.norm(tags[rows] - anchors[k], axis=1) - ranges
-            distances += float(np.sum(np.log1p((off / unit) ** 2)))
-    return anchors, (linear / len(tags), distances / len(tags))
+    for k in np.unique(problem.anchor_index):
+        part = problem.of_anchor(int(k))
+        tags = scales[:, None, None] * part.centers + part.tag_from_center
+        ranges = part.range_m - problem.bias_mean_m[k]
+        anchors[:, k], residuals = multilaterate(tags, ranges)
+        off = np.linalg.norm(tags - anchors[:, k, None], axis=-1) - ranges
+        costs += np.sum(np.log1p((np.stack([residuals, off]) / unit) ** 2), axis=-1)
+    return anchors, costs / len(problem.range_m)
 
 
 def _residual_unit(problem: RangeProblem) -> float:

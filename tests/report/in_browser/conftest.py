@@ -80,9 +80,13 @@ class Browser:
         for kind, (x, y) in steps:
             self.command("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
 
+    def draw_frame(self) -> None:
+        """Wait until what was done has been drawn."""
+        self._driver.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(arguments[0]))")
+
     def picture(self, selector: str) -> Pixels:
         """(h, w, 3) pixels of an element, once the next frame is drawn."""
-        self._driver.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(arguments[0]))")
+        self.draw_frame()
         box = self.run(
             "const box = document.querySelector(arguments[0]).getBoundingClientRect();"
             "return {x: box.x + scrollX, y: box.y + scrollY, width: box.width, height: box.height, scale: 1}",

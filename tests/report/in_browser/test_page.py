@@ -224,7 +224,7 @@ def test_a_wheel_with_a_key_zooms_a_drag_moves_and_a_double_click_goes_back(brow
     chart = "rangesfmFigures.scale_candidates[0]"
 
     def domain() -> list[float]:
-        browser.picture("#scale_candidates")
+        browser.draw_frame()
         low, high = browser.run(f"return {chart}.view.scale('x').domain()")
         return [low, high]
 

@@ -6,7 +6,11 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.geometry.similarity import path_shape
-from rangesfm.ranging.errors.noise import robust_stddev
+from rangesfm.ranging.errors.noise import robust_stddevs
+
+_NUM_ROUNDS = 12
+# Of normal equations with ones on the diagonal: what rounding leaves of them, where outliers take all weight from one.
+_RIDGE = 1e-16
 
 
 def multilaterate(positions: Array, ranges: Array) -> tuple[Array, Array]:
@@ -15,27 +19,32 @@ def multilaterate(positions: Array, ranges: Array) -> tuple[Array, Array]:
     rho^2 = |p|^2 - 2 a.p + |a|^2 is linear in (a, |a|^2). Where the positions lie in a plane,
     the height above it follows from |a|^2; its sign is arbitrary.
 
+    Args:
+        positions: (..., n, 3), of one point or of many at once.
+        ranges: (n,) or (..., n).
+
     Returns:
-        the point (3,), and (n,) residuals in metres (of the linear model).
+        the point (..., 3), and (..., n) residuals in metres (of the linear model).
     """
     shape = path_shape(positions)
-    local = (positions - shape.centroid) @ shape.axes
+    local = (positions - shape.centroid[..., None, :]) @ shape.axes
     # Noise of about a decimetre decides which directions the ranges see at all.
-    seen = shape.stddevs > max(0.02 * shape.stddevs[0], 1e-9)
-    design = np.column_stack([-2 * local[:, seen], np.ones(len(local))])
-    squared = ranges**2 - np.sum(local**2, axis=1)
+    seen = shape.stddevs > np.maximum(0.02 * shape.stddevs[..., :1], 1e-9)
+    squared = ranges**2 - np.sum(local**2, axis=-1)
+    design = np.concatenate([-2 * local * seen[..., None, :], np.ones_like(local[..., :1])], axis=-1)
+    sizes = np.linalg.norm(design, axis=-2, keepdims=True)
+    sizes = np.where(sizes > 0, sizes, 1.0)
+    design, nothing = design / sizes, np.concatenate([~seen, np.zeros_like(seen[..., :1])], axis=-1)
+    rest = (nothing + _RIDGE)[..., None] * np.eye(4)
     weights = 1 / np.maximum(2 * ranges, 1e-3)
-    robust = np.ones(len(local))
-    for _ in range(12):
-        w = weights * np.sqrt(robust)
-        solution = np.linalg.lstsq(design * w[:, None], squared * w, rcond=1e-10)[0]
-        residuals = weights * (design @ solution - squared)
-        robust = 1 / (1 + (residuals / (2 * robust_stddev(residuals))) ** 2)
-    point = np.zeros(3)
-    point[seen] = solution[:-1]
-    rest = solution[-1] - float(point @ point)
-    unseen = np.flatnonzero(~seen)
-    if len(unseen):
-        point[unseen[-1]] = np.sqrt(max(rest, 0.0))
-    anchor: Array = shape.centroid + shape.axes @ point
+    robust = np.ones_like(squared)
+    for _ in range(_NUM_ROUNDS):
+        weighted = (design * (weights**2 * robust)[..., None]).swapaxes(-1, -2)
+        solution = np.linalg.solve(weighted @ design + rest, weighted @ squared[..., None])
+        residuals = weights * ((design @ solution)[..., 0] - squared)
+        robust = 1 / (1 + (residuals / (2 * robust_stddevs(residuals))) ** 2)
+    point, height = np.split(solution[..., 0] / sizes[..., 0, :], [3], axis=-1)
+    above = np.sqrt(np.maximum(height - np.sum(point**2, axis=-1, keepdims=True), 0.0))
+    point = np.where(~seen & (np.arange(3) == 2), above, point)
+    anchor: Array = shape.centroid + (shape.axes @ point[..., None])[..., 0]
     return anchor, residuals

@@ -32,8 +32,8 @@ def robust_stddev(residuals: npt.ArrayLike) -> float:
 
 
 def robust_stddevs(residuals: Array) -> Array:
-    """(m, 1) the same of each row of (m, n)."""
-    stddevs: Array = _STDDEV_PER_MAD * np.median(np.abs(residuals), axis=1, keepdims=True)
+    """(..., 1) the same of each row of (..., n)."""
+    stddevs: Array = _STDDEV_PER_MAD * np.median(np.abs(residuals), axis=-1, keepdims=True)
     return np.maximum(stddevs, MIN_STDDEV_M)
 
 
