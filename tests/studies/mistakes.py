@@ -93,9 +93,9 @@ def kinds(ids: list[str]) -> list[Kind]:
         Kind("clock drifts", _clock_drift, ("clock drift", "clock jump"), ("clock drift", "")),
         Kind("clock jumps", _clock_jump, ("clock jump", "clock drift"), ("clock jump", "")),
         Kind("times in whole seconds", _whole_seconds, ("clock offset",)),
-        Kind("photos' times reversed", _reversed, ("clock offset", "clock drift", "clock jump")),
+        Kind("photos' times reversed", _reversed, ("photos reversed",)),
         Kind("map breaks", _map_breaks, ("map break",), ("map break", "")),
-        Kind("radio warms up", _warming, ("step",), ("step", "")),
+        Kind("radio warms up", _warming, ("radio drift",), ("radio drift", "")),
         Kind("surveyor in between", _body, ("behind the camera",), ("behind the camera", "")),
         Kind("all step", _step(None, 0.5), ("step",), ("step", "")),
         Kind("all step early", _step(None, 0.25), ("step", "stretch"), ("step", "")),
@@ -108,7 +108,7 @@ def kinds(ids: list[str]) -> list[Kind]:
     if ids:
         pair = ("range share", "anchors' scale")
         places = tuple(f"anchor {what} {name}" for name in (*ids[1:3], ids[-1]) for what in ("place", "coordinate"))
-        mixed = (f"anchor's outliers {ids[0]}", f"anchor hardly used {ids[0]}")
+        mixed = (f"anchor mixed up {ids[0]}",)
         made += [
             Kind("ranges long by a share", _range_share, pair, ("range share", "")),
             Kind("anchors too small by a share", _anchor_share, pair, ("anchors' scale", "")),
@@ -267,9 +267,8 @@ def _map_breaks(given: Given, size: float, rng: np.random.Generator) -> None:
 
 
 def _warming(given: Given, size: float, rng: np.random.Generator) -> None:
-    """All ranges longer and longer, at last by three times the size."""
-    since = (given.time_s - given.time_s.min()) / np.ptp(given.time_s)
-    given.range_m = given.range_m + 3 * size * since
+    """All ranges longer and longer."""
+    given.range_m = given.range_m + size * (given.time_s - given.time_s.min()) / np.ptp(given.time_s)
 
 
 def _body(given: Given, size: float, rng: np.random.Generator) -> None:
@@ -421,14 +420,18 @@ def told(
         return {**line, "refused": run_.refusal, "smallest": None}
     tests = run_.trust.tests
     causes = [f"{c.name} {c.subject}".strip() for c in run_.trust.causes]
-    named = [*causes, *(f"{t.name} {t.subject}".strip() for t in tests if t.rejected and t.stddev is None)]
+    rejected = [f"{t.name} {t.subject}".strip() for t in tests if t.rejected]
+    of_evidence = [f"{t.name} {t.subject}".strip() for t in tests if t.rejected and t.stddev is None]
+    named = [name for name in dict.fromkeys([*rejected, *causes]) if name in causes or name in of_evidence]
+    # What comes before the causes is what the survey's first sentence says.
+    first = named[:1] if named and f"{tests[0].name} {tests[0].subject}".strip() not in causes else causes
     effects = [(t.effect_on_scale, f"{t.name} {t.subject}".strip()) for t in tests if t.effect_on_scale is not None]
     return {
         **line,
         "refused": "",
         "named": named,
         "is_named": any(_is(name, right) for name in named),
-        "is_first": any(_is(name, right) for name in causes or named[:1]),
+        "is_first": any(_is(name, right) for name in first),
         "found": bool(named),
         "doubts": run_.doubts,
         "wrong": run_.is_wrong,

@@ -62,7 +62,28 @@ def test_most_ranges_without_line_of_sight_are_a_finding() -> None:
     given = surveyed(DRONE, SEED)
     rng = np.random.default_rng(0)
     given.range_m = given.range_m + (rng.random(len(given.range_m)) < 0.7) * rng.exponential(1.0, len(given.range_m))
-    assert any("no radio does" in reason for reason in trust(given).reasons)
+    assert "no radio does" in trust(given).reasons[0]
+
+
+def test_an_anchor_that_is_mostly_blocked_is_named_before_what_that_looks_like() -> None:
+    given = surveyed(HALL, SEED)
+    rng, num = np.random.default_rng(0), len(given.range_m)
+    given.range_m = given.range_m + (given.is_of("A1") & (rng.random(num) < 0.7)) * rng.exponential(1.5, num)
+    likeliest = trust(given).tests[0]
+    assert (likeliest.name, likeliest.subject) == ("anchor's outliers", "A1")
+
+
+def test_ranges_to_another_anchor_under_a_label_are_named() -> None:
+    given = surveyed(HALL, SEED)
+    (mistake,) = [each for each in kinds(given.ids) if each.name == "a third of A1 is of A2"]
+    mistake.make(given, 1.0, np.random.default_rng(SEED))
+    assert "as long as those to A2" in trust(given).reasons[0]
+
+
+def test_a_step_of_all_ranges_is_found_at_its_own_time() -> None:
+    given = surveyed(DRONE, SEED)
+    given.range_m = given.range_m + 0.5 * (given.time_s > np.quantile(given.time_s, 0.5))
+    assert "from 50 s after the first range on the ranges read about 0.5" in trust(given).reasons[0]
 
 
 # With the first seed y, x and z together fit so much better by chance that the place is named, not the coordinate.
@@ -112,6 +133,8 @@ def test_an_anchor_that_reads_long_is_named_unless_radios_do_so() -> None:
     ("kind", "size", "name"),
     [
         ("all step", 0.4, "step"),
+        ("radio warms up", 1.0, "radio drift"),
+        ("photos' times reversed", 1.0, "photos reversed"),
         ("map breaks", 0.6, "map break"),
         ("tag slips", 0.6, "tag slipped"),
         ("surveyor in between", 0.25, "behind the camera"),

@@ -9,7 +9,7 @@ import numpy as np
 
 from rangesfm.report.content import Content
 from rangesfm.report.plot import Figure, Mark, Panel, Series
-from rangesfm.report.text import percent, rough, signed
+from rangesfm.report.text import mistake, percent, rough, signed
 from rangesfm.result.entries import MistakeEntry
 
 MAX_NUM_ROWS = 16
@@ -74,7 +74,7 @@ def _panel(
         kind, to = _kind(test), min(value, end)
         series.append(Series(kind, _COLORS[kind], np.array([[0.0, row], [to, row]]), "line"))
         marks.append(Mark(kind, _COLORS[kind], "disc", to, row, "", test.words))
-        rows.append((float(row), f"{test.name} {test.subject}".strip(), told))
+        rows.append((float(row), mistake(test.name, test.subject), told))
     return Panel(
         title,
         description,

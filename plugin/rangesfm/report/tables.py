@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,8 +14,8 @@ from markupsafe import Markup
 
 from rangesfm.ranging.errors.components import component_words
 from rangesfm.report.content import Content, in_natural_order
-from rangesfm.report.text import count, duration, fixed, keyed, plain, signed
-from rangesfm.result.entries import AnchorEntry, median, rms
+from rangesfm.report.text import count, duration, fixed, keyed, mistake, plain, signed
+from rangesfm.result.entries import AnchorEntry, MistakeEntry, median, rms
 from rangesfm.survey.settings import KEYS
 
 _Columns = Mapping[str, Callable[[Any], str]]
@@ -104,14 +105,35 @@ def mistakes(content: Content) -> Table:
         cells = _cells(f"tests.{i}", test, dict.fromkeys(names, partial(fixed, decimals=4)))
         unit = "share" if test.unit == "1" else test.unit
         verdict = "found" if test.rejected else unfound
-        rows.append([f"{test.words}{others}", bar, verdict, unit, *cells])
+        rows.append([mistake(test.name, test.subject), f"{test.words}{others}", bar, verdict, unit, *cells])
     return Table(
         "Mistakes that may have been made",
-        ["if it was made", "evidence", "", "unit", "stddev", "smallest found", "of the scale", "of places m"],
+        [
+            "mistake",
+            "if it was made",
+            "evidence",
+            "",
+            "unit",
+            "stddev",
+            "smallest found",
+            "of the scale",
+            "of places m",
+        ],
         rows,
-        "A bar more than half full is beyond chance. What is not found may still be there, smaller than the smallest "
-        "that is found; the last two columns say what that may do, to the scale as a share of it. All tests are in "
-        "result.json.",
+        f"A bar more than half full is beyond chance{_from_stddevs(tests)}. What is not found may still be there, "
+        "smaller than the smallest that is found; the last two columns say what that may do, to the scale as a share "
+        "of it. All tests are in result.json.",
+    )
+
+
+def _from_stddevs(tests: Sequence[MistakeEntry]) -> str:
+    """Where a single number is beyond chance, as so many were looked for."""
+    least = min((test.threshold for test in tests if test.stddev and test.threshold), default=None)
+    if least is None:
+        return ""
+    return (
+        f", for a single number {math.sqrt(least):.1f} of its stddevs: among as many as are looked for here, one of "
+        "three comes up without any mistake"
     )
 
 

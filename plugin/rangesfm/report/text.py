@@ -46,6 +46,12 @@ def percent(share: float) -> str:
     return rough(100 * share, "%")
 
 
+def mistake(name: str, subject: str) -> str:
+    """In a few words, for a row of a table or of a figure."""
+    of_anchor = name.removeprefix("anchor's ").removeprefix("anchor ")
+    return f"anchor {subject}: {of_anchor}" if of_anchor != name else f"{name} {subject}".strip()
+
+
 def decimals_for(stddev: float | None, *, default: int) -> int:
     """Decimals that show two digits of the stddev."""
     if stddev is None or stddev <= 0:

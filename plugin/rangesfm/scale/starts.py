@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
@@ -38,12 +39,17 @@ _IN_MIDDLE = 1e-6
 
 def spread_subset(problem: RangeProblem, max_num_per_anchor: int) -> RangeProblem:
     """Evenly spaced ranges of each anchor, at most so many."""
+    return problem.subset(spread_rows(problem, max_num_per_anchor))
+
+
+def spread_rows(problem: RangeProblem, max_num_per_anchor: int) -> npt.NDArray[np.int64]:
+    """Which ranges these are, ascending."""
     rows = []
     for k in range(problem.num_anchors):
         of_anchor = np.flatnonzero(problem.anchor_index == k)
         count = min(len(of_anchor), max_num_per_anchor)
         rows.append(of_anchor[np.linspace(0, len(of_anchor) - 1, count).astype(np.int64)] if count else of_anchor)
-    return problem.subset(np.sort(np.concatenate(rows)))
+    return np.sort(np.concatenate(rows))
 
 
 def scale_candidates(problem: RangeProblem) -> Array:

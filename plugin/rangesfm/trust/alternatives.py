@@ -13,16 +13,19 @@ from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.ranging.anchors.multilateration import multilaterate
 from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.scale.range_equation import RangeProblem, RangeState, predicted_ranges, solve
-from rangesfm.scale.starts import spread_subset
+from rangesfm.scale.starts import spread_rows
 from rangesfm.trust.corrected import corrected
 from rangesfm.trust.hypothesis import Correction
 from rangesfm.trust.ranges_on_map import RangesOnMap
 
 _NUM_PER_ANCHOR, _NUM_EVALUATIONS = 25, 12
 _FOOT_M = 0.3048
-_IN_FEET = "the anchors' coordinates are in feet"
-_RANGES_IN_FEET = "the ranges are in feet, or the anchors' coordinates were converted from feet and are no feet"
-_SCALE_FACTORS = np.geomspace(1 / 4, 4, 13).tolist()
+_UNITS_M = {
+    "the anchors' coordinates are in feet": _FOOT_M,
+    "the ranges are in feet, or the anchors' coordinates were converted from feet and are no feet": 1 / _FOOT_M,
+    "the ranges are of both ways, there and back": 2.0,
+}
+_SCALE_FACTORS = np.geomspace(1 / 4, 4, 7).tolist()
 _AXES_OF_ANCHORS = {
     "x and y are swapped": np.eye(3)[[1, 0, 2]],
     "y and z are swapped": np.eye(3)[[0, 2, 1]],
@@ -96,9 +99,9 @@ def other_axes(on_map: RangesOnMap) -> Iterator[Alternative]:
 
 
 def other_units(on_map: RangesOnMap) -> Iterator[Alternative]:
-    """Feet."""
+    """Feet, and ranges that are twice as long."""
     given = _given_m(on_map)
-    for words, metres in ((_IN_FEET, _FOOT_M), (_RANGES_IN_FEET, 1 / _FOOT_M)):
+    for words, metres in _UNITS_M.items():
         if len(given) < 2:
             return
         middle = np.mean(list(given.values()), axis=0)
@@ -106,8 +109,21 @@ def other_units(on_map: RangesOnMap) -> Iterator[Alternative]:
             "anchors' unit",
             "",
             words,
-            "check the unit of the anchors' file against a taped distance between two of them",
+            "check the unit of ranges and anchors' file against a taped distance between two of them",
             Correction(anchors_m={name: middle + metres * (at - middle) for name, at in given.items()}),
+        )
+
+
+def photos_reversed(on_map: RangesOnMap) -> Iterator[Alternative]:
+    """The photos' times run backwards, as where their order was taken from names that count down."""
+    if on_map.velocity is not None:
+        times = on_map.time_s
+        yield Alternative(
+            "photos reversed",
+            "",
+            "the photos' times run backwards: the last photo has the time of the first",
+            "check the photos' times, or the order that they were given in",
+            Correction(time_shift_s=times.min() + times.max() - 2 * times),
         )
 
 
@@ -131,6 +147,7 @@ ALTERNATIVES: tuple[Callable[[RangesOnMap], Iterator[Alternative]], ...] = (
     lines_shifted,
     other_axes,
     other_units,
+    photos_reversed,
     other_lever_arms,
 )
 
@@ -141,29 +158,40 @@ class Refits:
     def __init__(self, on_map: RangesOnMap, scatter_m: float):
         self._on_map = on_map
         self._scatter_m = scatter_m
-        self._seen = _anchors_by_map(self._thinned(on_map.problem))
+        self._rows = spread_rows(on_map.problem, _NUM_PER_ANCHOR)
+        self._seen = _anchors_by_map(self._thinned(on_map))
 
-    def _thinned(self, problem: RangeProblem) -> RangeProblem:
-        thin = spread_subset(problem, _NUM_PER_ANCHOR)
+    def _thinned(self, on_map: RangesOnMap) -> RangeProblem:
+        thin = on_map.problem.subset(self._rows)
         return replace(thin, stddev_m=np.full(len(thin.range_m), self._scatter_m))
 
-    def of(self, correction: Correction) -> tuple[float, RangesOnMap]:
-        """The cost of the best fit of thinned ranges, and the map at it."""
+    def start(self, correction: Correction) -> tuple[float, RangesOnMap]:
+        """The cost of thinned ranges before any fit, and the map there."""
         right = corrected(self._on_map, correction)
-        thin = self._thinned(right.problem)
-        start = min(self._starts(right.problem), key=lambda state: _cost(thin, state))
-        fit = solve(thin, start, loss=CAUCHY, tolerance=1e-4, max_num_evaluations=_NUM_EVALUATIONS)
-        return fit.cost, replace(right, state=fit.state)
+        thin, seen = self._thinned(right), self._seen
+        if np.any(correction.time_shift_s):
+            seen = _anchors_by_map(thin)
+        starts = [(_cost(thin, state), state) for state in self._starts(thin, *seen)]
+        cost, state = min(starts, key=lambda each: each[0])
+        return cost, replace(right, state=state)
 
-    def _starts(self, problem: RangeProblem) -> Iterator[RangeState]:
+    def of(self, start: RangesOnMap) -> tuple[float, RangesOnMap]:
+        """The cost of their best fit, and the map at it."""
+        fit = solve(
+            self._thinned(start), start.state, loss=CAUCHY, tolerance=1e-4, max_num_evaluations=_NUM_EVALUATIONS
+        )
+        return fit.cost, replace(start, state=fit.state)
+
+    def _starts(self, problem: RangeProblem, placed: Similarity, seen_m: Array) -> Iterator[RangeState]:
+        """As the map lies; and by where it sees the anchors (m, 3), lying as they are seen from."""
         known = np.asarray(np.isfinite(problem.anchor_mean_m).all(axis=1))
         anchors_m = np.where(known[:, None], problem.anchor_mean_m, self._on_map.state.anchors_m)
         yield replace(self._on_map.state, anchors_m=anchors_m)
-        if not problem.frame_is_free:
-            return
-        placed, seen_m = self._seen
-        usable = known & np.isfinite(seen_m).all(axis=1)
-        if usable.sum() >= 3:
+        is_seen = np.asarray(np.isfinite(seen_m).all(axis=1))
+        if not problem.frame_is_free and not known.any():
+            yield RangeState(placed, np.where(is_seen[:, None], seen_m, anchors_m), self._on_map.state.bias_m)
+        usable = known & is_seen
+        if problem.frame_is_free and usable.sum() >= 3:
             motion = align_points(seen_m[usable], anchors_m[usable])
             yield RangeState(motion @ placed, anchors_m, self._on_map.state.bias_m)
 

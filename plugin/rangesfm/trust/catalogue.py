@@ -145,13 +145,18 @@ def range_shares(problem: Linearized) -> Iterator[Hypothesis]:
         def left_out(_: Array, of_ranges: Mask = of_ranges) -> Correction:
             return Correction(left_out=of_ranges)
 
+        def level(size: Array, of_ranges: Mask = of_ranges, mean: float = mean) -> Correction:
+            grown_m = np.linalg.norm(problem.on_map.from_anchor_m, axis=1) - mean
+            return Correction(longer_m=np.where(of_ranges, size[0] * grown_m, 0.0))
+
         yield Hypothesis(
             "anchor share",
             problem.on_map.anchor_ids[k],
             unit="1",
             words=of_one,
             remedy="look at its ranges in the log, and leave it out (use_anchors)",
-            correction=left_out,
+            correction=level,
+            adoption=left_out,
             is_linear=True,
             is_in_interval=True,
             effect=of_cells(problem, np.where(is_of, by_distance + mean, 0.0)),
@@ -253,6 +258,27 @@ def lever_arms(problem: Linearized) -> Iterator[Hypothesis]:
         )
 
 
+def radios_warming(problem: Linearized) -> Iterator[Hypothesis]:
+    """The radio's delay grows or shrinks all the time, by more than radios drift."""
+    of_ranges, since = problem.on_map.time_s - problem.time_s.mean(), problem.time_s - problem.time_s.mean()
+    lasts, unit = float(np.ptp(of_ranges)), "s" if problem.by_time is not None else "m of the path"
+
+    def words(size: Array) -> str:
+        how = "longer" if size[0] > 0 else "shorter"
+        return f"the ranges get {how} and {how}, by about {abs(size[0]):.2f} m within {lasts:.0f} {unit}"
+
+    yield Hypothesis(
+        "radio drift",
+        "",
+        unit="m",
+        words=words,
+        remedy="let the radio warm up before the survey, or calibrate it at the end too",
+        correction=lambda size: Correction(longer_m=size[0] / lasts * of_ranges),
+        is_linear=True,
+        effect=of_cells(problem, -since / lasts),
+    )
+
+
 def people_in_between(problem: Linearized) -> Iterator[Hypothesis]:
     """Whoever carries the camera stands between the tag and the anchors behind."""
     on_map = problem.on_map
@@ -320,6 +346,7 @@ STANDING: tuple[Callable[[Linearized], Iterator[Hypothesis]], ...] = (
     anchors_in_another_scale,
     heights_never_measured,
     lever_arms,
+    radios_warming,
     people_in_between,
     clocks,
 )

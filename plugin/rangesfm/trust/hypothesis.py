@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from rangesfm.arrays import Array, Mask
 from rangesfm.trust.linearized import Linearized
+
+# In the unit of a hypothesis: for a slope between two of its sizes.
+_SMALL = 1e-4
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,7 @@ class Hypothesis:
         adoption: what takes its place where the mistake is adopted; None: the correction itself.
         most: beyond which an estimate is not believed, in its unit.
         unawares: beyond which nobody makes it without seeing it, in its unit: a larger one need not be feared.
+        finer: the same at times between those that are looked at; None: it is of no time.
         narrower: of fewer numbers, which explain as much if the mistake was of their kind.
         is_linear: whether one step finds its size, however large it is.
         is_in_interval: whether the scale's interval counts how large it usually is, or it changes what a metre is.
@@ -82,9 +86,19 @@ class Hypothesis:
     adoption: Callable[[Array], Correction] | None = None
     most: float = np.inf
     unawares: float = np.inf
+    finer: Callable[[], Iterator[Hypothesis]] | None = None
     narrower: tuple[Hypothesis, ...] = ()
     is_linear: bool = False
     is_in_interval: bool = False
+
+    def at_size(self, problem: Linearized, sizes: Array) -> Hypothesis:
+        """With its effect about an estimate, by what would correct it: that of a large mistake is not linear."""
+        longer_m = self.correction(sizes).longer_m
+        if longer_m is None:
+            return self
+        steps = [self.correction(sizes + _SMALL * unit).longer_m for unit in np.eye(len(sizes))]
+        slopes = [(step - longer_m) / _SMALL for step in steps if step is not None]
+        return replace(self, effect=of_cells(problem, -problem.cells.mean(np.stack(slopes, axis=1))))
 
     @property
     def num(self) -> int:

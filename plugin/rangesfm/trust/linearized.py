@@ -8,13 +8,14 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.ranging.errors.cells import Cells, cells, noisiness
-from rangesfm.ranging.errors.learned import LearnedErrors, learn_errors, usual_errors
+from rangesfm.ranging.errors.learned import ExpectedErrors, LearnedErrors
 from rangesfm.ranging.errors.noise import MIN_STDDEV_M, robust_stddev
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.scale.range_equation import (
     Columns,
+    RangeProblem,
+    RangeState,
     columns_of,
-    predicted_ranges,
     prior_jacobian,
     prior_residuals,
     range_gradient,
@@ -32,7 +33,8 @@ _OUTLYING = 3.0
 _LEAST_SCATTER_M = 0.08
 _NO_WEIGHT = 1e-6
 # What the ranges to each anchor, and those to all, drift by in a minute, as hands and bodies move, however little a
-# survey shows of the radio's own drift: too slow to be told from a step that is looked for.
+# survey shows of the radio's own drift (a component that is learnt, to nothing where steps are allowed to explain it):
+# too slow to be told from a step that is looked for.
 _WANDERING_M, _WANDERING_S = 0.025, 60.0
 # In spreads over radios: what errs by more than that is no radio but a mistake, which shall not pass for noise.
 _MOST_UNUSUAL = 3.0
@@ -52,7 +54,7 @@ class Linearized:
         by_lever_arm: (c, 3) derivative of the residual by the tag's place in the camera.
         by_time: (c,) by the clocks' offset; None without clocks.
         on_map: the ranges. scatter_m: stddev of one among its neighbours.
-        errors: what is assumed random.
+        expected: of the errors, before anything is measured. errors: what is assumed random.
     """
 
     residual_m: Array
@@ -68,6 +70,7 @@ class Linearized:
     by_time: Array | None
     on_map: RangesOnMap
     scatter_m: float
+    expected: ExpectedErrors
     errors: LearnedErrors
 
     @property
@@ -78,76 +81,80 @@ class Linearized:
         """With what is left random when (c, k) columns and (r, k) priors explain what they can."""
         # At the place where nothing speaks against what is known beforehand.
         back = np.linalg.lstsq(self.prior_design, self.prior_residual, rcond=1e-12)[0]
-        alone = replace(self.cells, of_range=np.arange(len(self.cells)), weight=self.cells.worth)
-        curve_m = self.on_map.curve_stddev_m
-        learnt = learn_errors(
-            alone,
+        learnt = self.expected.learnt(
             off_m=self.design @ back - self.residual_m,
             design=np.hstack([self.design, columns]),
             prior_design=np.hstack([self.prior_design, priors]),
             noise_m=self.scatter_m,
-            curve_stddev_m=None if curve_m is None else self.cells.mean(curve_m),
-            ruled_out=self.on_map.ruled_out,
-            others_m2=_wandering(self.cells),
             most_unusual=_MOST_UNUSUAL,
         )
         return replace(self, errors=learnt)
 
     def with_usual_errors(self) -> Linearized:
         """As radios and maps have them that scatter like this."""
-        return replace(self, errors=_usual(self.cells, self.on_map, self.scatter_m))
+        return replace(self, errors=_usual(self.expected, self.scatter_m))
 
 
-def linearized(on_map: RangesOnMap, cells_of_ranges: Cells | None = None, scatter_m: float = 0.0) -> Linearized:
+def linearized(on_map: RangesOnMap, cells_of_ranges: Cells | None = None) -> Linearized:
     """At the map's own state, with the errors that are usual.
 
     Args:
-        cells_of_ranges, scatter_m: as found before; None: they are found by the residuals, of whatever is not far from
-            its neighbours, however far from the map.
+        cells_of_ranges: of ranges that do not scatter; None: they are found by the residuals, of whatever is not far
+            from its neighbours, however far from the map.
     """
-    problem = replace(on_map.problem, bias_stddev_m=np.zeros(on_map.problem.num_anchors))
-    state = replace(on_map.state, bias_m=problem.bias_mean_m)
-    columns = columns_of([problem])[0]
-    residual_m, gradient = predicted_ranges(problem, state) - problem.range_m, range_gradient(problem, state)
+    scatter_m = 0.0
     if cells_of_ranges is None:
-        cells_of_ranges, scatter_m = _cells(on_map, residual_m, gradient)
-    mean, turned = cells_of_ranges.mean, state.metric_from_model.rotation.T
-    arms = tag_positions(problem, state.metric_from_model) - state.metric_from_model.translation
-    by_time = None
-    if on_map.velocity is not None:
-        velocity_m_per_s = state.metric_from_model.scale * on_map.velocity @ turned
-        by_time = mean(np.sum(gradient.by_tag * velocity_m_per_s, axis=1))
-    return Linearized(
-        residual_m=mean(residual_m),
-        design=mean(range_jacobian(problem, columns, state, state)),
-        prior_residual=prior_residuals(problem, columns, state),
-        prior_design=prior_jacobian(problem, columns, state, state),
-        columns=columns,
-        place=_place(mean(state.metric_from_model.scale * problem.centers @ turned), mean(arms), columns),
-        cells=cells_of_ranges,
-        time_s=mean(on_map.time_s),
-        gradient=RangeGradient(mean(gradient.distance_m), mean(gradient.by_tag)),
-        by_lever_arm=mean(gradient.by_tag_in_cam(on_map.world_from_cam)),
-        by_time=by_time,
-        on_map=on_map,
-        scatter_m=scatter_m,
-        errors=_usual(cells_of_ranges, on_map, scatter_m),
-    )
+        problem, state = _without_biases(on_map)
+        gradient = range_gradient(problem, state)
+        cells_of_ranges, scatter_m = _cells(on_map, _residual_m(problem, state, gradient), gradient)
+    expected = ExpectedErrors.of(cells_of_ranges, on_map.curve_stddev_m, on_map.ruled_out, _wandering(cells_of_ranges))
+    return _linearized(on_map, expected, scatter_m, _usual(expected, scatter_m))
 
 
 def at_state(problem: Linearized, on_map: RangesOnMap) -> Linearized:
     """The same cells and the same errors, linearised elsewhere, or of corrected ranges."""
-    return replace(linearized(on_map, problem.cells, problem.scatter_m), errors=problem.errors)
+    return _linearized(on_map, problem.expected, problem.scatter_m, problem.errors)
 
 
-def _usual(cells_of_ranges: Cells, on_map: RangesOnMap, scatter_m: float) -> LearnedErrors:
-    return usual_errors(
-        cells_of_ranges,
-        curve_stddev_m=on_map.curve_stddev_m,
-        ruled_out=on_map.ruled_out,
-        stddevs={"white": scatter_m},
-        others_m2=_wandering(cells_of_ranges),
+def _without_biases(on_map: RangesOnMap) -> tuple[RangeProblem, RangeState]:
+    """What ranges are off by for each anchor's sake is random."""
+    problem = replace(on_map.problem, bias_stddev_m=np.zeros(on_map.problem.num_anchors))
+    return problem, replace(on_map.state, bias_m=problem.bias_mean_m)
+
+
+def _residual_m(problem: RangeProblem, state: RangeState, gradient: RangeGradient) -> Array:
+    return gradient.distance_m + state.bias_m[problem.anchor_index] - problem.range_m
+
+
+def _linearized(on_map: RangesOnMap, expected: ExpectedErrors, scatter_m: float, errors: LearnedErrors) -> Linearized:
+    problem, state = _without_biases(on_map)
+    columns, gradient = columns_of([problem])[0], range_gradient(problem, state)
+    mean, rotation = expected.cells.mean, state.metric_from_model.rotation
+    arms = tag_positions(problem, state.metric_from_model) - state.metric_from_model.translation
+    by_tag_in_model, by_time = gradient.by_tag @ rotation, None
+    if on_map.velocity is not None:
+        by_time = mean(state.metric_from_model.scale * np.einsum("ni,ni->n", by_tag_in_model, on_map.velocity))
+    return Linearized(
+        residual_m=mean(_residual_m(problem, state, gradient)),
+        design=mean(range_jacobian(problem, columns, state, state)),
+        prior_residual=prior_residuals(problem, columns, state),
+        prior_design=prior_jacobian(problem, columns, state, state),
+        columns=columns,
+        place=_place(mean(state.metric_from_model.scale * problem.centers @ rotation.T), mean(arms), columns),
+        cells=expected.cells,
+        time_s=mean(on_map.time_s),
+        gradient=RangeGradient(mean(gradient.distance_m), mean(gradient.by_tag)),
+        by_lever_arm=mean(np.einsum("nji,nj->ni", on_map.model_from_cam, by_tag_in_model)),
+        by_time=by_time,
+        on_map=on_map,
+        scatter_m=scatter_m,
+        expected=expected,
+        errors=errors,
     )
+
+
+def _usual(expected: ExpectedErrors, scatter_m: float) -> LearnedErrors:
+    return expected.usual({"white": scatter_m})
 
 
 def _wandering(cells_of_ranges: Cells) -> dict[str, Array]:
@@ -161,7 +168,7 @@ def _cells(on_map: RangesOnMap, residual_m: Array, gradient: RangeGradient) -> t
     order = np.lexsort((on_map.time_s, on_map.tag_index, index))
     off_m, scatter_m = _off_neighbours(residual_m[order], index[order])
     is_near = np.empty(len(order), dtype=bool)
-    is_near[order] = np.abs(off_m) <= _OUTLYING * max(scatter_m, _LEAST_SCATTER_M)
+    is_near[order] = np.abs(off_m) <= near_m(scatter_m)
     of_ranges = cells(
         index,
         on_map.tag_index,
@@ -173,6 +180,11 @@ def _cells(on_map: RangesOnMap, residual_m: Array, gradient: RangeGradient) -> t
         _MAX_NUM_CELLS,
     )
     return of_ranges, scatter_m
+
+
+def near_m(scatter_m: float) -> float:
+    """How far from its neighbours a range may be that scatters like this."""
+    return _OUTLYING * max(scatter_m, _LEAST_SCATTER_M)
 
 
 def _off_neighbours(values: Array, anchor_index: Indices) -> tuple[Array, float]:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rangesfm.scale.range_equation import state_after
-from rangesfm.trust.alternatives import ALTERNATIVES, Alternative, Refits
+from rangesfm.scale.range_equation import RangeState, state_after
+from rangesfm.trust.alternatives import ALTERNATIVES, Refits
 from rangesfm.trust.catalogue import STANDING
 from rangesfm.trust.corrected import corrected
 from rangesfm.trust.hypothesis import Correction, Effect, Hypothesis, of_cells
@@ -19,6 +19,8 @@ from rangesfm.trust.testing import Factorization, Test, overlap
 
 # Explanations that are tried with the noise that each of them leaves.
 _NUM_TRIED, _NUM_OF_KIND, _NUM_NEARLY = 6, 2, 3
+# Alternatives that are fitted: where the map itself sees the anchors, the right one begins near its end.
+_NUM_FITTED = 12
 # Of two that differ by less in twice the logarithm of their likelihood, neither is named alone.
 _AS_LIKELY = 6.0
 _SAME = 0.95
@@ -35,6 +37,7 @@ class Cause:
         gain: by how much it makes the ranges likelier, as twice a logarithm, with the noise that it leaves.
         penalty: for what it may choose.
         correction: what would be right.
+        state: the likeliest with it.
         test: None for an alternative.
     """
 
@@ -45,11 +48,17 @@ class Cause:
     gain: float
     penalty: float
     correction: Correction
+    state: RangeState
     test: Test | None
 
     @property
     def score(self) -> float:
         return self.gain - self.penalty
+
+    def undone(self, on_map: RangesOnMap) -> RangesOnMap:
+        """The ranges as they would be without it."""
+        correction = self.correction if self.test is None else self.test.hypothesis.correction(self.test.sizes)
+        return corrected(replace(on_map, state=self.state), correction)
 
 
 @dataclass(frozen=True)
@@ -101,18 +110,27 @@ def _causes(problem: Linearized, nominated: Sequence[Test], *, is_sure: bool) ->
     before = Factorization(_learnt(_settled(problem), [])).deviance()
     num = len(problem.residual_m)
     causes = []
+    factorized = Factorization(problem)
     for test in _varied(nominated):
-        again, deviance = _settled_test(problem, test.hypothesis)
+        again, deviance, state = _settled_test(problem, _at_best_time(factorized, test.hypothesis))
         gain = before - deviance
         # What is not linear was tested by its first step, which says little of a large mistake.
         if _is_possible(again) and ((is_sure and test.hypothesis.is_linear) or gain > test.threshold):
-            causes.append(_cause(replace(again, threshold=test.threshold), gain, _penalty(again, num)))
+            causes.append(_cause(replace(again, threshold=test.threshold), state, gain, _penalty(again, num)))
     if not causes and not is_sure:
         return []
     causes += _alternatives(problem, before)
     causes.sort(key=lambda cause: -cause.score)
     likeliest = [cause for k, cause in enumerate(causes) if not k or _is_rival(causes[0], cause)]
     return [_narrowed(problem, cause, before) for cause in likeliest[: 1 + _MAX_NUM_RIVALS]]
+
+
+def _at_best_time(factorized: Factorization, hypothesis: Hypothesis) -> Hypothesis:
+    """Ranges between the true time of a step and the one that was looked at fit neither way."""
+    if hypothesis.finer is None:
+        return hypothesis
+    tests = factorized.estimates([hypothesis, *hypothesis.finer()])
+    return max(tests, key=lambda test: test.statistic).hypothesis
 
 
 def _varied(tests: Sequence[Test]) -> list[Test]:
@@ -127,12 +145,12 @@ def _is_rival(best: Cause, other: Cause) -> bool:
     return best.test is not None and other.test is not None and overlap(best.test, other.test) > _SAME
 
 
-def _settled_test(problem: Linearized, hypothesis: Hypothesis) -> tuple[Test, float]:
+def _settled_test(problem: Linearized, hypothesis: Hypothesis) -> tuple[Test, float, RangeState]:
     """The test of a hypothesis and its deviance, with the errors that it leaves and, if not linear, at the state."""
     original, sizes, at = hypothesis, np.zeros(hypothesis.num), problem
     for _ in range(_NUM_SETTLING):
         factorized = Factorization(at)
-        [test] = factorized.test([hypothesis], 0)
+        [test] = factorized.estimates([hypothesis])
         change = np.linalg.norm(test.sizes - sizes if original.is_linear else test.sizes)
         sizes = test.sizes if original.is_linear else sizes + test.sizes
         if change < _SETTLED * np.linalg.norm(sizes):
@@ -143,13 +161,13 @@ def _settled_test(problem: Linearized, hypothesis: Hypothesis) -> tuple[Test, fl
             at = at_state(at, moved)
             continue
         at = at_state(at, corrected(moved, original.correction(sizes)))
-        standing = _standing(at)
-        there = {h.key: h for h in [*standing, *(n for h in standing for n in h.narrower)]}
-        hypothesis = there.get(hypothesis.key, hypothesis)
+        there = (each for of_kind in STANDING for h in of_kind(at) for each in (h, *h.narrower))
+        found = next((each for each in there if each.key == original.key), None)
+        hypothesis = found or original.at_size(at, sizes)
     factorized = Factorization(_learnt(at, [hypothesis]))
-    [test] = factorized.test([hypothesis], 0)
+    [test] = factorized.estimates([hypothesis])
     sizes = test.sizes if original.is_linear else sizes + test.sizes
-    return replace(test, hypothesis=original, sizes=sizes), factorized.deviance(test)
+    return replace(test, hypothesis=original, sizes=sizes), factorized.deviance(test), at.on_map.state
 
 
 def _narrowed(problem: Linearized, cause: Cause, before: float) -> Cause:
@@ -157,16 +175,16 @@ def _narrowed(problem: Linearized, cause: Cause, before: float) -> Cause:
     if cause.test is None or not cause.test.hypothesis.narrower:
         return cause
     tried = [_settled_test(problem, h) for h in cause.test.hypothesis.narrower]
-    best, deviance = min(tried, key=lambda each: each[1])
+    best, deviance, state = min(tried, key=lambda each: each[1])
     test = replace(best, threshold=cause.test.threshold)
-    narrow = _cause(test, before - deviance, _penalty(best, len(problem.residual_m)))
+    narrow = _cause(test, state, before - deviance, _penalty(best, len(problem.residual_m)))
     return narrow if narrow.score > cause.score else cause
 
 
-def _cause(test: Test, gain: float, penalty: float) -> Cause:
+def _cause(test: Test, state: RangeState, gain: float, penalty: float) -> Cause:
     h = test.hypothesis
     adoption = (h.adoption or h.correction)(test.sizes)
-    return Cause(h.name, h.subject, h.words(test.sizes), h.remedy, gain, penalty, adoption, test)
+    return Cause(h.name, h.subject, h.words(test.sizes), h.remedy, gain, penalty, adoption, state, test)
 
 
 def _alternatives(problem: Linearized, before: float) -> Iterator[Cause]:
@@ -176,14 +194,16 @@ def _alternatives(problem: Linearized, before: float) -> Iterator[Cause]:
     if not tried:
         return
     refits = Refits(on_map, problem.scatter_m)
-    as_given, _ = refits.of(Correction())
-    fits = sorted(((*refits.of(each.correction), each) for each in tried), key=lambda fit: fit[0])
+    as_given, _ = refits.of(refits.start(Correction())[1])
+    starts = sorted(((*refits.start(each.correction), each) for each in tried), key=lambda start: start[0])
+    fits = sorted(((*refits.of(start), each) for _, start, each in starts[:_NUM_FITTED]), key=lambda fit: fit[0])
     for _, refitted, each in [fit for fit in fits if fit[0] < as_given][:_NUM_TRIED]:
         moved = _settled(at_state(problem, refitted))
         gain = before - Factorization(_learnt(moved, [])).deviance()
         penalty = 2 * float(np.log(len(tried)))
         if gain > penalty + _AS_LIKELY:
-            yield _cause_of(each, gain, penalty)
+            state = moved.on_map.state
+            yield Cause(each.name, each.subject, each.words, each.remedy, gain, penalty, each.correction, state, None)
 
 
 def _settled(problem: Linearized) -> Linearized:
@@ -192,10 +212,6 @@ def _settled(problem: Linearized) -> Linearized:
     state = state_after((problem.columns,), problem.on_map.state, here.step())
     there = at_state(problem, replace(problem.on_map, state=state))
     return min(problem, there, key=lambda each: Factorization(each.with_usual_errors()).deviance())
-
-
-def _cause_of(each: Alternative, gain: float, penalty: float) -> Cause:
-    return Cause(each.name, each.subject, each.words, each.remedy, gain, penalty, each.correction, None)
 
 
 def _best_of_each(tests: Sequence[Test], problem: Linearized) -> list[Test]:

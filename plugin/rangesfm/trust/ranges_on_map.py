@@ -49,8 +49,13 @@ class RangesOnMap:
     @property
     def world_from_cam(self) -> Array:
         """(n, 3, 3) in the metric world."""
-        turned: Array = self.state.metric_from_model.rotation @ self.model_from_cam
+        turned: Array = np.einsum("ij,njk->nik", self.state.metric_from_model.rotation, self.model_from_cam)
         return turned
+
+    @property
+    def residual_m(self) -> Array:
+        """(n,) predicted minus measured, but for biases."""
+        return np.asarray(np.linalg.norm(self.from_anchor_m, axis=1) - self.problem.range_m)
 
     @property
     def from_anchor_m(self) -> Array:

@@ -14,6 +14,7 @@ from rangesfm.trust.linearized import Linearized
 
 # A step is best found where it was: the ranges between the true time and the one that is tried fit neither way.
 _NUM_TIMES = 32
+_NUM_FINER = 17
 # Of the survey, on either side: what begins later or ends sooner lasts as good as always.
 _LEAST_SHARE = 1 / 12
 # Shares of the survey that a stretch may last.
@@ -32,7 +33,7 @@ def anchors_moved(problem: Linearized) -> Iterator[Hypothesis]:
 
         remedy = "fix anchors so that nobody bumps into them, and use its ranges from before only"
         yield from _elsewhere(
-            problem, k, "anchor moved", words, remedy, UNSEEN_MOVE_M, -np.eye(3), -problem.gradient.by_tag
+            problem, k, "anchor moved", words, remedy, UNSEEN_MOVE_M, lambda: -np.eye(3), -problem.gradient.by_tag
         )
 
 
@@ -44,7 +45,9 @@ def map_breaks(problem: Linearized) -> Iterator[Hypothesis]:
         return f"the map breaks: {when} it lies {far} ({_in_axes(-size)} in x, y, z)"
 
     remedy = "look at the photos there for a false match or too little overlap, and map the parts apart"
-    yield from _elsewhere(problem, None, "map break", words, remedy, UNSEEN_MOVE_M, np.eye(3), problem.gradient.by_tag)
+    yield from _elsewhere(
+        problem, None, "map break", words, remedy, UNSEEN_MOVE_M, lambda: np.eye(3), problem.gradient.by_tag
+    )
 
 
 def tags_slipped(problem: Linearized) -> Iterator[Hypothesis]:
@@ -56,7 +59,14 @@ def tags_slipped(problem: Linearized) -> Iterator[Hypothesis]:
 
     remedy = "fix the tag to the camera, and run the two parts as surveys of their own"
     yield from _elsewhere(
-        problem, None, "tag slipped", words, remedy, MISMEASURED_M, problem.on_map.world_from_cam, problem.by_lever_arm
+        problem,
+        None,
+        "tag slipped",
+        words,
+        remedy,
+        MISMEASURED_M,
+        lambda: problem.on_map.world_from_cam,
+        problem.by_lever_arm,
     )
 
 
@@ -67,23 +77,25 @@ def _elsewhere(
     words: Callable[[str, Array], str],
     remedy: str,
     unawares: float,
-    axes: Array,
+    axes: Callable[[], Array],
     by_shift: Array,
+    around: float | None = None,
 ) -> Iterator[Hypothesis]:
     """From some time on tags are elsewhere, as seen from an anchor, or from all.
 
     Args:
         words: of when, and of a shift.
-        axes: (3, 3), or (n, 3, 3) for each range: along which they are shifted.
+        axes: along which they are shifted, (3, 3), or (n, 3, 3) for each range.
         by_shift: (c, 3) by how much the predicted ranges grow along these.
+        around: as of ``_changes``.
     """
-    from_anchor_m, times = problem.on_map.from_anchor_m, problem.on_map.time_s
-    for time, after in _changes(problem, anchor, 3 * _MIN_NUM_CELLS):
-        of_ranges = _of_ranges(problem, anchor) & (times > time)
+    for time, after in _changes(problem, anchor, 3 * _MIN_NUM_CELLS, around):
+        later = partial(_later, problem, anchor, time)
 
-        def back(size: Array, of_ranges: Mask = of_ranges) -> Correction:
-            grown_m = np.linalg.norm(from_anchor_m + axes @ size, axis=1) - np.linalg.norm(from_anchor_m, axis=1)
-            return Correction(longer_m=np.where(of_ranges, grown_m, 0.0))
+        def back(size: Array, later: Callable[[], Mask] = later) -> Correction:
+            from_anchor_m = problem.on_map.from_anchor_m
+            grown_m = np.linalg.norm(from_anchor_m + axes() @ size, axis=1) - np.linalg.norm(from_anchor_m, axis=1)
+            return Correction(longer_m=np.where(later(), grown_m, 0.0))
 
         yield Hypothesis(
             name,
@@ -92,8 +104,9 @@ def _elsewhere(
             words=partial(words, _when(problem, time)),
             remedy=remedy,
             correction=back,
-            adoption=_left_out(of_ranges),
+            adoption=_left_out(later),
             unawares=unawares,
+            finer=partial(_elsewhere, problem, anchor, name, words, remedy, unawares, axes, by_shift, around=time),
             effect=of_cells(problem, -after[:, None] * by_shift),
         )
 
@@ -105,42 +118,51 @@ def _in_axes(shift: Array) -> str:
 def steps(problem: Linearized) -> Iterator[Hypothesis]:
     """From some time on ranges read longer, those of one anchor or of all."""
     for k in [*(_heard(problem) if len(_heard(problem)) > 1 else []), None]:
-        name = "" if k is None else problem.on_map.anchor_ids[k]
-        for time, after in _changes(problem, k, _MIN_NUM_CELLS):
-            of_ranges = _of_ranges(problem, k) & (problem.on_map.time_s > time)
+        yield from _steps(problem, k)
 
-            def words(size: Array, name: str = name, when: str = _when(problem, time)) -> str:
-                to, how = f" to anchor {name}" if name else "", "longer" if size[0] > 0 else "shorter"
-                return f"{when} on the ranges{to} read about {abs(size[0]):.2f} m {how}"
 
-            def correction(size: Array, of_ranges: Mask = of_ranges) -> Correction:
-                return Correction(longer_m=np.where(of_ranges, size[0], 0.0))
+def _steps(problem: Linearized, anchor: int | None, around: float | None = None) -> Iterator[Hypothesis]:
+    name = "" if anchor is None else problem.on_map.anchor_ids[anchor]
+    for time, after in _changes(problem, anchor, _MIN_NUM_CELLS, around):
+        later = partial(_later, problem, anchor, time)
 
-            yield Hypothesis(
-                "anchor step" if name else "step",
-                name,
-                unit="m",
-                is_linear=True,
-                words=words,
-                remedy="see what changed then: a tag that slipped, a restarted radio, a door or a vehicle in between",
-                correction=correction,
-                effect=of_cells(problem, -after),
-            )
+        def words(size: Array, name: str = name, when: str = _when(problem, time)) -> str:
+            to, how = f" to anchor {name}" if name else "", "longer" if size[0] > 0 else "shorter"
+            return f"{when} on the ranges{to} read about {abs(size[0]):.2f} m {how}"
+
+        def correction(size: Array, later: Callable[[], Mask] = later) -> Correction:
+            return Correction(longer_m=np.where(later(), size[0], 0.0))
+
+        yield Hypothesis(
+            "anchor step" if name else "step",
+            name,
+            unit="m",
+            is_linear=True,
+            words=words,
+            remedy="see what changed then: a tag that slipped, a restarted radio, a door or a vehicle in between",
+            correction=correction,
+            finer=partial(_steps, problem, anchor, around=time),
+            effect=of_cells(problem, -after),
+        )
 
 
 def stretches(problem: Linearized) -> Iterator[Hypothesis]:
     """For a while ranges read longer."""
-    windows, times = list(_windows(problem)), problem.on_map.time_s
+    windows = list(_windows(problem))
     for k in [*(_heard(problem) if len(_heard(problem)) > 1 else []), None]:
         name = "" if k is None else problem.on_map.anchor_ids[k]
         for start, end, share in windows:
             inside = np.where(_is_of(problem.cells.anchor_index, k), share, 0.0)
             if inside.sum() < _MIN_NUM_CELLS:
                 continue
+            within = partial(_later, problem, k, start, end)
 
             def words(size: Array, name: str = name, when: str = _when(problem, start, end)) -> str:
                 to = f" to anchor {name}" if name else ""
                 return f"{when} the ranges{to} read about {abs(size[0]):.2f} m too {'long' if size[0] > 0 else 'short'}"
+
+            def correction(size: Array, within: Callable[[], Mask] = within) -> Correction:
+                return Correction(longer_m=np.where(within(), size[0], 0.0))
 
             yield Hypothesis(
                 "anchor stretch" if name else "stretch",
@@ -149,23 +171,24 @@ def stretches(problem: Linearized) -> Iterator[Hypothesis]:
                 is_linear=True,
                 words=words,
                 remedy="look for what stood in the line of sight, and leave that stretch out",
-                correction=_left_out(_of_ranges(problem, k) & (times > start) & (times <= end)),
+                correction=correction,
+                adoption=_left_out(within),
                 effect=of_cells(problem, -inside),
             )
 
 
-def clock_jumps(problem: Linearized) -> Iterator[Hypothesis]:
+def clock_jumps(problem: Linearized, around: float | None = None) -> Iterator[Hypothesis]:
     """The clocks' offset jumped at some time."""
     if problem.by_time is None:
         return
-    for time, after in _changes(problem, None, _MIN_NUM_CELLS):
-        of_ranges = problem.on_map.time_s > time
+    for time, after in _changes(problem, None, _MIN_NUM_CELLS, around):
+        later = partial(_later, problem, None, time)
 
         def words(size: Array, when: str = _when(problem, time)) -> str:
             return f"the clocks' offset jumped by about {size[0]:+.2f} s {when}"
 
-        def correction(size: Array, of_ranges: Mask = of_ranges) -> Correction:
-            return Correction(time_shift_s=np.where(of_ranges, size[0], 0.0))
+        def correction(size: Array, later: Callable[[], Mask] = later) -> Correction:
+            return Correction(time_shift_s=np.where(later(), size[0], 0.0))
 
         yield Hypothesis(
             "clock jump",
@@ -175,6 +198,7 @@ def clock_jumps(problem: Linearized) -> Iterator[Hypothesis]:
             words=words,
             remedy="see whether a logger was restarted then, and run the two parts as surveys of their own",
             correction=correction,
+            finer=partial(clock_jumps, problem, around=time),
             effect=of_cells(problem, -after * problem.by_time),
         )
 
@@ -188,20 +212,35 @@ def _of_ranges(problem: Linearized, anchor: int | None) -> Mask:
     return _is_of(problem.on_map.problem.anchor_index, anchor)
 
 
+def _later(problem: Linearized, anchor: int | None, start: float, end: float = np.inf) -> Mask:
+    """(n,) ranges to an anchor, or to all, from between two times."""
+    times = problem.on_map.time_s
+    return _of_ranges(problem, anchor) & (times > start) & (times <= end)
+
+
 def _is_of(anchor_index: Indices, anchor: int | None) -> Mask:
     """Of one anchor, or of all."""
     return np.ones(len(anchor_index), dtype=bool) if anchor is None else np.asarray(anchor_index == anchor)
 
 
-def _left_out(rows: Mask) -> Callable[[Array], Correction]:
-    return lambda _: Correction(left_out=rows)
+def _left_out(rows: Callable[[], Mask]) -> Callable[[Array], Correction]:
+    return lambda _: Correction(left_out=rows())
 
 
-def _changes(problem: Linearized, anchor: int | None, least: int) -> Iterator[tuple[float, Array]]:
+def _changes(
+    problem: Linearized, anchor: int | None, least: int, around: float | None = None
+) -> Iterator[tuple[float, Array]]:
     """Times away from the ends, with (c,) shares of the cells of an anchor, or of all, that are from later; as many
-    cells as that at least on either side."""
+    cells as that at least on either side.
+
+    Args:
+        around: only times about this one, closer to each other.
+    """
     ends = _LEAST_SHARE, 1 - _LEAST_SHARE
     times = np.unique(np.quantile(problem.on_map.time_s[_of_ranges(problem, anchor)], np.linspace(*ends, _NUM_TIMES)))
+    if around is not None:
+        at = int(np.searchsorted(times, around))
+        times = np.linspace(times[max(at - 1, 0)], times[min(at + 1, len(times) - 1)], _NUM_FINER)
     is_of = _is_of(problem.cells.anchor_index, anchor)
     for time, share in zip(times.tolist(), _shares_after(problem, times), strict=True):
         after = np.where(is_of, share, 0.0)
@@ -211,12 +250,12 @@ def _changes(problem: Linearized, anchor: int | None, least: int) -> Iterator[tu
 
 def _windows(problem: Linearized) -> Iterator[tuple[float, float, Array]]:
     """Begin and end, and (c,) shares of the cells that are from in between."""
-    for share in _STRETCHES:
-        starts = np.arange(0.0, 1.0 - share + 1e-9, share / 2)
-        for start in starts:
-            times = np.quantile(problem.on_map.time_s, [start, min(start + share, 1.0)])
-            after = _shares_after(problem, times)
-            yield float(times[0]), float(times[1]), after[0] - after[1]
+    starts = [(start, share) for share in _STRETCHES for start in np.arange(0.0, 1.0 - share + 1e-9, share / 2)]
+    ends = np.quantile(problem.on_map.time_s, [(start, min(start + share, 1.0)) for start, share in starts])
+    times, rows = np.unique(ends, return_inverse=True)
+    after = _shares_after(problem, times)
+    for (start, end), (first, last) in zip(ends.tolist(), rows.reshape(ends.shape), strict=True):
+        yield start, end, after[first] - after[last]
 
 
 def _shares_after(problem: Linearized, times: Array) -> Array:

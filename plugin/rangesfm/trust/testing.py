@@ -8,7 +8,7 @@ T = e'H (H'H)^-1 H'e, chi-square with as many degrees of freedom as columns, and
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -100,35 +100,43 @@ class Factorization:
 
     def test(self, hypotheses: Sequence[Hypothesis], seed: int) -> list[Test]:
         """All of them, with thresholds that hold for all together."""
+        tests = self.estimates(hypotheses)
+        thresholds = _thresholds([t.basis for t in tests], np.array([t.num for t in tests]), seed)
+        return [replace(t, threshold=threshold) for t, threshold in zip(tests, thresholds.tolist(), strict=True)]
+
+    def estimates(self, hypotheses: Sequence[Hypothesis]) -> list[Test]:
+        """The same without a threshold."""
         effects = Effect.of_all([h.effect for h in hypotheses])
         whitened = self._whitened(effects.columns, effects.priors)
         left = self._off(whitened)
         ends = np.cumsum([h.num for h in hypotheses])
         parts = [slice(end - h.num, end) for end, h in zip(ends, hypotheses, strict=True)]
         bases = [_basis_of(left[:, part], whitened[:, part]) for part in parts]
-        nums = np.array([basis.shape[1] for basis in bases])
-        thresholds = _thresholds(bases, nums, seed)
         by_unknowns = -self._solved(whitened)
         return [
-            self._test(h, left[:, part], basis, by_unknowns[:, part], threshold)
-            for h, part, basis, threshold in zip(hypotheses, parts, bases, thresholds, strict=True)
+            self._test(h, left[:, part], basis, by_unknowns[:, part])
+            for h, part, basis in zip(hypotheses, parts, bases, strict=True)
         ]
 
-    def _test(self, hypothesis: Hypothesis, left: Array, basis: Array, by_unknowns: Array, threshold: float) -> Test:
-        inverse = np.asarray(np.linalg.pinv(left.T @ left, rcond=_NOTHING_LEFT, hermitian=True), dtype=np.float64)
+    def _test(self, hypothesis: Hypothesis, left: Array, basis: Array, by_unknowns: Array) -> Test:
+        values, vectors = np.linalg.eigh(left.T @ left)
+        is_seen = values > _NOTHING_LEFT * values[-1]
+        # Of the inverse, without what is not seen.
+        root = vectors[:, is_seen] / np.sqrt(values[is_seen])
+        inverse = root @ root.T
         is_whole = basis.shape[1] == left.shape[1]
         worst, on_scale, on_place = np.inf, np.inf, np.inf
         if is_whole:
             needed = noncentrality(basis.shape[1])
-            worst = float(np.sqrt(needed * np.linalg.eigvalsh(inverse)[-1]))
+            worst = float(np.sqrt(needed / values[is_seen][0]))
             # Of all mistakes on the edge of being found, the one that does most.
-            of_unit = by_unknowns @ _root(inverse)
+            of_unit = by_unknowns @ root
             on_scale = float(np.sqrt(needed) * np.linalg.norm(of_unit[0]))
             on_place = float(np.sqrt(needed * max(np.linalg.eigvalsh(of_unit.T @ self._place @ of_unit)[-1], 0.0)))
         return Test(
             hypothesis=hypothesis,
             statistic=float(np.sum((basis.T @ self.residual) ** 2)),
-            threshold=threshold,
+            threshold=np.inf,
             num=basis.shape[1],
             sizes=inverse @ (left.T @ self.residual),
             stddevs=np.sqrt(np.diag(inverse)) if is_whole else np.full(len(inverse), np.inf),
@@ -183,8 +191,3 @@ def overlap(first: Test, second: Test) -> float:
     if not first.num or not second.num:
         return 0.0
     return float(np.linalg.norm(first.basis.T @ second.basis) / np.sqrt(min(first.num, second.num)))
-
-
-def _root(matrix: Array) -> Array:
-    values, vectors = np.linalg.eigh(matrix)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

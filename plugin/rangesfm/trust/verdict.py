@@ -9,7 +9,8 @@ import numpy as np
 
 from rangesfm.arrays import Indices
 from rangesfm.scale.verdict import DOUBTFUL_ABOVE
-from rangesfm.trust.evidence import evidence
+from rangesfm.trust.evidence import MIXED_UP, OF_SINGLE_RANGES, evidence
+from rangesfm.trust.linearized import linearized
 from rangesfm.trust.mistakes import Cause, Findings, find_mistakes
 from rangesfm.trust.ranges_on_map import RangesOnMap
 from rangesfm.trust.table import MistakeTest, finite
@@ -42,10 +43,33 @@ def trust_in(on_map: RangesOnMap, *, seed: int = 0) -> TrustVerdict:
     """Test all that may be wrong with the ranges on a map."""
     found = find_mistakes(on_map, seed=seed)
     shown = list(evidence(found.problem))
-    rows = [*_of_causes(found), *(row_of(test) for test in _others(found)), *shown]
-    reasons = [*([sentence(found.causes)] if found.causes else []), *(_reason(row) for row in shown if row.rejected)]
+    before = _before_causes(found, shown)
+    after = [row for row in shown if row not in before]
+    rows = [*before, *_of_causes(found), *(row_of(test) for test in _others(found)), *after]
+    reasons = [_reason(row) for row in before]
+    reasons += [*([sentence(found.causes)] if found.causes else []), *(_reason(row) for row in after if row.rejected)]
     reasons = reasons or list(_what_could_hide(found))
     return TrustVerdict(tuple(rows), tuple(reasons), found.causes, on_map.rows)
+
+
+def _before_causes(found: Findings, shown: Sequence[MistakeTest]) -> list[MistakeTest]:
+    """What single ranges show that the likeliest cause leaves, and which may look like it: blocked ranges as a step.
+
+    Of an anchor if the cause is one of its own; of all if they scatter by more than the cause changes them.
+    """
+    about_ranges = [row for row in shown if row.rejected and row.name in OF_SINGLE_RANGES]
+    if not about_ranges or not found.causes:
+        return []
+    cause, on_map = found.causes[0], found.problem.on_map
+    undone = cause.undone(on_map)
+    changed_m = float(np.sqrt(np.mean((undone.residual_m - replace(on_map, state=cause.state).residual_m) ** 2)))
+    left = {(row.name, row.subject) for row in evidence(linearized(undone)) if row.rejected}
+    return [
+        row
+        for row in about_ranges
+        if (row.name == MIXED_UP or (row.name, row.subject) in left)
+        and (f"{cause.subject} ".startswith(f"{row.subject} ") if row.subject else row.statistic > changed_m)
+    ]
 
 
 def sentence(causes: Sequence[Cause]) -> str:

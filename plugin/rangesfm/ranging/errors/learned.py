@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -114,23 +114,8 @@ def learn_errors(
         others_m2: (c, c) covariances of what else there is, by name, of which nothing is to be learnt.
         most_unusual: how far above its median any stddev may be, in spreads over radios.
     """
-    widening = max(1.0, noise_m / _USUAL_NOISE_M) ** _WIDENING_POWER
-    components = [component for component in COMPONENTS if component.name not in ruled_out]
-    of_cells = [_covariance(component, cells, widening) for component in components]
-    medians = [_median(component, curve_stddev_m is not None) for component in components]
-    known = _known(cells, curve_stddev_m, others_m2)
-    likelihood = _Likelihood(
-        np.array(of_cells),
-        np.log(medians),
-        np.array([component.spread for component in components]),
-        np.sum([*known.values(), np.zeros((len(cells), len(cells)))], axis=0),
-        cells.mean(off_m),
-        cells.mean(design),
-        prior_design,
-    )
-    stddevs = likelihood.mean_stddevs(likelihood.most_likely(most_unusual))
-    covariances = stddevs[:, None, None] ** 2 * likelihood.of_components
-    return _of_components(cells, components, stddevs, covariances, known)
+    expected = ExpectedErrors.of(cells, curve_stddev_m, ruled_out, others_m2)
+    return expected.learnt(cells.mean(off_m), cells.mean(design), prior_design, noise_m, most_unusual)
 
 
 def usual_errors(
@@ -147,11 +132,7 @@ def usual_errors(
         curve_stddev_m, ruled_out, others_m2: as of ``learn_errors``.
         stddevs: of some components, by name, in place of these.
     """
-    components = [component for component in COMPONENTS if component.name not in ruled_out]
-    known = usual_stddevs(is_calibrated=curve_stddev_m is not None) | dict(stddevs or {})
-    sizes = np.array([known[component.name] for component in components])
-    covariances = np.array([size**2 * _covariance(c, cells, 1.0) for c, size in zip(components, sizes, strict=True)])
-    return _of_components(cells, components, sizes, covariances, _known(cells, curve_stddev_m, others_m2))
+    return ExpectedErrors.of(cells, curve_stddev_m, ruled_out, others_m2).usual(stddevs or {})
 
 
 def usual_stddevs(*, is_calibrated: bool) -> dict[str, float]:
@@ -159,15 +140,71 @@ def usual_stddevs(*, is_calibrated: bool) -> dict[str, float]:
     return {c.name: float(_median(c, is_calibrated) * np.exp(c.spread**2)) for c in COMPONENTS}
 
 
-def _of_components(
-    cells: Cells, components: Sequence[Component], stddevs: Array, covariances: Array, known: Mapping[str, Array]
-) -> LearnedErrors:
-    """With what is known otherwise."""
-    names = (*(component.name for component in components), *known)
-    stddevs = np.append(stddevs, np.ones(len(known)))
-    return LearnedErrors(
-        cells, cells.of_range, names, stddevs, np.concatenate([covariances, *(m[None] for m in known.values())])
-    )
+@dataclass(frozen=True)
+class ExpectedErrors:
+    """What radios let expect of c cells before anything is measured: k components of which there is to learn.
+
+    Attributes:
+        components: these. of_components: (k, c, c) covariances for a stddev of 1 of each.
+        known: (c, c) covariances that nothing is to be learnt of, by name.
+        is_calibrated: whether a learnt error curve has been taken off.
+    """
+
+    cells: Cells
+    components: tuple[Component, ...]
+    of_components: Array
+    known: Mapping[str, Array]
+    is_calibrated: bool
+
+    @classmethod
+    def of(
+        cls,
+        cells: Cells,
+        curve_stddev_m: Array | None,
+        ruled_out: Collection[str],
+        others_m2: Mapping[str, Array] | None,
+    ) -> ExpectedErrors:
+        """As of ``learn_errors``."""
+        components = tuple(component for component in COMPONENTS if component.name not in ruled_out)
+        of_components = np.array([_covariance(component, cells) for component in components])
+        known = _known(cells, curve_stddev_m, others_m2)
+        return cls(cells, components, of_components, known, curve_stddev_m is not None)
+
+    def usual(self, stddevs: Mapping[str, float]) -> LearnedErrors:
+        """As most radios have them, some of them as given by name."""
+        usual = usual_stddevs(is_calibrated=self.is_calibrated) | dict(stddevs)
+        sizes = np.array([usual[component.name] for component in self.components])
+        return self._of(sizes, sizes[:, None, None] ** 2 * self.of_components)
+
+    def learnt(
+        self, off_m: Array, design: Array, prior_design: Array, noise_m: float, most_unusual: float
+    ) -> LearnedErrors:
+        """As of ``learn_errors``, with (c,) and (c, p) of cells."""
+        # A map bends no more for a bad radio, and the noise says itself how large it is.
+        widening = max(1.0, noise_m / _USUAL_NOISE_M) ** _WIDENING_POWER
+        widened = [1.0 if c.name in ("bending", "white") else widening**2 for c in self.components]
+        likelihood = _Likelihood(
+            np.array(widened)[:, None, None] * self.of_components if widening > 1 else self.of_components,
+            np.log([_median(component, self.is_calibrated) for component in self.components]),
+            np.array([component.spread for component in self.components]),
+            np.sum([*self.known.values(), np.zeros((len(self.cells), len(self.cells)))], axis=0),
+            off_m,
+            design,
+            prior_design,
+        )
+        stddevs = likelihood.mean_stddevs(likelihood.most_likely(most_unusual))
+        return self._of(stddevs, stddevs[:, None, None] ** 2 * likelihood.of_components)
+
+    def _of(self, stddevs: Array, covariances: Array) -> LearnedErrors:
+        """With what is known otherwise."""
+        names = (*(component.name for component in self.components), *self.known)
+        return LearnedErrors(
+            self.cells,
+            self.cells.of_range,
+            names,
+            np.append(stddevs, np.ones(len(self.known))),
+            np.concatenate([covariances, *(m[None] for m in self.known.values())]),
+        )
 
 
 def _median(component: Component, is_calibrated: bool) -> float:
@@ -176,13 +213,10 @@ def _median(component: Component, is_calibrated: bool) -> float:
     return component.median
 
 
-def _covariance(component: Component, cells: Cells, widening: float) -> Array:
+def _covariance(component: Component, cells: Cells) -> Array:
     """(c, c) for a stddev of 1."""
     covariance = component.correlation(cells)
-    if component.is_of_anchor:
-        covariance = covariance * np.outer(cells.noisiness, cells.noisiness)
-    # A map bends no more for a bad radio, and the noise says itself how large it is.
-    return covariance if component.name in ("bending", "white") else widening**2 * covariance
+    return covariance * np.outer(cells.noisiness, cells.noisiness) if component.is_of_anchor else covariance
 
 
 def _known(cells: Cells, curve_stddev_m: Array | None, others_m2: Mapping[str, Array] | None) -> dict[str, Array]:
