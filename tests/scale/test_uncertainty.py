@@ -11,7 +11,10 @@ import pytest
 
 from rangesfm.demo.ranges import Radio
 from rangesfm.options import RangeModelOptions, ScaleOptions
-from rangesfm.scale.estimate import ScaleUncertainty
+from rangesfm.ranging.association import associate
+from rangesfm.ranging.errors.components import CLOCKS
+from rangesfm.scale.estimate import ScaleEstimate, ScaleUncertainty
+from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.uncertainty import expected_scale_uncertainty, scale_uncertainty
 
 if TYPE_CHECKING:
@@ -134,3 +137,27 @@ def test_best_weights_that_disagree_by_more_than_chance_widen_no_further(make_su
         assert stated["reweighting"] < 1.345 * chance
     # Of errors a thousandth as large nothing that the best weights say is chance any more.
     assert stated["reweighting"] > 0.5 * chance
+
+
+def test_what_the_clocks_leave_open_is_part_of_scale_and_place(make_survey: MakeSurvey) -> None:
+    survey, stddev_s = make_survey(), 0.5
+    anchors = survey.anchors("site", survey.anchors_m)
+
+    def estimate(time_offset_s: float, stddev_s: float) -> ScaleEstimate:
+        placed = associate(survey.simulated.log, survey.trajectory, survey.tag_in_cam_m, time_offset_s=time_offset_s)
+        placed = replace(placed, time_offset_stddev_s=stddev_s)
+        return initialize_scale(placed, survey.trajectory, anchors, anchor_frame="site")
+
+    right, off, told = estimate(0.0, 0.0), estimate(stddev_s, 0.0), estimate(stddev_s, stddev_s)
+    assert CLOCKS not in off.uncertainty.components
+    assert told.uncertainty.components[CLOCKS] > 0
+    # Half a second on, the whole map is turned along its loop.
+    between = off.metric_from_sfm.rotation @ right.metric_from_sfm.rotation.T
+    turn_rad = np.arccos((np.trace(between) - 1) / 2)
+    assert turn_rad > 4 * heading_stddev_rad(off)
+    assert turn_rad < 2 * heading_stddev_rad(told)
+
+
+def heading_stddev_rad(estimate: ScaleEstimate) -> float:
+    assert estimate.placement is not None
+    return float(np.sqrt(estimate.placement[3, 3]))

@@ -57,6 +57,7 @@ class RangeObservations:
         tag_from_center: (n, 3) lever arm turned into the world, metres.
         center_stddev: (n,) of the interpolated centre, each coordinate, model units; 0 at a keyframe
             if the times are exact.
+        time_offset_stddev_s: of the clocks' offset by which they were put there.
     """
 
     log: RangeLog
@@ -68,6 +69,7 @@ class RangeObservations:
     center_offsets: Array
     tag_from_center: Array
     center_stddev: Array
+    time_offset_stddev_s: float = 0.0
 
     @property
     def has_place(self) -> Mask:
@@ -160,7 +162,7 @@ def joined_observations(
         keyframes: where the keyframes of each path are in the joined one.
     """
     number = path_of_each(parts)
-    joined: dict[str, npt.NDArray[Any]] = {"status": np.min([part.status for part in parts], axis=0)}
+    joined: dict[str, Any] = {"status": np.min([part.status for part in parts], axis=0)}
     for k, (part, similarity, keyframe) in enumerate(zip(parts, joined_from_part, keyframes, strict=True)):
         rows = number == k
         moved: dict[str, npt.NDArray[Any]] = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -36,6 +36,12 @@ class ScaleUncertainty:
     def empirical(self) -> float:
         """The honest one: all components together, and never less than the formal one."""
         return max(float(np.linalg.norm(list(self.components.values()))), self.formal)
+
+    def beside(self, name: str, stddev: float) -> ScaleUncertainty:
+        """With more of a component."""
+        return replace(
+            self, components={**self.components, name: float(np.hypot(self.components.get(name, 0), stddev))}
+        )
 
     @property
     def half_width_95(self) -> float:

@@ -77,7 +77,9 @@ def initialize_scale(
         solution = solution_from(problem, error.in_first_camera)
     table = _paper_table(solution)
     rotations = model_from_cam(observations, trajectory, problem)
-    learned = learned_errors(problem, solution, observations, rotations)
+    learned = learned_errors(
+        problem, solution, observations, rotations, camera_velocities(observations, trajectory, problem)
+    )
     posed = problem if lengths is None else _bent(problem, lengths)
     uncertainty = scale_uncertainty(posed, solution, learned, lengths.components["bending"] if lengths else 0.0)
     per_anchor = scale_per_anchor(solution, observations.log.anchor_ids)
@@ -191,6 +193,18 @@ def model_from_cam(observations: RangeObservations, trajectory: Trajectory, prob
     nearest = np.where(observations.weight < 0.5, observations.before, observations.after)[problem.rows]
     turned: Array = problem.first_camera_from_sfm.rotation @ trajectory.world_from_cam[nearest]
     return turned
+
+
+def camera_velocities(observations: RangeObservations, trajectory: Trajectory, problem: ScaleProblem) -> Array | None:
+    """(k, 3) there, in the first camera's frame, model units per second; None where there is no one way in time."""
+    times = trajectory.timestamps_s
+    if observations.log.timestamp_s is None or times is None or len(times) < 2:
+        return None
+    if (np.diff(times) <= 0).any():  # two cameras at once
+        return None
+    nearest = np.where(observations.weight < 0.5, observations.before, observations.after)[problem.rows]
+    velocities = np.gradient(trajectory.centers, times, axis=0)[nearest]
+    return np.asarray(velocities @ problem.first_camera_from_sfm.rotation.T)
 
 
 def _paper_table(solution: Solution) -> TwoCandidate | None:

@@ -11,7 +11,7 @@ from scipy.special import chndtrix
 
 from rangesfm.arrays import Array
 from rangesfm.ranging.errors.cells import MAX_NUM_CELLS, Cells, cells, noisiness
-from rangesfm.ranging.errors.components import GIVEN, REWEIGHTING
+from rangesfm.ranging.errors.components import CLOCKS, GIVEN, REWEIGHTING
 from rangesfm.ranging.errors.learned import ROUNDING, LearnedErrors, learn_errors, usual_errors
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.estimate import NORMAL_95, ScaleUncertainty
@@ -36,22 +36,34 @@ _MAX_CHANCE = 1.345
 
 
 def learned_errors(
-    posed: ScaleProblem, solution: Solution, observations: RangeObservations, model_from_cam: Array
+    posed: ScaleProblem,
+    solution: Solution,
+    observations: RangeObservations,
+    model_from_cam: Array,
+    velocities: Array | None = None,
 ) -> LearnedErrors:
     """What the residuals of a solution say of the ranges' errors.
 
     Args:
         model_from_cam: (n, 3, 3) rotation of the camera at each range, into the world of the problem.
+        velocities: (n, 3) of the camera there, model units per second; None: the clocks' offset does not matter.
     """
     linear, taken_off = _linear(posed, solution), observations.log.shared_stddev_m
+    of_ranges = _cells(posed, solution, observations, model_from_cam)
+    by_clocks = {}
+    if velocities is not None and observations.time_offset_stddev_s:
+        placed, by = solution.fit.state.metric_from_model, range_gradient(solution.problem, solution.fit.state)
+        rates = of_ranges.mean(placed.scale * np.sum(by.by_tag * (velocities @ placed.rotation.T), axis=1))
+        by_clocks[CLOCKS] = observations.time_offset_stddev_s**2 * np.outer(rates, rates)
     return learn_errors(
-        _cells(posed, solution, observations, model_from_cam),
+        of_ranges,
         off_m=linear.off_m,
         design=linear.design,
         prior_design=linear.prior_design,
         noise_m=solution.noise_stddev_m,
         curve_stddev_m=None if taken_off is None else taken_off[posed.rows],
         ruled_out=ruled_out(solution.problem),
+        others_m2=by_clocks,
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.observations import RangeObservations
-from rangesfm.scale.initialize import model_from_cam
+from rangesfm.scale.initialize import camera_velocities, model_from_cam
 from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import RangeProblem, RangeState, tag_positions
 from rangesfm.scale.solution import Solution
@@ -73,7 +73,7 @@ def ranges_on_map(
         problem=replace(posed.ranges, stddev_m=np.ones(len(rows)), share=None),
         state=solution.fit.state,
         model_from_cam=model_from_cam(observations, trajectory, posed),
-        velocity=_velocities(posed, observations, trajectory) if log.timestamp_s is not None else None,
+        velocity=camera_velocities(observations, trajectory, posed),
         time_s=times_of_ranges(posed, solution, observations),
         tag_index=log.tag_index[rows],
         tag_ids=log.tag_ids,
@@ -83,12 +83,3 @@ def ranges_on_map(
         curve_stddev_m=None if log.shared_stddev_m is None else log.shared_stddev_m[rows],
         ruled_out=tuple(ruled_out(posed.ranges)),
     )
-
-
-def _velocities(posed: ScaleProblem, observations: RangeObservations, trajectory: Trajectory) -> Array | None:
-    times = trajectory.timestamps_s
-    if times is None or len(times) < 2 or (np.diff(times) <= 0).any():  # two cameras at once have no one way
-        return None
-    nearest = np.where(observations.weight < 0.5, observations.before, observations.after)[posed.rows]
-    velocities = np.gradient(trajectory.centers, times, axis=0)[nearest]
-    return np.asarray(velocities @ posed.first_camera_from_sfm.rotation.T)

@@ -20,12 +20,13 @@ from rangesfm.join.models import ModelVerdict, PathOfModel, Ranging, join_models
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock.estimate import TimeOffset, estimate_time_offset
 from rangesfm.ranging.clock.rivals import REMEDY, Rival
+from rangesfm.ranging.errors.components import CLOCKS
 from rangesfm.ranging.log import RangeKind
 from rangesfm.ranging.observations import RangeObservations, RangeStatus, hold_out
 from rangesfm.refine.radio import predicted_ranges
 from rangesfm.refine.with_ranges import RefineSummary, refine_with_ranges
 from rangesfm.result.metric_result import MetricResult
-from rangesfm.scale.estimate import ScaleEstimate
+from rangesfm.scale.estimate import NORMAL_95, ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
@@ -35,9 +36,9 @@ from rangesfm.vision.image_times import ImageTimes
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.trust_in_map import named_causes, tested
 
-# Scales of two clock offsets further apart than this are no answer, unless one of the offsets is nearly certain.
+# Scales of two clock offsets further apart than this are no answer, unless the others are hardly likely together.
 _MAX_SPREAD = 0.03
-_NEARLY_CERTAIN = 0.95
+_HARDLY_LIKELY = 0.05
 _ANY_STDDEV = 1e3
 
 
@@ -178,13 +179,16 @@ def refine_by_survey(
         scaled: in the metric world. trajectory: of the unscaled model, as the scale stage had it.
         tape: distances to keep to.
     """
+    errors = estimate.errors
+    if survey.refine.time_offset_stddev_s and errors.learned is not None:
+        errors = replace(errors, learned=errors.learned.without(CLOCKS))
     return refine_with_ranges(
         scaled,
         trajectory,
         estimate.observations,
         estimate.metric_from_sfm,
         estimate.anchors,
-        estimate.errors,
+        errors,
         tag_in_cam_m=inputs.tag_in_cam_m,
         first_pose_is_fixed=estimate.frame != "site",
         gravity=gravity_of(survey.scale.up_in_first_camera),
@@ -219,6 +223,8 @@ def scale_by_survey(
 ) -> MetricResult:
     """The scale of a map, its doubts told, and the map rescaled."""
     sfm, trajectory, observations = path.sfm, path.trajectory, path.observations
+    if offset is not None and offset.offset_matters:
+        observations = replace(observations, time_offset_stddev_s=offset.stddev_s)
     distances = None
     if inputs.tape is not None:
         distances = locate_distances(inputs.tape, sfm, observations.log.anchor_ids)
@@ -226,9 +232,10 @@ def scale_by_survey(
         estimate = estimate_scale(survey, inputs, observations, trajectory, inputs.anchor_frame, distances)
     except GeometryError as error:
         raise _with_cause(error, survey, inputs, observations, trajectory, distances) from None
-    by_rivals = (
-        () if offset is None else doubts_by_rivals(survey, inputs, trajectory, distances, offset, estimate.value)
-    )
+    by_rivals: tuple[str, ...] = ()
+    if offset is not None and offset.rivals:
+        by_rivals, stddev = scale_by_rivals(survey, inputs, trajectory, distances, offset, estimate.value)
+        estimate = replace(estimate, uncertainty=estimate.uncertainty.beside(CLOCKS, stddev))
     for doubt in (*by_rivals, *(estimate.reasons if estimate.verdict != "good" else ())):
         journal.warn(doubt)
     scaled = rescale(sfm, estimate.metric_from_sfm)
@@ -267,24 +274,30 @@ def _with_cause(
     return GeometryError(f"{error}; {causes}") if causes else error
 
 
-def doubts_by_rivals(
+def scale_by_rivals(
     survey: Survey,
     inputs: RangingInputs,
     trajectory: Trajectory,
     distances: LocatedDistances | None,
     offset: TimeOffset,
     scale: float,
-) -> tuple[str, ...]:
-    """Solve the scale for every rival of an offset; its doubts in words, none if there is no rival.
+) -> tuple[tuple[str, ...], float]:
+    """Solve the scale for every rival of an offset.
 
     Args:
         distances: as the scale was estimated with.
         scale: at the offset, metres per SfM unit.
 
+    Returns:
+        doubts in words, and the relative stddev of the scale by the choice: that of all the offsets by their
+        probabilities, and no less than what makes a 95 % interval of it hold the scales of all; without those that are
+        far apart, which are hardly likely then.
+
     Raises:
         GeometryError: the offset is not certain, and another scale follows from a rival.
     """
     doubts, far_apart = [], []
+    far_probability, variance, farthest = 0.0, 0.0, 0.0
     for rival in offset.rivals:
         said = f"{rival.value_s:+.2f} s ({rival.probability:.0%})"
         other = _scale_of(rival, survey, inputs, trajectory, distances, offset)
@@ -295,13 +308,17 @@ def doubts_by_rivals(
         doubts.append(f"the time offset may also be {said}, which gives a scale of {other:.6g} ({change:+.1%})")
         if abs(change) > _MAX_SPREAD:
             far_apart.append(f"{said} gives {other:.6g} ({change:+.1%})")
-    if far_apart and offset.probability < _NEARLY_CERTAIN:
+            far_probability += rival.probability
+        else:
+            variance += rival.probability * float(np.log1p(change)) ** 2
+            farthest = max(farthest, abs(float(np.log1p(change))))
+    if far_probability > _HARDLY_LIKELY:
         raise GeometryError(
             "the motion leaves the time offset open, and the scale with it: "
             f"{offset.value_s:+.2f} s ({offset.probability:.0%}) gives {scale:.6g} m per unit, "
             f"{', '.join(far_apart)}: {REMEDY}"
         )
-    return tuple(doubts)
+    return tuple(doubts), max(float(np.sqrt(variance)), farthest / NORMAL_95)
 
 
 def _scale_of(
@@ -327,6 +344,9 @@ def refine_map(survey: Survey, inputs: RangingInputs, metric: MetricResult, jour
     Raises:
         SolverError: the scaled one is no map either.
     """
+    offset = metric.time_offset
+    if offset is not None and not offset.is_certain and not survey.refine.time_offset_stddev_s:
+        survey = survey.changed({"refine.time_offset_stddev_s": offset.stddev_s})
     refined, summary = refine_by_survey(
         survey, inputs, metric.scaled, metric.trajectory, metric.estimate, _control(inputs, metric)
     )

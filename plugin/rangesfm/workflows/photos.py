@@ -288,7 +288,7 @@ class AdjustmentWithRanges:
             found = estimate_time_offset(
                 inputs.log, path, inputs.tag_in_cam_m, association=survey.ranges, seed=survey.output.seed
             )
-            if found.rivals:
+            if found.rivals or not found.is_certain:
                 raise GeometryError("more than one time offset is likely")
             self._offset_s, self._num_with_offset = found.value_s, len(path)
         return ranges_on_path(survey, inputs, path, self._offset_s or 0.0)

@@ -50,13 +50,14 @@ class Walk:
         num_anchors: int = 4,
         outlier_share: float = 0.2,
         drift: float = 0.0,
+        noise_m: float = 0.1,
         tag_in_cam_m: tuple[float, float, float] = TAG_IN_CAM_M,
     ) -> RangeLog:
         """A range at each time (camera's clock) to one of the anchors; some read far too long."""
         rng = np.random.default_rng([seed, 1])
         anchor = rng.integers(0, num_anchors, len(times_s))
         tag = self.center(times_s) + self.rotation(times_s).apply(tag_in_cam_m)
-        ranges = np.linalg.norm(tag - ANCHORS_M[anchor], axis=1) + rng.normal(0, 0.1, len(times_s))
+        ranges = np.linalg.norm(tag - ANCHORS_M[anchor], axis=1) + rng.normal(0, noise_m, len(times_s))
         ranges += (rng.random(len(times_s)) < outlier_share) * rng.exponential(1.5, len(times_s))
         radio_times = times_s - offset_s - drift * (times_s - times_s.mean())
         return RangeLog.from_arrays([f"A{k}" for k in anchor], np.maximum(ranges, 0.05), timestamp_s=radio_times)
@@ -372,6 +373,22 @@ def test_motion_that_does_not_determine_the_offset_is_refused(
     log = walk.log(range_times(-1, 71), 3.0, num_anchors=num_anchors)
     with pytest.raises(GeometryError, match="--ranges_time_offset"):
         estimate(log, walk.photos(photo_times(70), center_stddev_m=center_stddev_m))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_an_offset_that_the_motion_tells_but_loosely_is_given_with_its_stddev(seed: int) -> None:
+    """A third of an even walk around an ellipse: later is nearly the same as further round."""
+
+    def center(times: Array) -> Array:
+        turn = 2 * np.pi * times / 33
+        return np.stack([4.4 * np.cos(turn), 3.1 * np.sin(turn), 1.6 + 0 * times], axis=1)
+
+    walk = Walk(center, no_turn)
+    log = walk.log(range_times(-3, 17, rate_hz=50, seed=seed), 3.0, seed=seed, noise_m=0.02, outlier_share=0)
+    found = estimate(log, walk.photos(photo_times(14), seed))
+    assert abs(found.value_s - 3.0) < 3 * found.stddev_s
+    assert not found.is_certain
+    assert "too even to tell the time offset well" in (found.note or "")
 
 
 def test_laps_that_differ_by_twice_the_noise_are_told_apart() -> None:

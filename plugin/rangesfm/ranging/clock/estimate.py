@@ -32,6 +32,8 @@ _NUM_RANGES_OF_FINAL = 40000
 _MIN_SAME_SHARE = 0.95
 # Around the best offset the curve shows all: at least this far, and so many stddevs.
 _FINE_REACH_S, _FINE_REACH_STDDEVS = 1.0, 6.0
+# An offset less certain than this is none.
+_MOST_UNCERTAIN_S = 0.5
 # Photos too far apart for ranges to be interpolated still show the motion: up to this many times their usual gap.
 _MAX_GAPS = 1.5
 
@@ -52,6 +54,7 @@ class TimeOffset:
         note: what the user should know; None if nothing.
         probability: that the value is the right offset and none of the rivals.
         rivals: the other offsets that cannot be ruled out, the likeliest first.
+        is_certain: whether its stddev makes less of a range than the noise does.
     """
 
     value_s: float
@@ -65,6 +68,7 @@ class TimeOffset:
     note: str | None
     probability: float = 1.0
     rivals: tuple[Rival, ...] = ()
+    is_certain: bool = True
 
     def of_rival(self, rival: Rival) -> TimeOffset:
         """The same clocks at a rival's offset; a drift is that of the value alone."""
@@ -161,11 +165,13 @@ def _offset_of_motion(
         )
     near = ranges_on_path(ranges, path, best.offset_s, _NUM_RANGES_OF_FINAL)
     final, timing, drift, reference_s = fit_clocks(near, path, best.offset_s)
-    if not timing.stddev_s * np.sqrt(np.mean(final.rates**2)) < final.residual_stddev_m:
-        raise GeometryError(
-            f"the motion is too even to tell the time offset (about {final.offset_s:+.2f} s, "
-            f"stddev {timing.stddev_s:.2g} s): {REMEDY}"
-        )
+    is_certain = bool(timing.stddev_s * np.sqrt(np.mean(final.rates**2)) < final.residual_stddev_m)
+    found = f"(about {final.offset_s:+.2f} s, stddev {timing.stddev_s:.2g} s)"
+    if not is_certain and not timing.stddev_s < _MOST_UNCERTAIN_S:
+        raise GeometryError(f"the motion is too even to tell the time offset {found}: {REMEDY}")
+    notes = [drift_note(drift, timing.drift_stddev, near.times_s)] if drift else []
+    if not is_certain:
+        notes.append(f"the motion is too even to tell the time offset well {found}: {REMEDY} if you know it better")
     weighed = scan_offsets(final.ranges, path, final.squares.weights)
     return TimeOffset(
         value_s=final.offset_s,
@@ -176,9 +182,10 @@ def _offset_of_motion(
         drift_stddev=timing.drift_stddev,
         drift_is_followed=drift != 0,
         reference_s=reference_s,
-        note=drift_note(drift, timing.drift_stddev, near.times_s) if drift else None,
+        note="; ".join(notes) or None,
         probability=probability,
         rivals=tuple(Rival(fit.offset_s, probability) for fit, probability in rivals),
+        is_certain=is_certain,
     )
 
 

@@ -199,6 +199,10 @@ REWEIGHTING = "reweighting"
 """None either: by how much the best weights for these errors would change the scale."""
 
 
+CLOCKS = "clocks"
+"""None either: by how far the clocks' offset may be another."""
+
+
 def component_words(names: Iterable[str]) -> dict[str, str]:
     """What each component is, for people."""
     words = {component.name: component.words for component in COMPONENTS}
@@ -206,6 +210,7 @@ def component_words(names: Iterable[str]) -> dict[str, str]:
         LEARNT_CURVE: "the learnt error curve",
         GIVEN: "tapes, anchors' positions and what else was given",
         REWEIGHTING: "what the best weights for these errors would change",
+        CLOCKS: "the clocks' offset, as far as the motion leaves it open",
         "tape": "how the lengths were measured",
         "marks": "where their ends are in the photos",
     }
