@@ -122,7 +122,8 @@ def test_shares_of_pairs_are_matched_as_colmap_matches_pairs(monkeypatch: pytest
     share = MatchingShare(tmp_path, [(1, 2)], "matcher", "verification")  # type: ignore[arg-type]
     share.match(SilentProgress())
     assert (handed[0], handed[2]) == ("matcher", "verification")
-    assert changes(handed[1]) == {"match_list_path": tmp_path / "pairs.txt", "block_size": 64}
+    # As many photos at once as go by the features of each: of a database without any, one.
+    assert changes(handed[1]) == {"match_list_path": tmp_path / "pairs.txt", "block_size": 1}
 
 
 def test_a_model_is_adjusted_as_colmap_adjusts_it() -> None:

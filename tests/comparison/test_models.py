@@ -67,7 +67,7 @@ def result(walked_survey: WalkedSurvey, tmp_path_factory: pytest.TempPathFactory
     files = walked_survey.folder
     output_path = tmp_path_factory.mktemp("result") / "out"
     survey = survey_of(files, {"anchors.frame": "site", "output.path": output_path, "report.enabled": False})
-    survey = survey.model_copy(update={"model_path": files / "sparse" / "0"})
+    survey = survey.changed({"images.model": files / "sparse" / "0"})
     scale_model(survey, progress=SilentProgress())
     return survey.output.path
 

@@ -137,3 +137,11 @@ class TestRoles:
     def test_nodes_that_are_numbered_by_side_are_never_confused(self) -> None:
         log = log_of(("0", "1"), ("1", "2"))
         assert tell_roles(log, Sides.APART, known_anchor_ids={"0", "1", "2"}) is log
+
+
+def test_a_clock_that_begins_anew_is_told_from_rows_in_no_order() -> None:
+    times = np.arange(200) % 100 * 0.5
+    shuffled = np.random.default_rng(0).permutation(times)
+    for timestamp_s, num_restarts in ((times, 1), (np.sort(times), 0), (shuffled, 0)):
+        log = RangeLog.from_arrays(["A"] * 200, [1.0] * 200, timestamp_s=timestamp_s)
+        assert log.num_restarts == num_restarts

@@ -71,7 +71,7 @@ def test_all_together_alarm_for_nothing_as_seldom_as_they_say(
 ) -> None:
     rng, num = np.random.default_rng(1), 150
     factor, tried = np.linalg.cholesky(problem.errors.covariance_m2), hypotheses(problem)
-    thresholds = [test.threshold for test in Factorization(problem).test(tried, 0)]
+    thresholds = np.array([test.threshold for test in Factorization(problem).test(tried, 0)])
     # The same whatever was measured, and most of the work.
     monkeypatch.setattr(testing, "_thresholds", lambda *_: thresholds)
     alarms = 0

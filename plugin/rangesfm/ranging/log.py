@@ -18,6 +18,8 @@ from rangesfm.files.tables import Categories
 DEFAULT_TAG_ID = "tag"
 # Two ranges of one radio to another take time: if this share of them has the time of the one before, it was rounded.
 _MIN_REPEATED_SHARE = 0.25
+# Where more steps than this share go back in time, the log is in another order than time's.
+_MOST_GOING_BACK = 0.05
 
 
 class RangeKind(IntEnum):
@@ -145,11 +147,13 @@ class RangeLog:
 
     @property
     def num_restarts(self) -> int:
-        """How often the times between one tag and one anchor jump back by a quarter of the whole log."""
+        """How often the times between one tag and one anchor jump back by a quarter of the whole log; 0 without order."""
         if self.timestamp_s is None or len(self) < 2:
             return 0
         order = np.argsort(self._link, kind="stable")
         steps = np.diff(self.timestamp_s[order])[np.diff(self._link[order]) == 0]
+        if np.count_nonzero(steps < 0) > _MOST_GOING_BACK * len(steps):
+            return 0
         return int(np.count_nonzero(steps < -0.25 * np.ptp(self.timestamp_s)))
 
     @property

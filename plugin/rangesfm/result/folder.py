@@ -53,15 +53,14 @@ _WRITTEN = (*RESULT_FILES, "trajectory.tum", "points.ply", "sparse_scaled/0", "s
 
 
 def refuse_to_overwrite(inputs: Iterable[InputPath], folder: Path) -> None:
-    """Raise InputError for an input that stands where a result will be written, or that results would stand in."""
+    """Raise InputError for an input that stands where a result will be written, or that results would stand among."""
     written = {(folder / name).resolve() for name in _WRITTEN}
     for item in inputs:
         path = item.path.resolve()
         if not written.isdisjoint((path, *path.parents)):
             raise InputError("the results would overwrite this input, expected another output path", item.path)
-        is_model = item.role == "model" and any(path.glob("cameras.*"))
-        if path.is_dir() and (path == folder.resolve() or (is_model and path in folder.resolve().parents)):
-            raise InputError("the results would stand in this input, expected another output path", item.path)
+        if path.is_dir() and path == folder.resolve():
+            raise InputError("the results would stand among this input, expected another output path", item.path)
 
 
 def forget_result(folder: Path) -> None:
