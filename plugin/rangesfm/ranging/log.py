@@ -147,7 +147,7 @@ class RangeLog:
 
     @property
     def num_restarts(self) -> int:
-        """How often the times between one tag and one anchor jump back by a quarter of the whole log; 0 without order."""
+        """How often times between one tag and one anchor jump back by a quarter of the log; 0 of a log in no order."""
         if self.timestamp_s is None or len(self) < 2:
             return 0
         order = np.argsort(self._link, kind="stable")
