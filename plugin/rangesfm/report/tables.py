@@ -123,6 +123,7 @@ def mistakes(content: Content) -> Table:
         f"A bar more than half full is beyond chance{_from_stddevs(tests)}. What is not found may still be there, "
         "smaller than the smallest that is found; the last two columns say what that may do, to the scale as a share "
         "of it. All tests are in result.json.",
+        kind="mistakes",
     )
 
 
