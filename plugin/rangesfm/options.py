@@ -375,7 +375,7 @@ class RefineOptions(Options):
     lever_arm_stddev_m: _Uncertainty = 0.0
     """Of each coordinate of the tags' places in the camera frame, which are refined unless it is 0."""
     time_offset_stddev_s: _Uncertainty = 0.0
-    """Of the clocks' offset, which is refined unless it is 0."""
+    """Of the clocks' offset, which is refined unless it is 0; one that the motion tells but loosely is, by its own."""
     short_range_stddev_m: _Uncertainty = 0.0
     """Of an error of short ranges that all share and that dies out with a length of 1 m, which is refined unless it is
     0 (they are trusted less instead)."""
