@@ -32,7 +32,8 @@ class LearnedErrors:
     Attributes:
         cells: of the ranges.
         of_range: (n,) the cell of each range; -1 of one that took no part.
-        names, stddevs: of the components; metres, ``slope`` a share of the distance.
+        names, stddevs: of the components; metres, ``slope`` a share of the distance; of what is not learnt, of cells on
+            average.
         covariances_m2: (k, c, c) that each of them adds.
     """
 
@@ -202,7 +203,7 @@ class ExpectedErrors:
             self.cells,
             self.cells.of_range,
             names,
-            np.append(stddevs, np.ones(len(self.known))),
+            np.append(stddevs, [np.sqrt(np.trace(m) / len(m)) for m in self.known.values()]),
             np.concatenate([covariances, *(m[None] for m in self.known.values())]),
         )
 
