@@ -77,6 +77,11 @@ class RangeObservations:
         return np.asarray(self.status <= RangeStatus.OUTLIER)
 
     @property
+    def nearest(self) -> Indices:
+        """(n,) keyframe; -1 without a place."""
+        return np.where(self.weight < 0.5, self.before, self.after)
+
+    @property
     def placed_rows(self) -> Indices:
         """(k,) rows of those that have a place, in ``log.own_order``."""
         order = self.log.own_order

@@ -190,8 +190,9 @@ def placement_covariance(solution: Solution, covariance: Array) -> Array | None:
 
 def model_from_cam(observations: RangeObservations, trajectory: Trajectory, problem: ScaleProblem) -> Array:
     """(k, 3, 3) rotation at the keyframe nearest to each range, into the first camera's frame."""
-    nearest = np.where(observations.weight < 0.5, observations.before, observations.after)[problem.rows]
-    turned: Array = problem.first_camera_from_sfm.rotation @ trajectory.world_from_cam[nearest]
+    turned: Array = (
+        problem.first_camera_from_sfm.rotation @ trajectory.world_from_cam[observations.nearest[problem.rows]]
+    )
     return turned
 
 
@@ -202,8 +203,7 @@ def camera_velocities(observations: RangeObservations, trajectory: Trajectory, p
         return None
     if (np.diff(times) <= 0).any():  # two cameras at once
         return None
-    nearest = np.where(observations.weight < 0.5, observations.before, observations.after)[problem.rows]
-    velocities = np.gradient(trajectory.centers, times, axis=0)[nearest]
+    velocities = np.gradient(trajectory.centers, times, axis=0)[observations.nearest[problem.rows]]
     return np.asarray(velocities @ problem.first_camera_from_sfm.rotation.T)
 
 

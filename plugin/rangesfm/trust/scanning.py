@@ -130,9 +130,6 @@ def _steps(problem: Linearized, anchor: int | None, around: float | None = None)
             to, how = f" to anchor {name}" if name else "", "longer" if size[0] > 0 else "shorter"
             return f"{when} on the ranges{to} read about {abs(size[0]):.2f} m {how}"
 
-        def correction(size: Array, later: Callable[[], Mask] = later) -> Correction:
-            return Correction(longer_m=np.where(later(), size[0], 0.0))
-
         yield Hypothesis(
             "anchor step" if name else "step",
             name,
@@ -140,7 +137,7 @@ def _steps(problem: Linearized, anchor: int | None, around: float | None = None)
             is_linear=True,
             words=words,
             remedy="see what changed then: a tag that slipped, a restarted radio, a door or a vehicle in between",
-            correction=correction,
+            correction=_longer(later),
             finer=partial(_steps, problem, anchor, around=time),
             effect=of_cells(problem, -after),
         )
@@ -161,9 +158,6 @@ def stretches(problem: Linearized) -> Iterator[Hypothesis]:
                 to = f" to anchor {name}" if name else ""
                 return f"{when} the ranges{to} read about {abs(size[0]):.2f} m too {'long' if size[0] > 0 else 'short'}"
 
-            def correction(size: Array, within: Callable[[], Mask] = within) -> Correction:
-                return Correction(longer_m=np.where(within(), size[0], 0.0))
-
             yield Hypothesis(
                 "anchor stretch" if name else "stretch",
                 name,
@@ -171,7 +165,7 @@ def stretches(problem: Linearized) -> Iterator[Hypothesis]:
                 is_linear=True,
                 words=words,
                 remedy="look for what stood in the line of sight, and leave that stretch out",
-                correction=correction,
+                correction=_longer(within),
                 adoption=_left_out(within),
                 effect=of_cells(problem, -inside),
             )
@@ -221,6 +215,10 @@ def _later(problem: Linearized, anchor: int | None, start: float, end: float = n
 def _is_of(anchor_index: Indices, anchor: int | None) -> Mask:
     """Of one anchor, or of all."""
     return np.ones(len(anchor_index), dtype=bool) if anchor is None else np.asarray(anchor_index == anchor)
+
+
+def _longer(rows: Callable[[], Mask]) -> Callable[[Array], Correction]:
+    return lambda size: Correction(longer_m=np.where(rows(), size[0], 0.0))
 
 
 def _left_out(rows: Callable[[], Mask]) -> Callable[[Array], Correction]:

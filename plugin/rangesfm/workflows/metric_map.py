@@ -310,8 +310,8 @@ def scale_by_rivals(
             far_apart.append(f"{said} gives {other:.6g} ({change:+.1%})")
             far_probability += rival.probability
         else:
-            variance += rival.probability * float(np.log1p(change)) ** 2
-            farthest = max(farthest, abs(float(np.log1p(change))))
+            apart = abs(float(np.log1p(change)))
+            variance, farthest = variance + rival.probability * apart**2, max(farthest, apart)
     if far_probability > _HARDLY_LIKELY:
         raise GeometryError(
             "the motion leaves the time offset open, and the scale with it: "

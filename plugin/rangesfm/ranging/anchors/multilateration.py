@@ -9,7 +9,7 @@ from rangesfm.geometry.similarity import path_shape
 from rangesfm.ranging.errors.noise import robust_stddevs
 
 _NUM_ROUNDS = 12
-# Of normal equations with ones on the diagonal: what rounding leaves of them, where outliers take all weight from one.
+# On the diagonal of normal equations, whose columns have length 1 before weights: where outliers take all weight.
 _RIDGE = 1e-16
 
 
