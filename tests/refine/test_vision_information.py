@@ -1,4 +1,4 @@
-"""A point in a camera is told from one that is only near."""
+"""A point that wrong matches put into a camera, or next to it, is told from one that is only near."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from tests.simulated.model import SyntheticModel
 
 from rangesfm.colmap.transform import rescale
 from rangesfm.geometry.similarity import Similarity
-from rangesfm.refine.vision_information import model_observations, model_poses, points_in_cameras
+from rangesfm.refine.vision_information import misplaced_points, model_observations, model_poses
 
 
-def ids_in_cameras(model: pycolmap.Reconstruction) -> list[int]:
+def misplaced_ids(model: pycolmap.Reconstruction) -> list[int]:
     frame_ids = np.array(sorted(model.reg_frame_ids()))
     rays = model_observations(model, frame_ids)
-    found: list[int] = rays.point_ids[points_in_cameras(rays, model_poses(model, frame_ids))].tolist()
+    found: list[int] = rays.point_ids[misplaced_points(rays, model_poses(model, frame_ids))].tolist()
     return found
 
 
@@ -30,14 +30,15 @@ def put_to_depth(model: pycolmap.Reconstruction, depth: float) -> int:
 
 
 @pytest.mark.parametrize(
-    ("depth_m", "is_in_camera"), [(0.0, True), (1e-10, True), (1e-4, True), (0.05, False), (1e8, False)]
+    ("depth_m", "is_misplaced"),
+    [(-1.0, True), (0.0, True), (1e-10, True), (1e-4, True), (0.05, True), (1.5, False), (1e8, False)],
 )
 @pytest.mark.parametrize("scale", [1.0, 1e-3])
 def test_it_is_found_by_its_depth_whatever_the_unit(
-    chain: SyntheticModel, depth_m: float, is_in_camera: bool, scale: float
+    chain: SyntheticModel, depth_m: float, is_misplaced: bool, scale: float
 ) -> None:
     model = chain.reconstruction
-    assert ids_in_cameras(model) == []
+    assert misplaced_ids(model) == []
     point_id = put_to_depth(model, depth_m)
     elsewhere = rescale(model, Similarity(scale, np.eye(3), np.array([3.0, -2.0, 5.0])))
-    assert ids_in_cameras(elsewhere) == ([point_id] if is_in_camera else [])
+    assert misplaced_ids(elsewhere) == ([point_id] if is_misplaced else [])

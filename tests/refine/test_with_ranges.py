@@ -656,7 +656,7 @@ class TestWithNoise:
         assert 0.1 < summary.bend_m < stddev_m
         assert summary.num_iterations <= 5
 
-    @pytest.mark.parametrize("depth_m", [1e-5, 1e-6, 1e-10])
+    @pytest.mark.parametrize("depth_m", [0.01, 1e-5, 1e-6, 1e-10])
     def test_a_point_in_a_camera_changes_nothing(self, depth_m: float) -> None:
         """Nor does it keep the solver from free steps, or the covariance from being found."""
         path, radio = lap_path(60.0, share=0.1), Radio(range_stddev_m=RANGE_STDDEV_M)

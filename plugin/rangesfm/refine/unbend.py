@@ -57,7 +57,7 @@ class Unbent:
 
 
 def unbend(
-    problem: RefinementProblem, rays: Observations, in_camera: npt.NDArray[np.bool_], errors: RangeErrors
+    problem: RefinementProblem, rays: Observations, misplaced: npt.NDArray[np.bool_], errors: RangeErrors
 ) -> Unbent:
     """Solve the keyframe graph and move the model after it, in place: as a whole, to which the photos are indifferent,
     or, where it bends, keyframe by keyframe.
@@ -67,8 +67,8 @@ def unbend(
     outlier. From there a bounded loss, which is that of the scale and of the full problem, sets aside what is one.
 
     Args:
-        rays: all that the photos see, in the problem's frames. in_camera: the points that lie in one, which hold
-            nothing together.
+        rays: all that the photos see, in the problem's frames. misplaced: the points that hold nothing
+            together.
         errors: of the ranges that take part.
     """
     metric, frame_ids, ranges = problem.metric, problem.frame_ids, problem.ranges
@@ -76,7 +76,7 @@ def unbend(
         return Unbent(errors, 0.0, problem.anchors, 0.0, 0)
     before = model_poses(metric, frame_ids)
     graph = KeyframeGraph(
-        vision=vision_information(rays.of_points(~in_camera), before),
+        vision=vision_information(rays.of_points(~misplaced), before),
         antennas=ranges.antennas.subset(ranges.rows),
         range_m=ranges.observations.log.range_m[ranges.rows],
         errors=errors,

@@ -29,8 +29,10 @@ _MAX_NUM_PIECES = 20000
 _BATCH = 2000
 # In stddevs: from here on an observation has half the say.
 _ROBUST_WIDTH = 3.0
-# Of the median depth: a point so near lies in the camera. What a point says goes by the square.
-_MIN_DEPTH = 1e-4
+# Of the median depth: no lens shows sharply what is so near.
+_MIN_DEPTH = 0.01
+# From one photo to another: no feature is recognised in so different a size.
+_MAX_DEPTH_RATIO = 10.0
 
 
 @dataclass(frozen=True)
@@ -168,18 +170,20 @@ def project(observations: Observations, poses: Poses, points: Array) -> tuple[Ar
     return in_rig, in_cam, derivative * observations.weight[:, None, None]
 
 
-def points_in_cameras(observations: Observations, poses: Poses) -> npt.NDArray[np.bool_]:
-    """(p,) whether a point lies in a camera that sees it: what a mapper makes, now and then, of wrong matches of photos
-    from one place.
+def misplaced_points(observations: Observations, poses: Poses) -> npt.NDArray[np.bool_]:
+    """(p,) whether a point lies in or behind a camera that sees it, or far nearer to it than to another: what a mapper
+    makes, now and then, of wrong matches.
 
-    A feature goes by its point's place over the depth. At next to no depth, what such a point says about one photo is
-    so much more than all else that rounding it makes a solver's matrix indefinite in all but timid steps; one of 50 000
-    does.
+    A feature goes by its point's place over the depth. A step of centimetres may turn next to no depth into any: one
+    such point of ten thousand lets a solver take timid steps only, which end anywhere and pass for convergence.
     """
     depth = project(observations, poses, observations.points)[1][:, 2]
-    in_camera: npt.NDArray[np.bool_] = np.zeros(len(observations.points), dtype=np.bool_)
-    in_camera[observations.point[np.abs(depth) < _MIN_DEPTH * np.median(np.abs(depth))]] = True
-    return in_camera
+    farthest = np.zeros(len(observations.points))
+    np.maximum.at(farthest, observations.point, depth)
+    least = np.maximum(_MIN_DEPTH * np.median(np.abs(depth)), farthest[observations.point] / _MAX_DEPTH_RATIO)
+    misplaced: npt.NDArray[np.bool_] = np.zeros(len(observations.points), dtype=np.bool_)
+    misplaced[observations.point[~(depth >= least)]] = True
+    return misplaced
 
 
 def ray_residuals(observations: Observations, in_cam: Array) -> Array:

@@ -31,7 +31,7 @@ from rangesfm.refine.distances import MeasuredDistances, add_marker_points, remo
 from rangesfm.refine.problem import AddedBlocks, RefinementProblem
 from rangesfm.refine.radio import RadioEstimate, RadioRanges
 from rangesfm.refine.unbend import SAME_ERRORS, Unbent, unbend
-from rangesfm.refine.vision_information import model_observations, model_poses, points_in_cameras
+from rangesfm.refine.vision_information import misplaced_points, model_observations, model_poses
 
 # Solutions of the full problem, with the weights of ranges and pixels estimated anew in between.
 _MAX_NUM_ROUNDS = 3
@@ -110,7 +110,7 @@ def refine_with_ranges(
 ) -> tuple[pycolmap.Reconstruction, RefineSummary]:
     """Bundle adjustment of a scaled model with range residuals.
 
-    Points that lie in a camera which sees them take no part.
+    Points that wrong matches put into a camera that sees them, or far nearer to it than to another, take no part.
 
     Args:
         reconstruction: in the metric world; it is copied, not changed.
@@ -186,13 +186,13 @@ def _between_anchors(
 
 
 def _refine(problem: RefinementProblem, errors: RangeErrors) -> RefineSummary:
-    """Unbend the map, then solve the full problem, both without the points that lie in a camera."""
+    """Unbend the map, then solve the full problem, both without the misplaced points."""
     frame_ids = problem.frame_ids
     rays = model_observations(problem.metric, frame_ids)
-    in_camera = points_in_cameras(rays, model_poses(problem.metric, frame_ids))
-    problem = replace(problem, left_out_ids=frozenset(rays.point_ids[in_camera].tolist()))
+    misplaced = misplaced_points(rays, model_poses(problem.metric, frame_ids))
+    problem = replace(problem, left_out_ids=frozenset(rays.point_ids[misplaced].tolist()))
     bundle = problem.of_photos(problem.options.max_num_iterations)
-    start = unbend(problem, rays.with_pixel_stddev(bundle.pixel_stddev), in_camera, errors)
+    start = unbend(problem, rays.with_pixel_stddev(bundle.pixel_stddev), misplaced, errors)
     return _adjust(problem, bundle, start)
 
 
