@@ -22,13 +22,14 @@ class Step:
 
     Attributes:
         is_successful: whether the parameters moved. trust_region_radius: with which the step was found.
-        cost: after it. gain: by how much it fell.
+        cost: after it. gain: by how much it fell. expected_gain: by how much it would have, were all residuals linear.
     """
 
     is_successful: bool
     trust_region_radius: float
     cost: float
     gain: float
+    expected_gain: float
 
 
 def solve(adjuster: pycolmap.CeresBundleAdjuster, is_enough: Callable[[Step], bool]) -> Any:
@@ -53,7 +54,9 @@ def solve(adjuster: pycolmap.CeresBundleAdjuster, is_enough: Callable[[Step], bo
         def __call__(self, summary: Any) -> Any:
             # An exception must not pass through the solver.
             try:
-                step = Step(summary.step_is_successful, self.radius, summary.cost, summary.cost_change)
+                gain, share = summary.cost_change, summary.relative_decrease
+                expected = gain / share if share else 0.0
+                step = Step(summary.step_is_successful, self.radius, summary.cost, gain, expected)
                 self.radius = summary.trust_region_radius
                 if summary.iteration == 0 or not is_enough(step):
                     return pyceres.CallbackReturnType.SOLVER_CONTINUE

@@ -41,7 +41,8 @@ class Solution:
         num_iterations: successful and not. initial_cost, final_cost: half the sum of squares, in pixels.
         seconds: of the solver.
         converged: whether it stopped because nothing was left to gain.
-        is_still: whether the keyframes had come to rest by then, in steps as free as the first.
+        is_still: whether the keyframes had come to rest by then, in steps as free as the first. is_stuck: whether such
+            steps still promise what matters, and none of them can be taken.
         message: the solver's own words.
     """
 
@@ -51,6 +52,7 @@ class Solution:
     seconds: float
     converged: bool
     is_still: bool
+    is_stuck: bool
     message: str
 
 
@@ -151,9 +153,16 @@ def solve(problem: BundleAdjustment, tolerance_m: float) -> Solution:
         seconds=time.monotonic() - start,
         converged=summary.termination_type.name in ("CONVERGENCE", "USER_SUCCESS"),
         is_still=stillness.is_still,
-        message=f"What is left to gain moves nothing that matters ({tolerance_m:.2g} m)."
-        if stillness.is_still
-        else summary.message,
+        is_stuck=stillness.is_stuck,
+        message=_message(stillness, tolerance_m, summary.message),
+    )
+
+
+def _message(stillness: Stillness, tolerance_m: float, of_solver: str) -> str:
+    if stillness.is_still:
+        return f"What is left to gain moves nothing that matters ({tolerance_m:.2g} m)."
+    return (
+        "Some points or the lens allow small steps only, which do not get there." if stillness.is_stuck else of_solver
     )
 
 
@@ -169,16 +178,18 @@ def solve_until_still(
         before: the solution so far. num_left: iterations after which to give up.
 
     Returns:
-        what was done, and whether the keyframes came to rest.
+        what was done, and whether the keyframes came to rest where nothing is left to gain.
     """
     solutions: list[Solution] = []
-    is_still, centers = before.is_still, keyframe_centers(problem.metric)
-    while not is_still and num_left > 0:
+    is_still, is_stuck, centers = before.is_still, False, keyframe_centers(problem.metric)
+    while not (is_still or is_stuck) and num_left > 0:
         _settle_radio(problem)
-        solutions.append(solve(problem, tolerance_m))
-        num_left -= max(solutions[-1].num_iterations, 1)
+        solutions.append(found := solve(problem, tolerance_m))
+        num_left -= max(found.num_iterations, 1)
         last, centers = centers, keyframe_centers(problem.metric)
-        is_still = solutions[-1].is_still or farthest(last, centers) <= tolerance_m
+        is_at_rest = farthest(last, centers) <= tolerance_m
+        is_still = found.is_still or (is_at_rest and not found.is_stuck)
+        is_stuck = is_at_rest and found.is_stuck
     return solutions, is_still
 
 

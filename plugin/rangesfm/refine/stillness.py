@@ -15,6 +15,8 @@ _FREE_TRUST_REGION_RADIUS = 1e8
 # Of half the sum of squares in stddevs: where the optimum is no further below, nothing that the map says is further
 # than 0.05 of its stddev from what it says there.
 _MAX_GAIN_LEFT = 0.5 * 0.05**2
+# Likewise; of what a free step promised, and no step kept.
+_MAX_PROMISE_LEFT = 0.5
 # Relative, of the last step: with more than that, the cost still falls by orders of magnitude.
 _MAX_LAST_GAIN = 1e-4
 # What the steps to come add up to, in the size of the last one: at least and at most.
@@ -32,7 +34,12 @@ class Stillness:
         self.is_still = False
         self._metric, self._residual_stddev, self._tolerance_m = metric, residual_stddev, tolerance_m
         self._centers = keyframe_centers(metric)
-        self._last_m = self._last_gain = 0.0
+        self._last_m = self._last_gain = self._promise = 0.0
+
+    @property
+    def is_stuck(self) -> bool:
+        """Whether a free step would gain what matters if residuals were linear, and smaller ones did not get there."""
+        return self._promise > _MAX_PROMISE_LEFT
 
     def is_over(self, step: ceres.Step) -> bool:
         """Whether to stop: nothing is left to gain, or nothing in steps that the solver dares not make larger.
@@ -41,6 +48,8 @@ class Stillness:
         end. A long path may bend by metres for next to no cost, and a map that little holds may sway by centimetres
         for as little: keyframes are still, or the cost.
         """
+        if step.trust_region_radius >= _FREE_TRUST_REGION_RADIUS:
+            self._promise = step.expected_gain / self._residual_stddev**2
         if not step.is_successful:
             self._last_m = self._last_gain = 0.0
             return False
@@ -48,6 +57,7 @@ class Stillness:
         moved_m, gain = farthest(before, self._centers), step.gain / self._residual_stddev**2
         is_near = _left(moved_m, self._last_m) <= self._tolerance_m or _left(gain, self._last_gain) <= _MAX_GAIN_LEFT
         self._last_m, self._last_gain = moved_m, gain
+        self._promise -= gain
         is_over = is_near and step.gain <= _MAX_LAST_GAIN * step.cost
         self.is_still = is_over and step.trust_region_radius >= _FREE_TRUST_REGION_RADIUS
         return is_over

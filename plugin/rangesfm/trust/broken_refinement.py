@@ -22,6 +22,8 @@ _OF_MEDIANS = 1.5
 _LARGE, _MANY_MORE = 10.0, 0.05
 # Of the median distance of the points from the middle of the path.
 _MAX_POINTS_GROWTH = 2.0
+# Of the median residual of the ranges, or of their stddev: a refinement brings them nearer.
+_MAX_RESIDUAL_GROWTH = 2.0
 # Half widths of the scale's 95 % interval: beyond them it is no longer the same map.
 _MAX_HALF_WIDTHS = 3.0
 
@@ -47,6 +49,7 @@ def why_broken(
         *_out_of_line(before, after, summary, _max_growth(scaled, summary, range_loss_scale)),
         *_points_thrown_away(before.points - old.mean(axis=0), after.points - new.mean(axis=0)),
         *_another_scale(old, new, estimate),
+        *_ranges_lost(estimate, summary),
         *_anchors_gone(summary, old),
     )
 
@@ -102,6 +105,15 @@ def _another_scale(old: Array, new: Array, estimate: ScaleEstimate) -> Iterator[
             f"the refinement changed the scale by {100 * (change - 1):+.1f} %, where it was known to "
             f"{100 * half_width:.1f} % (95 % interval)"
         )
+
+
+def _ranges_lost(estimate: ScaleEstimate, summary: RefineSummary) -> Iterator[str]:
+    if estimate.solution is None:
+        return
+    old_m = float(np.median(np.abs(estimate.solution.fit.residuals_m)))
+    new_m = float(np.nanmedian(np.abs(summary.predicted_m - summary.observations.log.range_m)))
+    if new_m > _MAX_RESIDUAL_GROWTH * max(old_m, estimate.noise_stddev_m):
+        yield f"ranges and map are {new_m:.2g} m apart (median), where they were {old_m:.2g} m"
 
 
 def _anchors_gone(summary: RefineSummary, path_m: Array) -> Iterator[str]:

@@ -97,7 +97,8 @@ def _of_points(points: PointErrors) -> Iterator[Doubt]:
 def _of_solver(summary: RefineSummary) -> Iterator[Doubt]:
     if not summary.converged:
         reason = f"the refinement stopped before it converged: {summary.message}"
-        yield Doubt(reason, "give it more iterations ([refine] max_num_iterations)")
+        remedy = "give it more iterations ([refine] max_num_iterations), or the map fewer wrong points"
+        yield Doubt(reason, remedy)
     for misfit in summary.misfits:
         yield Doubt(f"after the refinement {misfit}", "check clocks, lever arm and anchors")
 

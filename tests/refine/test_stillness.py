@@ -1,0 +1,53 @@
+"""A solver that has come to rest is told from one that cannot take the steps it would need."""
+
+from __future__ import annotations
+
+import pytest
+from tests.simulated.model import SyntheticModel
+
+from rangesfm.ceres import Step
+from rangesfm.refine.stillness import Stillness
+
+FREE, TIMID = 1e10, 1e2
+
+
+def after(chain: SyntheticModel, *steps: Step) -> Stillness:
+    """Of a map that does not move."""
+    stillness = Stillness(chain.reconstruction, residual_stddev=0.5, tolerance_m=1e-3)
+    for step in steps:
+        stillness.is_over(step)
+    return stillness
+
+
+def kept(radius: float, gain: float) -> Step:
+    return Step(True, radius, cost=1e4, gain=gain, expected_gain=gain)
+
+
+def refused(radius: float, expected_gain: float) -> Step:
+    return Step(False, radius, cost=1e12, gain=-1e12, expected_gain=expected_gain)
+
+
+def test_free_steps_that_gain_nothing_are_stillness(chain: SyntheticModel) -> None:
+    found = after(chain, kept(FREE, 1e-6))
+    assert found.is_still
+    assert not found.is_stuck
+
+
+def test_what_free_steps_promise_and_timid_ones_do_not_reach_is_none(chain: SyntheticModel) -> None:
+    found = after(chain, refused(FREE, 250.0), refused(1e6, 250.0), kept(TIMID, 1e-6))
+    assert not found.is_still
+    assert found.is_stuck
+
+
+@pytest.mark.parametrize(("gain", "is_stuck"), [(249.9, False), (249.0, True)])
+def test_smaller_steps_may_get_there(chain: SyntheticModel, gain: float, is_stuck: bool) -> None:
+    """Half a square of a stddev, 0.125 here, may be left."""
+    assert after(chain, refused(FREE, 250.0), kept(TIMID, gain)).is_stuck == is_stuck
+
+
+def test_rounding_in_a_map_without_noise_is_no_promise(chain: SyntheticModel) -> None:
+    assert not after(chain, refused(FREE, 1e-20)).is_stuck
+
+
+def test_a_free_step_that_is_taken_keeps_its_promise(chain: SyntheticModel) -> None:
+    assert not after(chain, refused(FREE, 250.0), kept(FREE, 250.0)).is_stuck
