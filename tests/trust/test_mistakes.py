@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.studies.erring_surveys import SITES, Given, run, surveyed
+from tests.studies.erring_surveys import SITES, Given, Site, run, surveyed
 from tests.studies.mistakes import kinds
 
 from rangesfm.trust.verdict import TrustVerdict
@@ -105,12 +105,16 @@ def test_two_labels_that_were_swapped_are_named() -> None:
     np.testing.assert_array_equal(found.causes[0].correction.anchors_m["E"], anchors["E"])
 
 
-def test_labels_that_are_one_line_off_are_named() -> None:
-    given = surveyed(HALL, SEED)
+@pytest.mark.parametrize("site", [HALL, YARD])
+def test_labels_that_are_one_line_off_are_named(site: Site) -> None:
+    """The lines of the file count, not the alphabet."""
+    given = surveyed(site, SEED)
     at = list(given.anchors_m.values())
     given.anchors_m = dict(zip(given.anchors_m, [*at[1:], at[0]], strict=True))
     given.needs_search = True
-    assert trust(given).causes[0].name == "lines shifted"
+    found = trust(given)
+    assert found.causes[0].name == "lines shifted"
+    assert "in the line after it" in found.reasons[0]
 
 
 def test_long_ranges_and_small_coordinates_are_named_together() -> None:

@@ -42,6 +42,7 @@ class ScaleProblem:
         anchors_are_known: whether the scale can lean on given anchor positions.
         notes: why the map has no place in the site frame, for the user.
         left_out: anchors with too few ranges on the path to be placed.
+        order_given: ids of the anchors as they were given, which is the order of their file.
     """
 
     ranges: RangeProblem
@@ -53,6 +54,7 @@ class ScaleProblem:
     anchors_are_known: bool
     notes: tuple[str, ...]
     left_out: tuple[str, ...]
+    order_given: tuple[str, ...]
 
 
 def scale_problem(
@@ -120,6 +122,7 @@ def scale_problem(
         bool(known.any()),
         tuple(notes),
         left_out,
+        tuple(anchor.anchor_id for anchor in anchors),
     )
 
 

@@ -73,13 +73,14 @@ def labels_swapped(on_map: RangesOnMap) -> Iterator[Alternative]:
 
 def lines_shifted(on_map: RangesOnMap) -> Iterator[Alternative]:
     """The anchors' labels and coordinates, off by a line."""
-    given = _given_m(on_map)
-    for by in (1, -1) if len(given) > 2 else ():
-        at = list(given.values())
+    placed_m = _given_m(on_map)
+    given = [name for name in on_map.order_given if name in placed_m]
+    at = [placed_m[name] for name in given]
+    for by, whose in ((1, "before"), (-1, "after")) if len(given) > 2 else ():
         yield Alternative(
             "lines shifted",
             "",
-            "each anchor has the coordinates of the one in the next line of the anchors' file",
+            f"each anchor has the coordinates of the one in the line {whose} it in the anchors' file",
             "compare the labels on the devices with the anchors' file",
             Correction(anchors_m=dict(zip(given, at[by:] + at[:by], strict=True))),
         )

@@ -26,7 +26,7 @@ class RangesOnMap:
         model_from_cam: (n, 3, 3) into the model's world.
         velocity: (n, 3) of the camera there, model units per second; None where ranges have no times.
         time_s: (n,) on the radio's clock; where the log names photos, the way along the path in metres.
-        tag_index: (n,). tag_ids, anchor_ids: by index.
+        tag_index: (n,). tag_ids, anchor_ids: by index. order_given: of the anchors in their file.
         rows: (n,) of the log.
         weights: (n,) robust weights by which the estimate took them.
         curve_stddev_m: (n,) of a learnt error curve that has been taken off; None if none has.
@@ -41,6 +41,7 @@ class RangesOnMap:
     tag_index: Indices
     tag_ids: tuple[str, ...]
     anchor_ids: tuple[str, ...]
+    order_given: tuple[str, ...]
     rows: Indices
     weights: Array
     curve_stddev_m: Array | None
@@ -78,6 +79,7 @@ def ranges_on_map(
         tag_index=log.tag_index[rows],
         tag_ids=log.tag_ids,
         anchor_ids=log.anchor_ids,
+        order_given=posed.order_given,
         rows=rows,
         weights=solution.fit.weights,
         curve_stddev_m=None if log.shared_stddev_m is None else log.shared_stddev_m[rows],
