@@ -105,6 +105,15 @@ def test_two_labels_that_were_swapped_are_named() -> None:
     np.testing.assert_array_equal(found.causes[0].correction.anchors_m["E"], anchors["E"])
 
 
+@pytest.mark.parametrize("needs_search", [False, True], ids=["placed", "not placed"])
+def test_photos_in_reverse_are_named(needs_search: bool) -> None:
+    """Also where they leave the map no place in the site, and of the anchors only their distances count."""
+    given = surveyed(HALL, 5)
+    given.time_s = given.time_s.min() + given.time_s.max() - given.time_s
+    given.needs_search = needs_search
+    assert [cause.name for cause in trust(given).causes] == ["photos reversed"]
+
+
 @pytest.mark.parametrize("site", [HALL, YARD])
 def test_labels_that_are_one_line_off_are_named(site: Site) -> None:
     """The lines of the file count, not the alphabet."""

@@ -18,7 +18,7 @@ from rangesfm.trust.corrected import corrected
 from rangesfm.trust.hypothesis import Correction
 from rangesfm.trust.ranges_on_map import RangesOnMap
 
-_NUM_PER_ANCHOR, _NUM_EVALUATIONS = 25, 12
+_NUM_PER_ANCHOR, _NUM_EVALUATIONS = 25, 25
 _FOOT_M = 0.3048
 _UNITS_M = {
     "the anchors' coordinates are in feet": _FOOT_M,
