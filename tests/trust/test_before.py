@@ -119,6 +119,7 @@ def test_ranges_that_last_a_fraction_of_the_walk_are_told() -> None:
 def test_keyframes_too_far_apart_for_the_ranges_between_them_are_told_and_one_pause_is_not() -> None:
     assert not list(notes_on_gaps(np.append(np.arange(10.0), 11.5), 2.0))
     assert not list(notes_on_gaps(np.array([3.0]), 2.0))
+    assert not list(notes_on_gaps(np.concatenate([np.arange(10.0), 3600 + np.arange(10.0)]), 2.0))
     (note,) = notes_on_gaps(np.array([0.0, 1.0, 3.1, 5.2, 7.3]), 2.0)
     assert "for 86 % of the time keyframes are more than 2 s apart (in the median 2.1 s)" in note
 

@@ -23,6 +23,8 @@ _MIN_ANCHORS_ALIKE = 3
 _FAR_M, _FAR_SHARE = 300.0, 0.95
 # Of an anchor's ranges that are one and the same value, and of the others': a tag that stands still repeats all.
 _STUCK_SHARE, _MOVING_SHARE, _MIN_RANGES = 0.5, 0.2, 20
+# Of the median gap between photos: between two walks.
+_PAUSE = 30.0
 # Clocks that count seconds since 1970 have passed this.
 _SINCE_1970_S = 1e9
 _LONG_GAP_S = 60.0
@@ -112,13 +114,14 @@ def notes_on_times(radio_s: Array, photos_s: Array) -> Iterator[str]:
 
 
 def notes_on_gaps(photos_s: Array, max_gap_s: float) -> Iterator[str]:
-    """Of keyframes too far apart for the ranges between them.
+    """Of keyframes too far apart for the ranges between them, within a walk.
 
     Args:
         photos_s: times, ascending.
         max_gap_s: farther apart, ranges between two have no place.
     """
-    gaps_s = np.diff(photos_s)
+    gaps_s = np.diff(np.unique(photos_s))
+    gaps_s = gaps_s[gaps_s <= _PAUSE * np.median(gaps_s)] if len(gaps_s) else gaps_s
     if len(gaps_s) and (share := gaps_s[gaps_s > max_gap_s].sum() / gaps_s.sum()) > _MAX_SHARE_BETWEEN_FAR_PHOTOS:
         yield (
             f"for {100 * share:.0f} % of the time keyframes are more than {max_gap_s:g} s apart (in the median "
