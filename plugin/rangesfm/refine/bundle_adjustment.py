@@ -161,9 +161,9 @@ def solve(problem: BundleAdjustment, tolerance_m: float) -> Solution:
 def _message(stillness: Stillness, tolerance_m: float, of_solver: str) -> str:
     if stillness.is_still:
         return f"What is left to gain moves nothing that matters ({tolerance_m:.2g} m)."
-    return (
-        "Some points or the lens allow small steps only, which do not get there." if stillness.is_stuck else of_solver
-    )
+    if stillness.is_stuck:
+        return "Some points or the lens allow small steps only, which do not get there."
+    return of_solver
 
 
 def solve_until_still(
@@ -181,15 +181,16 @@ def solve_until_still(
         what was done, and whether the keyframes came to rest where nothing is left to gain.
     """
     solutions: list[Solution] = []
-    is_still, is_stuck, centers = before.is_still, False, keyframe_centers(problem.metric)
-    while not (is_still or is_stuck) and num_left > 0:
+    is_over = is_still = before.is_still
+    centers = keyframe_centers(problem.metric)
+    while not is_over and num_left > 0:
         _settle_radio(problem)
         solutions.append(found := solve(problem, tolerance_m))
         num_left -= max(found.num_iterations, 1)
         last, centers = centers, keyframe_centers(problem.metric)
         is_at_rest = farthest(last, centers) <= tolerance_m
-        is_still = found.is_still or (is_at_rest and not found.is_stuck)
-        is_stuck = is_at_rest and found.is_stuck
+        is_over = found.is_still or is_at_rest
+        is_still = is_over and (found.is_still or not found.is_stuck)
     return solutions, is_still
 
 

@@ -67,8 +67,7 @@ def unbend(
     outlier. From there a bounded loss, which is that of the scale and of the full problem, sets aside what is one.
 
     Args:
-        rays: all that the photos see, in the problem's frames. misplaced: the points that hold nothing
-            together.
+        rays: all that the photos see, in the problem's frames. misplaced: the points that hold nothing together.
         errors: of the ranges that take part.
     """
     metric, frame_ids, ranges = problem.metric, problem.frame_ids, problem.ranges
