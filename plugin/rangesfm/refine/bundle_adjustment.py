@@ -228,6 +228,8 @@ def _bundle_adjuster(
     # Steps are compared with all parameters, of which points on the horizon may be millions of metres.
     solver.gradient_tolerance = solver.parameter_tolerance = 0.0
     solver.max_num_iterations = max_num_iterations
+    # A turn of the whole world is no straight line to its points: left where a step takes them, they refuse it.
+    solver.use_inner_iterations = True
     solver.num_threads = num_threads
     ba.ceres.solver_options = solver
     ba.ceres.min_num_residuals_for_cpu_multi_threading = _MIN_NUM_RESIDUALS_FOR_THREADS
