@@ -8,7 +8,13 @@ from scipy.sparse import csr_array
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import sequence_path
 
-from rangesfm.ceres.linear_solver import inverse_is_affordable, max_num_images_direct, overlaps_in, overlaps_of
+from rangesfm.ceres.linear_solver import (
+    dense_is_faster,
+    inverse_is_affordable,
+    max_num_images_direct,
+    overlaps_in,
+    overlaps_of,
+)
 from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.refine.bundle_adjustment import bundle_adjustment
@@ -55,6 +61,11 @@ def test_photos_that_see_others_here_and_there_keep_colmaps_limit() -> None:
 
 def test_below_the_limit_nothing_changes() -> None:
     assert max_num_images_direct(each_with_the_next(50, 3), 100) == 100
+
+
+def test_photos_that_all_see_the_same_are_solved_densely_and_those_along_a_path_are_not() -> None:
+    assert dense_is_faster(csr_array(np.ones((100, 100))))
+    assert not dense_is_faster(each_with_the_next(100, 30))
 
 
 def test_the_inverse_is_affordable_along_a_path_but_not_of_photos_that_all_see_the_same() -> None:

@@ -11,6 +11,8 @@ from rangesfm.arrays import Indices
 
 # Of an entry of a sparse factor, in time, against one of a dense factor.
 _SPARSE_SLOWDOWN = 8
+# Of a multiplication, where whole blocks of photos are eliminated at once.
+_BLOCKWISE_SLOWDOWN = 2
 
 
 def max_num_images_direct(overlaps: csr_array, limit: int) -> int:
@@ -28,6 +30,11 @@ def max_num_images_direct(overlaps: csr_array, limit: int) -> int:
     """
     num = overlaps.shape[0]
     return num if num > limit and _cost(_envelope_widths(overlaps)) <= _cost(np.arange(limit)) else limit
+
+
+def dense_is_faster(overlaps: csr_array) -> bool:
+    """Whether photos see so much of what the others see that a sparse factor only costs more; as above."""
+    return _cost(np.arange(overlaps.shape[0])) < _BLOCKWISE_SLOWDOWN * _cost(_envelope_widths(overlaps))
 
 
 def inverse_is_affordable(overlaps: csr_array, limit: int) -> bool:

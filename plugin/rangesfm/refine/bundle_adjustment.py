@@ -12,7 +12,7 @@ import pycolmap
 
 from rangesfm import ceres
 from rangesfm.arrays import Array
-from rangesfm.ceres.linear_solver import max_num_images_direct, overlaps_in
+from rangesfm.ceres.linear_solver import dense_is_faster, max_num_images_direct, overlaps_in
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import SolverError
 from rangesfm.geometry.trajectory import pose_of
@@ -233,9 +233,12 @@ def _bundle_adjuster(
     solver.num_threads = num_threads
     ba.ceres.solver_options = solver
     ba.ceres.min_num_residuals_for_cpu_multi_threading = _MIN_NUM_RESIDUALS_FOR_THREADS
-    limit = ba.ceres.max_num_images_direct_sparse_cpu_solver
-    if metric.num_reg_images() > limit:
-        ba.ceres.max_num_images_direct_sparse_cpu_solver = max_num_images_direct(overlaps_in(metric), limit)
+    num = metric.num_reg_images()
+    if num > ba.ceres.max_num_images_direct_dense_cpu_solver:
+        overlaps, limit = overlaps_in(metric), ba.ceres.max_num_images_direct_sparse_cpu_solver
+        ba.ceres.max_num_images_direct_sparse_cpu_solver = limit = max_num_images_direct(overlaps, limit)
+        if num <= limit and dense_is_faster(overlaps):
+            ba.ceres.max_num_images_direct_dense_cpu_solver = num
     apply_options(ba, options.bundle_adjustment, "refine.bundle_adjustment")
 
     config = pycolmap.BundleAdjustmentConfig()
