@@ -28,8 +28,6 @@ from rangesfm.refine.vision_information import Poses, VisionInformation
 _MAX_NUM_STEPS = 60
 _INITIAL_DAMPING = 1e-8
 _MAX_DAMPING = 1e6
-# Of the largest slope: with slopes that have changed by less, a step is as good.
-_SAME_SLOPES = 0.01
 # For the number of parameters that the ranges determine: random vectors to estimate a trace with.
 _NUM_PROBES = 12
 # Columns that a range depends on: two poses, an anchor, its bias.
@@ -118,7 +116,7 @@ def solve_graph(graph: KeyframeGraph, start: GraphState, *, tolerance_m: float) 
         step_count += 1
         step = _factor(terms.hessian, layout, damping).solve(-terms.gradient[layout.free])
         trial = _moved(state, layout, step)
-        trial_terms = _Terms.at(graph, layout, trial, near=terms)
+        trial_terms = _Terms.at(graph, layout, trial)
         if not trial_terms.cost < terms.cost:
             damping *= 10
             continue
@@ -210,29 +208,22 @@ class _Terms:
 
     Attributes:
         whitened: (k, columns) derivative of the ranges' residuals, robust weights included.
-        slopes: derivative of the relative poses. of_vision: the photos' part of the Hessian.
     """
 
     cost: float
     gradient: Array
     hessian: sparse.csc_array
     whitened: sparse.csr_array
-    slopes: sparse.bsr_array
-    of_vision: sparse.csr_array
 
     @classmethod
-    def at(cls, graph: KeyframeGraph, layout: _Layout, state: GraphState, near: _Terms | None = None) -> _Terms:
-        """``near``: of another state, whose costly part of the Hessian serves again where it is near indeed."""
-        residuals, slopes = _relative_poses(graph.vision, state.poses)
+    def at(cls, graph: KeyframeGraph, layout: _Layout, state: GraphState) -> _Terms:
+        residuals, jacobian = _relative_poses(graph.vision, state.poses)
         bound = graph.vision.matrix @ residuals
         cost = 0.5 * float(residuals @ bound)
         gradient = np.zeros(layout.num)
-        gradient[: layout.first_anchor] = slopes.T @ bound
-        if near is not None and _are_alike(slopes, near.slopes):
-            slopes, of_vision = near.slopes, near.of_vision
-        else:
-            of_vision = (slopes.T @ (graph.vision.matrix @ slopes)).tocsr()
-            of_vision.resize(layout.num, layout.num)
+        gradient[: layout.first_anchor] = jacobian.T @ bound
+        hessian = (jacobian.T @ (graph.vision.matrix @ jacobian)).tocsr()
+        hessian.resize(layout.num, layout.num)
 
         scaled, derivative = _range_rows(graph, layout, state)
         rho, weights, _ = graph.errors.weight * graph.errors.loss.rho(scaled**2)
@@ -243,13 +234,8 @@ class _Terms:
         off, prior = _prior_rows(graph, layout, state)
         cost += 0.5 * float(off @ off)
         gradient = gradient + prior.T @ off
-        hessian = of_vision + layout.squares(derivative) + prior.T @ prior
-        # Symmetric: its transpose has it by columns.
-        return cls(cost, gradient, hessian.T, derivative, slopes, of_vision)
-
-
-def _are_alike(slopes: sparse.bsr_array, before: sparse.bsr_array) -> bool:
-    return bool(np.abs(slopes.data - before.data).max() < _SAME_SLOPES * np.abs(before.data).max())
+        hessian = hessian + layout.squares(derivative) + prior.T @ prior
+        return cls(cost, gradient, hessian.T, derivative)  # symmetric: its transpose has it by columns
 
 
 def _relative_poses(vision: VisionInformation, poses: Poses) -> tuple[Array, sparse.bsr_array]:

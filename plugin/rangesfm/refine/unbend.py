@@ -33,7 +33,7 @@ _MAX_NUM_ROUNDS = 12
 SAME_ERRORS = 0.05
 # Of the ranges' stddev. A turn of the whole world by centimetres takes the full problem, of which all points have to
 # follow it, tens of iterations; here it takes one step.
-_TOLERANCE = 0.01
+_TOLERANCE = 0.001
 # Likewise. The same goes for a part of the map that turns about a weak link.
 _MIN_BEND = 0.05
 
