@@ -8,7 +8,7 @@ import numpy as np
 
 from rangesfm.arrays import Indices
 from rangesfm.trust.linearized import Linearized, near_m
-from rangesfm.trust.table import MistakeTest
+from rangesfm.trust.testing import MistakeTest
 
 # Real radios show 0.03 to 0.15 m beside outliers, old ones 0.2 m: of a stddev beyond that something else is the cause.
 _MOST_NOISE_M, _MOST_LASTING_M = 0.25, 0.25
@@ -28,34 +28,27 @@ OF_SINGLE_RANGES = ("range noise", "anchor's outliers", MIXED_UP)
 def evidence(problem: Linearized) -> Iterator[MistakeTest]:
     """Of the noise as learnt beside the likeliest mistake, and of each anchor's ranges."""
     far = _NOISE_BY_DISTANCE * float(problem.gradient.distance_m.mean())
-    yield _noise("range noise", problem.scatter_m, _MOST_NOISE_M + far, "scatter")
-    yield _noise("lasting errors", _lasting_m(problem), _MOST_LASTING_M + far, "err for seconds")
+    for kind, what, stddev_m, most_m in (
+        ("range noise", "scatter", problem.scatter_m, _MOST_NOISE_M + far),
+        ("lasting errors", "err for seconds", _lasting_m(problem), _MOST_LASTING_M + far),
+    ):
+        words = f"the ranges {what} by {stddev_m:.2f} m, which no radio does in the open ({most_m:.2f} m at most)"
+        yield _seen(kind, "", stddev_m, most_m, words, _FEW_OBSTRUCTED, unit="m")
     on_map, cells = problem.on_map, problem.cells
     index = on_map.problem.anchor_index
-    for k in np.unique(index):
+    for k in np.unique(index).tolist():
         is_of, name = index == k, on_map.anchor_ids[k]
         unused = float(np.mean(on_map.weights[is_of] < 0.1))
-        num = np.count_nonzero(is_of)
-        yield _share(
-            "anchor hardly used",
-            name,
-            unused,
-            1 - _LEAST_USED,
-            f"only {round((1 - unused) * num)} of {num} ranges to anchor {name} fit the map",
-            "look whether it is the anchor that it is taken for, and where it stands",
-        )
-        is_outlying = is_of & (cells.weight < 0.5)
-        if np.count_nonzero(is_outlying) >= _MIN_NUM_OUTLYING and len(on_map.anchor_ids) > 1:
-            yield _mixed_up(problem, int(k), np.flatnonzero(is_outlying))
-        outlying = float(np.count_nonzero(is_outlying) / num)
-        yield _share(
-            "anchor's outliers",
-            name,
-            outlying,
-            _MOST_OUTLYING,
-            f"{100 * outlying:.0f} % of the ranges to anchor {name} are far from those right before and after",
-            _FEW_OBSTRUCTED,
-        )
+        num = int(np.count_nonzero(is_of))
+        words = f"only {round((1 - unused) * num)} of {num} ranges to anchor {name} fit the map"
+        remedy = "look whether it is the anchor that it is taken for, and where it stands"
+        yield _seen("anchor hardly used", name, unused, 1 - _LEAST_USED, words, remedy)
+        rows = np.flatnonzero(is_of & (cells.weight < 0.5))
+        if len(rows) >= _MIN_NUM_OUTLYING and len(on_map.anchor_ids) > 1:
+            yield _mixed_up(problem, k, rows)
+        outlying = len(rows) / num
+        words = f"{100 * outlying:.0f} % of the ranges to anchor {name} are far from those right before and after"
+        yield _seen("anchor's outliers", name, outlying, _MOST_OUTLYING, words, _FEW_OBSTRUCTED)
 
 
 def _mixed_up(problem: Linearized, anchor: int, outlying: Indices) -> MistakeTest:
@@ -72,7 +65,7 @@ def _mixed_up(problem: Linearized, anchor: int, outlying: Indices) -> MistakeTes
         f"are as long as those to {other}"
     )
     remedy = f"see whether two devices bear the label {name}, and leave it out (use_anchors)"
-    return _share(MIXED_UP, name, float(fitting.max()), _MOST_OF_OTHER, words, remedy)
+    return _seen(MIXED_UP, name, float(fitting.max()), _MOST_OF_OTHER, words, remedy)
 
 
 def _lasting_m(problem: Linearized) -> float:
@@ -82,10 +75,7 @@ def _lasting_m(problem: Linearized) -> float:
     return float(np.sqrt(variances / len(problem.cells)))
 
 
-def _noise(name: str, stddev_m: float, most_m: float, what: str) -> MistakeTest:
-    words = f"the ranges {what} by {stddev_m:.2f} m, which no radio does in the open ({most_m:.2f} m at most)"
-    return MistakeTest(name, "", stddev_m, most_m, stddev_m, None, "m", most_m, None, None, words, _FEW_OBSTRUCTED)
-
-
-def _share(name: str, subject: str, share: float, most: float, words: str, remedy: str) -> MistakeTest:
-    return MistakeTest(name, subject, share, most, share, None, "1", most, None, None, words, remedy)
+def _seen(
+    name: str, subject: str, found: float, most: float, words: str, remedy: str, *, unit: str = "1"
+) -> MistakeTest:
+    return MistakeTest(name, subject, found, most, words, remedy, unit, size=found, smallest_detectable=most)

@@ -77,6 +77,12 @@ class Linearized:
     def num_priors(self) -> int:
         return len(self.prior_residual)
 
+    @property
+    def heard(self) -> list[int]:
+        """The anchors that there are ranges to."""
+        anchors: list[int] = np.unique(self.cells.anchor_index).tolist()
+        return anchors
+
     def with_learnt_errors(self, columns: Array, priors: Array) -> Linearized:
         """With what is left random when (c, k) columns and (r, k) priors explain what they can."""
         # At the place where nothing speaks against what is known beforehand.

@@ -13,8 +13,7 @@ from rangesfm.trust.evidence import MIXED_UP, OF_SINGLE_RANGES, evidence
 from rangesfm.trust.linearized import linearized
 from rangesfm.trust.mistakes import Cause, Findings, find_mistakes
 from rangesfm.trust.ranges_on_map import RangesOnMap
-from rangesfm.trust.table import MistakeTest, finite
-from rangesfm.trust.testing import Test
+from rangesfm.trust.testing import MistakeTest, Test, row_of
 
 
 @dataclass(frozen=True)
@@ -45,11 +44,13 @@ def trust_in(on_map: RangesOnMap, *, seed: int = 0) -> TrustVerdict:
     shown = list(evidence(found.problem))
     before = _before_causes(found, shown)
     after = [row for row in shown if row not in before]
-    rows = [*before, *_of_causes(found), *(row_of(test) for test in _others(found)), *after]
-    reasons = [_reason(row) for row in before]
-    reasons += [*([sentence(found.causes)] if found.causes else []), *(_reason(row) for row in after if row.rejected)]
-    reasons = reasons or list(_what_could_hide(found))
-    return TrustVerdict(tuple(rows), tuple(reasons), found.causes, on_map.rows)
+    named = {(cause.name, cause.subject) for cause in found.causes}
+    others = (row_of(test) for test in found.tests if test.hypothesis.key not in named)
+    rows = (*before, *map(_row_of_cause, found.causes), *others, *after)
+    reasons = [f"{row.words}: {row.remedy}" for row in (*before, *(row for row in after if row.rejected))]
+    if found.causes:
+        reasons.insert(len(before), sentence(found.causes))
+    return TrustVerdict(rows, tuple(reasons or _what_could_hide(found)), found.causes, on_map.rows)
 
 
 def _before_causes(found: Findings, shown: Sequence[MistakeTest]) -> list[MistakeTest]:
@@ -98,44 +99,8 @@ def _hidden_effect(test: Test) -> float:
     return test.effect_on_log_scale * min(1.0, test.hypothesis.unawares / test.smallest_detectable)
 
 
-def _reason(row: MistakeTest) -> str:
-    return f"{row.words}: {row.remedy}"
-
-
-def _others(found: Findings) -> list[Test]:
-    named = {(cause.name, cause.subject) for cause in found.causes}
-    return [test for test in found.tests if test.hypothesis.key not in named]
-
-
-def _of_causes(found: Findings) -> list[MistakeTest]:
-    """With the statistic by which they were found: how much likelier they make the ranges."""
-    rows = []
-    for cause in found.causes:
-        if cause.test is None:
-            rows.append(
-                MistakeTest(
-                    cause.name, cause.subject, cause.gain, cause.penalty, None, None, "", None, None, None,
-                    cause.words, cause.remedy,
-                )
-            )  # fmt: skip
-            continue
-        rows.append(row_of(cause.test, max(cause.test.statistic, cause.gain), cause.words))
-    return rows
-
-
-def row_of(test: Test, statistic: float | None = None, words: str | None = None) -> MistakeTest:
-    one = len(test.sizes) == 1
-    return MistakeTest(
-        name=test.hypothesis.name,
-        subject=test.hypothesis.subject,
-        statistic=test.statistic if statistic is None else statistic,
-        threshold=test.threshold if np.isfinite(test.threshold) else 0.0,
-        size=finite(float(test.sizes[0] if one else np.linalg.norm(test.sizes))),
-        stddev=finite(float(test.stddevs[0] if one else np.linalg.norm(test.stddevs))),
-        unit=test.hypothesis.unit,
-        smallest_detectable=finite(test.smallest_detectable),
-        effect_on_scale=finite(test.effect_on_log_scale),
-        effect_on_place_m=finite(test.effect_on_place_m),
-        words=test.hypothesis.words(test.sizes) if words is None else words,
-        remedy=test.hypothesis.remedy,
-    )
+def _row_of_cause(cause: Cause) -> MistakeTest:
+    """With the statistic by which it was found: how much likelier it makes the ranges."""
+    if cause.test is None:
+        return MistakeTest(cause.name, cause.subject, cause.gain, cause.penalty, cause.words, cause.remedy)
+    return row_of(cause.test, max(cause.test.statistic, cause.gain), cause.words)
