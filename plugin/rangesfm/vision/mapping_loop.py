@@ -18,6 +18,8 @@ from typing import Any, Protocol
 
 import pycolmap
 
+from rangesfm.vision.snapshots import write_snapshot
+
 
 class GlobalAdjustment(Protocol):
     """A global bundle adjustment in place of COLMAP's."""
@@ -191,7 +193,7 @@ class _MappingLoop:
                     model.extract_colors_for_image(image_id, options.image_path)
                 if 0 < options.snapshot_frames_freq <= model.num_reg_frames() - num_in_snapshot:
                     num_in_snapshot = model.num_reg_frames()
-                    _write_snapshot(model, Path(options.snapshot_path))
+                    write_snapshot(model, Path(options.snapshot_path))
                 self.pipeline.callback(pycolmap.IncrementalPipelineCallback.NEXT_IMAGE_REG_CALLBACK)
             has_failed = image_id is None
         if model.num_reg_frames() != adjusted[0] and model.num_points3D() != adjusted[1]:
@@ -242,10 +244,3 @@ class _MappingLoop:
             if num_changed < options.ba_global_max_refinement_change * num_observations:
                 break
         mapper.filter_frames(self.mapper_options)
-
-
-def _write_snapshot(model: pycolmap.Reconstruction, path: Path) -> None:
-    """Under the time in milliseconds, as COLMAP does."""
-    folder = path / f"{time.time_ns() // 1_000_000:010d}"
-    folder.mkdir()
-    model.write_binary(folder)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import pycolmap
@@ -17,13 +17,10 @@ from rangesfm.progress import Progress
 from rangesfm.vision.camera import PhotoCameras, cameras_of_photos, check_camera
 from rangesfm.vision.features import extract_features, feature_options
 from rangesfm.vision.given_database import GivenDatabase, opened
-from rangesfm.vision.mapping import remove_models
-from rangesfm.vision.masks import contents_of_masks
 from rangesfm.vision.matching import MatchingOptions, match_features, matching_options, verify_matches
-from rangesfm.vision.photos import Photos, usable_photos
+from rangesfm.vision.photos import Photos, contents_of_masks, usable_photos
 from rangesfm.vision.renewed_database import RenewedDatabase, forget_database
 from rangesfm.vision.rigs import Rigs
-from rangesfm.vision.snapshots import remove_snapshots
 from rangesfm.vision.steps import Steps, fingerprint
 
 
@@ -56,8 +53,8 @@ class Workspace:
 
     def remove_old_models(self) -> None:
         self._before_change()
-        remove_models(self.models)
-        remove_snapshots(self.snapshots)
+        for folder in (self.models, self.snapshots):
+            shutil.rmtree(folder, ignore_errors=True)
 
     @contextmanager
     def logged(self) -> Iterator[None]:
@@ -67,19 +64,6 @@ class Workspace:
                 yield
             except ReconstructionError as error:
                 raise ReconstructionError(f"{error} (COLMAP's log: {self.log})") from error
-
-
-@dataclass(frozen=True)
-class MatchedPhotos:
-    """Photos with their matches in a database.
-
-    Attributes:
-        photos: in the order of their ids 1, 2, ...
-        inputs: fingerprint of the matches.
-    """
-
-    photos: Photos
-    inputs: str
 
 
 def match_photos(
@@ -92,8 +76,11 @@ def match_photos(
     space: Workspace,
     *,
     restart: bool,
-) -> MatchedPhotos:
-    """Features and matches of photos; arguments and errors as of ``reconstruct``."""
+) -> tuple[Photos, str]:
+    """Features and matches of photos, returned by their ids 1, 2, ..., with the matches' fingerprint.
+
+    Arguments and errors as of ``reconstruct``.
+    """
     check_camera(camera)
     for_features = feature_options(mapper)
     for_matching = matching_options(mapper, len(image_names), seed)
@@ -101,14 +88,21 @@ def match_photos(
     cameras = cameras_of_photos(camera, photos, rigs)
     masks = contents_of_masks(mapper.mask_path, photos)
     space.begin(restart=restart)
-    _say_left_out(photos, space.progress)
+    if photos.left_out:
+        name, reason = next(iter(photos.left_out.items()))
+        num, num_all = len(photos.left_out), len(photos.left_out) + len(photos.names)
+        space.progress.message(f"{num} of {num_all} photos are left out; the first, {name}, {reason}")
     with opened(mapper.database_path, photos, space.output) as given:
         if given is not None:
             space.progress.message(given.note)
             photos = given.photos
             is_open = all(table.model is None for table in camera.tables)
             cameras = given.cameras() if is_open else cameras_of_photos(camera, photos, rigs)
-        _say_guessed(cameras, space.progress)
+        if cameras.guessed:
+            space.progress.message(
+                f"the camera's parameters are of photos of another shape than {cameras.guessed[0]}: COLMAP guesses its"
+                f" camera ({len(cameras.guessed)} of {len(cameras.cameras)} cameras)"
+            )
         return _match(photos, cameras, rigs, given, masks, mapper, for_features, for_matching, space)
 
 
@@ -122,7 +116,7 @@ def _match(
     for_features: pycolmap.FeatureExtractionOptions,
     for_matching: MatchingOptions,
     space: Workspace,
-) -> MatchedPhotos:
+) -> tuple[Photos, str]:
     steps, progress, database = space.steps, space.progress, space.database
     has_matches = given is not None and given.num_pairs > 0
 
@@ -161,19 +155,4 @@ def _match(
         )
         inputs = fingerprint(inputs, of_matches)
         steps.run("matching", inputs, database, prepare_matching, match)
-    return MatchedPhotos(photos, inputs)
-
-
-def _say_left_out(photos: Photos, progress: Progress) -> None:
-    if photos.left_out:
-        name, reason = next(iter(photos.left_out.items()))
-        num = len(photos.left_out)
-        progress.message(f"{num} of {num + len(photos.names)} photos are left out; the first, {name}, {reason}")
-
-
-def _say_guessed(cameras: PhotoCameras, progress: Progress) -> None:
-    if cameras.guessed:
-        progress.message(
-            f"the camera's parameters are of photos of another shape than {cameras.guessed[0]}: COLMAP guesses its"
-            f" camera ({len(cameras.guessed)} of {len(cameras.cameras)} cameras)"
-        )
+    return photos, inputs

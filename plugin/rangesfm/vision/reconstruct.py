@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import pycolmap
 
+from rangesfm.errors import InputError, ReconstructionError
+from rangesfm.files.atomic import scratch_folder
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import Progress, SilentProgress
-from rangesfm.vision.mapping import hold_cameras, map_photos, pipeline_options, read_models
+from rangesfm.vision.mapping import PipelineOptions, hold_what_is_known, map_photos, pipeline_options, read_models
 from rangesfm.vision.mapping_loop import GlobalAdjustment
 from rangesfm.vision.matched_photos import Workspace, match_photos
-from rangesfm.vision.rig_places import hold_rigs, place_cameras
+from rangesfm.vision.photos import Photos
 from rangesfm.vision.rigs import NO_RIGS, Rigs
 from rangesfm.vision.steps import fingerprint
 
@@ -78,9 +81,9 @@ def reconstruct(
     progress = progress or SilentProgress()
     space = Workspace(Path(output_path), progress, before_change)
     options = pipeline_options(camera, mapper, seed)
-    matched = match_photos(Path(image_path), image_names, camera, mapper, rigs, seed, space, restart=restart)
+    photos, of_matches = match_photos(Path(image_path), image_names, camera, mapper, rigs, seed, space, restart=restart)
     refines = [table.mapping_refines_intrinsics for table in camera.tables]
-    inputs = [matched.inputs, mapper.method, mapper.pipeline, *refines]
+    inputs = [of_matches, mapper.method, mapper.pipeline, *refines]
     if adjustment is not None:
         inputs.append(adjustment.inputs)
     with space.logged():
@@ -90,27 +93,50 @@ def reconstruct(
                 fingerprint(*inputs),
                 space.database,
                 lambda: rigs.apply(space.database),
-                lambda: place_cameras(matched.photos, rigs, pipeline_options(camera, mapper, seed), space),
+                lambda: _place_cameras(photos, rigs, pipeline_options(camera, mapper, seed), space),
             )
-        hold_cameras(options, camera, space.database)
-        if "ba_refine_sensor_from_rig" not in mapper.pipeline:
-            hold_rigs(options, rigs, space.database)
+        hold_what_is_known(options, camera, mapper, rigs, space.database)
         space.steps.run(
             "mapping",
             fingerprint(*inputs),
             space.models / "0",
             space.remove_old_models,
             lambda: map_photos(
-                space.database, matched.photos, space.models, space.snapshots, options, space.log, progress, adjustment
+                space.database, photos, space.models, space.snapshots, options, space.log, progress, adjustment
             ),
             unfinished=space.snapshots,
         )
     found = read_models(space.models)
-    _say_separate(found, progress)
+    if len(found) > 1:
+        sizes = ", ".join(str(model.num_reg_images()) for model in found)
+        progress.message(f"{len(found)} separate models of {sizes} photos")
     return ReconstructionSummary(found, len(image_names), found[0].num_reg_images(), space.steps.seconds, space.log)
 
 
-def _say_separate(models: tuple[pycolmap.Reconstruction, ...], progress: Progress) -> None:
-    if len(models) > 1:
-        sizes = ", ".join(str(model.num_reg_images()) for model in models)
-        progress.message(f"{len(models)} separate models of {sizes} photos")
+def _place_cameras(photos: Photos, rigs: Rigs, options: PipelineOptions, space: Workspace) -> None:
+    """Map the photos as if there were no rigs, and enter in the database where their cameras sit in that model.
+
+    Places that are known say what its unit is, so that all go together.
+
+    Raises:
+        ReconstructionError: there is no model, or a camera of a rig is not in it together with its reference camera.
+    """
+    with scratch_folder(space.output / "rigs") as folder:
+        database_path = Path(shutil.copyfile(space.database, folder / "database.db"))
+        with pycolmap.Database.open(database_path) as database:
+            pycolmap.apply_rig_config([], database)
+        models = folder / "sparse"
+        map_photos(database_path, photos, models, folder / "snapshots", options, space.log, space.progress)
+        model = read_models(models)[0]
+    rigs.rescale(model)
+    why_not = (
+        "without the rig no photos of its cameras that were taken at once come into one model: say in"
+        f" {rigs.path} where they sit (cam_from_rig)"
+    )
+    try:
+        rigs.apply(space.database, model)
+    except InputError as error:  # there are frames of which it has no other camera's photo
+        raise ReconstructionError(why_not) from error
+    with pycolmap.Database.open(space.database) as database:
+        if any(pose is None for rig in database.read_all_rigs() for pose in rig.non_ref_sensors.values()):
+            raise ReconstructionError(why_not)

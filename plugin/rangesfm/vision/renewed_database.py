@@ -14,17 +14,18 @@ from rangesfm.progress import Progress
 from rangesfm.vision.camera import PhotoCameras
 from rangesfm.vision.database import (
     clear_matches,
+    copy_features,
     copy_matches,
+    copying,
     create_database,
+    name_photos,
     remove_database,
-    restore_names,
     write_positions,
 )
-from rangesfm.vision.exif import exif_position
 from rangesfm.vision.given_database import GivenDatabase
 from rangesfm.vision.matching import MatchingOptions
 from rangesfm.vision.pairs import pairs_to_match
-from rangesfm.vision.photos import Photos
+from rangesfm.vision.photos import Photos, exif_position
 from rangesfm.vision.rigs import Rigs
 from rangesfm.vision.steps import Steps
 
@@ -68,14 +69,15 @@ class RenewedDatabase:
             self._create(fresh)
             if self.given is not None:
                 self.given.copy_to(fresh)
-            elif num_taken := self._taken_over(earlier, fresh):
+            elif num_taken := self._take_over(earlier, fresh):
                 progress.message(f"features: those of {num_taken} photos are taken over from an earlier run")
             remove_database(self.path)  # also what SQLite keeps beside it, which would be taken for the new one's
         self._write_note()
 
     def begin_matching(self) -> None:
         """Forget the matches, unless they were made with the same options."""
-        restore_names(self.path, self.photos.names)
+        # In the place of those under which a process that was killed may have been matching.
+        name_photos(self.path, self.photos.names)
         if self.steps.notes.get(_NOTE, {}).get("matches") != self.match_inputs:
             clear_matches(self.path)
         self._write_note()
@@ -85,20 +87,18 @@ class RenewedDatabase:
         self.rigs.apply(path)
         write_positions(path, (exif_position(self.photos.folder / name) for name in self.photos.names))
 
-    def _taken_over(self, earlier: Mapping[str, Any], fresh: Path) -> int:
-        try:
-            return self._take_over(earlier, fresh)
-        except RuntimeError:  # somebody has damaged the earlier one
-            self._create(fresh)
-            return 0
-
     def _take_over(self, earlier: Mapping[str, Any], fresh: Path) -> int:
+        """Returns of how many photos there were features."""
         ids = self._earlier_ids(earlier)
         if not ids or not self.path.exists():
             return 0
-        same_matches = self.matching.is_by_place and earlier.get("matches") == self.match_inputs
-        pairs = pairs_to_match(fresh, self.photos, self.matching.pairing) if same_matches else []
-        return _copy(self.path, fresh, ids, pairs)
+        try:
+            same_matches = self.matching.is_by_place and earlier.get("matches") == self.match_inputs
+            pairs = pairs_to_match(fresh, self.photos, self.matching.pairing) if same_matches else []
+            return _copy(self.path, fresh, ids, pairs)
+        except RuntimeError:  # somebody has damaged the earlier one
+            self._create(fresh)
+            return 0
 
     def _earlier_ids(self, earlier: Mapping[str, Any]) -> dict[int, int]:
         """Id in the earlier database of each photo that has not changed, by its new one."""
@@ -126,15 +126,9 @@ def _copy(earlier: Path, new: Path, earlier_ids: Mapping[int, int], pairs: Itera
         pairs: of new ids, smaller first, whose matches are wanted; not those of photos that stood in the other order,
             as COLMAP does not match two photos as it would the other way round.
     """
-    with (
-        pycolmap.Database.open(earlier) as source,
-        pycolmap.Database.open(new) as target,
-        pycolmap.DatabaseTransaction(target),
-    ):
+    with copying(earlier, new) as (source, target):
         taken = {new_id: old_id for new_id, old_id in earlier_ids.items() if _has_features(source, old_id)}
-        for new_id, old_id in taken.items():
-            target.write_keypoints(new_id, source.read_keypoints(old_id))
-            target.write_descriptors(new_id, source.read_descriptors(old_id))
+        copy_features(source, target, {old_id: new_id for new_id, old_id in taken.items()})
     of_pairs = (((taken.get(first, 0), taken.get(second, 0)), (first, second)) for first, second in pairs)
     copy_matches(earlier, new, ((old, pair) for old, pair in of_pairs if 0 < old[0] < old[1]))
     return len(taken)

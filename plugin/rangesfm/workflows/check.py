@@ -21,9 +21,8 @@ from rangesfm.vision.camera import cameras_of_photos, check_camera
 from rangesfm.vision.features import feature_options
 from rangesfm.vision.given_database import opened
 from rangesfm.vision.image_times import ImageTimes, list_images
-from rangesfm.vision.masks import contents_of_masks
 from rangesfm.vision.matching import matching_options
-from rangesfm.vision.photos import Photos, usable_photos
+from rangesfm.vision.photos import Photos, contents_of_masks, usable_photos
 from rangesfm.vision.rigs import read_rigs
 from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.photos import checked_keyframes, read_inputs, read_registered
