@@ -37,7 +37,8 @@ class Journal:
         """By stage, and in total."""
         return {**self.seconds, "total": time.monotonic() - self.start}
 
-    def warn(self, text: str) -> None:
-        """A line for the user, kept for ``result.json``."""
-        self.warnings.append(text)
-        self.progress.message(text)
+    def warn(self, *texts: str) -> None:
+        """Lines for the user, kept for ``result.json``."""
+        for text in texts:
+            self.warnings.append(text)
+            self.progress.message(text)

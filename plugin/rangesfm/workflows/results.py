@@ -52,8 +52,7 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
         metric = metric.moved(inputs.site.offset_m)
     distances = _distances(metric)
     disagreeing = tuple(disagreements(distances, metric.estimate.uncertainty.empirical, BENDING))
-    for note in disagreeing:
-        journal.warn(note)
+    journal.warn(*disagreeing)
     metric = metric.doubted(disagreeing)
     folder = survey.output.path
     with replacing_result(folder):

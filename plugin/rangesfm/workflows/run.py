@@ -39,7 +39,6 @@ from rangesfm.workflows.photos import (
     checked_keyframes,
     find_keyframes,
     map_keyframes,
-    noted,
     read_inputs,
     read_registered,
     tell_of_times,
@@ -99,7 +98,8 @@ def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResul
     with sole_writer(survey.output.path):
         survey = with_photos_in_folder(survey, journal)
         if inputs.log.image_name is None:
-            times = noted(times_of_model(survey, sfm, survey.given_model_path), journal)
+            times = times_of_model(survey, sfm, survey.given_model_path)
+            journal.warn(*times.notes)
             tell_of_times(survey, inputs, times, journal)
         inputs = with_tags(survey, inputs, sorted(image.name for image in sfm.images.values()), journal)
         return to_metric(survey, inputs, [sfm], times, journal, refine=refine)
