@@ -15,7 +15,7 @@ from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.scale.range_equation import RangeProblem, RangeState, predicted_ranges, solve
 from rangesfm.scale.starts import spread_rows
 from rangesfm.trust.hypothesis import Correction, corrected
-from rangesfm.trust.ranges_on_map import RangesOnMap
+from rangesfm.trust.linearized import RangesOnMap
 
 _NUM_PER_ANCHOR, _NUM_EVALUATIONS = 25, 25
 _FOOT_M = 0.3048

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rangesfm.arrays import Array, Mask
-from rangesfm.trust.linearized import Linearized
-from rangesfm.trust.ranges_on_map import RangesOnMap
+from rangesfm.trust.linearized import Linearized, RangesOnMap
 
 # In the unit of a hypothesis: for a slope between two of its sizes.
 _SMALL = 1e-4

@@ -11,8 +11,7 @@ from rangesfm.scale.range_equation import RangeState, state_after
 from rangesfm.trust.alternatives import Alternative, Refits, alternatives
 from rangesfm.trust.catalogue import STANDING
 from rangesfm.trust.hypothesis import Correction, Effect, Hypothesis, corrected, of_cells
-from rangesfm.trust.linearized import Linearized, at_state, linearized
-from rangesfm.trust.ranges_on_map import RangesOnMap
+from rangesfm.trust.linearized import Linearized, RangesOnMap, at_state, linearized
 from rangesfm.trust.scanning import SCANNING
 from rangesfm.trust.testing import Factorization, Test, overlap
 

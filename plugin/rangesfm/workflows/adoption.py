@@ -9,12 +9,12 @@ import numpy as np
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError
 from rangesfm.join.models import PathOfModel
+from rangesfm.progress import Journal
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.trust.hypothesis import Correction
-from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.metric_map import ranges_on_path, scale_by_survey
 
 

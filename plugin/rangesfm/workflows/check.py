@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from rangesfm.errors import RangesfmError
-from rangesfm.progress import SilentProgress
+from rangesfm.progress import Journal, SilentProgress
 from rangesfm.ranging.log import RangeKind
 from rangesfm.sources.source import is_source, open_source
 from rangesfm.survey.inputs import RangingInputs, times_of_model
@@ -24,7 +24,6 @@ from rangesfm.vision.image_times import ImageTimes, list_images
 from rangesfm.vision.matching import matching_options
 from rangesfm.vision.photos import Photos, contents_of_masks, usable_photos
 from rangesfm.vision.rigs import read_rigs
-from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.photos import checked_keyframes, read_inputs, read_registered
 
 # More than these nobody reads.

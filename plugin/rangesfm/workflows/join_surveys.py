@@ -18,7 +18,7 @@ from rangesfm.files.atomic import sole_writer
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.join.models import PathOfModel
-from rangesfm.progress import Progress
+from rangesfm.progress import Journal, Progress
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.anchor_file import default_anchor_frame, read_anchors
 from rangesfm.ranging.anchors.site import local_site
@@ -29,7 +29,6 @@ from rangesfm.result.folder import ResultFolder, read_result_folder
 from rangesfm.result.ranges_as_used import RangesAsUsed
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
-from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.results import RunResult
 from rangesfm.workflows.run import map_in_metres
 

@@ -17,6 +17,7 @@ from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.join.models import ModelVerdict, PathOfModel, join_models
+from rangesfm.progress import Journal
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock.estimate import TimeOffset, estimate_time_offset
 from rangesfm.ranging.clock.rivals import REMEDY
@@ -33,10 +34,9 @@ from rangesfm.survey.settings import Survey
 from rangesfm.trust.broken_refinement import why_broken
 from rangesfm.trust.finished_map import Doubt, doubts_of_map, place_of_map
 from rangesfm.trust.lengths import trust_in_lengths
-from rangesfm.trust.ranges_on_map import ranges_on_map
+from rangesfm.trust.linearized import ranges_on_map
 from rangesfm.trust.verdict import TrustVerdict, sentence, trust_in
 from rangesfm.vision.image_times import ImageTimes
-from rangesfm.workflows.journal import Journal
 
 # Scales of two clock offsets further apart than this are no answer, unless the others are hardly likely together.
 _MAX_SPREAD = 0.03

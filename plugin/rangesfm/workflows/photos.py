@@ -21,6 +21,7 @@ from rangesfm.export import check_formats
 from rangesfm.files.atomic import sha256_of
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.join.models import PathOfModel
+from rangesfm.progress import Journal
 from rangesfm.ranging.clock.estimate import estimate_time_offset
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.result.folder import forget_result, refuse_to_overwrite
@@ -35,7 +36,6 @@ from rangesfm.vision.mapping_loop import GlobalAdjustment
 from rangesfm.vision.reconstruct import reconstruct
 from rangesfm.vision.rigs import read_rigs
 from rangesfm.vision.tags import find_tags
-from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.metric_map import estimate_scale, path_of_model, ranges_on_path, refine_by_survey
 
 # Fewer have no shape by which ranges could tell a scale.

@@ -16,14 +16,13 @@ from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import sole_writer
 from rangesfm.join.models import PathOfModel
-from rangesfm.progress import Progress
+from rangesfm.progress import Journal, Progress
 from rangesfm.ranging.clock.estimate import TimeOffset
 from rangesfm.survey.inputs import RangingInputs, times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes
 from rangesfm.vision.rigs import read_rigs
 from rangesfm.workflows.adoption import with_likeliest_cause
-from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.metric_map import (
     find_time_offset,
     join_by_survey,
