@@ -62,11 +62,7 @@ class _Triangles:
 
 
 def notes_on_distances(log: RangeLog, anchors: Sequence[Anchor]) -> Iterator[str]:
-    """What does not go together, the likeliest reason, and what to do; nothing where it does.
-
-    Args:
-        anchors: those with a position, in metres of one frame.
-    """
+    """What does not go together of the anchors with a position, the likeliest reason, and what to do."""
     surveyed = [anchor for anchor in anchors if anchor.position_m is not None and anchor.anchor_id in log.anchor_ids]
     if len(surveyed) < 2:
         return

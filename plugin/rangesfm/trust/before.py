@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from itertools import combinations
 
 import numpy as np
@@ -10,7 +10,6 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.colmap.reprojection import photo_errors_px, point_errors
-from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
@@ -42,24 +41,22 @@ def notes_before_work(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
     yield from _on_ranges(inputs.log)
     if inputs.anchor_frame == "unknown":
         return
-    surveyed = [anchor for anchor in inputs.anchors if anchor.position_m is not None]
+    surveyed = {anchor.anchor_id: anchor.position_m for anchor in inputs.anchors if anchor.position_m is not None}
     yield from _on_positions(surveyed, is_site=inputs.anchor_frame == "site")
-    yield from notes_on_distances(inputs.log, surveyed)
+    yield from notes_on_distances(inputs.log, inputs.anchors)
 
 
-def _on_positions(anchors: Sequence[Anchor], *, is_site: bool) -> Iterator[str]:
-    heights_m = np.array([anchor.position_m[2] for anchor in anchors if anchor.position_m is not None])
+def _on_positions(positions_m: Mapping[str, Array], *, is_site: bool) -> Iterator[str]:
+    heights_m = np.array([at[2] for at in positions_m.values()])
     if is_site and len(heights_m) >= _MIN_ANCHORS_ALIKE and np.ptp(heights_m) < _SAME_HEIGHT_M:
         yield (
             f"all {len(heights_m)} anchors have one height, {heights_m[0]:g} m: if nobody measured it, the map's "
             "height and tilt rest on a guess, and the ranges cannot show it; measure the heights of the antennas"
         )
-    for one, other in combinations(anchors, 2):
-        if one.position_m is None or other.position_m is None:
-            continue
-        if float(np.linalg.norm(one.position_m - other.position_m)) < _SAME_PLACE_M:
+    for one, other in combinations(positions_m, 2):
+        if np.linalg.norm(positions_m[one] - positions_m[other]) < _SAME_PLACE_M:
             yield (
-                f"anchors {one.anchor_id} and {other.anchor_id} have the same position: one of them stands elsewhere; "
+                f"anchors {one} and {other} have the same position: one of them stands elsewhere; "
                 "correct it, or leave its coordinates empty"
             )
 

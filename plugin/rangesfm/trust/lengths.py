@@ -24,7 +24,7 @@ def trust_in_lengths(estimate: ScaleEstimate, tape: Tape | None) -> TrustVerdict
     """
     lengths = estimate.lengths
     if lengths is None or tape is None:
-        return TrustVerdict((), (), (), np.zeros(0, dtype=np.int64))
+        return TrustVerdict((), ())
     taped = [tape.distances[row] for row in lengths.rows.tolist()]
     rows = list(_of_each(lengths, taped))
     left_out = [
@@ -39,7 +39,7 @@ def trust_in_lengths(estimate: ScaleEstimate, tape: Tape | None) -> TrustVerdict
     # Of printed tags only what was found: their sides are as many as they are alike.
     told = [row for row, one in zip(rows, taped, strict=True) if row.rejected or not one.is_printed]
     told.sort(key=lambda row: row.threshold - row.statistic)
-    return TrustVerdict((*told, *against), reasons, (), np.zeros(0, dtype=np.int64))
+    return TrustVerdict((*told, *against), reasons)
 
 
 def _of_each(lengths: LengthScale, taped: list[TapedDistance]) -> Iterator[MistakeTest]:

@@ -174,7 +174,7 @@ class Linearized:
 
     def with_usual_errors(self) -> Linearized:
         """As radios and maps have them that scatter like this."""
-        return replace(self, errors=_usual(self.expected, self.scatter_m))
+        return replace(self, errors=self.expected.usual({"white": self.scatter_m}))
 
 
 def linearized(on_map: RangesOnMap, cells_of_ranges: Cells | None = None) -> Linearized:
@@ -190,7 +190,7 @@ def linearized(on_map: RangesOnMap, cells_of_ranges: Cells | None = None) -> Lin
         gradient = range_gradient(problem, state)
         cells_of_ranges, scatter_m = _cells(on_map, _residual_m(problem, state, gradient), gradient)
     expected = ExpectedErrors.of(cells_of_ranges, on_map.curve_stddev_m, on_map.ruled_out, _wandering(cells_of_ranges))
-    return _linearized(on_map, expected, scatter_m, _usual(expected, scatter_m))
+    return _linearized(on_map, expected, scatter_m, expected.usual({"white": scatter_m}))
 
 
 def at_state(problem: Linearized, on_map: RangesOnMap) -> Linearized:
@@ -233,10 +233,6 @@ def _linearized(on_map: RangesOnMap, expected: ExpectedErrors, scatter_m: float,
         expected=expected,
         errors=errors,
     )
-
-
-def _usual(expected: ExpectedErrors, scatter_m: float) -> LearnedErrors:
-    return expected.usual({"white": scatter_m})
 
 
 def _wandering(cells_of_ranges: Cells) -> dict[str, Array]:

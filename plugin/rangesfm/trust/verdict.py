@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -41,8 +41,8 @@ class TrustVerdict:
 
     tests: tuple[MistakeTest, ...]
     reasons: tuple[str, ...]
-    causes: tuple[Cause, ...]
-    rows: Indices
+    causes: tuple[Cause, ...] = ()
+    rows: Indices = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def with_more(self, more: TrustVerdict) -> TrustVerdict:
         """With tests that were made of something else than ranges."""

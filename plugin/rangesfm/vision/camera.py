@@ -112,19 +112,19 @@ def _of_one_table(options: CameraOptions, photos: Photos, rigs: Rigs) -> PhotoCa
     groups: dict[Any, int] = {}
     of_photo = [groups.setdefault(key, len(groups)) for key in _keys(options.mode, photos, rigs)]
     firsts = [of_photo.index(group) for group in range(len(groups))]
-    if options.model is None or options.params is None:
-        return PhotoCameras(tuple(_guessed(options.model, photos, first) for first in firsts), tuple(of_photo))
-    known = calibrated_cameras(options.model, options.params, photos.sizes)
+    known: dict[tuple[int, int], pycolmap.Camera] = {}
+    if options.model is not None and options.params is not None:
+        known = calibrated_cameras(options.model, options.params, photos.sizes)
     for camera in known.values():
         _check_size(camera)
-    cameras, guessed = [], []
-    for first in firsts:
-        if photos.sizes[first] in known:
-            cameras.append(pycolmap.Camera(known[photos.sizes[first]].todict()))
-        else:
-            cameras.append(_guessed(options.model, photos, first))
-            guessed.append(photos.names[first])
-    return PhotoCameras(tuple(cameras), tuple(of_photo), tuple(guessed))
+    cameras = tuple(
+        pycolmap.Camera(known[photos.sizes[first]].todict())
+        if photos.sizes[first] in known
+        else _guessed(options.model, photos, first)
+        for first in firsts
+    )
+    guessed = tuple(photos.names[first] for first in firsts if known and photos.sizes[first] not in known)
+    return PhotoCameras(cameras, tuple(of_photo), guessed)
 
 
 def _keys(mode: str, photos: Photos, rigs: Rigs) -> list[Any]:

@@ -174,12 +174,7 @@ def joined_log(
     for id_ in use_anchors:
         if id_ not in anchor_ids:
             raise InputError(f"anchor {id_!r} to be used is in none of the surveys ({', '.join(sorted(anchor_ids))})")
-    # Ranges between two tags have no say, and no anchor.
-    parts = [
-        (survey, [k for k, id_ in enumerate(survey.ranges.anchor_id) if not use_anchors or id_ in use_anchors])
-        for survey in surveys
-    ]
-    parts = [(one, [k for k in rows if one.ranges.status[k] != RangeStatus.TAG_TAG.label]) for one, rows in parts]
+    parts = [(one, _rows_to_join(one.ranges, use_anchors)) for one in surveys]
     of_each = [(one, k) for one, rows in parts for k in rows]
     has_times = surveys[0].path.timestamps_s is not None
     log = RangeLog.from_arrays(
@@ -196,6 +191,12 @@ def joined_log(
 
 def _own(names: dict[str, str], name: str) -> str:
     return names.get(name, name)
+
+
+def _rows_to_join(ranges: RangesAsUsed, use_anchors: Sequence[str]) -> list[int]:
+    """Of the wanted anchors; ranges between two tags have no say, and no anchor."""
+    is_wanted = [not use_anchors or id_ in use_anchors for id_ in ranges.anchor_id]
+    return [k for k, wanted in enumerate(is_wanted) if wanted and ranges.status[k] != RangeStatus.TAG_TAG.label]
 
 
 def _camera_times_s(survey: FinishedRun) -> Array:
