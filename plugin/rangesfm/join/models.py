@@ -59,13 +59,7 @@ class PathOfModel:
 
 @dataclass(frozen=True)
 class JoinedModels:
-    """The models that could be joined, as one in the world and the unit of the first.
-
-    Attributes:
-        path: of all of them.
-        verdicts: on each model that there was.
-        notes: what the user should know.
-    """
+    """The models that could be joined, as one in the world and the unit of the first, and the verdicts on all."""
 
     path: PathOfModel
     verdicts: tuple[ModelVerdict, ...]

@@ -45,8 +45,8 @@ def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
         letter, direction = "xyz"[axis], np.eye(3)[axis]
         return Hypothesis(
             "anchor coordinate",
-            f"{name} {letter}",
             of_anchor_place(problem, k, direction[:, None]),
+            subject=f"{name} {letter}",
             words=lambda size: (
                 f"anchor {name}'s {letter} is given as {at[axis]:.3f} where about "
                 f"{at[axis] + size[0]:.2f} fits ({size[0]:+.2f} m)"
@@ -58,8 +58,8 @@ def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
 
     return Hypothesis(
         "anchor place",
-        name,
         of_anchor_place(problem, k, np.eye(3)),
+        subject=name,
         words=lambda size: (
             f"anchor {name} is about {np.linalg.norm(size):.2f} m from where its coordinates say "
             f"(by {in_axes(size)} in x, y, z)"
@@ -82,8 +82,8 @@ def anchor_biases(problem: Linearized) -> Iterator[Hypothesis]:
 def _bias(problem: Linearized, anchors: list[int], kind: str, subject: str, whose: str) -> Hypothesis:
     return Hypothesis(
         kind,
-        subject,
         of_cells(problem, -np.isin(problem.cells.anchor_index, anchors).astype(np.float64)),
+        subject=subject,
         words=lambda size: f"the ranges to {whose} {too_long(size)}",
         remedy="calibrate the radio's delay (range_bias_m in the anchors' file), or look for what stands in the way",
         correction=longer(lambda: np.isin(problem.on_map.problem.anchor_index, anchors)),
@@ -97,7 +97,6 @@ def range_shares(problem: Linearized) -> Iterator[Hypothesis]:
     distance_m = problem.on_map.problem.range_m
     yield Hypothesis(
         "range share",
-        "",
         of_cells(problem, -problem.gradient.distance_m),
         words=lambda size: f"all ranges read about {100 * abs(size[0]):.1f} % too {'long' if size[0] > 0 else 'short'}",
         remedy="check the unit, and the propagation speed that the radio assumes, against a taped distance",
@@ -127,8 +126,8 @@ def _share_of_anchor(problem: Linearized, k: int) -> Hypothesis:
 
     return Hypothesis(
         "anchor share",
-        name,
         of_cells(problem, np.where(is_of, -distance_m + mean, 0.0)),
+        subject=name,
         words=words,
         remedy="look at its ranges in the log, and leave it out (use_anchors)",
         correction=level,
@@ -148,7 +147,6 @@ def anchors_in_another_scale(problem: Linearized) -> Iterator[Hypothesis]:
     middle = given_m[known].mean(axis=0)
     yield Hypothesis(
         "anchors' scale",
-        "",
         Effect.of_sum(
             [of_anchor_place(problem, k, (given_m[k] - middle)[:, None]) for k in known if is_given(problem, k)]
         ),
@@ -173,7 +171,6 @@ def heights_never_measured(problem: Linearized) -> Iterator[Hypothesis]:
     up = np.array([0.0, 0.0, 1.0])
     yield Hypothesis(
         "anchor heights",
-        "",
         Effect.of_all([of_anchor_place(problem, k, up[:, None]) for k in known]),
         words=lambda size: (
             f"the anchors are all given a height of {given_m[known[0], 2]:g} m where heights fit that "
@@ -206,8 +203,8 @@ def _lever_arm(problem: Linearized, k: int) -> Hypothesis:
 
     return Hypothesis(
         "lever arm",
-        name,
         of_cells(problem, np.where((problem.cells.tag_index == k)[:, None], -problem.by_lever_arm, 0.0)),
+        subject=name,
         words=words,
         remedy="measure where the tag's antenna sits, x to the right, y down, z forward (--tag_in_cam)",
         correction=lambda size: Correction(tag_moves_m={on_map.tag_ids[k]: size}),
@@ -226,7 +223,6 @@ def radios_warming(problem: Linearized) -> Iterator[Hypothesis]:
 
     yield Hypothesis(
         "radio drift",
-        "",
         of_cells(problem, -since / lasts),
         words=words,
         remedy="let the radio warm up before the survey, or calibrate it at the end too",
@@ -241,7 +237,6 @@ def people_in_between(problem: Linearized) -> Iterator[Hypothesis]:
     is_behind = np.sum(on_map.from_anchor_m * on_map.world_from_cam[:, :, 2], axis=1) > 0
     yield Hypothesis(
         "behind the camera",
-        "",
         of_cells(problem, -problem.cells.mean(is_behind.astype(np.float64))),
         words=lambda size: f"the ranges to anchors behind the camera {too_long(size)}",
         remedy="carry the tag above the head, or see what stands behind it",
@@ -259,7 +254,6 @@ def clocks(problem: Linearized) -> Iterator[Hypothesis]:
     remedy = "let the offset be searched for (ranges_time_offset auto), or film a sharp turn at both ends"
     yield Hypothesis(
         "clock offset",
-        "",
         of_cells(problem, -problem.by_time),
         words=lambda size: (
             f"the clocks are off by about {abs(size[0]):.2f} s more than assumed ({size[0]:+.2f} s on the offset)"
@@ -270,7 +264,6 @@ def clocks(problem: Linearized) -> Iterator[Hypothesis]:
     )
     yield Hypothesis(
         "clock drift",
-        "",
         of_cells(problem, -problem.by_time * since),
         words=lambda size: (
             f"the radio's clock runs {1e6 * abs(size[0]):.0f} ppm too {'slow' if size[0] > 0 else 'fast'}"

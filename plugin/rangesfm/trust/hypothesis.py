@@ -77,11 +77,11 @@ class Hypothesis:
     """
 
     name: str
-    subject: str
     effect: Effect
     words: Callable[[Array], str]
     remedy: str
     correction: Callable[[Array], Correction]
+    subject: str = ""
     unit: str = "m"
     adoption: Callable[[Array], Correction] | None = None
     most: float = np.inf

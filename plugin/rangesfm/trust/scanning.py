@@ -92,8 +92,8 @@ def _elsewhere(
     for time, later, after in _changes(problem, anchor, 3 * _MIN_NUM_CELLS, around):
         yield Hypothesis(
             name,
-            whose,
             of_cells(problem, -after[:, None] * by_shift),
+            subject=whose,
             words=partial(words, whose, _when(problem, time)),
             remedy=remedy,
             correction=partial(back, later),
@@ -119,8 +119,8 @@ def _steps(problem: Linearized, anchor: int | None, around: float | None = None)
     for time, later, after in _changes(problem, anchor, _MIN_NUM_CELLS, around):
         yield Hypothesis(
             "anchor step" if name else "step",
-            name,
             of_cells(problem, -after),
+            subject=name,
             words=partial(words, _when(problem, time)),
             remedy="see what changed then: a tag that slipped, a restarted radio, a door or a vehicle in between",
             correction=longer(later),
@@ -145,8 +145,8 @@ def stretches(problem: Linearized) -> Iterator[Hypothesis]:
             within = partial(_later, problem, k, start, end)
             yield Hypothesis(
                 "anchor stretch" if name else "stretch",
-                name,
                 of_cells(problem, -inside),
+                subject=name,
                 words=partial(words, name, _when(problem, start, end)),
                 remedy="look for what stood in the line of sight, and leave that stretch out",
                 correction=longer(within),
@@ -169,7 +169,6 @@ def clock_jumps(problem: Linearized, around: float | None = None) -> Iterator[Hy
     for time, later, after in _changes(problem, None, _MIN_NUM_CELLS, around):
         yield Hypothesis(
             "clock jump",
-            "",
             of_cells(problem, -after * problem.by_time),
             words=partial(words, _when(problem, time)),
             remedy="see whether a logger was restarted then, and run the two parts as surveys of their own",

@@ -114,11 +114,7 @@ def match_features(
 
 
 def verify_matches(database_path: Path, photos: Photos, options: MatchingOptions, progress: Progress) -> None:
-    """Look which matches fit one geometry of two views, unless that has been done of all of them.
-
-    Raises:
-        ReconstructionError: those of no two photos do.
-    """
+    """Look which matches fit one geometry of two views, unless that is done; ReconstructionError if none do."""
     with pycolmap.Database.open(database_path) as database:
         num_pairs = database.num_matched_image_pairs()
         if database.num_verified_image_pairs() < num_pairs:

@@ -26,13 +26,7 @@ _MAX_NUM_FEATURES = 400_000
 
 @dataclass(frozen=True)
 class MatchingShare:
-    """Pairs of photos, and all that it takes to match them.
-
-    Attributes:
-        folder: of its own, which there is.
-        pairs: ids of photos, smaller first.
-        matcher, verification: COLMAP's options.
-    """
+    """Pairs of photos by their ids, smaller first, and all that it takes to match them in a folder of their own."""
 
     folder: Path
     pairs: Sequence[tuple[int, int]]

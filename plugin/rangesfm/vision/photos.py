@@ -54,11 +54,7 @@ class Photos:
 
 
 def usable_photos(folder: Path, names: Sequence[str]) -> Photos:
-    """Those that can be read.
-
-    Raises:
-        ReconstructionError: fewer than two of them.
-    """
+    """Those that can be read; ReconstructionError for fewer than two of them."""
     sizes = {name: image_size(folder / name) for name in names}
     usable = {name: size for name, size in sizes.items() if size is not None}
     left_out = {name: "cannot be read as an image" for name in names if name not in usable}

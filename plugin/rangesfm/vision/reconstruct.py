@@ -149,14 +149,7 @@ def _place_cameras(photos: Photos, rigs: Rigs, options: PipelineOptions, space: 
 
 
 class Workspace:
-    """The output folder of a reconstruction: what is where, and what of it an earlier run has done.
-
-    Attributes:
-        output: the folder, which ``begin`` makes.
-        database, models, snapshots, log: in it.
-        steps: the record of what is done.
-        progress: who listens.
-    """
+    """The output folder of a reconstruction: what is where, and what of it an earlier run has done."""
 
     def __init__(self, output: Path, progress: Progress, before_change: Callable[[], None]):
         self.progress = progress

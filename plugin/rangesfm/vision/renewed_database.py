@@ -39,15 +39,10 @@ class RenewedDatabase:
     Killed at any moment, it leaves a note that is true or none; without one nothing of the database is used.
 
     Attributes:
-        path: of the database.
-        photos: in the order of their ids.
-        contents: SHA-256 of each photo, by name.
-        cameras: that took them. rigs: that the cameras are on.
+        photos: in the order of their ids. contents: SHA-256 of each, by name.
         given: the user's database, whose features take the place of all that an earlier run has found.
-        matching: how they will be matched.
         feature_inputs: fingerprint of what features depend on beside the photo itself.
         match_inputs: likewise, of matches beside the two photos.
-        steps: keep the note.
     """
 
     path: Path

@@ -46,11 +46,7 @@ def with_likeliest_cause(
 
 
 def _corrected_inputs(inputs: RangingInputs, correction: Correction, rows: Indices) -> RangingInputs:
-    """Anchors, lever arms and ranges as they would be.
-
-    Args:
-        rows: of the log, those that the correction is of.
-    """
+    """Anchors, lever arms and ranges as they would be; the correction is of some rows of the log."""
     known = {anchor.anchor_id: anchor.position_m for anchor in inputs.anchors} | {**correction.anchors_m}
     anchors = tuple(replace(anchor, position_m=known[anchor.anchor_id]) for anchor in inputs.anchors)
     moves = np.array([correction.tag_moves_m.get(tag, np.zeros(3)) for tag in inputs.log.tag_ids]).reshape(-1, 3)

@@ -78,7 +78,7 @@ def check_survey(survey: Survey) -> CheckedSurvey:
         checked.warnings[:] = [text for text in checked.warnings if text not in inputs.log.notes]
         if len(inputs.log):
             _tell_of_radio(survey, inputs, checked)
-        _tell_of_others(survey, inputs, checked)
+        checked.facts += _facts_of_others(survey, inputs)
         if survey.images.path is not None and is_source(survey.images.path):
             return checked
         if model is None:
@@ -168,16 +168,16 @@ def _tell_of_radio(survey: Survey, inputs: RangingInputs, checked: CheckedSurvey
         checked.facts.append(f"lever arm: the tag is at {'; '.join(arms)} in the camera frame (right, down, forward)")
 
 
-def _tell_of_others(survey: Survey, inputs: RangingInputs, checked: CheckedSurvey) -> None:
+def _facts_of_others(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
     if inputs.tape is not None:
         only = "" if len(inputs.log) else ", which alone say how long a metre is (no ranges)"
-        checked.facts.append(f"taped distances: {len(inputs.tape.distances)}{only}")
+        yield f"taped distances: {len(inputs.tape.distances)}{only}"
     if survey.markers.dictionary is not None:
         side = "" if survey.markers.side_m is None else f" of {survey.markers.side_m:g} m"
-        checked.facts.append(f"tags: those of {survey.markers.dictionary}{side} will be looked for in the photos")
+        yield f"tags: those of {survey.markers.dictionary}{side} will be looked for in the photos"
     if inputs.reference is not None:
         name = "" if survey.report.reference is None else f" in {survey.report.reference.name}"
-        checked.facts.append(f"reference: {len(inputs.reference)} positions{name}, only to compare with")
+        yield f"reference: {len(inputs.reference)} positions{name}, only to compare with"
 
 
 def _tell_of_times(
