@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.distances.tape import Tape, read_tape
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import sha256_of
@@ -57,7 +57,7 @@ class RangingInputs:
     """
 
     log: RangeLog
-    tag_in_cam_m: npt.NDArray[np.float64]
+    tag_in_cam_m: Array
     anchors: tuple[Anchor, ...]
     anchor_frame: str
     site: Site
@@ -149,7 +149,7 @@ def _check_camera_is_heard(log: RangeLog) -> None:
         )
 
 
-def _lever_arms_of_log(log: RangeLog, survey: Survey) -> npt.NDArray[np.float64]:
+def _lever_arms_of_log(log: RangeLog, survey: Survey) -> Array:
     """(num_tags, 3) as ``RangingInputs.tag_in_cam_m``; InputError for a tag that ranges with anchors and has none."""
     given = survey.tag.lever_arms_m
     heard = np.unique(log.tag_index[log.kind == RangeKind.TAG_ANCHOR]).tolist()

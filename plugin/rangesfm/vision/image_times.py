@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import is_plain_name
 from rangesfm.files.folders import walk
@@ -53,7 +53,7 @@ class ImageTimes:
     """
 
     image_names: tuple[str, ...]
-    timestamps_s: npt.NDArray[np.float64]
+    timestamps_s: Array
     resolution_s: float
     source: str
     num_left_out: int = 0

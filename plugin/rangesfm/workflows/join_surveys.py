@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
 from rangesfm.export import check_formats
 from rangesfm.files.atomic import sole_writer
@@ -156,9 +155,7 @@ def _with_tags_of_their_own(surveys: Sequence[FinishedRun]) -> list[FinishedRun]
     ]
 
 
-def joined_log(
-    surveys: Sequence[FinishedRun], use_anchors: Sequence[str]
-) -> tuple[RangeLog, npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+def joined_log(surveys: Sequence[FinishedRun], use_anchors: Sequence[str]) -> tuple[RangeLog, Indices, Mask]:
     """All their ranges: on the cameras' clocks, or by photo.
 
     Args:
@@ -214,11 +211,7 @@ def _camera_times_s(survey: FinishedRun) -> Array:
 
 
 def paths_of_surveys(
-    surveys: Sequence[FinishedRun],
-    log: RangeLog,
-    number: npt.NDArray[np.int64],
-    is_check: npt.NDArray[np.bool_],
-    tags_in_cam_m: Array,
+    surveys: Sequence[FinishedRun], log: RangeLog, number: Indices, is_check: Mask, tags_in_cam_m: Array
 ) -> list[PathOfModel]:
     """Each survey's model with its own ranges on its path, as the survey put them there; checks stay checks."""
     paths = []

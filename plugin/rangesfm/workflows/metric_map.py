@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
+from rangesfm.arrays import Array
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.colmap.transform import rescale, without_photos
 from rangesfm.distances.ends import locate_distances, surveyed_distances
@@ -110,26 +110,25 @@ def ranges_on_paths(
             journal.warn(f"sparse/{k} is left out: its photos have no time, or are in other models too")
             continue
         names.update(path.image_names)
-        observations = hold_out(_on_path(survey, inputs, path, offsets_s), survey.ranges, survey.output.seed)
+        observations = ranges_on_path(survey, inputs, path, offsets_s, may_be_none=True)
         paths.append(PathOfModel(f"sparse/{k}", rest, path, observations))
     return paths
 
 
 def ranges_on_path(
-    survey: Survey, inputs: RangingInputs, trajectory: Trajectory, offset_s: float | npt.NDArray[np.float64]
+    survey: Survey,
+    inputs: RangingInputs,
+    trajectory: Trajectory,
+    offset_s: float | Array,
+    *,
+    may_be_none: bool = False,
 ) -> RangeObservations:
     """Ranges on the path; refused where the clocks cannot be right."""
-    observations = _on_path(survey, inputs, trajectory, offset_s)
-    if len(inputs.log) and not observations.has_place.any():
+    observations = associate(inputs.log, trajectory, inputs.tag_in_cam_m, time_offset_s=offset_s, options=survey.ranges)
+    if len(inputs.log) and not may_be_none and not observations.has_place.any():
         why = _why_no_range_has_a_place(observations, trajectory, float(np.mean(offset_s)))
         raise InputError(why, survey.ranges.path)
     return hold_out(observations, survey.ranges, survey.output.seed)
-
-
-def _on_path(
-    survey: Survey, inputs: RangingInputs, trajectory: Trajectory, offset_s: float | npt.NDArray[np.float64]
-) -> RangeObservations:
-    return associate(inputs.log, trajectory, inputs.tag_in_cam_m, time_offset_s=offset_s, options=survey.ranges)
 
 
 def _why_no_range_has_a_place(observations: RangeObservations, trajectory: Trajectory, offset_s: float) -> str:
