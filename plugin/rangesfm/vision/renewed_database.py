@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import pycolmap
 
 from rangesfm.files.atomic import new_file
 from rangesfm.progress import Progress
@@ -90,7 +88,17 @@ class RenewedDatabase:
         try:
             same_matches = self.matching.is_by_place and earlier.get("matches") == self.match_inputs
             pairs = pairs_to_match(fresh, self.photos, self.matching.pairing) if same_matches else []
-            return _copy(self.path, fresh, ids, pairs)
+            with copying(self.path, fresh) as (source, target):
+                taken = {
+                    new_id: old_id
+                    for new_id, old_id in ids.items()
+                    if source.exists_keypoints(old_id) and source.exists_descriptors(old_id)
+                }
+                copy_features(source, target, {old_id: new_id for new_id, old_id in taken.items()})
+            of_pairs = (((taken.get(first, 0), taken.get(second, 0)), (first, second)) for first, second in pairs)
+            # Not of photos that stood in the other order: COLMAP does not match two as it would the other way round.
+            copy_matches(self.path, fresh, ((old, pair) for old, pair in of_pairs if 0 < old[0] < old[1]))
+            return len(taken)
         except RuntimeError:  # somebody has damaged the earlier one
             self._create(fresh)
             return 0
@@ -111,23 +119,3 @@ class RenewedDatabase:
 def forget_database(steps: Steps) -> None:
     """Take nothing over from the database."""
     steps.note(_NOTE, {})
-
-
-def _copy(earlier: Path, new: Path, earlier_ids: Mapping[int, int], pairs: Iterable[tuple[int, int]]) -> int:
-    """Copy features and matches into a new database; returns of how many photos there were features.
-
-    Args:
-        earlier_ids: id of a photo in the earlier database by its id in the new one.
-        pairs: of new ids, smaller first, whose matches are wanted; not those of photos that stood in the other order,
-            as COLMAP does not match two photos as it would the other way round.
-    """
-    with copying(earlier, new) as (source, target):
-        taken = {new_id: old_id for new_id, old_id in earlier_ids.items() if _has_features(source, old_id)}
-        copy_features(source, target, {old_id: new_id for new_id, old_id in taken.items()})
-    of_pairs = (((taken.get(first, 0), taken.get(second, 0)), (first, second)) for first, second in pairs)
-    copy_matches(earlier, new, ((old, pair) for old, pair in of_pairs if 0 < old[0] < old[1]))
-    return len(taken)
-
-
-def _has_features(database: pycolmap.Database, image_id: int) -> bool:
-    return database.exists_keypoints(image_id) and database.exists_descriptors(image_id)
