@@ -26,7 +26,7 @@ from rangesfm.vision.camera import cameras_of_photos
 from rangesfm.vision.features import feature_options
 from rangesfm.vision.mapping import pipeline_options
 from rangesfm.vision.matching import matching_options
-from rangesfm.vision.matching_share import MatchingShare
+from rangesfm.vision.own_process import MatchingShare
 from rangesfm.vision.photos import Photos
 
 SEED = 3
@@ -120,7 +120,7 @@ def test_shares_of_pairs_are_matched_as_colmap_matches_pairs(monkeypatch: pytest
     handed: list[Any] = []
     monkeypatch.setattr(pycolmap, "match_image_pairs", lambda _, *options, **__: handed.extend(options))
     share = MatchingShare(tmp_path, [(1, 2)], "matcher", "verification")  # type: ignore[arg-type]
-    share.match(SilentProgress())
+    share.run(SilentProgress())
     assert (handed[0], handed[2]) == ("matcher", "verification")
     # As many photos at once as go by the features of each: of a database without any, one.
     assert changes(handed[1]) == {"match_list_path": tmp_path / "pairs.txt", "block_size": 1}

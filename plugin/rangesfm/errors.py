@@ -30,13 +30,10 @@ def printable(text: str) -> str:
 
 def shown(value: object) -> str:
     """A value of an option as a message names it."""
-    is_text = isinstance(value, (str, Path))
-    return printable(f"'{value}'" if is_text else "a table" if isinstance(value, Mapping) else _digits(value))
-
-
-def _digits(value: object) -> str:
+    if isinstance(value, (str, Path)):
+        return printable(f"'{value}'")
     try:
-        return str(value)
+        return "a table" if isinstance(value, Mapping) else printable(str(value))
     except ValueError:  # a whole number of thousands of digits
         return "a number beyond all bounds"
 
@@ -98,13 +95,9 @@ class GeometryError(RangesfmError):
 class ReconstructionError(RangesfmError):
     """The photos did not give a model."""
 
-    exit_status = 4
-
 
 class SolverError(RangesfmError):
     """A solver failed, or the compiled part does not fit the installed packages."""
-
-    exit_status = 4
 
 
 @dataclass(frozen=True)

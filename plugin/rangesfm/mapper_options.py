@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -9,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from rangesfm.errors import OptionError
-from rangesfm.option_model import Options, Told, looks_like
+from rangesfm.option_model import Options, Told
 
 _LIKE_OURS = 0.85  # a key this similar to one of ours is a slip; others are pycolmap's
 
@@ -58,30 +59,23 @@ class MapperOptions(Options):
         return self.num_threads if self.num_threads > 0 else os.cpu_count() or 1
 
     @model_validator(mode="after")
-    def _tree_is_there(self) -> MapperOptions:
+    def _has_all_that_it_needs(self) -> MapperOptions:
         by_tree = self.matching == "vocabtree" or self.pairing.get("loop_detection") is True
         if by_tree and self.vocab_tree_path is None and "vocab_tree_path" not in self.pairing:
             message = "[mapper] vocab_tree_path is not given, expected COLMAP's vocabulary tree for this matching"
             raise OptionError(message, "mapper", "matching" if self.matching == "vocabtree" else "pairing")
-        return self
-
-    @model_validator(mode="after")
-    def _features_are_from_photos(self) -> MapperOptions:
         if self.mask_path is not None and self.database_path is not None:
-            message = (
-                "[mapper] mask_path is given beside database_path, expected one of them: there are features already"
-            )
-            raise OptionError(message, "mapper", "mask_path")
+            why = "is given beside database_path, expected one of them: there are features already"
+            raise self.refused("mask_path", why)
         return self
 
     @model_validator(mode="before")
     @classmethod
     def _others_to_pipeline(cls, values: dict[str, Any]) -> dict[str, Any]:
         """pycolmap knows best what its keys may be; only one much like ours is a slip."""
+        known = list(cls.model_fields)
         others = {
-            name: value
-            for name, value in values.items()
-            if name not in cls.model_fields and not looks_like(name, cls.model_fields, _LIKE_OURS)
+            name: value for name, value in values.items() if not difflib.get_close_matches(name, known, 1, _LIKE_OURS)
         }
         ours = {name: value for name, value in values.items() if name not in others}
         if others and isinstance(pipeline := ours.get("pipeline", {}), dict):

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import difflib
 import types
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -88,6 +87,10 @@ class Options(BaseModel):
         given = {name: getattr(self, name) for name in self.model_fields_set}
         return type(self)(**{**given, **values})
 
+    def refused(self, key: str, why: str) -> OptionError:
+        """An error about one of the keys: what it is, and what was expected."""
+        return OptionError(f"[{self.table}] {key} {why}", self.table, key)
+
     @classmethod
     @cache
     def keys(cls) -> Mapping[str, Key]:
@@ -111,19 +114,14 @@ class Options(BaseModel):
         name = str(where[0])
         keys = cls.keys()
         if name not in keys:
-            nearest = nearest_known(name, keys)
-            return OptionError(
-                f"unknown key {shown(name)} in [{cls.table}]; the nearest known one is '{nearest}'", cls.table, name
+            message = (
+                f"unknown key {shown(name)} in [{cls.table}]; the nearest known one is '{nearest_known(name, keys)}'"
             )
+            return OptionError(message, cls.table, name)
         value, expected = values[name], keys[name].expected
         if len(where) > 1 and isinstance(value, Mapping) and where[1] in value:
             name, value, expected = f"{name}.{where[1]}", value[where[1]], expected.removeprefix(_TABLE_OF)
         return OptionError(f"[{cls.table}] {printable(name)} is {shown(value)}, expected {expected}", cls.table, name)
-
-
-def looks_like(name: str, known: Iterable[str], min_likeness: float) -> bool:
-    """Whether a name is as like a known one as that, from 0 to 1."""
-    return bool(difflib.get_close_matches(name, list(known), 1, min_likeness))
 
 
 def _default(value: Any) -> str:

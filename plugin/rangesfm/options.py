@@ -285,17 +285,13 @@ class TagOptions(Options):
     @model_validator(mode="after")
     def _one_or_several(self) -> TagOptions:
         if "tag_in_cam_m" in self.model_fields_set and self.lever_arms_m:
-            raise OptionError(
-                f"[tag] tag_in_cam_m is {list(self.tag_in_cam_m)}, expected nothing beside lever_arms_m: either one "
-                "lever arm or one by tag id",
-                "tag",
-                "tag_in_cam_m",
-            )
+            why = "expected nothing beside lever_arms_m: either one lever arm or one by tag id"
+            raise self.refused("tag_in_cam_m", f"is {list(self.tag_in_cam_m)}, {why}")
         return self
 
 
 class ScaleOptions(Options):
-    """How the scale is found."""
+    """How the scale is found, and distances taped on the site."""
 
     table: ClassVar[str] = "scale"
 
@@ -314,25 +310,16 @@ class ScaleOptions(Options):
     adopt: bool = False
     """Where the tests find a mistake, run again as if its likeliest cause were so: an anchor unknown, a lever arm as it
     fits, labels swapped, a stretch of ranges left out; what changed is said."""
-
-
-class ScaleAndTapeOptions(ScaleOptions):
-    """How the scale is found, and distances taped on the site."""
-
     distances: Annotated[Path | None, Told(role="file")] = None
     """CSV from,to,distance_m[,stddev_m,kind]: taped distances."""
     markers: Annotated[Path | None, Told(role="file")] = None
     """CSV marker,image_name,x_px,y_px: marks that they refer to."""
 
     @model_validator(mode="after")
-    def _markers_are_of_distances(self) -> ScaleAndTapeOptions:
+    def _markers_are_of_distances(self) -> ScaleOptions:
         if self.markers is not None and self.distances is None:
-            raise OptionError(
-                f"[scale] markers is '{self.markers}', expected distances beside it: marks are only the ends of taped "
-                "distances",
-                "scale",
-                "markers",
-            )
+            why = "expected distances beside it: marks are only the ends of taped distances"
+            raise self.refused("markers", f"is '{self.markers}', {why}")
         return self
 
 
@@ -353,11 +340,7 @@ class MarkerOptions(Options):
     @model_validator(mode="after")
     def _side_is_of_a_dictionary(self) -> MarkerOptions:
         if self.side_m is not None and self.dictionary is None:
-            raise OptionError(
-                f"[markers] side_m is {self.side_m:g}, expected a dictionary beside it: which tags are they?",
-                "markers",
-                "side_m",
-            )
+            raise self.refused("side_m", f"is {self.side_m:g}, expected a dictionary beside it: which tags are they?")
         return self
 
 

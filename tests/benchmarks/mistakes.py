@@ -111,7 +111,7 @@ def main() -> None:
             write_ranges_csv(replace(log, range_m=log.range_m + longer_m * late), folder / "uwb.csv")
             tests, refinement = list[float](), list[float]()
             with (
-                mock.patch("rangesfm.workflows.trust_in_map.trust_in", timed(trust_in, tests)),
+                mock.patch("rangesfm.workflows.metric_map.trust_in", timed(trust_in, tests)),
                 mock.patch("rangesfm.workflows.metric_map.refine_with_ranges", timed(refine_with_ranges, refinement)),
             ):
                 summary = refine_model(survey, progress=SilentProgress()).summary

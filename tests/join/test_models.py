@@ -23,13 +23,14 @@ from rangesfm.demo.ranges import CameraPath, Radio
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import align_points
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
-from rangesfm.join.models import JoinedModels, PathOfModel, Ranging, join_models
-from rangesfm.options import RangeModelOptions, ScaleOptions
+from rangesfm.join.models import JoinedModels, PathOfModel, join_models
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.site import local_site
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers.canonical import write_ranges_csv
+from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.reconstruct import ReconstructionSummary
 from rangesfm.workflows.run import run_survey, scale_model
@@ -64,15 +65,13 @@ class Halves:
         return replace(self, log=log, parts=tuple(parts))
 
     def join(self, frame: str, known: tuple[str, ...] = tuple(ANCHORS_M)) -> JoinedModels:
-        return join_models(self.parts, self.ranging(frame, known))
-
-    def ranging(self, frame: str, known: tuple[str, ...]) -> Ranging:
         positions = {name: np.array(ANCHORS_M[name]) for name in known}
         if frame == "first_camera":
             positions = {name: (at - self.centers_m[0]) @ self.first_camera for name, at in positions.items()}
         anchors = [Anchor(name, None if frame == "unknown" else positions.get(name)) for name in self.log.anchor_ids]
-        options = ScaleOptions(max_relative_stddev=0.2)
-        return Ranging(anchors, frame, options, RangeModelOptions(), None, 0)
+        arms, (site, _) = np.array([TAG_IN_CAM_M]), local_site((), "unknown", None)
+        inputs = RangingInputs(self.log, arms, tuple(anchors), frame, site, None, None, ())
+        return join_models(self.parts, Survey().changed({"scale.max_relative_stddev": 0.2}), inputs)
 
     def off_m(self, centers: Array, *, with_scale: bool = True) -> float:
         """How far a photo is from the truth, at most, after the best similarity (or rigid motion) of all."""

@@ -26,7 +26,7 @@ from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.range_equation import RangeProblem, RangeState
 from rangesfm.trust.finished_map import by_similarity, doubts_of_map
-from rangesfm.trust.ranges_on_map import RangesOnMap, ranges_on_map
+from rangesfm.trust.linearized import RangesOnMap, ranges_on_map
 from rangesfm.trust.verdict import TrustVerdict, trust_in
 
 Array = npt.NDArray[np.float64]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-from rangesfm.options import AnchorOptions, ImageOptions, RangesOptions, ReportOptions, ScaleAndTapeOptions
+from rangesfm.options import AnchorOptions, ImageOptions, RangesOptions, ReportOptions, ScaleOptions
 from rangesfm.survey.inputs import input_hashes
 from rangesfm.survey.settings import Survey
 
@@ -40,7 +40,7 @@ def test_every_file_that_a_survey_names_is_listed(tmp_path: Path) -> None:
         ranges=RangesOptions(path=ranges, error_curve=curve),
         anchors=AnchorOptions(path=anchors),
         images=ImageOptions(times=times),
-        scale=ScaleAndTapeOptions(distances=distances, markers=markers),
+        scale=ScaleOptions(distances=distances, markers=markers),
         report=ReportOptions(reference=reference),
     )
     listed = {entry["path"]: entry["sha256"] for entry in input_hashes(survey)}

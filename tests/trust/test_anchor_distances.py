@@ -8,7 +8,7 @@ import pytest
 
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.log import RangeLog
-from rangesfm.trust.anchor_distances import notes_on_distances
+from rangesfm.trust.before import notes_on_distances
 
 Array = npt.NDArray[np.float64]
 SITE_M: dict[str, tuple[float, ...]] = {

@@ -14,7 +14,7 @@ from PIL import Image
 from rangesfm.errors import InputError, OptionError
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import SilentProgress
-from rangesfm.vision.matched_photos import Workspace, match_photos
+from rangesfm.vision.reconstruct import Workspace, match_photos
 from rangesfm.vision.rigs import NO_RIGS
 
 if TYPE_CHECKING:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from rangesfm.errors import GeometryError
+from rangesfm.join.models import PathOfModel
 from rangesfm.ranging.clock.estimate import TimeOffset
 from rangesfm.ranging.clock.rivals import Rival
 from rangesfm.ranging.clock.search import CostCurve
@@ -32,10 +33,10 @@ class Scales:
         inputs: Any = SimpleNamespace(log=log, anchor_frame="unknown")
         offset = time_offset(probability, (Rival(RIVAL_S, 1 - probability),))
         unused: Any = None
-        return metric_map.scale_by_rivals(unused, inputs, unused, None, offset, 2.0)
+        return metric_map.scale_by_rivals(unused, inputs, PathOfModel("", unused, unused, unused), offset, 2.0)
 
-    def estimate(self, survey: object, inputs: object, offset_s: float, *rest: object) -> SimpleNamespace:
-        scale = self.by_offset_s[offset_s]
+    def estimate(self, survey: object, inputs: object, path: Any) -> SimpleNamespace:
+        scale = self.by_offset_s[path.observations]
         if scale is None:
             raise GeometryError("no scale")
         return SimpleNamespace(value=scale)

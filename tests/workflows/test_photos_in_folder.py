@@ -15,11 +15,10 @@ from rangesfm.demo.survey import TIME_OFFSET_S, DemoSurvey
 from rangesfm.errors import InputError
 from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.options import CameraOptions
-from rangesfm.progress import SilentProgress
+from rangesfm.progress import Journal, SilentProgress
 from rangesfm.result.folder import read_result_folder
 from rangesfm.survey.settings import Survey, survey_from_tables
 from rangesfm.workflows.check import check_survey
-from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.photos import with_photos_in_folder
 
 IMAGE = raw(np.arange(48, dtype=np.uint8).reshape(6, 8, 1), "mono8")

@@ -15,11 +15,10 @@ import pytest
 from rangesfm.colmap.transform import rescale
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
-from rangesfm.progress import SilentProgress
+from rangesfm.progress import Journal, SilentProgress
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import Survey, survey_from_tables
 from rangesfm.workflows import photos
-from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.photos import find_keyframes, map_keyframes
 from rangesfm.workflows.run import refine_model
 

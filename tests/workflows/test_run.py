@@ -22,13 +22,12 @@ from tests.simulated.path import loop_path
 from rangesfm.colmap.model_files import read_model
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
-from rangesfm.progress import SilentProgress
+from rangesfm.progress import Journal, SilentProgress
 from rangesfm.ranging.readers import read_ranges
 from rangesfm.result.summary import ResultSummary
 from rangesfm.result.tables import ScaleCandidates, ScaleConsensus
 from rangesfm.survey.settings import KEYS, Survey
 from rangesfm.workflows.export_result import export_result
-from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.results import RunResult
 from rangesfm.workflows.run import refine_model, scale_model
 

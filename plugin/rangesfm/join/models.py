@@ -10,16 +10,15 @@ import pycolmap
 
 from rangesfm.colmap.transform import joined_model, rescale
 from rangesfm.distances.ends import distances_within, locatable, locate_distances
-from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory, joined_trajectory
-from rangesfm.options import RangeModelOptions, ScaleOptions
-from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.observations import RangeObservations, each_on_one_path, joined_observations
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.model_placement import ScaledModel, place_models
+from rangesfm.survey.inputs import RangingInputs
+from rangesfm.survey.settings import Survey
 
 
 @dataclass(frozen=True)
@@ -59,33 +58,15 @@ class PathOfModel:
 
 
 @dataclass(frozen=True)
-class Ranging:
-    """What the estimates of all models go by; as in ``initialize_scale``."""
-
-    anchors: Sequence[Anchor]
-    anchor_frame: str
-    scale: ScaleOptions
-    range_model: RangeModelOptions
-    tape: Tape | None
-    seed: int
-
-
-@dataclass(frozen=True)
 class JoinedModels:
-    """The models that could be joined, as one in the world and the unit of the first.
-
-    Attributes:
-        path: of all of them.
-        verdicts: on each model that there was.
-        notes: what the user should know.
-    """
+    """The models that could be joined, as one in the world and the unit of the first, and the verdicts on all."""
 
     path: PathOfModel
     verdicts: tuple[ModelVerdict, ...]
     notes: tuple[str, ...]
 
 
-def join_models(parts: Sequence[PathOfModel], ranging: Ranging) -> JoinedModels:
+def join_models(parts: Sequence[PathOfModel], survey: Survey, inputs: RangingInputs) -> JoinedModels:
     """Scale each model on its own, and lay them into one world by all their ranges with one set of anchors.
 
     Args:
@@ -97,10 +78,10 @@ def join_models(parts: Sequence[PathOfModel], ranging: Ranging) -> JoinedModels:
     exclusive = each_on_one_path([part.observations for part in parts])
     parts = [replace(part, observations=of) for part, of in zip(parts, exclusive, strict=True)]
     first = _first_in_time(parts)
-    scaled, reasons = _scaled_alone(parts, ranging, first)
+    scaled, reasons = _scaled_alone(parts, survey, inputs, first)
     placements = place_models(list(scaled.values()))
     reasons |= {k: reason for k, reason in zip(scaled, placements.reasons, strict=True) if reason}
-    if first in reasons and ranging.anchor_frame == "first_camera":
+    if first in reasons and inputs.anchor_frame == "first_camera":
         why = f"the anchors are given in the frame of the first photo, and {parts[first].name}, which has it, "
         reasons = {k: reasons.get(k, f"{why}has no place") for k in range(1, len(parts))}
     first_from_sfm = dict(zip(scaled, placements.first_from_sfm, strict=True))
@@ -129,14 +110,14 @@ def _first_in_time(parts: Sequence[PathOfModel]) -> int:
 
 
 def _scaled_alone(
-    parts: Sequence[PathOfModel], ranging: Ranging, first: int
+    parts: Sequence[PathOfModel], survey: Survey, inputs: RangingInputs, first: int
 ) -> tuple[dict[int, ScaledModel], dict[int, str]]:
     """The models whose scale their own ranges determine, and why those of others do not."""
     scaled: dict[int, ScaledModel] = {}
     reasons: dict[int, str] = {}
     for k, part in enumerate(parts):
         try:
-            scaled[k] = _alone(part, ranging, has_first_camera=k == first)
+            scaled[k] = _alone(part, survey, inputs, has_first_camera=k == first)
         except GeometryError as error:
             if k == 0:
                 raise
@@ -144,26 +125,26 @@ def _scaled_alone(
     return scaled, reasons
 
 
-def _alone(part: PathOfModel, ranging: Ranging, *, has_first_camera: bool) -> ScaledModel:
+def _alone(part: PathOfModel, survey: Survey, inputs: RangingInputs, *, has_first_camera: bool) -> ScaledModel:
     """A model by its own ranges. For one without the first camera, anchors given in its frame are those of a site."""
-    frame, options = ranging.anchor_frame, ranging.scale
+    frame, options = inputs.anchor_frame, survey.scale
     if not has_first_camera:
         frame = "site" if frame == "first_camera" else frame
         options = options.changed(up_in_first_camera=None)
     anchor_ids = part.observations.log.anchor_ids
     distances = None
-    if ranging.tape is not None:
-        within = distances_within(locatable(ranging.tape, part.sfm), part.sfm, anchor_ids)
+    if inputs.tape is not None:
+        within = distances_within(locatable(inputs.tape, part.sfm), part.sfm, anchor_ids)
         distances = locate_distances(within, part.sfm, anchor_ids)
     estimate = initialize_scale(
         part.observations,
         part.trajectory,
-        ranging.anchors,
+        inputs.anchors,
         anchor_frame=frame,
         options=options,
-        range_model=ranging.range_model,
+        range_model=survey.ranges,
         distances=distances,
-        seed=ranging.seed,
+        seed=survey.output.seed,
     )
     is_given = frame == "first_camera"
     return ScaledModel(

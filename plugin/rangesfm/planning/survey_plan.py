@@ -13,11 +13,8 @@ from rangesfm.planning.expected import OPEN, Expected, expect
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.errors.components import component_words
 from rangesfm.trust.catalogue import STANDING
-from rangesfm.trust.linearized import linearized
-from rangesfm.trust.ranges_on_map import ranges_on_map
-from rangesfm.trust.table import MistakeTest
-from rangesfm.trust.testing import Factorization
-from rangesfm.trust.verdict import row_of
+from rangesfm.trust.linearized import linearized, ranges_on_map
+from rangesfm.trust.testing import Factorization, MistakeTest, row_of
 
 _MAX_NUM_SHOWN = 5
 

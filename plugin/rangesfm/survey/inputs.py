@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.distances.tape import Tape, read_tape
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import sha256_of
@@ -57,7 +57,7 @@ class RangingInputs:
     """
 
     log: RangeLog
-    tag_in_cam_m: npt.NDArray[np.float64]
+    tag_in_cam_m: Array
     anchors: tuple[Anchor, ...]
     anchor_frame: str
     site: Site
@@ -96,7 +96,9 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     if frame != "unknown":
         _check_unit_of_anchors(log, anchors, survey.anchors.path)
     _check_held_out(survey, anchors, frame)
-    log, curve_notes = _without_known_errors(log, survey)
+    curve_path, curve_notes = survey.ranges.error_curve, list[str]()
+    if curve_path is not None:
+        log, curve_notes = correct_ranges(log, read_error_curve(curve_path))
     tape = None if survey.scale.distances is None else read_tape(survey.scale.distances, survey.scale.markers)
     reference = None if survey.report.reference is None else read_reference(survey.report.reference)
     notes = (*_notes(log, anchors, survey, anchors_are_of_log=given is None), *curve_notes)
@@ -125,11 +127,6 @@ def _check_held_out(survey: Survey, anchors: Sequence[Anchor], frame: str) -> No
             )
 
 
-def _without_known_errors(log: RangeLog, survey: Survey) -> tuple[RangeLog, list[str]]:
-    curve_path = survey.ranges.error_curve
-    return (log, []) if curve_path is None else correct_ranges(log, read_error_curve(curve_path))
-
-
 def read_log(
     options: LogOptions,
     anchor_ids: Collection[str] = (),
@@ -152,7 +149,7 @@ def _check_camera_is_heard(log: RangeLog) -> None:
         )
 
 
-def _lever_arms_of_log(log: RangeLog, survey: Survey) -> npt.NDArray[np.float64]:
+def _lever_arms_of_log(log: RangeLog, survey: Survey) -> Array:
     """(num_tags, 3) as ``RangingInputs.tag_in_cam_m``; InputError for a tag that ranges with anchors and has none."""
     given = survey.tag.lever_arms_m
     heard = np.unique(log.tag_index[log.kind == RangeKind.TAG_ANCHOR]).tolist()
@@ -246,11 +243,9 @@ def _of_wanted_tag(log: RangeLog, tag_id: str | None) -> RangeLog:
 def _of_wanted_anchors(log: RangeLog, use_anchors: Sequence[str]) -> RangeLog:
     if not use_anchors:
         return log
-    for anchor_id in use_anchors:
-        if anchor_id not in log.anchor_ids:
-            raise InputError(
-                f"anchor {anchor_id!r} to be used is not in the log ({', '.join(log.anchor_ids)})", log.source
-            )
+    if unheard := [anchor_id for anchor_id in use_anchors if anchor_id not in log.anchor_ids]:
+        message = f"anchor {unheard[0]!r} to be used is not in the log ({', '.join(log.anchor_ids)})"
+        raise InputError(message, log.source)
     # The last entry stands for the index of no anchor.
     wanted = np.array([*(anchor_id in use_anchors for anchor_id in log.anchor_ids), True])
     peer_is_wanted = wanted[np.where(log.kind == RangeKind.ANCHOR_ANCHOR, log.peer_index, -1)]
@@ -306,12 +301,12 @@ def input_hashes(survey: Survey) -> list[dict[str, Any]]:
             entries += [_folder(item.path)] if item.path.is_dir() else []
         else:
             files = sorted(item.path.glob("*.bin" if item.role == "model" else "*")) or [item.path]
-            entries += [_file(path) for path in files if path.is_file()]
+            entries += [
+                {"path": str(path), "sha256": sha256_of(path), "bytes": path.stat().st_size, "hashed": "content"}
+                for path in files
+                if path.is_file()
+            ]
     return entries
-
-
-def _file(path: Path) -> dict[str, Any]:
-    return {"path": str(path), "sha256": sha256_of(path), "bytes": path.stat().st_size, "hashed": "content"}
 
 
 def _folder(path: Path) -> dict[str, Any]:

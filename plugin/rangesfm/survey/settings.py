@@ -28,7 +28,7 @@ from rangesfm.options import (
     RangesOptions,
     RefineOptions,
     ReportOptions,
-    ScaleAndTapeOptions,
+    ScaleOptions,
     TagOptions,
 )
 
@@ -127,7 +127,7 @@ class Survey(BaseModel):
     anchors: AnchorOptions = AnchorOptions()
     tag: TagOptions = TagOptions()
     mapper: MapperOptions = MapperOptions()
-    scale: ScaleAndTapeOptions = ScaleAndTapeOptions()
+    scale: ScaleOptions = ScaleOptions()
     markers: MarkerOptions = MarkerOptions()
     refine: RefineOptions = RefineOptions()
     export: ExportOptions = ExportOptions()
@@ -236,19 +236,19 @@ def read_survey(
             type or out of bounds, and a file that does not exist.
     """
     tables, source = parse_toml(Path(path))
-    folder = Path(path).absolute().parent if base_folder is None else Path(base_folder).absolute()
-    return _survey(tables, folder, overrides or {}, source)
+    folder = Path(path).absolute().parent if base_folder is None else base_folder
+    return survey_from_tables(tables, folder, overrides, source)
 
 
 def survey_from_tables(
-    tables: Mapping[str, Any], base_folder: str | Path, overrides: Mapping[str, object] | None = None
+    tables: Mapping[str, Any],
+    base_folder: str | Path,
+    overrides: Mapping[str, object] | None = None,
+    source: Source | None = None,
 ) -> Survey:
     """The same from tables in memory, with paths relative to ``base_folder``."""
-    return _survey(tables, Path(base_folder).absolute(), overrides or {}, Source())
-
-
-def _survey(tables: Mapping[str, Any], folder: Path, overrides: Mapping[str, object], source: Source) -> Survey:
-    source = replace(source, overridden=tuple(overrides))
+    folder, overrides = Path(base_folder).absolute(), overrides or {}
+    source = replace(source or Source(), overridden=tuple(overrides))
     with source.naming_lines():
         tables, other_cameras = _with_one_camera(tables)
         refuse_unknown_tables(tables, TABLES)
@@ -293,8 +293,7 @@ def refuse_unknown_tables(tables: Mapping[str, Any], known: Collection[str]) -> 
     """OptionError for one that is not known, with the nearest that is, and for what is no table."""
     for name, table in tables.items():
         if name not in known:
-            nearest = nearest_known(name, known)
-            message = f"unknown table [{printable(name)}]; the nearest known one is '{nearest}'"
+            message = f"unknown table [{printable(name)}]; the nearest known one is '{nearest_known(name, known)}'"
             raise OptionError(message, "", name)
         if not isinstance(table, Mapping):
             raise OptionError(f"{name} is {shown(table)}, expected a table [{name}]", "", name)

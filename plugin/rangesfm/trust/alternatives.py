@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -14,9 +14,8 @@ from rangesfm.ranging.anchors.multilateration import multilaterate
 from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.scale.range_equation import RangeProblem, RangeState, predicted_ranges, solve
 from rangesfm.scale.starts import spread_rows
-from rangesfm.trust.corrected import corrected
-from rangesfm.trust.hypothesis import Correction
-from rangesfm.trust.ranges_on_map import RangesOnMap
+from rangesfm.trust.hypothesis import Correction, corrected
+from rangesfm.trust.linearized import RangesOnMap
 
 _NUM_PER_ANCHOR, _NUM_EVALUATIONS = 25, 25
 _FOOT_M = 0.3048
@@ -58,66 +57,12 @@ class Alternative:
     correction: Correction
 
 
-def labels_swapped(on_map: RangesOnMap) -> Iterator[Alternative]:
-    """Two anchors' labels, or their lines in the file."""
+def alternatives(on_map: RangesOnMap) -> Iterator[Alternative]:
+    """All that there are of a map."""
     given = _given_m(on_map)
-    for first, second in combinations(given, 2):
-        yield Alternative(
-            "labels swapped",
-            f"{first}, {second}",
-            f"anchors {first} and {second} bear each other's label",
-            "compare the labels on the devices with the anchors' file",
-            Correction(anchors_m={first: given[second], second: given[first]}),
-        )
-
-
-def lines_shifted(on_map: RangesOnMap) -> Iterator[Alternative]:
-    """The anchors' labels and coordinates, off by a line."""
-    placed_m = _given_m(on_map)
-    given = [name for name in on_map.order_given if name in placed_m]
-    at = [placed_m[name] for name in given]
-    for by, whose in ((1, "before"), (-1, "after")) if len(given) > 2 else ():
-        yield Alternative(
-            "lines shifted",
-            "",
-            f"each anchor has the coordinates of the one in the line {whose} it in the anchors' file",
-            "compare the labels on the devices with the anchors' file",
-            Correction(anchors_m=dict(zip(given, at[by:] + at[:by], strict=True))),
-        )
-
-
-def other_axes(on_map: RangesOnMap) -> Iterator[Alternative]:
-    """Of the anchors' coordinates."""
-    given = _given_m(on_map)
-    for words, axes in _AXES_OF_ANCHORS.items() if len(given) > 2 else ():
-        yield Alternative(
-            "anchors' axes",
-            "",
-            f"in the anchors' coordinates {words}",
-            "compare the anchors' file with a sketch of the site",
-            Correction(anchors_m={name: axes @ at for name, at in given.items()}),
-        )
-
-
-def other_units(on_map: RangesOnMap) -> Iterator[Alternative]:
-    """Feet, and ranges that are twice as long."""
-    given = _given_m(on_map)
-    for words, metres in _UNITS_M.items():
-        if len(given) < 2:
-            return
-        middle = np.mean(list(given.values()), axis=0)
-        yield Alternative(
-            "anchors' unit",
-            "",
-            words,
-            "check the unit of ranges and anchors' file against a taped distance between two of them",
-            Correction(anchors_m={name: middle + metres * (at - middle) for name, at in given.items()}),
-        )
-
-
-def photos_reversed(on_map: RangesOnMap) -> Iterator[Alternative]:
-    """The photos' times run backwards, as where their order was taken from names that count down."""
-    if on_map.velocity is not None:
+    for name, subject, words, remedy, anchors_m in (*_of_labels(on_map, given), *_of_coordinates(given)):
+        yield Alternative(name, subject, words, remedy, Correction(anchors_m))
+    if on_map.velocity is not None:  # as where their order was taken from names that count down
         times = on_map.time_s
         yield Alternative(
             "photos reversed",
@@ -126,31 +71,46 @@ def photos_reversed(on_map: RangesOnMap) -> Iterator[Alternative]:
             "check the photos' times, or the order that they were given in",
             Correction(time_shift_s=times.min() + times.max() - 2 * times),
         )
-
-
-def other_lever_arms(on_map: RangesOnMap) -> Iterator[Alternative]:
-    """Another convention of the camera's axes."""
     arms = _lever_arms_m(on_map)
     for words, axes in _AXES_OF_LEVER_ARM.items():
         moves = {tag: axes @ arm - arm for tag, arm in arms.items()}
         if max(np.linalg.norm(move) for move in moves.values()) > 1e-3:
-            yield Alternative(
-                "lever arm's axes",
-                "",
-                f"the lever arm {words}",
-                "give the tag's place in the camera, x to the right, y down, z forward (--tag_in_cam)",
-                Correction(tag_moves_m=moves),
-            )
+            remedy = "give the tag's place in the camera, x to the right, y down, z forward (--tag_in_cam)"
+            yield Alternative("lever arm's axes", "", f"the lever arm {words}", remedy, Correction(tag_moves_m=moves))
 
 
-ALTERNATIVES: tuple[Callable[[RangesOnMap], Iterator[Alternative]], ...] = (
-    labels_swapped,
-    lines_shifted,
-    other_axes,
-    other_units,
-    photos_reversed,
-    other_lever_arms,
-)
+_Anchors = Mapping[str, Array]
+_AlternativeAnchors = tuple[str, str, str, str, _Anchors]
+
+
+def _of_labels(on_map: RangesOnMap, given: _Anchors) -> Iterator[_AlternativeAnchors]:
+    """Two anchors' labels, or their lines in the file, are swapped; or all are off by a line."""
+    remedy = "compare the labels on the devices with the anchors' file"
+    for one, other in combinations(given, 2):
+        words = f"anchors {one} and {other} bear each other's label"
+        yield "labels swapped", f"{one}, {other}", words, remedy, {one: given[other], other: given[one]}
+    names = [name for name in on_map.order_given if name in given]
+    at = [given[name] for name in names]
+    for by, whose in ((1, "before"), (-1, "after")) if len(names) > 2 else ():
+        words = f"each anchor has the coordinates of the one in the line {whose} it in the anchors' file"
+        yield "lines shifted", "", words, remedy, dict(zip(names, at[by:] + at[:by], strict=True))
+
+
+def _of_coordinates(given: _Anchors) -> Iterator[_AlternativeAnchors]:
+    """Other axes; feet, and ranges that are twice as long."""
+    for axes_words, axes in _AXES_OF_ANCHORS.items() if len(given) > 2 else ():
+        words, remedy = (
+            f"in the anchors' coordinates {axes_words}",
+            "compare the anchors' file with a sketch of the site",
+        )
+        yield "anchors' axes", "", words, remedy, {name: axes @ at for name, at in given.items()}
+    if len(given) < 2:
+        return
+    middle = np.mean(list(given.values()), axis=0)
+    for words, metres in _UNITS_M.items():
+        remedy = "check the unit of ranges and anchors' file against a taped distance between two of them"
+        anchors_m = {name: middle + metres * (at - middle) for name, at in given.items()}
+        yield "anchors' unit", "", words, remedy, anchors_m
 
 
 class Refits:

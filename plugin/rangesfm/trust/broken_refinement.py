@@ -47,10 +47,8 @@ def why_broken(
     old, new = (trajectory.as_in(model).centers for model in (scaled, refined))
     return (
         *_out_of_line(before, after, summary, _max_growth(scaled, summary, range_loss_scale)),
-        *_points_thrown_away(before.points - old.mean(axis=0), after.points - new.mean(axis=0)),
-        *_another_scale(old, new, estimate),
-        *_ranges_lost(estimate, summary),
-        *_anchors_gone(summary, old),
+        *_elsewhere(before.points - old.mean(axis=0), after.points - new.mean(axis=0), old, new, estimate),
+        *_apart_from_ranges(estimate, summary, old),
     )
 
 
@@ -86,16 +84,12 @@ def _out_of_line(before: PointErrors, after: PointErrors, summary: RefineSummary
         )
 
 
-def _points_thrown_away(before: Array, after: Array) -> Iterator[str]:
-    """Of points about the path's middle; those on the horizon may go where they like, half of all may not."""
-    if not len(before):
-        return
-    old_m, new_m = (float(np.median(np.linalg.norm(points, axis=1))) for points in (before, after))
-    if new_m > _MAX_POINTS_GROWTH * old_m:
+def _elsewhere(old_points: Array, new_points: Array, old: Array, new: Array, estimate: ScaleEstimate) -> Iterator[str]:
+    """Points, from the path's middle, and keyframes."""
+    # Those on the horizon may go where they like, half of all may not.
+    old_m, new_m = (np.median(np.linalg.norm(of, axis=1)) if len(of) else 0.0 for of in (old_points, new_points))
+    if len(old_points) and new_m > _MAX_POINTS_GROWTH * old_m:
         yield f"the points were thrown away from the path: from {old_m:.3g} to {new_m:.3g} m (median)"
-
-
-def _another_scale(old: Array, new: Array, estimate: ScaleEstimate) -> Iterator[str]:
     if len(old) < 3:
         return
     change = align_most(old, new, IDENTITY).scale
@@ -107,17 +101,13 @@ def _another_scale(old: Array, new: Array, estimate: ScaleEstimate) -> Iterator[
         )
 
 
-def _ranges_lost(estimate: ScaleEstimate, summary: RefineSummary) -> Iterator[str]:
-    if estimate.solution is None:
-        return
-    old_m = float(np.median(np.abs(estimate.solution.fit.residuals_m)))
-    new_m = float(np.nanmedian(np.abs(summary.predicted_m - summary.observations.log.range_m)))
-    if new_m > _MAX_RESIDUAL_GROWTH * max(old_m, estimate.noise_stddev_m):
-        yield f"ranges and map are {new_m:.2g} m apart (median), where they were {old_m:.2g} m"
-
-
-def _anchors_gone(summary: RefineSummary, path_m: Array) -> Iterator[str]:
-    """Surveyed anchors that ended elsewhere altogether: by more than the path is large."""
+def _apart_from_ranges(estimate: ScaleEstimate, summary: RefineSummary, path_m: Array) -> Iterator[str]:
+    """Ranges that were lost, and surveyed anchors that ended elsewhere altogether: by more than the path is large."""
+    if estimate.solution is not None:
+        old_m = float(np.median(np.abs(estimate.solution.fit.residuals_m)))
+        new_m = float(np.nanmedian(np.abs(summary.predicted_m - summary.observations.log.range_m)))
+        if new_m > _MAX_RESIDUAL_GROWTH * max(old_m, estimate.noise_stddev_m):
+            yield f"ranges and map are {new_m:.2g} m apart (median), where they were {old_m:.2g} m"
     size_m = float(np.linalg.norm(path_shape(path_m).stddevs))
     for anchor in summary.anchors:
         prior_m, stddev_m = anchor.prior_position_m, anchor.prior_position_stddev_m

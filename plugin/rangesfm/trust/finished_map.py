@@ -26,8 +26,6 @@ _MAX_NOISE_M = 0.4
 # Share of an anchor's ranges below which it had no say, and how many it takes to speak of a share.
 _MIN_USED, _MIN_RANGES = 0.5, 10
 _CHECK_ANCHOR = "measure the anchors again, and see that each stands in the open and has its own label"
-_CHECK_RADIO = "check the unit of the ranges and the radio's calibration (rangesfm ranges calibrate)"
-_CHECK_MODEL = "check that model, photos and the camera's parameters belong together"
 
 
 @dataclass(frozen=True)
@@ -76,34 +74,28 @@ def doubts_of_map(
     stage = estimate if summary is None else summary
     noise_m = np.full(len(stage.observations.log), np.nan) if noise_is_given else stage.errors.stddev_m
     return (
-        *_of_points(points),
-        *(() if summary is None else _of_solver(summary)),
-        *_of_scale(estimate, refined_scale),
+        *_of_fit(estimate, summary, refined_scale, points),
         *_of_say(stage.observations),
         *_of_positions(stage.anchors),
         *_of_noise(stage.observations, noise_m),
     )
 
 
-def _of_points(points: PointErrors) -> Iterator[Doubt]:
+def _of_fit(
+    estimate: ScaleEstimate, summary: RefineSummary | None, refined_scale: float | None, points: PointErrors
+) -> Iterator[Doubt]:
+    """Of points that do not fit the photos, of the solver, and of a scale that the refinement took elsewhere."""
     if not points.fit:
         reason = (
             f"the map's points lie {points.median_px:.3g} px (median) from where the photos show them, expected below "
             f"{points.max_median_px:.3g} px"
         )
-        yield Doubt(reason, _CHECK_MODEL)
-
-
-def _of_solver(summary: RefineSummary) -> Iterator[Doubt]:
-    if not summary.converged:
-        reason = f"the refinement stopped before it converged: {summary.message}"
+        yield Doubt(reason, "check that model, photos and the camera's parameters belong together")
+    if summary is not None and not summary.converged:
         remedy = "give it more iterations ([refine] max_num_iterations), or the map fewer wrong points"
-        yield Doubt(reason, remedy)
-    for misfit in summary.misfits:
+        yield Doubt(f"the refinement stopped before it converged: {summary.message}", remedy)
+    for misfit in () if summary is None else summary.misfits:
         yield Doubt(f"after the refinement {misfit}", "check clocks, lever arm and anchors")
-
-
-def _of_scale(estimate: ScaleEstimate, refined_scale: float | None) -> Iterator[Doubt]:
     low, high = estimate.interval_95
     if refined_scale is not None and not low <= refined_scale <= high:
         reason = (
@@ -150,7 +142,8 @@ def _of_noise(observations: RangeObservations, noise_m: Array) -> Iterator[Doubt
         return
     whose = "the ranges" if len(noisy) == len(of_anchors) else f"the ranges to {', '.join(noisy)}"
     reason = f"{whose} scatter by {max(noisy.values()):.2f} m, where UWB radios do by 0.02 to 0.3 m"
-    yield Doubt(reason, f"{_CHECK_RADIO}; if this radio is so coarse, say so (range_stddev_m)")
+    remedy = "check the unit of the ranges and the radio's calibration (rangesfm ranges calibrate)"
+    yield Doubt(reason, f"{remedy}; if this radio is so coarse, say so (range_stddev_m)")
 
 
 def place_of_map(

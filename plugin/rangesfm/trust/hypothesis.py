@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rangesfm.arrays import Array, Mask
-from rangesfm.trust.linearized import Linearized
+from rangesfm.trust.linearized import Linearized, RangesOnMap
 
 # In the unit of a hypothesis: for a slope between two of its sizes.
 _SMALL = 1e-4
@@ -63,10 +63,10 @@ class Hypothesis:
     Attributes:
         name: the same for all of one kind. subject: which of them; an anchor's id, a time.
         effect: on the residuals.
-        unit: of the numbers.
         words: of an estimate (k,): what is probably the case.
         remedy: what to measure or to change.
         correction: of an estimate, what undoes it.
+        unit: of the numbers.
         adoption: what takes its place where the mistake is adopted; None: the correction itself.
         most: beyond which an estimate is not believed, in its unit.
         unawares: beyond which nobody makes it without seeing it, in its unit: a larger one need not be feared.
@@ -77,12 +77,12 @@ class Hypothesis:
     """
 
     name: str
-    subject: str
     effect: Effect
-    unit: str
     words: Callable[[Array], str]
     remedy: str
     correction: Callable[[Array], Correction]
+    subject: str = ""
+    unit: str = "m"
     adoption: Callable[[Array], Correction] | None = None
     most: float = np.inf
     unawares: float = np.inf
@@ -115,16 +115,73 @@ def of_cells(problem: Linearized, columns: Array) -> Effect:
     return Effect(columns, np.zeros((problem.num_priors, columns.shape[1])))
 
 
-def of_anchor_place(problem: Linearized, anchor: int, directions: Array) -> Effect | None:
-    """That the anchor is off by numbers times directions (3, k), towards where it is; None if nobody said where."""
+def is_given(problem: Linearized, anchor: int) -> bool:
+    """Whether somebody said where an anchor is."""
     given = problem.on_map.problem
-    if not np.isfinite(given.anchor_mean_m[anchor]).all() or not np.isfinite(given.anchor_stddev_m[anchor]):
-        return None
+    return bool(np.isfinite(given.anchor_mean_m[anchor]).all() and np.isfinite(given.anchor_stddev_m[anchor]))
+
+
+def of_anchor_place(problem: Linearized, anchor: int, directions: Array) -> Effect:
+    """That an anchor whose place is given is off by numbers times directions (3, k), towards where it is."""
+    stddev_m = problem.on_map.problem.anchor_stddev_m
     if problem.columns.anchor[anchor] < 0:
         is_of = (problem.cells.anchor_index == anchor)[:, None]
         return of_cells(problem, np.where(is_of, problem.gradient.by_tag @ directions, 0.0))
-    has_rows = (problem.columns.anchor >= 0) & np.isfinite(given.anchor_stddev_m)
+    has_rows = (problem.columns.anchor >= 0) & np.isfinite(stddev_m)
     row = 3 * np.count_nonzero(has_rows[:anchor])
     priors = np.zeros((problem.num_priors, directions.shape[1]))
-    priors[row : row + 3] = directions / given.anchor_stddev_m[anchor]
+    priors[row : row + 3] = directions / stddev_m[anchor]
     return Effect(np.zeros((len(problem.residual_m), directions.shape[1])), priors)
+
+
+def longer(rows: Callable[[], Mask]) -> Callable[[Array], Correction]:
+    """What undoes that some ranges read longer by a constant."""
+    return lambda size: Correction(longer_m=np.where(rows(), size[0], 0.0))
+
+
+def too_long(size: Array) -> str:
+    return f"read about {abs(size[0]):.2f} m too {'long' if size[0] > 0 else 'short'}"
+
+
+def in_axes(shift: Array) -> str:
+    return f"{shift[0]:+.2f}, {shift[1]:+.2f}, {shift[2]:+.2f} m"
+
+
+def corrected(on_map: RangesOnMap, correction: Correction) -> RangesOnMap:
+    """The same ranges, with anchors, lever arms, times and lengths as they would be; none is left out."""
+    problem, mean_m = on_map.problem, on_map.problem.anchor_mean_m.copy()
+    anchors_m = on_map.state.anchors_m.copy()
+    for name, position in correction.anchors_m.items():
+        k = on_map.anchor_ids.index(name)
+        mean_m[k] = np.full(3, np.nan) if position is None else position
+        anchors_m[k] = anchors_m[k] if position is None else position
+    problem = replace(problem, anchor_mean_m=mean_m)
+    on_map = replace(on_map, problem=problem, state=replace(on_map.state, anchors_m=anchors_m))
+    if on_map.velocity is not None and np.any(correction.time_shift_s):
+        on_map = _taken_later(on_map, np.broadcast_to(correction.time_shift_s, len(on_map.time_s)), on_map.velocity)
+    problem = on_map.problem
+    if correction.longer_m is not None:
+        problem = replace(problem, range_m=problem.range_m - correction.longer_m)
+    if correction.tag_moves_m:
+        moves = np.array([correction.tag_moves_m.get(tag, np.zeros(3)) for tag in on_map.tag_ids])
+        turned = np.einsum("nij,nj->ni", on_map.model_from_cam, moves[on_map.tag_index])
+        problem = replace(problem, tag_from_center=problem.tag_from_center + turned)
+    return replace(on_map, problem=problem)
+
+
+def _taken_later(on_map: RangesOnMap, shift_s: Array, velocity: Array) -> RangesOnMap:
+    """Each range where the one was taken that is nearest to its own time, and on by the velocity (n, 3) there."""
+    problem, taken_s = on_map.problem, on_map.time_s + shift_s
+    order = np.argsort(on_map.time_s, kind="stable")
+    rising_s = on_map.time_s[order]
+    after = np.clip(np.searchsorted(rising_s, taken_s), 1, len(order) - 1)
+    at = order[np.where(taken_s - rising_s[after - 1] < rising_s[after] - taken_s, after - 1, after)]
+    arms = np.einsum("nji,nj->ni", on_map.model_from_cam, problem.tag_from_center)
+    turned = on_map.model_from_cam[at]
+    centers = problem.centers[at] + velocity[at] * (taken_s - on_map.time_s[at])[:, None]
+    return replace(
+        on_map,
+        problem=replace(problem, centers=centers, tag_from_center=np.einsum("nij,nj->ni", turned, arms)),
+        model_from_cam=turned,
+        velocity=velocity[at],
+    )

@@ -1,4 +1,4 @@
-"""The problem of ranges on a map, linearised at its solution: what every test of a mistake looks at."""
+"""RangesOnMap, the ranges of a survey on its scaled map, and Linearized: what every test of a mistake looks at."""
 
 from __future__ import annotations
 
@@ -7,10 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.errors.cells import Cells, cells, noisiness
 from rangesfm.ranging.errors.learned import ExpectedErrors, LearnedErrors
 from rangesfm.ranging.errors.noise import MIN_STDDEV_M, robust_stddev
+from rangesfm.ranging.observations import RangeObservations
 from rangesfm.ranging.range_gradient import RangeGradient
+from rangesfm.scale.initialize import camera_velocities, model_from_cam
+from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import (
     Columns,
     RangeProblem,
@@ -22,7 +26,8 @@ from rangesfm.scale.range_equation import (
     range_jacobian,
     tag_positions,
 )
-from rangesfm.trust.ranges_on_map import RangesOnMap
+from rangesfm.scale.solution import Solution
+from rangesfm.scale.uncertainty import ruled_out, times_of_ranges
 
 # The tests learn the errors many times over: fewer cells than an interval has.
 _MAX_NUM_CELLS = 160
@@ -38,6 +43,77 @@ _NO_WEIGHT = 1e-6
 _WANDERING_M, _WANDERING_S = 0.025, 60.0
 # In spreads over radios: what errs by more than that is no radio but a mistake, which shall not pass for noise.
 _MOST_UNUSUAL = 3.0
+
+
+@dataclass(frozen=True)
+class RangesOnMap:
+    """n ranges that took part in an estimate, and its state.
+
+    Attributes:
+        problem: with stddevs of 1, so that its residuals and Jacobians are in metres.
+        state: the estimate.
+        model_from_cam: (n, 3, 3) into the model's world.
+        velocity: (n, 3) of the camera there, model units per second; None where ranges have no times.
+        time_s: (n,) on the radio's clock; where the log names photos, the way along the path in metres.
+        tag_index: (n,). tag_ids, anchor_ids: by index. order_given: of the anchors in their file.
+        rows: (n,) of the log.
+        weights: (n,) robust weights by which the estimate took them.
+        curve_stddev_m: (n,) of a learnt error curve that has been taken off; None if none has.
+        ruled_out: components of the errors that the user knows not to be there.
+    """
+
+    problem: RangeProblem
+    state: RangeState
+    model_from_cam: Array
+    velocity: Array | None
+    time_s: Array
+    tag_index: Indices
+    tag_ids: tuple[str, ...]
+    anchor_ids: tuple[str, ...]
+    order_given: tuple[str, ...]
+    rows: Indices
+    weights: Array
+    curve_stddev_m: Array | None
+    ruled_out: tuple[str, ...]
+
+    @property
+    def world_from_cam(self) -> Array:
+        """(n, 3, 3) in the metric world."""
+        turned: Array = np.einsum("ij,njk->nik", self.state.metric_from_model.rotation, self.model_from_cam)
+        return turned
+
+    @property
+    def residual_m(self) -> Array:
+        """(n,) predicted minus measured, but for biases."""
+        return np.asarray(np.linalg.norm(self.from_anchor_m, axis=1) - self.problem.range_m)
+
+    @property
+    def from_anchor_m(self) -> Array:
+        """(n, 3) from each range's anchor to its tag, in the metric world."""
+        tags_m = tag_positions(self.problem, self.state.metric_from_model)
+        return np.asarray(tags_m - self.state.anchors_m[self.problem.anchor_index])
+
+
+def ranges_on_map(
+    posed: ScaleProblem, solution: Solution, observations: RangeObservations, trajectory: Trajectory
+) -> RangesOnMap:
+    """As the scale stage left them."""
+    log, rows = observations.log, posed.rows
+    return RangesOnMap(
+        problem=replace(posed.ranges, stddev_m=np.ones(len(rows)), share=None),
+        state=solution.fit.state,
+        model_from_cam=model_from_cam(observations, trajectory, posed),
+        velocity=camera_velocities(observations, trajectory, posed),
+        time_s=times_of_ranges(posed, solution, observations),
+        tag_index=log.tag_index[rows],
+        tag_ids=log.tag_ids,
+        anchor_ids=log.anchor_ids,
+        order_given=posed.order_given,
+        rows=rows,
+        weights=solution.fit.weights,
+        curve_stddev_m=None if log.shared_stddev_m is None else log.shared_stddev_m[rows],
+        ruled_out=tuple(ruled_out(posed.ranges)),
+    )
 
 
 @dataclass(frozen=True)
@@ -77,6 +153,12 @@ class Linearized:
     def num_priors(self) -> int:
         return len(self.prior_residual)
 
+    @property
+    def heard(self) -> list[int]:
+        """The anchors that there are ranges to."""
+        anchors: list[int] = np.unique(self.cells.anchor_index).tolist()
+        return anchors
+
     def with_learnt_errors(self, columns: Array, priors: Array) -> Linearized:
         """With what is left random when (c, k) columns and (r, k) priors explain what they can."""
         # At the place where nothing speaks against what is known beforehand.
@@ -92,7 +174,7 @@ class Linearized:
 
     def with_usual_errors(self) -> Linearized:
         """As radios and maps have them that scatter like this."""
-        return replace(self, errors=_usual(self.expected, self.scatter_m))
+        return replace(self, errors=self.expected.usual({"white": self.scatter_m}))
 
 
 def linearized(on_map: RangesOnMap, cells_of_ranges: Cells | None = None) -> Linearized:
@@ -108,7 +190,7 @@ def linearized(on_map: RangesOnMap, cells_of_ranges: Cells | None = None) -> Lin
         gradient = range_gradient(problem, state)
         cells_of_ranges, scatter_m = _cells(on_map, _residual_m(problem, state, gradient), gradient)
     expected = ExpectedErrors.of(cells_of_ranges, on_map.curve_stddev_m, on_map.ruled_out, _wandering(cells_of_ranges))
-    return _linearized(on_map, expected, scatter_m, _usual(expected, scatter_m))
+    return _linearized(on_map, expected, scatter_m, expected.usual({"white": scatter_m}))
 
 
 def at_state(problem: Linearized, on_map: RangesOnMap) -> Linearized:
@@ -151,10 +233,6 @@ def _linearized(on_map: RangesOnMap, expected: ExpectedErrors, scatter_m: float,
         expected=expected,
         errors=errors,
     )
-
-
-def _usual(expected: ExpectedErrors, scatter_m: float) -> LearnedErrors:
-    return expected.usual({"white": scatter_m})
 
 
 def _wandering(cells_of_ranges: Cells) -> dict[str, Array]:

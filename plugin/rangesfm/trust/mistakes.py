@@ -8,12 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rangesfm.scale.range_equation import RangeState, state_after
-from rangesfm.trust.alternatives import ALTERNATIVES, Refits
+from rangesfm.trust.alternatives import Alternative, Refits, alternatives
 from rangesfm.trust.catalogue import STANDING
-from rangesfm.trust.corrected import corrected
-from rangesfm.trust.hypothesis import Correction, Effect, Hypothesis, of_cells
-from rangesfm.trust.linearized import Linearized, at_state, linearized
-from rangesfm.trust.ranges_on_map import RangesOnMap
+from rangesfm.trust.hypothesis import Correction, Effect, Hypothesis, corrected, of_cells
+from rangesfm.trust.linearized import Linearized, RangesOnMap, at_state, linearized
 from rangesfm.trust.scanning import SCANNING
 from rangesfm.trust.testing import Factorization, Test, overlap
 
@@ -29,25 +27,18 @@ _NUM_SETTLING, _SETTLED = 6, 0.05
 
 
 @dataclass(frozen=True)
-class Cause:
-    """An explanation that beats chance.
+class Cause(Alternative):
+    """An explanation that beats chance; its words are with the size that was found.
 
     Attributes:
-        name, subject, words, remedy: as of a Hypothesis; the words with the size that was found.
         gain: by how much it makes the ranges likelier, as twice a logarithm, with the noise that it leaves.
         penalty: for what it may choose.
-        correction: what would be right.
         state: the likeliest with it.
         test: None for an alternative.
     """
 
-    name: str
-    subject: str
-    words: str
-    remedy: str
     gain: float
     penalty: float
-    correction: Correction
     state: RangeState
     test: Test | None
 
@@ -82,7 +73,7 @@ def find_mistakes(on_map: RangesOnMap, *, seed: int = 0) -> Findings:
     are believed that make the ranges likelier with the noise that each of them leaves.
     """
     problem = linearized(on_map)
-    standing = _standing(problem)
+    standing = [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
     hypotheses = standing + [hypothesis for of_kind in SCANNING for hypothesis in of_kind(problem)]
     problem = _learnt(problem, standing)
     tests = _best_of_each(Factorization(problem).test(hypotheses, seed), problem)
@@ -99,10 +90,6 @@ def _learnt(problem: Linearized, explaining: Sequence[Hypothesis]) -> Linearized
     """With the errors that are left when some mistakes explain what they can."""
     effects = Effect.of_all([of_cells(problem, problem.design[:, :0]), *(h.effect for h in explaining)])
     return problem.with_learnt_errors(effects.columns, effects.priors)
-
-
-def _standing(problem: Linearized) -> list[Hypothesis]:
-    return [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
 
 
 def _causes(problem: Linearized, nominated: Sequence[Test], *, is_sure: bool) -> list[Cause]:
@@ -184,13 +171,13 @@ def _narrowed(problem: Linearized, cause: Cause, before: float) -> Cause:
 def _cause(test: Test, state: RangeState, gain: float, penalty: float) -> Cause:
     h = test.hypothesis
     adoption = (h.adoption or h.correction)(test.sizes)
-    return Cause(h.name, h.subject, h.words(test.sizes), h.remedy, gain, penalty, adoption, state, test)
+    return Cause(h.name, h.subject, h.words(test.sizes), h.remedy, adoption, gain, penalty, state, test)
 
 
 def _alternatives(problem: Linearized, before: float) -> Iterator[Cause]:
     """Those that make the ranges likelier than chance would."""
     on_map = problem.on_map
-    tried = [each for of_kind in ALTERNATIVES for each in of_kind(on_map)]
+    tried = list(alternatives(on_map))
     if not tried:
         return
     refits = Refits(on_map, problem.scatter_m)
@@ -202,8 +189,7 @@ def _alternatives(problem: Linearized, before: float) -> Iterator[Cause]:
         gain = before - Factorization(_learnt(moved, [])).deviance()
         penalty = 2 * float(np.log(len(tried)))
         if gain > penalty + _AS_LIKELY:
-            state = moved.on_map.state
-            yield Cause(each.name, each.subject, each.words, each.remedy, gain, penalty, each.correction, state, None)
+            yield Cause(**vars(each), gain=gain, penalty=penalty, state=moved.on_map.state, test=None)
 
 
 def _settled(problem: Linearized) -> Linearized:

@@ -9,7 +9,7 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.trust.catalogue import MISMEASURED_M, UNSEEN_MOVE_M
-from rangesfm.trust.hypothesis import Correction, Hypothesis, of_cells
+from rangesfm.trust.hypothesis import Correction, Hypothesis, in_axes, longer, of_cells, too_long
 from rangesfm.trust.linearized import Linearized
 
 # A step is best found where it was: the ranges between the true time and the one that is tried fit neither way.
@@ -21,62 +21,54 @@ _LEAST_SHARE = 1 / 12
 _STRETCHES = (1 / 4, 1 / 8, 1 / 16)
 # Of fewer cells on either side nothing can be said.
 _MIN_NUM_CELLS = 3
+# What is elsewhere from some time on: in words of whose, when and by how much, what to do, and what nobody overlooks.
+_MOVES: dict[str, tuple[Callable[[str, str, Array], str], str, float]] = {
+    "anchor moved": (
+        lambda whose, when, size: (
+            f"anchor {whose} was moved by about {np.linalg.norm(size):.2f} m {when} ({in_axes(size)} in x, y, z)"
+        ),
+        "fix anchors so that nobody bumps into them, and use its ranges from before only",
+        UNSEEN_MOVE_M,
+    ),
+    "map break": (
+        lambda _, when, size: (
+            f"the map breaks: {when} it lies about {np.linalg.norm(size):.2f} m from where it should "
+            f"({in_axes(-size)} in x, y, z)"
+        ),
+        "look at the photos there for a false match or too little overlap, and map the parts apart",
+        UNSEEN_MOVE_M,
+    ),
+    "tag slipped": (
+        lambda _, when, size: (
+            f"the tag slipped: {when} it sits about {np.linalg.norm(size):.2f} m elsewhere on the "
+            f"camera ({in_axes(size)} along the camera's x, y, z)"
+        ),
+        "fix the tag to the camera, and run the two parts as surveys of their own",
+        MISMEASURED_M,
+    ),
+}
 
 
 def anchors_moved(problem: Linearized) -> Iterator[Hypothesis]:
     """An anchor was moved at some time."""
-    for k in _heard(problem):
-        name = problem.on_map.anchor_ids[k]
-
-        def words(when: str, size: Array, name: str = name) -> str:
-            return f"anchor {name} was moved by about {np.linalg.norm(size):.2f} m {when} ({_in_axes(size)} in x, y, z)"
-
-        remedy = "fix anchors so that nobody bumps into them, and use its ranges from before only"
-        yield from _elsewhere(
-            problem, k, "anchor moved", words, remedy, UNSEEN_MOVE_M, lambda: -np.eye(3), -problem.gradient.by_tag
-        )
+    for k in problem.heard:
+        yield from _elsewhere(problem, k, "anchor moved", lambda: -np.eye(3), -problem.gradient.by_tag)
 
 
 def map_breaks(problem: Linearized) -> Iterator[Hypothesis]:
     """From some time on the map lies elsewhere, as after a wrong match."""
-
-    def words(when: str, size: Array) -> str:
-        far = f"about {np.linalg.norm(size):.2f} m from where it should"
-        return f"the map breaks: {when} it lies {far} ({_in_axes(-size)} in x, y, z)"
-
-    remedy = "look at the photos there for a false match or too little overlap, and map the parts apart"
-    yield from _elsewhere(
-        problem, None, "map break", words, remedy, UNSEEN_MOVE_M, lambda: np.eye(3), problem.gradient.by_tag
-    )
+    return _elsewhere(problem, None, "map break", lambda: np.eye(3), problem.gradient.by_tag)
 
 
 def tags_slipped(problem: Linearized) -> Iterator[Hypothesis]:
     """From some time on the tag sits elsewhere on the camera."""
-
-    def words(when: str, size: Array) -> str:
-        far = f"about {np.linalg.norm(size):.2f} m elsewhere on the camera"
-        return f"the tag slipped: {when} it sits {far} ({_in_axes(size)} along the camera's x, y, z)"
-
-    remedy = "fix the tag to the camera, and run the two parts as surveys of their own"
-    yield from _elsewhere(
-        problem,
-        None,
-        "tag slipped",
-        words,
-        remedy,
-        MISMEASURED_M,
-        lambda: problem.on_map.world_from_cam,
-        problem.by_lever_arm,
-    )
+    return _elsewhere(problem, None, "tag slipped", lambda: problem.on_map.world_from_cam, problem.by_lever_arm)
 
 
 def _elsewhere(
     problem: Linearized,
     anchor: int | None,
     name: str,
-    words: Callable[[str, Array], str],
-    remedy: str,
-    unawares: float,
     axes: Callable[[], Array],
     by_shift: Array,
     around: float | None = None,
@@ -84,90 +76,82 @@ def _elsewhere(
     """From some time on tags are elsewhere, as seen from an anchor, or from all.
 
     Args:
-        words: of when, and of a shift.
+        name: of the kind, of ``_MOVES``.
         axes: along which they are shifted, (3, 3), or (n, 3, 3) for each range.
         by_shift: (c, 3) by how much the predicted ranges grow along these.
         around: as of ``_changes``.
     """
-    for time, after in _changes(problem, anchor, 3 * _MIN_NUM_CELLS, around):
-        later = partial(_later, problem, anchor, time)
+    words, remedy, unawares = _MOVES[name]
+    whose = _name(problem, anchor)
 
-        def back(size: Array, later: Callable[[], Mask] = later) -> Correction:
-            from_anchor_m = problem.on_map.from_anchor_m
-            grown_m = np.linalg.norm(from_anchor_m + axes() @ size, axis=1) - np.linalg.norm(from_anchor_m, axis=1)
-            return Correction(longer_m=np.where(later(), grown_m, 0.0))
+    def back(later: Callable[[], Mask], size: Array) -> Correction:
+        from_anchor_m = problem.on_map.from_anchor_m
+        grown_m = np.linalg.norm(from_anchor_m + axes() @ size, axis=1) - np.linalg.norm(from_anchor_m, axis=1)
+        return Correction(longer_m=np.where(later(), grown_m, 0.0))
 
+    for time, later, after in _changes(problem, anchor, 3 * _MIN_NUM_CELLS, around):
         yield Hypothesis(
             name,
-            "" if anchor is None else problem.on_map.anchor_ids[anchor],
-            unit="m",
-            words=partial(words, _when(problem, time)),
+            of_cells(problem, -after[:, None] * by_shift),
+            subject=whose,
+            words=partial(words, whose, _when(problem, time)),
             remedy=remedy,
-            correction=back,
-            adoption=_left_out(later),
+            correction=partial(back, later),
+            adoption=partial(_left_out, later),
             unawares=unawares,
-            finer=partial(_elsewhere, problem, anchor, name, words, remedy, unawares, axes, by_shift, around=time),
-            effect=of_cells(problem, -after[:, None] * by_shift),
+            finer=partial(_elsewhere, problem, anchor, name, axes, by_shift, around=time),
         )
-
-
-def _in_axes(shift: Array) -> str:
-    return f"{shift[0]:+.2f}, {shift[1]:+.2f}, {shift[2]:+.2f} m"
 
 
 def steps(problem: Linearized) -> Iterator[Hypothesis]:
     """From some time on ranges read longer, those of one anchor or of all."""
-    for k in [*(_heard(problem) if len(_heard(problem)) > 1 else []), None]:
+    for k in _each_and_all(problem):
         yield from _steps(problem, k)
 
 
 def _steps(problem: Linearized, anchor: int | None, around: float | None = None) -> Iterator[Hypothesis]:
-    name = "" if anchor is None else problem.on_map.anchor_ids[anchor]
-    for time, after in _changes(problem, anchor, _MIN_NUM_CELLS, around):
-        later = partial(_later, problem, anchor, time)
+    name = _name(problem, anchor)
 
-        def words(size: Array, name: str = name, when: str = _when(problem, time)) -> str:
-            to, how = f" to anchor {name}" if name else "", "longer" if size[0] > 0 else "shorter"
-            return f"{when} on the ranges{to} read about {abs(size[0]):.2f} m {how}"
+    def words(when: str, size: Array) -> str:
+        to, how = f" to anchor {name}" if name else "", "longer" if size[0] > 0 else "shorter"
+        return f"{when} on the ranges{to} read about {abs(size[0]):.2f} m {how}"
 
+    for time, later, after in _changes(problem, anchor, _MIN_NUM_CELLS, around):
         yield Hypothesis(
             "anchor step" if name else "step",
-            name,
-            unit="m",
-            is_linear=True,
-            words=words,
+            of_cells(problem, -after),
+            subject=name,
+            words=partial(words, _when(problem, time)),
             remedy="see what changed then: a tag that slipped, a restarted radio, a door or a vehicle in between",
-            correction=_longer(later),
+            correction=longer(later),
+            is_linear=True,
             finer=partial(_steps, problem, anchor, around=time),
-            effect=of_cells(problem, -after),
         )
 
 
 def stretches(problem: Linearized) -> Iterator[Hypothesis]:
     """For a while ranges read longer."""
     windows = list(_windows(problem))
-    for k in [*(_heard(problem) if len(_heard(problem)) > 1 else []), None]:
-        name = "" if k is None else problem.on_map.anchor_ids[k]
+
+    def words(name: str, when: str, size: Array) -> str:
+        return f"{when} the ranges{f' to anchor {name}' if name else ''} {too_long(size)}"
+
+    for k in _each_and_all(problem):
+        name = _name(problem, k)
         for start, end, share in windows:
             inside = np.where(_is_of(problem.cells.anchor_index, k), share, 0.0)
             if inside.sum() < _MIN_NUM_CELLS:
                 continue
             within = partial(_later, problem, k, start, end)
-
-            def words(size: Array, name: str = name, when: str = _when(problem, start, end)) -> str:
-                to = f" to anchor {name}" if name else ""
-                return f"{when} the ranges{to} read about {abs(size[0]):.2f} m too {'long' if size[0] > 0 else 'short'}"
-
             yield Hypothesis(
                 "anchor stretch" if name else "stretch",
-                name,
-                unit="m",
-                is_linear=True,
-                words=words,
+                of_cells(problem, -inside),
+                subject=name,
+                words=partial(words, name, _when(problem, start, end)),
                 remedy="look for what stood in the line of sight, and leave that stretch out",
-                correction=_longer(within),
-                adoption=_left_out(within),
-                effect=of_cells(problem, -inside),
+                correction=longer(within),
+                adoption=partial(_left_out, within),
+                is_linear=True,
             )
 
 
@@ -175,41 +159,43 @@ def clock_jumps(problem: Linearized, around: float | None = None) -> Iterator[Hy
     """The clocks' offset jumped at some time."""
     if problem.by_time is None:
         return
-    for time, after in _changes(problem, None, _MIN_NUM_CELLS, around):
-        later = partial(_later, problem, None, time)
 
-        def words(size: Array, when: str = _when(problem, time)) -> str:
-            return f"the clocks' offset jumped by about {size[0]:+.2f} s {when}"
+    def words(when: str, size: Array) -> str:
+        return f"the clocks' offset jumped by about {size[0]:+.2f} s {when}"
 
-        def correction(size: Array, later: Callable[[], Mask] = later) -> Correction:
-            return Correction(time_shift_s=np.where(later(), size[0], 0.0))
+    def correction(later: Callable[[], Mask], size: Array) -> Correction:
+        return Correction(time_shift_s=np.where(later(), size[0], 0.0))
 
+    for time, later, after in _changes(problem, None, _MIN_NUM_CELLS, around):
         yield Hypothesis(
             "clock jump",
-            "",
+            of_cells(problem, -after * problem.by_time),
+            words=partial(words, _when(problem, time)),
+            remedy="see whether a logger was restarted then, and run the two parts as surveys of their own",
+            correction=partial(correction, later),
             unit="s",
             is_linear=True,
-            words=words,
-            remedy="see whether a logger was restarted then, and run the two parts as surveys of their own",
-            correction=correction,
             finer=partial(clock_jumps, problem, around=time),
-            effect=of_cells(problem, -after * problem.by_time),
         )
 
 
-def _heard(problem: Linearized) -> list[int]:
-    heard: list[int] = np.unique(problem.cells.anchor_index).tolist()
-    return heard
+def _name(problem: Linearized, anchor: int | None) -> str:
+    return "" if anchor is None else problem.on_map.anchor_ids[anchor]
 
 
-def _of_ranges(problem: Linearized, anchor: int | None) -> Mask:
-    return _is_of(problem.on_map.problem.anchor_index, anchor)
+def _each_and_all(problem: Linearized) -> list[int | None]:
+    """Anchors, if there are several, and None for all of them."""
+    return [*(problem.heard if len(problem.heard) > 1 else []), None]
 
 
 def _later(problem: Linearized, anchor: int | None, start: float, end: float = np.inf) -> Mask:
     """(n,) ranges to an anchor, or to all, from between two times."""
-    times = problem.on_map.time_s
-    return _of_ranges(problem, anchor) & (times > start) & (times <= end)
+    on_map = problem.on_map
+    return _is_of(on_map.problem.anchor_index, anchor) & (on_map.time_s > start) & (on_map.time_s <= end)
+
+
+def _left_out(rows: Callable[[], Mask], _: Array) -> Correction:
+    return Correction(left_out=rows())
 
 
 def _is_of(anchor_index: Indices, anchor: int | None) -> Mask:
@@ -217,25 +203,18 @@ def _is_of(anchor_index: Indices, anchor: int | None) -> Mask:
     return np.ones(len(anchor_index), dtype=bool) if anchor is None else np.asarray(anchor_index == anchor)
 
 
-def _longer(rows: Callable[[], Mask]) -> Callable[[Array], Correction]:
-    return lambda size: Correction(longer_m=np.where(rows(), size[0], 0.0))
-
-
-def _left_out(rows: Callable[[], Mask]) -> Callable[[Array], Correction]:
-    return lambda _: Correction(left_out=rows())
-
-
 def _changes(
     problem: Linearized, anchor: int | None, least: int, around: float | None = None
-) -> Iterator[tuple[float, Array]]:
-    """Times away from the ends, with (c,) shares of the cells of an anchor, or of all, that are from later; as many
-    cells as that at least on either side.
+) -> Iterator[tuple[float, Callable[[], Mask], Array]]:
+    """Times away from the ends, with the ranges to an anchor, or to all, that are from later, and (c,) shares of the
+    cells that are; as many cells as that at least on either side.
 
     Args:
         around: only times about this one, closer to each other.
     """
     ends = _LEAST_SHARE, 1 - _LEAST_SHARE
-    times = np.unique(np.quantile(problem.on_map.time_s[_of_ranges(problem, anchor)], np.linspace(*ends, _NUM_TIMES)))
+    of_ranges = _is_of(problem.on_map.problem.anchor_index, anchor)
+    times = np.unique(np.quantile(problem.on_map.time_s[of_ranges], np.linspace(*ends, _NUM_TIMES)))
     if around is not None:
         at = int(np.searchsorted(times, around))
         times = np.linspace(times[max(at - 1, 0)], times[min(at + 1, len(times) - 1)], _NUM_FINER)
@@ -243,7 +222,7 @@ def _changes(
     for time, share in zip(times.tolist(), _shares_after(problem, times), strict=True):
         after = np.where(is_of, share, 0.0)
         if min(after.sum(), is_of.sum() - after.sum()) >= least:
-            yield time, after
+            yield time, partial(_later, problem, anchor, time), after
 
 
 def _windows(problem: Linearized) -> Iterator[tuple[float, float, Array]]:
@@ -267,13 +246,8 @@ def _shares_after(problem: Linearized, times: Array) -> Array:
 
 def _when(problem: Linearized, start: float, end: float | None = None) -> str:
     begin = problem.on_map.time_s.min()
-    if problem.by_time is None:
-        unit, after = "m", "along the path"
-    else:
-        unit, after = "s", "after the first range"
-    if end is None:
-        return f"from {start - begin:.0f} {unit} {after}"
-    return f"from {start - begin:.0f} to {end - begin:.0f} {unit} {after}"
+    what = "m along the path" if problem.by_time is None else "s after the first range"
+    return f"from {start - begin:.0f}{'' if end is None else f' to {end - begin:.0f}'} {what}"
 
 
 SCANNING: tuple[Callable[[Linearized], Iterator[Hypothesis]], ...] = (

@@ -57,6 +57,40 @@ class Test:
         return self.statistic > self.threshold
 
 
+@dataclass(frozen=True)
+class MistakeTest:
+    """One hypothesis on one survey, as a row of the table.
+
+    Attributes:
+        name, subject: of which kind, and of what; an anchor's id, or nothing.
+        statistic, threshold: the mistake was made, or something that looks like it, where the first is larger.
+        words: what is the case if it was made. remedy: what to do then.
+        unit: of ``size``, ``stddev`` and ``smallest_detectable``; "1": a share.
+        size, stddev: of the mistake, as estimated; the length of a vector. None: not estimated.
+        smallest_detectable: that would have been found, in four cases of five; None: no such mistake is ever found.
+        effect_on_scale: relative, effect_on_place_m: root mean square along the path: the most that a mistake of that
+            size does; None: there is no limit to it.
+    """
+
+    name: str
+    subject: str
+    statistic: float
+    threshold: float
+    words: str
+    remedy: str
+    unit: str = ""
+    size: float | None = None
+    stddev: float | None = None
+    smallest_detectable: float | None = None
+    effect_on_scale: float | None = None
+    effect_on_place_m: float | None = None
+
+    @property
+    def rejected(self) -> bool:
+        """Whether chance alone does not explain it."""
+        return self.statistic > self.threshold
+
+
 class Factorization:
     """The factorisation that all tests share."""
 
@@ -191,3 +225,27 @@ def overlap(first: Test, second: Test) -> float:
     if not first.num or not second.num:
         return 0.0
     return float(np.linalg.norm(first.basis.T @ second.basis) / np.sqrt(min(first.num, second.num)))
+
+
+def row_of(test: Test, statistic: float | None = None, words: str | None = None) -> MistakeTest:
+    """As found, or with another statistic and other words."""
+    one = len(test.sizes) == 1
+    return MistakeTest(
+        name=test.hypothesis.name,
+        subject=test.hypothesis.subject,
+        statistic=test.statistic if statistic is None else statistic,
+        threshold=test.threshold if np.isfinite(test.threshold) else 0.0,
+        size=finite(float(test.sizes[0] if one else np.linalg.norm(test.sizes))),
+        stddev=finite(float(test.stddevs[0] if one else np.linalg.norm(test.stddevs))),
+        unit=test.hypothesis.unit,
+        smallest_detectable=finite(test.smallest_detectable),
+        effect_on_scale=finite(test.effect_on_log_scale),
+        effect_on_place_m=finite(test.effect_on_place_m),
+        words=test.hypothesis.words(test.sizes) if words is None else words,
+        remedy=test.hypothesis.remedy,
+    )
+
+
+def finite(value: float) -> float | None:
+    """None for what has no limit."""
+    return float(value) if np.isfinite(value) else None

@@ -1,20 +1,31 @@
-"""What the tests of a map say, for people: the table, and a sentence that names the likeliest cause."""
+"""What the tests of a map say, for people: the table, with what is no mistake of one size, and the likeliest cause."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from rangesfm.arrays import Indices
 from rangesfm.scale.verdict import DOUBTFUL_ABOVE
-from rangesfm.trust.evidence import MIXED_UP, OF_SINGLE_RANGES, evidence
-from rangesfm.trust.linearized import linearized
+from rangesfm.trust.linearized import Linearized, RangesOnMap, linearized, near_m
 from rangesfm.trust.mistakes import Cause, Findings, find_mistakes
-from rangesfm.trust.ranges_on_map import RangesOnMap
-from rangesfm.trust.table import MistakeTest, finite
-from rangesfm.trust.testing import Test
+from rangesfm.trust.testing import MistakeTest, Test, row_of
+
+# Real radios show 0.03 to 0.15 m beside outliers, old ones 0.2 m: of a stddev beyond that something else is the cause.
+_MOST_NOISE_M, _MOST_LASTING_M = 0.25, 0.25
+# In metres for a metre of distance: a radio on 70 m is noisier than one in a room.
+_NOISE_BY_DISTANCE = 0.005
+_LASTING = ("time", "place", "view")
+_LEAST_USED, _MOST_OUTLYING = 0.4, 0.35
+# Of ranges far from their neighbours, those as long as to one other anchor; of fewer it is chance.
+_MOST_OF_OTHER, _MIN_NUM_OUTLYING = 0.5, 10
+_FEW_OBSTRUCTED = "place the anchors where nothing stands between them and the path"
+
+_MIXED_UP = "anchor mixed up"
+# What is seen of ranges beside those right before and after.
+_OF_SINGLE_RANGES = ("range noise", "anchor's outliers", _MIXED_UP)
 
 
 @dataclass(frozen=True)
@@ -30,8 +41,8 @@ class TrustVerdict:
 
     tests: tuple[MistakeTest, ...]
     reasons: tuple[str, ...]
-    causes: tuple[Cause, ...]
-    rows: Indices
+    causes: tuple[Cause, ...] = ()
+    rows: Indices = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def with_more(self, more: TrustVerdict) -> TrustVerdict:
         """With tests that were made of something else than ranges."""
@@ -42,14 +53,16 @@ class TrustVerdict:
 def trust_in(on_map: RangesOnMap, *, seed: int = 0) -> TrustVerdict:
     """Test all that may be wrong with the ranges on a map."""
     found = find_mistakes(on_map, seed=seed)
-    shown = list(evidence(found.problem))
+    shown = list(_evidence(found.problem))
     before = _before_causes(found, shown)
     after = [row for row in shown if row not in before]
-    rows = [*before, *_of_causes(found), *(row_of(test) for test in _others(found)), *after]
-    reasons = [_reason(row) for row in before]
-    reasons += [*([sentence(found.causes)] if found.causes else []), *(_reason(row) for row in after if row.rejected)]
-    reasons = reasons or list(_what_could_hide(found))
-    return TrustVerdict(tuple(rows), tuple(reasons), found.causes, on_map.rows)
+    named = {(cause.name, cause.subject) for cause in found.causes}
+    others = (row_of(test) for test in found.tests if test.hypothesis.key not in named)
+    rows = (*before, *map(_row_of_cause, found.causes), *others, *after)
+    reasons = [f"{row.words}: {row.remedy}" for row in (*before, *(row for row in after if row.rejected))]
+    if found.causes:
+        reasons.insert(len(before), sentence(found.causes))
+    return TrustVerdict(rows, tuple(reasons or _what_could_hide(found)), found.causes, on_map.rows)
 
 
 def _before_causes(found: Findings, shown: Sequence[MistakeTest]) -> list[MistakeTest]:
@@ -57,17 +70,17 @@ def _before_causes(found: Findings, shown: Sequence[MistakeTest]) -> list[Mistak
 
     Of an anchor if the cause is one of its own; of all if they scatter by more than the cause changes them.
     """
-    about_ranges = [row for row in shown if row.rejected and row.name in OF_SINGLE_RANGES]
+    about_ranges = [row for row in shown if row.rejected and row.name in _OF_SINGLE_RANGES]
     if not about_ranges or not found.causes:
         return []
     cause, on_map = found.causes[0], found.problem.on_map
     undone = cause.undone(on_map)
     changed_m = float(np.sqrt(np.mean((undone.residual_m - replace(on_map, state=cause.state).residual_m) ** 2)))
-    left = {(row.name, row.subject) for row in evidence(linearized(undone)) if row.rejected}
+    left = {(row.name, row.subject) for row in _evidence(linearized(undone)) if row.rejected}
     return [
         row
         for row in about_ranges
-        if (row.name == MIXED_UP or (row.name, row.subject) in left)
+        if (row.name == _MIXED_UP or (row.name, row.subject) in left)
         and (f"{cause.subject} ".startswith(f"{row.subject} ") if row.subject else row.statistic > changed_m)
     ]
 
@@ -98,44 +111,64 @@ def _hidden_effect(test: Test) -> float:
     return test.effect_on_log_scale * min(1.0, test.hypothesis.unawares / test.smallest_detectable)
 
 
-def _reason(row: MistakeTest) -> str:
-    return f"{row.words}: {row.remedy}"
+def _row_of_cause(cause: Cause) -> MistakeTest:
+    """With the statistic by which it was found: how much likelier it makes the ranges."""
+    if cause.test is None:
+        return MistakeTest(cause.name, cause.subject, cause.gain, cause.penalty, cause.words, cause.remedy)
+    return row_of(cause.test, max(cause.test.statistic, cause.gain), cause.words)
 
 
-def _others(found: Findings) -> list[Test]:
-    named = {(cause.name, cause.subject) for cause in found.causes}
-    return [test for test in found.tests if test.hypothesis.key not in named]
+def _evidence(problem: Linearized) -> Iterator[MistakeTest]:
+    """What is no mistake of one size, of the noise as learnt beside the likeliest one and of each anchor's ranges."""
+    far = _NOISE_BY_DISTANCE * float(problem.gradient.distance_m.mean())
+    for kind, what, stddev_m, most_m in (
+        ("range noise", "scatter", problem.scatter_m, _MOST_NOISE_M + far),
+        ("lasting errors", "err for seconds", _lasting_m(problem), _MOST_LASTING_M + far),
+    ):
+        words = f"the ranges {what} by {stddev_m:.2f} m, which no radio does in the open ({most_m:.2f} m at most)"
+        yield _seen(kind, "", stddev_m, most_m, words, _FEW_OBSTRUCTED, unit="m")
+    on_map, cells = problem.on_map, problem.cells
+    index = on_map.problem.anchor_index
+    for k in np.unique(index).tolist():
+        is_of, name = index == k, on_map.anchor_ids[k]
+        unused = float(np.mean(on_map.weights[is_of] < 0.1))
+        num = int(np.count_nonzero(is_of))
+        words = f"only {round((1 - unused) * num)} of {num} ranges to anchor {name} fit the map"
+        remedy = "look whether it is the anchor that it is taken for, and where it stands"
+        yield _seen("anchor hardly used", name, unused, 1 - _LEAST_USED, words, remedy)
+        rows = np.flatnonzero(is_of & (cells.weight < 0.5))
+        if len(rows) >= _MIN_NUM_OUTLYING and len(on_map.anchor_ids) > 1:
+            yield _mixed_up(problem, k, rows)
+        outlying = len(rows) / num
+        words = f"{100 * outlying:.0f} % of the ranges to anchor {name} are far from those right before and after"
+        yield _seen("anchor's outliers", name, outlying, _MOST_OUTLYING, words, _FEW_OBSTRUCTED)
 
 
-def _of_causes(found: Findings) -> list[MistakeTest]:
-    """With the statistic by which they were found: how much likelier they make the ranges."""
-    rows = []
-    for cause in found.causes:
-        if cause.test is None:
-            rows.append(
-                MistakeTest(
-                    cause.name, cause.subject, cause.gain, cause.penalty, None, None, "", None, None, None,
-                    cause.words, cause.remedy,
-                )
-            )  # fmt: skip
-            continue
-        rows.append(row_of(cause.test, max(cause.test.statistic, cause.gain), cause.words))
-    return rows
-
-
-def row_of(test: Test, statistic: float | None = None, words: str | None = None) -> MistakeTest:
-    one = len(test.sizes) == 1
-    return MistakeTest(
-        name=test.hypothesis.name,
-        subject=test.hypothesis.subject,
-        statistic=test.statistic if statistic is None else statistic,
-        threshold=test.threshold if np.isfinite(test.threshold) else 0.0,
-        size=finite(float(test.sizes[0] if one else np.linalg.norm(test.sizes))),
-        stddev=finite(float(test.stddevs[0] if one else np.linalg.norm(test.stddevs))),
-        unit=test.hypothesis.unit,
-        smallest_detectable=finite(test.smallest_detectable),
-        effect_on_scale=finite(test.effect_on_log_scale),
-        effect_on_place_m=finite(test.effect_on_place_m),
-        words=test.hypothesis.words(test.sizes) if words is None else words,
-        remedy=test.hypothesis.remedy,
+def _mixed_up(problem: Linearized, anchor: int, outlying: Indices) -> MistakeTest:
+    """Whether an anchor's ranges that are far from their neighbours are another's."""
+    on_map = problem.on_map
+    anchors_m, index = on_map.state.anchors_m, on_map.problem.anchor_index[outlying]
+    tags_m = on_map.from_anchor_m[outlying] + anchors_m[index]
+    off_m = np.linalg.norm(tags_m[:, None] - anchors_m, axis=2) - on_map.problem.range_m[outlying, None]
+    fitting = np.mean(np.abs(off_m) < near_m(problem.scatter_m), axis=0)
+    fitting[anchor] = 0.0
+    name, other = on_map.anchor_ids[anchor], on_map.anchor_ids[int(np.argmax(fitting))]
+    words = (
+        f"{100 * fitting.max():.0f} % of the ranges to anchor {name} that are far from those right before and after "
+        f"are as long as those to {other}"
     )
+    remedy = f"see whether two devices bear the label {name}, and leave it out (use_anchors)"
+    return _seen(_MIXED_UP, name, float(fitting.max()), _MOST_OF_OTHER, words, remedy)
+
+
+def _lasting_m(problem: Linearized) -> float:
+    """Root mean square over cells."""
+    lasting = np.isin(problem.errors.names, _LASTING)
+    variances = np.trace(problem.errors.covariances_m2[lasting].sum(axis=0))
+    return float(np.sqrt(variances / len(problem.cells)))
+
+
+def _seen(
+    name: str, subject: str, found: float, most: float, words: str, remedy: str, *, unit: str = "1"
+) -> MistakeTest:
+    return MistakeTest(name, subject, found, most, words, remedy, unit, size=found, smallest_detectable=most)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -12,8 +13,7 @@ import pycolmap
 from rangesfm.colmap.calibration import calibrated_cameras
 from rangesfm.errors import InputError, nearest_known
 from rangesfm.options import CameraOptions
-from rangesfm.vision.exif import exif_tags
-from rangesfm.vision.photos import Photos
+from rangesfm.vision.photos import Photos, exif_tags
 from rangesfm.vision.rigs import NO_RIGS, Rigs
 
 _TELLING_TAGS = (0x010F, 0x0110, 0xA431, 0x920A)  # make, model, serial number, focal length
@@ -97,8 +97,9 @@ def cameras_of_photos(options: CameraOptions, photos: Photos, rigs: Rigs = NO_RI
     guessed: list[str] = []
     for table in options.tables:
         own = photos.of([name for name in photos.names if table_of[name] is table])
+        if not own.names and table.images is not None:
+            raise InputError(f"[[camera]] images is '{table.images}', expected some photo's name, as {photos.names[0]}")
         if not own.names:
-            _check_pattern(table, photos.names[0])
             continue
         found = _of_one_table(table, own, rigs)
         place_of |= {name: len(cameras) + place for name, place in zip(own.names, found.of_photo, strict=True)}
@@ -107,28 +108,23 @@ def cameras_of_photos(options: CameraOptions, photos: Photos, rigs: Rigs = NO_RI
     return PhotoCameras(tuple(cameras), tuple(place_of[name] for name in photos.names), tuple(guessed))
 
 
-def _check_pattern(table: CameraOptions, name: str) -> None:
-    if table.images is not None:
-        raise InputError(f"[[camera]] images is '{table.images}', expected some photo's name, as {name}")
-
-
 def _of_one_table(options: CameraOptions, photos: Photos, rigs: Rigs) -> PhotoCameras:
     groups: dict[Any, int] = {}
     of_photo = [groups.setdefault(key, len(groups)) for key in _keys(options.mode, photos, rigs)]
     firsts = [of_photo.index(group) for group in range(len(groups))]
-    if options.model is None or options.params is None:
-        return PhotoCameras(tuple(_guessed(options.model, photos, first) for first in firsts), tuple(of_photo))
-    known = calibrated_cameras(options.model, options.params, photos.sizes)
+    known: dict[tuple[int, int], pycolmap.Camera] = {}
+    if options.model is not None and options.params is not None:
+        known = calibrated_cameras(options.model, options.params, photos.sizes)
     for camera in known.values():
         _check_size(camera)
-    cameras, guessed = [], []
-    for first in firsts:
-        if photos.sizes[first] in known:
-            cameras.append(pycolmap.Camera(known[photos.sizes[first]].todict()))
-        else:
-            cameras.append(_guessed(options.model, photos, first))
-            guessed.append(photos.names[first])
-    return PhotoCameras(tuple(cameras), tuple(of_photo), tuple(guessed))
+    cameras = tuple(
+        pycolmap.Camera(known[photos.sizes[first]].todict())
+        if photos.sizes[first] in known
+        else _guessed(options.model, photos, first)
+        for first in firsts
+    )
+    guessed = tuple(photos.names[first] for first in firsts if known and photos.sizes[first] not in known)
+    return PhotoCameras(cameras, tuple(of_photo), guessed)
 
 
 def _keys(mode: str, photos: Photos, rigs: Rigs) -> list[Any]:
@@ -141,18 +137,16 @@ def _keys(mode: str, photos: Photos, rigs: Rigs) -> list[Any]:
                 f"{name} is of {size[0]} x {size[1]} pixels, expected {first[0]} x {first[1]} as others of '{camera}'"
             )
             raise InputError(message, rigs.path)
-    keys = _keys_by_mode(mode, photos)
-    return [key if camera is None else (camera, "of a rig") for key, camera in zip(keys, in_rigs, strict=True)]
-
-
-def _keys_by_mode(mode: str, photos: Photos) -> list[Any]:
-    if mode == "per_image":
-        return list(photos.names)
-    if mode == "per_folder":
-        return [(PurePosixPath(name).parent, size) for name, size in zip(photos.names, photos.sizes, strict=True)]
-    if mode == "single":
-        return list(photos.sizes)
-    return [(_maker(photos.folder / name), size) for name, size in zip(photos.names, photos.sizes, strict=True)]
+    key_of: Callable[[str], Any] = {
+        "per_image": lambda name: name,
+        "per_folder": lambda name: PurePosixPath(name).parent,
+        "single": lambda name: None,
+        "auto": lambda name: _maker(photos.folder / name),
+    }[mode]
+    return [
+        (key_of(name), size) if camera is None else (camera, "of a rig")
+        for name, size, camera in zip(photos.names, photos.sizes, in_rigs, strict=True)
+    ]
 
 
 def _maker(path: Path) -> tuple[str, ...]:

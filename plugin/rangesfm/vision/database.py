@@ -7,7 +7,7 @@ process holds on it. The database is broken within seconds.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -63,13 +63,28 @@ def remove_database(path: Path) -> None:
         path.with_name(path.name + suffix).unlink(missing_ok=True)
 
 
-def copy_features(source_path: Path, path: Path, image_ids: Sequence[int]) -> None:
-    """A new database for matching some of another one's photos, which keep their ids and are called by them."""
+@contextmanager
+def copying(source_path: Path, path: Path) -> Iterator[tuple[pycolmap.Database, pycolmap.Database]]:
+    """A database and another one, to which something is to be written; of an error nothing is."""
     with (
         pycolmap.Database.open(source_path) as source,
         pycolmap.Database.open(path) as target,
         pycolmap.DatabaseTransaction(target),
     ):
+        yield source, target
+
+
+def copy_features(source: pycolmap.Database, target: pycolmap.Database, new_ids: Mapping[int, int]) -> None:
+    """Features of photos, by their ids in the source those in the target."""
+    for old, new in new_ids.items():
+        target.write_keypoints(new, source.read_keypoints(old))
+        if source.exists_descriptors(old):
+            target.write_descriptors(new, source.read_descriptors(old))
+
+
+def copy_photos(source_path: Path, path: Path, image_ids: Sequence[int]) -> None:
+    """A new database for matching some of another one's photos, which keep their ids and are called by them."""
+    with copying(source_path, path) as (source, target):
         for camera in source.read_all_cameras():
             target.write_camera(camera, use_camera_id=True)
         for rig in source.read_all_rigs():
@@ -80,8 +95,7 @@ def copy_features(source_path: Path, path: Path, image_ids: Sequence[int]) -> No
         for image_id, image in zip(image_ids, images, strict=True):
             image.name = str(image_id)
             target.write_image(image, use_image_id=True)
-            target.write_keypoints(image_id, source.read_keypoints(image_id))
-            target.write_descriptors(image_id, source.read_descriptors(image_id))
+        copy_features(source, target, {image_id: image_id for image_id in image_ids})
 
 
 def copy_matches(source_path: Path, path: Path, pairs: Iterable[tuple[tuple[int, int], tuple[int, int]]]) -> None:
@@ -90,20 +104,11 @@ def copy_matches(source_path: Path, path: Path, pairs: Iterable[tuple[tuple[int,
     Args:
         pairs: ids in the source, smaller first, and those of the same photos in the target, likewise.
     """
-    with (
-        pycolmap.Database.open(source_path) as source,
-        pycolmap.Database.open(path) as target,
-        pycolmap.DatabaseTransaction(target),
-    ):
+    with copying(source_path, path) as (source, target):
         for old, new in pairs:
-            if is_compared(source, *old):
+            if source.exists_two_view_geometry(*old):  # COLMAP has been through them, whether or not they match
                 target.write_matches(*new, source.read_matches(*old))
                 target.write_two_view_geometry(*new, source.read_two_view_geometry(*old))
-
-
-def restore_names(path: Path, image_names: Sequence[str]) -> None:
-    """In the place of those under which a process that was killed may have been matching."""
-    _rename(path, image_names)
 
 
 def clear_matches(path: Path) -> None:
@@ -118,14 +123,15 @@ def named_by_place(path: Path, image_names: Sequence[str]) -> Iterator[None]:
 
     COLMAP's sequential matching takes the order of names for the order in time.
     """
-    _rename(path, [f"{place:09d}" for place in range(len(image_names))])
+    name_photos(path, [f"{place:09d}" for place in range(len(image_names))])
     try:
         yield
     finally:
-        _rename(path, image_names)
+        name_photos(path, image_names)
 
 
-def _rename(path: Path, image_names: Sequence[str]) -> None:
+def name_photos(path: Path, image_names: Sequence[str]) -> None:
+    """By the order of their ids."""
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
         for image in database.read_all_images():
             image.name = image_names[image.image_id - 1]
@@ -135,16 +141,6 @@ def _rename(path: Path, image_names: Sequence[str]) -> None:
 def num_photos_with_features(database: pycolmap.Database) -> int:
     """How many photos COLMAP has been through, whether or not it found anything in them."""
     return sum(database.exists_keypoints(image_id) for image_id in range(1, database.num_images() + 1))
-
-
-def is_compared(database: pycolmap.Database, first: int, second: int) -> bool:
-    """Whether COLMAP has been through a pair of photos, whether or not they match."""
-    return bool(database.exists_two_view_geometry(first, second))
-
-
-def num_compared_pairs(database: pycolmap.Database) -> int:
-    """How many pairs of photos COLMAP has been through, whether or not they match."""
-    return database.num_verified_image_pairs()
 
 
 def num_matching_pairs(database: pycolmap.Database) -> int:

@@ -15,6 +15,7 @@ from rangesfm.colmap.log import colmap_log
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import scratch_folder, sha256_of
 from rangesfm.vision.camera import PhotoCameras
+from rangesfm.vision.database import copy_features, copying
 from rangesfm.vision.photos import MIN_NUM_PHOTOS, Photos
 
 
@@ -62,15 +63,8 @@ class GivenDatabase:
     def copy_to(self, path: Path) -> None:
         """Features and matches of the photos, into a database in which their ids are 1, 2, ..."""
         new = {id_: new_id for new_id, id_ in enumerate(self.ids, 1)}
-        with (
-            pycolmap.Database.open(self.path) as source,
-            pycolmap.Database.open(path) as target,
-            pycolmap.DatabaseTransaction(target),
-        ):
-            for id_, new_id in new.items():
-                target.write_keypoints(new_id, source.read_keypoints(id_))
-                if source.exists_descriptors(id_):
-                    target.write_descriptors(new_id, source.read_descriptors(id_))
+        with copying(self.path, path) as (source, target):
+            copy_features(source, target, new)
             for first, second in _pairs(source, new):
                 pair = new[first], new[second]
                 target.write_matches(*pair, source.read_matches(first, second))

@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import is_plain_name
 from rangesfm.files.folders import walk
 from rangesfm.files.tables import Table, has_columns, read_table
-from rangesfm.vision.exif import exif_tags
+from rangesfm.vision.photos import exif_tags
 
 IMAGE_EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 
@@ -53,7 +53,7 @@ class ImageTimes:
     """
 
     image_names: tuple[str, ...]
-    timestamps_s: npt.NDArray[np.float64]
+    timestamps_s: Array
     resolution_s: float
     source: str
     num_left_out: int = 0
@@ -189,8 +189,7 @@ def times_from_exif(folder: str | Path, names: Sequence[str]) -> ImageTimes:
     offsets = [_utc_offset(exif) for exif in exifs.values()]
     offset = next((known for known in offsets if known is not None), timedelta(0))
     stamps = {name: stamp for name, exif in exifs.items() if (stamp := _exif_stamp(exif, offset)) is not None}
-    _refuse_minority(stamps, names, "EXIF DateTimeOriginal", Path(folder))
-    return _in_time_order(stamps, names, "exif")
+    return _of_most(stamps, names, "exif", "EXIF DateTimeOriginal", Path(folder))
 
 
 def times_from_file_names(names: Sequence[str]) -> ImageTimes:
@@ -204,8 +203,7 @@ def times_from_file_names(names: Sequence[str]) -> ImageTimes:
         InputError: at most half of the names are times.
     """
     stamps = {name: stamp for name in names if (stamp := _name_stamp(name)) is not None}
-    _refuse_minority(stamps, names, "time in its name", None)
-    return _in_time_order(stamps, names, "file_names")
+    return _of_most(stamps, names, "file_names", "time in its name", None)
 
 
 def _in_time_order(stamps: Mapping[str, _Stamp], names: Sequence[str], source: str) -> ImageTimes:
@@ -248,7 +246,9 @@ def _refuse_repetitions(
             raise InputError(message, table.path, int(table.line[row]))
 
 
-def _refuse_minority(stamps: Mapping[str, _Stamp], names: Sequence[str], what: str, folder: Path | None) -> None:
+def _of_most(
+    stamps: Mapping[str, _Stamp], names: Sequence[str], source: str, what: str, folder: Path | None
+) -> ImageTimes:
     if 2 * len(stamps) <= len(names):
         first = next(name for name in names if name not in stamps)
         raise InputError(
@@ -256,6 +256,7 @@ def _refuse_minority(stamps: Mapping[str, _Stamp], names: Sequence[str], what: s
             "expected a CSV file image_name,timestamp_s then",
             folder,
         )
+    return _in_time_order(stamps, names, source)
 
 
 def _resolution(text: str) -> float:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.geometry.trajectory import ROUNDING_S
 from rangesfm.options import KeyframeOptions
@@ -39,7 +40,7 @@ def select_keyframes(photos: ImageTimes | Sequence[str], options: KeyframeOption
     return tuple(names[index] for index in kept)
 
 
-def _far_enough_apart(timestamps_s: np.typing.NDArray[np.float64], min_interval_s: float) -> list[int]:
+def _far_enough_apart(timestamps_s: Array, min_interval_s: float) -> list[int]:
     kept = [0]
     for index, time in enumerate(timestamps_s.tolist()):
         if time - timestamps_s[kept[-1]] >= min_interval_s - ROUNDING_S:

@@ -3,28 +3,31 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from contextlib import closing
 from pathlib import Path
 
 import pycolmap
 
+from rangesfm.colmap.log import append_log
 from rangesfm.colmap.model_files import read_model, write_binary_model
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import OptionError, ReconstructionError
 from rangesfm.files.atomic import new_folder, scratch_folder
 from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.processes.children import run_children
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import num_matching_pairs
 from rangesfm.vision.mapping_loop import GlobalAdjustment, incremental_mapping
+from rangesfm.vision.own_process import MODULE, WholeMapping, WholePipelineOptions
 from rangesfm.vision.photos import Photos
-from rangesfm.vision.snapshots import Snapshots, newest_snapshot, remove_snapshots
-from rangesfm.vision.whole_mapping import WholePipelineOptions, map_at_once
+from rangesfm.vision.rigs import Rigs
+from rangesfm.vision.snapshots import Snapshots, newest_snapshot
+
+PipelineOptions = pycolmap.IncrementalPipelineOptions | WholePipelineOptions
 
 
-def pipeline_options(
-    camera: CameraOptions, mapper: MapperOptions, seed: int
-) -> pycolmap.IncrementalPipelineOptions | WholePipelineOptions:
+def pipeline_options(camera: CameraOptions, mapper: MapperOptions, seed: int) -> PipelineOptions:
     """Of the mapper that is wanted.
 
     Raises:
@@ -33,55 +36,52 @@ def pipeline_options(
     if mapper.ranges_in_mapping and mapper.method != "incremental":
         message = f"[mapper] ranges_in_mapping is true, expected false beside method '{mapper.method}'"
         raise OptionError(message, "mapper", "ranges_in_mapping")
-    makers: Mapping[str, Callable[..., pycolmap.IncrementalPipelineOptions | WholePipelineOptions]]
-    makers = {"incremental": _incremental, "global": _global, "hierarchical": _hierarchical}
-    options = makers[mapper.method](camera, mapper, seed)
+    refines = [table.mapping_refines_intrinsics for table in camera.tables]
+    options: PipelineOptions
+    if mapper.method == "global":
+        options = pycolmap.GlobalPipelineOptions(num_threads=mapper.num_threads, random_seed=seed)
+        if not all(refines):
+            adjustment = options.mapper.bundle_adjustment
+            adjustment.refine_focal_length = adjustment.refine_extra_params = False
+    elif mapper.method == "hierarchical":
+        options = pycolmap.HierarchicalPipelineOptions(num_threads=mapper.num_threads, num_workers=mapper.num_cores)
+        # Each cluster is mapped by one thread: with several the search for an initial pair is a race.
+        options.incremental_options.num_threads = 1
+        _set_incremental(options.incremental_options, any(refines), seed)
+    else:
+        options = pycolmap.IncrementalPipelineOptions(num_threads=mapper.num_threads)
+        _set_incremental(options, any(refines), seed)
     apply_options(options, mapper.pipeline, "mapper.pipeline")
     return options
 
 
-def _incremental(camera: CameraOptions, mapper: MapperOptions, seed: int) -> pycolmap.IncrementalPipelineOptions:
-    options = pycolmap.IncrementalPipelineOptions(num_threads=mapper.num_threads)
-    _set_incremental(options, camera, seed)
-    return options
-
-
-def _global(camera: CameraOptions, mapper: MapperOptions, seed: int) -> pycolmap.GlobalPipelineOptions:
-    options = pycolmap.GlobalPipelineOptions(num_threads=mapper.num_threads, random_seed=seed)
-    if not all(table.mapping_refines_intrinsics for table in camera.tables):
-        adjustment = options.mapper.bundle_adjustment
-        adjustment.refine_focal_length = adjustment.refine_extra_params = False
-    return options
-
-
-def _hierarchical(camera: CameraOptions, mapper: MapperOptions, seed: int) -> pycolmap.HierarchicalPipelineOptions:
-    """Each cluster is mapped by one thread: with several the search for an initial pair is a race."""
-    options = pycolmap.HierarchicalPipelineOptions(num_threads=mapper.num_threads, num_workers=mapper.num_cores)
-    options.incremental_options.num_threads = 1
-    _set_incremental(options.incremental_options, camera, seed)
-    return options
-
-
-def _set_incremental(options: pycolmap.IncrementalPipelineOptions, camera: CameraOptions, seed: int) -> None:
+def _set_incremental(options: pycolmap.IncrementalPipelineOptions, refines_intrinsics: bool, seed: int) -> None:
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
-    if not any(table.mapping_refines_intrinsics for table in camera.tables):
+    if not refines_intrinsics:
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
 
 
-def hold_cameras(
-    options: pycolmap.IncrementalPipelineOptions | WholePipelineOptions, camera: CameraOptions, database_path: Path
+def hold_what_is_known(
+    options: PipelineOptions, camera: CameraOptions, mapper: MapperOptions, rigs: Rigs, database_path: Path
 ) -> None:
-    """Have the mapping keep the intrinsics of some cameras; the global mapper keeps those of all, or of none."""
+    """Have the mapping keep the intrinsics of some cameras, and the rigs of whose cameras all places are configured.
+
+    The global mapper keeps the intrinsics of all cameras, or of none; and it begins with the rigs that are known and
+    refines them: with rigs held, COLMAP 4.2's global positioning ends in a map without sense, of perfect matches too.
+    """
     if isinstance(options, pycolmap.HierarchicalPipelineOptions):
         options = options.incremental_options
-    refines = {table.mapping_refines_intrinsics for table in camera.tables}
-    if isinstance(options, pycolmap.IncrementalPipelineOptions) and len(refines) > 1:
+    if isinstance(options, pycolmap.GlobalPipelineOptions):
+        return
+    if len({table.mapping_refines_intrinsics for table in camera.tables}) > 1:
         with pycolmap.Database.open(database_path) as database:
             images = database.read_all_images()
         options.constant_cameras = {
             image.camera_id for image in images if not camera.of_photo(image.name).mapping_refines_intrinsics
         }
+    if any(rigs.are_known) and "ba_refine_sensor_from_rig" not in mapper.pipeline:
+        options.constant_rigs = rigs.ids_of_known(database_path)
 
 
 def map_photos(
@@ -89,7 +89,7 @@ def map_photos(
     photos: Photos,
     models_path: Path,
     snapshots_path: Path,
-    options: pycolmap.IncrementalPipelineOptions | WholePipelineOptions,
+    options: PipelineOptions,
     log: Path,
     progress: Progress,
     adjustment: GlobalAdjustment | None = None,
@@ -104,9 +104,9 @@ def map_photos(
         ReconstructionError: there is not a single model, or COLMAP failed.
     """
     if isinstance(options, pycolmap.IncrementalPipelineOptions):
-        models = map_incrementally(database_path, photos, models_path, snapshots_path, options, progress, adjustment)
+        models = _map_incrementally(database_path, photos, models_path, snapshots_path, options, progress, adjustment)
     else:
-        models = map_at_once(database_path, photos.folder, options, log, progress)
+        models = _map_at_once(database_path, photos.folder, options, log, progress)
     if not models:
         with pycolmap.Database.open(database_path) as database:
             num_matching = num_matching_pairs(database)
@@ -114,20 +114,23 @@ def map_photos(
             f"no model from {len(photos.names)} photos, of which {num_matching} pairs match: photos from"
             " more places sideways to the view, or known camera parameters, may help"
         )
-    write_models(models, models_path)
-    remove_snapshots(snapshots_path)
+    with new_folder(models_path) as temporary:
+        for index, model in enumerate(sorted(models, key=lambda model: -model.num_reg_images())):
+            (temporary / str(index)).mkdir()
+            write_binary_model(model, temporary / str(index))
+    shutil.rmtree(snapshots_path, ignore_errors=True)
 
 
-def map_incrementally(
+def _map_incrementally(
     database_path: Path,
     photos: Photos,
     models_path: Path,
     snapshots_path: Path,
     options: pycolmap.IncrementalPipelineOptions,
     progress: Progress,
-    adjustment: GlobalAdjustment | None = None,
+    adjustment: GlobalAdjustment | None,
 ) -> list[pycolmap.Reconstruction]:
-    """All models that COLMAP's incremental mapper makes; there may be none. Raises ReconstructionError if it fails."""
+    """All models that COLMAP's incremental mapper makes; there may be none."""
     begun = newest_snapshot(snapshots_path)
     num_begun = 0
     if begun is not None:
@@ -162,19 +165,23 @@ def map_incrementally(
         )
 
 
-def write_models(models: Iterable[pycolmap.Reconstruction], models_path: Path) -> None:
-    """As ``models_path``/0, /1, ..., the one with the most photos first."""
-    with new_folder(models_path) as temporary:
-        for index, model in enumerate(sorted(models, key=lambda model: -model.num_reg_images())):
-            (temporary / str(index)).mkdir()
-            write_binary_model(model, temporary / str(index))
+def _map_at_once(
+    database_path: Path, image_path: Path, options: WholePipelineOptions, log: Path, progress: Progress
+) -> list[pycolmap.Reconstruction]:
+    """The same of the mappers that take all photos at once; what COLMAP says is appended to the log."""
+    progress.message("mapping: this mapper does not say how far it is, and an interrupted one begins anew")
+    with scratch_folder(database_path.with_name("mapping")) as folder:
+        # A copy: they note there what they find of pairs of photos.
+        work = WholeMapping(Path(shutil.copyfile(database_path, folder / "database.db")), image_path, options)
+        try:
+            with closing(run_children(MODULE, [work], 1, lambda _: None)) as ended:
+                list(ended)
+        finally:
+            append_log(work.log, log)
+        return [read_model(path) for path in sorted(folder.iterdir()) if path.is_dir()]
 
 
 def read_models(models_path: Path) -> tuple[pycolmap.Reconstruction, ...]:
-    """The models that ``map_incrementally`` wrote, in their order."""
+    """The models that ``map_photos`` wrote, in their order."""
     folders = [folder for folder in models_path.iterdir() if folder.name.isdecimal()]
     return tuple(read_model(folder) for folder in sorted(folders, key=lambda folder: int(folder.name)))
-
-
-def remove_models(models_path: Path) -> None:
-    shutil.rmtree(models_path, ignore_errors=True)

@@ -18,6 +18,8 @@ from typing import Any, Protocol
 
 import pycolmap
 
+from rangesfm.vision.snapshots import write_snapshot
+
 
 class GlobalAdjustment(Protocol):
     """A global bundle adjustment in place of COLMAP's."""
@@ -73,13 +75,12 @@ def incremental_mapping(
         if token.is_cancelled or 0 < options.max_runtime_seconds <= time.monotonic() - begin_s:
             raise _StoppedError
 
-    for when, callback in {
-        pycolmap.IncrementalPipelineCallback.INITIAL_IMAGE_PAIR_REG_CALLBACK: initial_image_pair_callback,
-        pycolmap.IncrementalPipelineCallback.NEXT_IMAGE_REG_CALLBACK: lambda: next_image_callback(
-            manager.get(manager.size() - 1)
-        ),
-    }.items():
-        pipeline.add_callback(when, partial(call, callback))
+    def add_photo() -> None:
+        next_image_callback(manager.get(manager.size() - 1))
+
+    whens = pycolmap.IncrementalPipelineCallback
+    pipeline.add_callback(whens.INITIAL_IMAGE_PAIR_REG_CALLBACK, partial(call, initial_image_pair_callback))
+    pipeline.add_callback(whens.NEXT_IMAGE_REG_CALLBACK, partial(call, add_photo))
     if pipeline.database_cache.num_images():
         _map_with_relaxed_demands(pipeline, adjustment)
     return [manager.get(index) for index in range(manager.size())]
@@ -120,13 +121,7 @@ def _relaxed(
 
 @dataclass(frozen=True)
 class _MappingLoop:
-    """One run of the mapper over a database.
-
-    Attributes:
-        pipeline: COLMAP's, for its options and what it decides. mapper: over the same matches.
-        mapper_options: with the present demands on an initial pair.
-        adjustment: instead of COLMAP's, wherever it can.
-    """
+    """One run of the mapper over a database, with the present demands on an initial pair (``mapper_options``)."""
 
     pipeline: pycolmap.IncrementalPipeline
     mapper: pycolmap.IncrementalMapper
@@ -191,7 +186,7 @@ class _MappingLoop:
                     model.extract_colors_for_image(image_id, options.image_path)
                 if 0 < options.snapshot_frames_freq <= model.num_reg_frames() - num_in_snapshot:
                     num_in_snapshot = model.num_reg_frames()
-                    _write_snapshot(model, Path(options.snapshot_path))
+                    write_snapshot(model, Path(options.snapshot_path))
                 self.pipeline.callback(pycolmap.IncrementalPipelineCallback.NEXT_IMAGE_REG_CALLBACK)
             has_failed = image_id is None
         if model.num_reg_frames() != adjusted[0] and model.num_points3D() != adjusted[1]:
@@ -201,10 +196,8 @@ class _MappingLoop:
     def _register_next(self, model: pycolmap.Reconstruction) -> int | None:
         """The photo that was registered, by its points or else by its matches; None: none could be."""
         options, mapper = self.pipeline.options, self.mapper
-        without_points = [True] if options.structure_less_registration_only else [False]
-        if options.structure_less_registration_fallback and not options.structure_less_registration_only:
-            without_points.append(True)
-        for structure_less in without_points:
+        only, fallback = options.structure_less_registration_only, options.structure_less_registration_fallback
+        for structure_less in (True,) if only else (False, True) if fallback else (False,):
             register = mapper.register_next_structure_less_image if structure_less else mapper.register_next_image
             next_images = mapper.find_next_images(self.mapper_options, structure_less=structure_less)
             for trial, image_id in enumerate(next_images):
@@ -242,10 +235,3 @@ class _MappingLoop:
             if num_changed < options.ba_global_max_refinement_change * num_observations:
                 break
         mapper.filter_frames(self.mapper_options)
-
-
-def _write_snapshot(model: pycolmap.Reconstruction, path: Path) -> None:
-    """Under the time in milliseconds, as COLMAP does."""
-    folder = path / f"{time.time_ns() // 1_000_000:010d}"
-    folder.mkdir()
-    model.write_binary(folder)

@@ -21,13 +21,12 @@ from rangesfm.options import MapperOptions
 from rangesfm.processes.children import run_children
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
-from rangesfm.vision.database import is_compared, num_compared_pairs, num_matching_pairs
+from rangesfm.vision.database import num_matching_pairs
 from rangesfm.vision.features import refuse_learned
-from rangesfm.vision.matching_share import MatchingShare
+from rangesfm.vision.own_process import MODULE, MatchingShare
 from rangesfm.vision.pairs import NamedPairs, Pairing, pairing_options, pairs_to_match
 from rangesfm.vision.photos import Photos
 
-_PROCESS = "rangesfm.vision.matching_share"
 _MIN_NUM_PAIRS = 100  # for less, a second process does not pay
 _MAX_NUM_PAIRS = 2000  # of one share, whose database is one of at most some hundred photos
 # A tile's pairs are of few photos for one share, a small one's for COLMAP's memory.
@@ -100,7 +99,7 @@ def match_features(
     """
     pairs = pairs_to_match(database_path, photos, options.pairing)
     with pycolmap.Database.open(database_path) as database:
-        missing = [pair for pair in pairs if not is_compared(database, *pair)]
+        missing = [pair for pair in pairs if not database.exists_two_view_geometry(*pair)]
     num_there, num_all = len(pairs) - len(missing), len(pairs)
     progress.update(num_there, num_all)
     with scratch_folder(database_path.with_name("matching")) as folder:
@@ -115,20 +114,16 @@ def match_features(
 
 
 def verify_matches(database_path: Path, photos: Photos, options: MatchingOptions, progress: Progress) -> None:
-    """Look which matches fit one geometry of two views, unless that has been done of all of them.
-
-    Raises:
-        ReconstructionError: those of no two photos do.
-    """
+    """Look which matches fit one geometry of two views, unless that is done; ReconstructionError if none do."""
     with pycolmap.Database.open(database_path) as database:
         num_pairs = database.num_matched_image_pairs()
-        if num_compared_pairs(database) < num_pairs:
+        if database.num_verified_image_pairs() < num_pairs:
             run_in_background(
                 lambda token: pycolmap.geometric_verification(
                     database_path, two_view_geometry_options=options.verification, cancellation_token=token
                 ),
                 progress,
-                lambda: num_compared_pairs(database),
+                database.num_verified_image_pairs,
                 num_pairs,
             )
     _require_matches(database_path, photos)
@@ -163,7 +158,7 @@ def _match_shares(
         shutil.rmtree(share.folder)
 
     try:
-        with closing(run_children(_PROCESS, prepared(), num_at_once, update)) as ended:
+        with closing(run_children(MODULE, prepared(), num_at_once, update)) as ended:
             for _ in ended:
                 take_first()
     finally:  # interrupted: what there is saves the next run doing it

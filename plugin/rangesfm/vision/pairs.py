@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import pycolmap
 
@@ -36,15 +37,13 @@ def pairing_options(mapper: MapperOptions, num_photos: int) -> Pairing | NamedPa
     way = mapper.matching
     if way == "auto":
         way = "exhaustive" if num_photos <= _MAX_NUM_EXHAUSTIVE else "sequential"
-    options: Pairing
-    if way == "sequential":
-        options = pycolmap.SequentialPairingOptions()
-    elif way == "spatial":
-        options = pycolmap.SpatialPairingOptions()
-    elif way == "vocabtree":
-        options = pycolmap.VocabTreePairingOptions()
-    else:
-        options = pycolmap.ExhaustivePairingOptions()
+    ways: dict[str, Pairing] = {
+        "exhaustive": pycolmap.ExhaustivePairingOptions(),
+        "sequential": pycolmap.SequentialPairingOptions(),
+        "spatial": pycolmap.SpatialPairingOptions(),
+        "vocabtree": pycolmap.VocabTreePairingOptions(),
+    }
+    options = ways[way]
     if mapper.vocab_tree_path is not None and way in ("sequential", "vocabtree"):
         options.vocab_tree_path = mapper.vocab_tree_path  # type: ignore[union-attr]
     apply_options(options, mapper.pairing, "mapper.pairing")
@@ -80,28 +79,25 @@ def pairs_to_match(database_path: Path, photos: Photos, pairing: Pairing | Named
     """
     if isinstance(pairing, tuple):
         return _pairs_of_names(photos.names, pairing)
+    generators: dict[type[Pairing], Callable[..., Any]] = {
+        pycolmap.ExhaustivePairingOptions: pycolmap.ExhaustivePairGenerator,
+        pycolmap.SequentialPairingOptions: pycolmap.SequentialPairGenerator,
+        pycolmap.SpatialPairingOptions: pycolmap.SpatialPairGenerator,
+        pycolmap.VocabTreePairingOptions: pycolmap.VocabTreePairGenerator,
+    }
     # COLMAP's sequential matching takes the order of names for the order in time.
     is_sequential = isinstance(pairing, pycolmap.SequentialPairingOptions)
     naming = named_by_place(database_path, photos.names) if is_sequential else nullcontext()
     with naming, pycolmap.Database.open(database_path) as database:
-        if isinstance(pairing, pycolmap.SequentialPairingOptions):
-            pairs = pycolmap.SequentialPairGenerator(pairing, database).all_pairs()
-        elif isinstance(pairing, pycolmap.SpatialPairingOptions):
-            pairs = pycolmap.SpatialPairGenerator(pairing, database).all_pairs()
-        elif isinstance(pairing, pycolmap.VocabTreePairingOptions):
-            pairs = _alike(pairing, database)
-        else:
-            pairs = pycolmap.ExhaustivePairGenerator(pairing, database).all_pairs()
+        try:
+            pairs = generators[type(pairing)](pairing, database).all_pairs()
+        except (RuntimeError, ValueError) as error:
+            if not isinstance(pairing, pycolmap.VocabTreePairingOptions):
+                raise
+            reason = " ".join(str(error).split())
+            raise InputError(f"is no vocabulary tree for these features ({reason})", pairing.vocab_tree_path) from None
     # The most alike to a photo is itself.
     return sorted({(min(pair), max(pair)) for pair in pairs if pair[0] != pair[1]})
-
-
-def _alike(pairing: pycolmap.VocabTreePairingOptions, database: pycolmap.Database) -> list[tuple[int, int]]:
-    try:
-        return pycolmap.VocabTreePairGenerator(pairing, database).all_pairs()
-    except (RuntimeError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"is no vocabulary tree for these features ({reason})", pairing.vocab_tree_path) from None
 
 
 def _pairs_of_names(names: Sequence[str], pairs: NamedPairs) -> list[tuple[int, int]]:

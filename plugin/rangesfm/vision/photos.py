@@ -1,7 +1,8 @@
-"""The photos that can be read."""
+"""The files of photos: which can be read, what cameras write into them beside the pixels, and their masks."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,10 +10,15 @@ from typing import Any
 
 from PIL import Image
 
-from rangesfm.errors import ReconstructionError
-from rangesfm.files.atomic import state_and_sha256
+from rangesfm.errors import InputError, ReconstructionError
+from rangesfm.files.atomic import sha256_of, state_and_sha256
 
 MIN_NUM_PHOTOS = 2
+UNREADABLE = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
+"""What Pillow's readers raise."""
+_EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
+_LATITUDE, _LONGITUDE, _ALTITUDE = 2, 4, 6
+_LATITUDE_REF, _LONGITUDE_REF, _ALTITUDE_REF = 1, 3, 5
 
 
 @dataclass(frozen=True)
@@ -48,11 +54,7 @@ class Photos:
 
 
 def usable_photos(folder: Path, names: Sequence[str]) -> Photos:
-    """Those that can be read.
-
-    Raises:
-        ReconstructionError: fewer than two of them.
-    """
+    """Those that can be read; ReconstructionError for fewer than two of them."""
     sizes = {name: image_size(folder / name) for name in names}
     usable = {name: size for name, size in sizes.items() if size is not None}
     left_out = {name: "cannot be read as an image" for name in names if name not in usable}
@@ -70,5 +72,66 @@ def image_size(path: Path) -> tuple[int, int] | None:
     try:
         with Image.open(path) as image:
             return int(image.width), int(image.height)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # what Pillow's readers raise
+    except UNREADABLE:
         return None
+
+
+def exif_tags(path: Path) -> dict[int, Any]:
+    """Tags of the photo and of its exposure, by number; none if the file has none or is no image."""
+    try:
+        with Image.open(path) as image:
+            exif = image.getexif()
+            return {**exif, **exif.get_ifd(_EXIF_IFD)}
+    except UNREADABLE:
+        return {}
+
+
+def exif_position(path: Path) -> tuple[float, float, float] | None:
+    """Latitude and longitude in degrees (WGS 84) and altitude in metres, 0 where it says none; None without a place."""
+    try:
+        with Image.open(path) as image:
+            tags = image.getexif().get_ifd(_GPS_IFD)
+        latitude = _degrees(tags[_LATITUDE], tags.get(_LATITUDE_REF) == "S")
+        longitude = _degrees(tags[_LONGITUDE], tags.get(_LONGITUDE_REF) == "W")
+        below = tags.get(_ALTITUDE_REF) in (1, b"\x01")
+        altitude_m = float(tags.get(_ALTITUDE, 0.0)) * (-1 if below else 1)
+    except (*UNREADABLE, LookupError, TypeError, ZeroDivisionError):
+        return None
+    place = latitude, longitude, altitude_m
+    return place if all(map(math.isfinite, place)) else None
+
+
+def _degrees(parts: Any, is_negative: bool) -> float:
+    degrees, minutes, seconds = map(float, parts)
+    return (degrees + minutes / 60 + seconds / 3600) * (-1 if is_negative else 1)
+
+
+def contents_of_masks(folder: Path | None, photos: Photos) -> dict[str, str]:
+    """SHA-256 of each photo's mask; none without a folder of them.
+
+    Raises:
+        InputError: a photo has none, which COLMAP would leave without features, or one of another size, which COLMAP
+            would take for one of the photo's size.
+    """
+    if folder is None:
+        return {}
+    if not folder.is_dir():
+        raise InputError("no such folder, expected one of masks ([mapper] mask_path)", folder)
+    masks = {name: _mask(folder, name) for name in photos.names}
+    if missing := [name for name, mask in masks.items() if not mask.is_file()]:
+        raise InputError(
+            f"{len(missing)} of {len(masks)} photos have no mask there, the first is {missing[0]}: expected"
+            f" {missing[0]}.png",
+            folder,
+        )
+    for name, size in zip(photos.names, photos.sizes, strict=True):
+        if (found := image_size(masks[name])) != size:
+            what = "cannot be read as an image" if found is None else f"is of {found[0]} x {found[1]} pixels"
+            raise InputError(f"{what}, expected {size[0]} x {size[1]} as the photo {name}", masks[name])
+    return {name: sha256_of(mask) for name, mask in masks.items()}
+
+
+def _mask(folder: Path, name: str) -> Path:
+    """As COLMAP looks for it: that of a.png may also be called a.png."""
+    mask = folder / f"{name}.png"
+    return folder / name if not mask.is_file() and name.lower().endswith(".png") else mask

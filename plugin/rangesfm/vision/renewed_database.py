@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import pycolmap
 
 from rangesfm.files.atomic import new_file
 from rangesfm.progress import Progress
 from rangesfm.vision.camera import PhotoCameras
 from rangesfm.vision.database import (
     clear_matches,
+    copy_features,
     copy_matches,
+    copying,
     create_database,
+    name_photos,
     remove_database,
-    restore_names,
     write_positions,
 )
-from rangesfm.vision.exif import exif_position
 from rangesfm.vision.given_database import GivenDatabase
 from rangesfm.vision.matching import MatchingOptions
 from rangesfm.vision.pairs import pairs_to_match
-from rangesfm.vision.photos import Photos
+from rangesfm.vision.photos import Photos, exif_position
 from rangesfm.vision.rigs import Rigs
 from rangesfm.vision.steps import Steps
 
@@ -38,15 +37,10 @@ class RenewedDatabase:
     Killed at any moment, it leaves a note that is true or none; without one nothing of the database is used.
 
     Attributes:
-        path: of the database.
-        photos: in the order of their ids.
-        contents: SHA-256 of each photo, by name.
-        cameras: that took them. rigs: that the cameras are on.
+        photos: in the order of their ids. contents: SHA-256 of each, by name.
         given: the user's database, whose features take the place of all that an earlier run has found.
-        matching: how they will be matched.
         feature_inputs: fingerprint of what features depend on beside the photo itself.
         match_inputs: likewise, of matches beside the two photos.
-        steps: keep the note.
     """
 
     path: Path
@@ -68,14 +62,15 @@ class RenewedDatabase:
             self._create(fresh)
             if self.given is not None:
                 self.given.copy_to(fresh)
-            elif num_taken := self._taken_over(earlier, fresh):
+            elif num_taken := self._take_over(earlier, fresh):
                 progress.message(f"features: those of {num_taken} photos are taken over from an earlier run")
             remove_database(self.path)  # also what SQLite keeps beside it, which would be taken for the new one's
         self._write_note()
 
     def begin_matching(self) -> None:
         """Forget the matches, unless they were made with the same options."""
-        restore_names(self.path, self.photos.names)
+        # In the place of those under which a process that was killed may have been matching.
+        name_photos(self.path, self.photos.names)
         if self.steps.notes.get(_NOTE, {}).get("matches") != self.match_inputs:
             clear_matches(self.path)
         self._write_note()
@@ -85,20 +80,28 @@ class RenewedDatabase:
         self.rigs.apply(path)
         write_positions(path, (exif_position(self.photos.folder / name) for name in self.photos.names))
 
-    def _taken_over(self, earlier: Mapping[str, Any], fresh: Path) -> int:
-        try:
-            return self._take_over(earlier, fresh)
-        except RuntimeError:  # somebody has damaged the earlier one
-            self._create(fresh)
-            return 0
-
     def _take_over(self, earlier: Mapping[str, Any], fresh: Path) -> int:
+        """Returns of how many photos there were features."""
         ids = self._earlier_ids(earlier)
         if not ids or not self.path.exists():
             return 0
-        same_matches = self.matching.is_by_place and earlier.get("matches") == self.match_inputs
-        pairs = pairs_to_match(fresh, self.photos, self.matching.pairing) if same_matches else []
-        return _copy(self.path, fresh, ids, pairs)
+        try:
+            same_matches = self.matching.is_by_place and earlier.get("matches") == self.match_inputs
+            pairs = pairs_to_match(fresh, self.photos, self.matching.pairing) if same_matches else []
+            with copying(self.path, fresh) as (source, target):
+                taken = {
+                    new_id: old_id
+                    for new_id, old_id in ids.items()
+                    if source.exists_keypoints(old_id) and source.exists_descriptors(old_id)
+                }
+                copy_features(source, target, {old_id: new_id for new_id, old_id in taken.items()})
+            of_pairs = (((taken.get(first, 0), taken.get(second, 0)), (first, second)) for first, second in pairs)
+            # Not of photos that stood in the other order: COLMAP does not match two as it would the other way round.
+            copy_matches(self.path, fresh, ((old, pair) for old, pair in of_pairs if 0 < old[0] < old[1]))
+            return len(taken)
+        except RuntimeError:  # somebody has damaged the earlier one
+            self._create(fresh)
+            return 0
 
     def _earlier_ids(self, earlier: Mapping[str, Any]) -> dict[int, int]:
         """Id in the earlier database of each photo that has not changed, by its new one."""
@@ -116,29 +119,3 @@ class RenewedDatabase:
 def forget_database(steps: Steps) -> None:
     """Take nothing over from the database."""
     steps.note(_NOTE, {})
-
-
-def _copy(earlier: Path, new: Path, earlier_ids: Mapping[int, int], pairs: Iterable[tuple[int, int]]) -> int:
-    """Copy features and matches into a new database; returns of how many photos there were features.
-
-    Args:
-        earlier_ids: id of a photo in the earlier database by its id in the new one.
-        pairs: of new ids, smaller first, whose matches are wanted; not those of photos that stood in the other order,
-            as COLMAP does not match two photos as it would the other way round.
-    """
-    with (
-        pycolmap.Database.open(earlier) as source,
-        pycolmap.Database.open(new) as target,
-        pycolmap.DatabaseTransaction(target),
-    ):
-        taken = {new_id: old_id for new_id, old_id in earlier_ids.items() if _has_features(source, old_id)}
-        for new_id, old_id in taken.items():
-            target.write_keypoints(new_id, source.read_keypoints(old_id))
-            target.write_descriptors(new_id, source.read_descriptors(old_id))
-    of_pairs = (((taken.get(first, 0), taken.get(second, 0)), (first, second)) for first, second in pairs)
-    copy_matches(earlier, new, ((old, pair) for old, pair in of_pairs if 0 < old[0] < old[1]))
-    return len(taken)
-
-
-def _has_features(database: pycolmap.Database, image_id: int) -> bool:
-    return database.exists_keypoints(image_id) and database.exists_descriptors(image_id)

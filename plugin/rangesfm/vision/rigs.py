@@ -110,27 +110,31 @@ class Rigs:
 
     def baselines(self, model: pycolmap.Reconstruction, stddev_m: float) -> tuple[TapedDistance, ...]:
         """The known distances of each rig's cameras from its reference camera, as if taped between two photos."""
-        found = []
-        for config in self.configs:
-            reference = next(camera.image_prefix for camera in config.cameras if camera.ref_sensor)
-            for camera in config.cameras:
-                length_m = _baseline_m(camera)
-                ends = next(_pairs(model, reference, camera.image_prefix), None) if length_m else None
-                if ends is not None:
-                    found.append(TapedDistance(ends, length_m, stddev_m, CONTROL, line=0, is_everywhere=True))
-        return tuple(found)
+        found = ((length_m, next(pairs, None)) for length_m, pairs in self._baselines_in(model))
+        return tuple(
+            TapedDistance(ends, length_m, stddev_m, CONTROL, line=0, is_everywhere=True)
+            for length_m, ends in found
+            if ends is not None
+        )
 
     def rescale(self, model: pycolmap.Reconstruction) -> None:
         """Bring a model made without the rigs to the scale of the cameras whose places are known, if there are any."""
-        ratios = []
+        ratios = [
+            length_m / length
+            for length_m, pairs in self._baselines_in(model)
+            for pair in pairs
+            if (length := _distance(model, pair)) > 0
+        ]
+        if ratios:
+            model.transform(pycolmap.Sim3d(float(np.median(ratios)), pycolmap.Rotation3d(), np.zeros(3)))
+
+    def _baselines_in(self, model: pycolmap.Reconstruction) -> Iterator[tuple[float, Iterator[tuple[str, str]]]]:
+        """Each known distance of a camera from its rig's first, with the photos of a model that are so far apart."""
         for config in self.configs:
             reference = next(camera.image_prefix for camera in config.cameras if camera.ref_sensor)
             for camera in config.cameras:
                 if length_m := _baseline_m(camera):
-                    pairs = _pairs(model, reference, camera.image_prefix)
-                    ratios += [length_m / length for pair in pairs if (length := _distance(model, pair)) > 0]
-        if ratios:
-            model.transform(pycolmap.Sim3d(float(np.median(ratios)), pycolmap.Rotation3d(), np.zeros(3)))
+                    yield length_m, _pairs(model, reference, camera.image_prefix)
 
 
 NO_RIGS = Rigs()

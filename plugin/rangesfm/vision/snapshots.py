@@ -35,16 +35,21 @@ class Snapshots:
     def add_photo(self, model: pycolmap.Reconstruction) -> None:
         """To be called when COLMAP has added a photo to the first model."""
         if self._is_just_refined(model):
-            folder = self._scratch / f"{time.time_ns() // 1_000_000:013d}"
-            folder.mkdir()
-            model.write_binary(folder)
-            _keep(folder, self._path)
+            _keep(write_snapshot(model, self._scratch), self._path)
 
     def _is_just_refined(self, model: pycolmap.Reconstruction) -> bool:
         """All cameras have moved since the last photo; the photos next to a new one alone move otherwise."""
         poses = {id_: pose_of(model.frame(id_)).params.tobytes() for id_ in model.reg_frame_ids()}
         before, self._poses = self._poses, poses
         return bool(before) and all(poses[id_] != pose for id_, pose in before.items() if id_ in poses)
+
+
+def write_snapshot(model: pycolmap.Reconstruction, path: Path) -> Path:
+    """Into a folder of its own, called by the time in milliseconds as COLMAP does."""
+    folder = path / f"{time.time_ns() // 1_000_000:013d}"
+    folder.mkdir()
+    model.write_binary(folder)
+    return folder
 
 
 def newest_snapshot(path: Path) -> Path | None:
@@ -56,10 +61,6 @@ def newest_snapshot(path: Path) -> Path | None:
             continue
         return folder
     return None
-
-
-def remove_snapshots(path: Path) -> None:
-    shutil.rmtree(path, ignore_errors=True)
 
 
 def _keep(model: Path, path: Path) -> None:

@@ -51,8 +51,9 @@ class Steps:
             work: goes on from whatever it left when it was interrupted.
             unfinished: where it leaves that, if not in ``output``.
         """
-        is_same = self._record.get(name, {}).get("inputs") == inputs
-        if self.is_done(name, inputs, output):
+        state = self._record.get(name, {})
+        is_same = state.get("inputs") == inputs
+        if is_same and state.get("done") and output.exists():
             self._progress.message(f"{name}: taken over from an earlier run")
             return
         self._progress.stage(name)
@@ -64,11 +65,6 @@ class Steps:
         work()
         self._set_state(name, inputs, done=True)
         self.seconds[name] = time.perf_counter() - start
-
-    def is_done(self, name: str, inputs: str, output: Path) -> bool:
-        """Whether a step was done with the same inputs and its output is still there."""
-        state = self._record.get(name, {})
-        return bool(state.get("inputs") == inputs and state.get("done") and output.exists())
 
     def forget(self, first: str) -> None:
         """Nothing is known any more of this step and of those after it."""

@@ -16,6 +16,7 @@ from rangesfm.arrays import Array
 from rangesfm.distances.tape import CONTROL, FOUND_STDDEV_PX, Marker, TapedDistance
 from rangesfm.errors import InputError
 from rangesfm.progress import Progress
+from rangesfm.vision.photos import UNREADABLE
 
 # To OpenCV the centre of the first pixel is (0, 0), to COLMAP (0.5, 0.5).
 _CENTRE_PX = 0.5
@@ -87,7 +88,7 @@ def find_tags(folder: Path, image_names: Sequence[str], dictionary: str, progres
         try:
             with Image.open(folder / name) as photo:
                 pixels = np.array(photo.convert("L"))
-        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        except UNREADABLE as error:
             raise InputError(f"cannot be read as a photo ({error})", folder / name) from None
         corners, ids, _ = detector.detectMarkers(pixels)
         numbers = [] if ids is None else np.ravel(ids).tolist()

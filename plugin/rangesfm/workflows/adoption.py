@@ -9,12 +9,13 @@ import numpy as np
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError
 from rangesfm.join.models import PathOfModel
+from rangesfm.progress import Journal
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.trust.hypothesis import Correction
-from rangesfm.workflows.journal import Journal
+from rangesfm.trust.verdict import TrustVerdict
 from rangesfm.workflows.metric_map import ranges_on_path, scale_by_survey
 
 
@@ -30,10 +31,10 @@ def with_likeliest_cause(
     if metric.models:
         journal.warn("nothing is adopted: the map is joined from several models")
         return inputs, metric
-    cause, rows = metric.trust.causes[0], metric.trust.rows
-    corrected = corrected_inputs(inputs, cause.correction, rows)
+    cause = metric.trust.causes[0]
+    corrected = _corrected_inputs(inputs, cause.correction, metric.trust.rows)
     try:
-        moved = replace(path, observations=_observations(survey, corrected, path, metric, cause.correction, rows))
+        moved = replace(path, observations=_observations(survey, corrected, path, metric, metric.trust))
         adopted = scale_by_survey(survey, corrected, moved, metric.time_offset, journal)
     except GeometryError as error:
         journal.warn(f"nothing is adopted, as with that {error}")
@@ -44,18 +45,10 @@ def with_likeliest_cause(
     return corrected, adopted.doubted((said,))
 
 
-def corrected_inputs(inputs: RangingInputs, correction: Correction, rows: Indices) -> RangingInputs:
-    """Anchors, lever arms and ranges as they would be.
-
-    Args:
-        rows: of the log, those that the correction is of.
-    """
-    anchors = tuple(
-        replace(anchor, position_m=correction.anchors_m[anchor.anchor_id])
-        if anchor.anchor_id in correction.anchors_m
-        else anchor
-        for anchor in inputs.anchors
-    )
+def _corrected_inputs(inputs: RangingInputs, correction: Correction, rows: Indices) -> RangingInputs:
+    """Anchors, lever arms and ranges as they would be; the correction is of some rows of the log."""
+    known = {anchor.anchor_id: anchor.position_m for anchor in inputs.anchors} | {**correction.anchors_m}
+    anchors = tuple(replace(anchor, position_m=known[anchor.anchor_id]) for anchor in inputs.anchors)
     moves = np.array([correction.tag_moves_m.get(tag, np.zeros(3)) for tag in inputs.log.tag_ids]).reshape(-1, 3)
     log = inputs.log
     if correction.longer_m is not None:
@@ -64,16 +57,11 @@ def corrected_inputs(inputs: RangingInputs, correction: Correction, rows: Indice
 
 
 def _observations(
-    survey: Survey,
-    inputs: RangingInputs,
-    path: PathOfModel,
-    metric: MetricResult,
-    correction: Correction,
-    rows: Indices,
+    survey: Survey, inputs: RangingInputs, path: PathOfModel, metric: MetricResult, trust: TrustVerdict
 ) -> RangeObservations:
     """On the path anew; what is left out counts as held out."""
-    offset, times = metric.time_offset, inputs.log.timestamp_s
-    known_s = metric.time_offset_s or 0.0
+    correction, rows = trust.causes[0].correction, trust.rows
+    offset, times, known_s = metric.time_offset, inputs.log.timestamp_s, metric.time_offset_s or 0.0
     shift_s = _spread(np.broadcast_to(correction.time_shift_s, len(rows)), rows, len(inputs.log))
     offset_s = shift_s + (known_s if offset is None or times is None else offset.at(times))
     observations = ranges_on_path(survey, inputs, path.trajectory, offset_s)

@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from rangesfm.errors import RangesfmError
-from rangesfm.progress import SilentProgress
+from rangesfm.progress import Journal, SilentProgress
 from rangesfm.ranging.log import RangeKind
 from rangesfm.sources.source import is_source, open_source
 from rangesfm.survey.inputs import RangingInputs, times_of_model
@@ -21,11 +21,9 @@ from rangesfm.vision.camera import cameras_of_photos, check_camera
 from rangesfm.vision.features import feature_options
 from rangesfm.vision.given_database import opened
 from rangesfm.vision.image_times import ImageTimes, list_images
-from rangesfm.vision.masks import contents_of_masks
 from rangesfm.vision.matching import matching_options
-from rangesfm.vision.photos import Photos, usable_photos
+from rangesfm.vision.photos import Photos, contents_of_masks, usable_photos
 from rangesfm.vision.rigs import read_rigs
-from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.photos import checked_keyframes, read_inputs, read_registered
 
 # More than these nobody reads.
@@ -80,7 +78,7 @@ def check_survey(survey: Survey) -> CheckedSurvey:
         checked.warnings[:] = [text for text in checked.warnings if text not in inputs.log.notes]
         if len(inputs.log):
             _tell_of_radio(survey, inputs, checked)
-        _tell_of_others(survey, inputs, checked)
+        checked.facts += _facts_of_others(survey, inputs)
         if survey.images.path is not None and is_source(survey.images.path):
             return checked
         if model is None:
@@ -170,16 +168,16 @@ def _tell_of_radio(survey: Survey, inputs: RangingInputs, checked: CheckedSurvey
         checked.facts.append(f"lever arm: the tag is at {'; '.join(arms)} in the camera frame (right, down, forward)")
 
 
-def _tell_of_others(survey: Survey, inputs: RangingInputs, checked: CheckedSurvey) -> None:
+def _facts_of_others(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
     if inputs.tape is not None:
         only = "" if len(inputs.log) else ", which alone say how long a metre is (no ranges)"
-        checked.facts.append(f"taped distances: {len(inputs.tape.distances)}{only}")
+        yield f"taped distances: {len(inputs.tape.distances)}{only}"
     if survey.markers.dictionary is not None:
         side = "" if survey.markers.side_m is None else f" of {survey.markers.side_m:g} m"
-        checked.facts.append(f"tags: those of {survey.markers.dictionary}{side} will be looked for in the photos")
+        yield f"tags: those of {survey.markers.dictionary}{side} will be looked for in the photos"
     if inputs.reference is not None:
         name = "" if survey.report.reference is None else f" in {survey.report.reference.name}"
-        checked.facts.append(f"reference: {len(inputs.reference)} positions{name}, only to compare with")
+        yield f"reference: {len(inputs.reference)} positions{name}, only to compare with"
 
 
 def _tell_of_times(

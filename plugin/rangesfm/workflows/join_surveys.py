@@ -8,17 +8,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
 from rangesfm.export import check_formats
 from rangesfm.files.atomic import sole_writer
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.join.models import PathOfModel
-from rangesfm.progress import Progress
+from rangesfm.progress import Journal, Progress
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.anchor_file import default_anchor_frame, read_anchors
 from rangesfm.ranging.anchors.site import local_site
@@ -29,7 +28,6 @@ from rangesfm.result.folder import ResultFolder, read_result_folder
 from rangesfm.result.ranges_as_used import RangesAsUsed
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
-from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.results import RunResult
 from rangesfm.workflows.run import map_in_metres
 
@@ -157,9 +155,7 @@ def _with_tags_of_their_own(surveys: Sequence[FinishedRun]) -> list[FinishedRun]
     ]
 
 
-def joined_log(
-    surveys: Sequence[FinishedRun], use_anchors: Sequence[str]
-) -> tuple[RangeLog, npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+def joined_log(surveys: Sequence[FinishedRun], use_anchors: Sequence[str]) -> tuple[RangeLog, Indices, Mask]:
     """All their ranges: on the cameras' clocks, or by photo.
 
     Args:
@@ -175,12 +171,7 @@ def joined_log(
     for id_ in use_anchors:
         if id_ not in anchor_ids:
             raise InputError(f"anchor {id_!r} to be used is in none of the surveys ({', '.join(sorted(anchor_ids))})")
-    # Ranges between two tags have no say, and no anchor.
-    parts = [
-        (survey, [k for k, id_ in enumerate(survey.ranges.anchor_id) if not use_anchors or id_ in use_anchors])
-        for survey in surveys
-    ]
-    parts = [(one, [k for k in rows if one.ranges.status[k] != RangeStatus.TAG_TAG.label]) for one, rows in parts]
+    parts = [(one, _rows_to_join(one.ranges, use_anchors)) for one in surveys]
     of_each = [(one, k) for one, rows in parts for k in rows]
     has_times = surveys[0].path.timestamps_s is not None
     log = RangeLog.from_arrays(
@@ -199,6 +190,12 @@ def _own(names: dict[str, str], name: str) -> str:
     return names.get(name, name)
 
 
+def _rows_to_join(ranges: RangesAsUsed, use_anchors: Sequence[str]) -> list[int]:
+    """Of the wanted anchors; ranges between two tags have no say, and no anchor."""
+    is_wanted = [not use_anchors or id_ in use_anchors for id_ in ranges.anchor_id]
+    return [k for k, wanted in enumerate(is_wanted) if wanted and ranges.status[k] != RangeStatus.TAG_TAG.label]
+
+
 def _camera_times_s(survey: FinishedRun) -> Array:
     """(n,) when each range was taken, by the photos around it; of those without a place, by the clocks' offset."""
     ranges, times = survey.ranges, survey.result.timestamps_s
@@ -214,11 +211,7 @@ def _camera_times_s(survey: FinishedRun) -> Array:
 
 
 def paths_of_surveys(
-    surveys: Sequence[FinishedRun],
-    log: RangeLog,
-    number: npt.NDArray[np.int64],
-    is_check: npt.NDArray[np.bool_],
-    tags_in_cam_m: Array,
+    surveys: Sequence[FinishedRun], log: RangeLog, number: Indices, is_check: Mask, tags_in_cam_m: Array
 ) -> list[PathOfModel]:
     """Each survey's model with its own ranges on its path, as the survey put them there; checks stay checks."""
     paths = []

@@ -6,20 +6,21 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
+from rangesfm.arrays import Array
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.colmap.transform import rescale, without_photos
-from rangesfm.distances.ends import LocatedDistances, locate_distances, surveyed_distances
+from rangesfm.distances.ends import locate_distances, surveyed_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.join.models import ModelVerdict, PathOfModel, Ranging, join_models
+from rangesfm.join.models import ModelVerdict, PathOfModel, join_models
+from rangesfm.progress import Journal
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock.estimate import TimeOffset, estimate_time_offset
-from rangesfm.ranging.clock.rivals import REMEDY, Rival
+from rangesfm.ranging.clock.rivals import REMEDY
 from rangesfm.ranging.errors.components import CLOCKS
 from rangesfm.ranging.log import RangeKind
 from rangesfm.ranging.observations import RangeObservations, RangeStatus, hold_out
@@ -32,9 +33,10 @@ from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.trust.broken_refinement import why_broken
 from rangesfm.trust.finished_map import Doubt, doubts_of_map, place_of_map
+from rangesfm.trust.lengths import trust_in_lengths
+from rangesfm.trust.linearized import ranges_on_map
+from rangesfm.trust.verdict import TrustVerdict, sentence, trust_in
 from rangesfm.vision.image_times import ImageTimes
-from rangesfm.workflows.journal import Journal
-from rangesfm.workflows.trust_in_map import named_causes, tested
 
 # Scales of two clock offsets further apart than this are no answer, unless the others are hardly likely together.
 _MAX_SPREAD = 0.03
@@ -78,8 +80,7 @@ def find_time_offset(
             seed=survey.output.seed,
             progress=journal.progress,
         )
-    if offset.note:
-        journal.warn(offset.note)
+    journal.warn(*([offset.note] if offset.note else []))
     return offset
 
 
@@ -109,27 +110,25 @@ def ranges_on_paths(
             journal.warn(f"sparse/{k} is left out: its photos have no time, or are in other models too")
             continue
         names.update(path.image_names)
-        observations = hold_out(_on_path(survey, inputs, path, offsets_s), survey.ranges, survey.output.seed)
+        observations = ranges_on_path(survey, inputs, path, offsets_s, may_be_none=True)
         paths.append(PathOfModel(f"sparse/{k}", rest, path, observations))
     return paths
 
 
 def ranges_on_path(
-    survey: Survey, inputs: RangingInputs, trajectory: Trajectory, offset_s: float | npt.NDArray[np.float64]
+    survey: Survey,
+    inputs: RangingInputs,
+    trajectory: Trajectory,
+    offset_s: float | Array,
+    *,
+    may_be_none: bool = False,
 ) -> RangeObservations:
     """Ranges on the path; refused where the clocks cannot be right."""
-    observations = _on_path(survey, inputs, trajectory, offset_s)
-    if len(inputs.log) and not observations.has_place.any():
-        raise InputError(
-            _why_no_range_has_a_place(observations, trajectory, float(np.mean(offset_s))), survey.ranges.path
-        )
+    observations = associate(inputs.log, trajectory, inputs.tag_in_cam_m, time_offset_s=offset_s, options=survey.ranges)
+    if len(inputs.log) and not may_be_none and not observations.has_place.any():
+        why = _why_no_range_has_a_place(observations, trajectory, float(np.mean(offset_s)))
+        raise InputError(why, survey.ranges.path)
     return hold_out(observations, survey.ranges, survey.output.seed)
-
-
-def _on_path(
-    survey: Survey, inputs: RangingInputs, trajectory: Trajectory, offset_s: float | npt.NDArray[np.float64]
-) -> RangeObservations:
-    return associate(inputs.log, trajectory, inputs.tag_in_cam_m, time_offset_s=offset_s, options=survey.ranges)
 
 
 def _why_no_range_has_a_place(observations: RangeObservations, trajectory: Trajectory, offset_s: float) -> str:
@@ -144,20 +143,16 @@ def _why_no_range_has_a_place(observations: RangeObservations, trajectory: Traje
     return "no range is near enough to a keyframe in time: use more photos, or a larger max_interpolation_gap_s"
 
 
-def estimate_scale(
-    survey: Survey,
-    inputs: RangingInputs,
-    observations: RangeObservations,
-    trajectory: Trajectory,
-    anchor_frame: str,
-    distances: LocatedDistances | None,
-) -> ScaleEstimate:
-    """``initialize_scale`` by a survey's options; its arguments."""
+def estimate_scale(survey: Survey, inputs: RangingInputs, path: PathOfModel) -> ScaleEstimate:
+    """``initialize_scale`` by a survey's options, with the lengths of its inputs."""
+    distances = None
+    if inputs.tape is not None:
+        distances = locate_distances(inputs.tape, path.sfm, path.observations.log.anchor_ids)
     return initialize_scale(
-        observations,
-        trajectory,
+        path.observations,
+        path.trajectory,
         inputs.anchors,
-        anchor_frame=anchor_frame,
+        anchor_frame=inputs.anchor_frame,
         options=survey.scale,
         range_model=survey.ranges,
         distances=distances,
@@ -205,16 +200,13 @@ def join_by_survey(
     """All models that can be, as one."""
     if len(paths) == 1:
         return paths[0], ()
-    ranging = Ranging(inputs.anchors, inputs.anchor_frame, survey.scale, survey.ranges, inputs.tape, survey.output.seed)
-    joined = join_models(paths, ranging)
+    joined = join_models(paths, survey, inputs)
     left_out = [model for model in joined.verdicts if model.joined_from_sfm is None]
     if must_join and len(left_out) == len(paths) - 1:
         reasons = "; ".join(f"{model.name}: {model.reason}" for model in left_out)
         raise GeometryError(f"nothing can be joined to {paths[0].name}: {reasons}")
-    for note in joined.notes:
-        journal.warn(note)
-    for model in left_out:
-        journal.warn(f"{model.name} ({model.num_images} photos) is left out: {model.reason}")
+    whose = (f"{model.name} ({model.num_images} photos) is left out: {model.reason}" for model in left_out)
+    journal.warn(*joined.notes, *whose)
     return joined.path, joined.verdicts
 
 
@@ -222,26 +214,21 @@ def scale_by_survey(
     survey: Survey, inputs: RangingInputs, path: PathOfModel, offset: TimeOffset | None, journal: Journal
 ) -> MetricResult:
     """The scale of a map, its doubts told, and the map rescaled."""
-    sfm, trajectory, observations = path.sfm, path.trajectory, path.observations
     if offset is not None and offset.offset_matters:
-        observations = replace(observations, time_offset_stddev_s=offset.stddev_s)
-    distances = None
-    if inputs.tape is not None:
-        distances = locate_distances(inputs.tape, sfm, observations.log.anchor_ids)
+        path = replace(path, observations=replace(path.observations, time_offset_stddev_s=offset.stddev_s))
     try:
-        estimate = estimate_scale(survey, inputs, observations, trajectory, inputs.anchor_frame, distances)
+        estimate = estimate_scale(survey, inputs, path)
     except GeometryError as error:
-        raise _with_cause(error, survey, inputs, observations, trajectory, distances) from None
+        raise _with_cause(error, survey, inputs, path) from None
     by_rivals: tuple[str, ...] = ()
     if offset is not None and offset.rivals:
-        by_rivals, stddev = scale_by_rivals(survey, inputs, trajectory, distances, offset, estimate.value)
+        by_rivals, stddev = scale_by_rivals(survey, inputs, path, offset, estimate.value)
         estimate = replace(estimate, uncertainty=estimate.uncertainty.beside(CLOCKS, stddev))
-    for doubt in (*by_rivals, *(estimate.reasons if estimate.verdict != "good" else ())):
-        journal.warn(doubt)
-    scaled = rescale(sfm, estimate.metric_from_sfm)
+    journal.warn(*by_rivals, *(estimate.reasons if estimate.verdict != "good" else ()))
+    scaled = rescale(path.sfm, estimate.metric_from_sfm)
     predicted = predicted_ranges(
         scaled,
-        trajectory,
+        path.trajectory,
         estimate.observations,
         estimate.metric_from_sfm,
         inputs.tag_in_cam_m,
@@ -252,40 +239,49 @@ def scale_by_survey(
     tape = inputs.tape
     if tape is not None and (lengths := estimate.lengths) is not None:
         tape = tape.without(lengths.rows[~lengths.is_kept].tolist())
-    metric = MetricResult(trajectory, offset, offset_s, estimate, scaled, predicted, weights, tape=tape)
-    return tested(survey, metric.doubted(by_rivals), journal)
+    metric = MetricResult(path.trajectory, offset, offset_s, estimate, scaled, predicted, weights, tape=tape)
+    return _tested(survey, metric.doubted(by_rivals), journal)
 
 
-def _with_cause(
-    error: GeometryError,
-    survey: Survey,
-    inputs: RangingInputs,
-    observations: RangeObservations,
-    trajectory: Trajectory,
-    distances: LocatedDistances | None,
-) -> GeometryError:
+def _with_cause(error: GeometryError, survey: Survey, inputs: RangingInputs, path: PathOfModel) -> GeometryError:
     """A refusal with the mistake that the ranges show on the map all the same, if they show one."""
     lenient = survey.model_copy(update={"scale": survey.scale.changed(max_relative_stddev=_ANY_STDDEV)})
     try:
-        estimate = estimate_scale(lenient, inputs, observations, trajectory, inputs.anchor_frame, distances)
-    except GeometryError:
+        trust = _trust_in_ranges(survey, estimate_scale(lenient, inputs, path), path.trajectory)
+    except (GeometryError, np.linalg.LinAlgError):
         return error
-    causes = named_causes(estimate, trajectory, survey.output.seed)
-    return GeometryError(f"{error}; {causes}") if causes else error
+    return GeometryError(f"{error}; {sentence(trust.causes)}") if trust is not None and trust.causes else error
+
+
+def _tested(survey: Survey, metric: MetricResult, journal: Journal) -> MetricResult:
+    """The map with what the tests of mistakes say of it, and doubted if one was found.
+
+    The scaled map is looked at, refined or not: a refinement bends a map to ranges that are wrong.
+    """
+    trust = trust_in_lengths(metric.estimate, metric.tape)
+    try:
+        if (of_ranges := _trust_in_ranges(survey, metric.estimate, metric.trajectory)) is not None:
+            trust = of_ranges.with_more(trust)
+    except np.linalg.LinAlgError as error:
+        journal.warn(f"mistakes were not looked for, as the ranges determine too little: {error}")
+    journal.warn(*trust.reasons)
+    return replace(metric, trust=trust).doubted(trust.reasons)
+
+
+def _trust_in_ranges(survey: Survey, estimate: ScaleEstimate, trajectory: Trajectory) -> TrustVerdict | None:
+    """Of those on the scaled map; None where there are none."""
+    if estimate.problem is None or estimate.solution is None:
+        return None
+    on_map = ranges_on_map(estimate.problem, estimate.solution, estimate.observations, trajectory)
+    return trust_in(on_map, seed=survey.output.seed)
 
 
 def scale_by_rivals(
-    survey: Survey,
-    inputs: RangingInputs,
-    trajectory: Trajectory,
-    distances: LocatedDistances | None,
-    offset: TimeOffset,
-    scale: float,
+    survey: Survey, inputs: RangingInputs, path: PathOfModel, offset: TimeOffset, scale: float
 ) -> tuple[tuple[str, ...], float]:
     """Solve the scale for every rival of an offset.
 
     Args:
-        distances: as the scale was estimated with.
         scale: at the offset, metres per SfM unit.
 
     Returns:
@@ -296,12 +292,16 @@ def scale_by_rivals(
     Raises:
         GeometryError: the offset is not certain, and another scale follows from a rival.
     """
+    assert inputs.log.timestamp_s is not None, "clocks belong to a log with times"
     doubts, far_apart = [], []
     far_probability, variance, farthest = 0.0, 0.0, 0.0
     for rival in offset.rivals:
         said = f"{rival.value_s:+.2f} s ({rival.probability:.0%})"
-        other = _scale_of(rival, survey, inputs, trajectory, distances, offset)
-        if other is None:
+        offsets_s = offset.of_rival(rival).at(inputs.log.timestamp_s)
+        try:
+            observations = ranges_on_path(survey, inputs, path.trajectory, offsets_s)
+            other = estimate_scale(survey, inputs, replace(path, observations=observations)).value
+        except GeometryError:
             doubts.append(f"the time offset may also be {said}, which gives no scale")
             continue
         change = other / scale - 1
@@ -321,23 +321,6 @@ def scale_by_rivals(
     return tuple(doubts), max(float(np.sqrt(variance)), farthest / NORMAL_95)
 
 
-def _scale_of(
-    rival: Rival,
-    survey: Survey,
-    inputs: RangingInputs,
-    trajectory: Trajectory,
-    distances: LocatedDistances | None,
-    offset: TimeOffset,
-) -> float | None:
-    assert inputs.log.timestamp_s is not None, "clocks belong to a log with times"
-    offsets_s = offset.of_rival(rival).at(inputs.log.timestamp_s)
-    try:
-        observations = ranges_on_path(survey, inputs, trajectory, offsets_s)
-        return estimate_scale(survey, inputs, observations, trajectory, inputs.anchor_frame, distances).value
-    except GeometryError:
-        return None
-
-
 def refine_map(survey: Survey, inputs: RangingInputs, metric: MetricResult, journal: Journal) -> MetricResult:
     """The map refined with its ranges; the scaled one stays the result where that broke it.
 
@@ -347,9 +330,10 @@ def refine_map(survey: Survey, inputs: RangingInputs, metric: MetricResult, jour
     offset = metric.time_offset
     if offset is not None and not offset.is_certain and not survey.refine.time_offset_stddev_s:
         survey = survey.changed({"refine.time_offset_stddev_s": offset.stddev_s})
-    refined, summary = refine_by_survey(
-        survey, inputs, metric.scaled, metric.trajectory, metric.estimate, _control(inputs, metric)
-    )
+    tape = metric.tape or Tape()
+    if inputs.anchor_frame == "site" and metric.estimate.frame != "site":  # their positions could not be used
+        tape = tape.with_more(surveyed_distances(inputs.anchors))
+    refined, summary = refine_by_survey(survey, inputs, metric.scaled, metric.trajectory, metric.estimate, tape)
     if survey.refine.covariance and summary.covariance is None:
         journal.warn("no covariance of the poses: too many keyframes, or photos and ranges leave some of it open")
     broken = why_broken(
@@ -378,17 +362,8 @@ def judge_map(survey: Survey, metric: MetricResult, journal: Journal) -> MetricR
         point_errors(metric.final),
         noise_is_given=survey.ranges.range_stddev_m is not None or bool(np.isfinite(log.range_stddev_m).any()),
     )
-    for doubt in doubts:
-        journal.warn(doubt.reason)
+    journal.warn(*(doubt.reason for doubt in doubts))
     centers_m = metric.trajectory.as_in(metric.final).centers
     place = place_of_map(metric.estimate, metric.kept_refinement, centers_m, doubts)
     judged = replace(metric, place=place)
     return judged.doubted([doubt.reason for doubt in doubts], [doubt.advice for doubt in doubts])
-
-
-def _control(inputs: RangingInputs, metric: MetricResult) -> Tape:
-    """What was measured, and the distances between surveyed anchors where their positions could not be used."""
-    tape = metric.tape or Tape()
-    if inputs.anchor_frame == "site" and metric.estimate.frame != "site":
-        tape = tape.with_more(surveyed_distances(inputs.anchors))
-    return tape

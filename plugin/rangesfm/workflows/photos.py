@@ -20,6 +20,8 @@ from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.export import check_formats
 from rangesfm.files.atomic import sha256_of
 from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.join.models import PathOfModel
+from rangesfm.progress import Journal
 from rangesfm.ranging.clock.estimate import estimate_time_offset
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.result.folder import forget_result, refuse_to_overwrite
@@ -34,7 +36,6 @@ from rangesfm.vision.mapping_loop import GlobalAdjustment
 from rangesfm.vision.reconstruct import reconstruct
 from rangesfm.vision.rigs import read_rigs
 from rangesfm.vision.tags import find_tags
-from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.metric_map import estimate_scale, path_of_model, ranges_on_path, refine_by_survey
 
 # Fewer have no shape by which ranges could tell a scale.
@@ -50,8 +51,7 @@ def read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
         apply_options(pycolmap.BundleAdjustmentOptions(), survey.refine.bundle_adjustment, "refine.bundle_adjustment")
     refuse_to_overwrite(survey.input_paths(), survey.output.path)
     inputs = read_ranging_inputs(survey)
-    for note in (*inputs.notes, *notes_before_work(survey, inputs)):
-        journal.warn(note)
+    journal.warn(*inputs.notes, *notes_before_work(survey, inputs))
     return inputs
 
 
@@ -60,7 +60,9 @@ def checked_keyframes(
 ) -> tuple[tuple[str, ...], ImageTimes | None]:
     """The photos to reconstruct and their times, which have to do with those of the inputs."""
     keyframes, times = find_keyframes(survey, journal, log_names_photos=inputs.log.image_name is not None)
-    check_times(survey, inputs, _path_without_places(keyframes, times))
+    n, timestamps_s = len(keyframes), None if times is None else times.timestamps_s
+    nowhere = Trajectory(np.arange(n), keyframes, timestamps_s, np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))
+    check_times(survey, inputs, nowhere)
     tell_of_times(survey, inputs, times, journal)
     return keyframes, times
 
@@ -80,17 +82,9 @@ def tell_of_times(survey: Survey, inputs: RangingInputs, times: ImageTimes | Non
     """What is odd about the photos' times, and about two clocks whose offset nobody gave."""
     if times is None or inputs.log.timestamp_s is None:
         return
-    notes = [*notes_on_gaps(times.timestamps_s, survey.ranges.max_interpolation_gap_s)]
+    journal.warn(*notes_on_gaps(times.timestamps_s, survey.ranges.max_interpolation_gap_s))
     if survey.ranges.time_offset_s is None:
-        notes += notes_on_times(inputs.log.timestamp_s, times.timestamps_s)
-    for note in notes:
-        journal.warn(note)
-
-
-def _path_without_places(keyframes: tuple[str, ...], times: ImageTimes | None) -> Trajectory:
-    n = len(keyframes)
-    timestamps_s = None if times is None else times.timestamps_s
-    return Trajectory(np.arange(n), keyframes, timestamps_s, np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))
+        journal.warn(*notes_on_times(inputs.log.timestamp_s, times.timestamps_s))
 
 
 def read_registered(path: Path, journal: Journal) -> pycolmap.Reconstruction:
@@ -98,8 +92,7 @@ def read_registered(path: Path, journal: Journal) -> pycolmap.Reconstruction:
     model = read_model(path)
     if not model.num_reg_images():
         raise InputError("the model has no registered images", path)
-    for note in notes_on_model(model):
-        journal.warn(note)
+    journal.warn(*notes_on_model(model))
     return model
 
 
@@ -123,8 +116,7 @@ def with_photos_in_folder(survey: Survey, journal: Journal, *, restart: bool = F
             progress=journal.progress,
             restart=restart,
         )
-    for note in taken.notes:
-        journal.warn(note)
+    journal.warn(*taken.notes)
     values: dict[str, Any] = {"images.path": folder, "images.times": folder / TIMES_NAME}
     given = survey.camera
     if taken.camera is not None and given.model is None and given.params is None and not given.others:
@@ -152,7 +144,8 @@ def find_keyframes(
         if image_times is None or (log_names_photos and not survey.images.times and image_times.num_left_out):
             return select_keyframes(names, survey.images), None
         keyframes = select_keyframes(image_times, survey.images)
-        return keyframes, noted(image_times, journal).of(keyframes)
+        journal.warn(*image_times.notes)
+        return keyframes, image_times.of(keyframes)
 
 
 def with_tags(survey: Survey, inputs: RangingInputs, names: Sequence[str], journal: Journal) -> RangingInputs:
@@ -204,12 +197,6 @@ def map_keyframes(
         which = "the model" if len(summary.models) == 1 else f"the largest of {len(summary.models)} models"
         journal.warn(f"{summary.num_registered} of {summary.num_keyframes} keyframes are in {which}")
     return summary.models
-
-
-def noted(image_times: ImageTimes, journal: Journal) -> ImageTimes:
-    for note in image_times.notes:
-        journal.warn(note)
-    return image_times
 
 
 class AdjustmentWithRanges:
@@ -272,9 +259,11 @@ class AdjustmentWithRanges:
         return f"ranges took part in {self.num_with_ranges} of {num} global adjustments of the map while it grew"
 
     def _adjusted(self, model: pycolmap.Reconstruction, path: Trajectory) -> pycolmap.Reconstruction:
-        survey, inputs = self._survey, self._inputs
-        observations = self._observations(path)
-        estimate = estimate_scale(survey, inputs, observations, path, self._anchor_frame(path), distances=None)
+        survey, inputs = self._survey, replace(self._inputs, tape=None)
+        # Positions in the first camera's frame are of no use before that photo is part of the map.
+        if inputs.anchor_frame == "first_camera" and path.image_names[0] != self._first_keyframe:
+            inputs = replace(inputs, anchor_frame="unknown")
+        estimate = estimate_scale(survey, inputs, PathOfModel("", model, path, self._observations(path)))
         refine_intrinsics = survey.camera.mapping_refines_intrinsics
         asked = survey.changed({"camera.refine_intrinsics": refine_intrinsics, "refine.covariance": False})
         scaled = rescale(model, estimate.metric_from_sfm)
@@ -292,9 +281,3 @@ class AdjustmentWithRanges:
                 raise GeometryError("more than one time offset is likely")
             self._offset_s, self._num_with_offset = found.value_s, len(path)
         return ranges_on_path(survey, inputs, path, self._offset_s or 0.0)
-
-    def _anchor_frame(self, path: Trajectory) -> str:
-        """Positions in the first camera's frame are of no use before that photo is part of the map."""
-        is_there = path.image_names[0] == self._first_keyframe
-        frame = self._inputs.anchor_frame
-        return "unknown" if frame == "first_camera" and not is_there else frame

@@ -13,6 +13,7 @@ from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.tape import DistanceRow, disagreements, distance_rows
 from rangesfm.export import COVARIANCE_FORMATS
 from rangesfm.geometry.reference import write_reference
+from rangesfm.progress import Journal
 from rangesfm.report import write_report
 from rangesfm.result.entries import ComparisonRow
 from rangesfm.result.folder import REFERENCE_NAME, replacing_result
@@ -22,7 +23,6 @@ from rangesfm.result.write import write_models_and_tables
 from rangesfm.scale.lengths import BENDING
 from rangesfm.survey.inputs import RangingInputs, input_hashes
 from rangesfm.survey.settings import Survey
-from rangesfm.workflows.journal import Journal
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,7 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
         metric = metric.moved(inputs.site.offset_m)
     distances = _distances(metric)
     disagreeing = tuple(disagreements(distances, metric.estimate.uncertainty.empirical, BENDING))
-    for note in disagreeing:
-        journal.warn(note)
+    journal.warn(*disagreeing)
     metric = metric.doubted(disagreeing)
     folder = survey.output.path
     with replacing_result(folder):

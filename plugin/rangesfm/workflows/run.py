@@ -16,14 +16,13 @@ from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import sole_writer
 from rangesfm.join.models import PathOfModel
-from rangesfm.progress import Progress
+from rangesfm.progress import Journal, Progress
 from rangesfm.ranging.clock.estimate import TimeOffset
 from rangesfm.survey.inputs import RangingInputs, times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes
 from rangesfm.vision.rigs import read_rigs
 from rangesfm.workflows.adoption import with_likeliest_cause
-from rangesfm.workflows.journal import Journal
 from rangesfm.workflows.metric_map import (
     find_time_offset,
     join_by_survey,
@@ -39,7 +38,6 @@ from rangesfm.workflows.photos import (
     checked_keyframes,
     find_keyframes,
     map_keyframes,
-    noted,
     read_inputs,
     read_registered,
     tell_of_times,
@@ -99,7 +97,8 @@ def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResul
     with sole_writer(survey.output.path):
         survey = with_photos_in_folder(survey, journal)
         if inputs.log.image_name is None:
-            times = noted(times_of_model(survey, sfm, survey.given_model_path), journal)
+            times = times_of_model(survey, sfm, survey.given_model_path)
+            journal.warn(*times.notes)
             tell_of_times(survey, inputs, times, journal)
         inputs = with_tags(survey, inputs, sorted(image.name for image in sfm.images.values()), journal)
         return to_metric(survey, inputs, [sfm], times, journal, refine=refine)

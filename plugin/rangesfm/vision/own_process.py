@@ -1,6 +1,6 @@
-"""A share of the pairs of photos, matched in a process of its own with a database of its own.
+"""What COLMAP does in a process of its own: a share of the matching, and the mappers that take all photos at once.
 
-``python -m rangesfm.vision.matching_share PARENT`` matches one.
+``python -m rangesfm.vision.own_process PARENT`` does one such piece of work.
 """
 
 from __future__ import annotations
@@ -16,21 +16,17 @@ from rangesfm.colmap.log import colmap_log
 from rangesfm.processes.supervision import MessagesToParent, work_for_parent
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
-from rangesfm.vision.database import copy_features, copy_matches, num_compared_pairs
+from rangesfm.vision.database import copy_matches, copy_photos
 
+MODULE = "rangesfm.vision.own_process"
+WholePipelineOptions = pycolmap.GlobalPipelineOptions | pycolmap.HierarchicalPipelineOptions
 # Features that COLMAP keeps in memory, each of some 700 bytes with its index; what it forgets it indexes anew.
 _MAX_NUM_FEATURES = 400_000
 
 
 @dataclass(frozen=True)
 class MatchingShare:
-    """Pairs of photos, and all that it takes to match them.
-
-    Attributes:
-        folder: of its own, which there is.
-        pairs: ids of photos, smaller first.
-        matcher, verification: COLMAP's options.
-    """
+    """Pairs of photos by their ids, smaller first, and all that it takes to match them in a folder of their own."""
 
     folder: Path
     pairs: Sequence[tuple[int, int]]
@@ -48,10 +44,10 @@ class MatchingShare:
 
     def prepare(self, source: Path) -> None:
         """Take over the features of its photos; there each photo is called by its id."""
-        copy_features(source, self.database, sorted({id_ for pair in self.pairs for id_ in pair}))
+        copy_photos(source, self.database, sorted({id_ for pair in self.pairs for id_ in pair}))
         (self.folder / "pairs.txt").write_text("".join(f"{first} {second}\n" for first, second in self.pairs))
 
-    def match(self, progress: Progress) -> int:
+    def run(self, progress: Progress) -> int:
         """Returns how many pairs have been compared."""
         pairing = pycolmap.ImportedPairingOptions()
         pairing.match_list_path = self.folder / "pairs.txt"
@@ -63,7 +59,7 @@ class MatchingShare:
                     self.database, self.matcher, pairing, self.verification, cancellation_token=token
                 ),
                 progress,
-                lambda: num_compared_pairs(database),
+                database.num_verified_image_pairs,
                 len(self.pairs),
             )
         return len(self.pairs)
@@ -73,9 +69,31 @@ class MatchingShare:
         copy_matches(self.database, target, ((pair, pair) for pair in self.pairs))
 
 
-def _run(share: MatchingShare, parent: MessagesToParent) -> int:
+@dataclass(frozen=True)
+class WholeMapping:
+    """A mapping that neither says how far it is nor hears of a Ctrl-C; it writes the models beside the database."""
+
+    database: Path
+    image_path: Path
+    options: WholePipelineOptions
+
+    @property
+    def log(self) -> Path:
+        """What COLMAP said."""
+        return self.database.with_name("mapper.log")
+
+    def run(self, _: Progress) -> int:
+        """Returns how many models there are."""
+        where = self.database, self.image_path, self.database.parent
+        with colmap_log(self.log):
+            if isinstance(self.options, pycolmap.GlobalPipelineOptions):
+                return len(pycolmap.global_mapping(*where, self.options))
+            return len(pycolmap.hierarchical_mapping(*where, self.options))
+
+
+def _run(work: MatchingShare | WholeMapping, parent: MessagesToParent) -> int:
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # at once: what is written down is whole
-    return share.match(parent)
+    return work.run(parent)
 
 
 if __name__ == "__main__":
