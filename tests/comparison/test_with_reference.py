@@ -24,7 +24,7 @@ from rangesfm.comparison.with_reference import (
 from rangesfm.errors import InputError
 from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.result.ranges_as_used import RangesAsUsed
+from rangesfm.result.tables import RangesAsUsed
 
 Array = npt.NDArray[np.float64]
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from rangesfm.arrays import Array
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.result.folder import ResultFolder
-from rangesfm.result.ranges_as_used import RangesAsUsed
+from rangesfm.result.tables import RangesAsUsed
 
 if TYPE_CHECKING:
     import pycolmap

@@ -19,7 +19,7 @@ from rangesfm.report.plot import (
     running_median,
     time_axis,
 )
-from rangesfm.result.ranges_as_used import RangesAsUsed
+from rangesfm.result.tables import RangesAsUsed
 
 NUM_HISTOGRAM_BINS = 60
 NUM_MEDIAN_BINS = 48

@@ -18,7 +18,7 @@ from rangesfm.report.text import count
 from rangesfm.report.thumbnails import thumbnails
 from rangesfm.result.entries import AnchorEntry
 from rangesfm.result.metric_result import USED
-from rangesfm.result.ranges_as_used import RangesAsUsed
+from rangesfm.result.tables import RangesAsUsed
 
 MAX_NUM_POINTS = 500_000
 MAX_NUM_RANGES = 20_000
