@@ -43,10 +43,10 @@ _NUM_BENT = 40
 _NO_MOTION = 1e-6
 
 
-def _ascending(distances: tuple[float, float]) -> tuple[float, float]:
-    if not distances[0] < distances[1]:
+def ascending(ends: tuple[float, float]) -> tuple[float, float]:
+    if not ends[0] < ends[1]:
         raise ValueError("are not ascending")
-    return distances
+    return ends
 
 
 _Distance = Annotated[float, Field(ge=0.01, le=1e4)]
@@ -60,7 +60,7 @@ class PlannedPhotos(Options):
     field_of_view_deg: Annotated[float, Field(ge=5, le=170)] = 65.0
     """From the left edge of a photo to the right one."""
     seen_m: Annotated[
-        Annotated[tuple[_Distance, _Distance], Field(strict=False), AfterValidator(_ascending)],
+        Annotated[tuple[_Distance, _Distance], Field(strict=False), AfterValidator(ascending)],
         Told(expected="a list of 2 distances, the larger one last"),
     ] = (1.5, 8.0)
     """Nearest and farthest of what it sees."""

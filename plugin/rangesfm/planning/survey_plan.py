@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -59,14 +60,8 @@ class DetectableMistake:
 
     @classmethod
     def of(cls, test: MistakeTest) -> DetectableMistake:
-        return cls(
-            test.name,
-            test.subject,
-            test.unit,
-            _limited(test.smallest_detectable),
-            _limited(test.effect_on_scale),
-            _limited(test.effect_on_place_m),
-        )
+        sizes = (test.smallest_detectable, test.effect_on_scale, test.effect_on_place_m)
+        return cls(test.name, test.subject, test.unit, *map(_limited, sizes))
 
 
 @dataclass(frozen=True)
@@ -107,12 +102,12 @@ class SurveyPlan:
     @property
     def advice_for_scale(self) -> list[Advice]:
         """What gains most for the scale first."""
-        return ranked(self.advice, lambda advice: advice.scale_gain)
+        return ranked(self.advice, attrgetter("scale_gain"))
 
     @property
     def advice_for_place(self) -> list[Advice]:
         """What gains most for the place of the keyframe known least first."""
-        return ranked(self.advice, lambda advice: advice.place_gain)
+        return ranked(self.advice, attrgetter("place_gain"))
 
     @property
     def lines(self) -> list[str]:
@@ -137,7 +132,7 @@ def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
     """
     expected = expect(planned)
     verdict = expected.verdict
-    open_place = [why for why in [expected.mirror_image()] if why is not None]
+    open_place = expected.mirror_image()
     half_width = expected.uncertainty.half_width_95
     return SurveyPlan(
         num_ranges=planned.num_ranges,
@@ -151,7 +146,7 @@ def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
         place=_place(expected),
         keyframe_stddevs_m=tuple(expected.keyframe_stddevs_m.tolist()),
         verdict="doubtful" if open_place else verdict.verdict,
-        reasons=(*(f"a run will give the scale only: {why}" for why in open_place), *verdict.reasons),
+        reasons=(*([f"a run will give the scale only: {open_place}"] if open_place else []), *verdict.reasons),
         mistakes=_mistakes(expected),
         advice=advise(expected),
         expected=expected,
@@ -179,11 +174,7 @@ def _mistakes(expected: Expected) -> tuple[DetectableMistake, ...]:
     problem = replace(linearized(on_map, expected.learned.cells), errors=expected.learned)
     hypotheses = [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
     found = [DetectableMistake.of(row_of(test)) for test in Factorization(problem).test(hypotheses, seed=0)]
-    return tuple(sorted(found, key=lambda each: -_most(each)))
-
-
-def _most(mistake: DetectableMistake) -> float:
-    return np.inf if mistake.effect_on_scale is None else mistake.effect_on_scale
+    return tuple(sorted(found, key=lambda each: -np.inf if each.effect_on_scale is None else -each.effect_on_scale))
 
 
 def _known(plan: SurveyPlan) -> Iterator[str]:
@@ -195,11 +186,11 @@ def _known(plan: SurveyPlan) -> Iterator[str]:
     yield from (f"  {reason}" for reason in plan.reasons)
     if plan.place is not None:
         place = plan.place
-        x, y, z = (_metres(stddev_m) for stddev_m in place.stddev_m)
+        x, y, z = (_rough(stddev_m) for stddev_m in place.stddev_m)
         yield (
-            f"place: x {x}, y {y}, z {z}, heading {_degrees(place.heading_stddev_deg)}, tilt "
-            f"{_degrees(place.tilt_stddev_deg)}; keyframe {place.worst_keyframe} is known least, to "
-            f"{_metres(place.worst_keyframe_stddev_m)} (1 stddev)"
+            f"place: x {x}, y {y}, z {z}, heading {_rough(place.heading_stddev_deg, 'deg')}, tilt "
+            f"{_rough(place.tilt_stddev_deg, 'deg')}; keyframe {place.worst_keyframe} is known least, to "
+            f"{_rough(place.worst_keyframe_stddev_m)} (1 stddev)"
         )
 
 
@@ -222,32 +213,26 @@ def _found(plan: SurveyPlan) -> Iterator[str]:
         unit = "" if mistake.unit == "1" else f" {mistake.unit}"
         scale = "open" if mistake.effect_on_scale is None else f"{100 * mistake.effect_on_scale:.2g} %"
         place_m = np.inf if mistake.effect_on_place_m is None else mistake.effect_on_place_m
-        yield f"{what}: {mistake.smallest_detectable:.2g}{unit}; scale {scale}, place {_metres(place_m)}"
+        yield f"{what}: {mistake.smallest_detectable:.2g}{unit}; scale {scale}, place {_rough(place_m)}"
 
 
 def _advised(plan: SurveyPlan) -> Iterator[str]:
     if not plan.advice:
         yield "no single change gains much"
-    if for_scale := plan.advice_for_scale[:_MAX_NUM_SHOWN]:
-        yield "what would gain most for the scale:"
-        for number, advice in enumerate(for_scale, 1):
-            yield f"  {number}. {advice.words}: +-{100 * advice.scale_stddev:.2g} %"
-    if for_place := plan.advice_for_place[:_MAX_NUM_SHOWN]:
-        yield "what would gain most for the place of the keyframe known least:"
-        for number, advice in enumerate(for_place, 1):
-            yield f"  {number}. {advice.words}: {_metres(advice.place_stddev_m)}"
+    for_scale = [f"{each.words}: +-{100 * each.scale_stddev:.2g} %" for each in plan.advice_for_scale]
+    for_place = [f"{each.words}: {_rough(each.place_stddev_m)}" for each in plan.advice_for_place]
+    for what, best in {"the scale": for_scale, "the place of the keyframe known least": for_place}.items():
+        if best:
+            yield f"what would gain most for {what}:"
+        yield from (f"  {number}. {words}" for number, words in enumerate(best[:_MAX_NUM_SHOWN], 1))
 
 
 def _limited(value: float | None) -> float | None:
     return None if value is None or value > OPEN else value
 
 
-def _metres(stddev_m: float) -> str:
-    return f"{stddev_m:.2g} m" if np.isfinite(stddev_m) else "open"
-
-
-def _degrees(stddev_deg: float) -> str:
-    return f"{stddev_deg:.2g} deg" if np.isfinite(stddev_deg) else "open"
+def _rough(stddev: float, unit: str = "m") -> str:
+    return f"{stddev:.2g} {unit}" if np.isfinite(stddev) else "open"
 
 
 def _finite(value: Any) -> Any:
