@@ -7,7 +7,7 @@ import io
 import pytest
 from tests.cli.screen import Terminal
 
-from rangesfm.batch.course import Course, Figures
+from rangesfm.batch.course import Course
 from rangesfm.batch.jobs import Job
 from rangesfm.cli.batch import BatchTerminal
 from rangesfm.survey.settings import Survey
@@ -43,7 +43,7 @@ def go_on(course: Course, shown: BatchTerminal, clock: Clock) -> None:
     shown.show(course)
     course.tell(1, {"began_on": "there"})
     shown.show(course)
-    course.done(0, Figures(verdict="good"), "")
+    course.done(0, {"verdict": "good"}, "")
     clock.now_s = 14.0
     shown.show(course)
     course.failed(1, "the scale is not known", 3)

@@ -11,7 +11,7 @@ from typing import Any
 
 from distributed import Client, Future, KilledWorker, wait
 
-from rangesfm.batch.course import BatchListener, Course, Figures, Status, SurveyRow
+from rangesfm.batch.course import BatchListener, Course, Status, SurveyRow
 from rangesfm.batch.jobs import BatchOptions, Job, Share, share_this_machine
 from rangesfm.batch.page import render
 from rangesfm.batch.workers import (
@@ -151,7 +151,7 @@ class _Crew:
         if isinstance(ending, Failure):
             self._course.failed(task.index, ending.message, ending.exit_status)
         else:
-            self._course.done(task.index, Figures(**ending["figures"]), ending["reason"])
+            self._course.done(task.index, ending["figures"], ending["reason"])
 
     def _stop(self) -> None:
         """Have the workers interrupt what they are at, and wait for it; then nothing is half-written."""

@@ -8,6 +8,7 @@ import pickle
 import signal
 import socket
 import tempfile
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -113,9 +114,9 @@ def num_at_once(client: Client) -> Mapping[str, int]:
     except Exception as error:  # whatever went wrong there, it is raised here
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise InputError(f"the workers of the scheduler cannot run surveys ({reason})") from None
-    num: dict[str, int] = {}
+    num = Counter[str]()
     for host, num_threads in slots:
-        num[host] = num.get(host, 0) + num_threads
+        num[host] += num_threads
     return num
 
 

@@ -166,7 +166,7 @@ def _counted(state: SurveyState) -> str:
 def _ended(state: SurveyState) -> str:
     row = state.row
     seconds = "" if row.seconds is None else f" after {duration(row.seconds)}"
-    what = f"{row.figures.verdict or row.status.value}" if row.exit_status == 0 else row.status.value
+    what = (row.exit_status == 0 and row.verdict) or row.status.value
     reason = f": {row.reason}" if row.reason and row.reason != what else ""
     return f"{row.survey}: {what}{seconds}{reason}"
 
