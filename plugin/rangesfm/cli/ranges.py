@@ -209,8 +209,8 @@ def _ranges(args: argparse.Namespace, progress: Progress) -> Outcome:
         write_ranges_csv(log, args.output_path)
         lines += ["", f"written to {args.output_path}"]
     if args.plot is not None:
-        from rangesfm.report.pictures import write_picture
-        from rangesfm.report.range_plots import plot_ranges
+        from rangesfm.report.chart import write_picture
+        from rangesfm.report.figures_ranges import plot_ranges
 
         write_picture(plot_ranges(log), Path(args.plot))
         lines += ["", f"drawn in {args.plot}"]
@@ -295,8 +295,8 @@ def _calibrate(args: argparse.Namespace, progress: Progress) -> Outcome:
     calibration = calibrate_ranges(log, tags_m, anchors)
     lines = [*_notes_of(log), *_calibrated(calibration, len(log)), "", f"written to {args.output_path}"]
     if args.plot is not None:
-        from rangesfm.report.pictures import write_picture
-        from rangesfm.report.range_plots import plot_error_curve
+        from rangesfm.report.chart import write_picture
+        from rangesfm.report.figures_ranges import plot_error_curve
 
         write_picture(plot_error_curve(calibration), Path(args.plot))
         lines.append(f"drawn in {args.plot}")

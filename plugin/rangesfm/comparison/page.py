@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.comparison.models import ModelsComparison, carried_by
-from rangesfm.files.atomic import new_file, sole_writer
+from rangesfm.files.atomic import sole_writer
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.report.chart import page_charts
 from rangesfm.report.content import points_of
-from rangesfm.report.page import render
+from rangesfm.report.page import render, write_page
 from rangesfm.report.plot import WIDE_SIZE, Figure, Series, equal_view, figure_of, from_zero, views_of
 from rangesfm.report.scene import Scene, ScenePath, view_of
 
@@ -26,8 +26,8 @@ def write_comparison(comparison: ModelsComparison, folder: Path) -> Path:
         InputError: the folder cannot be written to, or a run is writing there.
     """
     path = folder / PAGE_NAME
-    with sole_writer(folder), new_file(path) as temporary:
-        temporary.write_text(render_comparison(comparison), encoding="utf-8", errors="xmlcharrefreplace")
+    with sole_writer(folder):
+        write_page(render_comparison(comparison), path)
     return path
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -180,6 +180,15 @@ class View:
         """(n, 2) places on the page of (n, 3) points."""
         return np.asarray(points[:, self.axes] * np.array([1.0, self.sign]))
 
+    def anchors(self, anchors_m: Mapping[str, npt.ArrayLike]) -> tuple[Array, tuple[Mark, ...]]:
+        """(n, 2) places of anchors, (3,) by id, and their marks."""
+        places = self.seen(np.array(list(anchors_m.values()), dtype=np.float64).reshape(-1, 3))
+        marks = [
+            Mark("anchor", "anchor", "triangle", x, y, anchor_id, f"anchor {anchor_id}")
+            for anchor_id, (x, y) in zip(anchors_m, places.tolist(), strict=True)
+        ]
+        return places, tuple(marks)
+
     def panel(self, what: str, unit: str, series: Iterable[Series], limits: Limits, **others: Any) -> Panel:
         """What ``equal_view`` says of the limits, and what else a Panel has."""
         x, y = (f"{'xyz'[axis]}{unit}" for axis in self.axes)
@@ -228,6 +237,11 @@ def time_axis(times_s: Array) -> tuple[Array, str]:
     if not np.isfinite(times_s).any():
         return np.arange(len(times_s), dtype=np.float64), "range number"
     return times_s - np.nanmin(times_s), "time s"
+
+
+def every_nth(num: int, most: int) -> int:
+    """Every how many-th of so many is drawn, where no more than most are to be."""
+    return max(1, -(-num // most))
 
 
 def from_zero(series: Iterable[Series]) -> Range:

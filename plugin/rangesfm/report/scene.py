@@ -14,11 +14,11 @@ from rangesfm.arrays import Array
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.report.content import Content
+from rangesfm.report.plot import every_nth
 from rangesfm.report.text import count
 from rangesfm.report.thumbnails import thumbnails
 from rangesfm.result.entries import AnchorEntry
 from rangesfm.result.metric_result import USED
-from rangesfm.result.tables import RangesAsUsed
 
 MAX_NUM_POINTS = 500_000
 MAX_NUM_RANGES = 20_000
@@ -105,7 +105,7 @@ def view_of(scene: Scene) -> dict[str, Any]:
     layers += [(path.id, path.name, path.color, "line" if path.has_orientations else "dashed") for path in scene.paths]
     layers += [("anchors", "Anchors", "anchor", "triangle")] if anchors else []
     num_left_out = len(scene.points_m) - (points["num"] if points else 0)
-    stride = 1 if content is None or content.ranges is None else range_stride(content.ranges)
+    stride = 1 if content is None or content.ranges is None else every_nth(len(content.ranges.status), MAX_NUM_RANGES)
     note = (
         "Drag to turn, wheel or pinch to zoom, right drag or two fingers to move; click a camera for its photo.",
         f"{count(num_left_out)} points far away or beyond the view's limit are not drawn." if num_left_out else "",
@@ -130,11 +130,6 @@ def view_of(scene: Scene) -> dict[str, Any]:
         "num_photos": len(photos) if scene.paths[-1].has_orientations else 0,
         "note": " ".join(filter(None, note)),
     }
-
-
-def range_stride(ranges: RangesAsUsed) -> int:
-    """Every how many-th range the view shows."""
-    return max(1, -(-len(ranges.status) // MAX_NUM_RANGES))
 
 
 def _path(path: ScenePath) -> dict[str, Any]:
@@ -217,7 +212,7 @@ def _ranges(content: Content, path: Trajectory) -> dict[str, Any] | None:
     ranges = content.ranges
     if ranges is None or len(ranges.status) == 0:
         return None
-    rows = np.arange(0, len(ranges.status), range_stride(ranges))
+    rows = np.arange(0, len(ranges.status), every_nth(len(ranges.status), MAX_NUM_RANGES))
     before, after, has_place = (of_all[rows] for of_all in ranges.places_on(path.image_names))
     weight = np.where(has_place, ranges.weight[rows], 0.0)
     anchor_ids, anchor = np.unique(np.array(ranges.anchor_id, dtype=str), return_inverse=True)
