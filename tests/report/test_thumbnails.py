@@ -6,7 +6,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from rangesfm.report.thumbnails import thumbnails
+from rangesfm.report.scene import thumbnails
 
 
 def test_a_name_from_a_file_fetches_nothing_from_outside_the_folder(tmp_path: Path) -> None:

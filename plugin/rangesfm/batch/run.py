@@ -11,19 +11,10 @@ from typing import Any
 
 from distributed import Client, Future, KilledWorker, wait
 
+from rangesfm.batch import workers
 from rangesfm.batch.course import BatchListener, Course, Status, SurveyRow
 from rangesfm.batch.jobs import BatchOptions, Job, Share, share_this_machine
 from rangesfm.batch.page import render
-from rangesfm.batch.workers import (
-    KilledError,
-    SurveyTask,
-    local_workers,
-    num_at_once,
-    run_on_worker,
-    stop_batch,
-    this_machine,
-    workers_of,
-)
 from rangesfm.ceres.doctor import versions
 from rangesfm.errors import FAILED, Failure
 from rangesfm.files.atomic import sole_writer, write_text
@@ -76,17 +67,17 @@ def run_batch(jobs: Sequence[Job], options: BatchOptions, output_path: Path, lis
 @contextmanager
 def _workers(options: BatchOptions, jobs: Sequence[Job], listener: BatchListener) -> Iterator[tuple[Client, Share]]:
     if options.scheduler is not None:
-        with workers_of(options.scheduler) as client:
-            at_once = num_at_once(client)
+        with workers.workers_of(options.scheduler) as client:
+            at_once = workers.num_at_once(client)
             if not at_once:
                 listener.message(f"{options.scheduler} has no workers yet: the surveys wait for some")
             yield client, Share(options.num_threads, options.memory_limit_bytes, at_once)
         return
     num_surveys = sum(job.survey is not None for job in jobs)
-    num_workers, share, note = share_this_machine(options, num_surveys, *this_machine())
+    num_workers, share, note = share_this_machine(options, num_surveys, *workers.this_machine())
     if note is not None:
         listener.message(note)
-    with local_workers(num_workers) as client:
+    with workers.local_workers(num_workers) as client:
         yield client, share
 
 
@@ -101,7 +92,7 @@ class _Crew:
         self._share = share
         self._batch = f"rangesfm-batch-{uuid.uuid4().hex}"
         self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._task_of: dict[Future, SurveyTask] = {}
+        self._task_of: dict[Future, workers.SurveyTask] = {}
 
     def run(self, jobs: Sequence[Job], restart: bool) -> None:
         """Until all surveys are over."""
@@ -110,7 +101,7 @@ class _Crew:
             self._client.subscribe_topic(self._batch, self._inbox.put)
             for index, job in enumerate(jobs):
                 if job.survey is not None:
-                    self._submit(SurveyTask(self._batch, index, job.survey, self._share, restart))
+                    self._submit(workers.SurveyTask(self._batch, index, job.survey, self._share, restart))
             while not self._course.is_over:
                 self._look()
         except BaseException:
@@ -121,9 +112,9 @@ class _Crew:
             self._listener.show(self._course)
             raise
 
-    def _submit(self, task: SurveyTask) -> None:
+    def _submit(self, task: workers.SurveyTask) -> None:
         key = f"{self._batch}-{len(self._task_of)}"
-        future = self._client.submit(run_on_worker, task, key=key, pure=False, retries=_NUM_RETRIES)
+        future = self._client.submit(workers.run_on_worker, task, key=key, pure=False, retries=_NUM_RETRIES)
         self._task_of[future] = task
         future.add_done_callback(self._inbox.put)
 
@@ -157,7 +148,7 @@ class _Crew:
         """Have the workers interrupt what they are at, and wait for it; then nothing is half-written."""
         futures = list(self._task_of)
         try:
-            self._client.run(stop_batch, self._batch, on_error="ignore")
+            self._client.run(workers.stop_batch, self._batch, on_error="ignore")
             with self._client.as_current():
                 wait(futures, timeout=_MAX_STOP_S)
             self._client.cancel(futures)
@@ -186,6 +177,6 @@ def _ending(future: Future) -> Any:
         return future.result(timeout=_MAX_STOP_S)
     if isinstance(error, KilledWorker):
         return Failure("the worker that had it was lost, and so were those that tried it again", FAILED)
-    if isinstance(error, KilledError):
+    if isinstance(error, workers.KilledError):
         return Failure(f"{error}; so it was each time it was tried", FAILED)
     return Failure(" ".join(f"its worker failed: {type(error).__name__}: {error}".split()), FAILED)

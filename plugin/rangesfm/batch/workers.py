@@ -130,9 +130,6 @@ class SurveyTask:
 
     Attributes:
         batch: the batch's own name, under which the worker tells how far it is.
-        index: of the survey in the batch.
-        share: what it may use.
-        restart: do anew what earlier runs have done.
     """
 
     batch: str

@@ -35,7 +35,6 @@ class NamedModel:
     """One of the models.
 
     Attributes:
-        name: as the user gave it.
         path: the keyframes in the model's own world.
         model: None where only positions are known.
         result: the result folder it comes from; None where it does not.
@@ -54,8 +53,6 @@ class ModelRow:
     """One model against the first.
 
     Attributes:
-        name: of the model.
-        num_photos: in it.
         base_from_model: the similarity that carries it onto the first; None with fewer than three common photos.
         common_names: the photos in both, in the first's order.
         moved, moved_aligned: (n,) distance of each of these cameras from where the first has it, as it is and after
@@ -87,8 +84,6 @@ class TapedRow:
     """One taped distance.
 
     Attributes:
-        ends: between what.
-        measured_m: by tape.
         lengths: in each model, in its own unit; None where there is only a path.
         lengths_m: the same, with the scale that carries the model onto the placed path; None without ranges.
     """

@@ -73,7 +73,7 @@ def _write_vertices(
 
 @dataclass(frozen=True)
 class _Header:
-    """What a PLY file says of itself, with end_header; the encoding is a key of _ORDERS, columns are of the vertices."""
+    """What a PLY file says of itself, with end_header; the encoding is a key of _ORDERS, columns those of vertices."""
 
     lines: list[str]
     num_bytes: int

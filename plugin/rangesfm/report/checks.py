@@ -16,13 +16,10 @@ class Check:
     """One traffic light.
 
     Attributes:
-        name: what is checked.
         meaning: one sentence on why it matters.
         value: None where the run did not measure it.
-        unit: of the value and the limits.
         green_limit, amber_limit: green up to the first, amber up to the second, red beyond
             (from the first upwards, where larger is better).
-        decimals: of the printed numbers.
         larger_is_better: the limits are lower ones.
         key: of the value in ``result.json``.
         no_matter: why any value is as good here, so that the light is green; None: it matters.

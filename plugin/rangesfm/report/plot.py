@@ -167,7 +167,6 @@ class View:
     """A look at the world along one of its axes.
 
     Attributes:
-        name: "Plan" or "Elevation".
         axes: the horizontal and the vertical one on the page.
         sign: of the vertical one there.
     """

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
+import io
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from PIL import Image, ImageOps
 
 from rangesfm.arrays import Array
+from rangesfm.files.atomic import stays_inside
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.report.content import Content
 from rangesfm.report.plot import every_nth
 from rangesfm.report.text import count
-from rangesfm.report.thumbnails import thumbnails
 from rangesfm.result.entries import AnchorEntry
 from rangesfm.result.metric_result import USED
 
@@ -25,6 +28,10 @@ MAX_NUM_RANGES = 20_000
 NUM_STEPS = 65535
 """Positions of points are whole steps of the largest side of their box."""
 
+MAX_NUM_THUMBNAILS, MAX_THUMBNAIL_BYTES = 160, 600_000
+"""The latter of all of them, as they stand in the page."""
+
+_WIDTHS_PX, _QUALITY = (256, 208, 160, 128), 60
 _FAR_QUANTILE = 0.005
 _SEEN_QUANTILE = 0.05
 _FRUSTUM_SHAPE = (0.6, 0.4)
@@ -38,9 +45,8 @@ class ScenePath:
     """One path of cameras.
 
     Attributes:
-        id: of its layer.
-        name: as the reader sees it.
-        color: name of a colour of the page's style.
+        id, name: of its layer, and as the reader sees it.
+        color: of the page's style.
         trajectory: in the scene's frame, metres.
         has_orientations: whether frusta can be drawn.
     """
@@ -262,3 +268,40 @@ def pack(values: npt.ArrayLike, kind: str) -> dict[str, str]:
     """
     array = np.ascontiguousarray(values, dtype=np.dtype(kind).newbyteorder("<"))
     return {"type": kind, "data": base64.b64encode(array.tobytes()).decode("ascii")}
+
+
+def thumbnails(folder: Path | None, image_names: Sequence[str]) -> dict[str, str]:
+    """JPEGs as data URIs by photo, evenly over the path; photos that cannot be read are left out.
+
+    So are those that a name from a file would fetch from outside the folder: the page is handed on.
+
+    All are made as wide as fits into MAX_THUMBNAIL_BYTES; if even the smallest do not fit, there are fewer.
+    """
+    image_names = [name for name in image_names if stays_inside(name)]
+    if folder is None or not folder.is_dir() or not image_names:
+        return {}
+    chosen = np.unique(np.linspace(0, len(image_names) - 1, MAX_NUM_THUMBNAILS).round().astype(int))
+    photos = {image_names[i]: _small_copy(folder / image_names[i]) for i in chosen}
+    made: dict[str, str] = {}
+    for width in _WIDTHS_PX:
+        made = {name: _data_uri(photo, width) for name, photo in photos.items() if photo is not None}
+        if sum(map(len, made.values())) <= MAX_THUMBNAIL_BYTES:
+            return made
+    num_bytes = np.cumsum([len(uri) for uri in made.values()])
+    return {name: uri for (name, uri), up_to_it in zip(made.items(), num_bytes) if up_to_it <= MAX_THUMBNAIL_BYTES}
+
+
+def _small_copy(path: Path) -> Image.Image | None:
+    width = _WIDTHS_PX[0]
+    try:
+        with Image.open(path) as photo:
+            photo.draft("RGB", (2 * width, 2 * width))  # a JPEG is decoded no larger than needed
+            return ImageOps.contain(photo.convert("RGB"), (width, width))
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return None
+
+
+def _data_uri(photo: Image.Image, width: int) -> str:
+    file = io.BytesIO()
+    ImageOps.contain(photo, (width, width)).save(file, "JPEG", quality=_QUALITY, optimize=True)
+    return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode("ascii")
