@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from tests.cli.screen import Clock
 from tests.result_document import result_document
 
 from rangesfm.batch.course import Course, Status, SurveyRow, exit_status_of, figures_of, format_rows
@@ -10,14 +11,6 @@ from rangesfm.batch.jobs import Job
 from rangesfm.errors import Failure
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import Survey
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.now_s = 100.0
-
-    def __call__(self) -> float:
-        return self.now_s
 
 
 @pytest.fixture

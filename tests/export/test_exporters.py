@@ -11,6 +11,7 @@ import pycolmap
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from tests.export.models import centers_of, synthesized
 from tests.result_document import anchor_entry, result_document
 
 from rangesfm.errors import InputError
@@ -29,10 +30,7 @@ ANCHORS = {"A1": np.array([1.0, 2.0, 3.0]), "Tür 2": FAR_AWAY}
 @pytest.fixture
 def model() -> pycolmap.Reconstruction:
     """A model far from its origin, as in a national grid."""
-    pycolmap.set_random_seed(1)
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 7, 80
-    reconstruction = pycolmap.synthesize_dataset(options)
+    reconstruction = synthesized(7, 80, seed=1)
     reconstruction.transform(pycolmap.Sim3d(3.0, pycolmap.Rotation3d(), FAR_AWAY))
     for index, point in enumerate(reconstruction.points3D.values()):
         point.color = np.array([index, 255 - index, 7], dtype=np.uint8)
@@ -43,10 +41,6 @@ def times_of(model: pycolmap.Reconstruction) -> dict[str, float]:
     """A second apart, later names earlier."""
     names = sorted((image.name for image in model.images.values()), reverse=True)
     return {name: 1.7e9 + i for i, name in enumerate(names)}
-
-
-def centers_of(model: pycolmap.Reconstruction) -> dict[str, Array]:
-    return {image.name: image.projection_center() for image in model.images.values()}
 
 
 def read_ply(path: Path) -> npt.NDArray[np.void]:
