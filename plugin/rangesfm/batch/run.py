@@ -9,7 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from dask.system import CPU_COUNT
 from distributed import Client, Future, KilledWorker, wait
+from distributed.system import MEMORY_LIMIT
 
 from rangesfm.batch import workers
 from rangesfm.batch.course import BatchListener, Course, Status, SurveyRow
@@ -74,7 +76,7 @@ def _workers(options: BatchOptions, jobs: Sequence[Job], listener: BatchListener
             yield client, Share(options.num_threads, options.memory_limit_bytes, at_once)
         return
     num_surveys = sum(job.survey is not None for job in jobs)
-    num_workers, share, note = share_this_machine(options, num_surveys, *workers.this_machine())
+    num_workers, share, note = share_this_machine(options, num_surveys, CPU_COUNT, MEMORY_LIMIT)
     if note is not None:
         listener.message(note)
     with workers.local_workers(num_workers) as client:

@@ -41,11 +41,6 @@ _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
 _stopped: set[str] = set()
 
 
-def this_machine() -> tuple[int, int]:
-    """Its cores and the bytes of its memory, as far as this process may use them."""
-    return CPU_COUNT, MEMORY_LIMIT
-
-
 @contextmanager
 def local_workers(num: int) -> Iterator[Client]:
     """Processes of this machine, each for one survey at a time, which only this machine can speak to."""

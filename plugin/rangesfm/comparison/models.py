@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array
 from rangesfm.colmap.model_files import read_model
 from rangesfm.comparison.ranges import ModelRanges, ranges_of_result
-from rangesfm.comparison.with_reference import MIN_NUM_ALIGNED, text_or_dash
+from rangesfm.comparison.with_reference import MIN_NUM_ALIGNED, known_keyframes, text_or_dash
 from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
@@ -179,16 +179,15 @@ def _read_model(path: Path) -> NamedModel:
 
 def _read_positions(path: Path, base: Trajectory) -> NamedModel:
     reference = read_reference(path)
-    positions, rotations = reference.positions_at(base)
-    known = np.flatnonzero(np.isfinite(positions).all(axis=1))
+    known, positions, rotations = known_keyframes(base, reference)
     if len(known) == 0:
         raise InputError(reference.why_nothing_is_known("keyframes", base.image_names, base.timestamps_s), path)
     trajectory = Trajectory(
         frame_ids=base.frame_ids[known],
         image_names=tuple(base.image_names[i] for i in known),
         timestamps_s=None if base.timestamps_s is None else base.timestamps_s[known],
-        centers=positions[known],
-        world_from_cam=np.tile(np.eye(3), (len(known), 1, 1)) if rotations is None else rotations[known],
+        centers=positions,
+        world_from_cam=np.tile(np.eye(3), (len(known), 1, 1)) if rotations is None else rotations,
     )
     return NamedModel(str(path), trajectory, None, None, has_orientations=rotations is not None)
 

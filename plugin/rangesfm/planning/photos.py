@@ -82,12 +82,12 @@ class PlannedPhotos(Options):
         """What they say of a path."""
         return vision_information(self.observations(path), Poses(path.world_from_cam, path.centers))
 
-    def observations(self, path: Trajectory, seed: int = 0) -> Observations:
+    def observations(self, path: Trajectory) -> Observations:
         """Of points that fill each photo of a path, evenly over it and over the logarithm of depth.
 
         They are so few that each stands for several, and exact.
         """
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(0)
         num = min(self.num_points, max(_NUM_COMPUTED // len(path), _LEAST_COMPUTED))
         wanted = np.full(len(path), num)
         points: list[Array] = []
