@@ -55,7 +55,7 @@ def test_time_left_is_that_of_those_that_are_done(course: Course, clock: Clock) 
 def test_whatever_is_not_over_when_it_is_interrupted_says_so(course: Course) -> None:
     course.tell(0, {"began_on": "here"})
     course.done(1, {}, "")
-    course.interrupted()
+    course.end_all(Status.INTERRUPTED, "interrupted")
     assert course.is_over
     assert [row.status.value for row in course.rows] == ["interrupted", "done", "interrupted", "interrupted"]
 

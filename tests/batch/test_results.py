@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rangesfm.batch.course import Course
+from rangesfm.batch.course import Course, Status
 from rangesfm.batch.jobs import Job
 from rangesfm.batch.run import write_results
 from rangesfm.errors import Failure
@@ -80,6 +80,6 @@ def test_the_page_escapes_names_and_links_to_reports_that_are_there(course: Cour
 def test_the_page_loads_itself_anew_until_the_batch_is_over(course: Course, tmp_path: Path) -> None:
     write_results(course, tmp_path)
     assert Page((tmp_path / "batch.html").read_text()).has_refresh
-    course.interrupted()
+    course.end_all(Status.INTERRUPTED, "interrupted")
     write_results(course, tmp_path)
     assert not Page((tmp_path / "batch.html").read_text()).has_refresh

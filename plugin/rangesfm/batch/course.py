@@ -98,13 +98,13 @@ def format_rows(rows: Sequence[SurveyRow]) -> str:
     """The rows as aligned plain text, and below them why surveys are not done."""
     header = ("survey", "result", "scale", "photos", "ranges used", "range RMS m", "RMSE m", "seconds")
     table = align_rows([header, *map(_texts, rows)])
-    reasons = [_why(row) for row in rows if row.status is not Status.DONE]
+    # Errors about the file itself name it already.
+    reasons = [
+        row.reason if row.reason.startswith(f"{row.survey}:") else f"{row.survey}: {row.reason}"
+        for row in rows
+        if row.status is not Status.DONE
+    ]
     return "\n".join([table, *([""] if reasons else []), *reasons])
-
-
-def _why(row: SurveyRow) -> str:
-    """Errors about the file itself name it already."""
-    return row.reason if row.reason.startswith(f"{row.survey}:") else f"{row.survey}: {row.reason}"
 
 
 def _texts(row: SurveyRow) -> tuple[str, ...]:
@@ -216,15 +216,8 @@ class Course:
         """One line why, and the exit status that ``rangesfm run`` has then."""
         self._end(index, Status.FAILED, reason, exit_status)
 
-    def interrupted(self) -> None:
-        """Whatever is not over will not be."""
-        self._end_others(Status.INTERRUPTED, "interrupted", None)
-
-    def all_failed(self, reason: str) -> None:
-        """Whatever is not over has failed."""
-        self._end_others(Status.FAILED, reason, FAILED)
-
-    def _end_others(self, status: Status, reason: str, exit_status: int | None) -> None:
+    def end_all(self, status: Status, reason: str, exit_status: int | None = None) -> None:
+        """Whatever is not over ends so."""
         for index, row in enumerate(self.rows):
             if not row.status.is_final:
                 self._end(index, status, reason, exit_status)

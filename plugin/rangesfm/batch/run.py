@@ -109,7 +109,7 @@ class _Crew:
         except BaseException:
             self._listener.message("stopping the workers")
             self._stop()
-            self._course.interrupted()
+            self._course.end_all(Status.INTERRUPTED, "interrupted")
             write_results(self._course, self._output_path)
             self._listener.show(self._course)
             raise
@@ -124,7 +124,7 @@ class _Crew:
         """Take in what has come, or wait a moment for it, and pass it on."""
         items = _all_of(self._inbox)
         if self._client.status != "running":
-            self._course.all_failed("the connection to the scheduler was lost")
+            self._course.end_all(Status.FAILED, "the connection to the scheduler was lost", FAILED)
             return
         if items:
             self._course.num_at_once = max(1, sum(self._client.nthreads().values()))

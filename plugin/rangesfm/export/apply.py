@@ -66,17 +66,13 @@ Transform = Callable[[Path, Similarity, Path], Path]
 
 def _transformer_of(path: Path) -> Transform:
     if path.is_dir():
-        return _transform_model
+        return lambda path, similarity, target: write_model(rescale(read_model(path), similarity), target)
     if not path.is_file():
         raise InputError("there is no such file", path)
     known: dict[str, Transform] = {".ply": transform_ply, ".obj": _transform_obj, ".json": _transform_json}
     if path.suffix.lower() not in known:
         raise InputError(f"cannot be carried over, expected {', '.join(known)} or the folder of a COLMAP model", path)
     return known[path.suffix.lower()]
-
-
-def _transform_model(path: Path, metric_from_sfm: Similarity, target: Path) -> Path:
-    return write_model(rescale(read_model(path), metric_from_sfm), target)
 
 
 def _transform_obj(path: Path, metric_from_sfm: Similarity, target: Path) -> Path:

@@ -61,7 +61,8 @@ class DetectableMistake:
     @classmethod
     def of(cls, test: MistakeTest) -> DetectableMistake:
         sizes = (test.smallest_detectable, test.effect_on_scale, test.effect_on_place_m)
-        return cls(test.name, test.subject, test.unit, *map(_limited, sizes))
+        limited = (None if size is None or size > OPEN else size for size in sizes)
+        return cls(test.name, test.subject, test.unit, *limited)
 
 
 @dataclass(frozen=True)
@@ -225,10 +226,6 @@ def _advised(plan: SurveyPlan) -> Iterator[str]:
         if best:
             yield f"what would gain most for {what}:"
         yield from (f"  {number}. {words}" for number, words in enumerate(best[:_MAX_NUM_SHOWN], 1))
-
-
-def _limited(value: float | None) -> float | None:
-    return None if value is None or value > OPEN else value
 
 
 def _rough(stddev: float, unit: str = "m") -> str:

@@ -264,7 +264,9 @@ def figure_spec(figure: Figure) -> Spec:
 
     def sheet(panel: Panel) -> Spec:
         panel = replace(panel, size=(min(panel.size[0], MAX_WIDTH_PX), panel.size[1]))
-        return panel_spec(panel, lambda i: {"values": _rows(panel.series[i])}) | {"title": panel.title}
+        points = [points_of(one).tolist() for one in panel.series]
+        rows = [[{"x": x, "y": y if math.isfinite(y) else None} for x, y in of_one] for of_one in points]
+        return panel_spec(panel, lambda i: {"values": rows[i]}) | {"title": panel.title}
 
     panels = [sheet(panel) for panel in figure.panels]
     if len(figure.entries) > 1:
@@ -279,10 +281,6 @@ def light_colors() -> dict[str, str]:
     """The page's colours by name, of its light theme."""
     light, _ = re.findall(r":root \{(.*?)\}", (ASSETS / "page.css").read_text(encoding="utf-8"), flags=re.DOTALL)
     return dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", light))
-
-
-def _rows(series: Series) -> list[dict[str, float | None]]:
-    return [{"x": x, "y": y if math.isfinite(y) else None} for x, y in points_of(series).tolist()]
 
 
 def _legend(entries: list[LegendEntry]) -> Spec:

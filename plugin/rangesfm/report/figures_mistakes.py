@@ -31,7 +31,7 @@ def mistakes(content: Content) -> Figure | None:
         "For each mistake how far the ranges speak for it, and where chance ends",
         "test value over its threshold (roots)",
         shown,
-        [_evidence(test) for test in shown],
+        [math.sqrt(max(test.statistic, 0.0) / test.threshold) if test.threshold > 0 else 0.0 for test in shown],
         [_size(test) for test in shown],
         _MOST_EVIDENCE,
         line=("beyond chance", 1.0),
@@ -91,10 +91,6 @@ def _kind(test: MistakeEntry) -> str:
     if test.rejected:
         return found
     return unfound if test.smallest_detectable is not None else never
-
-
-def _evidence(test: MistakeEntry) -> float:
-    return math.sqrt(max(test.statistic, 0.0) / test.threshold) if test.threshold > 0 else 0.0
 
 
 def _effect_percent(test: MistakeEntry) -> float:

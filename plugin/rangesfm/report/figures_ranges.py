@@ -156,10 +156,11 @@ def plot_ranges(log: RangeLog) -> Figure:
     """Every range of a log, one colour an anchor; over their number where the log has photos for times."""
     times = log.timestamp_s
     x = np.arange(len(log)) if times is None else times - times.min()
-    series = [
-        Series(anchor_id, _color(i, len(log.anchor_ids)), np.column_stack([x, log.range_m])[log.anchor_index == i])
-        for i, anchor_id in enumerate(log.anchor_ids)
-    ]
+    series = []
+    for i, anchor_id in enumerate(log.anchor_ids):
+        hue = colorsys.hsv_to_rgb(i / len(log.anchor_ids), 0.8, 0.75)
+        color = "#" + "".join(f"{round(255 * part):02x}" for part in hue)
+        series.append(Series(anchor_id, color, np.column_stack([x, log.range_m])[log.anchor_index == i]))
     label = "range" if times is None else f"s since {times.min():.3f}"
     y_range = (0.0, 1.05 * float(log.range_m.max()))
     return figure_of("ranges", "", "Ranges over time", (label, "m"), series, y_range=y_range, size=_SIZE_ALONE)
@@ -188,9 +189,3 @@ def plot_error_curve(calibration: Calibration) -> Figure:
         y_range=(float(curve.error_m.min()) - shown, float(curve.error_m.max()) + shown),
         size=_SIZE_ALONE,
     )
-
-
-def _color(index: int, num: int) -> str:
-    """Evenly over the circle of hues."""
-    red, green, blue = (round(255 * part) for part in colorsys.hsv_to_rgb(index / num, 0.8, 0.75))
-    return f"#{red:02x}{green:02x}{blue:02x}"
