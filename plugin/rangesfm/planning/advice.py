@@ -154,11 +154,14 @@ def _calibrated(planned: PlannedSurvey) -> PlannedSurvey:
 
 
 def _with_wider_anchors(planned: PlannedSurvey) -> PlannedSurvey:
-    """From the middle of the path, at the same heights."""
-    middle = planned.trajectory.centers.mean(axis=0)
-    out = [middle + (at - middle) * [_WIDER, _WIDER, 1.0] for at in planned.anchors_m]
-    moved = [replace(anchor, position_m=at) for anchor, at in zip(planned.anchors, out, strict=True)]
-    return replace(planned, anchors=tuple(moved))
+    moved = zip(planned.anchors, _farther_out(planned.trajectory, planned.anchors_m), strict=True)
+    return replace(planned, anchors=tuple(replace(anchor, position_m=at) for anchor, at in moved))
+
+
+def _farther_out(path: Trajectory, places_m: Array) -> Array:
+    """(n, 3) from the middle of the path, at the same heights."""
+    middle = path.centers.mean(axis=0)
+    return np.asarray(middle + (places_m - middle) * [_WIDER, _WIDER, 1.0])
 
 
 def _raised(planned: PlannedSurvey) -> Iterator[_Change]:
@@ -227,6 +230,5 @@ def _wider(path: Trajectory) -> Trajectory:
     """About its middle, at the same speed; photos as far apart in time as they were."""
     times = path.timestamps_s
     assert times is not None
-    middle = path.centers.mean(axis=0)
-    centers = middle + (path.centers - middle) * [_WIDER, _WIDER, 1.0]
-    return replace(path, centers=centers, timestamps_s=times[0] + _WIDER * (times - times[0]))
+    out = _farther_out(path, path.centers)
+    return replace(path, centers=out, timestamps_s=times[0] + _WIDER * (times - times[0]))

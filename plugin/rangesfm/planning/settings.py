@@ -204,12 +204,15 @@ def _planned(
     return planned
 
 
-def _path(path: PlannedPathOptions) -> Trajectory:
-    names = ("waypoints", "loop_inside_m", "file", "model")
-    given = [name for name in names if getattr(path, name) is not None]
+def _require_one(options: Options, *names: str) -> None:
+    given = [name for name in names if getattr(options, name) not in (None, {})]
     if len(given) != 1:
-        found = " and ".join(given) or "none"
-        raise OptionError(f"[path] has {found} of waypoints, loop_inside_m, file and model, expected one", "path")
+        found, known = " and ".join(given) or "none", f"{', '.join(names[:-1])} and {names[-1]}"
+        raise OptionError(f"[{options.table}] has {found} of {known}, expected one", options.table)
+
+
+def _path(path: PlannedPathOptions) -> Trajectory:
+    _require_one(path, "waypoints", "loop_inside_m", "file", "model")
     if path.file is not None:
         return path_from_file(path.file, path.photo_rate_hz)
     if path.model is not None:
@@ -228,10 +231,7 @@ def _allowed(options: PlannedAnchorOptions) -> Array | None:
 
 
 def _anchors(options: PlannedAnchorOptions, allowed_m: Array | None) -> tuple[Anchor, ...]:
-    given = [name for name in ("path", "places", "num_to_place") if getattr(options, name)]
-    if len(given) != 1:
-        found = " and ".join(given) or "none"
-        raise OptionError(f"[anchors] has {found} of path, places and num_to_place, expected one", "anchors")
+    _require_one(options, "path", "places", "num_to_place")
     if options.num_to_place is not None:
         num_allowed = 0 if allowed_m is None else len(allowed_m)
         if allowed_m is None or num_allowed < options.num_to_place:

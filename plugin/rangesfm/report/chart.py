@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import json
 import math
 import re
@@ -18,8 +16,8 @@ from PIL import Image
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import make_output_folder, new_file
-from rangesfm.report.plot import Figure, LegendEntry, Mark, Panel, Pixels, Range, Series
-from rangesfm.report.scene import pack
+from rangesfm.report.plot import Figure, LegendEntry, Mark, Panel, Range, Series
+from rangesfm.report.scene import data_uri, pack
 
 ASSETS = Path(__file__).with_name("assets")
 Spec: TypeAlias = dict[str, Any]
@@ -144,7 +142,8 @@ def _background(panel: Panel, x_range: Range, y_range: Range) -> list[Spec]:
     if panel.picture is not None:
         corners = dict(zip(("x", "x2", "y", "y2"), (*x_range, *y_range)))
         encoding = to_x2 | {"y2": {"field": "y2"}}
-        layers.append(_layer("image", [corners], encoding, url=_png(panel.picture), aspect=False))
+        colors = Image.fromarray(panel.picture).quantize(_NUM_PICTURE_COLORS, method=Image.Quantize.FASTOCTREE)
+        layers.append(_layer("image", [corners], encoding, url=data_uri(colors, "PNG"), aspect=False))
     if panel.band is not None:
         _, low, high = panel.band
         layers.append(_layer("rect", [{"x": low, "x2": high}], to_x2 | {"y": None}, color=css("interval")))
@@ -153,13 +152,6 @@ def _background(panel: Panel, x_range: Range, y_range: Range) -> list[Spec]:
     if panel.line is not None:
         layers.append(_layer("rule", [{"x": panel.line[1]}], {"y": None}, color=css("ink"), size=1.5))
     return layers
-
-
-def _png(picture: Pixels) -> str:
-    file = io.BytesIO()
-    colors = Image.fromarray(picture).quantize(_NUM_PICTURE_COLORS, method=Image.Quantize.FASTOCTREE)
-    colors.save(file, "PNG", optimize=True)
-    return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode("ascii")
 
 
 def _series(series: Series, data: Spec, y_range: Range) -> Spec:

@@ -284,7 +284,8 @@ def thumbnails(folder: Path | None, image_names: Sequence[str]) -> dict[str, str
     photos = {image_names[i]: _small_copy(folder / image_names[i]) for i in chosen}
     made: dict[str, str] = {}
     for width in _WIDTHS_PX:
-        made = {name: _data_uri(photo, width) for name, photo in photos.items() if photo is not None}
+        small = {name: ImageOps.contain(photo, (width, width)) for name, photo in photos.items() if photo is not None}
+        made = {name: data_uri(photo, "JPEG", quality=_QUALITY) for name, photo in small.items()}
         if sum(map(len, made.values())) <= MAX_THUMBNAIL_BYTES:
             return made
     num_bytes = np.cumsum([len(uri) for uri in made.values()])
@@ -301,7 +302,8 @@ def _small_copy(path: Path) -> Image.Image | None:
         return None
 
 
-def _data_uri(photo: Image.Image, width: int) -> str:
+def data_uri(picture: Image.Image, kind: str, **options: Any) -> str:
+    """A picture that stands in the page itself; kind: "PNG" or "JPEG"."""
     file = io.BytesIO()
-    ImageOps.contain(photo, (width, width)).save(file, "JPEG", quality=_QUALITY, optimize=True)
-    return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode("ascii")
+    picture.save(file, kind, optimize=True, **options)
+    return f"data:image/{kind.lower()};base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
