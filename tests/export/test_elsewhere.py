@@ -18,7 +18,7 @@ from PIL import Image
 from pyopf.io import load as load_opf
 from pyopf.resolve import resolve
 from scipy.spatial.transform import Rotation
-from tests.export.models import centers_of, synthesized
+from tests.export.models import centers_of, read_ply, synthesized, xyz
 
 from rangesfm.errors import InputError
 from rangesfm.export import COVARIANCE_FORMATS, EXPORTERS, MetricMap, export_map
@@ -78,14 +78,17 @@ def positions_centers(path: Path) -> Centers:
     return {name: np.array(numbers, dtype=np.float64) for name, *numbers in rows}
 
 
-def test_distances_between_cameras_agree_between_all_formats(tmp_path: Path) -> None:
+@pytest.mark.parametrize("shift", [np.zeros(3), np.array([2_600_000.0, 1_200_000.0, 400.0])], ids=["near", "far away"])
+def test_distances_between_cameras_agree_between_all_formats(shift: Array, tmp_path: Path) -> None:
     model = made()
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), shift))
     names = sorted(image.name for image in model.images.values())
     paths = {name: export(model, name, tmp_path) for name in EXPORTERS if name not in NEED_MORE}
     read: dict[str, Centers] = {
         "colmap": centers_of(pycolmap.Reconstruction(paths["colmap"])),
         "colmap_text": centers_of(pycolmap.Reconstruction(paths["colmap_text"])),
         "tum": tum_centers(paths["tum"], names),
+        "ply_cameras": dict(zip(names, xyz(read_ply(paths["ply_cameras"])), strict=True)),
         "kitti": kitti_centers(paths["kitti"], names),
         "model_aligner": positions_centers(paths["model_aligner"]),
         "nerfstudio": nerfstudio_centers(paths["nerfstudio"]),
@@ -103,7 +106,6 @@ NEED_MORE = {
     *COVARIANCE_FORMATS,
     "undistorted",
     "ply",
-    "ply_cameras",
     "ply_anchors",
     "laz",
     "gpkg",
