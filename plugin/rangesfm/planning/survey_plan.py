@@ -21,6 +21,8 @@ from rangesfm.trust.testing import Factorization
 from rangesfm.trust.verdict import row_of
 
 _MAX_NUM_SHOWN = 5
+# Of a mistake; what the ranges say of it is not known before they are measured.
+_SIZES = ("smallest_detectable", "effect_on_scale", "effect_on_place_m")
 
 
 @dataclass(frozen=True)
@@ -41,31 +43,6 @@ class PlannedPlace:
 
 
 @dataclass(frozen=True)
-class DetectableMistake:
-    """A mistake that may be made, as of a MistakeTest: None where there is no limit.
-
-    Attributes:
-        name, subject: of which kind, and of what.
-        unit: of ``smallest_detectable``; "1": a share.
-        smallest_detectable: that will be found, in four cases of five.
-        effect_on_scale, effect_on_place_m: the most that one of that size does.
-    """
-
-    name: str
-    subject: str
-    unit: str
-    smallest_detectable: float | None
-    effect_on_scale: float | None
-    effect_on_place_m: float | None
-
-    @classmethod
-    def of(cls, test: MistakeTest) -> DetectableMistake:
-        sizes = (test.smallest_detectable, test.effect_on_scale, test.effect_on_place_m)
-        limited = (None if size is None or size > OPEN else size for size in sizes)
-        return cls(test.name, test.subject, test.unit, *limited)
-
-
-@dataclass(frozen=True)
 class SurveyPlan:
     """What a run of the planned survey will state.
 
@@ -79,7 +56,7 @@ class SurveyPlan:
         place: None where the frame is the first camera's.
         keyframe_stddevs_m: (n,) of each keyframe's place in that frame.
         verdict, reasons: on the scale, as the run will judge it; "doubtful" too where it will leave the place open.
-        mistakes: what would be found of each, those that do most first.
+        mistakes: what would be found of each, and do then, those that do most first; None: without limit.
         advice: changes that would gain something.
         expected: the estimate that all this is of.
     """
@@ -96,7 +73,7 @@ class SurveyPlan:
     keyframe_stddevs_m: tuple[float, ...]
     verdict: str
     reasons: tuple[str, ...]
-    mistakes: tuple[DetectableMistake, ...]
+    mistakes: tuple[MistakeTest, ...]
     advice: tuple[Advice, ...]
     expected: Expected = field(repr=False)
 
@@ -119,7 +96,9 @@ class SurveyPlan:
         """What is infinite or not a number is null; advice in both orders."""
         content: dict[str, Any] = _finite(self)
         del content["advice"]
+        names = ("name", "subject", "unit", *_SIZES)
         return content | {
+            "mistakes": [{name: each[name] for name in names} for each in content["mistakes"]],
             "advice_for_scale": _finite(self.advice_for_scale),
             "advice_for_place": _finite(self.advice_for_place),
         }
@@ -169,12 +148,16 @@ def _place(expected: Expected) -> PlannedPlace | None:
     )
 
 
-def _mistakes(expected: Expected) -> tuple[DetectableMistake, ...]:
+def _mistakes(expected: Expected) -> tuple[MistakeTest, ...]:
     """Of every mistake that lasts for the whole survey; that it was made is not tested, as nothing was measured."""
     on_map = ranges_on_map(expected.posed, expected.solution, expected.observations, expected.planned.trajectory)
     problem = replace(linearized(on_map, expected.learned.cells), errors=expected.learned)
     hypotheses = [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
-    found = [DetectableMistake.of(row_of(test)) for test in Factorization(problem).test(hypotheses, seed=0)]
+    found = []
+    for test in Factorization(problem).test(hypotheses, seed=0):
+        row = row_of(test)
+        unlimited: dict[str, Any] = {name: None for name in _SIZES if (getattr(row, name) or 0.0) > OPEN}
+        found.append(replace(row, **unlimited))
     return tuple(sorted(found, key=lambda each: -np.inf if each.effect_on_scale is None else -each.effect_on_scale))
 
 
@@ -203,7 +186,7 @@ def _budget(plan: SurveyPlan) -> Iterator[str]:
 
 def _found(plan: SurveyPlan) -> Iterator[str]:
     yield "mistakes just too small to be found, and the most that they would do:"
-    of_kind: dict[str, DetectableMistake] = {}
+    of_kind: dict[str, MistakeTest] = {}
     for mistake in plan.mistakes:
         of_kind.setdefault(mistake.name, mistake)
     for mistake in list(of_kind.values())[:_MAX_NUM_SHOWN]:

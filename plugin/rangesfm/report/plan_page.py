@@ -13,13 +13,14 @@ import numpy as np
 from rangesfm.arrays import Array, Mask
 from rangesfm.files.atomic import make_output_folder, write_text
 from rangesfm.planning.advice import Advice
-from rangesfm.planning.survey_plan import DetectableMistake, SurveyPlan
+from rangesfm.planning.survey_plan import SurveyPlan
 from rangesfm.ranging.errors.components import component_words
 from rangesfm.report.chart import page_charts
 from rangesfm.report.page import render, write_page
 from rangesfm.report.plot import Figure, Limits, Panel, Pixels, Series, View, equal_view, views_of
 from rangesfm.report.tables import Table
 from rangesfm.report.text import count, duration, fixed, percent, rough
+from rangesfm.trust.table import MistakeTest
 
 # From well known to hardly, each as visible on a light page as on a dark one.
 _COLORS = ("#2f7ebc", "#2a9d8f", "#6f9a2b", "#c98b12", "#d4512b")
@@ -173,7 +174,7 @@ def _anchors(plan: SurveyPlan) -> Table:
     return Table("Anchors", ["anchor", "x m", "y m", "z m"], rows, is_narrow=True)
 
 
-def _mistakes(mistakes: Sequence[DetectableMistake]) -> Table:
+def _mistakes(mistakes: Sequence[MistakeTest]) -> Table:
     rows = [
         [
             f"{each.name} {each.subject}".strip(),
