@@ -16,7 +16,7 @@ from PIL import Image
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import make_output_folder, new_file
-from rangesfm.report.plot import Figure, LegendEntry, Mark, Panel, Range, Series
+from rangesfm.report.plot import Figure, Mark, Panel, Range, Series
 from rangesfm.report.scene import data_uri, pack
 
 ASSETS = Path(__file__).with_name("assets")
@@ -275,13 +275,13 @@ def light_colors() -> dict[str, str]:
     return dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", light))
 
 
-def _legend(entries: list[LegendEntry]) -> Spec:
+def _legend(entries: dict[str, tuple[str, str]]) -> Spec:
     """A layer of which nothing is seen but its legend."""
-    texts = [entry.text for entry in entries]
+    texts = list(entries)
     legend = {"title": None, "orient": "top", "columns": 6, "symbolOpacity": 1}
     ranges = {
-        "color": [css(entry.color) for entry in entries],
-        "shape": [_SYMBOLS.get(entry.shape, "square") for entry in entries],
+        "color": [css(color) for color, _ in entries.values()],
+        "shape": [_SYMBOLS.get(shape, "square") for _, shape in entries.values()],
     }
     encoding: Spec = {
         channel: {"field": "text", "scale": {"domain": texts, "range": values}, "legend": legend}

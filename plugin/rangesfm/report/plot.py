@@ -104,14 +104,6 @@ class Panel:
         return _widened(x_range), _widened(y_range)
 
 
-class LegendEntry(NamedTuple):
-    """Name, colour and shape ("dots", "line", "dashed", "filled", "triangle", "disc", "upright" or "strip")."""
-
-    text: str
-    color: str
-    shape: str
-
-
 @dataclass(frozen=True)
 class Figure:
     """Panels with one caption and one legend.
@@ -136,16 +128,14 @@ class Figure:
         return self.layout != "single" or self.panels[0].size[0] >= WIDE_SIZE[0]
 
     @property
-    def entries(self) -> list[LegendEntry]:
-        """The legend; what goes by one name is in it once."""
-        given: list[LegendEntry] = []
+    def entries(self) -> dict[str, tuple[str, str]]:
+        """The legend: colour and shape (a kind of Series, a shape of Mark, "upright" or "strip") of each text."""
+        given = [(one.name, one.color, one.kind) for panel in self.panels for one in panel.series if len(one.points)]
         for panel in self.panels:
-            given += [LegendEntry(one.name, one.color, one.kind) for one in panel.series if len(one.points)]
-        for panel in self.panels:
-            given += [LegendEntry(mark.name, mark.color, mark.shape) for mark in panel.marks]
-            given += [LegendEntry(panel.line[0], "ink", "upright")] if panel.line else []
-            given += [LegendEntry(panel.band[0], "interval", "strip")] if panel.band else []
-        return list({entry.text: entry for entry in given if entry.text}.values())
+            given += [(mark.name, mark.color, mark.shape) for mark in panel.marks]
+            given += [(panel.line[0], "ink", "upright")] if panel.line else []
+            given += [(panel.band[0], "interval", "strip")] if panel.band else []
+        return {text: (color, shape) for text, color, shape in given if text}
 
 
 def figure_of(
