@@ -36,7 +36,7 @@ sys.exit(main(argv))
 """
 IN_MATCHING = ("rangesfm.vision.matching", "append_log", 0)
 IN_MAPPING = ("rangesfm.vision.snapshots", "_keep", 3)
-AMONG_TABLES = ("rangesfm.result.table_file", "write_table", 2)
+AMONG_TABLES = ("rangesfm.result.tables", "write_table", 2)
 BEFORE_THE_RESULT = ("rangesfm.workflows.results", "input_hashes", 0)
 BEFORE_THE_REPORT = ("rangesfm.workflows.results", "write_report", 0)
 

@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 import pytest
+from tests.cli.screen import Clock
 from tests.result_document import result_document
 
-from rangesfm.batch.course import Course, Figures, Status, SurveyRow, exit_status_of, figures_of, format_rows
+from rangesfm.batch.course import Course, Status, SurveyRow, exit_status_of, figures_of, format_rows
 from rangesfm.batch.jobs import Job
 from rangesfm.errors import Failure
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import Survey
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.now_s = 100.0
-
-    def __call__(self) -> float:
-        return self.now_s
 
 
 @pytest.fixture
@@ -39,7 +32,7 @@ def test_an_attempt_begins_anew_where_a_worker_was_killed(course: Course, clock:
     course.tell(0, {"began_on": "two"})
     assert (course.states[0].stage, course.states[0].num_done) == ("", None)
     clock.now_s += 8
-    course.done(0, Figures(verdict="good"), "")
+    course.done(0, {"verdict": "good"}, "")
     row = course.rows[0]
     assert (row.status, row.num_attempts, row.host, row.seconds) == (Status.DONE, 2, "two", 8)
     course.tell(0, {"began_on": "late"})  # from a worker that was thought lost
@@ -52,7 +45,7 @@ def test_time_left_is_that_of_those_that_are_done(course: Course, clock: Clock) 
         course.tell(index, {"began_on": "here"})
     clock.now_s += 30
     assert course.seconds_left() is None
-    course.done(0, Figures(), "")
+    course.done(0, {}, "")
     course.tell(2, {"began_on": "here"})
     assert course.seconds_left() == pytest.approx((30 + 0 + 30) / 2)  # d waits, b is due, c has begun
     clock.now_s += 20
@@ -61,8 +54,8 @@ def test_time_left_is_that_of_those_that_are_done(course: Course, clock: Clock) 
 
 def test_whatever_is_not_over_when_it_is_interrupted_says_so(course: Course) -> None:
     course.tell(0, {"began_on": "here"})
-    course.done(1, Figures(), "")
-    course.interrupted()
+    course.done(1, {}, "")
+    course.end_all(Status.INTERRUPTED, "interrupted")
     assert course.is_over
     assert [row.status.value for row in course.rows] == ["interrupted", "done", "interrupted", "interrupted"]
 
@@ -81,7 +74,7 @@ def test_the_batch_ends_with_the_largest_of_the_statuses(statuses: tuple[int, ..
 
 
 def test_the_table_of_the_terminal_says_why_below() -> None:
-    done = SurveyRow("a.toml", Status.DONE, "short", 0, figures=Figures(verdict="doubtful", scale=0.5, num_photos=3))
+    done = SurveyRow("a.toml", Status.DONE, "short", 0, verdict="doubtful", scale=0.5, num_photos=3)
     failed = SurveyRow("b.toml", Status.FAILED, "no such file", 2)
     lines = format_rows([done, failed]).split("\n")
     assert lines[1].split() == ["a.toml", "doubtful", "0.5", "3", "-", "-", "-", "-"]
@@ -102,6 +95,6 @@ def test_figures_are_those_of_the_result() -> None:
         comparison=[comparison_row(2.0), comparison_row(0.1)],
         warnings=["one"],
     )
-    assert figures_of(ResultSummary.model_validate(result)) == Figures(
-        "good", 0.7, 0.02, "site", 14, 10, 8, 0.08, None, 0.1, 1
-    )
+    figures = figures_of(ResultSummary.model_validate(result))
+    assert list(figures.values()) == ["good", 0.7, 0.02, "site", 14, 10, 8, 0.08, None, 0.1, 1]
+    assert list(SurveyRow("", **figures).cells())[-11:] == list(figures)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rangesfm.batch.course import Course, Figures
+from rangesfm.batch.course import Course, Status
 from rangesfm.batch.jobs import Job
 from rangesfm.batch.run import write_results
 from rangesfm.errors import Failure
@@ -25,7 +25,8 @@ def course(tmp_path: Path) -> Course:
     course = Course([*jobs, Job(BAD_NAME, None, Failure(f"{BAD_NAME}: no such file", 2))])
     for i, verdict in enumerate(["good", "doubtful"]):
         course.tell(i, {"began_on": "here"})
-        figures = Figures(verdict, 0.5, 0.002, "site", 14, 725, 481, 0.0795, 0.51, 0.0821, 2)
+        found = (verdict, 0.5, 0.002, "site", 14, 725, 481, 0.0795, 0.51, 0.0821, 2)
+        figures = dict(zip(list(course.rows[i].cells())[-len(found) :], found))
         course.done(i, figures, "" if verdict == "good" else "short path")
     (tmp_path / "out #0").mkdir()
     (tmp_path / "out #0" / "report.html").touch()
@@ -79,6 +80,6 @@ def test_the_page_escapes_names_and_links_to_reports_that_are_there(course: Cour
 def test_the_page_loads_itself_anew_until_the_batch_is_over(course: Course, tmp_path: Path) -> None:
     write_results(course, tmp_path)
     assert Page((tmp_path / "batch.html").read_text()).has_refresh
-    course.interrupted()
+    course.end_all(Status.INTERRUPTED, "interrupted")
     write_results(course, tmp_path)
     assert not Page((tmp_path / "batch.html").read_text()).has_refresh

@@ -17,17 +17,15 @@ from rangesfm.errors import GeometryError, SolverError
 LOG = "timestamp_s,anchor_id,range_m\n0,a,1\n0.5,b,0\n1,a,2\n"
 
 
-def rangesfm_command(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+def run(*command: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     package_folder = str(Path(rangesfm.__path__[-1]).parent)
     path = os.pathsep.join([package_folder, os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
-    return subprocess.run(
-        [sys.executable, "-m", "rangesfm", *arguments],
-        capture_output=True,
-        text=True,
-        cwd=cwd,
-        env={**os.environ, "PYTHONPATH": path},
-        check=False,
-    )
+    env = {**os.environ, "PYTHONPATH": path}
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=env, check=False)
+
+
+def rangesfm_command(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return run(sys.executable, "-m", "rangesfm", *arguments, cwd=cwd)
 
 
 @pytest.fixture
@@ -61,23 +59,14 @@ def test_help_of_each_command_shows_an_example(command: str, capsys: pytest.Capt
     assert f"example:\n  rangesfm {command}" in text
 
 
-def test_help_needs_none_of_the_heavy_packages() -> None:
-    code = (
-        "import sys; from rangesfm.cli import main; main(['refine', '--help']); "
-        "sys.exit(bool({'numpy', 'scipy', 'pycolmap'} & set(sys.modules)))"
-    )
-    env = {**os.environ, "PYTHONPATH": str(Path(rangesfm.__path__[-1]).parent)}
-    assert subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, check=False).returncode == 0
-
-
-def test_help_on_all_commands_is_quick() -> None:
+@pytest.mark.parametrize(
+    ("argv", "heavy"),
+    [(["refine", "--help"], ["numpy", "scipy", "pycolmap"]), (["--help"], ["numpy", "pydantic", "pycolmap"])],
+)
+def test_help_is_quick_and_needs_none_of_the_heavy_packages(argv: list[str], heavy: list[str]) -> None:
     """What survey keys are made of is only imported by the command that needs it."""
-    code = (
-        "import sys; from rangesfm.cli import main; main(['--help']); "
-        "sys.exit(bool({'numpy', 'pydantic', 'pycolmap'} & set(sys.modules)))"
-    )
-    env = {**os.environ, "PYTHONPATH": str(Path(rangesfm.__path__[-1]).parent)}
-    assert subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, check=False).returncode == 0
+    code = f"import sys; from rangesfm.cli import main; main({argv}); sys.exit(bool(set({heavy}) & set(sys.modules)))"
+    assert run(sys.executable, "-c", code).returncode == 0
 
 
 def test_module_runs_as_a_command(folder: Path) -> None:
@@ -193,16 +182,13 @@ def test_traceback_is_shown_to_those_who_ask(
 
 
 def test_closed_stderr_is_no_error(folder: Path) -> None:
-    env = {**os.environ, "PYTHONPATH": str(Path(rangesfm.__path__[-1]).parent)}
-    script = f'"{sys.executable}" -m rangesfm ranges uwb.csv 2>&-'
-    done = subprocess.run(["bash", "-c", script], cwd=folder, env=env, capture_output=True, text=True, check=False)
+    done = run("bash", "-c", f'"{sys.executable}" -m rangesfm ranges uwb.csv 2>&-', cwd=folder)
     assert done.returncode == 0
     assert "canonical" in done.stdout
 
 
 def test_reader_that_goes_away_is_no_error(folder: Path) -> None:
     script = f'"{sys.executable}" -m rangesfm ranges uwb.csv | true; echo "${{PIPESTATUS[0]}}"'
-    env = {**os.environ, "PYTHONPATH": str(Path(rangesfm.__path__[-1]).parent)}
-    done = subprocess.run(["bash", "-c", script], cwd=folder, env=env, capture_output=True, text=True, check=False)
+    done = run("bash", "-c", script, cwd=folder)
     assert done.stderr == ""
     assert done.stdout.strip() in ("0", "141")

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.export.models import synthesized
 from tests.result_document import result_document
 
 from rangesfm.comparison.before_after import compare_folder, compare_models
@@ -24,7 +25,7 @@ from rangesfm.comparison.with_reference import (
 from rangesfm.errors import InputError
 from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.result.ranges_as_used import RangesAsUsed
+from rangesfm.result.tables import RangesAsUsed
 
 Array = npt.NDArray[np.float64]
 
@@ -203,10 +204,7 @@ def test_the_printed_table_has_a_dash_for_what_is_not_known() -> None:
 
 @pytest.fixture
 def model() -> pycolmap.Reconstruction:
-    pycolmap.set_random_seed(1)
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 8, 60
-    return pycolmap.synthesize_dataset(options)
+    return synthesized(8, 60, seed=1)
 
 
 def test_a_perfect_model_reprojects_exactly_and_a_moved_observation_shows(model: pycolmap.Reconstruction) -> None:

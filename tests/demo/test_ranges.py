@@ -7,11 +7,19 @@ import pytest
 from tests.simulated.path import loop_path
 from tests.simulated.ranges import simulate_ranges_at
 
-from rangesfm.demo.ranges import Radio, SimulatedRanges, simulate_ranges
+from rangesfm.demo.ranges import CameraPath, Radio, SimulatedRanges, simulate_ranges
 
 PATH = loop_path(100.0, start_s=50.0)
 ANCHORS = {"east": (9.0, 1.0, 0.5), "north": (0.0, 8.0, 2.0), "up": (-3.0, -2.0, 4.0)}
 TAG = (0.02, -0.12, -0.05)
+
+
+def test_path_goes_through_the_given_poses() -> None:
+    whole = loop_path(20.0, seed=4)
+    times = np.linspace(0.0, 20.0, 9)
+    path = CameraPath.through(times, whole.centers(times), whole.world_from_cam(times))
+    np.testing.assert_allclose(path.centers(times), whole.centers(times), atol=1e-12)
+    np.testing.assert_allclose(path.world_from_cam(times), whole.world_from_cam(times), atol=1e-9)
 
 
 def _errors(simulated: SimulatedRanges) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.export.models import synthesized
 
 from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
@@ -109,10 +110,7 @@ def test_an_obj_moves_and_keeps_the_rest(tmp_path: Path) -> None:
 
 @pytest.fixture
 def sfm() -> pycolmap.Reconstruction:
-    pycolmap.set_random_seed(2)
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 6, 40
-    return pycolmap.synthesize_dataset(options)
+    return synthesized(6, 40, seed=2)
 
 
 def nerfstudio_poses(path: Path) -> Array:

@@ -18,6 +18,7 @@ from PIL import Image
 from pyopf.io import load as load_opf
 from pyopf.resolve import resolve
 from scipy.spatial.transform import Rotation
+from tests.export.models import centers_of, read_ply, synthesized, xyz
 
 from rangesfm.errors import InputError
 from rangesfm.export import COVARIANCE_FORMATS, EXPORTERS, MetricMap, export_map
@@ -30,19 +31,15 @@ NEAR = np.array([1000.0, -2000.0, 300.0])
 
 
 def made(camera_model: str = "OPENCV") -> pycolmap.Reconstruction:
-    pycolmap.set_random_seed(3)
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 6, 60
-    options.camera_model_id = pycolmap.CameraModelId.__members__[camera_model]
-    options.camera_params = {
+    params = {
         "PINHOLE": [500.0, 510.0, 310.0, 245.0],
         "SIMPLE_RADIAL": [500.0, 310.0, 245.0, 0.03],
         "OPENCV": [500.0, 510.0, 310.0, 245.0, 0.02, -0.01, 1e-3, -2e-3],
         "OPENCV_FISHEYE": [500.0, 510.0, 310.0, 245.0, 0.02, -0.01, 1e-3, -2e-3],
         "FOV": [500.0, 510.0, 310.0, 245.0, 0.1],
     }[camera_model]
-    options.camera_width, options.camera_height = 640, 480
-    model = pycolmap.synthesize_dataset(options)
+    camera = {"camera_model_id": pycolmap.CameraModelId.__members__[camera_model], "camera_params": params}
+    model = synthesized(6, 60, seed=3, **camera, camera_width=640, camera_height=480)
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), NEAR))
     return model
 
@@ -55,10 +52,6 @@ def export(model: pycolmap.Reconstruction, name: str, folder: Path, images_path:
 
 def load(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
-
-
-def centers_of(model: pycolmap.Reconstruction) -> Centers:
-    return {image.name: image.projection_center() for image in model.images.values()}
 
 
 def opensfm_center(shot: dict[str, Any]) -> Array:
@@ -85,14 +78,17 @@ def positions_centers(path: Path) -> Centers:
     return {name: np.array(numbers, dtype=np.float64) for name, *numbers in rows}
 
 
-def test_distances_between_cameras_agree_between_all_formats(tmp_path: Path) -> None:
+@pytest.mark.parametrize("shift", [np.zeros(3), np.array([2_600_000.0, 1_200_000.0, 400.0])], ids=["near", "far away"])
+def test_distances_between_cameras_agree_between_all_formats(shift: Array, tmp_path: Path) -> None:
     model = made()
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), shift))
     names = sorted(image.name for image in model.images.values())
     paths = {name: export(model, name, tmp_path) for name in EXPORTERS if name not in NEED_MORE}
     read: dict[str, Centers] = {
         "colmap": centers_of(pycolmap.Reconstruction(paths["colmap"])),
         "colmap_text": centers_of(pycolmap.Reconstruction(paths["colmap_text"])),
         "tum": tum_centers(paths["tum"], names),
+        "ply_cameras": dict(zip(names, xyz(read_ply(paths["ply_cameras"])), strict=True)),
         "kitti": kitti_centers(paths["kitti"], names),
         "model_aligner": positions_centers(paths["model_aligner"]),
         "nerfstudio": nerfstudio_centers(paths["nerfstudio"]),
@@ -110,7 +106,6 @@ NEED_MORE = {
     *COVARIANCE_FORMATS,
     "undistorted",
     "ply",
-    "ply_cameras",
     "ply_anchors",
     "laz",
     "gpkg",
@@ -144,10 +139,7 @@ def test_nerfstudio_projects_points_where_colmap_does(camera_model: str, tmp_pat
 
 def of_two_cameras(first: str, second: str) -> pycolmap.Reconstruction:
     """Twelve photos, six of each camera."""
-    pycolmap.set_random_seed(3)
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 2, 6, 60
-    model = pycolmap.synthesize_dataset(options)
+    model = synthesized(6, 60, seed=3, num_rigs=2)
     for camera, name, focal_length in zip(model.cameras.values(), (first, second), (500.0, 700.0)):
         camera.model = pycolmap.CameraModelId.__members__[name]
         camera.params = [focal_length, focal_length, 310.0, 245.0, 0.02, -0.01, 1e-3, -2e-3]

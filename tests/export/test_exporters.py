@@ -11,6 +11,7 @@ import pycolmap
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from tests.export.models import centers_of, read_ply, synthesized, xyz
 from tests.result_document import anchor_entry, result_document
 
 from rangesfm.errors import InputError
@@ -20,7 +21,6 @@ from rangesfm.workflows.export_result import export_result
 
 Array = npt.NDArray[np.float64]
 
-PLY_CODES = {"double": "<f8", "float": "<f4", "uchar": "u1"}
 FAR_AWAY = np.array([2_600_000.0, 1_200_000.0, 400.0])
 METRIC_FROM_SFM = Similarity(0.37, Rotation.from_rotvec([0.1, -0.7, 2.5]).as_matrix(), np.array([1 / 3, -2e5, 1e-7]))
 ANCHORS = {"A1": np.array([1.0, 2.0, 3.0]), "Tür 2": FAR_AWAY}
@@ -29,10 +29,7 @@ ANCHORS = {"A1": np.array([1.0, 2.0, 3.0]), "Tür 2": FAR_AWAY}
 @pytest.fixture
 def model() -> pycolmap.Reconstruction:
     """A model far from its origin, as in a national grid."""
-    pycolmap.set_random_seed(1)
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 7, 80
-    reconstruction = pycolmap.synthesize_dataset(options)
+    reconstruction = synthesized(7, 80, seed=1)
     reconstruction.transform(pycolmap.Sim3d(3.0, pycolmap.Rotation3d(), FAR_AWAY))
     for index, point in enumerate(reconstruction.points3D.values()):
         point.color = np.array([index, 255 - index, 7], dtype=np.uint8)
@@ -43,30 +40,6 @@ def times_of(model: pycolmap.Reconstruction) -> dict[str, float]:
     """A second apart, later names earlier."""
     names = sorted((image.name for image in model.images.values()), reverse=True)
     return {name: 1.7e9 + i for i, name in enumerate(names)}
-
-
-def centers_of(model: pycolmap.Reconstruction) -> dict[str, Array]:
-    return {image.name: image.projection_center() for image in model.images.values()}
-
-
-def read_ply(path: Path) -> npt.NDArray[np.void]:
-    """The vertices of a binary PLY file, by its header alone."""
-    head, _, body = path.read_bytes().partition(b"end_header\n")
-    lines = [line.split() for line in head.decode("ascii").splitlines()]
-    assert lines[:2] == [["ply"], ["format", "binary_little_endian", "1.0"]]
-    columns = [
-        (name, PLY_CODES[code])
-        for keyword, code, name in (line[:3] for line in lines if len(line) == 3)
-        if keyword == "property"
-    ]
-    (num,) = (int(line[2]) for line in lines if line[:2] == ["element", "vertex"])
-    vertices = np.frombuffer(body, dtype=columns)
-    assert len(vertices) == num
-    return vertices
-
-
-def xyz(vertices: npt.NDArray[np.void]) -> Array:
-    return np.column_stack([vertices[axis] for axis in "xyz"])
 
 
 @pytest.mark.parametrize("name", ["colmap", "colmap_text"])
@@ -183,26 +156,6 @@ def test_a_name_that_colmap_would_split_is_refused(tmp_path: Path, model: pycolm
     with pytest.raises(InputError, match=r"'my photo\.jpg'"):
         write_positions(model, tmp_path / "positions.txt")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_distances_between_cameras_agree_between_the_formats(tmp_path: Path, model: pycolmap.Reconstruction) -> None:
-    names = sorted(centers_of(model))
-    tum, ply, binary, text, aligner = export_model(
-        model, ["tum", "ply_cameras", "colmap", "colmap_text", "model_aligner"], tmp_path
-    )
-    aligned = {line.split()[0]: np.array(line.split()[1:], dtype=float) for line in aligner.read_text().splitlines()}
-    found = [
-        np.loadtxt(tum)[:, 1:4],
-        xyz(read_ply(ply)),
-        *([centers_of(pycolmap.Reconstruction(path))[name] for name in names] for path in (binary, text)),
-        [aligned[name] for name in names],
-    ]
-    expected = np.array([centers_of(model)[name] for name in names])
-    for centers in map(np.array, found):
-        for i in range(len(names)):
-            distances = np.linalg.norm(np.delete(centers - centers[i], i, axis=0), axis=1)
-            truth = np.linalg.norm(np.delete(expected - expected[i], i, axis=0), axis=1)
-            np.testing.assert_allclose(distances, truth, rtol=1e-6)
 
 
 def test_an_unknown_format_is_named_with_the_known_ones_before_anything_is_written(

@@ -21,6 +21,7 @@ import trimesh
 from PIL import Image
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
+from tests.export.models import synthesized
 
 from rangesfm.colmap.transform import rescale
 from rangesfm.export import MetricMap, export_map
@@ -41,12 +42,8 @@ needs_evo = pytest.mark.skipif(shutil.which("evo_traj") is None, reason="evo is 
 
 @pytest.fixture(scope="module")
 def sfm() -> pycolmap.Reconstruction:
-    pycolmap.set_random_seed(1)
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, NUM_PHOTOS, NUM_POINTS
-    options.camera_width, options.camera_height = 64, 48
-    options.camera_params = [50.0, 32.0, 24.0, 0.0]
-    return pycolmap.synthesize_dataset(options)
+    camera = {"camera_width": 64, "camera_height": 48, "camera_params": [50.0, 32.0, 24.0, 0.0]}
+    return synthesized(NUM_PHOTOS, NUM_POINTS, seed=1, **camera)
 
 
 @pytest.fixture(scope="module")

@@ -233,30 +233,9 @@ def _summary(
         "check_ranges": {"num": len(held_out), "rms_m": _rms(held_out)},
         "refine": REFINE if is_refined else None,
         "comparison": [
-            {
-                "name": "true scale",
-                "num_keyframes": 160,
-                "rmse_m": 0.0712,
-                "rmse_se3_m": 0.0633,
-                "rmse_sim3_m": 0.0633,
-                "scale_error_percent": 0.0,
-            },
-            {
-                "name": "estimated scale",
-                "num_keyframes": 160,
-                "rmse_m": 0.0801,
-                "rmse_se3_m": 0.0702,
-                "rmse_sim3_m": 0.0633,
-                "scale_error_percent": 1.094,
-            },
-            {
-                "name": "refined",
-                "num_keyframes": 160,
-                "rmse_m": 0.0214,
-                "rmse_se3_m": 0.0187,
-                "rmse_sim3_m": 0.0186,
-                "scale_error_percent": -0.051,
-            },
+            _comparison_row("true scale", 0.0712, 0.0633, 0.0633, 0.0),
+            _comparison_row("estimated scale", 0.0801, 0.0702, 0.0633, 1.094),
+            _comparison_row("refined", 0.0214, 0.0187, 0.0186, -0.051),
         ],
         "inputs": [{"path": "uwb.csv", "sha256": "0" * 64, "bytes": 12345, "hashed": "content"}],
         "distances": [
@@ -288,6 +267,11 @@ def _summary(
     if not has_reference:
         del summary["comparison"]
     return result_document(**summary)
+
+
+def _comparison_row(name: str, *values: float) -> dict[str, Any]:
+    keys = ("rmse_m", "rmse_se3_m", "rmse_sim3_m", "scale_error_percent")
+    return {"name": name, "num_keyframes": 160, **dict(zip(keys, values, strict=True))}
 
 
 def _test(name: str, subject: str, statistic: float, *, rejected: bool) -> dict[str, Any]:

@@ -60,7 +60,7 @@ def test_the_legend_names_each_thing_once() -> None:
         panel_of(Series("a", "after", points), Series("a", "after", points, "line"), Series("b", "before", points)),
         panel_of(Series("a", "after", points), Series("empty", "third", points[:0])),
     )
-    assert [entry.text for entry in Figure("f", "", panels).entries] == ["a", "b"]
+    assert list(Figure("f", "", panels).entries) == ["a", "b"]
 
 
 def test_the_running_median_ignores_an_outlier_and_leaves_gaps() -> None:

@@ -5,19 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from tests.cli.screen import Clock
 
 from rangesfm.progress import SilentProgress
 from rangesfm.report.live import RELOAD_S, LivePage, live_page
 
 RELOAD = f'http-equiv="refresh" content="{RELOAD_S}"'
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 class Listener(SilentProgress):
@@ -42,9 +35,9 @@ def test_it_shows_stages_done_and_the_one_at_work_with_the_time_left(tmp_path: P
     clock, listener = Clock(), Listener()
     live = LivePage(listener, tmp_path / "out", clock=clock)
     live.stage("features")
-    clock.now += 12
+    clock.now_s += 12
     live.stage("mapping")
-    clock.now += 20
+    clock.now_s += 20
     live.update(10, 30)
     live.message("a warning with <b>")
     page = page_of(live)
@@ -62,7 +55,7 @@ def test_it_is_not_written_more_than_once_a_second_for_counts(tmp_path: Path) ->
     live.stage("matching")
     live.update(1, 10)
     assert "1 of 10" not in page_of(live)
-    clock.now += 1.5
+    clock.now_s += 1.5
     live.update(2, 10)
     assert "2 of 10" in page_of(live)
 

@@ -13,8 +13,8 @@ from PIL import Image
 from rangesfm.errors import InputError
 from rangesfm.ranging.log import RangeLog
 from rangesfm.report import write_report_pictures
-from rangesfm.report.pictures import figure_spec, write_picture
-from rangesfm.report.range_plots import plot_ranges
+from rangesfm.report.chart import figure_spec, write_picture
+from rangesfm.report.figures_ranges import plot_ranges
 
 MakeResult = Callable[..., Path]
 LOG = RangeLog.from_arrays(["a", "b", "a"], [1.0, 2.0, 3.0], timestamp_s=[1.7e9, 1.7e9 + 1, 1.7e9 + 2])

@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from rangesfm.errors import InputError
 from rangesfm.report import write_report
 from rangesfm.report.content import Content, true_ranges_m
-from rangesfm.report.scene import scene_of, view_of
+from rangesfm.report.scene import scene_of, thumbnails, view_of
 from rangesfm.result.folder import read_result_folder
 
 MakeResult = Callable[..., Path]
@@ -152,14 +153,13 @@ def test_every_number_of_the_result_stands_on_the_page_as_it_is(make_result: Mak
     assert set(wanted) - set(others) <= {key for key, _, _ in shown}
 
 
+def doubtful_place(reason: str, stddev_m: list[float]) -> dict[str, Any]:
+    others = {"heading_stddev_deg": 0.4, "worst_keyframe_stddev_m": 0.21}
+    return {"verdict": "doubtful", "reasons": [reason], "stddev_m": stddev_m, **others}
+
+
 def test_the_place_has_its_verdict_beside_that_of_the_scale(make_result: MakeResult) -> None:
-    place = {
-        "verdict": "doubtful",
-        "reasons": ["why not"],
-        "stddev_m": [0.03, 0.04, 0.12],
-        "heading_stddev_deg": 0.4,
-        "worst_keyframe_stddev_m": 0.21,
-    }
+    place = doubtful_place("why not", [0.03, 0.04, 0.12])
     texts = page_of(make_result(changes={"place": place})).texts
     begin = texts.index("Place: doubtful")
     assert begin > texts.index("Scale: good")
@@ -180,13 +180,7 @@ def test_what_would_help_and_what_speaks_against_both_is_said_once(make_result: 
             "calibrate the radio: 2 %",
         ],
     }
-    place = {
-        "verdict": "doubtful",
-        "reasons": [reason],
-        "stddev_m": [0.0, 0.0, 0.0],
-        "heading_stddev_deg": 0.0,
-        "worst_keyframe_stddev_m": 0.0,
-    }
+    place = doubtful_place(reason, [0.0, 0.0, 0.0])
     texts = page_of(make_result(changes={"scale": scale, "place": place})).texts
     assert [text for text in texts if "measure it again" in text or "calibrate" in text.lower()] == [
         "Probably A3 stands elsewhere: measure it again.",
@@ -385,3 +379,17 @@ def test_each_range_begins_at_its_own_tag(make_result: MakeResult) -> None:
 def test_mistakes_are_listed_by_what_became_of_the_search_for_them(make_result: MakeResult) -> None:
     texts = page_of(make_result()).texts
     assert {"found", "not found", "would not be found"} <= set(texts)
+
+
+def test_a_name_from_a_file_fetches_nothing_from_outside_the_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    (folder / "cam0").mkdir(parents=True)
+    for path in (tmp_path / "private.png", folder / "cam0" / "in.png"):
+        Image.new("L", (64, 48)).save(path)
+    names = ["cam0/in.png", "../private.png", str(tmp_path / "private.png"), "cam0/../../private.png"]
+    assert list(thumbnails(folder, names)) == ["cam0/in.png"]
+
+
+def test_what_is_no_photo_is_left_out(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_bytes(b"\xff\xd8\xff\xe0 no photo")
+    assert thumbnails(tmp_path, ["a.jpg", "missing.jpg"]) == {}

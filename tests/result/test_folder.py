@@ -14,13 +14,12 @@ from tests.result_document import anchor_entry, result_document
 from rangesfm.errors import InputError
 from rangesfm.result.folder import (
     RESULT_FILES,
-    TABLES,
     forget_result,
     read_result_folder,
     refuse_to_overwrite,
     replacing_result,
 )
-from rangesfm.result.ranges_as_used import RangesAsUsed
+from rangesfm.result.tables import TABLES, RangesAsUsed
 from rangesfm.survey.settings import InputPath
 
 PAGE = (Path(__file__).parents[2] / "examples" / "results.md").read_text(encoding="utf-8")

@@ -16,7 +16,7 @@ from rangesfm.errors import SolverError
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.progress import SilentProgress
 from rangesfm.result.folder import read_result_folder
-from rangesfm.result.ranges_as_used import RangesAsUsed
+from rangesfm.result.tables import RangesAsUsed
 from rangesfm.survey.settings import Survey
 from rangesfm.workflows.results import RunResult
 from rangesfm.workflows.run import refine_model, scale_model

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from enum import Enum
 from typing import Any, Protocol
 
 from rangesfm.batch.jobs import Job
+from rangesfm.comparison.with_reference import text_or_dash
 from rangesfm.errors import FAILED, INTERNAL_ERROR, one_line
 from rangesfm.files.tables import align_rows
 from rangesfm.result.summary import ResultSummary
@@ -29,15 +30,30 @@ class Status(str, Enum):
 
 
 @dataclass(frozen=True)
-class Figures:
-    """What a survey found, as far as it did; see ``result.json``.
+class SurveyRow:
+    """One row: of what a survey found, what ``result.json`` says of it.
 
     Attributes:
+        survey: its file.
+        reason: of a failure, or what the verdict names; one line.
+        exit_status: that ``rangesfm run`` would have had; None while it is not over.
+        num_attempts: how often a worker began it; more than 1 where one was killed.
+        seconds: from the beginning of the last attempt to the end.
+        host: where that was.
+        output_path: folder of its results; empty if its file cannot be read.
         scale, scale_stddev: metres per SfM unit; the larger of the formal and the empirical stddev.
         num_photos: in the model.
         rmse_m: of the final map's keyframe centres without alignment, where there is a reference.
     """
 
+    survey: str
+    status: Status = Status.WAITING
+    reason: str = ""
+    exit_status: int | None = None
+    num_attempts: int = 0
+    seconds: float | None = None
+    host: str = ""
+    output_path: str = ""
     verdict: str | None = None
     scale: float | None = None
     scale_stddev: float | None = None
@@ -50,54 +66,27 @@ class Figures:
     rmse_m: float | None = None
     num_warnings: int | None = None
 
-
-@dataclass(frozen=True)
-class SurveyRow:
-    """One row.
-
-    Attributes:
-        survey: its file.
-        reason: of a failure, or what the verdict names; one line.
-        exit_status: that ``rangesfm run`` would have had; None while it is not over.
-        num_attempts: how often a worker began it; more than 1 where one was killed.
-        seconds: from the beginning of the last attempt to the end.
-        host: where that was.
-        output_path: folder of its results; empty if its file cannot be read.
-    """
-
-    survey: str
-    status: Status = Status.WAITING
-    reason: str = ""
-    exit_status: int | None = None
-    num_attempts: int = 0
-    seconds: float | None = None
-    host: str = ""
-    output_path: str = ""
-    figures: Figures = Figures()
-
     def cells(self) -> dict[str, Any]:
         """By column; plain values."""
-        own = {item.name: getattr(self, item.name) for item in fields(self) if item.name != "figures"}
-        found = {item.name: getattr(self.figures, item.name) for item in fields(self.figures)}
-        return {**own, "status": self.status.value, **found}
+        return asdict(self) | {"status": self.status.value}
 
 
-def figures_of(summary: ResultSummary) -> Figures:
-    """From ``result.json``."""
+def figures_of(summary: ResultSummary) -> dict[str, Any]:
+    """Of a SurveyRow, those that come from ``result.json``."""
     scale, ranges = summary.scale, summary.ranges
-    return Figures(
-        verdict=scale.verdict,
-        scale=scale.value,
-        scale_stddev=scale.larger_stddev,
-        frame=summary.frame,
-        num_photos=summary.map.num_photos,
-        num_ranges=ranges.num,
-        num_ranges_used=ranges.num_used,
-        range_rms_m=ranges.rms_m,
-        reprojection_rms_px=None if summary.refine is None else summary.refine.reprojection_rms_px,
-        rmse_m=summary.comparison[-1].rmse_m if summary.comparison else None,
-        num_warnings=len(summary.warnings),
-    )
+    return {
+        "verdict": scale.verdict,
+        "scale": scale.value,
+        "scale_stddev": scale.larger_stddev,
+        "frame": summary.frame,
+        "num_photos": summary.map.num_photos,
+        "num_ranges": ranges.num,
+        "num_ranges_used": ranges.num_used,
+        "range_rms_m": ranges.rms_m,
+        "reprojection_rms_px": None if summary.refine is None else summary.refine.reprojection_rms_px,
+        "rmse_m": summary.comparison[-1].rmse_m if summary.comparison else None,
+        "num_warnings": len(summary.warnings),
+    }
 
 
 def exit_status_of(rows: Iterable[SurveyRow]) -> int:
@@ -109,31 +98,26 @@ def format_rows(rows: Sequence[SurveyRow]) -> str:
     """The rows as aligned plain text, and below them why surveys are not done."""
     header = ("survey", "result", "scale", "photos", "ranges used", "range RMS m", "RMSE m", "seconds")
     table = align_rows([header, *map(_texts, rows)])
-    reasons = [_why(row) for row in rows if row.status is not Status.DONE]
+    # Errors about the file itself name it already.
+    reasons = [
+        row.reason if row.reason.startswith(f"{row.survey}:") else f"{row.survey}: {row.reason}"
+        for row in rows
+        if row.status is not Status.DONE
+    ]
     return "\n".join([table, *([""] if reasons else []), *reasons])
 
 
-def _why(row: SurveyRow) -> str:
-    """Errors about the file itself name it already."""
-    return row.reason if row.reason.startswith(f"{row.survey}:") else f"{row.survey}: {row.reason}"
-
-
 def _texts(row: SurveyRow) -> tuple[str, ...]:
-    found = row.figures
     return (
         row.survey,
-        found.verdict or row.status.value,
-        _text(found.scale, ".6g"),
-        _text(found.num_photos, "d"),
-        _text(found.num_ranges_used, "d"),
-        _text(found.range_rms_m, ".3f"),
-        _text(found.rmse_m, ".4f"),
-        _text(row.seconds, ".1f"),
+        row.verdict or row.status.value,
+        text_or_dash(row.scale, ".6g"),
+        text_or_dash(row.num_photos, "d"),
+        text_or_dash(row.num_ranges_used, "d"),
+        text_or_dash(row.range_rms_m, ".3f"),
+        text_or_dash(row.rmse_m, ".4f"),
+        text_or_dash(row.seconds, ".1f"),
     )
-
-
-def _text(value: float | None, spec: str) -> str:
-    return "-" if value is None else f"{value:{spec}}"
 
 
 @dataclass(frozen=True)
@@ -224,34 +208,25 @@ class Course:
         elif "num_done" in message:
             self._states[index] = replace(state, num_done=message["num_done"], num_total=message["num_total"])
 
-    def done(self, index: int, figures: Figures, reason: str) -> None:
-        """With what it found, and the reasons of a verdict that is not good."""
-        self._end(index, Status.DONE, reason, 0, figures)
+    def done(self, index: int, figures: Mapping[str, Any], reason: str) -> None:
+        """With what it found (``figures_of``), and the reasons of a verdict that is not good."""
+        self._end(index, Status.DONE, reason, 0, **figures)
 
     def failed(self, index: int, reason: str, exit_status: int) -> None:
         """One line why, and the exit status that ``rangesfm run`` has then."""
         self._end(index, Status.FAILED, reason, exit_status)
 
-    def interrupted(self) -> None:
-        """Whatever is not over will not be."""
-        self._end_others(Status.INTERRUPTED, "interrupted", None)
-
-    def all_failed(self, reason: str) -> None:
-        """Whatever is not over has failed."""
-        self._end_others(Status.FAILED, reason, FAILED)
-
-    def _end_others(self, status: Status, reason: str, exit_status: int | None) -> None:
+    def end_all(self, status: Status, reason: str, exit_status: int | None = None) -> None:
+        """Whatever is not over ends so."""
         for index, row in enumerate(self.rows):
             if not row.status.is_final:
                 self._end(index, status, reason, exit_status)
 
-    def _end(
-        self, index: int, status: Status, reason: str, exit_status: int | None, figures: Figures | None = None
-    ) -> None:
+    def _end(self, index: int, status: Status, reason: str, exit_status: int | None, **figures: Any) -> None:
         state = self._states[index]
         seconds = None if state.began_s is None else self.seconds_running(state)
-        ended = replace(state.row, status=status, reason=reason, exit_status=exit_status, seconds=seconds)
-        self._states[index] = SurveyState(replace(ended, figures=figures or Figures()))
+        ended = replace(state.row, status=status, reason=reason, exit_status=exit_status, seconds=seconds, **figures)
+        self._states[index] = SurveyState(ended)
 
 
 def _first_row(job: Job) -> SurveyRow:

@@ -8,13 +8,13 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
-from rangesfm.batch.course import Course, Status, SurveyState
+from rangesfm.batch.course import Course, Status, SurveyRow
 from rangesfm.report import page
 from rangesfm.report.tables import Table
 from rangesfm.report.text import count, decimals_for, duration, fixed, plain
+from rangesfm.result.folder import REPORT_NAME
 
 RELOAD_S = 5
-_REPORT_NAME = "report.html"
 _HEADER = (
     "survey",
     "",
@@ -40,58 +40,57 @@ def render(course: Course, folder: Path) -> str:
     Args:
         folder: where the page will be, from which its links start.
     """
-    heading = f"{len(course.states)} surveys"
+    heading = f"{len(course.rows)} surveys"
     return page.render(
         "batch.html",
         title=f"{heading} – rangesfm batch",
         heading=heading,
         reload=None if course.is_over else RELOAD_S,
         tiles=_tiles(course),
-        table=Table("What each found", _HEADER, [_row(state, folder) for state in course.states], _NOTE),
-        reasons=[(_light(state), state.row) for state in course.states if state.row.reason],
+        table=Table("What each found", _HEADER, [_row(row, folder) for row in course.rows], _NOTE),
+        reasons=[(_light(row), row) for row in course.rows if row.reason],
     )
 
 
 def _tiles(course: Course) -> list[tuple[str, str, str]]:
     seconds = sum(row.seconds or 0.0 for row in course.rows)
-    num_left = len(course.states) - course.num(Status.DONE) - course.num(Status.FAILED)
+    num_left = len(course.rows) - course.num(Status.DONE) - course.num(Status.FAILED)
     return [
-        ("Done", count(course.num(Status.DONE)), f"of {count(len(course.states))}"),
+        ("Done", count(course.num(Status.DONE)), f"of {count(len(course.rows))}"),
         ("Failed", count(course.num(Status.FAILED)), "see below why"),
         ("Not done", count(num_left), "or not yet"),
         ("Time taken", duration(course.seconds), f"of all surveys {duration(seconds)}"),
     ]
 
 
-def _row(state: SurveyState, folder: Path) -> list[str]:
-    row, found = state.row, state.row.figures
-    decimals = decimals_for(found.scale_stddev, default=5)
-    scale = fixed(found.scale, decimals)
+def _row(row: SurveyRow, folder: Path) -> list[str]:
+    decimals = decimals_for(row.scale_stddev, default=5)
+    scale = fixed(row.scale, decimals)
     return [
-        _name(state, folder),
-        Markup("{} {}").format(page.light(_light(state)), found.verdict or row.status.value),
-        scale if found.scale_stddev is None else f"{scale} ± {fixed(found.scale_stddev, decimals)}",
-        count(found.num_photos),
-        f"{count(found.num_ranges_used)} of {count(found.num_ranges)}" if found.num_ranges is not None else plain(None),
-        fixed(found.range_rms_m, 3, "m"),
-        fixed(found.reprojection_rms_px, 2, "px"),
-        fixed(found.rmse_m, 3, "m"),
-        count(found.num_warnings),
+        _name(row, folder),
+        Markup("{} {}").format(page.light(_light(row)), row.verdict or row.status.value),
+        scale if row.scale_stddev is None else f"{scale} ± {fixed(row.scale_stddev, decimals)}",
+        count(row.num_photos),
+        f"{count(row.num_ranges_used)} of {count(row.num_ranges)}" if row.num_ranges is not None else plain(None),
+        fixed(row.range_rms_m, 3, "m"),
+        fixed(row.reprojection_rms_px, 2, "px"),
+        fixed(row.rmse_m, 3, "m"),
+        count(row.num_warnings),
         count(row.num_attempts),
         duration(row.seconds),
     ]
 
 
-def _name(state: SurveyState, folder: Path) -> str:
+def _name(row: SurveyRow, folder: Path) -> str:
     """With a link to the survey's report, where it has one."""
-    report = Path(state.row.output_path) / _REPORT_NAME
-    if state.row.status is not Status.DONE or not report.is_file():
-        return state.row.survey
+    report = Path(row.output_path) / REPORT_NAME
+    if row.status is not Status.DONE or not report.is_file():
+        return row.survey
     address = quote(Path(os.path.relpath(report, folder)).as_posix())
-    return Markup('<a href="{}">{}</a>').format(address, state.row.survey)
+    return Markup('<a href="{}">{}</a>').format(address, row.survey)
 
 
-def _light(state: SurveyState) -> str:
-    if state.row.status is Status.DONE:
-        return "green" if state.row.figures.verdict == "good" else "amber"
-    return "red" if state.row.status is Status.FAILED else "off"
+def _light(row: SurveyRow) -> str:
+    if row.status is Status.DONE:
+        return "green" if row.verdict == "good" else "amber"
+    return "red" if row.status is Status.FAILED else "off"

@@ -9,21 +9,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from dask.system import CPU_COUNT
 from distributed import Client, Future, KilledWorker, wait
+from distributed.system import MEMORY_LIMIT
 
-from rangesfm.batch.course import BatchListener, Course, Figures, Status, SurveyRow
+from rangesfm.batch import workers
+from rangesfm.batch.course import BatchListener, Course, Status, SurveyRow
 from rangesfm.batch.jobs import BatchOptions, Job, Share, share_this_machine
 from rangesfm.batch.page import render
-from rangesfm.batch.workers import (
-    KilledError,
-    SurveyTask,
-    local_workers,
-    num_at_once,
-    run_on_worker,
-    stop_batch,
-    this_machine,
-    workers_of,
-)
 from rangesfm.ceres.doctor import versions
 from rangesfm.errors import FAILED, Failure
 from rangesfm.files.atomic import sole_writer, write_text
@@ -76,17 +69,17 @@ def run_batch(jobs: Sequence[Job], options: BatchOptions, output_path: Path, lis
 @contextmanager
 def _workers(options: BatchOptions, jobs: Sequence[Job], listener: BatchListener) -> Iterator[tuple[Client, Share]]:
     if options.scheduler is not None:
-        with workers_of(options.scheduler) as client:
-            at_once = num_at_once(client)
+        with workers.workers_of(options.scheduler) as client:
+            at_once = workers.num_at_once(client)
             if not at_once:
                 listener.message(f"{options.scheduler} has no workers yet: the surveys wait for some")
             yield client, Share(options.num_threads, options.memory_limit_bytes, at_once)
         return
     num_surveys = sum(job.survey is not None for job in jobs)
-    num_workers, share, note = share_this_machine(options, num_surveys, *this_machine())
+    num_workers, share, note = share_this_machine(options, num_surveys, CPU_COUNT, MEMORY_LIMIT)
     if note is not None:
         listener.message(note)
-    with local_workers(num_workers) as client:
+    with workers.local_workers(num_workers) as client:
         yield client, share
 
 
@@ -101,7 +94,7 @@ class _Crew:
         self._share = share
         self._batch = f"rangesfm-batch-{uuid.uuid4().hex}"
         self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._task_of: dict[Future, SurveyTask] = {}
+        self._task_of: dict[Future, workers.SurveyTask] = {}
 
     def run(self, jobs: Sequence[Job], restart: bool) -> None:
         """Until all surveys are over."""
@@ -110,20 +103,20 @@ class _Crew:
             self._client.subscribe_topic(self._batch, self._inbox.put)
             for index, job in enumerate(jobs):
                 if job.survey is not None:
-                    self._submit(SurveyTask(self._batch, index, job.survey, self._share, restart))
+                    self._submit(workers.SurveyTask(self._batch, index, job.survey, self._share, restart))
             while not self._course.is_over:
                 self._look()
         except BaseException:
             self._listener.message("stopping the workers")
             self._stop()
-            self._course.interrupted()
+            self._course.end_all(Status.INTERRUPTED, "interrupted")
             write_results(self._course, self._output_path)
             self._listener.show(self._course)
             raise
 
-    def _submit(self, task: SurveyTask) -> None:
+    def _submit(self, task: workers.SurveyTask) -> None:
         key = f"{self._batch}-{len(self._task_of)}"
-        future = self._client.submit(run_on_worker, task, key=key, pure=False, retries=_NUM_RETRIES)
+        future = self._client.submit(workers.run_on_worker, task, key=key, pure=False, retries=_NUM_RETRIES)
         self._task_of[future] = task
         future.add_done_callback(self._inbox.put)
 
@@ -131,7 +124,7 @@ class _Crew:
         """Take in what has come, or wait a moment for it, and pass it on."""
         items = _all_of(self._inbox)
         if self._client.status != "running":
-            self._course.all_failed("the connection to the scheduler was lost")
+            self._course.end_all(Status.FAILED, "the connection to the scheduler was lost", FAILED)
             return
         if items:
             self._course.num_at_once = max(1, sum(self._client.nthreads().values()))
@@ -151,13 +144,13 @@ class _Crew:
         if isinstance(ending, Failure):
             self._course.failed(task.index, ending.message, ending.exit_status)
         else:
-            self._course.done(task.index, Figures(**ending["figures"]), ending["reason"])
+            self._course.done(task.index, ending["figures"], ending["reason"])
 
     def _stop(self) -> None:
         """Have the workers interrupt what they are at, and wait for it; then nothing is half-written."""
         futures = list(self._task_of)
         try:
-            self._client.run(stop_batch, self._batch, on_error="ignore")
+            self._client.run(workers.stop_batch, self._batch, on_error="ignore")
             with self._client.as_current():
                 wait(futures, timeout=_MAX_STOP_S)
             self._client.cancel(futures)
@@ -186,6 +179,6 @@ def _ending(future: Future) -> Any:
         return future.result(timeout=_MAX_STOP_S)
     if isinstance(error, KilledWorker):
         return Failure("the worker that had it was lost, and so were those that tried it again", FAILED)
-    if isinstance(error, KilledError):
+    if isinstance(error, workers.KilledError):
         return Failure(f"{error}; so it was each time it was tried", FAILED)
     return Failure(" ".join(f"its worker failed: {type(error).__name__}: {error}".split()), FAILED)

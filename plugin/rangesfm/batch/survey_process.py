@@ -7,7 +7,6 @@ it can be interrupted. It is given a (survey, restart), and ends with the survey
 from __future__ import annotations
 
 import sys
-from dataclasses import asdict
 from typing import Any
 
 from rangesfm.processes.supervision import MessagesToParent, work_for_parent
@@ -22,7 +21,7 @@ def _run(given: tuple[Survey, bool], worker: MessagesToParent) -> dict[str, Any]
 
     summary = run_survey(survey, progress=worker, restart=restart).summary
     reasons = summary.scale.reasons if summary.scale.verdict != "good" else ()
-    return {"figures": asdict(figures_of(summary)), "reason": "; ".join(reasons)}
+    return {"figures": figures_of(summary), "reason": "; ".join(reasons)}
 
 
 if __name__ == "__main__":

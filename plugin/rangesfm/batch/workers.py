@@ -8,6 +8,7 @@ import pickle
 import signal
 import socket
 import tempfile
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -38,11 +39,6 @@ _SILENT = logging.CRITICAL + 1
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
 # Batches whose surveys this worker is to leave alone.
 _stopped: set[str] = set()
-
-
-def this_machine() -> tuple[int, int]:
-    """Its cores and the bytes of its memory, as far as this process may use them."""
-    return CPU_COUNT, MEMORY_LIMIT
 
 
 @contextmanager
@@ -113,9 +109,9 @@ def num_at_once(client: Client) -> Mapping[str, int]:
     except Exception as error:  # whatever went wrong there, it is raised here
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise InputError(f"the workers of the scheduler cannot run surveys ({reason})") from None
-    num: dict[str, int] = {}
+    num = Counter[str]()
     for host, num_threads in slots:
-        num[host] = num.get(host, 0) + num_threads
+        num[host] += num_threads
     return num
 
 
@@ -129,9 +125,6 @@ class SurveyTask:
 
     Attributes:
         batch: the batch's own name, under which the worker tells how far it is.
-        index: of the survey in the batch.
-        share: what it may use.
-        restart: do anew what earlier runs have done.
     """
 
     batch: str

@@ -30,7 +30,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):  # whatever the locale, a name that it cannot spell is no failure
             stream.reconfigure(errors="backslashreplace")
     try:
-        _require_working_folder()
+        try:
+            os.getcwd()
+        except FileNotFoundError:
+            raise InputError("the working folder has been deleted: change to one that is there") from None
         try:
             args = parse(normalize(sys.argv[1:] if argv is None else argv))
         except SystemExit as ended:  # --help, which is printed, and --version, which is not
@@ -54,13 +57,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             traceback.print_exc()
         print("rangesfm: error:", "\n  ".join([failure.message, *failure.advice]), file=sys.stderr)
         return failure.exit_status
-
-
-def _require_working_folder() -> None:
-    try:
-        os.getcwd()
-    except FileNotFoundError:
-        raise InputError("the working folder has been deleted: change to one that is there") from None
 
 
 def _print(texts: Sequence[str]) -> None:

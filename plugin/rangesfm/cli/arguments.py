@@ -43,15 +43,11 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, **options: Any):
         super().__init__(**options)
-        self._later: list[Callable[[Parser], None]] = []
-
-    def add_later(self, add: Callable[[Parser], None]) -> None:
-        """Have arguments added when this parser is the one that reads."""
-        self._later.append(add)
+        self.later: list[Callable[[Parser], None]] = []  # what adds arguments when this parser is the one that reads
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
-        while self._later:
-            self._later.pop(0)(self)
+        while self.later:
+            self.later.pop(0)(self)
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
@@ -124,18 +120,13 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     for module in _COMMANDS_OF:
         import_module(f"rangesfm.cli.{module}").add_commands(commands)
     args: argparse.Namespace
-    args, unknown = parser.parse_known_args(_two_words_in_one(argv))
+    two = " ".join(argv[:2])  # a command of two words is one to argparse
+    args, unknown = parser.parse_known_args([two, *argv[2:]] if two in COMMANDS and len(argv) > 1 else list(argv))
     if not hasattr(args, "command"):
         parser.error("a command is missing, expected one of " + ", ".join(COMMANDS))
     if unknown:
         commands.by_name[args.command].error(_unknown(unknown[0], commands.by_name[args.command]))
     return args
-
-
-def _two_words_in_one(argv: Sequence[str]) -> list[str]:
-    """A command of two words as argparse knows it: as one."""
-    two = " ".join(argv[:2])
-    return [two, *argv[2:]] if two in COMMANDS and len(argv) > 1 else list(argv)
 
 
 def _unknown(argument: str, parser: Parser) -> str:

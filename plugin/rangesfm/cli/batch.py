@@ -68,7 +68,10 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     """
     if args.scheduler is not None and args.num_workers is not None:
         raise InputError("--num_workers is of this machine: with --scheduler, those that run there count")
-    _require_dask()
+    try:
+        import distributed  # noqa: F401
+    except ImportError:
+        raise InputError("rangesfm batch needs Dask: python -m pip install 'rangesfm[batch]'") from None
     from rangesfm.batch.course import exit_status_of, format_rows
     from rangesfm.batch.jobs import BatchOptions, read_jobs
     from rangesfm.batch.run import PAGE_NAME, TABLE_NAME, run_batch
@@ -85,13 +88,6 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
         f"page: {output_path / PAGE_NAME}",
     ]
     return Outcome(lines, exit_status_of(course.rows))
-
-
-def _require_dask() -> None:
-    try:
-        import distributed  # noqa: F401
-    except ImportError:
-        raise InputError("rangesfm batch needs Dask: python -m pip install 'rangesfm[batch]'") from None
 
 
 def _at_least_1(text: str) -> int:
@@ -166,7 +162,7 @@ def _counted(state: SurveyState) -> str:
 def _ended(state: SurveyState) -> str:
     row = state.row
     seconds = "" if row.seconds is None else f" after {duration(row.seconds)}"
-    what = f"{row.figures.verdict or row.status.value}" if row.exit_status == 0 else row.status.value
+    what = (row.exit_status == 0 and row.verdict) or row.status.value
     reason = f": {row.reason}" if row.reason and row.reason != what else ""
     return f"{row.survey}: {what}{seconds}{reason}"
 

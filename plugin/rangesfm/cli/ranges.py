@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -142,30 +142,32 @@ def _side(text: str) -> dict[str, Sequence[float]]:
 
 
 def _heights(text: str) -> dict[str, float]:
-    heights = {}
-    for anchor_id, word in _by_anchor(text).items():
-        try:
-            heights[anchor_id] = float(word)
-        except ValueError:
-            heights[anchor_id] = math.nan
-        if not math.isfinite(heights[anchor_id]):
-            raise argparse.ArgumentTypeError(f"'{word}' is not a height in metres")
-    return heights
+    return {
+        anchor_id: _number_of(word, math.isfinite, "a height in metres") for anchor_id, word in _by_anchor(text).items()
+    }
 
 
 def _positive(text: str) -> float:
-    if not (value := _not_negative(text)) > 0:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a length in metres, expected more than 0")
-    return value
+    _not_negative(text)
+    return _number_of(text, lambda value: value > 0, "a length in metres, expected more than 0")
 
 
 def _not_negative(text: str) -> float:
+    return _number_of(text, lambda value: 0 <= value < math.inf, "a length in metres, expected 0 or more")
+
+
+def _seconds(text: str) -> float:
+    said = f"a time in seconds, expected at most {_MAX_TIME_S:g} of them"
+    return _number_of(text, lambda value: abs(value) <= _MAX_TIME_S, said)
+
+
+def _number_of(text: str, is_good: Callable[[float], bool], what: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        value = -1.0
-    if not 0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"'{text}' is not a length in metres, expected 0 or more")
+        value = math.nan
+    if not is_good(value):
+        raise argparse.ArgumentTypeError(f"'{text}' is not {what}")
     return value
 
 
@@ -209,8 +211,8 @@ def _ranges(args: argparse.Namespace, progress: Progress) -> Outcome:
         write_ranges_csv(log, args.output_path)
         lines += ["", f"written to {args.output_path}"]
     if args.plot is not None:
-        from rangesfm.report.pictures import write_picture
-        from rangesfm.report.range_plots import plot_ranges
+        from rangesfm.report.chart import write_picture
+        from rangesfm.report.figures_ranges import plot_ranges
 
         write_picture(plot_ranges(log), Path(args.plot))
         lines += ["", f"drawn in {args.plot}"]
@@ -295,8 +297,8 @@ def _calibrate(args: argparse.Namespace, progress: Progress) -> Outcome:
     calibration = calibrate_ranges(log, tags_m, anchors)
     lines = [*_notes_of(log), *_calibrated(calibration, len(log)), "", f"written to {args.output_path}"]
     if args.plot is not None:
-        from rangesfm.report.pictures import write_picture
-        from rangesfm.report.range_plots import plot_error_curve
+        from rangesfm.report.chart import write_picture
+        from rangesfm.report.figures_ranges import plot_error_curve
 
         write_picture(plot_error_curve(calibration), Path(args.plot))
         lines.append(f"drawn in {args.plot}")
@@ -392,13 +394,3 @@ def _placed(log: RangeLog, placements: Sequence[AnchorPlacement]) -> list[str]:
         "",
         *(line + note for line, note in zip(align_rows(rows).split("\n"), notes, strict=True)),
     ]
-
-
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not abs(value) <= _MAX_TIME_S:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a time in seconds, expected at most {_MAX_TIME_S:g} of them")
-    return value

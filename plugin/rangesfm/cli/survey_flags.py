@@ -48,7 +48,7 @@ def add_flags(parser: Parser, *keys: str, without: tuple[str, ...] = (), by_own_
         by_own_names: whether the flags are called as the keys, for a command that is about one table.
     """
     # What the keys are made of takes longer to import than all else, and only the command that runs needs its flags.
-    parser.add_later(partial(_add_flags, keys=keys, without=without, by_own_names=by_own_names))
+    parser.later.append(partial(_add_flags, keys=keys, without=without, by_own_names=by_own_names))
 
 
 def _add_flags(parser: Parser, *, keys: tuple[str, ...], without: tuple[str, ...], by_own_names: bool) -> None:

@@ -17,7 +17,7 @@ from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.result.entries import ComparisonRow, median, rms
 from rangesfm.result.folder import ResultFolder, read_result_folder
-from rangesfm.result.ranges_as_used import RangesAsUsed
+from rangesfm.result.tables import RangesAsUsed
 
 _Pair = tuple[float, ...]
 

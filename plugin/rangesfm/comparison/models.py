@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array
 from rangesfm.colmap.model_files import read_model
 from rangesfm.comparison.ranges import ModelRanges, ranges_of_result
-from rangesfm.comparison.with_reference import MIN_NUM_ALIGNED, text_or_dash
+from rangesfm.comparison.with_reference import MIN_NUM_ALIGNED, known_keyframes, text_or_dash
 from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
@@ -35,7 +35,6 @@ class NamedModel:
     """One of the models.
 
     Attributes:
-        name: as the user gave it.
         path: the keyframes in the model's own world.
         model: None where only positions are known.
         result: the result folder it comes from; None where it does not.
@@ -54,8 +53,6 @@ class ModelRow:
     """One model against the first.
 
     Attributes:
-        name: of the model.
-        num_photos: in it.
         base_from_model: the similarity that carries it onto the first; None with fewer than three common photos.
         common_names: the photos in both, in the first's order.
         moved, moved_aligned: (n,) distance of each of these cameras from where the first has it, as it is and after
@@ -87,8 +84,6 @@ class TapedRow:
     """One taped distance.
 
     Attributes:
-        ends: between what.
-        measured_m: by tape.
         lengths: in each model, in its own unit; None where there is only a path.
         lengths_m: the same, with the scale that carries the model onto the placed path; None without ranges.
     """
@@ -184,16 +179,15 @@ def _read_model(path: Path) -> NamedModel:
 
 def _read_positions(path: Path, base: Trajectory) -> NamedModel:
     reference = read_reference(path)
-    positions, rotations = reference.positions_at(base)
-    known = np.flatnonzero(np.isfinite(positions).all(axis=1))
+    known, positions, rotations = known_keyframes(base, reference)
     if len(known) == 0:
         raise InputError(reference.why_nothing_is_known("keyframes", base.image_names, base.timestamps_s), path)
     trajectory = Trajectory(
         frame_ids=base.frame_ids[known],
         image_names=tuple(base.image_names[i] for i in known),
         timestamps_s=None if base.timestamps_s is None else base.timestamps_s[known],
-        centers=positions[known],
-        world_from_cam=np.tile(np.eye(3), (len(known), 1, 1)) if rotations is None else rotations[known],
+        centers=positions,
+        world_from_cam=np.tile(np.eye(3), (len(known), 1, 1)) if rotations is None else rotations,
     )
     return NamedModel(str(path), trajectory, None, None, has_orientations=rotations is not None)
 

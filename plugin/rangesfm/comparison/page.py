@@ -7,46 +7,40 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.comparison.models import ModelsComparison, carried_by
-from rangesfm.files.atomic import new_file, sole_writer
+from rangesfm.files.atomic import sole_writer
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.report.chart import page_charts
 from rangesfm.report.content import points_of
-from rangesfm.report.page import render
+from rangesfm.report.page import render, write_page
 from rangesfm.report.plot import WIDE_SIZE, Figure, Series, equal_view, figure_of, from_zero, views_of
 from rangesfm.report.scene import Scene, ScenePath, view_of
 
 COLORS = ("after", "before", "third", "fourth")
-PAGE_NAME = "comparison.html"
 
 
 def write_comparison(comparison: ModelsComparison, folder: Path) -> Path:
-    """Write ``comparison.html`` into a folder; returns its path.
+    """Write ``comparison.html`` into a folder; everything drawn is carried onto the first model, in its unit.
 
     Raises:
         InputError: the folder cannot be written to, or a run is writing there.
     """
-    path = folder / PAGE_NAME
-    with sole_writer(folder), new_file(path) as temporary:
-        temporary.write_text(render_comparison(comparison), encoding="utf-8", errors="xmlcharrefreplace")
-    return path
-
-
-def render_comparison(comparison: ModelsComparison) -> str:
-    """The page; everything drawn is carried onto the first model, in its unit."""
-    base = comparison.models[0]
+    base, path = comparison.models[0], folder / "comparison.html"
     aligned = [carried_by(row.base_from_model, model.path) for model, row in zip(comparison.models, comparison.rows)]
     title = f"{len(comparison.models)} models of {len(base.path)} photos"
     frame = "first_camera" if base.result is None else base.result.summary.frame
     figures = [*_moved_figure(comparison), _path_figure(comparison, aligned, frame)]
-    return render(
-        "comparison.html",
-        title=f"{title} – rangesfm comparison",
-        heading=title,
-        view=view_of(_scene(comparison, aligned, frame)),
-        figures=figures,
-        charts=page_charts(figures),
-        tables=comparison.tables,
-    )
+    with sole_writer(folder):
+        page = render(
+            "comparison.html",
+            title=f"{title} – rangesfm comparison",
+            heading=title,
+            view=view_of(_scene(comparison, aligned, frame)),
+            figures=figures,
+            charts=page_charts(figures),
+            tables=comparison.tables,
+        )
+        write_page(page, path)
+    return path
 
 
 def _color(index: int) -> str:

@@ -18,7 +18,7 @@ from rangesfm.ranging.clock.estimate import estimate_time_offset
 from rangesfm.ranging.log import RangeLog
 from rangesfm.result.folder import ResultFolder
 from rangesfm.result.metric_result import USED
-from rangesfm.result.ranges_as_used import RangesAsUsed
+from rangesfm.result.tables import RangesAsUsed
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.survey.inputs import RangingInputs, times_of_model
 from rangesfm.survey.settings import Survey

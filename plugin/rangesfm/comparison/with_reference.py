@@ -56,7 +56,7 @@ def with_true_scale(path: Trajectory, reference: Reference, *, frame: str = "sit
 
     A path whose scale the reference does not tell comes back unchanged.
     """
-    known, positions, _ = _known(path, reference)
+    known, positions, _ = known_keyframes(path, reference)
     scale = _scale_to(path.centers[known], positions)
     return path if scale is None else path.resized(scale, frame)
 
@@ -73,7 +73,7 @@ def reference_in_frame(path: Trajectory, reference: Reference, *, frame: str | N
     return Reference(positions, image_names=tuple(path.image_names[i] for i in known))
 
 
-def _known(path: Trajectory, reference: Reference) -> tuple[npt.NDArray[np.int64], Array, Array | None]:
+def known_keyframes(path: Trajectory, reference: Reference) -> tuple[npt.NDArray[np.int64], Array, Array | None]:
     """Rows of the k keyframes that the reference knows, their (k, 3) positions, and (k, 3, 3) rotations or None."""
     positions, world_from_cam = reference.positions_at(path)
     known = np.flatnonzero(np.isfinite(positions).all(axis=1))
@@ -83,8 +83,8 @@ def _known(path: Trajectory, reference: Reference) -> tuple[npt.NDArray[np.int64
 def _known_in_frame(
     path: Trajectory, reference: Reference, frame: str | None
 ) -> tuple[npt.NDArray[np.int64], Array | None]:
-    """Rows and positions of ``_known``, the latter in the path's world; None if it cannot be tied."""
-    known, positions, world_from_cam = _known(path, reference)
+    """Rows and positions of ``known_keyframes``, the latter in the path's world; None if it cannot be tied."""
+    known, positions, world_from_cam = known_keyframes(path, reference)
     if frame == "site":
         return known, positions
     if frame != "first_camera" or world_from_cam is None or len(known) == 0:
@@ -94,7 +94,7 @@ def _known_in_frame(
 
 
 def _compare_path(name: str, path: Trajectory, reference: Reference, frame: str | None) -> ComparisonRow:
-    known, target, _ = _known(path, reference)
+    known, target, _ = known_keyframes(path, reference)
     if len(known) == 0:
         raise InputError(reference.why_nothing_is_known("keyframes", path.image_names, path.timestamps_s))
     source = path.centers[known]

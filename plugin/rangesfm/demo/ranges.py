@@ -107,10 +107,8 @@ def simulate_ranges(
     """Ranges at the radio's rate all along a path.
 
     Args:
-        path: the camera's.
         anchors_m: (3,) position in the world by id.
         tag_in_cam_m: (3,) lever arm.
-        radio: how it measures.
         seed: of noise, obstruction and loss.
     """
     num_rounds = int((path.end_s - path.start_s) * radio.rate_hz)
@@ -134,7 +132,6 @@ def measure_ranges(
         times_s: (n,) on the camera's clock.
         tags_m: (n, 3) the moving antenna in the world.
         anchor_index: (n,) which of ``anchors_m`` each is to.
-        anchors_m, radio, seed: as for ``simulate_ranges``.
     """
     rng = np.random.default_rng(seed)
     ids = np.array(list(anchors_m))

@@ -10,7 +10,6 @@ from __future__ import annotations
 import csv
 import re
 import shutil
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -96,7 +95,7 @@ def make_demo_survey(folder: Path, *, num_photos: int = 40, seed: int = 0) -> De
     text = _survey_file(num_photos, seed)
     if _is_there(survey, text):
         return survey
-    if folder.exists() and (not folder.is_dir() or any(_names_of_others(folder))):
+    if folder.exists() and (not folder.is_dir() or any(map(_is_anothers, folder.iterdir()))):
         raise InputError("expected a new or an empty folder, or one that holds the same demo", folder)
     with sole_writer(folder):
         with new_folder(folder / "images") as images:
@@ -138,10 +137,9 @@ def _is_there(survey: DemoSurvey, text: str) -> bool:
         return False
 
 
-def _names_of_others(folder: Path) -> Iterator[str]:
-    """What is in a folder but for what a demo that is being made, or was killed, has there."""
-    names = (path.name for path in folder.iterdir())
-    return (name for name in names if name != LOCK_NAME and not re.fullmatch(LEFTOVER, name))
+def _is_anothers(path: Path) -> bool:
+    """Not what a demo that is being made, or was killed, has in its folder."""
+    return path.name != LOCK_NAME and not re.fullmatch(LEFTOVER, path.name)
 
 
 def _anchor_file(seed: int) -> str:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import pycolmap
+
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError, RangesfmError, failure_of
 from rangesfm.export.apply import apply_to, best_similarity
 from rangesfm.export.colmap import write_model, write_positions, write_project, write_transform, write_undistorted
@@ -13,20 +15,10 @@ from rangesfm.export.gis import write_features, write_laz
 from rangesfm.export.metric_map import MetricMap, in_frame
 from rangesfm.export.photogrammetry import write_nerfstudio, write_opensfm, write_opf
 from rangesfm.export.ply import write_anchors, write_cameras, write_points
-from rangesfm.export.trajectories import (
-    COVARIANCE_FORMATS,
-    write_covariances,
-    write_kitti,
-    write_trajectory,
-)
+from rangesfm.export.trajectories import COVARIANCE_FORMATS, write_covariances, write_kitti, write_trajectory
 from rangesfm.files.atomic import make_output_folder
+from rangesfm.geometry.similarity import Similarity
 from rangesfm.options import ExportOptions
-
-if TYPE_CHECKING:
-    import pycolmap
-
-    from rangesfm.arrays import Array
-    from rangesfm.geometry.similarity import Similarity
 
 __all__ = [
     "COVARIANCE_FORMATS",

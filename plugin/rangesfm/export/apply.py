@@ -66,17 +66,13 @@ Transform = Callable[[Path, Similarity, Path], Path]
 
 def _transformer_of(path: Path) -> Transform:
     if path.is_dir():
-        return _transform_model
+        return lambda path, similarity, target: write_model(rescale(read_model(path), similarity), target)
     if not path.is_file():
         raise InputError("there is no such file", path)
     known: dict[str, Transform] = {".ply": transform_ply, ".obj": _transform_obj, ".json": _transform_json}
     if path.suffix.lower() not in known:
         raise InputError(f"cannot be carried over, expected {', '.join(known)} or the folder of a COLMAP model", path)
     return known[path.suffix.lower()]
-
-
-def _transform_model(path: Path, metric_from_sfm: Similarity, target: Path) -> Path:
-    return write_model(rescale(read_model(path), metric_from_sfm), target)
 
 
 def _transform_obj(path: Path, metric_from_sfm: Similarity, target: Path) -> Path:
@@ -103,20 +99,17 @@ def _transform_json(path: Path, metric_from_sfm: Similarity, target: Path) -> Pa
     content = read_json(path)
     try:
         with overflow_raised():
-            _move_cameras(content, metric_from_sfm, path)
+            if isinstance(content, dict) and "frames" in content:
+                _move_nerfstudio(content, metric_from_sfm)
+            elif isinstance(content, list) and content and "position" in content[0]:
+                _move_splatting(content, metric_from_sfm)
+            else:
+                expected = "expected nerfstudio's transforms.json or a splatting cameras.json"
+                raise InputError(f"holds no cameras, {expected}", path)
     except (ArithmeticError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"a camera is not as expected ({error!r})", path) from error
     write_json(content, target)
     return target
-
-
-def _move_cameras(content: Json, metric_from_sfm: Similarity, path: Path) -> None:
-    if isinstance(content, dict) and "frames" in content:
-        _move_nerfstudio(content, metric_from_sfm)
-    elif isinstance(content, list) and content and "position" in content[0]:
-        _move_splatting(content, metric_from_sfm)
-    else:
-        raise InputError("holds no cameras, expected nerfstudio's transforms.json or a splatting cameras.json", path)
 
 
 def _move_nerfstudio(content: Json, metric_from_sfm: Similarity) -> None:

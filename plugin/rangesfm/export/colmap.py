@@ -112,17 +112,13 @@ def write_undistorted(map_: MetricMap, folder: Path) -> Path:
             raise InputError(f"there is no photo {name}, which the map needs, in this folder", images_path)
     with new_folder(folder) as temporary, tempfile.TemporaryDirectory() as model_path:
         write_binary_model(map_.reconstruction, Path(model_path))
-        _require_room(temporary, sum(os.path.getsize(images_path / name) for name in names))
+        # On a full disk the library that writes the photos ends the whole process, without a word of ours.
+        if shutil.disk_usage(temporary).free < sum(os.path.getsize(images_path / name) for name in names):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(temporary))
         with colmap_log(temporary / "undistortion.log"):
             pycolmap.undistort_images(temporary, model_path, images_path)
         _into_sparse_0(temporary)
     return folder
-
-
-def _require_room(folder: Path, num_bytes: int) -> None:
-    """On a full disk the library that writes the photos ends the whole process, without a word of ours."""
-    if shutil.disk_usage(folder).free < num_bytes:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
 
 
 def _into_sparse_0(folder: Path) -> None:

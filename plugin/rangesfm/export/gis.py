@@ -84,10 +84,11 @@ def write_features(map_: MetricMap, path: Path, driver: str) -> Path:
     times = np.full(len(trajectory), np.nan) if trajectory.timestamps_s is None else trajectory.timestamps_s
     names = np.array([*trajectory.image_names, *anchors], dtype=object)
     kinds = np.array(["camera"] * len(trajectory) + ["anchor"] * len(anchors), dtype=object)
+    points = [struct.pack("<BI3d", 1, _WKB_POINT_Z, *row) for row in coordinates.tolist()]
     with new_file(path) as temporary:
         pyogrio.raw.write(
             temporary,
-            geometry=_wkb(coordinates),
+            geometry=np.array(points, dtype=object),
             field_data=[kinds, names, np.concatenate([times, np.full(len(anchors), np.nan)])],
             fields=np.array(["kind", "name", "timestamp_s"]),
             layer="survey",
@@ -97,9 +98,3 @@ def write_features(map_: MetricMap, path: Path, driver: str) -> Path:
             **_OPTIONS.get(driver, {}),
         )
     return path
-
-
-def _wkb(coordinates: Array) -> np.ndarray[tuple[int], np.dtype[np.object_]]:
-    """(n,) well-known binary of points."""
-    points = [struct.pack("<BI3d", 1, _WKB_POINT_Z, *row) for row in coordinates.tolist()]
-    return np.array(points, dtype=object)

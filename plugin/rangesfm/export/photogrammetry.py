@@ -14,7 +14,7 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
-from rangesfm.export.metric_map import MetricMap, registered_images
+from rangesfm.export.metric_map import MetricMap, points_of, registered_images
 from rangesfm.export.ply import write_points
 from rangesfm.files.atomic import new_folder
 from rangesfm.files.records import write_json
@@ -118,11 +118,14 @@ def write_opensfm(map_: MetricMap, path: Path) -> Path:
         InputError: a camera model that OpenSfM does not know.
     """
     model, origin = map_.reconstruction, map_.georeference
-    images = registered_images(model)
+    images, (places, colors) = registered_images(model), points_of(model)
     reconstruction: dict[str, Any] = {
         "cameras": {str(i): _camera(model.cameras[i]) for i in sorted({image.camera_id for image in images})},
         "shots": {image.name: _shot(image, map_) for image in images},
-        "points": {str(i): _point(model.point3D(i)) for i in sorted(model.point3D_ids())},
+        "points": {
+            str(i): {"color": list(map(float, color)), "coordinates": at}
+            for i, at, color in zip(sorted(model.point3D_ids()), places.tolist(), colors)
+        },
     }
     if origin is not None:
         place = {"latitude": origin.lat_deg, "longitude": origin.lon_deg, "altitude": origin.height_m}
@@ -159,10 +162,6 @@ def _shot(image: pycolmap.Image, map_: MetricMap) -> dict[str, Any]:
     }
 
 
-def _point(point: pycolmap.Point3D) -> dict[str, Any]:
-    return {"color": [float(channel) for channel in point.color], "coordinates": point.xyz.tolist()}
-
-
 def write_opf(map_: MetricMap, folder: Path) -> Path:
     """Write ``project.opf`` and its ``camera_list.json``, ``input_control_points.json`` and ``constraints.json``.
 
@@ -175,10 +174,11 @@ def write_opf(map_: MetricMap, folder: Path) -> Path:
     model, stddev = map_.reconstruction, map_.relative_scale_stddev
     if stddev is None:
         raise InputError("the format 'opf' needs the stddev of the scale, which is not known of this model")
+    names = sorted(image.name for image in model.images.values())
     pairs = _distant_pairs(model)
     point_ids = [point_id for pair in pairs for point_id in pair]
     files = {
-        "camera_list.json": _file("camera-list", cameras=_cameras(model)),
+        "camera_list.json": _file("camera-list", cameras=[{"id": _uid(name), "uri": name} for name in names]),
         "input_control_points.json": _file(
             "input-control-points", gcps=[], mtps=[_tie_point(model, point_id) for point_id in point_ids]
         ),
@@ -228,12 +228,6 @@ def _distant_pairs(model: pycolmap.Reconstruction) -> list[tuple[int, int]]:
         left[second] = False
         pairs.append((seen[first], seen[second]))
     return pairs
-
-
-def _cameras(model: pycolmap.Reconstruction) -> list[dict[str, Any]]:
-    return [
-        {"id": _uid(image.name), "uri": image.name} for image in sorted(model.images.values(), key=lambda i: i.name)
-    ]
 
 
 def _uid(name: str) -> int:

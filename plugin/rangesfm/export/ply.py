@@ -24,6 +24,8 @@ ANCHOR_COLOR = (162, 28, 175)
 PLY_TYPES = {"f8": "double", "f4": "float", "u1": "uchar"}
 Vertices = npt.NDArray[np.void]
 _CODES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
+_CODES |= {"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4"}
+_CODES |= {"uint32": "u4", "float32": "f4", "float64": "f8"}
 _MAX_NUM_DIGITS = 18  # larger numbers are not for a machine's word
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _MAX_HEADER_BYTES = 1 << 16
@@ -38,26 +40,25 @@ def write_points(reconstruction: pycolmap.Reconstruction, path: Path) -> Path:
 
 def write_cameras(trajectory: Trajectory, path: Path) -> Path:
     """Write one vertex at each camera centre; its normal is the viewing direction."""
-    colors = np.tile(np.array(CAMERA_COLOR, dtype=np.uint8), (len(trajectory), 1))
-    return _write_vertices(path, trajectory.centers, colors, normals=trajectory.world_from_cam[:, :, 2])
+    return _write_vertices(path, trajectory.centers, CAMERA_COLOR, normals=trajectory.world_from_cam[:, :, 2])
 
 
 def write_anchors(anchors_m: Mapping[str, Array], path: Path) -> Path:
     """Write one vertex for each anchor, in the mapping's order; a comment names them."""
     xyz = np.array(list(anchors_m.values()), dtype=np.float64).reshape(-1, 3)
-    colors = np.tile(np.array(ANCHOR_COLOR, dtype=np.uint8), (len(xyz), 1))
     names = " ".join(anchor_id.encode("ascii", "backslashreplace").decode() for anchor_id in anchors_m)
-    return _write_vertices(path, xyz, colors, comment=f"anchors {' '.join(names.split())}")
+    return _write_vertices(path, xyz, ANCHOR_COLOR, comment=f"anchors {' '.join(names.split())}")
 
 
 def _write_vertices(
-    path: Path, xyz: Array, colors: npt.NDArray[np.uint8], normals: Array | None = None, comment: str | None = None
+    path: Path, xyz: Array, colors: npt.ArrayLike, normals: Array | None = None, comment: str | None = None
 ) -> Path:
-    """Positions as doubles, so that coordinates far from the origin keep their millimetres."""
+    """Positions as doubles, so that coordinates far from the origin keep their millimetres; (n, 3) colours or one."""
+    rgb = np.broadcast_to(np.asarray(colors, dtype=np.uint8), xyz.shape)
     columns: list[tuple[str, str, npt.NDArray[Any]]] = [(name, "f8", xyz[:, i]) for i, name in enumerate("xyz")]
     if normals is not None:
         columns += [(name, "f4", normals[:, i]) for i, name in enumerate(("nx", "ny", "nz"))]
-    columns += [(name, "u1", colors[:, i]) for i, name in enumerate(("red", "green", "blue"))]
+    columns += [(name, "u1", rgb[:, i]) for i, name in enumerate(("red", "green", "blue"))]
     vertices = np.empty(len(xyz), dtype=[(name, "<" + code) for name, code, _ in columns])
     for name, _, values in columns:
         vertices[name] = values
@@ -70,21 +71,9 @@ def _write_vertices(
     return path
 
 
-_CODES |= {"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4"}
-_CODES |= {"uint32": "u4", "float32": "f4", "float64": "f8"}
-
-
 @dataclass(frozen=True)
 class _Header:
-    """What a PLY file says of itself.
-
-    Attributes:
-        lines: all of them, with end_header.
-        num_bytes: of the header.
-        encoding: a key of _ORDERS.
-        num_vertices: of the first element.
-        columns: names of the vertex properties and their types.
-    """
+    """What a PLY file says of itself, with end_header; the encoding is a key of _ORDERS, columns those of vertices."""
 
     lines: list[str]
     num_bytes: int
@@ -110,9 +99,11 @@ def transform_ply(path: Path, new_from_old: Similarity, target: Path) -> Path:
             written = _moved(vertices, new_from_old)
     except FloatingPointError:
         raise InputError("the vertices hold infinite numbers, or too large ones", path) from None
-    is_double = written.dtype != vertices.dtype
+    text = "\n".join(header.lines) + "\n"
+    if written.dtype != vertices.dtype:
+        text = re.sub(r"^[ \t]*property[ \t].*[ \t]([xyz])[ \t]*$", r"property double \1", text, flags=re.MULTILINE)
     with new_file(target) as temporary:
-        temporary.write_bytes(_header_text(header, is_double) + _body(written, header) + rest)
+        temporary.write_bytes(text.encode("latin-1") + _body(written, header) + rest)
     return target
 
 
@@ -187,13 +178,6 @@ def _vectors(vertices: Vertices, names: tuple[str, str, str]) -> Array:
     if np.isinf(values).any():
         raise FloatingPointError("infinite")
     return values
-
-
-def _header_text(header: _Header, is_double: bool) -> bytes:
-    text = "\n".join(header.lines) + "\n"
-    if is_double:
-        text = re.sub(r"^[ \t]*property[ \t].*[ \t]([xyz])[ \t]*$", r"property double \1", text, flags=re.MULTILINE)
-    return text.encode("latin-1")
 
 
 def _body(vertices: Vertices, header: _Header) -> bytes:

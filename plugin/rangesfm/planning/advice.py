@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from operator import attrgetter
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from rangesfm.arrays import Array
 from rangesfm.geometry.similarity import NEARLY_STRAIGHT, path_shape
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.planning.expected import Expected, compare
+from rangesfm.planning.paths import way_along
 from rangesfm.planning.placement import spread_places
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
@@ -56,18 +57,15 @@ class Advice:
     place_gain: float
 
 
-class _Change(NamedTuple):
-    kind: str
-    subject: str
-    words: str
-    planned: PlannedSurvey
+_Change = tuple[str, str, str, PlannedSurvey]
+"""Kind, subject and words of an Advice, and the plan with the change made."""
 
 
 def advise(expected: Expected) -> tuple[Advice, ...]:
     """All changes of a plan that gain something, in no order; a map bends as it did before."""
     bending = expected.learned.stddev_of_component["bending"]
     before = _compared(expected.planned, bending)
-    afters = ((change, _compared(change.planned, bending)) for change in _changes(expected.planned))
+    afters = ((change, _compared(change[3], bending)) for change in _changes(expected.planned))
     found = (_advice(change, after, before, expected) for change, after in afters if before and after)
     return tuple(advice for advice in found if max(advice.scale_gain, advice.place_gain) > _LEAST_GAIN)
 
@@ -79,15 +77,11 @@ def _compared(planned: PlannedSurvey, bending: float) -> Expected | None:
 def best_words(advice: Iterable[Advice], *, for_scale: bool, for_place: bool) -> list[str]:
     """The changes that gain most for the scale, then for the place, as far as wanted, with what each gains."""
     advice = list(advice)
-    wanted: dict[str, Callable[[Advice], float]] = {}
-    if for_scale:
-        wanted["scale"] = lambda each: each.scale_gain
-    if for_place:
-        wanted["place"] = lambda each: each.place_gain
     gains: dict[str, list[str]] = {}
-    for what, gain in wanted.items():
+    for what, is_wanted in (("scale", for_scale), ("place", for_place)):
+        gain = attrgetter(f"{what}_gain")
         for each in ranked(advice, gain)[:_NUM_BEST]:
-            if gain(each) > _WORTH_SAYING:
+            if is_wanted and gain(each) > _WORTH_SAYING:
                 gains.setdefault(each.words, []).append(
                     f"the {what} would be {1 / (1 - gain(each)):.2g} times as certain"
                 )
@@ -133,23 +127,23 @@ def _changes(planned: PlannedSurvey) -> Iterator[_Change]:
     if planned.anchor_frame == "unknown" and len(planned.anchors) > 2:
         known = tuple(replace(anchor, position_stddev_m=_SURVEYED_M) for anchor in planned.anchors)
         survey = f"survey the anchors, to {_SURVEYED_M:g} m"
-        yield _Change("anchor survey", "", survey, replace(planned, anchors=known, anchor_frame="site"))
+        yield "anchor survey", "", survey, replace(planned, anchors=known, anchor_frame="site")
     if not planned.path_is_level:
         up = f"go up and down on the way, by {_UP_AND_DOWN_M:g} m, {_NUM_WAVES} times"
-        yield _Change("up and down", "", up, replace(planned, trajectory=_up_and_down(path)))
+        yield "up and down", "", up, replace(planned, trajectory=_up_and_down(path))
     if path_shape(path.centers).stddevs[1] < NEARLY_STRAIGHT * path_shape(path.centers).stddevs[0]:
         bent, off_m = _bent(path)
-        yield _Change("bend", "", f"walk a bend, up to {off_m:.2g} m off the line", replace(planned, trajectory=bent))
+        yield "bend", "", f"walk a bend, up to {off_m:.2g} m off the line", replace(planned, trajectory=bent)
     wide = f"walk {_WIDER:g} times as wide"
-    yield _Change("wider path", "", wide, replace(planned, trajectory=_wider(path)))
-    yield _Change("rate", "", "range twice as often", replace(planned, rate_hz=2 * planned.rate_hz))
+    yield "wider path", "", wide, replace(planned, trajectory=_wider(path))
+    yield "rate", "", "range twice as often", replace(planned, rate_hz=2 * planned.rate_hz)
     if planned.allowed_m is None:
-        yield _Change("wider anchors", "", f"put the anchors {_WIDER:g} times as far out", _with_wider_anchors(planned))
+        yield "wider anchors", "", f"put the anchors {_WIDER:g} times as far out", _with_wider_anchors(planned)
     if planned.curve_stddev_m is None:
-        yield _Change("calibration", "", f"{CALIBRATE}, to {_LEARNT_CURVE_M:g} m", _calibrated(planned))
+        yield "calibration", "", f"{CALIBRATE}, to {_LEARNT_CURVE_M:g} m", _calibrated(planned)
     length_m, stddev_m = _TAPED_M
     tape = f"tape a length of {length_m:g} m to {1000 * stddev_m:g} mm between two points of the map"
-    yield _Change("tape", "", tape, replace(planned, taped=(*planned.taped, _TAPED_M)))
+    yield "tape", "", tape, replace(planned, taped=(*planned.taped, _TAPED_M))
 
 
 def _calibrated(planned: PlannedSurvey) -> PlannedSurvey:
@@ -160,11 +154,14 @@ def _calibrated(planned: PlannedSurvey) -> PlannedSurvey:
 
 
 def _with_wider_anchors(planned: PlannedSurvey) -> PlannedSurvey:
-    """From the middle of the path, at the same heights."""
-    middle = planned.trajectory.centers.mean(axis=0)
-    out = [middle + (at - middle) * [_WIDER, _WIDER, 1.0] for at in planned.anchors_m]
-    moved = [replace(anchor, position_m=at) for anchor, at in zip(planned.anchors, out, strict=True)]
-    return replace(planned, anchors=tuple(moved))
+    moved = zip(planned.anchors, _farther_out(planned.trajectory, planned.anchors_m), strict=True)
+    return replace(planned, anchors=tuple(replace(anchor, position_m=at) for anchor, at in moved))
+
+
+def _farther_out(path: Trajectory, places_m: Array) -> Array:
+    """(n, 3) from the middle of the path, at the same heights."""
+    middle = path.centers.mean(axis=0)
+    return np.asarray(middle + (places_m - middle) * [_WIDER, _WIDER, 1.0])
 
 
 def _raised(planned: PlannedSurvey) -> Iterator[_Change]:
@@ -173,20 +170,17 @@ def _raised(planned: PlannedSurvey) -> Iterator[_Change]:
         for by_m in _RAISED_M:
             place = planned.anchors_m[k] + [0.0, 0.0, by_m]
             if lowest_m <= place[2] <= highest_m:
-                moved = (*planned.anchors[:k], replace(anchor, position_m=place), *planned.anchors[k + 1 :])
-                how = f"{'raise' if by_m > 0 else 'lower'} anchor {anchor.anchor_id} by {abs(by_m):g} m"
-                yield _Change(
-                    "anchor height", anchor.anchor_id, f"{how}, to {place[2]:g} m", replace(planned, anchors=moved)
-                )
+                verb = "raise" if by_m > 0 else "lower"
+                words = f"{verb} anchor {anchor.anchor_id} by {abs(by_m):g} m, to {place[2]:g} m"
+                yield "anchor height", anchor.anchor_id, words, planned.with_anchor_at(k, place)
 
 
 def _moved(planned: PlannedSurvey) -> Iterator[_Change]:
     """To where somebody allowed it."""
     for k, anchor in enumerate(planned.anchors if planned.allowed_m is not None else ()):
         for place in _free_places(planned):
-            moved = (*planned.anchors[:k], replace(anchor, position_m=place), *planned.anchors[k + 1 :])
             words = f"move anchor {anchor.anchor_id} to {_told(place)}"
-            yield _Change("anchor place", anchor.anchor_id, words, replace(planned, anchors=moved))
+            yield "anchor place", anchor.anchor_id, words, planned.with_anchor_at(k, place)
 
 
 def _with_one_more(planned: PlannedSurvey) -> Iterator[_Change]:
@@ -196,7 +190,7 @@ def _with_one_more(planned: PlannedSurvey) -> Iterator[_Change]:
     for place in _free_places(planned):
         more = (*planned.anchors, Anchor(name, place, stddev_m))
         words = f"add an anchor at {_told(place)}"
-        yield _Change("one more anchor", "", words, replace(planned, anchors=more))
+        yield "one more anchor", "", words, replace(planned, anchors=more)
 
 
 def _free_places(planned: PlannedSurvey) -> list[Array]:
@@ -216,8 +210,7 @@ def _told(place: Array) -> str:
 
 
 def _up_and_down(path: Trajectory) -> Trajectory:
-    steps = np.linalg.norm(np.diff(path.centers, axis=0), axis=1)
-    way = np.concatenate([[0.0], np.cumsum(steps)])
+    way = way_along(path.centers)
     wave = _UP_AND_DOWN_M * np.sin(2 * np.pi * _NUM_WAVES * way / max(float(way[-1]), 1e-9))
     return replace(path, centers=path.centers + wave[:, None] * [0.0, 0.0, 1.0])
 
@@ -237,7 +230,5 @@ def _wider(path: Trajectory) -> Trajectory:
     """About its middle, at the same speed; photos as far apart in time as they were."""
     times = path.timestamps_s
     assert times is not None
-    middle = path.centers.mean(axis=0)
-    factor = np.array([_WIDER, _WIDER, 1.0])
-    centers = middle + (path.centers - middle) * factor
-    return replace(path, centers=centers, timestamps_s=times[0] + _WIDER * (times - times[0]))
+    out = _farther_out(path, path.centers)
+    return replace(path, centers=out, timestamps_s=times[0] + _WIDER * (times - times[0]))

@@ -23,7 +23,7 @@ from rangesfm.scale.estimate import ScaleUncertainty
 from rangesfm.scale.initialize import model_from_cam, placement_covariance
 from rangesfm.scale.lengths import BENDING
 from rangesfm.scale.problem import ScaleProblem
-from rangesfm.scale.range_equation import RangeFit, fit_at, range_jacobian, tag_positions
+from rangesfm.scale.range_equation import RangeFit, RangeState, fit_at, range_jacobian, tag_positions
 from rangesfm.scale.solution import Solution, refuse_ambiguity, weighted
 from rangesfm.scale.uncertainty import (
     errors_to_expect,
@@ -50,7 +50,6 @@ class Expected:
         observations: simulated ranges. posed: the problem. solution: the fit, at the truth.
         learned: what the ranges will get wrong.
         uncertainty: of the scale.
-        covariance: (p, p) of all that the fit estimates.
         placement: (7, 7) as of a ScaleEstimate; None without a place in the site.
         by_ranges: (7, 7) the same by the ranges alone, whatever the map bends; of the scale where the frame is the
             first camera's.
@@ -63,7 +62,6 @@ class Expected:
     solution: Solution
     learned: LearnedErrors
     uncertainty: ScaleUncertainty
-    covariance: Array
     placement: Array | None
     by_ranges: Array
     bends_m: Array
@@ -142,26 +140,27 @@ def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expect
     Raises:
         GeometryError: the run will find too few ranges on the path.
     """
-    observations = planned.observations()
+    path, observations = planned.trajectory, planned.observations()
     posed = planned.posed(observations)
     state = planned.state(posed, observations.log.anchor_ids)
     num_alike = np.full(len(posed.rows), float(planned.num_alike))
     tags, scale = tag_positions(posed.ranges, state.metric_from_model), state.metric_from_model.scale
     errors = posed.errors.at(tags, scale * posed.center_stddev)
-    solution = _weighed(posed, errors, fit_at(weighted(posed.ranges, errors), state, num_alike))
-    rotations = model_from_cam(observations, planned.trajectory, posed)
-    made = _planned_map(planned, posed, observations)
+    solution = _at_the_truth(posed, errors, state, num_alike)
+    rotations, made = model_from_cam(observations, path, posed), None
+    if planned.photos is not None:
+        made = PlannedMap(path, planned.photos.information(path), posed, observations, planned.tag_in_cam_m)
     stddevs = usual_stddevs(is_calibrated=planned.curve_stddev_m is not None) | dict(planned.component_stddevs)
     if made is not None:
         stddevs["bending"] = float(np.hypot(stddevs["bending"], made.bend_m(solution)))
     learned = errors_to_expect(posed, solution, observations, rotations, stddevs, max_num_cells)
     for _ in range(_NUM_NOISE_ROUNDS):
         errors = _as_seen(solution, learned, num_alike)
-        solution = _weighed(posed, errors, fit_at(weighted(posed.ranges, errors), state, num_alike))
+        solution = _at_the_truth(posed, errors, state, num_alike)
     open_m2 = _undetermined(solution.fit)
-    covariance = parameter_covariance(solution, learned) + open_m2
     uncertainty = expected_scale_uncertainty(solution, learned, BENDING)
-    placement, bends_m = placement_covariance(solution, covariance), np.zeros(len(planned.trajectory))
+    placement = placement_covariance(solution, parameter_covariance(solution, learned) + open_m2)
+    bends_m = np.zeros(len(path))
     others = learned if made is None else learned.without("bending")
     by_ranges = placement_covariance(solution, parameter_covariance(solution, others) + open_m2)
     if by_ranges is None:
@@ -170,20 +169,12 @@ def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expect
     if made is not None:
         straightened = replace(solution, errors=_as_seen(solution, others, num_alike))
         bends_m = made.bends_m(straightened, others, planned.num_alike)
-    return Expected(
-        planned, observations, posed, solution, learned, uncertainty, covariance, placement, by_ranges, bends_m
-    )
+    return Expected(planned, observations, posed, solution, learned, uncertainty, placement, by_ranges, bends_m)
 
 
-def _planned_map(planned: PlannedSurvey, posed: ScaleProblem, observations: RangeObservations) -> PlannedMap | None:
-    if planned.photos is None:
-        return None
-    path = planned.trajectory
-    return PlannedMap(path, planned.photos.information(path), posed, observations, planned.tag_in_cam_m)
-
-
-def _weighed(posed: ScaleProblem, errors: RangeErrors, fit: RangeFit) -> Solution:
-    return Solution(weighted(posed.ranges, errors), fit, errors, errors.noise_m)
+def _at_the_truth(posed: ScaleProblem, errors: RangeErrors, state: RangeState, num_alike: Array) -> Solution:
+    problem = weighted(posed.ranges, errors)
+    return Solution(problem, fit_at(problem, state, num_alike), errors, errors.noise_m)
 
 
 def _undetermined(fit: RangeFit) -> Array:
@@ -207,7 +198,7 @@ def _as_seen(solution: Solution, learned: LearnedErrors, num_alike: Array) -> Ra
     design = cells.mean(range_jacobian(ones, solution.fit.columns[0], solution.fit.state, solution.fit.state))
     left = np.eye(len(cells)) - design @ parameter_influence(solution.fit, problem, learned)
     residuals_m2 = left @ learned.covariance_m2 @ left.T
-    white_m2 = _white_m2(learned)
+    white_m2 = np.diag(learned.covariances_m2[learned.names.index("white")]) * cells.worth  # (c,) of single ranges
     together_m2 = np.maximum(np.diag(residuals_m2), 1e-12)
     alone_m2 = white_m2 * (1 - 1 / np.maximum(cells.worth, 1.0))
     ordinary = np.hypot(errors.shared_m, errors.placing_m) < START_STDDEV_M
@@ -225,9 +216,3 @@ def _as_seen(solution: Solution, learned: LearnedErrors, num_alike: Array) -> Ra
     apart = float(np.sum(cells.total(num_alike * share / stddev_m**2) * (together_m2 + alone_m2)))
     inflation = max(float(np.sqrt(in_groups / apart)), 1.0)
     return replace(errors, stddev_m=stddev_m, share=share, inflation=inflation, noise_m=float(np.sqrt(noise_m2)))
-
-
-def _white_m2(learned: LearnedErrors) -> Array:
-    """(c,) variance of single ranges."""
-    white: Array = np.diag(learned.covariances_m2[learned.names.index("white")]) * learned.cells.worth
-    return white

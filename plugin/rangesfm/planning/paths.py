@@ -33,16 +33,25 @@ def path_through(
     steps = np.linalg.norm(np.diff(corners, axis=0), axis=1)
     if not steps.sum() > 0:
         raise OptionError("[path] waypoints go nowhere, expected two different places or more", "path", "waypoints")
-    kept = np.concatenate([[True], steps > 0])
-    way = np.concatenate([[0.0], np.cumsum(steps)])[kept]
-    corners = corners[kept]
+    corners = corners[np.append(True, steps > 0)]
+    way = way_along(corners)
     num = int(way[-1] / speed_m_per_s * photo_rate_hz) + 1
     _require_possible(num)
     times = np.arange(num) / photo_rate_hz
     at = speed_m_per_s * times
-    centers = np.column_stack([np.interp(at, way, column) for column in corners.T])
+    centers = places_on_way(at, way, corners)
     leg = np.clip(np.searchsorted(way, at, side="right") - 1, 0, len(corners) - 2)
     return _trajectory(times, centers, _looking(np.diff(corners, axis=0)[leg]))
+
+
+def way_along(corners: Array) -> Array:
+    """(n,) how far it is from the first of n corners to each, from one straight to the next."""
+    return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1)))
+
+
+def places_on_way(at: Array, way: Array, corners: Array) -> Array:
+    """(k, d) so far along the (n, d) corners, to which ``way`` is the way."""
+    return np.column_stack([np.interp(at, way, column) for column in corners.T])
 
 
 def loop_inside(corners_m: Sequence[Sequence[float]], heights_m: tuple[float, float]) -> list[tuple[float, ...]]:
@@ -54,9 +63,9 @@ def loop_inside(corners_m: Sequence[Sequence[float]], heights_m: tuple[float, fl
     corners = np.array(corners_m, dtype=np.float64)
     closed = np.vstack([corners, corners[:1]])
     sides = np.linalg.norm(np.diff(closed, axis=0), axis=1)
-    way = np.append(0.0, np.cumsum(sides))
+    way = way_along(closed)
     at = np.linspace(0.0, way[-1], max(int(_LOOP_SHARE * way[-1] / _LOOP_STEP_M), 4 * _NUM_WAVES) + 1)
-    outline = np.column_stack([np.interp(at, way, column) for column in closed.T])
+    outline = places_on_way(at, way, closed)
     middle = sides @ (closed[:-1] + closed[1:]) / (2 * max(float(way[-1]), 1e-9))
     low, high = heights_m
     heights = (low + high) / 2 + (high - low) / 2 * np.sin(2 * np.pi * _NUM_WAVES * at / max(float(way[-1]), 1e-9))

@@ -43,10 +43,10 @@ _NUM_BENT = 40
 _NO_MOTION = 1e-6
 
 
-def _ascending(distances: tuple[float, float]) -> tuple[float, float]:
-    if not distances[0] < distances[1]:
+def ascending(ends: tuple[float, float]) -> tuple[float, float]:
+    if not ends[0] < ends[1]:
         raise ValueError("are not ascending")
-    return distances
+    return ends
 
 
 _Distance = Annotated[float, Field(ge=0.01, le=1e4)]
@@ -60,7 +60,7 @@ class PlannedPhotos(Options):
     field_of_view_deg: Annotated[float, Field(ge=5, le=170)] = 65.0
     """From the left edge of a photo to the right one."""
     seen_m: Annotated[
-        Annotated[tuple[_Distance, _Distance], Field(strict=False), AfterValidator(_ascending)],
+        Annotated[tuple[_Distance, _Distance], Field(strict=False), AfterValidator(ascending)],
         Told(expected="a list of 2 distances, the larger one last"),
     ] = (1.5, 8.0)
     """Nearest and farthest of what it sees."""
@@ -82,12 +82,12 @@ class PlannedPhotos(Options):
         """What they say of a path."""
         return vision_information(self.observations(path), Poses(path.world_from_cam, path.centers))
 
-    def observations(self, path: Trajectory, seed: int = 0) -> Observations:
+    def observations(self, path: Trajectory) -> Observations:
         """Of points that fill each photo of a path, evenly over it and over the logarithm of depth.
 
         They are so few that each stands for several, and exact.
         """
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(0)
         num = min(self.num_points, max(_NUM_COMPUTED // len(path), _LEAST_COMPUTED))
         wanted = np.full(len(path), num)
         points: list[Array] = []

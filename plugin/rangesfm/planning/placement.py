@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.planning.expected import compare
+from rangesfm.planning.paths import places_on_way, way_along
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.progress import Progress, SilentProgress
 from rangesfm.ranging.anchors.anchor import Anchor
@@ -32,12 +32,12 @@ def places_in_box(low_m: Sequence[float], high_m: Sequence[float]) -> Array:
 def places_on_walls(walls_m: Sequence[Sequence[Sequence[float]]], heights_m: tuple[float, float]) -> Array:
     """(k, 3) evenly along walls, each from corner to corner as seen from above, at two heights."""
     walls = [np.array(wall, dtype=np.float64) for wall in walls_m]
-    ways = [np.append(0.0, np.cumsum(np.linalg.norm(np.diff(wall, axis=0), axis=1))) for wall in walls]
+    ways = [way_along(wall) for wall in walls]
     step = sum(way[-1] for way in ways) / _NUM_ALONG_WALLS
     spots = []
     for wall, way in zip(walls, ways, strict=True):
         at = np.linspace(0.0, way[-1], max(round(way[-1] / step), 1) + 1)
-        spots.append(np.column_stack([np.interp(at, way, column) for column in wall.T]))
+        spots.append(places_on_way(at, way, wall))
     # A wall that comes back to its start ends where it began.
     distinct = np.unique(np.round(np.vstack(spots), 6), axis=0)
     return np.vstack([np.insert(distinct, 2, height, axis=1) for height in heights_m])
@@ -79,8 +79,7 @@ def place_anchors(planned: PlannedSurvey, progress: Progress | None = None) -> P
             for place in planned.allowed_m:
                 if np.linalg.norm(planned.anchors_m - place, axis=1).min() == 0:
                     continue
-                moved = replace(planned.anchors[k], position_m=place)
-                tried = replace(planned, anchors=(*planned.anchors[:k], moved, *planned.anchors[k + 1 :]))
+                tried = planned.with_anchor_at(k, place)
                 badness = _badness(tried)
                 if badness < best - _LEAST_GAIN:
                     planned, best = tried, badness

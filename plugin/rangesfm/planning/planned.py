@@ -88,6 +88,11 @@ class PlannedSurvey:
         """That the radio will measure."""
         return int(self.duration_s * self.rate_hz) * len(self.anchors)
 
+    def with_anchor_at(self, k: int, place_m: Array) -> PlannedSurvey:
+        """The same with its k-th anchor elsewhere."""
+        moved = replace(self.anchors[k], position_m=place_m)
+        return replace(self, anchors=(*self.anchors[:k], moved, *self.anchors[k + 1 :]))
+
     def ranging(self, num_ranges: int) -> PlannedSurvey:
         """The same at such a rate that so many ranges come of it."""
         return replace(self, rate_hz=(num_ranges / len(self.anchors) + 0.5) / self.duration_s)
@@ -125,15 +130,9 @@ class PlannedSurvey:
         """
         from_site = self._site_from_first_camera.inverse() if self.anchor_frame == "first_camera" else IDENTITY
         told = [replace(a, position_m=from_site.apply(at)) for a, at in zip(self.anchors, self.anchors_m, strict=True)]
-        return scale_problem(
-            observations, self.trajectory, told, self.anchor_frame, self.range_model, self._located_distances()
-        )
-
-    def _located_distances(self) -> LocatedDistances | None:
-        if not self.taped:
-            return None
-        lengths, stddevs = np.array(self.taped, dtype=np.float64).T
-        return LocatedDistances.of(lengths, stddevs, model_length=lengths)
+        lengths, stddevs = np.array(self.taped, dtype=np.float64).reshape(-1, 2).T
+        taped = LocatedDistances.of(lengths, stddevs, model_length=lengths) if self.taped else None
+        return scale_problem(observations, self.trajectory, told, self.anchor_frame, self.range_model, taped)
 
     def state(self, posed: ScaleProblem, anchor_ids: tuple[str, ...]) -> RangeState:
         """The truth, in the frame of the problem."""

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, Field
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, OptionError
@@ -15,7 +15,7 @@ from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.option_model import Options, Told
 from rangesfm.options import RangeModelOptions, TagOptions
 from rangesfm.planning.paths import loop_inside, path_from_file, path_from_model, path_through
-from rangesfm.planning.photos import MAX_NUM_PHOTOS, PlannedPhotos
+from rangesfm.planning.photos import MAX_NUM_PHOTOS, PlannedPhotos, ascending
 from rangesfm.planning.placement import places_in_box, places_on_walls, spread_anchors
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
@@ -32,12 +32,6 @@ _MAX_NUM_ANCHORS = 64
 _MAX_DURATION_S = 1e5
 
 
-def _ascending(heights: tuple[float, float]) -> tuple[float, float]:
-    if not heights[0] < heights[1]:
-        raise ValueError("are not ascending")
-    return heights
-
-
 def _going_somewhere(corners: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
     if len(set(corners)) < 2:
         raise ValueError("are one place")
@@ -50,10 +44,8 @@ def _corners(corners: tuple[tuple[float, ...], tuple[float, ...]]) -> tuple[tupl
     return corners
 
 
-_Heights = Annotated[tuple[_Coordinate, _Coordinate], Field(strict=False), AfterValidator(_ascending)]
+_Heights = Annotated[tuple[_Coordinate, _Coordinate], Field(strict=False), AfterValidator(ascending)]
 _HEIGHTS = Told(expected="a list of 2 numbers, the larger one last")
-
-
 _Corners = Annotated[tuple[_Spot, ...], Field(strict=False), AfterValidator(_going_somewhere)]
 
 
@@ -133,22 +125,6 @@ class PlannedRadioOptions(RangeModelOptions):
     """Of components of the ranges' errors by name, as in result.json (default: as the radio is like)."""
 
 
-class Plan(BaseModel):
-    """A plan's tables.
-
-    Attributes:
-        anchors, path, radio, tag: its tables. photos: None where it has no such table.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    anchors: PlannedAnchorOptions
-    path: PlannedPathOptions
-    radio: PlannedRadioOptions
-    tag: TagOptions
-    photos: PlannedPhotos | None
-
-
 TABLES: dict[str, type[Options]] = {
     "anchors": PlannedAnchorOptions,
     "path": PlannedPathOptions,
@@ -174,7 +150,7 @@ def read_plan(path: str | Path) -> PlannedSurvey:
             for name, model in TABLES.items()
             if name != "photos" or name in tables
         }
-        return _planned(Plan(**{"photos": None, **options}))
+        return _planned(**options)
 
 
 def _absolute(table: dict[str, Any], model: type[Options], folder: Path) -> dict[str, Any]:
@@ -186,8 +162,13 @@ def _absolute(table: dict[str, Any], model: type[Options], folder: Path) -> dict
     }
 
 
-def _planned(plan: Plan) -> PlannedSurvey:
-    path, radio, tag = plan.path, plan.radio, plan.tag
+def _planned(
+    anchors: PlannedAnchorOptions,
+    path: PlannedPathOptions,
+    radio: PlannedRadioOptions,
+    tag: TagOptions,
+    photos: PlannedPhotos | None = None,
+) -> PlannedSurvey:
     if tag.lever_arms_m:
         raise OptionError(
             "[tag] lever_arms_m is given, expected tag_in_cam_m: a plan has one tag", "tag", "lever_arms_m"
@@ -196,11 +177,11 @@ def _planned(plan: Plan) -> PlannedSurvey:
     if unknown := [name for name in radio.stddevs if name not in known]:
         message = f"[radio] stddevs: there is no component {unknown[0]!r}, expected some of {', '.join(known)}"
         raise OptionError(message, "radio", f"stddevs.{unknown[0]}")
-    allowed_m = _allowed(plan.anchors)
+    allowed_m = _allowed(anchors)
     planned = PlannedSurvey(
         trajectory=_path(path),
-        anchors=_anchors(plan.anchors, allowed_m),
-        anchor_frame=plan.anchors.frame,
+        anchors=_anchors(anchors, allowed_m),
+        anchor_frame=anchors.frame,
         rate_hz=radio.rate_hz,
         tag_in_cam_m=tag.tag_in_cam_m,
         range_model=RangeModelOptions(
@@ -208,11 +189,11 @@ def _planned(plan: Plan) -> PlannedSurvey:
         ),
         curve_stddev_m=radio.curve_stddev_m,
         component_stddevs=({} if radio.like is None else stddevs_in(radio.like)) | radio.stddevs,
-        photos=plan.photos,
-        heights_m=plan.anchors.heights_m,
+        photos=photos,
+        heights_m=anchors.heights_m,
         path_is_level=path.is_level,
         allowed_m=allowed_m,
-        is_placed=plan.anchors.num_to_place is None,
+        is_placed=anchors.num_to_place is None,
     )
     if planned.duration_s > _MAX_DURATION_S:
         message = f"[path] takes {planned.duration_s:.3g} s, expected at most {_MAX_DURATION_S:g}"
@@ -223,12 +204,15 @@ def _planned(plan: Plan) -> PlannedSurvey:
     return planned
 
 
-def _path(path: PlannedPathOptions) -> Trajectory:
-    names = ("waypoints", "loop_inside_m", "file", "model")
-    given = [name for name in names if getattr(path, name) is not None]
+def _require_one(options: Options, *names: str) -> None:
+    given = [name for name in names if getattr(options, name) not in (None, {})]
     if len(given) != 1:
-        found = " and ".join(given) or "none"
-        raise OptionError(f"[path] has {found} of waypoints, loop_inside_m, file and model, expected one", "path")
+        found, known = " and ".join(given) or "none", f"{', '.join(names[:-1])} and {names[-1]}"
+        raise OptionError(f"[{options.table}] has {found} of {known}, expected one", options.table)
+
+
+def _path(path: PlannedPathOptions) -> Trajectory:
+    _require_one(path, "waypoints", "loop_inside_m", "file", "model")
     if path.file is not None:
         return path_from_file(path.file, path.photo_rate_hz)
     if path.model is not None:
@@ -247,10 +231,7 @@ def _allowed(options: PlannedAnchorOptions) -> Array | None:
 
 
 def _anchors(options: PlannedAnchorOptions, allowed_m: Array | None) -> tuple[Anchor, ...]:
-    given = [name for name in ("path", "places", "num_to_place") if getattr(options, name)]
-    if len(given) != 1:
-        found = " and ".join(given) or "none"
-        raise OptionError(f"[anchors] has {found} of path, places and num_to_place, expected one", "anchors")
+    _require_one(options, "path", "places", "num_to_place")
     if options.num_to_place is not None:
         num_allowed = 0 if allowed_m is None else len(allowed_m)
         if allowed_m is None or num_allowed < options.num_to_place:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from rangesfm.trust.linearized import linearized, ranges_on_map
 from rangesfm.trust.testing import Factorization, MistakeTest, row_of
 
 _MAX_NUM_SHOWN = 5
+# Of a mistake; what the ranges say of it is not known before they are measured.
+_SIZES = ("smallest_detectable", "effect_on_scale", "effect_on_place_m")
 
 
 @dataclass(frozen=True)
@@ -37,36 +40,6 @@ class PlannedPlace:
 
 
 @dataclass(frozen=True)
-class DetectableMistake:
-    """A mistake that may be made, as of a MistakeTest: None where there is no limit.
-
-    Attributes:
-        name, subject: of which kind, and of what.
-        unit: of ``smallest_detectable``; "1": a share.
-        smallest_detectable: that will be found, in four cases of five.
-        effect_on_scale, effect_on_place_m: the most that one of that size does.
-    """
-
-    name: str
-    subject: str
-    unit: str
-    smallest_detectable: float | None
-    effect_on_scale: float | None
-    effect_on_place_m: float | None
-
-    @classmethod
-    def of(cls, test: MistakeTest) -> DetectableMistake:
-        return cls(
-            test.name,
-            test.subject,
-            test.unit,
-            _limited(test.smallest_detectable),
-            _limited(test.effect_on_scale),
-            _limited(test.effect_on_place_m),
-        )
-
-
-@dataclass(frozen=True)
 class SurveyPlan:
     """What a run of the planned survey will state.
 
@@ -80,7 +53,7 @@ class SurveyPlan:
         place: None where the frame is the first camera's.
         keyframe_stddevs_m: (n,) of each keyframe's place in that frame.
         verdict, reasons: on the scale, as the run will judge it; "doubtful" too where it will leave the place open.
-        mistakes: what would be found of each, those that do most first.
+        mistakes: what would be found of each, and do then, those that do most first; None: without limit.
         advice: changes that would gain something.
         expected: the estimate that all this is of.
     """
@@ -97,19 +70,19 @@ class SurveyPlan:
     keyframe_stddevs_m: tuple[float, ...]
     verdict: str
     reasons: tuple[str, ...]
-    mistakes: tuple[DetectableMistake, ...]
+    mistakes: tuple[MistakeTest, ...]
     advice: tuple[Advice, ...]
     expected: Expected = field(repr=False)
 
     @property
     def advice_for_scale(self) -> list[Advice]:
         """What gains most for the scale first."""
-        return ranked(self.advice, lambda advice: advice.scale_gain)
+        return ranked(self.advice, attrgetter("scale_gain"))
 
     @property
     def advice_for_place(self) -> list[Advice]:
         """What gains most for the place of the keyframe known least first."""
-        return ranked(self.advice, lambda advice: advice.place_gain)
+        return ranked(self.advice, attrgetter("place_gain"))
 
     @property
     def lines(self) -> list[str]:
@@ -120,7 +93,9 @@ class SurveyPlan:
         """What is infinite or not a number is null; advice in both orders."""
         content: dict[str, Any] = _finite(self)
         del content["advice"]
+        names = ("name", "subject", "unit", *_SIZES)
         return content | {
+            "mistakes": [{name: each[name] for name in names} for each in content["mistakes"]],
             "advice_for_scale": _finite(self.advice_for_scale),
             "advice_for_place": _finite(self.advice_for_place),
         }
@@ -134,7 +109,7 @@ def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
     """
     expected = expect(planned)
     verdict = expected.verdict
-    open_place = [why for why in [expected.mirror_image()] if why is not None]
+    open_place = expected.mirror_image()
     half_width = expected.uncertainty.half_width_95
     return SurveyPlan(
         num_ranges=planned.num_ranges,
@@ -148,7 +123,7 @@ def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
         place=_place(expected),
         keyframe_stddevs_m=tuple(expected.keyframe_stddevs_m.tolist()),
         verdict="doubtful" if open_place else verdict.verdict,
-        reasons=(*(f"a run will give the scale only: {why}" for why in open_place), *verdict.reasons),
+        reasons=(*([f"a run will give the scale only: {open_place}"] if open_place else []), *verdict.reasons),
         mistakes=_mistakes(expected),
         advice=advise(expected),
         expected=expected,
@@ -170,17 +145,17 @@ def _place(expected: Expected) -> PlannedPlace | None:
     )
 
 
-def _mistakes(expected: Expected) -> tuple[DetectableMistake, ...]:
+def _mistakes(expected: Expected) -> tuple[MistakeTest, ...]:
     """Of every mistake that lasts for the whole survey; that it was made is not tested, as nothing was measured."""
     on_map = ranges_on_map(expected.posed, expected.solution, expected.observations, expected.planned.trajectory)
     problem = replace(linearized(on_map, expected.learned.cells), errors=expected.learned)
     hypotheses = [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
-    found = [DetectableMistake.of(row_of(test)) for test in Factorization(problem).test(hypotheses, seed=0)]
-    return tuple(sorted(found, key=lambda each: -_most(each)))
-
-
-def _most(mistake: DetectableMistake) -> float:
-    return np.inf if mistake.effect_on_scale is None else mistake.effect_on_scale
+    found = []
+    for test in Factorization(problem).test(hypotheses, seed=0):
+        row = row_of(test)
+        unlimited: dict[str, Any] = {name: None for name in _SIZES if (getattr(row, name) or 0.0) > OPEN}
+        found.append(replace(row, **unlimited))
+    return tuple(sorted(found, key=lambda each: -np.inf if each.effect_on_scale is None else -each.effect_on_scale))
 
 
 def _known(plan: SurveyPlan) -> Iterator[str]:
@@ -192,11 +167,11 @@ def _known(plan: SurveyPlan) -> Iterator[str]:
     yield from (f"  {reason}" for reason in plan.reasons)
     if plan.place is not None:
         place = plan.place
-        x, y, z = (_metres(stddev_m) for stddev_m in place.stddev_m)
+        x, y, z = (_rough(stddev_m) for stddev_m in place.stddev_m)
         yield (
-            f"place: x {x}, y {y}, z {z}, heading {_degrees(place.heading_stddev_deg)}, tilt "
-            f"{_degrees(place.tilt_stddev_deg)}; keyframe {place.worst_keyframe} is known least, to "
-            f"{_metres(place.worst_keyframe_stddev_m)} (1 stddev)"
+            f"place: x {x}, y {y}, z {z}, heading {_rough(place.heading_stddev_deg, 'deg')}, tilt "
+            f"{_rough(place.tilt_stddev_deg, 'deg')}; keyframe {place.worst_keyframe} is known least, to "
+            f"{_rough(place.worst_keyframe_stddev_m)} (1 stddev)"
         )
 
 
@@ -208,7 +183,7 @@ def _budget(plan: SurveyPlan) -> Iterator[str]:
 
 def _found(plan: SurveyPlan) -> Iterator[str]:
     yield "mistakes just too small to be found, and the most that they would do:"
-    of_kind: dict[str, DetectableMistake] = {}
+    of_kind: dict[str, MistakeTest] = {}
     for mistake in plan.mistakes:
         of_kind.setdefault(mistake.name, mistake)
     for mistake in list(of_kind.values())[:_MAX_NUM_SHOWN]:
@@ -219,32 +194,22 @@ def _found(plan: SurveyPlan) -> Iterator[str]:
         unit = "" if mistake.unit == "1" else f" {mistake.unit}"
         scale = "open" if mistake.effect_on_scale is None else f"{100 * mistake.effect_on_scale:.2g} %"
         place_m = np.inf if mistake.effect_on_place_m is None else mistake.effect_on_place_m
-        yield f"{what}: {mistake.smallest_detectable:.2g}{unit}; scale {scale}, place {_metres(place_m)}"
+        yield f"{what}: {mistake.smallest_detectable:.2g}{unit}; scale {scale}, place {_rough(place_m)}"
 
 
 def _advised(plan: SurveyPlan) -> Iterator[str]:
     if not plan.advice:
         yield "no single change gains much"
-    if for_scale := plan.advice_for_scale[:_MAX_NUM_SHOWN]:
-        yield "what would gain most for the scale:"
-        for number, advice in enumerate(for_scale, 1):
-            yield f"  {number}. {advice.words}: +-{100 * advice.scale_stddev:.2g} %"
-    if for_place := plan.advice_for_place[:_MAX_NUM_SHOWN]:
-        yield "what would gain most for the place of the keyframe known least:"
-        for number, advice in enumerate(for_place, 1):
-            yield f"  {number}. {advice.words}: {_metres(advice.place_stddev_m)}"
+    for_scale = [f"{each.words}: +-{100 * each.scale_stddev:.2g} %" for each in plan.advice_for_scale]
+    for_place = [f"{each.words}: {_rough(each.place_stddev_m)}" for each in plan.advice_for_place]
+    for what, best in {"the scale": for_scale, "the place of the keyframe known least": for_place}.items():
+        if best:
+            yield f"what would gain most for {what}:"
+        yield from (f"  {number}. {words}" for number, words in enumerate(best[:_MAX_NUM_SHOWN], 1))
 
 
-def _limited(value: float | None) -> float | None:
-    return None if value is None or value > OPEN else value
-
-
-def _metres(stddev_m: float) -> str:
-    return f"{stddev_m:.2g} m" if np.isfinite(stddev_m) else "open"
-
-
-def _degrees(stddev_deg: float) -> str:
-    return f"{stddev_deg:.2g} deg" if np.isfinite(stddev_deg) else "open"
+def _rough(stddev: float, unit: str = "m") -> str:
+    return f"{stddev:.2g} {unit}" if np.isfinite(stddev) else "open"
 
 
 def _finite(value: Any) -> Any:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rangesfm.files.atomic import new_file, sole_writer
+from rangesfm.files.atomic import sole_writer
+from rangesfm.report.chart import write_pictures
 from rangesfm.report.content import Content
-from rangesfm.report.page import figures_of, render_report
-from rangesfm.report.pictures import write_pictures
+from rangesfm.report.page import figures_of, render_report, write_page
 from rangesfm.result.folder import read_result_folder
 
 __all__ = ["write_report", "write_report_pictures"]
-
-PICTURES_FOLDER = "figures"
 
 
 def write_report(result_folder: Path, *, images_path: Path | None = None) -> Path:
@@ -32,9 +30,8 @@ def write_report(result_folder: Path, *, images_path: Path | None = None) -> Pat
     """
     result = read_result_folder(result_folder)
     path = result_folder / "report.html"
-    with sole_writer(result_folder), new_file(path) as temporary:
-        page = render_report(Content(result, images_path=images_path))
-        temporary.write_text(page, encoding="utf-8", errors="xmlcharrefreplace")
+    with sole_writer(result_folder):
+        write_page(render_report(Content(result, images_path=images_path)), path)
     return path
 
 
@@ -46,4 +43,4 @@ def write_report_pictures(result_folder: Path) -> list[Path]:
     """
     result = read_result_folder(result_folder)
     with sole_writer(result_folder):
-        return write_pictures(figures_of(Content(result)), result_folder / PICTURES_FOLDER)
+        return write_pictures(figures_of(Content(result)), result_folder / "figures")

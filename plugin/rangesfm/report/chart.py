@@ -1,11 +1,12 @@
-"""A panel as a Vega-Lite specification: what the page and a paper draw alike."""
+"""Figures as Vega-Lite specifications: what the page draws, and alike the pictures for a paper."""
 
 from __future__ import annotations
 
-import base64
-import io
+import json
 import math
+import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -13,8 +14,10 @@ import numpy as np
 from PIL import Image
 
 from rangesfm.arrays import Array
-from rangesfm.report.plot import Figure, Mark, Panel, Pixels, Range, Series
-from rangesfm.report.scene import pack
+from rangesfm.errors import InputError
+from rangesfm.files.atomic import make_output_folder, new_file
+from rangesfm.report.plot import Figure, Mark, Panel, Range, Series
+from rangesfm.report.scene import data_uri, pack
 
 ASSETS = Path(__file__).with_name("assets")
 Spec: TypeAlias = dict[str, Any]
@@ -26,6 +29,12 @@ ZOOM: Spec = {
     # A wheel alone scrolls the page; with a key, or when two fingers pinch, it zooms. A double click goes back.
     "select": {"type": "interval", "zoom": "wheel![event.ctrlKey || event.metaKey]"},
 }
+
+# Of a picture for a paper; and the width of its panels at most, for text to have the size that papers have.
+PNG_SCALE, MAX_WIDTH_PX = 2.5, 660.0
+FORMATS = ("png", "svg")
+_NUM_COLUMNS = {"single": 1, "views": 2, "panels": 3}
+_SYMBOLS = {"dots": "circle", "disc": "circle", "triangle": "triangle-up"}
 
 _NUM_PICTURE_COLORS = 128
 _MAP_DOT_PX, _DOT_PX = 1.6, 2.8
@@ -133,7 +142,8 @@ def _background(panel: Panel, x_range: Range, y_range: Range) -> list[Spec]:
     if panel.picture is not None:
         corners = dict(zip(("x", "x2", "y", "y2"), (*x_range, *y_range)))
         encoding = to_x2 | {"y2": {"field": "y2"}}
-        layers.append(_layer("image", [corners], encoding, url=_png(panel.picture), aspect=False))
+        colors = Image.fromarray(panel.picture).quantize(_NUM_PICTURE_COLORS, method=Image.Quantize.FASTOCTREE)
+        layers.append(_layer("image", [corners], encoding, url=data_uri(colors, "PNG"), aspect=False))
     if panel.band is not None:
         _, low, high = panel.band
         layers.append(_layer("rect", [{"x": low, "x2": high}], to_x2 | {"y": None}, color=css("interval")))
@@ -142,13 +152,6 @@ def _background(panel: Panel, x_range: Range, y_range: Range) -> list[Spec]:
     if panel.line is not None:
         layers.append(_layer("rule", [{"x": panel.line[1]}], {"y": None}, color=css("ink"), size=1.5))
     return layers
-
-
-def _png(picture: Pixels) -> str:
-    file = io.BytesIO()
-    colors = Image.fromarray(picture).quantize(_NUM_PICTURE_COLORS, method=Image.Quantize.FASTOCTREE)
-    colors.save(file, "PNG", optimize=True)
-    return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode("ascii")
 
 
 def _series(series: Series, data: Spec, y_range: Range) -> Spec:
@@ -186,8 +189,7 @@ def _labels(panel: Panel) -> list[Spec]:
         for side, (x, align, limit) in {"left": left, "right": right}.items():
             how = _LABEL | {"clip": False, "align": align, "limit": limit - 8}
             layers.append(_layer("text", rows, {"x": {"value": x}, "text": {"field": side}}, **how))
-    symbols = {"disc": "circle", "triangle": "triangle-up"}
-    marks = [{"x": m.x, "y": m.y, "shape": symbols[m.shape], "color": css(m.color)} for m in panel.marks]
+    marks = [{"x": m.x, "y": m.y, "shape": _SYMBOLS[m.shape], "color": css(m.color)} for m in panel.marks]
     if marks:
         as_it_is = {name: {"field": name, "type": "nominal", "scale": None} for name in ("shape", "color")}
         layers.append(_layer("point", marks, as_it_is, filled=True, size=75, opacity=1))
@@ -209,3 +211,82 @@ def joined_labels(panel: Panel) -> list[Mark]:
         else:
             groups.append([mark])
     return [group[0]._replace(label=", ".join(mark.label for mark in group)) for group in groups]
+
+
+def write_pictures(figures: list[Figure], folder: Path) -> list[Path]:
+    """Write each figure as ``NAME.png`` and ``NAME.svg`` into a folder; returns their paths.
+
+    Raises:
+        InputError: the folder cannot be written to.
+    """
+    make_output_folder(folder)
+    paths = []
+    for figure in figures:
+        for format in FORMATS:
+            paths.append(folder / f"{figure.name}.{format}")
+            write_picture(figure, paths[-1])
+    return paths
+
+
+def write_picture(figure: Figure, path: Path) -> None:
+    """Write a figure in the format that the file's name says.
+
+    Raises:
+        InputError: the file cannot be written, or the format is none of FORMATS.
+    """
+    format = path.suffix[1:].lower()
+    if format not in FORMATS:
+        raise InputError(f"no figure format is named '{format}', expected one of {', '.join(FORMATS)}", path)
+    import vl_convert  # 90 MB with a browser's script engine: only where a picture is drawn
+
+    spec = figure_spec(figure)
+    if format == "png":
+        data = vl_convert.vegalite_to_png(spec, scale=PNG_SCALE)
+    else:
+        data = vl_convert.vegalite_to_svg(spec).encode("utf-8")
+    try:
+        with new_file(path) as temporary:
+            temporary.write_bytes(data)
+    except OSError as error:
+        raise InputError(f"cannot be written ({error.strerror})", path) from error
+
+
+def figure_spec(figure: Figure) -> Spec:
+    """All panels of a figure with its legend, in the page's light colours."""
+
+    def sheet(panel: Panel) -> Spec:
+        panel = replace(panel, size=(min(panel.size[0], MAX_WIDTH_PX), panel.size[1]))
+        points = [points_of(one).tolist() for one in panel.series]
+        rows = [[{"x": x, "y": y if math.isfinite(y) else None} for x, y in of_one] for of_one in points]
+        return panel_spec(panel, lambda i: {"values": rows[i]}) | {"title": panel.title}
+
+    panels = [sheet(panel) for panel in figure.panels]
+    if len(figure.entries) > 1:
+        panels[0]["layer"].append(_legend(figure.entries))
+    columns = min(_NUM_COLUMNS[figure.layout], len(panels))
+    spec = {"background": "white", "padding": 8, "config": CONFIG, "concat": panels, "columns": columns}
+    colors = light_colors()
+    return dict(json.loads(re.sub(r"var\(--([\w-]+)\)", lambda found: colors[found[1]], json.dumps(spec))))
+
+
+def light_colors() -> dict[str, str]:
+    """The page's colours by name, of its light theme."""
+    light, _ = re.findall(r":root \{(.*?)\}", (ASSETS / "page.css").read_text(encoding="utf-8"), flags=re.DOTALL)
+    return dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", light))
+
+
+def _legend(entries: dict[str, tuple[str, str]]) -> Spec:
+    """A layer of which nothing is seen but its legend."""
+    texts = list(entries)
+    legend = {"title": None, "orient": "top", "columns": 6, "symbolOpacity": 1}
+    ranges = {
+        "color": [css(color) for color, _ in entries.values()],
+        "shape": [_SYMBOLS.get(shape, "square") for _, shape in entries.values()],
+    }
+    encoding: Spec = {
+        channel: {"field": "text", "scale": {"domain": texts, "range": values}, "legend": legend}
+        for channel, values in ranges.items()
+    }
+    data = {"values": [{"text": text} for text in texts]}
+    nowhere = {"x": None, "y": None}
+    return {"data": data, "mark": {"type": "point", "filled": True, "opacity": 0}, "encoding": encoding | nowhere}

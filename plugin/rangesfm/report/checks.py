@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from operator import attrgetter
+from typing import Any
 
 from markupsafe import Markup
 
 from rangesfm.report.text import count, decimals_for, fixed, keyed, sentence, signed
-from rangesfm.result.entries import ScaleEntry, TimeOffsetEntry
+from rangesfm.result.entries import ScaleEntry
 from rangesfm.result.summary import ResultSummary
 
 
@@ -16,13 +19,10 @@ class Check:
     """One traffic light.
 
     Attributes:
-        name: what is checked.
         meaning: one sentence on why it matters.
         value: None where the run did not measure it.
-        unit: of the value and the limits.
         green_limit, amber_limit: green up to the first, amber up to the second, red beyond
             (from the first upwards, where larger is better).
-        decimals: of the printed numbers.
         larger_is_better: the limits are lower ones.
         key: of the value in ``result.json``.
         no_matter: why any value is as good here, so that the light is green; None: it matters.
@@ -86,26 +86,30 @@ def quality_checks(summary: ResultSummary) -> tuple[Check, ...]:
     uncertainty = _relative_percent(scale.larger_stddev, scale.value)
     share_used = _relative_percent(ranges.num_used, ranges.num)
     reprojection_px = None if summary.refine is None else summary.refine.reprojection_rms_px
+
+    def told(key: str, text_of: Callable[[Any], str] = count) -> str:
+        value = attrgetter(key)(summary)
+        return keyed(key, value, text_of(value))
+
+    def by_digits(value: float | None) -> str:
+        return fixed(value, decimals_for(value, default=5))
+
     of_scale = Markup("One standard deviation: the larger of the formal, {}, and the empirical one, {}.").format(
-        _shown("scale.stddev_formal", scale.stddev_formal), _shown("scale.stddev_empirical", scale.stddev_empirical)
+        told("scale.stddev_formal", by_digits), told("scale.stddev_empirical", by_digits)
     )
     of_anchors = "Farthest that the scale from one anchor alone is from the joint one."
-    of_check_ranges = Markup("RMS of {} ranges held out, which no estimate has seen.").format(
-        keyed("check_ranges.num", summary.check_ranges.num, count(summary.check_ranges.num))
-    )
+    of_check_ranges = Markup("RMS of {} ranges held out, which no estimate has seen.").format(told("check_ranges.num"))
     of_ranges = Markup("RMS of the ranges used; half of them are within {}.").format(
-        keyed("ranges.median_abs_m", ranges.median_abs_m, fixed(ranges.median_abs_m, 3, "m"))
+        told("ranges.median_abs_m", lambda x: fixed(x, 3, "m"))
     )
-    of_share = Markup("{} of the {} ranges in the log had a say.").format(
-        keyed("ranges.num_used", ranges.num_used, count(ranges.num_used)),
-        keyed("ranges.num", ranges.num, count(ranges.num)),
-    )
+    of_share = Markup("{} of the {} ranges in the log had a say.").format(told("ranges.num_used"), told("ranges.num"))
     decimals = min(decimals_for(offset.stddev_s, default=3), 6)
     of_clocks = Markup("Standard deviation of image time minus range time, {}.").format(
-        keyed("time_offset.value_s", offset.value_s, signed(offset.value_s, decimals, "s"))
+        told("time_offset.value_s", lambda x: signed(x, decimals, "s"))
     )
     of_points = "RMS distance of the map's points from where the photos show them."
-    no_matter = _why_no_offset_matters(offset)
+    does_not = sentence(offset.note or "any offset near this one gives the same result")
+    no_matter = does_not if offset.offset_matters is False else None
     checked_m, clocks_s = summary.check_ranges.rms_m, offset.stddev_s
     checks_of_ranges = (
         Check("Anchor agreement", of_anchors, _anchor_spread_percent(scale), "%", 2.0, 5.0, 2),
@@ -119,16 +123,6 @@ def quality_checks(summary: ResultSummary) -> tuple[Check, ...]:
         *(checks_of_ranges if summary.has_ranges else ()),
         Check("Reprojection", of_points, reprojection_px, "px", 1.0, 2.0, 2, key="refine.reprojection_rms_px"),
     )
-
-
-def _shown(key: str, value: float | None) -> str:
-    return keyed(key, value, fixed(value, decimals_for(value, default=5)))
-
-
-def _why_no_offset_matters(offset: TimeOffsetEntry) -> str | None:
-    if offset.offset_matters is not False:
-        return None
-    return sentence(offset.note or "any offset near this one gives the same result")
 
 
 def _relative_percent(part: float | None, whole: float) -> float | None:

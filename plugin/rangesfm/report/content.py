@@ -7,19 +7,15 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.result.folder import ResultFolder
-from rangesfm.result.ranges_as_used import RangesAsUsed
-
-if TYPE_CHECKING:
-    import pycolmap
-
+from rangesfm.result.tables import RangesAsUsed
 
 DEFAULT_FOLDER = "out"
 MAX_KEYFRAME_SHARE = 0.1

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,6 @@ from rangesfm.report.text import mistake, percent, rough, signed
 from rangesfm.result.entries import MistakeEntry
 
 MAX_NUM_ROWS = 16
-_BEYOND_CHANCE = 1.0
 # Ends of the axes; what lies beyond is drawn at the edge.
 _MOST_EVIDENCE, _MOST_EFFECT_PERCENT = 3.0, 20.0
 _ROW_HEIGHT_PX = 22.0
@@ -31,10 +31,10 @@ def mistakes(content: Content) -> Figure | None:
         "For each mistake how far the ranges speak for it, and where chance ends",
         "test value over its threshold (roots)",
         shown,
-        _evidence,
+        [math.sqrt(max(test.statistic, 0.0) / test.threshold) if test.threshold > 0 else 0.0 for test in shown],
         [_size(test) for test in shown],
         _MOST_EVIDENCE,
-        line=("beyond chance", _BEYOND_CHANCE),
+        line=("beyond chance", 1.0),
     )
     low, high = content.summary.scale.interval_95 or (1.0, 1.0)
     could_hide = _panel(
@@ -42,7 +42,7 @@ def mistakes(content: Content) -> Figure | None:
         "For each mistake how much one that is just not found may change the scale",
         "change of the scale %",
         shown,
-        _effect_percent,
+        [_effect_percent(test) for test in shown],
         [_smallest(test) for test in shown],
         _MOST_EFFECT_PERCENT,
         band=("half of the scale's interval", 0.0, 50 * math.log(high / low)),
@@ -60,14 +60,11 @@ def _panel(
     description: str,
     label: str,
     tests: Sequence[MistakeEntry],
-    value_of: Callable[[MistakeEntry], float],
+    values: Sequence[float],
     right: Sequence[str],
     most: float,
-    *,
-    line: tuple[str, float] | None = None,
-    band: tuple[str, float, float] | None = None,
+    **of_panel: Any,
 ) -> Panel:
-    values = [value_of(test) for test in tests]
     end = min(1.15 * max(1.0, *values), most)
     series, marks, rows = [], [], []
     for row, (test, value, told) in enumerate(zip(tests, values, right, strict=True)):
@@ -85,8 +82,7 @@ def _panel(
         y_range=(len(tests) - 0.5, -0.5),
         size=(200.0, _ROW_HEIGHT_PX * len(tests) + 10),
         rows=tuple(rows),
-        line=line,
-        band=band,
+        **of_panel,
     )
 
 
@@ -95,10 +91,6 @@ def _kind(test: MistakeEntry) -> str:
     if test.rejected:
         return found
     return unfound if test.smallest_detectable is not None else never
-
-
-def _evidence(test: MistakeEntry) -> float:
-    return math.sqrt(max(test.statistic, 0.0) / test.threshold) if test.threshold > 0 else 0.0
 
 
 def _effect_percent(test: MistakeEntry) -> float:

@@ -12,7 +12,6 @@ from rangesfm.report.plot import (
     WIDE_SIZE,
     Figure,
     Limits,
-    Mark,
     Panel,
     Pixels,
     Series,
@@ -80,13 +79,8 @@ def _trajectory_view(content: Content, view: View) -> Panel:
     lines = [Series(name, color, view.seen(path.centers), "line") for name, color, path in paths if path is not None]
     if content.reference_m is not None:
         lines.append(Series("reference", "reference", view.seen(content.reference_m), "dashed"))
-    anchors = content.result.anchor_positions_m
-    places = view.seen(np.array(list(anchors.values())).reshape(-1, 3))
+    places, marks = view.anchors(content.result.anchor_positions_m)
     limits = equal_view(np.concatenate([*(line.points for line in lines), places]))
-    marks = tuple(
-        Mark("anchor", "anchor", "triangle", x, y, anchor_id, f"anchor {anchor_id}")
-        for anchor_id, (x, y) in zip(anchors, places.tolist())
-    )
     return view.panel("the camera's path with the anchors", " m", lines, limits, marks=marks)
 
 

@@ -1,10 +1,14 @@
-"""Figures of the ranges: residuals over time and their distribution, and true errors where a reference tells them."""
+"""Figures of ranges: of a log or a radio alone; of a result their residuals, and true errors by a reference."""
 
 from __future__ import annotations
+
+import colorsys
 
 import numpy as np
 
 from rangesfm.arrays import Array
+from rangesfm.ranging.errors.calibration import Calibration
+from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.report.content import Content, in_natural_order
 from rangesfm.report.plot import (
@@ -13,13 +17,14 @@ from rangesfm.report.plot import (
     Panel,
     Range,
     Series,
+    every_nth,
     figure_of,
     from_zero,
     histogram,
     running_median,
     time_axis,
 )
-from rangesfm.result.ranges_as_used import RangesAsUsed
+from rangesfm.result.tables import RangesAsUsed
 
 NUM_HISTOGRAM_BINS = 60
 NUM_MEDIAN_BINS = 48
@@ -27,6 +32,7 @@ MAX_NUM_DRAWN = 6_000
 """Ranges that a figure has a dot for; medians and histograms are of all."""
 
 PANEL_SIZE = (270.0, 125.0)
+_SIZE_ALONE = (660.0, 330.0)
 _COLORS = {"measured": "rejected", "scaled": "before", "refined": "after"}
 
 
@@ -77,7 +83,9 @@ def absolute_errors(content: Content) -> Figure | None:
     points = {name: np.column_stack([times, np.abs(m - true_m)])[rows] for name, m in lengths.items()}
     points = {name: errors for name, errors in points.items() if np.isfinite(errors[:, 1]).any()}
     x_range = (float(times[rows].min()), float(times[rows].max()))
-    dots = [Series(name, _COLORS[name], errors[:: _stride(len(rows))]) for name, errors in points.items()]
+    dots = [
+        Series(name, _COLORS[name], errors[:: every_nth(len(rows), MAX_NUM_DRAWN)]) for name, errors in points.items()
+    ]
     sizes = np.concatenate([series.points[:, 1] for series in dots])
     return figure_of(
         "absolute_range_errors",
@@ -100,7 +108,7 @@ def _residual_panel(content: Content, ranges: RangesAsUsed, anchor_id: str) -> P
     is_mine = np.array(ranges.anchor_id, dtype=str) == anchor_id
     is_used = is_mine & ranges.is_used
     is_rejected = is_mine & (np.array(ranges.status, dtype=str) == RangeStatus.OUTLIER.label)
-    is_drawn = np.arange(len(times)) % _stride(len(times)) == 0
+    is_drawn = np.arange(len(times)) % every_nth(len(times), MAX_NUM_DRAWN) == 0
     points = {name: np.column_stack([times, m]) for name, m in ranges.residuals_by_model_m.items()}
     *_, final = points.values()
     return Panel(
@@ -123,14 +131,10 @@ def _median(name: str, points: Array, x_range: Range) -> Series:
     return Series(name, _COLORS[name], running_median(points, x_range, NUM_MEDIAN_BINS), "line", is_data=False)
 
 
-def _stride(num: int) -> int:
-    """Every how many-th range is drawn."""
-    return max(1, -(-num // MAX_NUM_DRAWN))
-
-
 def _thinned(num: int) -> str:
     """What a caption says where not all are drawn."""
-    return "" if _stride(num) == 1 else f" One range in {_stride(num)} is drawn; the medians are of all."
+    stride = every_nth(num, MAX_NUM_DRAWN)
+    return "" if stride == 1 else f" One range in {stride} is drawn; the medians are of all."
 
 
 def _of_used(ranges: RangesAsUsed) -> dict[str, Array]:
@@ -146,3 +150,42 @@ def _has_residuals(ranges: RangesAsUsed) -> bool:
 def _residual_limit(ranges: RangesAsUsed) -> float:
     """Half the height of the residual axes: room for nearly all ranges used, before and after."""
     return max(1.15 * max(float(np.quantile(np.abs(known), 0.995)) for known in _of_used(ranges).values()), 1e-3)
+
+
+def plot_ranges(log: RangeLog) -> Figure:
+    """Every range of a log, one colour an anchor; over their number where the log has photos for times."""
+    times = log.timestamp_s
+    x = np.arange(len(log)) if times is None else times - times.min()
+    series = []
+    for i, anchor_id in enumerate(log.anchor_ids):
+        hue = colorsys.hsv_to_rgb(i / len(log.anchor_ids), 0.8, 0.75)
+        color = "#" + "".join(f"{round(255 * part):02x}" for part in hue)
+        series.append(Series(anchor_id, color, np.column_stack([x, log.range_m])[log.anchor_index == i]))
+    label = "range" if times is None else f"s since {times.min():.3f}"
+    y_range = (0.0, 1.05 * float(log.range_m.max()))
+    return figure_of("ranges", "", "Ranges over time", (label, "m"), series, y_range=y_range, size=_SIZE_ALONE)
+
+
+def plot_error_curve(calibration: Calibration) -> Figure:
+    """A radio's error curve with two stddevs on either side, over the errors that it was learnt from."""
+    curve = calibration.curve
+    shown = 5 * calibration.noise_stddev_m
+
+    def line(name: str, kind: str, num_stddevs: int) -> Series:
+        error_m = curve.error_m + num_stddevs * curve.stddev_m
+        return Series(name, "after", np.column_stack([curve.distance_m, error_m]), kind)
+
+    return figure_of(
+        "error_curve",
+        "",
+        "Errors of ranges over their distance",
+        ("distance, m", "measured minus true, m"),
+        (
+            Series("errors", "rejected", np.column_stack([calibration.distance_m, calibration.error_m])),
+            line("curve", "line", 0),
+            line("± two standard deviations", "dashed", 2),
+            line("± two standard deviations", "dashed", -2),
+        ),
+        y_range=(float(curve.error_m.min()) - shown, float(curve.error_m.max()) + shown),
+        size=_SIZE_ALONE,
+    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rangesfm.report.content import Content, in_natural_order
-from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Series, figure_of, from_zero, time_axis
+from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Series, every_nth, figure_of, from_zero, time_axis
 from rangesfm.report.text import signed
 from rangesfm.result.tables import ScaleCandidates, ScaleConsensus, TimeOffsetCurve
 
@@ -51,7 +51,7 @@ def candidates(content: Content) -> Figure | None:
     table, scale = content.result.read(ScaleCandidates), content.summary.scale.value
     if table is None or len(table.alpha0) == 0:
         return None
-    stride = -(-len(table.alpha0) // MAX_NUM_CANDIDATES)
+    stride = every_nth(len(table.alpha0), MAX_NUM_CANDIDATES)
     times, label = time_axis(table.timestamp_s[::stride])
     found = np.array([[times.min(), scale], [times.max(), scale]])
     caption = (

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from rangesfm.files.atomic import make_output_folder, new_file
+from rangesfm.files.atomic import make_output_folder
 from rangesfm.progress import Progress
-from rangesfm.report.page import render
+from rangesfm.report.page import render, write_page
 from rangesfm.report.text import duration
 
 PAGE_NAME = "live.html"
@@ -82,8 +82,7 @@ class LivePage:
             seconds=self._clock() - self._stage_start,
             messages=self._messages,
         )
-        with new_file(self.path) as temporary:
-            temporary.write_text(page, encoding="utf-8", errors="xmlcharrefreplace")
+        write_page(page, self.path)
 
 
 @contextmanager

@@ -10,9 +10,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 from markupsafe import Markup
 
-from rangesfm.report import figures_mistakes, figures_path, figures_ranges, figures_scale, head, tables, text
+from rangesfm.files.atomic import new_file
+from rangesfm.report import figures_mistakes, figures_path, figures_ranges, figures_scale, tables, text
 from rangesfm.report.chart import ASSETS, css, page_charts
 from rangesfm.report.checks import quality_checks
 from rangesfm.report.content import Content
@@ -95,11 +97,25 @@ def render_report(content: Content) -> str:
         heading=content.title,
         summary=content.summary,
         checks=quality_checks(content.summary),
-        tiles=head.tiles(content),
+        tiles=_tiles(content),
         view=None if scene is None else view_of(scene),
         sections=sections,
         charts=page_charts([figure for _, _, figures, _ in sections for figure in figures]),
     )
+
+
+def _tiles(content: Content) -> list[tuple[str, str, str]]:
+    """Name, value and a note on it, of how large the survey was."""
+    path, seconds, anchors = content.final, content.summary.seconds, content.summary.anchors
+    num_surveyed = sum(anchor.surveyed_position_m is not None for anchor in anchors.values())
+    length_m = None if path is None else float(np.linalg.norm(np.diff(path.centers, axis=0), axis=1).sum())
+    known = [value for value in seconds.values() if value is not None]
+    return [
+        ("Keyframes", text.count(None if path is None else len(path)), f"path of {text.fixed(length_m, 2, 'm')}"),
+        ("Map points", text.count(None if path is None else len(content.points_m)), "seen by two keyframes or more"),
+        *([("Anchors", text.count(len(anchors)), f"{num_surveyed} of them surveyed")] if anchors else []),
+        ("Time taken", text.duration(seconds.get("total") or (sum(known) if known else None)), "all stages"),
+    ]
 
 
 def render(template: str, *, charts: Mapping[str, Any] = MappingProxyType({}), **values: Any) -> str:
@@ -114,6 +130,12 @@ def render(template: str, *, charts: Mapping[str, Any] = MappingProxyType({}), *
     styles = [_asset(name) for name in STYLES]
     page = _environment().get_template(template)
     return page.render(policy=policy, styles=styles, script=script, charts=charts, **values)
+
+
+def write_page(page: str, path: Path) -> None:
+    """Write a page, whole or not at all."""
+    with new_file(path) as temporary:
+        temporary.write_text(page, encoding="utf-8", errors="xmlcharrefreplace")
 
 
 def _asset(name: str) -> str:
@@ -151,7 +173,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters |= {function.__name__: function for function in _FILTERS}
-    environment.globals |= {"keyed": text.keyed, "decimals_for": text.decimals_for}
-    environment.globals |= {"said_once": head.said_once, "css": css}
+    globals_ = (text.keyed, text.decimals_for, text.said_once, css)
+    environment.globals |= {function.__name__: function for function in globals_}
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
     return environment

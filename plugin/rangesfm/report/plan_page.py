@@ -11,15 +11,16 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.arrays import Array, Mask
-from rangesfm.files.atomic import make_output_folder, new_file, write_text
+from rangesfm.files.atomic import make_output_folder, write_text
 from rangesfm.planning.advice import Advice
-from rangesfm.planning.survey_plan import DetectableMistake, SurveyPlan
+from rangesfm.planning.survey_plan import SurveyPlan
 from rangesfm.ranging.errors.components import component_words
 from rangesfm.report.chart import page_charts
-from rangesfm.report.page import render
-from rangesfm.report.plot import Figure, Limits, Mark, Panel, Pixels, Series, View, equal_view, views_of
+from rangesfm.report.page import render, write_page
+from rangesfm.report.plot import Figure, Limits, Panel, Pixels, Series, View, equal_view, views_of
 from rangesfm.report.tables import Table
 from rangesfm.report.text import count, duration, fixed, percent, rough
+from rangesfm.trust.table import MistakeTest
 
 # From well known to hardly, each as visible on a light page as on a dark one.
 _COLORS = ("#2f7ebc", "#2a9d8f", "#6f9a2b", "#c98b12", "#d4512b")
@@ -35,8 +36,7 @@ def write_plan(plan: SurveyPlan, folder: Path) -> list[Path]:
     make_output_folder(folder)
     numbers, page = folder / "plan.json", folder / "plan.html"
     write_text(json.dumps(plan.as_json(), indent=2) + "\n", numbers)
-    with new_file(page) as temporary:
-        temporary.write_text(render_plan(plan), encoding="utf-8", errors="xmlcharrefreplace")
+    write_page(render_plan(plan), page)
     return [numbers, page]
 
 
@@ -92,7 +92,7 @@ def accuracy_views(plan: SurveyPlan) -> Figure:
 
 
 def _view(plan: SurveyPlan, view: View, centers: Array, edges: Array) -> Panel:
-    places = view.seen(np.array(list(plan.anchors_m.values())))
+    places, marks = view.anchors(plan.anchors_m)
     line = view.seen(centers)
     limits = equal_view(np.vstack([line, places]))
     of_keyframe = np.digitize(plan.keyframe_stddevs_m, edges)
@@ -102,10 +102,6 @@ def _view(plan: SurveyPlan, view: View, centers: Array, edges: Array) -> Panel:
         Series(name, _color(band, len(names)), _stretches(line, of_keyframe == band), "line")
         for band, name in enumerate(shown)
     ]
-    marks = tuple(
-        Mark("anchor", "anchor", "triangle", x, y, name, f"anchor {name}")
-        for name, (x, y) in zip(plan.anchors_m, places.tolist(), strict=True)
-    )
     area = _area(plan, view, centers.mean(axis=0), edges, limits)
     return view.panel("the path and the anchors", " m", series, limits, marks=marks, picture=area)
 
@@ -118,7 +114,9 @@ def _area(plan: SurveyPlan, view: View, middle: Array, edges: Array, limits: Lim
     places = np.tile(middle, (width * height, 1))
     places[:, view.axes] = np.column_stack([across.ravel(), view.sign * down.ravel()])
     bands = np.digitize(plan.expected.stddevs_at(places), edges)
-    palette = np.array([_rgb(_color(band, len(edges) + 1)) for band in range(len(edges) + 1)], dtype=np.uint8)
+    palette = np.array(
+        [tuple(bytes.fromhex(_color(band, len(edges) + 1)[1:])) for band in range(len(edges) + 1)], dtype=np.uint8
+    )
     pixels: Pixels = np.insert(palette[bands], 3, _AREA_OPACITY, axis=1).reshape(height, width, 4)
     return pixels
 
@@ -145,10 +143,6 @@ def _names(edges: Array) -> list[str]:
 
 def _color(band: int, num: int) -> str:
     return _OPEN_COLOR if band == num - 1 else _COLORS[round(band * (len(_COLORS) - 1) / max(num - 2, 1))]
-
-
-def _rgb(color: str) -> tuple[int, ...]:
-    return tuple(bytes.fromhex(color[1:]))
 
 
 def _stretches(line: Array, inside: Mask) -> Array:
@@ -180,7 +174,7 @@ def _anchors(plan: SurveyPlan) -> Table:
     return Table("Anchors", ["anchor", "x m", "y m", "z m"], rows, is_narrow=True)
 
 
-def _mistakes(mistakes: Sequence[DetectableMistake]) -> Table:
+def _mistakes(mistakes: Sequence[MistakeTest]) -> Table:
     rows = [
         [
             f"{each.name} {each.subject}".strip(),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -104,14 +104,6 @@ class Panel:
         return _widened(x_range), _widened(y_range)
 
 
-class LegendEntry(NamedTuple):
-    """Name, colour and shape ("dots", "line", "dashed", "filled", "triangle", "disc", "upright" or "strip")."""
-
-    text: str
-    color: str
-    shape: str
-
-
 @dataclass(frozen=True)
 class Figure:
     """Panels with one caption and one legend.
@@ -136,16 +128,14 @@ class Figure:
         return self.layout != "single" or self.panels[0].size[0] >= WIDE_SIZE[0]
 
     @property
-    def entries(self) -> list[LegendEntry]:
-        """The legend; what goes by one name is in it once."""
-        given: list[LegendEntry] = []
+    def entries(self) -> dict[str, tuple[str, str]]:
+        """The legend: colour and shape (a kind of Series, a shape of Mark, "upright" or "strip") of each text."""
+        given = [(one.name, one.color, one.kind) for panel in self.panels for one in panel.series if len(one.points)]
         for panel in self.panels:
-            given += [LegendEntry(one.name, one.color, one.kind) for one in panel.series if len(one.points)]
-        for panel in self.panels:
-            given += [LegendEntry(mark.name, mark.color, mark.shape) for mark in panel.marks]
-            given += [LegendEntry(panel.line[0], "ink", "upright")] if panel.line else []
-            given += [LegendEntry(panel.band[0], "interval", "strip")] if panel.band else []
-        return list({entry.text: entry for entry in given if entry.text}.values())
+            given += [(mark.name, mark.color, mark.shape) for mark in panel.marks]
+            given += [(panel.line[0], "ink", "upright")] if panel.line else []
+            given += [(panel.band[0], "interval", "strip")] if panel.band else []
+        return {text: (color, shape) for text, color, shape in given if text}
 
 
 def figure_of(
@@ -167,7 +157,6 @@ class View:
     """A look at the world along one of its axes.
 
     Attributes:
-        name: "Plan" or "Elevation".
         axes: the horizontal and the vertical one on the page.
         sign: of the vertical one there.
     """
@@ -179,6 +168,15 @@ class View:
     def seen(self, points: Array) -> Array:
         """(n, 2) places on the page of (n, 3) points."""
         return np.asarray(points[:, self.axes] * np.array([1.0, self.sign]))
+
+    def anchors(self, anchors_m: Mapping[str, npt.ArrayLike]) -> tuple[Array, tuple[Mark, ...]]:
+        """(n, 2) places of anchors, (3,) by id, and their marks."""
+        places = self.seen(np.array(list(anchors_m.values()), dtype=np.float64).reshape(-1, 3))
+        marks = [
+            Mark("anchor", "anchor", "triangle", x, y, anchor_id, f"anchor {anchor_id}")
+            for anchor_id, (x, y) in zip(anchors_m, places.tolist(), strict=True)
+        ]
+        return places, tuple(marks)
 
     def panel(self, what: str, unit: str, series: Iterable[Series], limits: Limits, **others: Any) -> Panel:
         """What ``equal_view`` says of the limits, and what else a Panel has."""
@@ -228,6 +226,11 @@ def time_axis(times_s: Array) -> tuple[Array, str]:
     if not np.isfinite(times_s).any():
         return np.arange(len(times_s), dtype=np.float64), "range number"
     return times_s - np.nanmin(times_s), "time s"
+
+
+def every_nth(num: int, most: int) -> int:
+    """Every how many-th of so many is drawn, where no more than most are to be."""
+    return max(1, -(-num // most))
 
 
 def from_zero(series: Iterable[Series]) -> Range:

@@ -3,28 +3,35 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
+import io
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from PIL import Image, ImageOps
 
 from rangesfm.arrays import Array
+from rangesfm.files.atomic import stays_inside
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.report.content import Content
+from rangesfm.report.plot import every_nth
 from rangesfm.report.text import count
-from rangesfm.report.thumbnails import thumbnails
 from rangesfm.result.entries import AnchorEntry
 from rangesfm.result.metric_result import USED
-from rangesfm.result.ranges_as_used import RangesAsUsed
 
 MAX_NUM_POINTS = 500_000
 MAX_NUM_RANGES = 20_000
 NUM_STEPS = 65535
 """Positions of points are whole steps of the largest side of their box."""
 
+MAX_NUM_THUMBNAILS, MAX_THUMBNAIL_BYTES = 160, 600_000
+"""The latter of all of them, as they stand in the page."""
+
+_WIDTHS_PX, _QUALITY = (256, 208, 160, 128), 60
 _FAR_QUANTILE = 0.005
 _SEEN_QUANTILE = 0.05
 _FRUSTUM_SHAPE = (0.6, 0.4)
@@ -38,9 +45,8 @@ class ScenePath:
     """One path of cameras.
 
     Attributes:
-        id: of its layer.
-        name: as the reader sees it.
-        color: name of a colour of the page's style.
+        id, name: of its layer, and as the reader sees it.
+        color: of the page's style.
         trajectory: in the scene's frame, metres.
         has_orientations: whether frusta can be drawn.
     """
@@ -105,7 +111,7 @@ def view_of(scene: Scene) -> dict[str, Any]:
     layers += [(path.id, path.name, path.color, "line" if path.has_orientations else "dashed") for path in scene.paths]
     layers += [("anchors", "Anchors", "anchor", "triangle")] if anchors else []
     num_left_out = len(scene.points_m) - (points["num"] if points else 0)
-    stride = 1 if content is None or content.ranges is None else range_stride(content.ranges)
+    stride = 1 if content is None or content.ranges is None else every_nth(len(content.ranges.status), MAX_NUM_RANGES)
     note = (
         "Drag to turn, wheel or pinch to zoom, right drag or two fingers to move; click a camera for its photo.",
         f"{count(num_left_out)} points far away or beyond the view's limit are not drawn." if num_left_out else "",
@@ -130,11 +136,6 @@ def view_of(scene: Scene) -> dict[str, Any]:
         "num_photos": len(photos) if scene.paths[-1].has_orientations else 0,
         "note": " ".join(filter(None, note)),
     }
-
-
-def range_stride(ranges: RangesAsUsed) -> int:
-    """Every how many-th range the view shows."""
-    return max(1, -(-len(ranges.status) // MAX_NUM_RANGES))
 
 
 def _path(path: ScenePath) -> dict[str, Any]:
@@ -217,7 +218,7 @@ def _ranges(content: Content, path: Trajectory) -> dict[str, Any] | None:
     ranges = content.ranges
     if ranges is None or len(ranges.status) == 0:
         return None
-    rows = np.arange(0, len(ranges.status), range_stride(ranges))
+    rows = np.arange(0, len(ranges.status), every_nth(len(ranges.status), MAX_NUM_RANGES))
     before, after, has_place = (of_all[rows] for of_all in ranges.places_on(path.image_names))
     weight = np.where(has_place, ranges.weight[rows], 0.0)
     anchor_ids, anchor = np.unique(np.array(ranges.anchor_id, dtype=str), return_inverse=True)
@@ -267,3 +268,42 @@ def pack(values: npt.ArrayLike, kind: str) -> dict[str, str]:
     """
     array = np.ascontiguousarray(values, dtype=np.dtype(kind).newbyteorder("<"))
     return {"type": kind, "data": base64.b64encode(array.tobytes()).decode("ascii")}
+
+
+def thumbnails(folder: Path | None, image_names: Sequence[str]) -> dict[str, str]:
+    """JPEGs as data URIs by photo, evenly over the path; photos that cannot be read are left out.
+
+    So are those that a name from a file would fetch from outside the folder: the page is handed on.
+
+    All are made as wide as fits into MAX_THUMBNAIL_BYTES; if even the smallest do not fit, there are fewer.
+    """
+    image_names = [name for name in image_names if stays_inside(name)]
+    if folder is None or not folder.is_dir() or not image_names:
+        return {}
+    chosen = np.unique(np.linspace(0, len(image_names) - 1, MAX_NUM_THUMBNAILS).round().astype(int))
+    photos = {image_names[i]: _small_copy(folder / image_names[i]) for i in chosen}
+    made: dict[str, str] = {}
+    for width in _WIDTHS_PX:
+        small = {name: ImageOps.contain(photo, (width, width)) for name, photo in photos.items() if photo is not None}
+        made = {name: data_uri(photo, "JPEG", quality=_QUALITY) for name, photo in small.items()}
+        if sum(map(len, made.values())) <= MAX_THUMBNAIL_BYTES:
+            return made
+    num_bytes = np.cumsum([len(uri) for uri in made.values()])
+    return {name: uri for (name, uri), up_to_it in zip(made.items(), num_bytes) if up_to_it <= MAX_THUMBNAIL_BYTES}
+
+
+def _small_copy(path: Path) -> Image.Image | None:
+    width = _WIDTHS_PX[0]
+    try:
+        with Image.open(path) as photo:
+            photo.draft("RGB", (2 * width, 2 * width))  # a JPEG is decoded no larger than needed
+            return ImageOps.contain(photo.convert("RGB"), (width, width))
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return None
+
+
+def data_uri(picture: Image.Image, kind: str, **options: Any) -> str:
+    """A picture that stands in the page itself; kind: "PNG" or "JPEG"."""
+    file = io.BytesIO()
+    picture.save(file, kind, optimize=True, **options)
+    return f"data:image/{kind.lower()};base64,{base64.b64encode(file.getvalue()).decode('ascii')}"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from markupsafe import Markup
@@ -100,3 +102,15 @@ def keyed(key: str, value: Any, text: str) -> str:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return text
     return Markup('<data value="{}" data-key="{}">{}</data>').format(repr(float(value)), key, text)
+
+
+def said_once(texts: Iterable[str], others: Sequence[str] = ()) -> list[str]:
+    """Texts without those that the others say already, or that begin as one before with the same measure."""
+    said, measures = " ".join(others), set[str]()
+    kept = []
+    for text in texts:
+        measure = re.split(r"[,;:(]", text)[0].strip()
+        if text and text not in said and measure not in measures:
+            kept.append(text)
+        measures.add(measure)
+    return kept

@@ -3,45 +3,31 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
+import pycolmap
 
 from rangesfm.arrays import Array
-from rangesfm.errors import InputError
+from rangesfm.colmap.model_files import read_model
+from rangesfm.errors import BAD_INPUT, InputError
+from rangesfm.export import COVARIANCE_FORMATS, MetricMap, export_map, write_model
 from rangesfm.files.atomic import path_of
+from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.reference import Reference, read_reference
-from rangesfm.result.ranges_as_used import RangesAsUsed
+from rangesfm.options import ExportOptions
+from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.summary import ResultSummary
-from rangesfm.result.table_file import TableFile
-from rangesfm.result.tables import (
-    CenterCovariances,
-    PhotoTimes,
-    ScaleCandidates,
-    ScaleConsensus,
-    TagCorners,
-    TimeOffsetCurve,
-)
+from rangesfm.result.tables import TABLES, PhotoTimes, TableFile
 from rangesfm.survey.settings import InputPath
-
-if TYPE_CHECKING:
-    import pycolmap
 
 _Table = TypeVar("_Table", bound=TableFile)
 
-TABLES: tuple[type[TableFile], ...] = (
-    RangesAsUsed,
-    PhotoTimes,
-    CenterCovariances,
-    ScaleCandidates,
-    ScaleConsensus,
-    TimeOffsetCurve,
-    TagCorners,
-)
 REPORT_NAME = "report.html"
 DATABASE_NAME = "database.db"
 REFERENCE_NAME = "reference.csv"
@@ -95,6 +81,57 @@ def replacing_result(folder: Path) -> Iterator[None]:
             forget_result(folder)
 
 
+def write_models_and_tables(
+    found: MetricResult,
+    export: ExportOptions,
+    folder: Path,
+    *,
+    images_path: Path | None = None,
+    georeference: Georeference | None = None,
+) -> InputError | None:
+    """Write a result's models, its tables and the formats that were asked for beside them, each whole or not at all.
+
+    What an earlier run left of those that are not written goes.
+
+    Returns:
+        What is to be said of formats that cannot be written, which spoil nothing else.
+    """
+    write_model(found.scaled, folder / "sparse_scaled" / "0")
+    if found.refined is None:
+        shutil.rmtree(folder / "sparse_metric", ignore_errors=True)
+    else:
+        write_model(found.final, folder / "sparse_metric" / "0")
+    for kind in TABLES:
+        table = kind.of(found)
+        if table is None:
+            (folder / kind.NAME).unlink(missing_ok=True)
+        else:
+            table.write(folder)
+    times = PhotoTimes.of(found)
+    map_ = MetricMap(
+        found.final,
+        timestamps_s=None if times is None else times.by_name,
+        anchors_m={a.anchor_id: a.position_m for a in found.anchors if np.isfinite(a.position_m).all()},
+        metric_from_sfm=found.estimate.metric_from_sfm,
+        relative_scale_stddev=found.estimate.uncertainty.empirical,
+        images_path=images_path,
+        database_path=folder / DATABASE_NAME,
+        is_site=found.estimate.frame == "site",
+        georeference=georeference,
+        center_covariance_m2=found.center_covariance_m2,
+    )
+    impossible = [] if found.final.num_points3D() else ["ply"]
+    impossible += [] if found.center_covariance_m2 else COVARIANCE_FORMATS
+    formats = tuple(name for name in export.formats if name not in impossible)
+    try:
+        export_map(map_, folder, export.changed(formats=formats))
+    except InputError as error:
+        if error.exit_status != BAD_INPUT:  # a full disk, of which the rest has no more
+            raise
+        return error
+    return None
+
+
 @dataclass(frozen=True)
 class ResultFolder:
     """A run's output folder, read back for comparison, export, report and joining.
@@ -141,8 +178,6 @@ class ResultFolder:
 
     def read_model(self, stage: str) -> pycolmap.Reconstruction | None:
         """The model ``stage``/0 ("sparse", "sparse_scaled" or "sparse_metric"); None if it is not there."""
-        from rangesfm.colmap.model_files import read_model
-
         path = self.path / stage / "0"
         return read_model(path) if path.is_dir() else None
 

@@ -15,23 +15,7 @@ from typing import Any, ClassVar, Literal
 
 from rangesfm.distances.tape import CONTROL, DistanceRow
 from rangesfm.files.records import NumberOrNull, Record, Text
-from rangesfm.result.entries import (
-    AnchorEntry,
-    CheckRangesEntry,
-    ComparisonRow,
-    GeoreferenceEntry,
-    InputEntry,
-    MapEntry,
-    MistakeEntry,
-    ModelEntry,
-    PlaceEntry,
-    RangesEntry,
-    RefineEntry,
-    ScaleEntry,
-    Settings,
-    SimilarityEntry,
-    TimeOffsetEntry,
-)
+from rangesfm.result import entries
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.scale.estimate import ScaleSensitivity
 
@@ -59,24 +43,24 @@ class ResultSummary(Record):
 
     NAME: ClassVar = "result.json"
 
-    scale: ScaleEntry
-    place: PlaceEntry | None
-    metric_from_sfm: SimilarityEntry
+    scale: entries.ScaleEntry
+    place: entries.PlaceEntry | None
+    metric_from_sfm: entries.SimilarityEntry
     frame: Literal["site", "first_camera"]
-    map: MapEntry
-    anchors: dict[Text, AnchorEntry]
-    time_offset: TimeOffsetEntry
-    ranges: RangesEntry
-    check_ranges: CheckRangesEntry
-    refine: RefineEntry | None
-    models: tuple[ModelEntry, ...]
-    tests: tuple[MistakeEntry, ...] = ()
+    map: entries.MapEntry
+    anchors: dict[Text, entries.AnchorEntry]
+    time_offset: entries.TimeOffsetEntry
+    ranges: entries.RangesEntry
+    check_ranges: entries.CheckRangesEntry
+    refine: entries.RefineEntry | None
+    models: tuple[entries.ModelEntry, ...]
+    tests: tuple[entries.MistakeEntry, ...] = ()
     distances: tuple[DistanceRow, ...]
-    comparison: tuple[ComparisonRow, ...] = ()
-    georeference: GeoreferenceEntry | None
+    comparison: tuple[entries.ComparisonRow, ...] = ()
+    georeference: entries.GeoreferenceEntry | None
     versions: dict[Text, Text]
-    settings: Settings
-    inputs: tuple[InputEntry, ...]
+    settings: entries.Settings
+    inputs: tuple[entries.InputEntry, ...]
     seconds: dict[Text, NumberOrNull]
     warnings: tuple[Text, ...]
 
@@ -90,18 +74,18 @@ class ResultSummary(Record):
         """Of what the stages found, and of ``others``: entries from ``distances`` on, which do not follow from that."""
         estimate = found.estimate
         return cls(
-            scale=ScaleEntry.model_validate(estimate),
-            place=None if found.place is None else PlaceEntry.model_validate(found.place),
-            metric_from_sfm=SimilarityEntry.of(estimate.metric_from_sfm),
+            scale=entries.ScaleEntry.model_validate(estimate),
+            place=None if found.place is None else entries.PlaceEntry.model_validate(found.place),
+            metric_from_sfm=entries.SimilarityEntry.of(estimate.metric_from_sfm),
             frame="site" if estimate.frame == "site" else "first_camera",
-            map=MapEntry(num_photos=found.final.num_reg_images(), num_points3D=found.final.num_points3D()),
-            anchors={anchor.anchor_id: AnchorEntry.model_validate(anchor) for anchor in found.anchors},
-            time_offset=TimeOffsetEntry.of(found),
-            ranges=RangesEntry.of(found),
-            check_ranges=CheckRangesEntry.of(found),
-            refine=RefineEntry.of(found),
-            tests=tuple(MistakeEntry.model_validate(test) for test in (found.trust.tests if found.trust else ())),
-            models=tuple(ModelEntry.of(model, estimate.metric_from_sfm) for model in found.models),
+            map=entries.MapEntry(num_photos=found.final.num_reg_images(), num_points3D=found.final.num_points3D()),
+            anchors={anchor.anchor_id: entries.AnchorEntry.model_validate(anchor) for anchor in found.anchors},
+            time_offset=entries.TimeOffsetEntry.of(found),
+            ranges=entries.RangesEntry.of(found),
+            check_ranges=entries.CheckRangesEntry.of(found),
+            refine=entries.RefineEntry.of(found),
+            tests=tuple(map(entries.MistakeEntry.model_validate, found.trust.tests if found.trust else ())),
+            models=tuple(entries.ModelEntry.of(model, estimate.metric_from_sfm) for model in found.models),
             **others,
         )
 

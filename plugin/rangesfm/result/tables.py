@@ -1,18 +1,178 @@
-"""The small tables of the result folder: times, covariances, and how scale and clock offset came about."""
+"""The tables of the result folder: CSV files, each a class whose fields are the columns."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Annotated, ClassVar
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar, get_type_hints
 
 import numpy as np
 
-from rangesfm.arrays import Array
-from rangesfm.result.metric_result import MetricResult
-from rangesfm.result.table_file import Column, Numbers, NumbersOrEmpty, Rounded, RoundedOrEmpty, TableFile, Texts
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.files.tables import Table, read_table, write_table
+from rangesfm.ranging.observations import RangeStatus
+from rangesfm.result.metric_result import USED, MetricResult
 
+_Kind = TypeVar("_Kind", bound="TableFile")
+_TEXT = "s"
+
+
+class Column(NamedTuple):
+    """How a column is written, and whether its cells may be empty (of numbers: NaN).
+
+    Attributes:
+        format_spec: as ".6g"; of text "s"; empty: so that the numbers are read as they were.
+    """
+
+    format_spec: str
+    may_be_empty: bool = False
+
+
+Texts = Annotated[tuple[str, ...], Column(_TEXT)]
+TextsOrEmpty = Annotated[tuple[str, ...], Column(_TEXT, may_be_empty=True)]
+Numbers = Annotated[Array, Column("")]
+NumbersOrEmpty = Annotated[Array, Column("", may_be_empty=True)]
+Rounded = Annotated[Array, Column(".6g")]
+RoundedOrEmpty = Annotated[Array, Column(".6g", may_be_empty=True)]
 _Covariance = Annotated[Array, Column(".9g")]
+
+
+@dataclass(frozen=True)
+class TableFile(ABC):
+    """n rows; each field is a column (``Texts``, ``Numbers``, ...), in the order and by the names of the file."""
+
+    NAME: ClassVar[str]
+
+    @classmethod
+    @abstractmethod
+    def of(cls: type[_Kind], found: MetricResult) -> _Kind | None:
+        """What a run found, for this file; None: the run does not leave it."""
+
+    @classmethod
+    def columns(cls) -> dict[str, Column]:
+        """By name, in their order."""
+        hints = get_type_hints(cls, include_extras=True)
+        return {field.name: hints[field.name].__metadata__[0] for field in fields(cls)}
+
+    def write(self, folder: Path) -> None:
+        """Write the file into a folder, whole or not at all."""
+        columns = self.columns()
+        cells = [_cells(getattr(self, name), column.format_spec) for name, column in columns.items()]
+        write_table(folder / self.NAME, list(columns), zip(*cells, strict=True))
+
+    @classmethod
+    def read(cls: type[_Kind], folder: Path) -> _Kind | None:
+        """Read the file of a folder; None if it is not there.
+
+        Raises:
+            InputError: it is not what a run writes; with the line.
+        """
+        path, columns = folder / cls.NAME, cls.columns()
+        if not path.is_file():
+            return None
+        texts = [name for name, column in columns.items() if column.format_spec == _TEXT]
+        table = read_table(path, list(columns), text=texts)
+        return cls(**{name: _values(table, name, column) for name, column in columns.items()})
+
+
+def _cells(values: Any, format_spec: str) -> Iterable[str]:
+    if format_spec == _TEXT:
+        return tuple(values)
+    return (f"{value:{format_spec}}" if math.isfinite(value) else "" for value in values.tolist())
+
+
+def _values(table: Table, name: str, column: Column) -> Any:
+    if column.format_spec == _TEXT:
+        return tuple(table.text(name, empty="" if column.may_be_empty else None))
+    return table.numbers(name, empty=np.nan if column.may_be_empty else None)
+
+
+@dataclass(frozen=True)
+class RangesAsUsed(TableFile):
+    """n ranges, in the order of the log; a peer of its kind stands in a range's other column.
+
+    Attributes:
+        timestamp_s: (n,) on the radio's clock, NaN where the log gives photos instead.
+        image_name: n names, empty where the log gives times.
+        anchor_id, tag_id: n ids.
+        range_m: (n,) measured.
+        range_stddev_m: (n,) noise as weighted last; NaN without a place.
+        keyframe_before, keyframe_after: n photos between which each range was taken; empty without a place.
+        weight: (n,) of the later one, in [0, 1]; NaN without a place.
+        predicted_scaled_m, predicted_refined_m: (n,) with the scaled and with the refined model; NaN where not
+            applicable.
+        residual_m: (n,) predicted with the final model minus measured.
+        robust_weight: (n,) in [0, 1] by that residual; NaN for ranges that have no say.
+        status: n labels of RangeStatus.
+    """
+
+    NAME: ClassVar = "ranges.csv"
+    timestamp_s: NumbersOrEmpty
+    image_name: TextsOrEmpty
+    anchor_id: Texts
+    tag_id: Texts
+    range_m: Numbers
+    range_stddev_m: RoundedOrEmpty
+    keyframe_before: TextsOrEmpty
+    keyframe_after: TextsOrEmpty
+    weight: RoundedOrEmpty
+    predicted_scaled_m: RoundedOrEmpty
+    predicted_refined_m: RoundedOrEmpty
+    residual_m: RoundedOrEmpty
+    robust_weight: RoundedOrEmpty
+    status: Texts
+
+    @classmethod
+    def of(cls, found: MetricResult) -> RangesAsUsed | None:
+        observations, log = found.observations, found.observations.log
+        if not len(log):
+            return None
+        unknown = np.full(len(log), np.nan)
+        has_say = np.isin(observations.status, (*USED, RangeStatus.OUTLIER))
+        labels = {int(status): status.label for status in RangeStatus}
+        names = (*found.trajectory.image_names, "")
+        tag_ids, anchor_ids = log.end_ids()
+        return cls(
+            timestamp_s=unknown if log.timestamp_s is None else log.timestamp_s,
+            image_name=("",) * len(log) if log.image_name is None else log.image_name,
+            anchor_id=tuple(anchor_ids),
+            tag_id=tuple(tag_ids),
+            range_m=log.range_m,
+            range_stddev_m=found.range_stddev_m,
+            keyframe_before=tuple(names[i] for i in observations.before),
+            keyframe_after=tuple(names[i] for i in observations.after),
+            weight=np.where(observations.before >= 0, observations.weight, np.nan),
+            predicted_scaled_m=found.predicted_scaled_m,
+            predicted_refined_m=unknown if found.kept_refinement is None else found.kept_refinement.predicted_m,
+            residual_m=found.residuals_m,
+            robust_weight=np.where(has_say, found.weights, np.nan),
+            status=tuple(labels[status] for status in observations.status.tolist()),
+        )
+
+    def places_on(self, image_names: Sequence[str]) -> tuple[Indices, Indices, Mask]:
+        """(n,) which of a path's keyframes are before and after each range, -1 for none; and whether it has a place."""
+        index_of = {name: i for i, name in enumerate(image_names)}
+        before, after = (
+            np.array([index_of.get(name, -1) for name in names], dtype=np.int64)
+            for names in (self.keyframe_before, self.keyframe_after)
+        )
+        return before, after, (before >= 0) & (after >= 0) & np.isfinite(self.weight)
+
+    @property
+    def residuals_by_model_m(self) -> dict[str, Array]:
+        """(n,) predicted minus measured, with the "scaled" model and, if there is one, with the "refined"."""
+        refined = self.predicted_refined_m - self.range_m
+        both = {"scaled": self.predicted_scaled_m - self.range_m, "refined": refined}
+        return both if np.isfinite(refined).any() else {"scaled": both["scaled"]}
+
+    @property
+    def is_used(self) -> Mask:
+        """(n,) ranges with a say in the final model, however small."""
+        return np.isin(np.array(self.status, dtype=str), [status.label for status in USED])
 
 
 @dataclass(frozen=True)
@@ -131,3 +291,7 @@ class TimeOffsetCurve(TableFile):
     def of(cls, found: MetricResult) -> TimeOffsetCurve | None:
         curve = None if found.time_offset is None else found.time_offset.curve
         return None if curve is None else cls(curve.offsets_s, curve.costs_m)
+
+
+_OF_A_RUN = (RangesAsUsed, PhotoTimes, CenterCovariances, ScaleCandidates, ScaleConsensus, TimeOffsetCurve, TagCorners)
+TABLES: tuple[type[TableFile], ...] = _OF_A_RUN

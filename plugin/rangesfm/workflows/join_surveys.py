@@ -25,7 +25,7 @@ from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.result.folder import ResultFolder, read_result_folder
-from rangesfm.result.ranges_as_used import RangesAsUsed
+from rangesfm.result.tables import RangesAsUsed
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.workflows.results import RunResult

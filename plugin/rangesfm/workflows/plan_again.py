@@ -21,7 +21,7 @@ from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.result.folder import read_result_folder
 from rangesfm.result.metric_result import MetricResult
-from rangesfm.result.ranges_as_used import RangesAsUsed
+from rangesfm.result.tables import RangesAsUsed
 from rangesfm.scale.verdict import CALIBRATE
 
 # Of photos without times.

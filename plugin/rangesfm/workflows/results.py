@@ -16,10 +16,9 @@ from rangesfm.geometry.reference import write_reference
 from rangesfm.progress import Journal
 from rangesfm.report import write_report
 from rangesfm.result.entries import ComparisonRow
-from rangesfm.result.folder import REFERENCE_NAME, replacing_result
+from rangesfm.result.folder import REFERENCE_NAME, replacing_result, write_models_and_tables
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.summary import ResultSummary
-from rangesfm.result.write import write_models_and_tables
 from rangesfm.scale.lengths import BENDING
 from rangesfm.survey.inputs import RangingInputs, input_hashes
 from rangesfm.survey.settings import Survey

@@ -28,7 +28,7 @@ function makeGrid(box, up) {
 
 /** Keeps a bar of round length up to date. */
 function attachScaleBar(stage, bar) {
-  stage.on("frame", () => {
+  stage.addEventListener("frame", () => {
     const perPixel = stage.metresPerPixel();
     const length = roundLength(130 * perPixel);
     bar.style.width = `${(length / perPixel).toFixed(1)}px`;

@@ -13,11 +13,11 @@ function makePoints(stage, { steps, colors, origin, extent, num }) {
   points.scale.setScalar(extent);
   points.frustumCulled = false;
   let share = 1;
-  stage.on("slow", () => {
+  stage.addEventListener("slow", () => {
     share = Math.max(LEAST_SHARE_WHILE_MOVING, 0.6 * share);
     geometry.setDrawRange(0, Math.ceil(share * num));
   });
-  stage.on("rest", () => geometry.setDrawRange(0, num));
+  stage.addEventListener("rest", () => geometry.setDrawRange(0, num));
   return points;
 }
 

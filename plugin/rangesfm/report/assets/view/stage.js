@@ -6,7 +6,8 @@ const FIELD_OF_VIEW_DEG = 45;
 const SLOPE = Math.tan((FIELD_OF_VIEW_DEG * Math.PI) / 360);
 const MARGIN = 1.08;
 
-class Stage {
+/** Its events: "frame" (drawn), "slow" (frames take long while moving), "rest" (moving has ended). */
+class Stage extends EventTarget {
   /** Returns null where the browser has no WebGL. */
   static on(canvas, labels, up, box) {
     const context = canvas.getContext("webgl2", { antialias: true, alpha: false });
@@ -14,6 +15,7 @@ class Stage {
   }
 
   constructor(canvas, labels, context, up, box) {
+    super();
     THREE.ColorManagement.enabled = false; // colours go to the screen as the photos have them
     Object.assign(this, { canvas, box, scene: new THREE.Scene(), lastFrame: null, isRequested: false });
     this.center = new THREE.Vector3(...box.low).add(new THREE.Vector3(...box.high)).divideScalar(2);
@@ -23,7 +25,6 @@ class Stage {
     this.camera = new THREE.PerspectiveCamera(FIELD_OF_VIEW_DEG, 1, box.radius / 500, box.radius * 50);
     this.camera.up.set(...up);
     this.controls = new THREE.OrbitControls(this.camera, canvas);
-    this.listeners = { frame: [], slow: [], rest: [] };
     this.controls.addEventListener("change", () => this.requestFrame());
     this.controls.addEventListener("start", () => (this.lastFrame = performance.now()));
     this.controls.addEventListener("end", () => this.#rest());
@@ -33,11 +34,6 @@ class Stage {
       this.scene.background.set(themeColor("stage"));
       this.requestFrame();
     });
-  }
-
-  /** name: "frame" (drawn), "slow" (frames take long while moving), "rest" (moving has ended). */
-  on(name, callback) {
-    this.listeners[name].push(callback);
   }
 
   add(...objects) {
@@ -64,10 +60,10 @@ class Stage {
     this.camera.updateProjectionMatrix();
     this.renderer.render(this.scene, this.camera);
     this.labels.render(this.scene, this.camera);
-    this.#tell("frame");
+    this.dispatchEvent(new Event("frame"));
     if (this.lastFrame === null) return;
     const duration = performance.now() - this.lastFrame;
-    if (duration > SLOW_FRAME_MS && duration < 1000) this.#tell("slow");
+    if (duration > SLOW_FRAME_MS && duration < 1000) this.dispatchEvent(new Event("slow"));
     this.lastFrame += duration;
   }
 
@@ -102,12 +98,8 @@ class Stage {
 
   #rest() {
     this.lastFrame = null;
-    this.#tell("rest");
+    this.dispatchEvent(new Event("rest"));
     this.requestFrame();
-  }
-
-  #tell(event) {
-    for (const callback of this.listeners[event]) callback();
   }
 }
 

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 from rangesfm.errors import InputError
-from rangesfm.result.folder import TABLES
-from rangesfm.result.table_file import TableFile
-from rangesfm.result.tables import CenterCovariances, PhotoTimes, ScaleConsensus, TimeOffsetCurve
+from rangesfm.result.tables import TABLES, CenterCovariances, PhotoTimes, ScaleConsensus, TableFile, TimeOffsetCurve
 
 
 def example(kind: type[TableFile], num_rows: int) -> TableFile:
