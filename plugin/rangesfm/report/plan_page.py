@@ -20,7 +20,7 @@ from rangesfm.report.page import render, write_page
 from rangesfm.report.plot import Figure, Limits, Panel, Pixels, Series, View, equal_view, views_of
 from rangesfm.report.tables import Table
 from rangesfm.report.text import count, duration, fixed, percent, rough
-from rangesfm.trust.table import MistakeTest
+from rangesfm.trust.testing import MistakeTest
 
 # From well known to hardly, each as visible on a light page as on a dark one.
 _COLORS = ("#2f7ebc", "#2a9d8f", "#6f9a2b", "#c98b12", "#d4512b")
