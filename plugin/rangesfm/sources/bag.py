@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from rangesfm.colmap.opencv_camera import colmap_camera
 from rangesfm.errors import InputError
-from rangesfm.files.bags import open_bag, type_name
+from rangesfm.files.bags import messages_of, open_bag, stamp_s, type_name
 from rangesfm.sources.pixels import image_file, opened, raw_image
 from rangesfm.sources.source import MAX_SIDE_PX, Frame, Source
 
@@ -48,7 +48,7 @@ def open_images(path: Path, topic: str | None) -> Source:
         size_px = image.size
         camera, notes = _camera(bag, topic, kind, size_px, path)
         duration_s = bag.duration * 1e-9
-    is_stamped = _stamp_s(message) > 0
+    is_stamped = stamp_s(message) > 0
     clock = "the stamps of their headers" if is_stamped else "when they arrived, as their headers have no stamps"
     what = f"{num_by_topic[topic]} images of {topic}, {size_px[0]} x {size_px[1]} pixels"
     frames = partial(_frames, path, topic, is_stamped)
@@ -76,14 +76,13 @@ def _chosen(num_by_topic: dict[str, int], topic: str | None, path: Path) -> str:
 def _messages(bag: AnyReader, topic: str) -> Iterator[tuple[str, Any, float]]:
     """Type, content and time of arrival of each message of a topic."""
     connections = [item for item in bag.connections if item.topic == topic]
-    for connection, received_ns, data in bag.messages(connections):
-        yield type_name(connection.msgtype), bag.deserialize(data, connection.msgtype), received_ns * 1e-9
+    return ((type_name(kind), message, received_s) for kind, message, received_s in messages_of(bag, connections))
 
 
 def _frames(path: Path, topic: str, is_stamped: bool) -> Iterator[Frame]:
     with open_bag(path) as bag:
         for number, (kind, message, received_s) in enumerate(_messages(bag, topic)):
-            time_s = _stamp_s(message) if is_stamped else received_s
+            time_s = stamp_s(message) if is_stamped else received_s
             if kind == _COMPRESSED:
                 content, suffix = image_file(message, path)
                 grey = partial(opened, content, path, reduced_to_px=MAX_SIDE_PX)
@@ -118,11 +117,6 @@ def _camera(
         )
     except InputError as error:
         return None, (f"{info_topic} is not taken as the camera: {error}",)
-
-
-def _stamp_s(message: Any) -> float:
-    """0 for a stamp that nobody set."""
-    return float(message.header.stamp.sec + message.header.stamp.nanosec * 1e-9)
 
 
 def _grey(message: Any, path: Path) -> Image:

@@ -18,7 +18,7 @@ from rangesfm.ranging.errors.noise_of_log import find_quantization_m, quantizati
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers import canonical, ros
 from rangesfm.ranging.readers.canonical import write_ranges_csv
-from rangesfm.ranging.readers.printed_formats import PRINTED
+from rangesfm.ranging.readers.printed import PRINTED
 from rangesfm.ranging.readers.reader import Reader, ReadOptions
 from rangesfm.ranging.readers.roles import tell_roles
 from rangesfm.ranging.readers.several import files_of_log, join_logs

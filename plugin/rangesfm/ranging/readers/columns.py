@@ -16,7 +16,7 @@ from rangesfm.errors import InputError
 from rangesfm.files.tables import Categories, Table, read_table
 from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.layout import MISSING, Layout
-from rangesfm.ranging.readers.reader import ReadOptions, far_above_all, no_usable_range, told_far
+from rangesfm.ranging.readers.reader import ReadOptions, which_are_measured
 from rangesfm.ranging.readers.times import (
     CIVIL_TIME,
     CIVIL_UNITS,
@@ -37,7 +37,6 @@ QUANTITIES = (
 )
 
 _MAX_TIME_S = 1e11  # three thousand years
-_NOTHING = 1e-12  # in any unit
 _TEXTS = ("image_name", "date", "anchor_id", "tag_id", "antenna")
 
 
@@ -98,11 +97,8 @@ def read_columns(path: Path, columns: Columns, options: ReadOptions, format: str
     row = np.repeat(np.arange(len(table)), num_ends)
     anchor, tag = _anchors(table, name, columns), _tags(table, name, columns)
     ranges = _ranges(table, name, columns, options)
-    far = far_above_all(ranges)
-    measured = (ranges > _NOTHING) & (ranges < far)
-    notes += [] if np.isinf(far) else [told_far(int(np.sum(ranges == far)), far)]
-    if not np.any(measured):
-        raise no_usable_range(len(ranges), path)
+    measured, more = which_are_measured(ranges, path)
+    notes += more
     row, ranges, anchor = row[measured], ranges[measured], anchor.subset(measured)
     tag = None if tag is None else tag.subset(measured)
     times = None if timestamps is None else timestamps[row]

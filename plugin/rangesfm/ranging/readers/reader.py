@@ -6,12 +6,13 @@ import math
 import shlex
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Mask
 from rangesfm.errors import InputError
 from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
@@ -20,6 +21,7 @@ from rangesfm.ranging.readers.roles import Sides
 
 # A value that stands for no measurement: so often, so many times the largest range, where so many show what is usual.
 _MIN_NUM_FAR, _FAR, _MIN_NUM = 3, 4.0, 20
+_NOTHING = 1e-12  # in any unit
 
 
 class ReadOptions(LogOptions):
@@ -68,40 +70,23 @@ class Reading(NamedTuple):
     los: int = -1
 
 
-def far_above_all(ranges: Array) -> float:
-    """The value that stands for no measurement, as 65535: the largest one, far above all others and often; else inf."""
+def which_are_measured(ranges: Array, path: Path) -> tuple[Mask, tuple[str, ...]]:
+    """(n,) which of the ranges in a file are one, and what to say of the others; InputError if none is.
+
+    Those are none that are not positive, and the largest where it stands for no measurement, as 65535: far above all
+    others and often.
+    """
     positive = ranges[(ranges > 0) & (ranges < math.inf)]
     largest = float(np.max(positive, initial=0.0))
     others = positive[positive < largest]
-    is_often = len(positive) - len(others) >= _MIN_NUM_FAR
-    return largest if is_often and len(others) >= _MIN_NUM and largest > _FAR * others.max() else math.inf
-
-
-def told_far(num: int, value: float) -> str:
-    return f"{value:.10g} stands there {num} times, far above all other ranges: taken for no measurement"
-
-
-def log_of_readings(readings: Iterable[Reading], path: Path, format: str) -> RangeLog:
-    """All of it; InputError if no range was found."""
-    readings = list(readings)
-    far = far_above_all(np.array([reading.range_m for reading in readings]))
-    measured = [reading for reading in readings if 0 < reading.range_m < far]
-    if not measured:
-        raise no_usable_range(len(readings), path)
-    times, anchor_ids, ranges, lines, tag_ids, stddevs, los = zip(*measured)
-    return RangeLog.from_arrays(
-        anchor_ids,
-        ranges,
-        timestamp_s=times,
-        range_stddev_m=[stddev if 0 < stddev < math.inf else math.nan for stddev in stddevs],
-        tag_id=tag_ids,
-        los=los,
-        line=lines,
-        source=path,
-        format=format,
-        num_no_measurement=len(readings) - len(measured),
-        notes=() if math.isinf(far) else (told_far(sum(reading.range_m == far for reading in readings), far),),
-    )
+    num_far = len(positive) - len(others)
+    is_far = num_far >= _MIN_NUM_FAR and len(others) >= _MIN_NUM and largest > _FAR * others.max()
+    measured: Mask = (ranges > _NOTHING) & (ranges < (largest if is_far else math.inf))
+    if not measured.any():
+        said = f"all {len(ranges)} records say that there was no measurement" if len(ranges) else "no records"
+        raise InputError(f"no usable range: {said}", path)
+    note = f"{largest:.10g} stands there {num_far} times, far above all other ranges: taken for no measurement"
+    return measured, (note,) if is_far else ()
 
 
 def reader_of_readings(
@@ -117,11 +102,21 @@ def reader_of_readings(
         if options.columns or options.range_unit is not None or options.separator is not None:
             message = "the log has a format of its own, without columns, range_unit or separator to be given"
             raise InputError(message, path)
-        return log_of_readings(readings(path, options), path, name)
+        found = list(readings(path, options))
+        measured, notes = which_are_measured(np.array([reading.range_m for reading in found], np.float64), path)
+        times, anchor_ids, ranges, lines, tag_ids, stddevs, los = zip(*compress(found, measured))
+        return RangeLog.from_arrays(
+            anchor_ids,
+            ranges,
+            timestamp_s=times,
+            range_stddev_m=[stddev if 0 < stddev < math.inf else math.nan for stddev in stddevs],
+            tag_id=tag_ids,
+            los=los,
+            line=lines,
+            source=path,
+            format=name,
+            num_no_measurement=len(found) - len(ranges),
+            notes=notes,
+        )
 
     return Reader(name, recognizes, read, read_anchors, sides)
-
-
-def no_usable_range(num_records: int, path: Path) -> InputError:
-    said = f"all {num_records} records say that there was no measurement" if num_records else "no records"
-    return InputError(f"no usable range: {said}", path)

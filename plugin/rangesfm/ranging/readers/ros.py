@@ -5,15 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rangesfm.errors import InputError
-from rangesfm.files.bags import SQLITE_HEAD, open_bag, type_name
+from rangesfm.files.bags import SQLITE_HEAD, messages_of, open_bag, stamp_s, type_name
 from rangesfm.ranging.readers.reader import Reading, ReadOptions, reader_of_readings
 from rangesfm.ranging.readers.roles import Sides
-
-if TYPE_CHECKING:
-    from rosbags.highlevel import AnyReader
 
 _BEGINS = ("#ROSBAG V", SQLITE_HEAD)
 _MCAP = "MCAP0"
@@ -25,24 +22,19 @@ def _recognizes(head: str) -> bool:
 
 
 def _readings(path: Path, options: ReadOptions) -> Iterator[Reading]:
-    with open_bag(path) as bag:
-        yield from _in_bag(bag, path)
-
-
-def _in_bag(bag: AnyReader, path: Path) -> Iterator[Reading]:
     """The ranges in all messages that hold any, each with the 1-based number of its message as its line."""
-    connections = [connection for connection in bag.connections if type_name(connection.msgtype) in _RANGES_IN]
-    if not connections:
-        found = ", ".join(sorted({connection.msgtype for connection in bag.connections})) or "no messages"
-        raise InputError(f"no ranges in this bag; it has {found}, expected one of {', '.join(_RANGES_IN)}", path)
-    for number, (connection, received_ns, data) in enumerate(bag.messages(connections), 1):
-        message = bag.deserialize(data, connection.msgtype)
-        try:
-            readings = list(_RANGES_IN[type_name(connection.msgtype)](message))
-        except AttributeError as error:
-            raise InputError(f"a {connection.msgtype} has another definition than expected ({error})", path) from None
-        for reading in readings:
-            yield reading._replace(timestamp_s=reading.timestamp_s or received_ns * 1e-9, line=number)
+    with open_bag(path) as bag:
+        connections = [connection for connection in bag.connections if type_name(connection.msgtype) in _RANGES_IN]
+        if not connections:
+            found = ", ".join(sorted({connection.msgtype for connection in bag.connections})) or "no messages"
+            raise InputError(f"no ranges in this bag; it has {found}, expected one of {', '.join(_RANGES_IN)}", path)
+        for number, (kind, message, received_s) in enumerate(messages_of(bag, connections), 1):
+            try:
+                readings = list(_RANGES_IN[type_name(kind)](message))
+            except AttributeError as error:
+                raise InputError(f"a {kind} has another definition than expected ({error})", path) from None
+            for reading in readings:
+                yield reading._replace(timestamp_s=reading.timestamp_s or received_s, line=number)
 
 
 def _range_stamped(message: Any) -> Iterator[Reading]:
@@ -85,10 +77,7 @@ _RANGES_IN: dict[str, Callable[[Any], Iterator[Reading]]] = {
 
 
 def _stamped(message: Any, anchor_id: Any, range_m: Any, tag_id: Any, stddev_m: Any, los: int = -1) -> Reading:
-    """At the time of the header, 0 if nobody set it."""
-    stamp = message.header.stamp
-    time_s = float(stamp.sec + stamp.nanosec * 1e-9)
-    return Reading(time_s, str(anchor_id), float(range_m), 0, str(tag_id), float(stddev_m), los)
+    return Reading(stamp_s(message), str(anchor_id), float(range_m), 0, str(tag_id), float(stddev_m), los)
 
 
 def _root(variance: float) -> float:
