@@ -139,16 +139,11 @@ def _distances(table: Table) -> tuple[TapedDistance, ...]:
             raise table.error(row, "to", "another end than 'from'")
         if kind not in (CONTROL, CHECK):
             raise table.error(row, "kind", f"{CONTROL} or {CHECK}")
-    lengths = _positive(table, "distance_m", "a number of metres greater than 0", empty=None)
-    stddevs = _positive(table, "stddev_m", "a number of metres greater than 0, or nothing", empty=DEFAULT_STDDEV_M)
+    metres = "a number of metres greater than 0"
+    lengths = table.numbers("distance_m", expected=metres, above=0.0)
+    stddevs = table.numbers("stddev_m", empty=DEFAULT_STDDEV_M, expected=f"{metres}, or nothing", above=0.0)
     rows = zip(starts, ends, lengths.tolist(), stddevs.tolist(), kinds, table.line.tolist(), strict=True)
     return tuple(TapedDistance((a, b), length, stddev, kind, line) for a, b, length, stddev, kind, line in rows)
-
-
-def _positive(table: Table, column: str, expected: str, *, empty: float | None) -> npt.NDArray[np.float64]:
-    values = table.numbers(column, empty=empty, expected=expected)
-    table.refuse(values <= 0, column, expected)
-    return values
 
 
 def _markers(table: Table) -> dict[str, Marker]:

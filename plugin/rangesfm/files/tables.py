@@ -120,6 +120,8 @@ class Table:
         empty: float | None = None,
         missing: Collection[str] = ("",),
         expected: str = "a number",
+        least: float = -np.inf,
+        above: float = -np.inf,
     ) -> npt.NDArray[np.float64]:
         """The cells as finite numbers, (n,).
 
@@ -127,6 +129,7 @@ class Table:
             empty: stands for empty cells, which are refused if it is None, and for a column that is not there.
             missing: what an empty cell may look like, in small letters.
             expected: what the message calls a good cell.
+            least, above: numbers less than one, and those not above the other, are refused.
         """
         if column not in self and empty is not None:
             return np.full(len(self), empty)
@@ -138,6 +141,7 @@ class Table:
             if empty is None or raw[row].strip().lower() not in missing:
                 raise self.error(row, column, expected)
             values[row] = empty
+        self.refuse((values < least) | (values <= above), column, expected)
         return values
 
     def error(self, row: int, column: str, expected: str) -> InputError:

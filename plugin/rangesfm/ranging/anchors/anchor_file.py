@@ -37,9 +37,10 @@ def read_anchors(path: str | Path) -> tuple[Anchor, ...]:
     anchor_ids = table.text("anchor_id")
     _check_unique(table, anchor_ids)
     positions = _positions(table)
-    position_stddevs = _not_negative(table, "position_stddev_m", empty=0.0)
+    expected = "a number of metres that is not negative, or nothing"
+    position_stddevs = table.numbers("position_stddev_m", empty=0.0, expected=expected, least=0.0)
     biases = table.numbers("range_bias_m", empty=0.0)
-    bias_stddevs = _not_negative(table, "range_bias_stddev_m", empty=np.nan)
+    bias_stddevs = table.numbers("range_bias_stddev_m", empty=np.nan, expected=expected, least=0.0)
     return tuple(
         Anchor(
             anchor_id=anchor_id,
@@ -105,10 +106,3 @@ def _positions(table: Table) -> Array:
         column = _COORDINATES[int(np.argmax(unknown[row]))]
         raise table.error(row, column, "all three coordinates or none")
     return positions
-
-
-def _not_negative(table: Table, column: str, *, empty: float) -> Array:
-    expected = "a number of metres that is not negative, or nothing"
-    values = table.numbers(column, empty=empty, expected=expected)
-    table.refuse(values < 0, column, expected)
-    return values

@@ -102,24 +102,26 @@ def read_columns(path: Path, columns: Columns, options: ReadOptions, format: str
     row, ranges, anchor = row[measured], ranges[measured], anchor.subset(measured)
     tag = None if tag is None else tag.subset(measured)
     times = None if timestamps is None else timestamps[row]
-    unit: str | None = "m"
+    unit = "m"
     if "range" in name or columns.wide:
         with _asking("range", path, options):
             pair = anchor.index if tag is None else anchor.index * len(tag.names) + tag.index
             column = name.get("range") or next(iter(columns.wide))
             column = f"{column} {units.get(column, '')}".strip()
-            unit = options.range_unit or _noted(notes, range_unit(column, ranges, times, pair))
-    per_metre = UNITS_PER_METRE[unit or "m"]
-    stddevs = _stddevs(table, name["range_stddev"], per_metre) if "range_stddev" in name else None
-    los = _line_of_sight(table, name) if {"los", "nlos"} & set(name) else None
+            unit = options.range_unit or range_unit(column, ranges, times, pair, notes)
+    per_metre = UNITS_PER_METRE[unit]
+    stddevs, los = np.full(len(table), np.nan), _line_of_sight(table, name)
+    if "range_stddev" in name:
+        expected = "a positive number or nothing"
+        stddevs = table.numbers(name["range_stddev"], empty=np.nan, expected=expected, above=0.0) / per_metre
     return RangeLog.from_arrays(
         anchor,
         ranges / per_metre,
         timestamp_s=times,
         image_name=None if image_name is None else [image_name[k] for k in row.tolist()],
-        range_stddev_m=None if stddevs is None else stddevs[row],
+        range_stddev_m=stddevs[row],
         tag_id=tag,
-        los=None if los is None else los[row],
+        los=los[row],
         line=table.line[row],
         source=path,
         format=format,
@@ -140,12 +142,6 @@ def _asking(quantity: str, path: Path, options: ReadOptions) -> Iterator[None]:
         raise InputError(
             message, path, advice=[options.command(path, **{flag: unit}) for unit in doubt.units]
         ) from None
-
-
-def _noted(notes: list[str], unit_and_note: tuple[str, str | None]) -> str:
-    unit, note = unit_and_note
-    notes += [] if note is None else [note]
-    return unit
 
 
 def _anchors(table: Table, name: Mapping[str, str], columns: Columns) -> Categories:
@@ -239,7 +235,7 @@ def _timestamps(
         return _civil_times(table, name, unit, notes)
     times = table.numbers(column, expected=f"a time in {unit or 's'}")
     if unit is None:
-        unit = _noted(notes, time_unit(f"{column} {units.get(column, '')}".strip(), times))
+        unit = time_unit(f"{column} {units.get(column, '')}".strip(), times, notes)
     seconds = (times - (days_before_1970(times) if unit == "d" else 0.0)) * SECONDS_PER_UNIT[unit]
     table.refuse(np.abs(seconds) > _MAX_TIME_S, column, f"a time in {unit}")
     return seconds + 1e-9 * table.numbers(name["nanoseconds"]) if "nanoseconds" in name else seconds
@@ -267,15 +263,10 @@ def _civil_times(table: Table, name: Mapping[str, str], unit: str | None, notes:
     return seconds
 
 
-def _stddevs(table: Table, column: str, per_metre: float) -> Array:
-    expected = "a positive number or nothing"
-    stddevs = table.numbers(column, empty=np.nan, expected=expected) / per_metre
-    table.refuse(stddevs <= 0, column, expected)
-    return stddevs
-
-
 def _line_of_sight(table: Table, name: Mapping[str, str]) -> npt.NDArray[np.int8]:
-    column = name.get("los") or name["nlos"]
+    column = name.get("los") or name.get("nlos")
+    if column is None:
+        return np.full(len(table), -1, np.int8)
     expected = "1 (line of sight), 0 (none) or nothing"
     los = table.numbers(column, empty=-1.0, expected=expected)
     wrong = ~np.isin(los, (0.0, 1.0)) & (np.array(table.text(column, empty="")) != "")
