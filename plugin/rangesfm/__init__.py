@@ -52,7 +52,7 @@ _HOME = {
     "rescale": "rangesfm.colmap.transform",
     "run_survey": "rangesfm.workflows.run",
     "select_keyframes": "rangesfm.vision.keyframes",
-    "tag_positions": "rangesfm.ranging.tag_positions",
+    "tag_positions": "rangesfm.ranging.association",
     "trajectory_from_reconstruction": "rangesfm.geometry.trajectory",
     "trilaterate": "rangesfm.ranging.anchors.trilateration",
     "trilaterate_anchors": "rangesfm.ranging.anchors.anchor_survey",

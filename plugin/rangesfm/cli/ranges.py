@@ -179,7 +179,7 @@ def _read_log(args: argparse.Namespace, anchor_ids: Sequence[str] = ()) -> Range
 def _read_placed_log(args: argparse.Namespace) -> tuple[RangeLog, Array]:
     """The log, of one tag, and (n, 3) where that was at each of the ranges; NaN: not known."""
     from rangesfm.geometry.reference import read_reference
-    from rangesfm.ranging.tag_positions import tag_positions
+    from rangesfm.ranging.association import tag_positions
     from rangesfm.survey.inputs import of_one_tag
 
     log, known = of_one_tag(_read_log(args), args.tag_id), read_reference(args.positions)

@@ -13,16 +13,16 @@ from pydantic import AliasChoices, Field
 
 from rangesfm.errors import InputError
 from rangesfm.files.records import Number, NumberOrNull, Record, Text
-from rangesfm.files.tables import Table, has_columns, read_table
+from rangesfm.files.tables import Table, read_table
 
 CONTROL, CHECK = "control", "check"
 # Of one that cannot belong to the map.
 LEFT_OUT = "left out"
 # What a steel tape and a steady hand are good for.
 DEFAULT_STDDEV_M = 0.01
-_DISTANCE_COLUMNS = ("from", "to", "distance_m")
+DISTANCE_COLUMNS = ("from", "to", "distance_m")
 _PIXELS = ("x_px", "y_px")
-_MARKER_COLUMNS = ("marker", "image_name", *_PIXELS)
+MARKER_COLUMNS = ("marker", "image_name", *_PIXELS)
 _CLICKED_STDDEV_PX = 1.0
 FOUND_STDDEV_PX = 0.3
 """Of a corner that a library found."""
@@ -106,16 +106,6 @@ class Tape:
         return replace(self, distances=tuple(distances))
 
 
-def is_distances_file(head: str) -> bool:
-    """Whether a file that begins like this is one of taped distances."""
-    return has_columns(head, _DISTANCE_COLUMNS)
-
-
-def is_markers_file(head: str) -> bool:
-    """Whether a file that begins like this says where marks are in photos."""
-    return has_columns(head, _MARKER_COLUMNS)
-
-
 def read_tape(distances_path: str | Path, markers_path: str | Path | None = None) -> Tape:
     """Read ``from,to,distance_m[,stddev_m,kind]`` and ``marker,image_name,x_px,y_px``.
 
@@ -124,8 +114,8 @@ def read_tape(distances_path: str | Path, markers_path: str | Path | None = None
     Raises:
         InputError: with the line, for what is not as described.
     """
-    distances = _distances(read_table(distances_path, _DISTANCE_COLUMNS, ["stddev_m", "kind"]))
-    markers = None if markers_path is None else _markers(read_table(markers_path, _MARKER_COLUMNS))
+    distances = _distances(read_table(distances_path, DISTANCE_COLUMNS, ["stddev_m", "kind"]))
+    markers = None if markers_path is None else _markers(read_table(markers_path, MARKER_COLUMNS))
     return Tape(distances, markers, Path(distances_path), None if markers_path is None else Path(markers_path))
 
 

@@ -196,7 +196,8 @@ def read_table(
     known, aliases = (*required, *optional), aliases or {}
     found = [cell.strip() for cell in _split_row(header_row, separator, path, header_line)]
     names = [name if name in known else aliases.get(name, name) for name in found]
-    _check_has_header(names, required, optional, path, header_line)
+    if all(_number(name) is not None for name in names):
+        raise InputError(f"no header row, expected {_expected(required, optional)}", path, header_line)
     _check_names(names, required, optional, path, header_line)
     wanted = {name: names.index(name) for name in known if name in names}
     reread = partial(_table_of_texts, path, names, wanted, header_line, body, separator)
@@ -340,13 +341,6 @@ def _split_row(row: str, separator: str, path: Path | None = None, line: int | N
     except csv.Error as error:
         raise InputError(f"not a row of cells ({error})", path, line) from None
     return cells
-
-
-def _check_has_header(
-    names: list[str], required: Sequence[str], optional: Sequence[str], path: Path, line: int
-) -> None:
-    if all(_number(name) is not None for name in names):
-        raise InputError(f"no header row, expected {_expected(required, optional)}", path, line)
 
 
 def _check_names(names: list[str], required: Sequence[str], optional: Sequence[str], path: Path, line: int) -> None:

@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from rangesfm.distances.tape import is_distances_file, is_markers_file
+from rangesfm.distances.tape import DISTANCE_COLUMNS, MARKER_COLUMNS
 from rangesfm.errors import InputError
 from rangesfm.files.bags import is_bag, is_bag_folder
 from rangesfm.files.folders import LEFT_BY_RUNS, walk
-from rangesfm.files.tables import read_head
+from rangesfm.files.tables import has_columns, read_head
 from rangesfm.findings.calibration import Calibration, read_calibrations
 from rangesfm.geometry.reference import is_reference_file
-from rangesfm.ranging.anchors.anchor_file import is_anchor_file
+from rangesfm.ranging.anchors.anchor_file import ANCHOR_ALIASES, ANCHOR_COLUMNS
 from rangesfm.ranging.errors.error_curve import is_error_curve_file
 from rangesfm.ranging.readers import find_log_reader, read_ranges
 from rangesfm.sources.bag import has_images
@@ -32,11 +33,11 @@ _TABLE_EXTENSIONS = (".csv", ".tsv", ".txt", ".log", ".dat")
 _MAX_NUM_UNSURE = 3
 # By the header row, once it is known that the file is no log.
 _TABLES = {
-    "scale.markers": is_markers_file,
-    "scale.distances": is_distances_file,
+    "scale.markers": partial(has_columns, required=MARKER_COLUMNS),
+    "scale.distances": partial(has_columns, required=DISTANCE_COLUMNS),
     "ranges.error_curve": is_error_curve_file,
     "report.reference": is_reference_file,
-    "anchors.path": is_anchor_file,
+    "anchors.path": partial(has_columns, required=ANCHOR_COLUMNS, aliases=ANCHOR_ALIASES),
     "images.times": is_image_times_file,
 }
 

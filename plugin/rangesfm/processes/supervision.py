@@ -17,14 +17,16 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import IO, Any, TextIO
 
 import psutil
 
-from rangesfm.errors import failure_of
+from rangesfm.errors import ReconstructionError, failure_of
 
 _PR_SET_PDEATHSIG = 1
 _UPDATE_INTERVAL_S = 0.5
@@ -159,6 +161,70 @@ def supervise(
             process.wait()
         died_of = signal.Signals(-process.returncode) if process.returncode < 0 else None
         return Ended(last, died_of, watched.needed_bytes, watched.stopped_at is not None, _last_line(errors))
+
+
+def run_children(
+    module: str, given: Iterable[object], num_at_once: int, update: Callable[[int], None]
+) -> Generator[None, None, None]:
+    """Have pieces of work done, each by a process; yields once for each that is done, in their order.
+
+    Leaving the iteration (``contextlib.closing``) interrupts the processes, and waits for their end.
+
+    Args:
+        module: what they run, by ``work_for_parent``; it ends with the number of items that it has done.
+        given: what each process is given. Not taken from before there is need of it: no more than one waits.
+        update: called several times a second with the number of items that all of them have done.
+
+    Raises:
+        ReconstructionError: a process failed; the others were interrupted.
+    """
+    stop, num_done = threading.Event(), list[int]()
+    pending: deque[Future[None]] = deque()
+
+    def run(place: int, work: bytes) -> None:
+        def listen(message: dict[str, Any]) -> None:
+            num_done[place] = message.get("num_done", num_done[place])
+
+        if stop.is_set():
+            return
+        environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+        ended = supervise(
+            child_command(module),
+            work,
+            listen,
+            environment=environment,
+            memory_limit_bytes=None,
+            is_stopped=stop.is_set,
+        )
+        last = ended.last or {}
+        if "done" in last:
+            num_done[place] = last["done"]
+        elif not ended.stopped:
+            raise ReconstructionError(last["failed"]["message"] if "failed" in last else ended.how)
+
+    def wait_for_first() -> None:
+        while not wait([pending[0]], timeout=_POLL_INTERVAL_S).done:
+            update(sum(num_done))
+            for future in pending:
+                if future.done():
+                    future.result()
+        pending.popleft().result()
+        update(sum(num_done))
+
+    with ThreadPoolExecutor(num_at_once, thread_name_prefix="child") as executor:
+        try:
+            for place, work in enumerate(given):
+                num_done.append(0)
+                pending.append(executor.submit(run, place, pickle.dumps(work)))
+                if len(pending) > num_at_once:
+                    wait_for_first()
+                    yield
+            while pending:
+                wait_for_first()
+                yield
+        except BaseException:
+            stop.set()
+            raise
 
 
 class _Watched:

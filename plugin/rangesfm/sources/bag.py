@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rangesfm.colmap.opencv_camera import colmap_camera
+from rangesfm.colmap.calibration import colmap_camera
 from rangesfm.errors import InputError
 from rangesfm.files.bags import messages_of, open_bag, stamp_s, type_name
 from rangesfm.sources.pixels import image_file, opened, raw_image

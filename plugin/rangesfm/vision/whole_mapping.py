@@ -17,8 +17,7 @@ import pycolmap
 from rangesfm.colmap.log import append_log, colmap_log
 from rangesfm.colmap.model_files import read_model
 from rangesfm.files.atomic import scratch_folder
-from rangesfm.processes.children import run_children
-from rangesfm.processes.supervision import MessagesToParent, work_for_parent
+from rangesfm.processes.supervision import MessagesToParent, run_children, work_for_parent
 from rangesfm.progress import Progress
 
 WholePipelineOptions = pycolmap.GlobalPipelineOptions | pycolmap.HierarchicalPipelineOptions

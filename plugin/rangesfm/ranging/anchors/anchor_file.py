@@ -9,17 +9,13 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.files.tables import Table, has_columns, read_table, write_table
+from rangesfm.files.tables import Table, read_table, write_table
 from rangesfm.ranging.anchors.anchor import Anchor
 
 _COORDINATES = ("x_m", "y_m", "z_m")
 _OPTIONAL = ("position_stddev_m", "range_bias_m", "range_bias_stddev_m")
-_ALIASES = {"": "anchor_id", "id": "anchor_id", "Anchor_ID": "anchor_id", "x": "x_m", "y": "y_m", "z": "z_m"}
-
-
-def is_anchor_file(head: str) -> bool:
-    """Whether a file that begins like this is one of anchors."""
-    return has_columns(head, ["anchor_id", *_COORDINATES], _ALIASES)
+ANCHOR_COLUMNS = ("anchor_id", *_COORDINATES)
+ANCHOR_ALIASES = {"": "anchor_id", "id": "anchor_id", "Anchor_ID": "anchor_id", "x": "x_m", "y": "y_m", "z": "z_m"}
 
 
 def read_anchors(path: str | Path) -> tuple[Anchor, ...]:
@@ -31,7 +27,7 @@ def read_anchors(path: str | Path) -> tuple[Anchor, ...]:
     Raises:
         InputError: with the line, for an anchor named twice, an incomplete position, or what is not a number.
     """
-    table = read_table(path, ["anchor_id", *_COORDINATES], _OPTIONAL, aliases=_ALIASES, separator=None)
+    table = read_table(path, ANCHOR_COLUMNS, _OPTIONAL, aliases=ANCHOR_ALIASES, separator=None)
     if not len(table):
         raise InputError("names no anchor, expected one a line", path)
     anchor_ids = table.text("anchor_id")
@@ -60,7 +56,7 @@ def write_anchors(anchors: Sequence[Anchor], path: str | Path) -> None:
         InputError: the file cannot be written.
     """
     try:
-        write_table(Path(path), ["anchor_id", *_COORDINATES, *_OPTIONAL], map(_row, anchors))
+        write_table(Path(path), [*ANCHOR_COLUMNS, *_OPTIONAL], map(_row, anchors))
     except OSError as error:
         raise InputError(f"cannot be written ({error.strerror})", path) from error
 

@@ -1,4 +1,4 @@
-"""Robust least squares for a point and a range bias, also without a first guess.
+"""Robust least squares for a point and a range bias, also without a first guess, and how wrong they may be.
 
     predicted = || p - a || + b
 
@@ -7,15 +7,19 @@ p: known position of the tag; a: the point that is sought, an anchor's antenna; 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.similarity import path_shape
 from rangesfm.ranging.anchors.multilateration import multilaterate
+from rangesfm.ranging.errors.cells import cells, noisiness
 from rangesfm.ranging.errors.inlier_noise import inlier_noise
+from rangesfm.ranging.errors.learned import learn_errors
 from rangesfm.ranging.errors.robust_loss import CAUCHY, RobustLoss
 from rangesfm.ranging.range_gradient import RangeGradient
 
@@ -32,6 +36,8 @@ _NUM_NOISE_ROUNDS = 4
 _USUAL_NOISE_M = 0.1
 _USUAL_NOISE_COUNTS = 2.0
 _MIN_ORDINARY = 0.3
+# Of the errors that are learnt: each anchor's bias is estimated with a prior of its own, and the path is known.
+_NOT_HERE = ("bias", "common_bias", "bending")
 
 
 @dataclass(frozen=True)
@@ -105,6 +111,11 @@ class PointFit:
     @property
     def residuals_m(self) -> Array:
         return self.problem.residuals_m(self.x)
+
+    @property
+    def off_m(self) -> Array:
+        """(n,) measured minus predicted, with the bias that was expected."""
+        return -self.problem.residuals_m(np.append(self.x[:3], self.problem.prior_mean[3]))
 
     @property
     def weights(self) -> Array:
@@ -209,3 +220,70 @@ def _directions() -> Array:
     height, turn = 1 - 2 * step / _NUM_DIRECTIONS, np.pi * (1 + 5**0.5) * step
     flat = np.sqrt(1 - height**2)
     return np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
+
+
+@dataclass(frozen=True)
+class FitErrors:
+    """Of the n ranges of one anchor.
+
+    Attributes:
+        of_cell: (n,) the cell of each.
+        covariance_m2: (c, c) of the errors of cells.
+    """
+
+    of_cell: Indices
+    covariance_m2: Array
+
+    def of_sums(self, influence: Array) -> Array:
+        """(k, k) covariance of (k, n) sums of the ranges' errors."""
+        of_cells = np.stack([np.bincount(self.of_cell, row, len(self.covariance_m2)) for row in influence])
+        covariance: Array = of_cells @ self.covariance_m2 @ of_cells.T
+        return covariance
+
+    def inflation(self, fit: PointFit, change_m: Array) -> float:
+        """How much larger a stddev is than if ranges erred independently, of what changes them by (n,) ``change_m``."""
+        weight = fit.weights * change_m / fit.problem.stddev_m**2
+        formal = float(weight @ change_m)
+        return float(np.sqrt(max(self.of_sums(weight[None])[0, 0] / formal, 1.0))) if formal > 0 else 1.0
+
+    def inflation_of_bias(self, fit: PointFit) -> float:
+        """The same of the bias, all else adapted."""
+        root = np.sqrt(fit.weights) / fit.problem.stddev_m
+        slopes = fit.problem.slopes(fit.x)
+        adapted = np.linalg.lstsq(root[:, None] * slopes[:, :3], root, rcond=None)[0]
+        return self.inflation(fit, 1.0 - slopes[:, :3] @ adapted)
+
+
+def errors_of_fits(
+    fits: Sequence[PointFit], times_s: Sequence[Array], tags: Sequence[Indices], *, is_calibrated: bool
+) -> list[FitErrors]:
+    """What the residuals of all fits together say of their ranges' errors.
+
+    Args:
+        fits: one for each anchor, of n_k ranges. times_s, tags: (n_k,) of each, when and by which tag.
+        is_calibrated: whether an error curve has been taken off, whose stddev the ranges share.
+    """
+    lengths = [len(fit.residuals_m) for fit in fits]
+    anchor_index = np.repeat(np.arange(len(fits)), lengths)
+    slopes = [fit.problem.slopes(fit.x) for fit in fits]
+    curve_stddev_m = np.concatenate([fit.problem.shared_stddev_m for fit in fits])
+    precision = np.concatenate([fit.own_stddev_m**-2 for fit in fits])
+    learned = learn_errors(
+        cells(
+            anchor_index,
+            np.concatenate(tags),
+            np.concatenate(times_s),
+            np.concatenate([fit.problem.positions_m - fit.x[:3] for fit in fits]),
+            np.tile(np.eye(3), (len(anchor_index), 1, 1)),
+            np.concatenate([fit.weights for fit in fits]) * precision / precision.mean(),
+            noisiness(anchor_index, np.concatenate([fit.residuals_m for fit in fits]), len(fits)),
+        ),
+        off_m=np.concatenate([fit.off_m for fit in fits]),
+        design=block_diag(*slopes),
+        prior_design=block_diag(*(fit.problem.prior for fit in fits)),
+        noise_m=float(precision.mean() ** -0.5),
+        curve_stddev_m=curve_stddev_m if is_calibrated else None,
+        ruled_out=_NOT_HERE,
+    )
+    covariance = learned.covariance_m2
+    return [FitErrors(learned.of_range[anchor_index == k], covariance) for k in range(len(fits))]

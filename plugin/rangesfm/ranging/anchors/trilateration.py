@@ -16,8 +16,14 @@ import numpy.typing as npt
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import PathShape, oriented, path_shape
-from rangesfm.ranging.anchors.fit_errors import FitErrors, errors_of_fits
-from rangesfm.ranging.anchors.point_fit import PointFit, PointProblem, fit_with_own_noise, improve
+from rangesfm.ranging.anchors.point_fit import (
+    FitErrors,
+    PointFit,
+    PointProblem,
+    errors_of_fits,
+    fit_with_own_noise,
+    improve,
+)
 from rangesfm.ranging.errors.noise import short_range_stddev
 from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE, SAME_COST
 
@@ -120,6 +126,11 @@ class AnchorRanges:
         return np.concatenate([[0.0], np.cumsum(steps_m)])
 
     @property
+    def tags(self) -> Indices:
+        """(n,)"""
+        return np.zeros(len(self.range_m), dtype=np.int64) if self.tag_index is None else self.tag_index
+
+    @property
     def shape(self) -> PathShape:
         """Of the tag's positions about their mean; of a level one where the height is known: only that counts."""
         centred = self.tag_positions_m - self.tag_positions_m.mean(axis=0)
@@ -202,7 +213,6 @@ def trilaterate(
         GeometryError: too few ranges, positions on a line or all close together, or else an anchor less
             certain than ``options.max_position_stddev_m``.
     """
-
     positions, ranges = (np.asarray(values, dtype=np.float64) for values in (tag_positions_m, range_m))
     arrays: dict[str, Any] = {
         name: None if values is None else np.asarray(values, dtype=np.float64) for name, values in known.items()
@@ -225,24 +235,16 @@ def trilaterate_together(
             fits[k] = anchor.fit(options)
         except GeometryError as error:
             results[k] = error
-    errors = _errors([anchors[k] for k in fits], list(fits.values()))
+    fitted = [anchors[k] for k in fits]
+    times_s, tags = [anchor.times_s for anchor in fitted], [anchor.tags for anchor in fitted]
+    is_calibrated = all(anchor.shared_stddev_m is not None for anchor in fitted)
+    errors = errors_of_fits([*fits.values()], times_s, tags, is_calibrated=is_calibrated) if fits else []
     for (k, fit), of_fit in zip(fits.items(), errors, strict=True):
         try:
             results[k] = _conclude(anchors[k], _Found.of(fit, of_fit), options)
         except GeometryError as error:
             results[k] = error
     return [results[k] for k in range(len(anchors))]
-
-
-def _errors(anchors: Sequence[AnchorRanges], fits: Sequence[PointFit]) -> list[FitErrors]:
-    if not fits:
-        return []
-    tags = [
-        np.zeros(len(anchor.range_m), dtype=np.int64) if anchor.tag_index is None else anchor.tag_index
-        for anchor in anchors
-    ]
-    is_calibrated = all(anchor.shared_stddev_m is not None for anchor in anchors)
-    return errors_of_fits(fits, [anchor.times_s for anchor in anchors], tags, is_calibrated=is_calibrated)
 
 
 def _conclude(anchor: AnchorRanges, found: _Found, options: TrilaterationOptions) -> Trilateration:
