@@ -55,7 +55,7 @@ _HOME = {
     "tag_positions": "rangesfm.ranging.association",
     "trajectory_from_reconstruction": "rangesfm.geometry.trajectory",
     "trilaterate": "rangesfm.ranging.anchors.trilateration",
-    "trilaterate_anchors": "rangesfm.ranging.anchors.anchor_survey",
+    "trilaterate_anchors": "rangesfm.ranging.anchors.trilateration",
     "two_candidate": "rangesfm.scale.two_candidate",
     "write_report": "rangesfm.report",
 }

@@ -29,7 +29,7 @@ from rangesfm.progress import SilentProgress
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.readers.canonical import write_ranges_csv
+from rangesfm.ranging.readers import write_ranges_csv
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.reconstruct import ReconstructionSummary
 from rangesfm.workflows.run import run_survey, scale_model

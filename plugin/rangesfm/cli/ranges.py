@@ -16,7 +16,7 @@ from rangesfm.progress import Progress
 if TYPE_CHECKING:
     from rangesfm.arrays import Array
     from rangesfm.ranging.anchors.anchor import Anchor
-    from rangesfm.ranging.anchors.anchor_survey import AnchorPlacement
+    from rangesfm.ranging.anchors.trilateration import AnchorPlacement
     from rangesfm.ranging.errors.calibration import Calibration
     from rangesfm.ranging.log import RangeLog
     from rangesfm.ranging.summary import LinkSummary, RangeSummary
@@ -333,8 +333,7 @@ def _trilaterate(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm run survey.toml --anchors anchors.csv --anchor_frame site
     """
     from rangesfm.ranging.anchors.anchor_file import write_anchors
-    from rangesfm.ranging.anchors.anchor_survey import trilaterate_anchors
-    from rangesfm.ranging.anchors.trilateration import TrilaterationOptions
+    from rangesfm.ranging.anchors.trilateration import TrilaterationOptions, trilaterate_anchors
 
     log, tags_m = _read_placed_log(args)
     options = TrilaterationOptions(

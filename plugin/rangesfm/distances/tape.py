@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from pydantic import AliasChoices, Field
 
 from rangesfm.errors import InputError
 from rangesfm.files.records import Number, NumberOrNull, Record, Text
-from rangesfm.files.tables import Table, read_table
+from rangesfm.files.tables import Table, read_table, repeated
 
 CONTROL, CHECK = "control", "check"
 # Of one that cannot belong to the map.
@@ -142,15 +142,13 @@ def _markers(table: Table) -> dict[str, Marker]:
     rows_of: dict[str, list[int]] = {}
     for row, name in enumerate(names):
         rows_of.setdefault(name, []).append(row)
-    return {name: _marker(table, image_names, pixels, rows) for name, rows in rows_of.items()}
-
-
-def _marker(table: Table, image_names: Sequence[str], pixels: npt.NDArray[np.float64], rows: list[int]) -> Marker:
-    seen_in = [image_names[row] for row in rows]
-    for k, row in enumerate(rows):
-        if seen_in[k] in seen_in[:k]:
-            raise table.error(row, "image_name", "a photo in which this marker has no place yet")
-    return Marker(tuple(seen_in), pixels[rows], tuple(table.line[rows].tolist()))
+    markers = {}
+    for name, rows in rows_of.items():
+        seen_in = tuple(image_names[row] for row in rows)
+        if again := repeated(seen_in):
+            raise table.error(rows[again[0]], "image_name", "a photo in which this marker has no place yet")
+        markers[name] = Marker(seen_in, pixels[rows], tuple(table.line[rows].tolist()))
+    return markers
 
 
 class DistanceRow(Record):

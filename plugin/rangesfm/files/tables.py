@@ -12,7 +12,7 @@ import io
 import os
 import stat
 import zlib
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import compress
@@ -248,6 +248,20 @@ def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(header)
         writer.writerows(rows)
+
+
+def write_user_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """As ``write_table``, to a path that the user gave: InputError if it cannot be written."""
+    try:
+        write_table(path, header, rows)
+    except OSError as error:
+        raise InputError(f"cannot be written ({error.strerror})", path) from error
+
+
+def repeated(keys: Iterable[Hashable]) -> tuple[int, int] | None:
+    """Where the first key stands that has been there before, and where that was; None if all differ."""
+    first: dict[Hashable, int] = {}
+    return next(((k, first[key]) for k, key in enumerate(keys) if first.setdefault(key, k) != k), None)
 
 
 def read_text(path: str | Path, *, errors: str = "strict") -> str:

@@ -12,7 +12,16 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
-from rangesfm.files.tables import Table, has_columns, header_names, read_head, read_table, read_text, write_table
+from rangesfm.files.tables import (
+    Table,
+    has_columns,
+    header_names,
+    read_head,
+    read_table,
+    read_text,
+    repeated,
+    write_table,
+)
 from rangesfm.geometry.trajectory import ROUNDING_S, Trajectory
 
 POSITION_COLUMNS = ("x_m", "y_m", "z_m")
@@ -190,12 +199,11 @@ def _from_table(table: Table, key: str) -> Reference:
         raise InputError("no pose in the file, only its header row", table.path)
     positions = np.column_stack([table.numbers(column) for column in POSITION_COLUMNS])
     rotations = _rotations(table)
+    if again := repeated(table.text(key) if key == "image_name" else table.numbers(key).tolist()):
+        raise table.error(again[0], key, "one not said before")
     if key == "image_name":
-        names = table.text(key)
-        _refuse_repeated(table, key, names)
-        return Reference(positions, image_names=tuple(names), world_from_cam=rotations)
+        return Reference(positions, image_names=tuple(table.text(key)), world_from_cam=rotations)
     times = table.numbers(key)
-    _refuse_repeated(table, key, times.tolist())
     order = np.argsort(times)
     turns = None if rotations is None else rotations[order]
     return Reference(positions[order], timestamps_s=times[order], world_from_cam=turns)
@@ -218,14 +226,6 @@ def _rotations(table: Table) -> Array | None:
         raise InputError(message, table.path, int(table.line[wrong[0]]))
     rotations: Array = Rotation.from_quat(quaternions).as_matrix()
     return rotations
-
-
-def _refuse_repeated(table: Table, column: str, keys: Sequence[str] | Sequence[float]) -> None:
-    seen: set[object] = set()
-    for row, key in enumerate(keys):
-        if key in seen:
-            raise table.error(row, column, "one not said before")
-        seen.add(key)
 
 
 def _rows(values: Array, index: npt.NDArray[np.int64]) -> Array:

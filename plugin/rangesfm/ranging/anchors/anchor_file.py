@@ -9,7 +9,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.files.tables import Table, read_table, write_table
+from rangesfm.files.tables import Table, read_table, repeated, write_user_table
 from rangesfm.ranging.anchors.anchor import Anchor
 
 _COORDINATES = ("x_m", "y_m", "z_m")
@@ -31,7 +31,10 @@ def read_anchors(path: str | Path) -> tuple[Anchor, ...]:
     if not len(table):
         raise InputError("names no anchor, expected one a line", path)
     anchor_ids = table.text("anchor_id")
-    _check_unique(table, anchor_ids)
+    if again := repeated(anchor_ids):
+        row, first = again
+        message = f"anchor {anchor_ids[row]} stands in line {table.line[first]} already, expected each once"
+        raise InputError(message, path, int(table.line[row]))
     positions = _positions(table)
     expected = "a number of metres that is not negative, or nothing"
     position_stddevs = table.numbers("position_stddev_m", empty=0.0, expected=expected, least=0.0)
@@ -50,44 +53,22 @@ def read_anchors(path: str | Path) -> tuple[Anchor, ...]:
 
 
 def write_anchors(anchors: Sequence[Anchor], path: str | Path) -> None:
-    """Write anchors so that ``read_anchors`` reads them: empty coordinates where the position is unknown.
+    """Write anchors so that ``read_anchors`` reads them: cells are empty where nothing is known.
 
     Raises:
         InputError: the file cannot be written.
     """
-    try:
-        write_table(Path(path), [*ANCHOR_COLUMNS, *_OPTIONAL], map(_row, anchors))
-    except OSError as error:
-        raise InputError(f"cannot be written ({error.strerror})", path) from error
-
-
-def _row(anchor: Anchor) -> list[str]:
-    bias = ["", ""]
-    if anchor.range_bias_stddev_m is not None:
-        bias = [f"{anchor.range_bias_m:.4f}", f"{anchor.range_bias_stddev_m:.4f}"]
-    if anchor.position_m is None:
-        return [anchor.anchor_id, "", "", "", "", *bias]
-    return [
-        anchor.anchor_id,
-        *(f"{coordinate:.4f}" for coordinate in anchor.position_m),
-        f"{anchor.position_stddev_m:.4f}",
-        *bias,
-    ]
+    rows = []
+    for anchor in anchors:
+        place = 4 * [None] if anchor.position_m is None else [*anchor.position_m, anchor.position_stddev_m]
+        bias = 2 * [None] if anchor.range_bias_stddev_m is None else [anchor.range_bias_m, anchor.range_bias_stddev_m]
+        rows.append([anchor.anchor_id, *("" if number is None else f"{number:.4f}" for number in (*place, *bias))])
+    write_user_table(Path(path), [*ANCHOR_COLUMNS, *_OPTIONAL], rows)
 
 
 def default_anchor_frame(anchors: Sequence[Anchor]) -> str:
     """The frame of anchors of which the user said none: "site" if any position is known, else "unknown"."""
     return "site" if any(anchor.position_m is not None for anchor in anchors) else "unknown"
-
-
-def _check_unique(table: Table, anchor_ids: list[str]) -> None:
-    if len(set(anchor_ids)) == len(anchor_ids):
-        return
-    first_line: dict[str, int] = {}
-    for anchor_id, line in zip(anchor_ids, table.line.tolist()):
-        if first_line.setdefault(anchor_id, line) != line:
-            message = f"anchor {anchor_id} stands in line {first_line[anchor_id]} already, expected each once"
-            raise InputError(message, table.path, line)
 
 
 def _positions(table: Table) -> Array:

@@ -16,13 +16,16 @@ from scipy.optimize import least_squares
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.similarity import path_shape
-from rangesfm.ranging.anchors.multilateration import multilaterate
 from rangesfm.ranging.errors.cells import cells, noisiness
 from rangesfm.ranging.errors.inlier_noise import inlier_noise
 from rangesfm.ranging.errors.learned import learn_errors
+from rangesfm.ranging.errors.noise import robust_stddevs
 from rangesfm.ranging.errors.robust_loss import CAUCHY, RobustLoss
 from rangesfm.ranging.range_gradient import RangeGradient
 
+_NUM_ROUNDS = 12
+# On the diagonal of normal equations, whose columns have length 1 before weights: where outliers take all weight.
+_RIDGE = 1e-16
 _CONVERGED = 1e-13
 # Of a search: as many ranges and directions of starts, widths of the loss in units, and how far apart places are two.
 _MAX_NUM_RANGES = 300
@@ -38,6 +41,43 @@ _USUAL_NOISE_COUNTS = 2.0
 _MIN_ORDINARY = 0.3
 # Of the errors that are learnt: each anchor's bias is estimated with a prior of its own, and the path is known.
 _NOT_HERE = ("bias", "common_bias", "bending")
+
+
+def multilaterate(positions: Array, ranges: Array) -> tuple[Array, Array]:
+    """A point from its distances to known positions, robustly, without a start.
+
+    rho^2 = |p|^2 - 2 a.p + |a|^2 is linear in (a, |a|^2). Where the positions lie in a plane,
+    the height above it follows from |a|^2; its sign is arbitrary.
+
+    Args:
+        positions: (..., n, 3), of one point or of many at once.
+        ranges: (n,) or (..., n).
+
+    Returns:
+        the point (..., 3), and (..., n) residuals in metres (of the linear model).
+    """
+    shape = path_shape(positions)
+    local = (positions - shape.centroid[..., None, :]) @ shape.axes
+    # Noise of about a decimetre decides which directions the ranges see at all.
+    seen = shape.stddevs > np.maximum(0.02 * shape.stddevs[..., :1], 1e-9)
+    squared = ranges**2 - np.sum(local**2, axis=-1)
+    design = np.concatenate([-2 * local * seen[..., None, :], np.ones_like(local[..., :1])], axis=-1)
+    sizes = np.linalg.norm(design, axis=-2, keepdims=True)
+    sizes = np.where(sizes > 0, sizes, 1.0)
+    design, nothing = design / sizes, np.concatenate([~seen, np.zeros_like(seen[..., :1])], axis=-1)
+    rest = (nothing + _RIDGE)[..., None] * np.eye(4)
+    weights = 1 / np.maximum(2 * ranges, 1e-3)
+    robust = np.ones_like(squared)
+    for _ in range(_NUM_ROUNDS):
+        weighted = (design * (weights**2 * robust)[..., None]).swapaxes(-1, -2)
+        solution = np.linalg.solve(weighted @ design + rest, weighted @ squared[..., None])
+        residuals = weights * ((design @ solution)[..., 0] - squared)
+        robust = 1 / (1 + (residuals / (2 * robust_stddevs(residuals))) ** 2)
+    point, height = np.split(solution[..., 0] / sizes[..., 0, :], [3], axis=-1)
+    above = np.sqrt(np.maximum(height - np.sum(point**2, axis=-1, keepdims=True), 0.0))
+    point = np.where(~seen & (np.arange(3) == 2), above, point)
+    anchor: Array = shape.centroid + (shape.axes @ point[..., None])[..., 0]
+    return anchor, residuals
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ its own, and what ranges get wrong is learnt from those of all anchors together.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy.typing as npt
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import PathShape, oriented, path_shape
+from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.point_fit import (
     FitErrors,
     PointFit,
@@ -26,6 +27,7 @@ from rangesfm.ranging.anchors.point_fit import (
 )
 from rangesfm.ranging.errors.noise import short_range_stddev
 from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE, SAME_COST
+from rangesfm.ranging.log import RangeLog
 
 # Three numbers, and one range more to see that they fit.
 MIN_NUM_RANGES = 4
@@ -137,11 +139,7 @@ class AnchorRanges:
         return path_shape(centred if self.height_m is None else centred * [1.0, 1.0, 0.0])
 
     def fit(self, options: TrilaterationOptions) -> PointFit:
-        """The most likely place, as if the ranges erred independently.
-
-        Raises:
-            GeometryError: too few ranges.
-        """
+        """The most likely place, as if the ranges erred independently; GeometryError for too few ranges."""
         num = len(self.range_m)
         if num < MIN_NUM_RANGES:
             raise GeometryError(f"{num} ranges at known positions of the tag, {MIN_NUM_RANGES} are needed")
@@ -222,6 +220,74 @@ def trilaterate(
     if isinstance(found, GeometryError):
         raise found
     return found
+
+
+@dataclass(frozen=True)
+class AnchorPlacement:
+    """What trilateration says of one anchor.
+
+    Attributes:
+        num_ranges: its ranges at known positions of the tag.
+        found: where it stands; None if that is not determined, for the reason ``why_not``.
+    """
+
+    anchor_id: str
+    num_ranges: int
+    found: Trilateration | None
+    why_not: str | None
+
+    @property
+    def anchor(self) -> Anchor:
+        """For an anchors' file: without a position if there is none, or if there are two."""
+        if self.found is None:
+            return Anchor(self.anchor_id)
+        bias = (self.found.range_bias_m, self.found.range_bias_stddev_m)
+        if self.found.mirror_position_m is not None:
+            return Anchor(self.anchor_id, None, 0.0, *bias)
+        return Anchor(self.anchor_id, self.found.position_m, self.found.position_stddev_m, *bias)
+
+
+def trilaterate_anchors(
+    log: RangeLog,
+    tag_positions_m: Array,
+    *,
+    toward: Mapping[str, Sequence[float]] | None = None,
+    height_m: Mapping[str, float] | None = None,
+    options: TrilaterationOptions | None = None,
+) -> tuple[AnchorPlacement, ...]:
+    """Place every anchor of a log; what the ranges get wrong is learnt from all of them together.
+
+    Args:
+        log: n ranges.
+        tag_positions_m: (n, 3) where the tag was at each; NaN where unknown (see ``tag_positions``).
+        toward: by anchor, the direction in which it lies of two places that fit alike (see ``trilaterate``).
+        height_m: by anchor, its z where that is known.
+
+    Returns:
+        one placement for each anchor, in the order of the log.
+    """
+    known = np.isfinite(tag_positions_m).all(axis=1)
+    rows = [np.flatnonzero(known & (log.anchor_index == k)) for k in range(len(log.anchor_ids))]
+    anchors = [
+        AnchorRanges(
+            tag_positions_m[own],
+            log.range_m[own],
+            range_stddev_m=log.range_stddev_m[own],
+            shared_stddev_m=None if log.shared_stddev_m is None else log.shared_stddev_m[own],
+            timestamp_s=None if log.timestamp_s is None else log.timestamp_s[own],
+            tag_index=log.tag_index[own],
+            toward=None if toward is None or anchor_id not in toward else np.asarray(toward[anchor_id], np.float64),
+            height_m=None if height_m is None else height_m.get(anchor_id),
+        )
+        for anchor_id, own in zip(log.anchor_ids, rows, strict=True)
+    ]
+    results = trilaterate_together(anchors, options or TrilaterationOptions())
+    return tuple(
+        AnchorPlacement(anchor_id, len(own), None, str(found))
+        if isinstance(found, GeometryError)
+        else AnchorPlacement(anchor_id, len(own), found, None)
+        for anchor_id, own, found in zip(log.anchor_ids, rows, results, strict=True)
+    )
 
 
 def trilaterate_together(

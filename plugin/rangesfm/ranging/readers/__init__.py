@@ -16,17 +16,16 @@ from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.noise_of_log import find_quantization_m, quantization_stddev_m
 from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.readers import canonical, ros
-from rangesfm.ranging.readers.canonical import write_ranges_csv
+from rangesfm.ranging.readers import ros
 from rangesfm.ranging.readers.printed import PRINTED
 from rangesfm.ranging.readers.reader import Reader, ReadOptions
 from rangesfm.ranging.readers.roles import tell_roles
 from rangesfm.ranging.readers.several import files_of_log, join_logs
-from rangesfm.ranging.readers.table import MAPPED, PRESETS, TABLE, table_reader
+from rangesfm.ranging.readers.table import CANONICAL, MAPPED, PRESETS, TABLE, table_reader, write_ranges_csv
 
 __all__ = ["find_log_reader", "read_anchors_in_log", "read_ranges", "reader_names", "write_ranges_csv"]
 
-_READERS = (ros.READER, canonical.READER, *PRESETS, MAPPED, TABLE, *PRINTED)
+_READERS = (ros.READER, CANONICAL, *PRESETS, MAPPED, TABLE, *PRINTED)
 
 
 def reader_names() -> tuple[str, ...]:

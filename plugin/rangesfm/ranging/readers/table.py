@@ -1,4 +1,8 @@
-"""Any table: by the columns that the user names, by those of a known data set, or by what its names and values say."""
+"""Any table: by the columns that the user names, by those of a known data set, or by what its names and values say.
+
+The canonical CSV is ``timestamp_s,anchor_id,range_m[,tag_id,range_stddev_m,los]``. ``image_name`` may take the place of
+``timestamp_s``; where both stand, the time counts.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +12,11 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from rangesfm.errors import InputError, printable
-from rangesfm.files.tables import header_names, read_head
-from rangesfm.ranging.log import RangeLog
+from rangesfm.files.tables import header_names, read_head, write_user_table
+from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.columns import QUANTITIES, STAMPS, Columns, read_columns
 from rangesfm.ranging.readers.guess import Guess, described, guess_columns
 from rangesfm.ranging.readers.layout import Layout, find_layout, layout_without_header
@@ -18,6 +24,12 @@ from rangesfm.ranging.readers.reader import Reader, ReadOptions
 from rangesfm.ranging.readers.roles import Sides
 from rangesfm.ranging.readers.several import anchor_of_file
 
+_BY_TIME = Columns(
+    required={"timestamp": "timestamp_s", "anchor_id": "anchor_id", "range": "range_m"},
+    optional={"tag_id": "tag_id", "range_stddev": "range_stddev_m", "los": "los"},
+    is_strict=True,
+)
+_BY_IMAGE = replace(_BY_TIME, required={"image_name": "image_name", "anchor_id": "anchor_id", "range": "range_m"})
 _PRESETS = {
     "starloc": {"timestamp": "time_s", "range": "range", "tag_id": "from_id", "anchor_id": "to_id"},
     "miluv": {"timestamp": "timestamp", "range": "range", "tag_id": "from_id", "anchor_id": "to_id"},
@@ -153,6 +165,44 @@ def _spanned(text: str) -> list[str]:
     return [f"{span[1]}{number}" for number in range(int(span[2]), int(span[4]) + 1)]
 
 
+def write_ranges_csv(log: RangeLog, path: str | Path) -> None:
+    """Write ``log`` as canonical CSV; optional columns only where the log says anything.
+
+    Of a range between two of a kind, the peer stands in the column of the tag (or of the anchor).
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    columns: dict[str, Iterable[str]] = {}
+    if log.timestamp_s is not None:
+        columns["timestamp_s"] = map(repr, log.timestamp_s.tolist())
+    else:
+        columns["image_name"] = log.image_name or ()
+    tag_id, columns["anchor_id"] = log.end_ids()
+    columns["range_m"] = map(repr, log.range_m.tolist())
+    if set(tag_id) != {DEFAULT_TAG_ID}:
+        columns["tag_id"] = tag_id
+    if not np.all(np.isnan(log.range_stddev_m)):
+        columns["range_stddev_m"] = ("" if np.isnan(stddev) else repr(stddev) for stddev in log.range_stddev_m.tolist())
+    if np.any(log.los >= 0):
+        columns["los"] = ("" if los < 0 else str(los) for los in log.los)
+    write_user_table(Path(path), [*columns], zip(*columns.values()))
+
+
+def _recognizes_canonical(head: str) -> bool:
+    names = {*header_names(head)}
+    return {"anchor_id", "range_m"} <= names and not names.isdisjoint({"timestamp_s", "image_name"})
+
+
+def _read_canonical(path: Path, options: ReadOptions) -> RangeLog:
+    if options.columns or options.timestamp_unit not in (None, "s") or options.range_unit not in (None, "m"):
+        raise InputError("the canonical CSV has fixed columns in seconds and metres; use format 'mapped'", path)
+    names = header_names(read_head(path), options.separator)
+    columns = _BY_IMAGE if "image_name" in names and "timestamp_s" not in names else _BY_TIME
+    return read_columns(path, columns, options.changed(timestamp_unit=None, range_unit=None), CANONICAL.name)
+
+
+CANONICAL = Reader("canonical", _recognizes_canonical, _read_canonical)
 PRESETS = tuple(
     Reader(
         name,
