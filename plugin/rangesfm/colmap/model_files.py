@@ -251,11 +251,7 @@ def _check_names_of_text(path: Path) -> None:
 
 
 def write_binary_model(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write a model's files into a folder that is there.
-
-    Raises:
-        OSError: a file ends before its records do, as on a full disk: COLMAP does not look.
-    """
+    """Write a model's files into a folder; OSError if one ends too soon, as on a full disk: COLMAP does not look."""
     model.write_binary(folder)
     try:
         for name in MODEL_FILES:

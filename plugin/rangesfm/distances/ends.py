@@ -164,11 +164,7 @@ def images_by_name(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Image]:
 
 
 def triangulate_markers(tape: Tape, model: pycolmap.Reconstruction) -> dict[str, Array]:
-    """(3,) place of each marker that is the end of a distance.
-
-    Raises:
-        InputError: as ``locate_distances`` does.
-    """
+    """(3,) place of each marker that is the end of a distance; InputError as ``locate_distances`` has it."""
     images, ends = images_by_name(model), {name for taped in tape.distances for name in taped.ends}
     markers = (tape.markers or {}).items()
     return {name: _triangulate(name, marker, images, tape) for name, marker in markers if name in ends}

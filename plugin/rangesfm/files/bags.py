@@ -31,11 +31,7 @@ def is_bag(path: Path) -> bool:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[AnyReader]:
-    """Yield the bag; whatever goes wrong with it inside the block becomes an InputError.
-
-    Raises:
-        InputError: there is none, it is broken, or the package rosbags is not installed.
-    """
+    """Yield the bag; whatever goes wrong with it, also inside the block, or without rosbags, becomes an InputError."""
     if not path.exists():
         raise InputError("no such file", path)
     _check_database(path)

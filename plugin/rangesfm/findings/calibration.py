@@ -37,11 +37,7 @@ class Calibration:
 
 
 def read_calibrations(path: Path) -> tuple[Calibration, ...]:
-    """The cameras of a file; none if it is no calibration.
-
-    Raises:
-        InputError: it is one, but lacks something, or has a model that COLMAP does not know.
-    """
+    """The cameras of a file, none if it is no calibration; InputError for one that lacks something or is not known."""
     try:
         return tuple(_READERS[path.suffix.lower()](path)) if path.suffix.lower() in _READERS else ()
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:

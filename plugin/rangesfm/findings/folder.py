@@ -60,11 +60,7 @@ class Found:
 
 
 def look_into(folders: Sequence[Path]) -> Found:
-    """Look at all that folders hold, however deep, but for hidden files and results.
-
-    Raises:
-        InputError: one of them is no folder.
-    """
+    """Look at all that folders hold, however deep, but for hidden files and results; InputError if one is no folder."""
     paths: dict[str, list[Path]] = defaultdict(list)
     calibrations: dict[Path, tuple[Calibration, ...]] = {}
     models: list[Path] = []

@@ -138,9 +138,8 @@ def _holds_at(crs: str, geographic: Array) -> bool:
     if area is None:
         return True
     lon, lat = geographic[:, 0], geographic[:, 1]
-    within_lon = (lon >= area.west - _MARGIN_DEG) & (lon <= area.east + _MARGIN_DEG)
-    if area.west > area.east:  # across the date line
-        within_lon = (lon >= area.west - _MARGIN_DEG) | (lon <= area.east + _MARGIN_DEG)
+    west, east = lon >= area.west - _MARGIN_DEG, lon <= area.east + _MARGIN_DEG
+    within_lon = west | east if area.west > area.east else west & east  # across the date line
     return bool(np.all(within_lon & (lat >= area.south - _MARGIN_DEG) & (lat <= area.north + _MARGIN_DEG)))
 
 

@@ -57,7 +57,15 @@ class Reference:
         return len(self.positions_m)
 
     def positions_at(self, trajectory: Trajectory, max_gap_s: float = 0.05) -> tuple[Array, Array | None]:
-        """Reference poses of the keyframes.
+        """``poses`` of the keyframes; InputError if the reference is by time and the trajectory has no times."""
+        if self.image_names is None and trajectory.timestamps_s is None:
+            raise InputError("the reference is by time, but the photos have no times (images.csv)")
+        return self.poses(trajectory.image_names, trajectory.timestamps_s, max_gap_s)
+
+    def poses(
+        self, image_names: Sequence[str] | None, times_s: Array | None, max_gap_s: float
+    ) -> tuple[Array, Array | None]:
+        """Reference poses of n photos, or at (n,) times: whichever the reference has.
 
         By photo: those of the same name. By time: interpolated linearly (rotations on the
         shortest arc) between two samples at most ``max_gap_s`` apart; in longer gaps and at
@@ -65,24 +73,15 @@ class Reference:
 
         Returns:
             (n, 3) positions, NaN where unknown, and (n, 3, 3) rotations likewise; None if the reference has none.
-
-        Raises:
-            InputError: the reference is by time and the trajectory has no times.
         """
         if self.image_names is not None:
-            return self.poses_of(trajectory.image_names)
-        if trajectory.timestamps_s is None:
-            raise InputError("the reference is by time, but the photos have no times (images.csv)")
-        return self.poses_at(trajectory.timestamps_s, max_gap_s)
+            assert image_names is not None
+            index_of = {name: i for i, name in enumerate(self.image_names)}
+            return self._at_index(np.array([index_of.get(name, -1) for name in image_names], dtype=np.int64))
+        assert times_s is not None
+        return self._poses_at(times_s, max_gap_s)
 
-    def poses_of(self, image_names: Sequence[str]) -> tuple[Array, Array | None]:
-        """Poses of n photos, NaN where unknown, as ``positions_at`` returns them; only of a reference by photo."""
-        assert self.image_names is not None
-        index_of = {name: i for i, name in enumerate(self.image_names)}
-        return self._at_index(np.array([index_of.get(name, -1) for name in image_names], dtype=np.int64))
-
-    def poses_at(self, times: Array, max_gap_s: float) -> tuple[Array, Array | None]:
-        """Poses at (n,) times, as ``positions_at`` finds them; only of a reference by time."""
+    def _poses_at(self, times: Array, max_gap_s: float) -> tuple[Array, Array | None]:
         assert self.timestamps_s is not None
         known = self.timestamps_s
         after = np.clip(np.searchsorted(known, times, side="right"), 1, max(len(known) - 1, 1))

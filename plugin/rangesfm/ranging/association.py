@@ -67,7 +67,10 @@ def associate(
     options = options or AssociationOptions()
     status = np.full(len(log), RangeStatus.USED, dtype=np.int8)
     if log.image_name is not None:
-        before, after, weight = _places_by_name(log.image_name, trajectory, status)
+        index_of = {name: index for index, name in enumerate(trajectory.image_names)}
+        before = after = np.array([index_of.get(name, -1) for name in log.image_name], dtype=np.int64)
+        weight = np.zeros(len(log))
+        status[before < 0] = RangeStatus.UNKNOWN_IMAGE
     elif trajectory.timestamps_s is not None:
         times = log.timestamp_s + time_offset_s if log.timestamp_s is not None else np.empty(0)
         before, after, weight = _places_by_time(log, times, trajectory.timestamps_s, options, status)
@@ -106,27 +109,19 @@ def tag_positions(
     Raises:
         InputError: one is by time and the other by name, a lever arm without rotations, or nothing in common.
     """
-    positions, rotations = _poses(log, path, time_offset_s, max_gap_s)
+    if (log.image_name is None) != (path.image_names is None):
+        ours, theirs = ("name", "time") if path.image_names is None else ("time", "name")
+        raise InputError(f"the ranges are by {ours} and the positions by {theirs}, expected both alike", log.source)
+    times_s = None if log.timestamp_s is None else log.timestamp_s + time_offset_s
+    positions, rotations = path.poses(log.image_name, times_s, max_gap_s)
     lever = np.asarray(tag_in_cam_m, dtype=np.float64)
     if np.any(lever != 0):
         if rotations is None:
             raise InputError("a lever arm needs the rotations qx,qy,qz,qw beside the positions")
         positions = positions + rotations @ lever
     if len(log) and not np.isfinite(positions).any():
-        times_s = None if log.timestamp_s is None else log.timestamp_s + time_offset_s
         raise InputError(path.why_nothing_is_known("ranges", log.image_name, times_s, max_gap_s), log.source)
     return positions
-
-
-def _poses(log: RangeLog, path: Reference, time_offset_s: float, max_gap_s: float) -> tuple[Array, Array | None]:
-    if log.image_name is not None:
-        if path.image_names is None:
-            raise InputError("the ranges are by name and the positions by time, expected both alike", log.source)
-        return path.poses_of(log.image_name)
-    if path.timestamps_s is None:
-        raise InputError("the ranges are by time and the positions by name, expected both alike", log.source)
-    assert log.timestamp_s is not None
-    return path.poses_at(log.timestamp_s + time_offset_s, max_gap_s)
 
 
 def is_too_long(gaps_s: npt.ArrayLike, options: AssociationOptions) -> Mask:
@@ -135,11 +130,7 @@ def is_too_long(gaps_s: npt.ArrayLike, options: AssociationOptions) -> Mask:
 
 
 def lever_arms(log: RangeLog, tag_in_cam_m: npt.ArrayLike) -> Array:
-    """(num_tags, 3) in the order of ``log.tag_ids``, from one lever arm for all or one for each.
-
-    Raises:
-        InputError: it is neither.
-    """
+    """(num_tags, 3) in the order of ``log.tag_ids``, from one lever arm for all or one for each; else InputError."""
     given = np.asarray(tag_in_cam_m, dtype=np.float64)
     num_tags = len(log.tag_ids)
     if given.shape not in ((3,), (num_tags, 3)):
@@ -148,15 +139,6 @@ def lever_arms(log: RangeLog, tag_in_cam_m: npt.ArrayLike) -> Array:
             log.source,
         )
     return np.broadcast_to(given, (num_tags, 3))
-
-
-def _places_by_name(
-    image_names: tuple[str, ...], trajectory: Trajectory, status: npt.NDArray[np.int8]
-) -> tuple[Indices, Indices, Array]:
-    index_of = {name: index for index, name in enumerate(trajectory.image_names)}
-    keyframe = np.array([index_of.get(name, -1) for name in image_names], dtype=np.int64)
-    status[keyframe < 0] = RangeStatus.UNKNOWN_IMAGE
-    return keyframe, keyframe, np.zeros(len(keyframe))
 
 
 def _places_by_time(
@@ -174,8 +156,9 @@ def _places_by_time(
 
     at_keyframe = distance <= options.max_time_difference_s
     interpolated = inside & ~is_too_long(gap, options)
-    of_camera = log.kind == RangeKind.TAG_ANCHOR
-    lonely = of_camera & ~interpolated & _keyframe_is_isolated(keyframe_times, options)[nearest]
+    # Only at a keyframe with a gap on both sides can standing still matter.
+    long_gap = np.concatenate([[True], is_too_long(np.diff(keyframe_times), options), [True]])
+    lonely = (log.kind == RangeKind.TAG_ANCHOR) & ~interpolated & (long_gap[:-1] & long_gap[1:])[nearest]
     still = lonely & _camera_is_still(log, nearest, distance, times, lonely, keyframe_times)
     same_time = distance <= min(_SAME_TIME_S, options.max_time_difference_s)
     snapped = same_time | ((at_keyframe | still) & ~interpolated)
@@ -185,12 +168,6 @@ def _places_by_time(
     no_place = ~(snapped | interpolated)
     status[no_place] = np.where(inside[no_place], RangeStatus.NO_KEYFRAME_NEAR, RangeStatus.OUTSIDE_PATH)
     return before, after, weight
-
-
-def _keyframe_is_isolated(keyframe_times: Array, options: AssociationOptions) -> Mask:
-    """(n,) keyframes with a gap on both sides: only there can standing still matter."""
-    long_gap = np.concatenate([[True], is_too_long(np.diff(keyframe_times), options), [True]])
-    return np.asarray(long_gap[:-1] & long_gap[1:])
 
 
 def _camera_is_still(

@@ -31,13 +31,8 @@ class RangeKind(IntEnum):
 
 
 class PeerRanges(NamedTuple):
-    """k ranges between two anchors, or between two tags.
-
-    Attributes:
-        rows: (k,) which ranges of the log these are.
-        ends: (k, 2) int, the two nodes, into the log's ``anchor_ids`` or ``tag_ids``.
-        end_ids: k pairs of their ids.
-    """
+    """k ranges between two anchors, or between two tags: (k,) rows of the log, and the (k, 2) two nodes of each, into
+    the log's ``anchor_ids`` or ``tag_ids``."""
 
     rows: Indices
     ends: Indices

@@ -165,11 +165,7 @@ def _opened(content: bytes, path: Path, *, reduced_to_px: int | None = None) -> 
 
 
 def _raw_image(message: Any, path: Path) -> Image.Image:
-    """The picture of an Image, in grey or in colour.
-
-    Raises:
-        InputError: its encoding is not known, or it has too few bytes.
-    """
+    """The picture of an Image, in grey or in colour; InputError for an unknown encoding or too few bytes."""
     height, width, encoding = message.height, message.width, message.encoding
     if encoding not in _READERS:
         raise InputError(f"an image in the encoding '{encoding}', expected one of {', '.join(_READERS)}", path)

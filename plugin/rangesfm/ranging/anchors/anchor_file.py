@@ -53,11 +53,7 @@ def read_anchors(path: str | Path) -> tuple[Anchor, ...]:
 
 
 def write_anchors(anchors: Sequence[Anchor], path: str | Path) -> None:
-    """Write anchors so that ``read_anchors`` reads them: cells are empty where nothing is known.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write anchors so that ``read_anchors`` reads them, with empty cells for what is not known; or InputError."""
     rows = []
     for anchor in anchors:
         place = 4 * [None] if anchor.position_m is None else [*anchor.position_m, anchor.position_stddev_m]

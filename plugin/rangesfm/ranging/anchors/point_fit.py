@@ -264,12 +264,7 @@ def _directions() -> Array:
 
 @dataclass(frozen=True)
 class FitErrors:
-    """Of the n ranges of one anchor.
-
-    Attributes:
-        of_cell: (n,) the cell of each.
-        covariance_m2: (c, c) of the errors of cells.
-    """
+    """Of the n ranges of one anchor: (n,) the cell of each, and (c, c) the covariance of the errors of cells."""
 
     of_cell: Indices
     covariance_m2: Array
@@ -297,11 +292,9 @@ class FitErrors:
 def errors_of_fits(
     fits: Sequence[PointFit], times_s: Sequence[Array], tags: Sequence[Indices], *, is_calibrated: bool
 ) -> list[FitErrors]:
-    """What the residuals of all fits together say of their ranges' errors.
+    """What the residuals of all fits together say of their ranges' errors; ``times_s``, ``tags``: (n_k,) of each fit.
 
-    Args:
-        fits: one for each anchor, of n_k ranges. times_s, tags: (n_k,) of each, when and by which tag.
-        is_calibrated: whether an error curve has been taken off, whose stddev the ranges share.
+    ``is_calibrated``: an error curve has been taken off, whose stddev the ranges share.
     """
     lengths = [len(fit.residuals_m) for fit in fits]
     anchor_index = np.repeat(np.arange(len(fits)), lengths)

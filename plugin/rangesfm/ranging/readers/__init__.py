@@ -147,9 +147,5 @@ def _choose_reader(path: Path, options: ReadOptions, format: str | None) -> Read
 
 
 def find_log_reader(path: Path) -> Reader:
-    """The reader of a file of which nothing is said.
-
-    Raises:
-        InputError: it is no radio's log, or not for sure; a table that may be one has advice.
-    """
+    """The reader of a file of which nothing is said; InputError, with advice for tables, if it is no log for sure."""
     return _choose_reader(path, ReadOptions(), None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,6 @@ from rangesfm.ranging.readers.roles import Sides
 _BEGINS = ("#ROSBAG V", SQLITE_HEAD)
 _MCAP = "MCAP0"
 _LED_NO_LINE_OF_SIGHT = 16
-
-
-def _recognizes(head: str) -> bool:
-    return head.startswith(_BEGINS) or head[1:6] == _MCAP
 
 
 def _readings(path: Path, options: ReadOptions) -> Iterator[Reading]:
@@ -35,10 +31,6 @@ def _readings(path: Path, options: ReadOptions) -> Iterator[Reading]:
                 raise InputError(f"a {kind} has another definition than expected ({error})", path) from None
             for reading in readings:
                 yield reading._replace(timestamp_s=reading.timestamp_s or received_s, line=number)
-
-
-def _range_stamped(message: Any) -> Iterator[Reading]:
-    yield _stamped(message, message.to_id, message.range, message.from_id, _root(message.covariance))
 
 
 def _two_way_range_stamped(message: Any) -> Iterator[Reading]:
@@ -66,8 +58,8 @@ def _linktrack_tagframe(message: Any) -> Iterator[Reading]:
 
 
 # By the last part of the type's name: any package may define it. A time of 0 is none, that of receiving counts.
-_RANGES_IN: dict[str, Callable[[Any], Iterator[Reading]]] = {
-    "RangeStamped": _range_stamped,
+_RANGES_IN: dict[str, Callable[[Any], Iterable[Reading]]] = {
+    "RangeStamped": lambda each: [_stamped(each, each.to_id, each.range, each.from_id, _root(each.covariance))],
     "TwoWayRangeStamped": _two_way_range_stamped,
     "UwbRange": _uwb_range,
     "LinktrackNodeframe2": _linktrack_nodeframe,
@@ -88,4 +80,6 @@ def _character(value: int | str) -> str:
     return value if isinstance(value, str) else chr(value)
 
 
-READER = reader_of_readings("ros", _recognizes, _readings, sides=Sides.ASKED)
+READER = reader_of_readings(
+    "ros", lambda head: head.startswith(_BEGINS) or head[1:6] == _MCAP, _readings, sides=Sides.ASKED
+)

@@ -17,11 +17,7 @@ _ID_IN_NAME = re.compile(r"(?:.*[^0-9A-Za-z])?([A-Za-z]{0,2}\d{1,3}|(?=[A-F]*\d)
 
 
 def files_of_log(path: Path) -> list[Path]:
-    """The files that a path stands for: itself, all those in a folder, or those that fit a pattern as ``uwb_*.csv``.
-
-    Raises:
-        InputError: there are none.
-    """
+    """The files of a log: the path itself, all in a folder, or those of a pattern as ``uwb_*.csv``; or InputError."""
     text = str(path)
     if "\0" in text:
         raise InputError("no file has such a name", path)

@@ -59,10 +59,10 @@ _NO_RANGES = (
 
 
 def table_reader(path: Path, options: ReadOptions) -> Reader:
-    """The reader of one table that nobody described, if it can be understood.
+    """The reader of one table that nobody described.
 
     Raises:
-        InputError: it cannot, or not for sure; with what was found, the closest guess and what to type.
+        InputError: it is not understood for sure; with what was found, the closest guess and what to type.
     """
     layout = find_layout(path, options.separator)
     guess = None if layout is None else guess_columns(layout)
@@ -166,12 +166,9 @@ def _spanned(text: str) -> list[str]:
 
 
 def write_ranges_csv(log: RangeLog, path: str | Path) -> None:
-    """Write ``log`` as canonical CSV; optional columns only where the log says anything.
+    """Write ``log`` as canonical CSV, optional columns only where the log says anything; or InputError.
 
     Of a range between two of a kind, the peer stands in the column of the tag (or of the anchor).
-
-    Raises:
-        InputError: the file cannot be written.
     """
     columns: dict[str, Iterable[str]] = {}
     if log.timestamp_s is not None:
