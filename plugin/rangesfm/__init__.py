@@ -41,7 +41,7 @@ _HOME = {
     "find_image_times": "rangesfm.vision.image_times",
     "initialize_scale": "rangesfm.scale.initialize",
     "plan_survey": "rangesfm.planning.survey_plan",
-    "read_anchors": "rangesfm.ranging.anchors.anchor_file",
+    "read_anchors": "rangesfm.ranging.anchors.anchor",
     "read_image_times_csv": "rangesfm.vision.image_times",
     "read_plan": "rangesfm.planning.settings",
     "read_ranges": "rangesfm.ranging.readers",

@@ -195,7 +195,7 @@ def _ranges(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm ranges log.csv --columns timestamp=t,anchor_id=node,range=d --timestamp_unit ms \
         --output_path ranges.csv
     """
-    from rangesfm.ranging.anchors.anchor_file import read_anchors
+    from rangesfm.ranging.anchors.anchor import read_anchors
     from rangesfm.ranging.readers import read_anchors_in_log, write_ranges_csv
     from rangesfm.ranging.summary import summarize_ranges
 
@@ -286,7 +286,7 @@ def _calibrate(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm ranges calibrate log.csv --anchors anchors.csv --positions truth.csv \
         --output_path curve.csv
     """
-    from rangesfm.ranging.anchors.anchor_file import read_anchors
+    from rangesfm.ranging.anchors.anchor import read_anchors
     from rangesfm.ranging.errors.calibration import calibrate_ranges
     from rangesfm.ranging.errors.error_curve import write_error_curve
 
@@ -332,7 +332,7 @@ def _trilaterate(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm trilaterate uwb.csv --positions total_station.csv --side above --output_path anchors.csv
       rangesfm run survey.toml --anchors anchors.csv --anchor_frame site
     """
-    from rangesfm.ranging.anchors.anchor_file import write_anchors
+    from rangesfm.ranging.anchors.anchor import write_anchors
     from rangesfm.ranging.anchors.trilateration import TrilaterationOptions, trilaterate_anchors
 
     log, tags_m = _read_placed_log(args)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ from rangesfm.files.folders import LEFT_BY_RUNS, walk
 from rangesfm.files.tables import has_columns, read_head
 from rangesfm.findings.calibration import Calibration, read_calibrations
 from rangesfm.geometry.reference import is_reference_file
-from rangesfm.ranging.anchors.anchor_file import ANCHOR_ALIASES, ANCHOR_COLUMNS
+from rangesfm.ranging.anchors.anchor import ANCHOR_ALIASES, ANCHOR_COLUMNS
 from rangesfm.ranging.errors.error_curve import is_error_curve_file
 from rangesfm.ranging.readers import find_log_reader, read_ranges
 from rangesfm.sources.bag import has_images
@@ -32,7 +32,7 @@ _TABLE_EXTENSIONS = (".csv", ".tsv", ".txt", ".log", ".dat")
 # Of tables that may be the log, where there is none.
 _MAX_NUM_UNSURE = 3
 # By the header row, once it is known that the file is no log.
-_TABLES = {
+_TABLES: dict[str, Callable[[str], bool]] = {
     "scale.markers": partial(has_columns, required=MARKER_COLUMNS),
     "scale.distances": partial(has_columns, required=DISTANCE_COLUMNS),
     "ranges.error_curve": is_error_curve_file,

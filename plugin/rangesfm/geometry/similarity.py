@@ -73,7 +73,7 @@ def off_origin(centers: Array) -> npt.NDArray[np.bool_]:
     return is_off
 
 
-def align_points(source: Array, target: Array, weights: Array | None = None, *, with_scale: bool = True) -> Similarity:
+def align_points(source: Array, target: Array, *, with_scale: bool = True) -> Similarity:
     """The similarity (or rigid motion) target_from_source with least squared error.
 
     Umeyama, "Least-squares estimation of transformation parameters between two point
@@ -81,11 +81,9 @@ def align_points(source: Array, target: Array, weights: Array | None = None, *, 
 
     Args:
         source, target: (n, 3) corresponding points, n >= 3 for a unique answer.
-        weights: (n,) of the squared errors; None for equal ones.
         with_scale: False keeps the scale at 1, as do points that are all in one place.
     """
-    w = np.ones(len(source)) if weights is None else weights
-    w = w / w.sum()
+    w = np.ones(len(source)) / len(source)
     mean_source, mean_target = w @ source, w @ target
     centered_source, centered_target = source - mean_source, target - mean_target
     u, singular_values, vt = np.linalg.svd((centered_target * w[:, None]).T @ centered_source)

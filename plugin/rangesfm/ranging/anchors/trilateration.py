@@ -175,17 +175,9 @@ class _Found:
         problem = replace(fit.problem, prior=fit.problem.prior * inflation)
         return cls(replace(fit, problem=problem, x=improve(problem, fit.x)), errors, inflation)
 
-    @property
-    def problem(self) -> PointProblem:
-        return self.fit.problem
-
-    @property
-    def x(self) -> Array:
-        return self.fit.x
-
     def judged_by(self, inflation: float) -> PointProblem:
         """The problem with costs in which errors that go together count for what they are."""
-        problem = self.problem
+        problem = self.fit.problem
         return replace(problem, stddev_m=inflation * problem.stddev_m, prior=problem.prior / self.inflation)
 
 
@@ -321,20 +313,20 @@ def _conclude(anchor: AnchorRanges, found: _Found, options: TrilaterationOptions
     across = shape.axes[:, 2] if anchor.height_m is None else oriented(level[:, None])[:, 0]
     mirror = _mirror(found, covariance, shape.centroid, across)
     if mirror is not None:
-        apart = (mirror - found.x)[:3]
+        apart = (mirror - found.fit.x)[:3]
         told = None if anchor.toward is None else _unless_along_plane(anchor.toward, apart)
         # Where no range tells the two apart, rounding would choose.
         is_free = told is not None or abs(_gap(found, mirror)) < SAME_COST
         if is_free and apart @ (across if told is None else told) > 0:
-            found, mirror = replace(found, fit=replace(found.fit, x=mirror)), found.x
+            found, mirror = replace(found, fit=replace(found.fit, x=mirror)), found.fit.x
             covariance = _covariance(found)
         mirror = mirror if told is None else None
     middle = anchor.tag_positions_m.mean(axis=0)
     return Trilateration(
-        position_m=middle + found.x[:3],
+        position_m=middle + found.fit.x[:3],
         covariance_m2=covariance[:3, :3],
         mirror_position_m=None if mirror is None else middle + mirror[:3],
-        range_bias_m=float(found.x[3]),
+        range_bias_m=float(found.fit.x[3]),
         range_bias_stddev_m=float(np.sqrt(covariance[3, 3])) if options.range_bias_stddev_m > 0 else 0.0,
         noise_stddev_m=found.fit.noise_m,
         residuals_m=found.fit.residuals_m,
@@ -348,8 +340,8 @@ def _covariance(found: _Found) -> Array:
     Huber and Ronchetti, "Robust Statistics" (2009), section 6.3: the sandwich of the covariance of the gradient between
     inverses of the information. The weakest direction by the cost itself.
     """
-    problem, weights = found.problem, found.fit.weights
-    jacobian = problem.jacobian(found.x)
+    problem, weights = found.fit.problem, found.fit.weights
+    jacobian = problem.jacobian(found.fit.x)
     of_prior = problem.prior.T @ problem.prior
     inverse = _inverse((jacobian * weights[:, None]).T @ jacobian + of_prior)
     influence = inverse @ (jacobian * (weights / problem.stddev_m)[:, None]).T
@@ -372,8 +364,8 @@ def _with_weak_direction(found: _Found, sandwich: Array, formal: Array) -> Array
     along = np.append(axes[:, 2], 0.0)
     # The other numbers follow along as they do where the curvature holds.
     tied = formal @ along / variances[2]
-    inflation = found.errors.inflation(found.fit, found.problem.slopes(found.x) @ tied)
-    if inflation * np.sqrt(variances[2]) < _NONLINEAR * float(np.median(found.problem.range_m)):
+    inflation = found.errors.inflation(found.fit, found.fit.problem.slopes(found.fit.x) @ tied)
+    if inflation * np.sqrt(variances[2]) < _NONLINEAR * float(np.median(found.fit.problem.range_m)):
         return sandwich
     rest = np.eye(4) - np.outer(tied, along)
     changed: Array = rest @ sandwich @ rest.T + _profile_stddev(found, along, inflation) ** 2 * np.outer(tied, tied)
@@ -382,11 +374,11 @@ def _with_weak_direction(found: _Found, sandwich: Array, formal: Array) -> Array
 
 def _profile_stddev(found: _Found, along: Array, inflation: float) -> float:
     """How far the point moves ``along`` (4,) until the cost, all else adapted, has risen by that of one stddev."""
-    num = len(found.problem.range_m)
+    num = len(found.fit.problem.range_m)
     rows = np.linspace(0, num - 1, min(num, _MAX_RANGES_OF_PROFILE)).astype(np.int64)
     part = found.judged_by(inflation).subset(rows)
     hold = np.vstack([part.prior, _HOLD * np.sqrt(np.sum(part.stddev_m**-2)) * along])
-    best = improve(part, found.x)
+    best = improve(part, found.fit.x)
     allowed = part.cost(best) + 0.5 * len(rows) / num
 
     def is_far(step: float) -> bool:
@@ -421,9 +413,9 @@ def _refuse_uncertain(covariance: Array, shape: PathShape, options: Trilateratio
 
 def _mirror(found: _Found, covariance: Array, centroid: Array, across: Array) -> Array | None:
     """(4,) the place on the other side of the tag's positions, if it is another one and fits as well."""
-    height = float((found.x[:3] - centroid) @ across)
-    other = improve(found.problem, found.x - 2 * height * np.append(across, 0.0))
-    apart = (other - found.x)[:3]
+    height = float((found.fit.x[:3] - centroid) @ across)
+    other = improve(found.fit.problem, found.fit.x - 2 * height * np.append(across, 0.0))
+    apart = (other - found.fit.x)[:3]
     distance = float(np.linalg.norm(apart))
     stddev = float(np.sqrt(apart @ covariance[:3, :3] @ apart)) / max(distance, 1e-12)
     return other if distance > 2 * stddev and _gap(found, other) < _MIN_COST_GAP else None
@@ -434,10 +426,10 @@ def _gap(found: _Found, mirror: Array) -> float:
 
     By a bounded loss: outliers cost the same wherever the point is.
     """
-    problem = found.problem
+    problem = found.fit.problem
     inflation = found.errors.inflation(found.fit, problem.residuals_m(mirror) - found.fit.residuals_m)
     judged = found.judged_by(inflation)
-    return judged.cost(mirror, GEMAN_MCCLURE) - judged.cost(found.x, GEMAN_MCCLURE)
+    return judged.cost(mirror, GEMAN_MCCLURE) - judged.cost(found.fit.x, GEMAN_MCCLURE)
 
 
 def _unless_along_plane(direction: Array, across: Array) -> Array | None:

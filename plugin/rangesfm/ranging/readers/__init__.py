@@ -18,8 +18,7 @@ from rangesfm.ranging.errors.noise_of_log import find_quantization_m, quantizati
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers import ros
 from rangesfm.ranging.readers.printed import PRINTED
-from rangesfm.ranging.readers.reader import Reader, ReadOptions
-from rangesfm.ranging.readers.roles import tell_roles
+from rangesfm.ranging.readers.reader import Reader, ReadOptions, tell_roles
 from rangesfm.ranging.readers.several import files_of_log, join_logs
 from rangesfm.ranging.readers.table import CANONICAL, MAPPED, PRESETS, TABLE, table_reader, write_ranges_csv
 

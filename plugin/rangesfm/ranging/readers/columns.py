@@ -97,8 +97,8 @@ def read_columns(path: Path, columns: Columns, options: ReadOptions, format: str
     row = np.repeat(np.arange(len(table)), num_ends)
     anchor, tag = _anchors(table, name, columns), _tags(table, name, columns)
     ranges = _ranges(table, name, columns, options)
-    measured, more = which_are_measured(ranges, path)
-    notes += more
+    measured, of_far = which_are_measured(ranges, path)
+    notes += of_far
     row, ranges, anchor = row[measured], ranges[measured], anchor.subset(measured)
     tag = None if tag is None else tag.subset(measured)
     times = None if timestamps is None else timestamps[row]

@@ -15,7 +15,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.ranging.readers import vocabulary as terms
 from rangesfm.ranging.readers.layout import Column, Layout
-from rangesfm.ranging.readers.roles import Sides
+from rangesfm.ranging.readers.reader import Sides
 
 _MAX_NUM_IDS = 64
 _SAME_SPOT_M = 1.5  # tags on one rig are not further apart, nor does their range to an anchor differ by more

@@ -19,8 +19,7 @@ from rangesfm.errors import InputError
 from rangesfm.files.tables import read_text
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.log import DEFAULT_TAG_ID
-from rangesfm.ranging.readers.reader import Reader, Reading, ReadOptions, reader_of_readings
-from rangesfm.ranging.readers.roles import Sides
+from rangesfm.ranging.readers.reader import Reader, Reading, ReadOptions, Sides, reader_of_readings
 from rangesfm.ranging.readers.times import HostClock
 
 _LOST = Reading(0.0, "", math.nan)

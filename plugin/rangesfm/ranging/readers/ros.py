@@ -9,8 +9,7 @@ from typing import Any
 
 from rangesfm.errors import InputError
 from rangesfm.files.bags import SQLITE_HEAD, messages_of, open_bag, stamp_s, type_name
-from rangesfm.ranging.readers.reader import Reading, ReadOptions, reader_of_readings
-from rangesfm.ranging.readers.roles import Sides
+from rangesfm.ranging.readers.reader import Reading, ReadOptions, Sides, reader_of_readings
 
 _BEGINS = ("#ROSBAG V", SQLITE_HEAD)
 _MCAP = "MCAP0"

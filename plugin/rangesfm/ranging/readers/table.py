@@ -20,8 +20,7 @@ from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.columns import QUANTITIES, STAMPS, Columns, read_columns
 from rangesfm.ranging.readers.guess import Guess, described, guess_columns
 from rangesfm.ranging.readers.layout import Layout, find_layout, layout_without_header
-from rangesfm.ranging.readers.reader import Reader, ReadOptions
-from rangesfm.ranging.readers.roles import Sides
+from rangesfm.ranging.readers.reader import Reader, ReadOptions, Sides
 from rangesfm.ranging.readers.several import anchor_of_file
 
 _BY_TIME = Columns(
