@@ -79,26 +79,23 @@ class Reference:
             index_of = {name: i for i, name in enumerate(self.image_names)}
             return self._at_index(np.array([index_of.get(name, -1) for name in image_names], dtype=np.int64))
         assert times_s is not None
-        return self._poses_at(times_s, max_gap_s)
-
-    def _poses_at(self, times: Array, max_gap_s: float) -> tuple[Array, Array | None]:
         assert self.timestamps_s is not None
         known = self.timestamps_s
-        after = np.clip(np.searchsorted(known, times, side="right"), 1, max(len(known) - 1, 1))
+        after = np.clip(np.searchsorted(known, times_s, side="right"), 1, max(len(known) - 1, 1))
         after = np.minimum(after, len(known) - 1)
         before = np.maximum(after - 1, 0)
-        nearest = np.where(times - known[before] <= known[after] - times, before, after)
-        nearest[np.abs(times - known[nearest]) > MAX_TIME_DIFFERENCE_S] = -1
+        nearest = np.where(times_s - known[before] <= known[after] - times_s, before, after)
+        nearest[np.abs(times_s - known[nearest]) > MAX_TIME_DIFFERENCE_S] = -1
         positions, rotations = self._at_index(nearest)
 
         gap = known[after] - known[before]
-        between = (gap > 0) & (gap <= max_gap_s + ROUNDING_S) & (times >= known[before]) & (times <= known[after])
-        weight = ((times - known[before])[between] / gap[between])[:, None]
+        between = (gap > 0) & (gap <= max_gap_s + ROUNDING_S) & (times_s >= known[before]) & (times_s <= known[after])
+        weight = ((times_s - known[before])[between] / gap[between])[:, None]
         start_m, end_m = self.positions_m[before[between]], self.positions_m[after[between]]
         positions[between] = (1 - weight) * start_m + weight * end_m
         if rotations is not None and between.any():
             assert self.world_from_cam is not None
-            rotations[between] = Slerp(known, Rotation.from_matrix(self.world_from_cam))(times[between]).as_matrix()
+            rotations[between] = Slerp(known, Rotation.from_matrix(self.world_from_cam))(times_s[between]).as_matrix()
         return positions, rotations
 
     def why_nothing_is_known(

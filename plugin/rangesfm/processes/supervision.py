@@ -155,7 +155,7 @@ def supervise(
         )
         try:
             watched = _Watched(process, memory_limit_bytes, is_stopped)
-            last = _talk(process, given, listen, watched)
+            last = _talk(watched, given, listen)
         finally:
             process.kill()  # no harm if it has ended
             process.wait()
@@ -227,36 +227,33 @@ def run_children(
             raise
 
 
+@dataclass
 class _Watched:
-    """Interrupts or kills a process where that is due."""
+    """A process that is interrupted or killed where that is due."""
 
-    def __init__(
-        self, process: subprocess.Popen[bytes], memory_limit_bytes: int | None, is_stopped: Callable[[], bool]
-    ):
-        self._process = process
-        self._limit = memory_limit_bytes
-        self._is_stopped = is_stopped
-        self.needed_bytes: int | None = None
-        self.stopped_at: float | None = None
+    process: subprocess.Popen[bytes]
+    memory_limit_bytes: int | None
+    is_stopped: Callable[[], bool]
+    needed_bytes: int | None = None
+    stopped_at: float | None = None
 
     def look(self) -> None:
-        if self._limit is not None and self.needed_bytes is None:
+        if self.memory_limit_bytes is not None and self.needed_bytes is None:
             with suppress(psutil.Error):  # it has ended
-                used = psutil.Process(self._process.pid).memory_info().rss
-                if used > self._limit:
+                used = psutil.Process(self.process.pid).memory_info().rss
+                if used > self.memory_limit_bytes:
                     self.needed_bytes = used
-                    self._process.kill()
-        if self.stopped_at is None and self._is_stopped():
+                    self.process.kill()
+        if self.stopped_at is None and self.is_stopped():
             self.stopped_at = time.monotonic()
-            self._process.send_signal(signal.SIGINT)
+            self.process.send_signal(signal.SIGINT)
         if self.stopped_at is not None and time.monotonic() - self.stopped_at > _MAX_STOP_S:
-            self._process.kill()
+            self.process.kill()
 
 
-def _talk(
-    process: subprocess.Popen[bytes], given: bytes, listen: Callable[[dict[str, Any]], None], watched: _Watched
-) -> dict[str, Any] | None:
+def _talk(watched: _Watched, given: bytes, listen: Callable[[dict[str, Any]], None]) -> dict[str, Any] | None:
     """Hand over and listen until the process closes its stdout; returns its last message."""
+    process = watched.process
     assert process.stdin is not None
     assert process.stdout is not None
     lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()

@@ -192,9 +192,8 @@ def _camera_is_still(
     for burst in np.split(log.range_m[order], starts[1:]):
         if len(burst) >= 6:
             early, late = np.array_split(burst, 2)
-            noise = robust_stddev(np.concatenate([_deviations(early), _deviations(late)]))
             drifts.append((np.median(late) - np.median(early)) * np.sqrt(len(burst) / 4))
-            noises.append(noise)
+            noises.append(robust_stddev(np.concatenate([_deviations(early), _deviations(late)])))
     if not drifts:
         return still
     # 1.25 is the price of a median over a mean.
@@ -294,10 +293,14 @@ def _spline_error(times: Array, centers: Array) -> float:
     """Stddev (each coordinate) half-way between keyframes, from how well every second one predicts the others."""
     if len(times) < 8:
         return 0.0
-    missed = _median_miss(times, centers)
-    gain = _MAX_HALVING_GAIN
+    missed, gain = _median_miss(times, centers), _MAX_HALVING_GAIN
     if len(times) >= 16:
-        gain = _halving_gain(_median_miss(times[::2], centers[::2]), missed)
+        # All keyframes gain over every second one what these gain over every fourth, as long as the motion lasts longer
+        # than the gaps. Where already every second keyframe says little of the others, these tell no more than that it
+        # is between nothing and the most: the mean of the two (of logarithms) is within a factor of about two.
+        gain = _median_miss(times[::2], centers[::2]) / max(missed, 1e-300)
+        is_telling = gain >= _MIN_TELLING_GAIN
+        gain = min(gain, _MAX_HALVING_GAIN) if is_telling else float(np.sqrt(_MAX_HALVING_GAIN * max(gain, 1.0)))
     return missed / (_MEDIAN_LENGTH * gain)
 
 
@@ -306,16 +309,3 @@ def _median_miss(times: Array, centers: Array) -> float:
     missed = CubicSpline(times[::2], centers[::2])(times[1:-1:2]) - centers[1:-1:2]
     # Of lengths, so that it does not depend on how the world's axes lie.
     return float(np.median(np.linalg.norm(missed, axis=1)))
-
-
-def _halving_gain(missed_by_fourth: float, missed_by_second: float) -> float:
-    """What all keyframes gain over every second one, from what these gain over every fourth.
-
-    Both gain the same as long as the motion lasts longer than the gaps. Where already every second
-    keyframe says little of the others, these tell no more than that it is between nothing and the
-    most: the mean of the two (of logarithms) is within a factor of about two.
-    """
-    ratio = missed_by_fourth / max(missed_by_second, 1e-300)
-    if ratio >= _MIN_TELLING_GAIN:
-        return min(ratio, _MAX_HALVING_GAIN)
-    return float(np.sqrt(_MAX_HALVING_GAIN * max(ratio, 1.0)))

@@ -25,6 +25,7 @@ from rangesfm.ranging.readers.table import CANONICAL, MAPPED, PRESETS, TABLE, ta
 __all__ = ["find_log_reader", "read_anchors_in_log", "read_ranges", "reader_names", "write_ranges_csv"]
 
 _READERS = (ros.READER, CANONICAL, *PRESETS, MAPPED, TABLE, *PRINTED)
+_NOTHING_SAID = ReadOptions()
 
 
 def reader_names() -> tuple[str, ...]:
@@ -68,7 +69,9 @@ def read_ranges(
     source = paths[0] if len(paths) == 1 else paths[0].parent
     log = logs[0] if len(logs) == 1 else join_logs(logs, source)
     log = tell_roles(log, chosen[0][1].sides, known_anchor_ids=anchor_ids, known_tag_ids=tag_ids)
-    return _not_better_than_rounding(log)
+    step_m = None if np.all(np.isnan(log.range_stddev_m)) else find_quantization_m(log.range_m)
+    least_m = 0.0 if step_m is None else quantization_stddev_m(step_m)
+    return replace(log, range_stddev_m=np.maximum(log.range_stddev_m, least_m))
 
 
 def read_anchors_in_log(path: str | Path | Sequence[str | Path], *, format: str | None = None) -> tuple[Anchor, ...]:
@@ -84,7 +87,7 @@ def read_anchors_in_log(path: str | Path | Sequence[str | Path], *, format: str 
     Raises:
         InputError: for a file that is missing, empty or of no known format.
     """
-    chosen = _choose_readers(_paths(path), ReadOptions(), format)
+    chosen = _choose_readers(_paths(path), _NOTHING_SAID, format)
     return tuple(anchor for file, reader in chosen for anchor in reader.read_anchors(file))
 
 
@@ -95,13 +98,6 @@ def _paths(path: str | Path | Sequence[str | Path]) -> list[Path]:
     return [*map(Path, paths)]
 
 
-def _not_better_than_rounding(log: RangeLog) -> RangeLog:
-    step_m = None if np.all(np.isnan(log.range_stddev_m)) else find_quantization_m(log.range_m)
-    if step_m is None:
-        return log
-    return replace(log, range_stddev_m=np.maximum(log.range_stddev_m, quantization_stddev_m(step_m)))
-
-
 def _choose_readers(paths: Sequence[Path], options: ReadOptions, format: str | None) -> list[tuple[Path, Reader]]:
     """Every file of the log with its reader; what else is in a folder is left out."""
     files = [file for path in paths for file in files_of_log(path)]
@@ -110,7 +106,7 @@ def _choose_readers(paths: Sequence[Path], options: ReadOptions, format: str | N
     refused: InputError | None = None
     for file in files:
         try:
-            chosen.append((file, _choose_reader(file, options, format)))
+            chosen.append((file, find_log_reader(file, options, format)))
         except InputError as error:
             if not is_folder:
                 raise
@@ -126,7 +122,8 @@ def _choose_readers(paths: Sequence[Path], options: ReadOptions, format: str | N
     return chosen
 
 
-def _choose_reader(path: Path, options: ReadOptions, format: str | None) -> Reader:
+def find_log_reader(path: Path, options: ReadOptions = _NOTHING_SAID, format: str | None = None) -> Reader:
+    """The reader of a file; InputError, with advice for tables, if it is no log for sure."""
     if format is not None and format != TABLE.name:
         named = next((reader for reader in _READERS if reader.name == format), None)
         if named is None:
@@ -143,8 +140,3 @@ def _choose_reader(path: Path, options: ReadOptions, format: str | None) -> Read
     if "\0" in head:
         raise InputError("is neither text nor a bag: unpack it, or save it as UTF-8 text", path)
     return table_reader(path, options)
-
-
-def find_log_reader(path: Path) -> Reader:
-    """The reader of a file of which nothing is said; InputError, with advice for tables, if it is no log for sure."""
-    return _choose_reader(path, ReadOptions(), None)

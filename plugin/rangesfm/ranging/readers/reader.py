@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from itertools import compress
@@ -38,6 +38,12 @@ class ReadOptions(LogOptions):
         flags = {**said, "separator": self.separator, **more}
         typed = [word for flag, value in flags.items() if value for word in (f"--{flag}", value)]
         return shlex.join(["rangesfm", "ranges", *(self.given or [str(path)]), *typed])
+
+    def which_unit(self, path: Path, quantity: str, units: Sequence[str], why: str) -> InputError:
+        """What asks for a unit that may be one or another, with the commands that say it."""
+        flag, either = f"{quantity}_unit", " or ".join(units)
+        message = f"the {quantity} has {why}, which may be {either}; say which by --{flag} (in a survey file: {flag})"
+        return InputError(message, path, advice=[self.command(path, **{flag: unit}) for unit in units])
 
 
 class Sides(Enum):

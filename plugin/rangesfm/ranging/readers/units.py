@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.errors import InputError
 from rangesfm.ranging.readers.times import SECONDS_PER_UNIT, unit_by_digits
 from rangesfm.ranging.readers.vocabulary import LENGTHS, TIMES, words_of
 
@@ -25,16 +28,12 @@ _NEAR_M, _NEAR_WITH_DECIMALS_M = 0.6, 2.0
 _MAX_SHARE_OF_JUMPS = 0.25
 
 
-class UnclearUnitError(Exception):
-    """Values that may be in several units: ``units``."""
-
-    def __init__(self, units: list[str], why: str):
-        super().__init__(why)
-        self.units = units
+Ask = Callable[[Sequence[str], str], InputError]
+"""Makes the question which of several units it is, and why it may be any of them."""
 
 
-def time_unit(name: str, times: Array, notes: list[str]) -> str:
-    """The unit of a column of numbers, with a note where the name does not say it; or UnclearUnitError."""
+def time_unit(name: str, times: Array, notes: list[str], ask: Ask) -> str:
+    """The unit of a column of numbers, with a note where the name does not say it; asks where it may be several."""
     named, distinct = _named(name, TIMES), np.unique(times)
     by_digits = unit_by_digits(float(np.median(times))) if len(times) else None
     step = float(np.median(np.diff(distinct))) if len(distinct) > 1 else 0.0
@@ -49,14 +48,14 @@ def time_unit(name: str, times: Array, notes: list[str]) -> str:
     if mean_step < _FASTEST_ON_AVERAGE_S:
         slow = [unit for unit in ("min", "h", "d") if mean_step * SECONDS_PER_UNIT[unit] <= _SLOWEST_S]
         if not days_before_1970(distinct):
-            raise UnclearUnitError(slow, f"steps of {mean_step:.2g} between its numbers")
+            raise ask(slow, f"steps of {mean_step:.2g} between its numbers")
         notes.append(f"{name} looks like days (steps of {mean_step:.2g}): taken as such")
         return "d"
     can_be = [unit for unit, least in _FASTEST_S.items() if least <= step * SECONDS_PER_UNIT[unit] <= _SLOWEST_S]
     if can_be == ["s"] or _SECONDS_SINCE_1970[0] <= distinct[0] < _SECONDS_SINCE_1970[1]:
         return "s"
     if len(can_be) != 1:
-        raise UnclearUnitError(can_be or [*_FASTEST_S], f"steps of {step:g} between its numbers")
+        raise ask(can_be or [*_FASTEST_S], f"steps of {step:g} between its numbers")
     notes.append(f"{name} looks like {can_be[0]} (steps of {step:g}): taken as such")
     return can_be[0]
 
@@ -67,7 +66,7 @@ def days_before_1970(days: Array) -> float:
     return next((first for (low, high), first in _DAYS_OF_1970.items() if low < middle < high), 0.0)
 
 
-def range_unit(name: str, ranges: Array, times: Array | None, pair: Indices, notes: list[str]) -> str:
+def range_unit(name: str, ranges: Array, times: Array | None, pair: Indices, notes: list[str], ask: Ask) -> str:
     """As ``time_unit``, of positive ranges between some pairs of nodes; ``times`` in seconds."""
     named = _named(name, LENGTHS)
     if named is not None or len(ranges) < _MIN_NUM:
@@ -85,7 +84,7 @@ def range_unit(name: str, ranges: Array, times: Array | None, pair: Indices, not
         return "m"
     kind = f"{'whole' if are_whole else 'decimal'} numbers, most of them up to {most:g}"
     if len(can_be) != 1:
-        raise UnclearUnitError(can_be or [*_LARGEST_M], kind)
+        raise ask(can_be or [*_LARGEST_M], kind)
     notes.append(f"{name} looks like {can_be[0]} ({kind}): taken as such")
     return can_be[0]
 
