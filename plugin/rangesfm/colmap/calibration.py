@@ -30,15 +30,11 @@ _MODELS = {
 def colmap_camera(
     distortion: str, pinhole: Iterable[float], coefficients: Iterable[float], path: Path
 ) -> tuple[str, tuple[float, ...]]:
-    """COLMAP's name of the model and its parameters.
+    """COLMAP's name of the model and its parameters; InputError, with the path, if COLMAP has no such model.
 
     Args:
         distortion: the model's name in Kalibr or ROS.
         pinhole: fx, fy, cx, cy in pixels.
-        path: where it stands, for the message.
-
-    Raises:
-        InputError: COLMAP has no such model.
     """
     if distortion not in _MODELS:
         raise InputError(f"distortion_model is '{distortion}', expected one of {', '.join(_MODELS)}", path)
@@ -51,11 +47,7 @@ def colmap_camera(
 
 
 def calibrated_cameras(model: str, params: Sequence[float], sizes: Iterable[Size]) -> dict[Size, pycolmap.Camera]:
-    """The given camera for each size of photos that it can have: the most common one, and the same enlarged or reduced.
-
-    Args:
-        sizes: width and height in pixels of each photo.
-    """
+    """The given camera for each size (pixels) of photos that it can have: the most common, and the same rescaled."""
     import pycolmap  # slow to load, and of no use to who only looks for cameras in files
 
     counted = Counter(sizes)

@@ -182,10 +182,8 @@ def distance_rows(tape: Tape, lengths_m: npt.NDArray[np.float64]) -> list[Distan
 def disagreements(rows: Iterable[DistanceRow], relative_scale_stddev: float, bending: float = 0.0) -> Iterator[str]:
     """What to tell of distances that the map misses by more than tape, scale and bending explain.
 
-    A control distance has held the scale already, so that the scale's error does not excuse it.
-
-    Args:
-        bending: stddev by which the scale varies from place to place, relative.
+    A control distance has held the scale already, so that the scale's error does not excuse it. ``bending``: relative
+    stddev by which the scale varies from place to place.
     """
     for row in rows:
         of_scale = relative_scale_stddev if row.kind == CHECK else 0.0

@@ -98,8 +98,7 @@ def align_points(source: Array, target: Array, *, with_scale: bool = True) -> Si
 def align_most(source: Array, target: Array, start: Similarity) -> Similarity:
     """``align_points`` without the points that lie elsewhere than most: a few that moved on their own have no say.
 
-    Args:
-        start: about how most of the points lie to each other.
+    ``start``: about how most of the points lie to each other.
     """
     found = start
     for _ in range(_NUM_TRIMMINGS):
@@ -170,10 +169,9 @@ _MAX_RADIUS = 2.0
 
 
 def path_kind(points: Array) -> str:
-    """ "straight", "circular" (and flat), "flat", "spherical" or "general": the symmetries that ranges cannot see past.
+    """The symmetries of (n, 3) points, n >= 1, that ranges cannot see past.
 
-    Args:
-        points: (n, 3), n >= 1.
+    It is "straight", "circular" (and flat), "flat", "spherical" or "general".
     """
     shape = path_shape(points)
     if shape.stddevs[1] <= NEARLY_STRAIGHT * shape.stddevs[0]:

@@ -115,13 +115,9 @@ def trajectory_from_reconstruction(
 
 
 def joined_trajectory(parts: Sequence[Trajectory]) -> tuple[Trajectory, list[npt.NDArray[np.int64]]]:
-    """One path of several parts in one world, in the order of ``trajectory_from_reconstruction``.
+    """One path of several parts in one world, and for each part where its keyframes are in it.
 
-    Args:
-        parts: all with times, or none.
-
-    Returns:
-        the path, and for each part where its keyframes are in it.
+    All parts have times, or none; the order is that of ``trajectory_from_reconstruction``.
     """
     names = np.array([name for part in parts for name in part.image_names], dtype=object)
     times = [part.timestamps_s for part in parts if part.timestamps_s is not None]

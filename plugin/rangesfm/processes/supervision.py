@@ -62,11 +62,9 @@ class MessagesToParent:
 
 
 def work_for_parent(work: Callable[[Any, MessagesToParent], Any]) -> None:
-    """Do what a process is there for.
+    """Do what a process is there for: ``work``, called with what the process is given.
 
-    Args:
-        work: called with what the process is given; what it returns (plain values), or the error that it raises, is
-            the process's last message.
+    What that returns (plain values), or the error that it raises, is the process's last message.
     """
     # It may have been started where Ctrl-C is ignored, and by a command that waits for SIGTERM in its own way.
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -91,8 +91,7 @@ class RangeObservations:
 def hold_out(observations: RangeObservations, checks: CheckOptions, seed: int) -> RangeObservations:
     """Set usable ranges aside as checks: of some anchors, of a stretch of time, and a random share of the rest.
 
-    Raises:
-        InputError: an anchor to be held out is not in the log, or a stretch of time holds no range.
+    InputError for an anchor that is not in the log, or a stretch of time that holds no range.
     """
     log, status = observations.log, observations.status.copy()
     chosen = np.zeros(len(log), dtype=bool)

@@ -40,14 +40,7 @@ def has_images(path: Path) -> bool:
 
 
 def open_images(path: Path, topic: str | None) -> Source:
-    """What the images of a bag are.
-
-    Args:
-        topic: of them, if there are several such; None: there is one.
-
-    Raises:
-        InputError: the bag cannot be read or has no images, or nothing tells which are meant.
-    """
+    """What the images of a bag are, by their topic if there are several; InputError as ``open_source`` has it."""
     with open_bag(path) as bag:
         num_by_topic = _num_by_topic(bag)
         topic = _chosen(num_by_topic, topic, path)
@@ -188,8 +181,7 @@ def _luma_and_colours(luma: int, pixels: _Pixels) -> _Pixels:
 def _colours_of_mosaic(red: tuple[int, int], pixels: _Pixels) -> _Pixels:
     """Of pixels behind red, green and blue filters; those two colours that one lacks are of its neighbours.
 
-    Args:
-        red: row and column of a red one in the first 2 x 2 pixels; blue is across from it.
+    ``red``: row and column of a red one in the first 2 x 2 pixels; blue is across from it.
     """
     has_red, has_blue = (np.zeros(pixels.shape[:2], bool) for _ in range(2))
     has_red[red[0] :: 2, red[1] :: 2] = has_blue[1 - red[0] :: 2, 1 - red[1] :: 2] = True

@@ -172,7 +172,7 @@ def fit_with_own_noise(problem: PointProblem, given_m: Array) -> PointFit:
     """
     is_given = np.isfinite(given_m)
     unit = np.where(is_given, given_m, np.median(given_m[is_given]) if is_given.any() else _USUAL_NOISE_M)
-    x, noise = best_start(problem, unit)
+    x, noise = _best_start(problem, unit)
     for _ in range(_NUM_NOISE_ROUNDS):
         noise = max(noise, 1.0) if is_given.all() else noise
         now = replace(problem, stddev_m=np.hypot(noise * unit, problem.shared_stddev_m))
@@ -209,18 +209,11 @@ def improve(problem: PointProblem, x: Array, tolerance: float = _CONVERGED) -> A
     return np.asarray(found.x)
 
 
-def best_start(problem: PointProblem, unit_m: Array) -> tuple[Array, float]:
-    """The most likely point, whatever the outliers.
+def _best_start(problem: PointProblem, unit_m: Array) -> tuple[Array, float]:
+    """The most likely unknowns (4,), whatever the outliers, and the noise there as a multiple of ``unit_m``.
 
     Starts all around the tag and a linear one follow the minima of a Cauchy loss while it narrows from metres to
-    centimetres; the likelihood chooses among all that they pass.
-
-    Args:
-        problem: of its stddevs only the shared ones are looked at.
-        unit_m: (n,) how the noise of the ranges compares.
-
-    Returns:
-        (4,) unknowns, and the noise there as a multiple of ``unit_m``.
+    centimetres; the likelihood chooses among all that they pass. ``unit_m`` (n,): how the noise of the ranges compares.
     """
     rows = np.linspace(0, len(unit_m) - 1, min(len(unit_m), _MAX_NUM_RANGES)).astype(np.int64)
     part, unit_m = problem.subset(rows), unit_m[rows]

@@ -211,13 +211,12 @@ def _ranges_by_stamps(table: Table, name: Mapping[str, str], options: StampOptio
 def _timestamps(
     table: Table, name: Mapping[str, str], units: Mapping[str, str], options: ReadOptions, notes: list[str]
 ) -> Array:
-    column, unit = name["timestamp"], options.timestamp_unit
+    column, said = name["timestamp"], options.timestamp_unit
     ask = partial(options.which_unit, table.path, "timestamp")
-    if unit in CIVIL_UNITS or "date" in name or (unit is None and not table.begins_with_number(column)):
-        return _civil_times(table, name, unit, notes, ask)
-    times = table.numbers(column, expected=f"a time in {unit or 's'}")
-    if unit is None:
-        unit = time_unit(f"{column} {units.get(column, '')}".strip(), times, notes, ask)
+    if said in CIVIL_UNITS or "date" in name or (said is None and not table.begins_with_number(column)):
+        return _civil_times(table, name, said, notes, ask)
+    times = table.numbers(column, expected=f"a time in {said or 's'}")
+    unit = said or time_unit(f"{column} {units.get(column, '')}".strip(), times, notes, ask)
     seconds = (times - (days_before_1970(times) if unit == "d" else 0.0)) * SECONDS_PER_UNIT[unit]
     table.refuse(np.abs(seconds) > _MAX_TIME_S, column, f"a time in {unit}")
     return seconds + 1e-9 * table.numbers(name["nanoseconds"]) if "nanoseconds" in name else seconds

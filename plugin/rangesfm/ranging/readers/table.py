@@ -21,7 +21,6 @@ from rangesfm.ranging.readers.columns import QUANTITIES, STAMPS, Columns, read_c
 from rangesfm.ranging.readers.guess import Guess, described, guess_columns
 from rangesfm.ranging.readers.layout import Layout, find_layout, layout_without_header
 from rangesfm.ranging.readers.reader import Reader, ReadOptions, Sides
-from rangesfm.ranging.readers.several import anchor_of_file
 
 _BY_TIME = Columns(
     required={"timestamp": "timestamp_s", "anchor_id": "anchor_id", "range": "range_m"},
@@ -39,6 +38,7 @@ _INROLS_COLUMNS = ("index", "timestamp", "anchor_id", "r")
 _INROLS_COMMENT = re.compile(
     r"\s{0,99}#[ \t]{0,9}index[ \t]{1,9}timestamp[ \t]{1,9}anchor_id[ \t]{1,9}r[ \t]{0,9}(?:\n|$)"
 )
+_ID_IN_NAME = re.compile(r"(?:.*[^0-9A-Za-z])?([A-Za-z]{0,2}\d{1,3}|(?=[A-F]*\d)[0-9A-F]{4})", re.ASCII)
 _SPAN = re.compile(r"(\D*)(\d{1,4})-(\D*)(\d{1,4})", re.ASCII)
 _POSITIONS_ONLY = (
     "holds positions that the radio computed and not the ranges they came from; "
@@ -57,6 +57,13 @@ _NO_RANGES = (
 )
 
 
+def _anchor_of_file(path: Path) -> str:
+    """The anchor that the name of a file stands for: A5 of ``run_3_A5.csv``, else all of the name before its ending."""
+    stem = path.name.split(".")[0]
+    found = _ID_IN_NAME.fullmatch(stem)
+    return found[1] if found else stem
+
+
 def table_reader(path: Path, options: ReadOptions) -> Reader:
     """The reader of one table that nobody described.
 
@@ -68,7 +75,7 @@ def table_reader(path: Path, options: ReadOptions) -> Reader:
     if layout is None or guess is None or guess.missing or guess.doubts:
         raise _question(path, options, layout, guess)
     notes = tuple(_notes(path, layout, guess))
-    columns = Columns({**guess.columns}, {}, guess.wide, anchor_of_file(path), layout, notes=notes)
+    columns = Columns({**guess.columns}, {}, guess.wide, _anchor_of_file(path), layout, notes=notes)
     read = partial(read_columns, columns=columns, format=TABLE.name)
     return replace(TABLE, read=lambda path, options: read(path, options=options), sides=guess.sides)
 
@@ -80,7 +87,7 @@ def _notes(path: Path, layout: Layout, guess: Guess) -> Iterable[str]:
     )
     yield from guess.notes
     if "anchor_id" not in guess.columns and not guess.wide:
-        yield f"no column says which anchor it was: it is called '{anchor_of_file(path)}', as the file"
+        yield f"no column says which anchor it was: it is called '{_anchor_of_file(path)}', as the file"
 
 
 def _question(path: Path, options: ReadOptions, layout: Layout | None, guess: Guess | None) -> InputError:
@@ -138,7 +145,7 @@ def _read(path: Path, options: ReadOptions, *, format: str) -> RangeLog:
             raise InputError(f"columns name no column range, nor the time stamps {wanted}; found {found}", path)
         columns = {**{stamp: stamps[stamp] for stamp in STAMPS[:4]}, **columns}
         third_message = {stamp: stamps[stamp] for stamp in STAMPS[4:]}
-    return read_columns(path, Columns(columns, third_message, wide, anchor_of_file(path), layout), options, format)
+    return read_columns(path, Columns(columns, third_message, wide, _anchor_of_file(path), layout), options, format)
 
 
 def _wide(told: Mapping[str, str], path: Path) -> dict[str, tuple[str, str]]:
