@@ -63,18 +63,10 @@ class LocatedDistances:
     ) -> LocatedDistances:
         """All control, between points that are anywhere, or between anchors."""
         k = len(distance_m)
-        nothing = np.zeros(k, dtype=bool)
-        return cls(
-            np.full(k, np.nan) if model_length is None else model_length,
-            np.full((k, 2), -1, dtype=np.int64) if anchor_pair is None else anchor_pair,
-            distance_m,
-            stddev_m,
-            nothing,
-            np.full((k, 2, 3), np.nan),
-            np.zeros(k),
-            nothing,
-            nothing,
-        )
+        length = np.full(k, np.nan) if model_length is None else model_length
+        pair = np.full((k, 2), -1, dtype=np.int64) if anchor_pair is None else anchor_pair
+        no, nowhere = np.zeros(k, dtype=bool), np.full((k, 2, 3), np.nan)
+        return cls(length, pair, distance_m, stddev_m, no, nowhere, np.zeros(k), no, no)
 
     @property
     def is_between_points(self) -> npt.NDArray[np.bool_]:

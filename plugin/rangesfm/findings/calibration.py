@@ -73,10 +73,8 @@ def _read_yaml(path: Path) -> Iterator[Calibration]:
     if not isinstance(content, dict):
         return
     if "camera_matrix" in content:
-        (fx, _, cx, _, fy, cy), coefficients = (
-            content["camera_matrix"]["data"][:6],
-            content["distortion_coefficients"]["data"],
-        )
+        fx, _, cx, _, fy, cy = content["camera_matrix"]["data"][:6]
+        coefficients = content["distortion_coefficients"]["data"]
         size = (content["image_width"], content["image_height"])
         yield _of_opencv(path, content["distortion_model"], (fx, fy, cx, cy), coefficients, size)
     for name, camera in content.items():

@@ -89,9 +89,8 @@ def look_into(folders: Sequence[Path]) -> Found:
                 notes.append(str(error))
     for suffix, those in not_read.items():
         notes.append(f"{len(those)} of {suffix}, as {those[0].name}: {_NOT_READ[suffix]}")
-    return Found(
-        dict(paths), calibrations, tuple(models), (*notes, *([] if LOG in paths else unsure[:_MAX_NUM_UNSURE]))
-    )
+    notes += [] if LOG in paths else unsure[:_MAX_NUM_UNSURE]
+    return Found(dict(paths), calibrations, tuple(models), tuple(notes))
 
 
 def _key_of(path: Path) -> str | None:

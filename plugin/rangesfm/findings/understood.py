@@ -60,7 +60,7 @@ def understand(folders: Sequence[Path], given: Mapping[str, object]) -> Understo
     folders = [Path(os.path.abspath(folder)) for folder in folders]
     found = look_into(folders)
     roles = {item.dotted: item.role for item in KEYS}
-    values = {key: _path(value) if roles[key] is not None else value for key, value in given.items()}
+    values = {key: value if roles[key] is None else Path(os.path.abspath(str(value))) for key, value in given.items()}
     notes, questions = list(found.notes), []
     for item in KEYS:
         key, paths = item.dotted, found.paths.get(item.dotted, [])
@@ -89,10 +89,6 @@ def understand(folders: Sequence[Path], given: Mapping[str, object]) -> Understo
         raise InputError("neither photos nor a radio's log nor lengths in there", folders[0], advice=notes)
     _add_camera(values, found, notes)
     return Understood(values, tuple(notes))
-
-
-def _path(value: object) -> Path:
-    return Path(os.path.abspath(str(value)))
 
 
 def _chosen(key: str, paths: Sequence[Path]) -> Path | None:

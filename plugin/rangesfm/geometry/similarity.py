@@ -21,11 +21,7 @@ class Similarity:
 
     def __matmul__(self, inner: Similarity) -> Similarity:
         """``(a_from_b @ b_from_c)`` is ``a_from_c``."""
-        return Similarity(
-            self.scale * inner.scale,
-            self.rotation @ inner.rotation,
-            self.apply(inner.translation),
-        )
+        return Similarity(self.scale * inner.scale, self.rotation @ inner.rotation, self.apply(inner.translation))
 
     def apply(self, points: Array) -> Array:
         """Map points of shape (..., 3)."""

@@ -59,13 +59,8 @@ class Trajectory:
         known = [row for row, name in enumerate(self.image_names) if name in timestamps_s]
         rows = sorted(known, key=lambda row: timestamps_s[self.image_names[row]])
         names = tuple(self.image_names[row] for row in rows)
-        return Trajectory(
-            self.frame_ids[rows],
-            names,
-            np.array([timestamps_s[name] for name in names], dtype=np.float64),
-            self.centers[rows],
-            self.world_from_cam[rows],
-        )
+        times = np.array([timestamps_s[name] for name in names], dtype=np.float64)
+        return Trajectory(self.frame_ids[rows], names, times, self.centers[rows], self.world_from_cam[rows])
 
     def resized(self, factor: float, frame: str) -> Trajectory:
         """The path with another scale, otherwise placed as it is.

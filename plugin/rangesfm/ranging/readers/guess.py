@@ -26,12 +26,9 @@ class Guess:
     """What a table seems to hold.
 
     Attributes:
-        columns: name in the file of each quantity.
+        columns: name in the file of each quantity; those that could not be found at all are ``missing``.
         wide: columns of ranges, each with its anchor and tag.
-        sides: what the columns of ids mean.
-        notes: what was taken as what.
         doubts: why it is no more than a guess; none: it is sure.
-        missing: quantities that could not be found at all.
         span: ``wide`` in a few words, where its columns have no names: quantity and columns.
     """
 
