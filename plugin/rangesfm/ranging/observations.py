@@ -150,12 +150,9 @@ def each_on_one_path(parts: Sequence[RangeObservations]) -> list[RangeObservatio
 def joined_observations(
     parts: Sequence[RangeObservations], joined_from_part: Sequence[Similarity], keyframes: Sequence[Indices]
 ) -> RangeObservations:
-    """All ranges on the joined path.
+    """All ranges on the joined path, each with a place on one path at most.
 
-    Args:
-        parts: of one log, each range with a place on one path at most.
-        joined_from_part: world of each path to that of the joined one.
-        keyframes: where the keyframes of each path are in the joined one.
+    ``joined_from_part``: from the world of each path; ``keyframes``: where those of each path are in the joined one.
     """
     is_free = np.ones(len(parts[0].log), dtype=bool)
     joined: dict[str, Any] = {"status": np.min([part.status for part in parts], axis=0)}

@@ -76,17 +76,10 @@ def read_ranges(
 
 
 def read_anchors_in_log(path: str | Path | Sequence[str | Path], *, format: str | None = None) -> tuple[Anchor, ...]:
-    """The anchors whose positions a log tells beside its ranges, as those of the DWM1001 do.
+    """The anchors whose positions a log tells beside its ranges, as those of the DWM1001 do; none if it tells none.
 
-    Args:
-        format: one of ``reader_names()``; None: recognised by content.
-
-    Returns:
-        Each at the median of its positions, unknown where several share a place (nobody set them up);
-        empty if the format tells none.
-
-    Raises:
-        InputError: for a file that is missing, empty or of no known format.
+    Each is at the median of its positions, unknown where several share a place (nobody set them up). ``format`` is one
+    of ``reader_names()``; None: recognised by content. InputError for a file that is missing, empty or of no known one.
     """
     chosen = _choose_readers(_paths(path), _NOTHING_SAID, format)
     return tuple(anchor for file, reader in chosen for anchor in reader.read_anchors(file))

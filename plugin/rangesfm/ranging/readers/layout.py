@@ -145,10 +145,6 @@ class Layout:
     are_records: bool = False
 
     @property
-    def header(self) -> tuple[str, ...]:
-        return tuple(column.name for column in self.columns)
-
-    @property
     def units(self) -> dict[str, str]:
         """Behind the numbers of each column."""
         return {column.name: column.unit for column in self.columns}

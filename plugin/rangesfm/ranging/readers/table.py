@@ -76,15 +76,15 @@ def table_reader(path: Path, options: ReadOptions) -> Reader:
         raise _question(path, options, layout, guess)
     notes = tuple(_notes(path, layout, guess))
     columns = Columns({**guess.columns}, {}, guess.wide, _anchor_of_file(path), layout, notes=notes)
-    read = partial(read_columns, columns=columns, format=TABLE.name)
-    return replace(TABLE, read=lambda path, options: read(path, options=options), sides=guess.sides)
+    return replace(
+        TABLE, read=lambda path, options: read_columns(path, columns, options, TABLE.name), sides=guess.sides
+    )
 
 
 def _notes(path: Path, layout: Layout, guess: Guess) -> Iterable[str]:
     said = ", ".join(f"{quantity} = {name}" for quantity, name in guess.columns.items())
-    yield f"columns taken: {said}" + (
-        "" if layout.has_names else " (by their numbers and values: the table has no names)"
-    )
+    by_values = "" if layout.has_names else " (by their numbers and values: the table has no names)"
+    yield f"columns taken: {said}{by_values}"
     yield from guess.notes
     if "anchor_id" not in guess.columns and not guess.wide:
         yield f"no column says which anchor it was: it is called '{_anchor_of_file(path)}', as the file"
@@ -134,11 +134,11 @@ def _read(path: Path, options: ReadOptions, *, format: str) -> RangeLog:
     layout = find_layout(path, options.separator) if format == MAPPED.name else None
     if format == "inrol":
         layout = layout_without_header(path, _INROLS_COLUMNS, " ")
-    elif layout is not None and not {*columns.values(), *wide} <= {*layout.header}:
+    elif layout is not None and not {*columns.values(), *wide} <= layout.units.keys():
         layout = None
     third_message = {}
     if "range" not in columns and not wide:
-        names = layout.header if layout else header_names(read_head(path), options.separator)
+        names = [*layout.units] if layout else header_names(read_head(path), options.separator)
         stamps = {stamp: columns.get(stamp, stamp) for stamp in STAMPS}
         if not {*(stamps[stamp] for stamp in STAMPS[:4])} <= set(names):
             wanted, found = ", ".join(STAMPS[:4]), printable(", ".join(names))
