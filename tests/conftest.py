@@ -32,7 +32,7 @@ from rangesfm.demo.survey import TIME_OFFSET_S as DEMO_TIME_OFFSET_S
 from rangesfm.demo.survey import DemoSurvey
 from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.geometry.similarity import Similarity
-from rangesfm.ranging.readers.canonical import write_ranges_csv
+from rangesfm.ranging.readers import write_ranges_csv
 
 Array = npt.NDArray[np.float64]
 Command = Callable[..., "subprocess.CompletedProcess[str]"]

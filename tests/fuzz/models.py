@@ -44,7 +44,7 @@ def make_survey(folder: Path) -> None:
     from tests.simulated.path import loop_path
 
     from rangesfm.demo.ranges import Radio, simulate_ranges
-    from rangesfm.ranging.readers.canonical import write_ranges_csv
+    from rangesfm.ranging.readers import write_ranges_csv
 
     anchors_m = {"A1": (-6.0, -5.0, 0.5), "A2": (6.0, -5.0, 2.5), "A3": (6.0, 5.0, 0.7), "A4": (-6.0, 5.0, 2.2)}
     path = loop_path(15.0, start_s=0.0, seed=3)

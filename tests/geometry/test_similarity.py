@@ -77,16 +77,6 @@ def test_alignment_never_mirrors(rng: np.random.Generator) -> None:
     assert np.linalg.det(found.rotation) == pytest.approx(1.0)
 
 
-def test_alignment_ignores_points_without_weight(rng: np.random.Generator) -> None:
-    truth = random_similarity(rng, 2.0)
-    source = rng.normal(size=(8, 3))
-    target = truth.apply(source)
-    target[0] += 100.0
-    weights = np.ones(8)
-    weights[0] = 0.0
-    assert_equal(align_points(source, target, weights), truth)
-
-
 def test_rigid_alignment_keeps_the_scale_at_one(rng: np.random.Generator) -> None:
     truth = random_similarity(rng, 1.0)
     source = rng.normal(size=(6, 3))

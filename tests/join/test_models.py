@@ -29,7 +29,7 @@ from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.site import local_site
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.readers.canonical import write_ranges_csv
+from rangesfm.ranging.readers import write_ranges_csv
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.reconstruct import ReconstructionSummary

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rangesfm.ranging.log import RangeKind, RangeLog
-from rangesfm.ranging.readers.roles import Sides, tell_roles
+from rangesfm.ranging.readers.reader import Sides, tell_roles
 
 
 def log_of(*pairs: tuple[str, str]) -> RangeLog:

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
 from rangesfm.geometry.reference import Reference
+from rangesfm.ranging.association import tag_positions
 from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.tag_positions import tag_positions
 
 Array = npt.NDArray[np.float64]
 

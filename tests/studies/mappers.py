@@ -35,7 +35,7 @@ from rangesfm.demo.ranges import Radio, simulate_ranges
 from rangesfm.geometry.reference import Reference, read_reference, write_reference
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import SilentProgress
-from rangesfm.ranging.readers.canonical import write_ranges_csv
+from rangesfm.ranging.readers import write_ranges_csv
 from rangesfm.vision.mapping import map_photos, pipeline_options, read_models
 from rangesfm.vision.photos import Photos
 

@@ -20,10 +20,9 @@ import numpy.typing as npt
 from tests.studies.real_logs import MAX_GAP_S, read_set
 
 from rangesfm.geometry.reference import Reference
-from rangesfm.ranging.anchors.anchor_survey import AnchorPlacement, trilaterate_anchors
-from rangesfm.ranging.anchors.trilateration import TrilaterationOptions
+from rangesfm.ranging.anchors.trilateration import AnchorPlacement, TrilaterationOptions, trilaterate_anchors
+from rangesfm.ranging.association import tag_positions
 from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.tag_positions import tag_positions
 
 Array = npt.NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from rangesfm.progress import Progress
 if TYPE_CHECKING:
     from rangesfm.arrays import Array
     from rangesfm.ranging.anchors.anchor import Anchor
-    from rangesfm.ranging.anchors.anchor_survey import AnchorPlacement
+    from rangesfm.ranging.anchors.trilateration import AnchorPlacement
     from rangesfm.ranging.errors.calibration import Calibration
     from rangesfm.ranging.log import RangeLog
     from rangesfm.ranging.summary import LinkSummary, RangeSummary
@@ -181,7 +181,7 @@ def _read_log(args: argparse.Namespace, anchor_ids: Sequence[str] = ()) -> Range
 def _read_placed_log(args: argparse.Namespace) -> tuple[RangeLog, Array]:
     """The log, of one tag, and (n, 3) where that was at each of the ranges; NaN: not known."""
     from rangesfm.geometry.reference import read_reference
-    from rangesfm.ranging.tag_positions import tag_positions
+    from rangesfm.ranging.association import tag_positions
     from rangesfm.survey.inputs import of_one_tag
 
     log, known = of_one_tag(_read_log(args), args.tag_id), read_reference(args.positions)
@@ -197,7 +197,7 @@ def _ranges(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm ranges log.csv --columns timestamp=t,anchor_id=node,range=d --timestamp_unit ms \
         --output_path ranges.csv
     """
-    from rangesfm.ranging.anchors.anchor_file import read_anchors
+    from rangesfm.ranging.anchors.anchor import read_anchors
     from rangesfm.ranging.readers import read_anchors_in_log, write_ranges_csv
     from rangesfm.ranging.summary import summarize_ranges
 
@@ -288,7 +288,7 @@ def _calibrate(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm ranges calibrate log.csv --anchors anchors.csv --positions truth.csv \
         --output_path curve.csv
     """
-    from rangesfm.ranging.anchors.anchor_file import read_anchors
+    from rangesfm.ranging.anchors.anchor import read_anchors
     from rangesfm.ranging.errors.calibration import calibrate_ranges
     from rangesfm.ranging.errors.error_curve import write_error_curve
 
@@ -334,9 +334,8 @@ def _trilaterate(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm trilaterate uwb.csv --positions total_station.csv --side above --output_path anchors.csv
       rangesfm run survey.toml --anchors anchors.csv --anchor_frame site
     """
-    from rangesfm.ranging.anchors.anchor_file import write_anchors
-    from rangesfm.ranging.anchors.anchor_survey import trilaterate_anchors
-    from rangesfm.ranging.anchors.trilateration import TrilaterationOptions
+    from rangesfm.ranging.anchors.anchor import write_anchors
+    from rangesfm.ranging.anchors.trilateration import TrilaterationOptions, trilaterate_anchors
 
     log, tags_m = _read_placed_log(args)
     options = TrilaterationOptions(

@@ -1,21 +1,55 @@
-"""A camera's given parameters, and the photos that they are of."""
+"""Cameras that somebody calibrated: as OpenCV, Kalibr and ROS describe them, and for photos of several sizes."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-import pycolmap
+from rangesfm.errors import InputError
+
+if TYPE_CHECKING:
+    import pycolmap
 
 Size = tuple[int, int]
 
+# To OpenCV, and so to Kalibr and ROS, the centre of the first pixel is (0, 0); to COLMAP it is (0.5, 0.5).
+_CORNER_PX = 0.5
+# COLMAP's model and how many parameters it has beside fx, fy, cx, cy.
+_MODELS = {
+    "none": ("PINHOLE", 0),
+    "radtan": ("OPENCV", 4),
+    "plumb_bob": ("OPENCV", 4),
+    "rational_polynomial": ("FULL_OPENCV", 8),
+    "equidistant": ("OPENCV_FISHEYE", 4),
+    "fisheye": ("OPENCV_FISHEYE", 4),
+}
 
-def calibrated_cameras(model: str, params: Sequence[float], sizes: Iterable[Size]) -> dict[Size, pycolmap.Camera]:
-    """The given camera for each size of photos that it can have: the most common one, and the same enlarged or reduced.
+
+def colmap_camera(
+    distortion: str, pinhole: Iterable[float], coefficients: Iterable[float], path: Path
+) -> tuple[str, tuple[float, ...]]:
+    """COLMAP's name of the model and its parameters; InputError, with the path, if COLMAP has no such model.
 
     Args:
-        sizes: width and height in pixels of each photo.
+        distortion: the model's name in Kalibr or ROS.
+        pinhole: fx, fy, cx, cy in pixels.
     """
+    if distortion not in _MODELS:
+        raise InputError(f"distortion_model is '{distortion}', expected one of {', '.join(_MODELS)}", path)
+    model, num = _MODELS[distortion]
+    given = [*map(float, coefficients)]
+    if model == "OPENCV" and any(given[num:]):  # a third radial coefficient
+        model, num = "FULL_OPENCV", 8
+    fx, fy, cx, cy = map(float, pinhole)
+    return model, (fx, fy, cx + _CORNER_PX, cy + _CORNER_PX, *[*given, *[0.0] * num][:num])
+
+
+def calibrated_cameras(model: str, params: Sequence[float], sizes: Iterable[Size]) -> dict[Size, pycolmap.Camera]:
+    """The given camera for each size (pixels) of photos that it can have: the most common, and the same rescaled."""
+    import pycolmap  # slow to load, and of no use to who only looks for cameras in files
+
     counted = Counter(sizes)
     own, _ = max(counted.items(), key=lambda item: (item[1], item[0]))
     given = pycolmap.Camera.create_from_model_name(pycolmap.INVALID_CAMERA_ID, model, 1.0, *own)

@@ -8,6 +8,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -148,11 +149,6 @@ class _Cursor:
             raise struct.error
         return start
 
-    def skip_text(self) -> None:
-        """Up to and with the zero byte that ends it."""
-        end = self.data.find(b"\0", self.place)
-        self.skip(end + 1 - self.place if end >= 0 else len(self.data))
-
 
 def _walk_camera(cursor: _Cursor) -> int:
     cursor.skip(4)
@@ -170,29 +166,25 @@ def _walk_rig(cursor: _Cursor) -> int:
     return start
 
 
-def _walk_frame(cursor: _Cursor) -> int:
-    cursor.skip(64)
-    return cursor.skip(cursor.number("I") * 16)
+def _walk_groups(cursor: _Cursor, num_before: int, code: str, size: int) -> int:
+    """Over what is before the groups, in bytes, and the groups, whose number has this code."""
+    cursor.skip(num_before)
+    return cursor.skip(cursor.number(code) * size)
 
 
 def _walk_image(cursor: _Cursor) -> int:
-    cursor.skip(64)
-    cursor.skip_text()
-    return cursor.skip(cursor.number("Q") * _FEATURE.itemsize)
-
-
-def _walk_point(cursor: _Cursor) -> int:
-    cursor.skip(43)
-    return cursor.skip(cursor.number("Q") * _ELEMENT.itemsize)
+    """With a name, which a zero byte ends."""
+    end = cursor.data.find(b"\0", cursor.place + 64)
+    return _walk_groups(cursor, end + 1 - cursor.place if end >= 0 else len(cursor.data), "Q", _FEATURE.itemsize)
 
 
 # Each steps over a record and tells where the groups begin with which it ends.
 _WALKS: dict[str, Callable[[_Cursor], int]] = {
     "cameras.bin": _walk_camera,
     "rigs.bin": _walk_rig,
-    "frames.bin": _walk_frame,
+    "frames.bin": partial(_walk_groups, num_before=64, code="I", size=16),
     "images.bin": _walk_image,
-    "points3D.bin": _walk_point,
+    "points3D.bin": partial(_walk_groups, num_before=43, code="Q", size=_ELEMENT.itemsize),
 }
 MODEL_FILES = tuple(_WALKS)
 """COLMAP's binary files, each a count and so many records."""
@@ -251,11 +243,7 @@ def _check_names_of_text(path: Path) -> None:
 
 
 def write_binary_model(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write a model's files into a folder that is there.
-
-    Raises:
-        OSError: a file ends before its records do, as on a full disk: COLMAP does not look.
-    """
+    """Write a model's files into a folder; OSError if one ends too soon, as on a full disk: COLMAP does not look."""
     model.write_binary(folder)
     try:
         for name in MODEL_FILES:

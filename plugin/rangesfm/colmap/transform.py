@@ -87,7 +87,11 @@ class _Addition:
 
     def _add_rigs(self) -> tuple[dict[int, int], dict[int, int]]:
         """New ids of rigs and of cameras, by those in the model."""
-        same = {rig_id for rig_id in self.model.rigs if self._is_there(rig_id)}
+        same = {
+            rig_id
+            for rig_id in self.model.rigs
+            if self.joined.exists_rig(rig_id) and _description(self.joined, rig_id) == _description(self.model, rig_id)
+        }
         cameras_of = {rig_id: _camera_ids(rig) for rig_id, rig in self.model.rigs.items()}
         shared = {camera_id for rig_id in same for camera_id in cameras_of[rig_id]}
         camera_ids = _free_ids(set(self.model.cameras) - shared, self.joined.cameras) | {id_: id_ for id_ in shared}
@@ -99,13 +103,6 @@ class _Addition:
                 self.joined.add_camera(camera)
             self.joined.add_rig(_renumbered(self.model.rig(old_id), rig_ids[old_id], camera_ids))
         return rig_ids, camera_ids
-
-    def _is_there(self, rig_id: int) -> bool:
-        """Whether the joined model has this very rig."""
-        if not self.joined.exists_rig(rig_id):
-            return False
-        rigs = [_description(model, rig_id) for model in (self.joined, self.model)]
-        return bool(rigs[0] == rigs[1])
 
     def _add_frame(
         self, frame: pycolmap.Frame, frame_id: int, rig_id: int, camera_ids: dict[int, int], image_ids: dict[int, int]
@@ -147,9 +144,8 @@ def _description(model: pycolmap.Reconstruction, rig_id: int) -> Any:
         sensor.id: None if pose is None else pose.matrix().tolist() for sensor, pose in rig.non_ref_sensors.items()
     }
     cameras = [
-        (id_, camera.model, camera.width, camera.height, camera.params.tolist())
-        for id_ in _camera_ids(rig)
-        for camera in [model.camera(id_)]
+        (camera.camera_id, camera.model, camera.width, camera.height, camera.params.tolist())
+        for camera in map(model.camera, _camera_ids(rig))
     ]
     return rig.ref_sensor_id.id, others, cameras
 

@@ -21,7 +21,7 @@ from rangesfm.demo.ranges import CameraPath, Radio, SimulatedRanges, simulate_ra
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import LEFTOVER, LOCK_NAME, new_folder, sole_writer, write_text
 from rangesfm.geometry.reference import Reference, write_reference
-from rangesfm.ranging.readers.canonical import write_ranges_csv
+from rangesfm.ranging.readers import write_ranges_csv
 
 PHOTOS = Path(__file__).with_name("photos")
 PATH_FILE = PHOTOS / "path.csv"

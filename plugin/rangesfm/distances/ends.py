@@ -63,18 +63,10 @@ class LocatedDistances:
     ) -> LocatedDistances:
         """All control, between points that are anywhere, or between anchors."""
         k = len(distance_m)
-        nothing = np.zeros(k, dtype=bool)
-        return cls(
-            np.full(k, np.nan) if model_length is None else model_length,
-            np.full((k, 2), -1, dtype=np.int64) if anchor_pair is None else anchor_pair,
-            distance_m,
-            stddev_m,
-            nothing,
-            np.full((k, 2, 3), np.nan),
-            np.zeros(k),
-            nothing,
-            nothing,
-        )
+        length = np.full(k, np.nan) if model_length is None else model_length
+        pair = np.full((k, 2), -1, dtype=np.int64) if anchor_pair is None else anchor_pair
+        no, nowhere = np.zeros(k, dtype=bool), np.full((k, 2, 3), np.nan)
+        return cls(length, pair, distance_m, stddev_m, no, nowhere, np.zeros(k), no, no)
 
     @property
     def is_between_points(self) -> npt.NDArray[np.bool_]:
@@ -144,15 +136,10 @@ def locate_distances(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Seq
 def distances_within(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Sequence[str]) -> Tape:
     """Those of the distances that one of several models can hold: both ends in its photos, or anchors."""
     images = images_by_name(model)
-    marked = {
-        name
-        for name, marker in (tape.markers or {}).items()
-        if sum(image_name in images for image_name in marker.image_names) >= 2
-    }
-    points = images.keys() | marked
-    within = (
-        taped for taped in tape.distances if points.issuperset(taped.ends) or set(anchor_ids).issuperset(taped.ends)
-    )
+    markers = (tape.markers or {}).items()
+    marked = {name for name, marker in markers if sum(photo in images for photo in marker.image_names) >= 2}
+    ends = (images.keys() | marked, set(anchor_ids))
+    within = (taped for taped in tape.distances if any(known.issuperset(taped.ends) for known in ends))
     return replace(tape, distances=tuple(within))
 
 
@@ -169,30 +156,25 @@ def images_by_name(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Image]:
 
 
 def triangulate_markers(tape: Tape, model: pycolmap.Reconstruction) -> dict[str, Array]:
-    """(3,) place of each marker that is the end of a distance.
-
-    Raises:
-        InputError: as ``locate_distances`` does.
-    """
-    images = images_by_name(model)
-    return {name: _triangulate(name, marker, images, tape) for name, marker in _wanted_markers(tape).items()}
-
-
-def _wanted_markers(tape: Tape) -> dict[str, Marker]:
-    ends = {name for taped in tape.distances for name in taped.ends}
-    return {name: marker for name, marker in (tape.markers or {}).items() if name in ends}
+    """(3,) place of each marker that is the end of a distance; InputError as ``locate_distances`` has it."""
+    images, ends = images_by_name(model), {name for taped in tape.distances for name in taped.ends}
+    markers = (tape.markers or {}).items()
+    return {name: _triangulate(name, marker, images, tape) for name, marker in markers if name in ends}
 
 
 def _triangulate(name: str, marker: Marker, images: dict[str, pycolmap.Image], tape: Tape) -> Array:
     """The marker's place, from the photos that are in the model."""
+
+    def wrong(what: str, k: int = 0) -> InputError:
+        return InputError(f"marker {name!r} {what}", tape.markers_path, marker.lines[k])
+
     seen = [k for k, image_name in enumerate(marker.image_names) if image_name in images]
     if len(seen) < 2:
-        message = f"marker {name!r} is marked in {len(seen)} photos of the model, expected two or more"
-        raise InputError(message, tape.markers_path, marker.lines[0])
+        raise wrong(f"is marked in {len(seen)} photos of the model, expected two or more")
     views = [images[marker.image_names[k]] for k in seen]
     in_cam = [_camera(view).cam_from_img(marker.pixels[k]) for k, view in zip(seen, views, strict=True)]
     if any(at is None for at in in_cam):
-        raise InputError(f"marker {name!r} has a mark outside its photo", tape.markers_path, marker.lines[0])
+        raise wrong("has a mark outside its photo")
     rays = np.array([[*np.ravel(at), 1.0] for at in in_cam if at is not None])
     rays /= np.linalg.norm(rays, axis=1)[:, None]
     # From the first camera: far from its origin a linear triangulation loses half its digits.
@@ -200,14 +182,12 @@ def _triangulate(name: str, marker: Marker, images: dict[str, pycolmap.Image], t
     relative = pycolmap.triangulate_multi_view_point([_cam_from_world_at(origin, view) for view in views], rays)
     point = None if relative is None else np.ravel(relative) + origin
     if point is None or _widest_angle_deg(point, views) < _MIN_TRIANGULATION_ANGLE_DEG:
-        message = f"marker {name!r} is seen from one direction only, expected photos from different places"
-        raise InputError(message, tape.markers_path, marker.lines[0])
+        raise wrong("is seen from one direction only, expected photos from different places")
     for k, view in zip(seen, views, strict=True):
         camera, seen_at = _camera(view), view.project_point(point)
         off_px = np.inf if seen_at is None else float(np.linalg.norm(seen_at - marker.pixels[k]))
         if off_px > _MAX_REPROJECTION * max(camera.width, camera.height):
-            message = f"marker {name!r} is {off_px:.0f} px from where the other photos put it: is it the same point?"
-            raise InputError(message, tape.markers_path, marker.lines[k])
+            raise wrong(f"is {off_px:.0f} px from where the other photos put it: is it the same point?", k)
     return point
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,16 +13,16 @@ from pydantic import AliasChoices, Field
 
 from rangesfm.errors import InputError
 from rangesfm.files.records import Number, NumberOrNull, Record, Text
-from rangesfm.files.tables import Table, has_columns, read_table
+from rangesfm.files.tables import Table, read_table, repeated
 
 CONTROL, CHECK = "control", "check"
 # Of one that cannot belong to the map.
 LEFT_OUT = "left out"
 # What a steel tape and a steady hand are good for.
 DEFAULT_STDDEV_M = 0.01
-_DISTANCE_COLUMNS = ("from", "to", "distance_m")
+DISTANCE_COLUMNS = ("from", "to", "distance_m")
 _PIXELS = ("x_px", "y_px")
-_MARKER_COLUMNS = ("marker", "image_name", *_PIXELS)
+MARKER_COLUMNS = ("marker", "image_name", *_PIXELS)
 _CLICKED_STDDEV_PX = 1.0
 FOUND_STDDEV_PX = 0.3
 """Of a corner that a library found."""
@@ -106,16 +106,6 @@ class Tape:
         return replace(self, distances=tuple(distances))
 
 
-def is_distances_file(head: str) -> bool:
-    """Whether a file that begins like this is one of taped distances."""
-    return has_columns(head, _DISTANCE_COLUMNS)
-
-
-def is_markers_file(head: str) -> bool:
-    """Whether a file that begins like this says where marks are in photos."""
-    return has_columns(head, _MARKER_COLUMNS)
-
-
 def read_tape(distances_path: str | Path, markers_path: str | Path | None = None) -> Tape:
     """Read ``from,to,distance_m[,stddev_m,kind]`` and ``marker,image_name,x_px,y_px``.
 
@@ -124,8 +114,8 @@ def read_tape(distances_path: str | Path, markers_path: str | Path | None = None
     Raises:
         InputError: with the line, for what is not as described.
     """
-    distances = _distances(read_table(distances_path, _DISTANCE_COLUMNS, ["stddev_m", "kind"]))
-    markers = None if markers_path is None else _markers(read_table(markers_path, _MARKER_COLUMNS))
+    distances = _distances(read_table(distances_path, DISTANCE_COLUMNS, ["stddev_m", "kind"]))
+    markers = None if markers_path is None else _markers(read_table(markers_path, MARKER_COLUMNS))
     return Tape(distances, markers, Path(distances_path), None if markers_path is None else Path(markers_path))
 
 
@@ -139,16 +129,11 @@ def _distances(table: Table) -> tuple[TapedDistance, ...]:
             raise table.error(row, "to", "another end than 'from'")
         if kind not in (CONTROL, CHECK):
             raise table.error(row, "kind", f"{CONTROL} or {CHECK}")
-    lengths = _positive(table, "distance_m", "a number of metres greater than 0", empty=None)
-    stddevs = _positive(table, "stddev_m", "a number of metres greater than 0, or nothing", empty=DEFAULT_STDDEV_M)
+    metres = "a number of metres greater than 0"
+    lengths = table.numbers("distance_m", expected=metres, above=0.0)
+    stddevs = table.numbers("stddev_m", empty=DEFAULT_STDDEV_M, expected=f"{metres}, or nothing", above=0.0)
     rows = zip(starts, ends, lengths.tolist(), stddevs.tolist(), kinds, table.line.tolist(), strict=True)
     return tuple(TapedDistance((a, b), length, stddev, kind, line) for a, b, length, stddev, kind, line in rows)
-
-
-def _positive(table: Table, column: str, expected: str, *, empty: float | None) -> npt.NDArray[np.float64]:
-    values = table.numbers(column, empty=empty, expected=expected)
-    table.refuse(values <= 0, column, expected)
-    return values
 
 
 def _markers(table: Table) -> dict[str, Marker]:
@@ -157,15 +142,13 @@ def _markers(table: Table) -> dict[str, Marker]:
     rows_of: dict[str, list[int]] = {}
     for row, name in enumerate(names):
         rows_of.setdefault(name, []).append(row)
-    return {name: _marker(table, image_names, pixels, rows) for name, rows in rows_of.items()}
-
-
-def _marker(table: Table, image_names: Sequence[str], pixels: npt.NDArray[np.float64], rows: list[int]) -> Marker:
-    seen_in = [image_names[row] for row in rows]
-    for k, row in enumerate(rows):
-        if seen_in[k] in seen_in[:k]:
-            raise table.error(row, "image_name", "a photo in which this marker has no place yet")
-    return Marker(tuple(seen_in), pixels[rows], tuple(table.line[rows].tolist()))
+    markers = {}
+    for name, rows in rows_of.items():
+        seen_in = tuple(image_names[row] for row in rows)
+        if again := repeated(seen_in):
+            raise table.error(rows[again[0]], "image_name", "a photo in which this marker has no place yet")
+        markers[name] = Marker(seen_in, pixels[rows], tuple(table.line[rows].tolist()))
+    return markers
 
 
 class DistanceRow(Record):
@@ -199,10 +182,8 @@ def distance_rows(tape: Tape, lengths_m: npt.NDArray[np.float64]) -> list[Distan
 def disagreements(rows: Iterable[DistanceRow], relative_scale_stddev: float, bending: float = 0.0) -> Iterator[str]:
     """What to tell of distances that the map misses by more than tape, scale and bending explain.
 
-    A control distance has held the scale already, so that the scale's error does not excuse it.
-
-    Args:
-        bending: stddev by which the scale varies from place to place, relative.
+    A control distance has held the scale already, so that the scale's error does not excuse it. ``bending``: relative
+    stddev by which the scale varies from place to place.
     """
     for row in rows:
         of_scale = relative_scale_stddev if row.kind == CHECK else 0.0

@@ -221,8 +221,10 @@ def _holder(lock: Path) -> str:
 
 def remove_leftovers(folder: Path) -> None:
     """Remove what killed processes left half-written in ``folder`` and in the folders in it."""
-    inside = [path for path in folder.iterdir() if path.is_dir() and not path.is_symlink()]
-    _remove_dead(path for parent in (folder, *inside) for path in _entries(parent))
+    for parent, subfolders, names in os.walk(folder):  # passes over what is gone, or not ours to look into
+        _remove_dead(Path(parent, name) for name in (*subfolders, *names))
+        if Path(parent) != folder:
+            subfolders.clear()
 
 
 def _remove_dead(paths: Iterable[Path]) -> None:
@@ -235,13 +237,6 @@ def _remove_dead(paths: Iterable[Path]) -> None:
             shutil.rmtree(path, ignore_errors=True)
         else:
             path.unlink(missing_ok=True)
-
-
-def _entries(folder: Path) -> list[Path]:
-    try:
-        return list(folder.iterdir())
-    except OSError:  # gone, or not ours to look into
-        return []
 
 
 def _is_alive(pid: int) -> bool:

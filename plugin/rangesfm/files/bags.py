@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rangesfm.errors import InputError
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
+    from rosbags.interfaces import Connection
 
 SQLITE_HEAD = "SQLite format 3\0"
 _ROS2 = (".mcap", ".db3")
@@ -30,11 +31,7 @@ def is_bag(path: Path) -> bool:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[AnyReader]:
-    """Yield the bag; whatever goes wrong with it inside the block becomes an InputError.
-
-    Raises:
-        InputError: there is none, it is broken, or the package rosbags is not installed.
-    """
+    """Yield the bag; whatever goes wrong with it, also inside the block, or without rosbags, becomes an InputError."""
     if not path.exists():
         raise InputError("no such file", path)
     _check_database(path)
@@ -54,6 +51,17 @@ def open_bag(path: Path) -> Iterator[AnyReader]:
     except Exception as error:  # whatever a broken bag makes its parsers do
         text = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"cannot be read as a ROS bag ({text})", path) from error
+
+
+def messages_of(bag: AnyReader, connections: Sequence[Connection]) -> Iterator[tuple[str, Any, float]]:
+    """Type, content and time of arrival in seconds of each message, in their order."""
+    for connection, received_ns, data in bag.messages(connections):
+        yield connection.msgtype, bag.deserialize(data, connection.msgtype), received_ns * 1e-9
+
+
+def stamp_s(message: Any) -> float:
+    """The time in the header of a message; 0 if nobody set it."""
+    return float(message.header.stamp.sec + message.header.stamp.nanosec * 1e-9)
 
 
 def type_name(message_type: str) -> str:

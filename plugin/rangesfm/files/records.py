@@ -27,10 +27,9 @@ _EXPECTED = {
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file; NaN and infinity, which some programs write and JSON does not know, become None.
+    """The content of a JSON file, or InputError, with the line where there is one.
 
-    Raises:
-        InputError: it is not there or no JSON, with the line where there is one.
+    NaN and infinity, which some programs write and JSON does not know, become None.
     """
     try:
         return json.loads(
@@ -112,11 +111,7 @@ class Record(BaseModel):
 
     @classmethod
     def read(cls: type[_Kind], path: Path) -> _Kind:
-        """Read the file.
-
-        Raises:
-            InputError: it is not there, no JSON, or not what ``write`` leaves; with the key.
-        """
+        """Read the file; InputError, with the key, if it is not what ``write`` leaves."""
         content = read_json(path)
         if not isinstance(content, dict):
             raise InputError("expected a JSON object", path, 1)

@@ -12,7 +12,7 @@ import io
 import os
 import stat
 import zlib
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import compress
@@ -120,6 +120,8 @@ class Table:
         empty: float | None = None,
         missing: Collection[str] = ("",),
         expected: str = "a number",
+        least: float = -np.inf,
+        above: float = -np.inf,
     ) -> npt.NDArray[np.float64]:
         """The cells as finite numbers, (n,).
 
@@ -127,6 +129,7 @@ class Table:
             empty: stands for empty cells, which are refused if it is None, and for a column that is not there.
             missing: what an empty cell may look like, in small letters.
             expected: what the message calls a good cell.
+            least, above: numbers less than one, and those not above the other, are refused.
         """
         if column not in self and empty is not None:
             return np.full(len(self), empty)
@@ -138,6 +141,7 @@ class Table:
             if empty is None or raw[row].strip().lower() not in missing:
                 raise self.error(row, column, expected)
             values[row] = empty
+        self.refuse((values < least) | (values <= above), column, expected)
         return values
 
     def error(self, row: int, column: str, expected: str) -> InputError:
@@ -192,7 +196,8 @@ def read_table(
     known, aliases = (*required, *optional), aliases or {}
     found = [cell.strip() for cell in _split_row(header_row, separator, path, header_line)]
     names = [name if name in known else aliases.get(name, name) for name in found]
-    _check_has_header(names, required, optional, path, header_line)
+    if all(_number(name) is not None for name in names):
+        raise InputError(f"no header row, expected {_expected(required, optional)}", path, header_line)
     _check_names(names, required, optional, path, header_line)
     wanted = {name: names.index(name) for name in known if name in names}
     reread = partial(_table_of_texts, path, names, wanted, header_line, body, separator)
@@ -243,6 +248,20 @@ def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(header)
         writer.writerows(rows)
+
+
+def write_user_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """As ``write_table``, to a path that the user gave: InputError if it cannot be written."""
+    try:
+        write_table(path, header, rows)
+    except OSError as error:
+        raise InputError(f"cannot be written ({error.strerror})", path) from error
+
+
+def repeated(keys: Iterable[Hashable]) -> tuple[int, int] | None:
+    """Where the first key stands that has been there before, and where that was; None if all differ."""
+    first: dict[Hashable, int] = {}
+    return next(((k, first[key]) for k, key in enumerate(keys) if first.setdefault(key, k) != k), None)
 
 
 def read_text(path: str | Path, *, errors: str = "strict") -> str:
@@ -336,13 +355,6 @@ def _split_row(row: str, separator: str, path: Path | None = None, line: int | N
     except csv.Error as error:
         raise InputError(f"not a row of cells ({error})", path, line) from None
     return cells
-
-
-def _check_has_header(
-    names: list[str], required: Sequence[str], optional: Sequence[str], path: Path, line: int
-) -> None:
-    if all(_number(name) is not None for name in names):
-        raise InputError(f"no header row, expected {_expected(required, optional)}", path, line)
 
 
 def _check_names(names: list[str], required: Sequence[str], optional: Sequence[str], path: Path, line: int) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from rangesfm.colmap.opencv_camera import colmap_camera
+from rangesfm.colmap.calibration import colmap_camera
 from rangesfm.errors import InputError
 from rangesfm.files.tables import read_head
 
@@ -37,11 +37,7 @@ class Calibration:
 
 
 def read_calibrations(path: Path) -> tuple[Calibration, ...]:
-    """The cameras of a file; none if it is no calibration.
-
-    Raises:
-        InputError: it is one, but lacks something, or has a model that COLMAP does not know.
-    """
+    """The cameras of a file, none if it is no calibration; InputError for one that lacks something or is not known."""
     try:
         return tuple(_READERS[path.suffix.lower()](path)) if path.suffix.lower() in _READERS else ()
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
@@ -77,10 +73,8 @@ def _read_yaml(path: Path) -> Iterator[Calibration]:
     if not isinstance(content, dict):
         return
     if "camera_matrix" in content:
-        (fx, _, cx, _, fy, cy), coefficients = (
-            content["camera_matrix"]["data"][:6],
-            content["distortion_coefficients"]["data"],
-        )
+        fx, _, cx, _, fy, cy = content["camera_matrix"]["data"][:6]
+        coefficients = content["distortion_coefficients"]["data"]
         size = (content["image_width"], content["image_height"])
         yield _of_opencv(path, content["distortion_model"], (fx, fy, cx, cy), coefficients, size)
     for name, camera in content.items():

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from rangesfm.distances.tape import is_distances_file, is_markers_file
+from rangesfm.distances.tape import DISTANCE_COLUMNS, MARKER_COLUMNS
 from rangesfm.errors import InputError
 from rangesfm.files.bags import is_bag, is_bag_folder
 from rangesfm.files.folders import LEFT_BY_RUNS, walk
-from rangesfm.files.tables import read_head
+from rangesfm.files.tables import has_columns, read_head
 from rangesfm.findings.calibration import Calibration, read_calibrations
 from rangesfm.geometry.reference import is_reference_file
-from rangesfm.ranging.anchors.anchor_file import is_anchor_file
+from rangesfm.ranging.anchors.anchor import ANCHOR_ALIASES, ANCHOR_COLUMNS
 from rangesfm.ranging.errors.error_curve import is_error_curve_file
 from rangesfm.ranging.readers import find_log_reader, read_ranges
 from rangesfm.sources.bag import has_images
@@ -31,12 +32,12 @@ _TABLE_EXTENSIONS = (".csv", ".tsv", ".txt", ".log", ".dat")
 # Of tables that may be the log, where there is none.
 _MAX_NUM_UNSURE = 3
 # By the header row, once it is known that the file is no log.
-_TABLES = {
-    "scale.markers": is_markers_file,
-    "scale.distances": is_distances_file,
+_TABLES: dict[str, Callable[[str], bool]] = {
+    "scale.markers": partial(has_columns, required=MARKER_COLUMNS),
+    "scale.distances": partial(has_columns, required=DISTANCE_COLUMNS),
     "ranges.error_curve": is_error_curve_file,
     "report.reference": is_reference_file,
-    "anchors.path": is_anchor_file,
+    "anchors.path": partial(has_columns, required=ANCHOR_COLUMNS, aliases=ANCHOR_ALIASES),
     "images.times": is_image_times_file,
 }
 
@@ -59,11 +60,7 @@ class Found:
 
 
 def look_into(folders: Sequence[Path]) -> Found:
-    """Look at all that folders hold, however deep, but for hidden files and results.
-
-    Raises:
-        InputError: one of them is no folder.
-    """
+    """Look at all that folders hold, however deep, but for hidden files and results; InputError if one is no folder."""
     paths: dict[str, list[Path]] = defaultdict(list)
     calibrations: dict[Path, tuple[Calibration, ...]] = {}
     models: list[Path] = []
@@ -92,9 +89,8 @@ def look_into(folders: Sequence[Path]) -> Found:
                 notes.append(str(error))
     for suffix, those in not_read.items():
         notes.append(f"{len(those)} of {suffix}, as {those[0].name}: {_NOT_READ[suffix]}")
-    return Found(
-        dict(paths), calibrations, tuple(models), (*notes, *([] if LOG in paths else unsure[:_MAX_NUM_UNSURE]))
-    )
+    notes += [] if LOG in paths else unsure[:_MAX_NUM_UNSURE]
+    return Found(dict(paths), calibrations, tuple(models), tuple(notes))
 
 
 def _key_of(path: Path) -> str | None:

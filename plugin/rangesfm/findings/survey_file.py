@@ -29,14 +29,9 @@ _BEGIN = """\
 
 
 def survey_text(values: Mapping[str, Any], folder: Path) -> str:
-    """A whole file.
+    """A whole file of values by dotted key; InputError for the name of a path that no such file can hold.
 
-    Args:
-        values: by dotted key, with absolute paths.
-        folder: where the file will be: paths inside it are written relative to it.
-
-    Raises:
-        InputError: the name of a path that no such file can hold.
+    Paths are absolute; those inside ``folder``, where the file will be, are written relative to it.
     """
     lines, table = [_BEGIN], ""
     for item in KEYS:

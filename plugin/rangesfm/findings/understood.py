@@ -8,12 +8,10 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
 from rangesfm.errors import InputError
-from rangesfm.findings.calibration import Calibration
 from rangesfm.findings.folder import LOG, MODEL, PHOTOS, Found, look_into
 from rangesfm.ranging.readers import read_ranges
 from rangesfm.sources.source import is_source, open_source
@@ -62,7 +60,7 @@ def understand(folders: Sequence[Path], given: Mapping[str, object]) -> Understo
     folders = [Path(os.path.abspath(folder)) for folder in folders]
     found = look_into(folders)
     roles = {item.dotted: item.role for item in KEYS}
-    values = {key: _path(value) if roles[key] is not None else value for key, value in given.items()}
+    values = {key: value if roles[key] is None else Path(os.path.abspath(str(value))) for key, value in given.items()}
     notes, questions = list(found.notes), []
     for item in KEYS:
         key, paths = item.dotted, found.paths.get(item.dotted, [])
@@ -93,10 +91,6 @@ def understand(folders: Sequence[Path], given: Mapping[str, object]) -> Understo
     return Understood(values, tuple(notes))
 
 
-def _path(value: object) -> Path:
-    return Path(os.path.abspath(str(value)))
-
-
 def _chosen(key: str, paths: Sequence[Path]) -> Path | None:
     """The only one, or the one of the usual name, or files of one anchor each as one log; None: nobody knows."""
     usual = [path for path in paths if path.stem.lower() in _USUAL_NAMES.get(key, ())]
@@ -121,8 +115,9 @@ def _tops(paths: Sequence[Path], folders: Sequence[Path]) -> list[Path]:
 def _pattern(paths: Sequence[Path]) -> Path | None:
     """A pattern for the files of one log, each of another anchor; None if they are no such files."""
     names, folder = [path.name for path in paths], paths[0].parent
-    prefix = _common_beginning(names)
-    suffix = _common_beginning([name[len(prefix) :][::-1] for name in names])[::-1]
+    common = os.path.commonprefix
+    prefix = common(names)
+    suffix = common([name[len(prefix) :][::-1] for name in names])[::-1]
     pattern = Path(folder, f"{prefix}*{suffix}")
     if glob.has_magic(f"{folder}{prefix}{suffix}") or {*map(Path, glob.glob(str(pattern)))} != {*paths}:
         return None
@@ -131,11 +126,6 @@ def _pattern(paths: Sequence[Path]) -> Path | None:
     except InputError:
         return None
     return pattern if all(len(ids) == 1 for ids in anchors) and len({*anchors}) == len(paths) else None
-
-
-def _common_beginning(texts: Sequence[str]) -> str:
-    alike = takewhile(lambda characters: len({*characters}) == 1, zip(*texts))
-    return "".join(characters[0] for characters in alike)
 
 
 def _add_camera(values: dict[str, Any], found: Found, notes: list[str]) -> None:
@@ -154,17 +144,14 @@ def _add_camera(values: dict[str, Any], found: Found, notes: list[str]) -> None:
         notes.append(f"the lever arm is that of {path.name}")
     if {"camera.model", "camera.params", MODEL} & values.keys():  # a model has its own
         return
-    fitting = _of_size(cameras, _size_px(values))
+    size_px = _size_px(values)
+    fitting = [camera for camera in cameras if None in (camera.size_px, size_px) or camera.size_px == size_px]
     if len(fitting) == 1:
         values |= {"camera.model": fitting[0].model, "camera.params": fitting[0].params}
         notes.append(f"the camera is that of {path.name}")
     else:
         sizes = ", ".join(" x ".join(map(str, camera.size_px)) for camera in cameras if camera.size_px)
         notes.append(f"{path.name}: {len(fitting)} of its cameras ({sizes} pixels) fit the photos: none is taken")
-
-
-def _of_size(cameras: Sequence[Calibration], size_px: tuple[int, int] | None) -> list[Calibration]:
-    return [camera for camera in cameras if None in (camera.size_px, size_px) or camera.size_px == size_px]
 
 
 def _size_px(values: Mapping[str, Any]) -> tuple[int, int] | None:

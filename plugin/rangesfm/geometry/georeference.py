@@ -65,16 +65,10 @@ class Georeference:
 
 
 def georeference_at(coordinates: Array, crs: str) -> tuple[Georeference, Array]:
-    """The local frame around points given in ``crs``, and the points in it.
+    """The local frame around the middle of points (n, 3) in ``crs``, and the points in it, in metres.
 
-    Args:
-        coordinates: (n, 3) in ``crs``, east or longitude first, then height; NaN rows stay NaN.
-
-    Returns:
-        the frame, whose origin is the middle of the points, and (n, 3) the points in metres.
-
-    Raises:
-        InputError: the system is not known, or the points lie outside of where it holds.
+    They are east or longitude first, then height; NaN rows stay NaN. InputError if the system is not known, or does not
+    hold where they are.
     """
     geographic = _apply(_geographic_from(crs), coordinates)
     if not _holds_at(crs, geographic[np.isfinite(coordinates).all(axis=1)]):
@@ -98,11 +92,8 @@ def georeference_of_anchor(
     Args:
         place: latitude and longitude in degrees, ellipsoidal height in metres (WGS 84), the frame's origin.
         up_in_world: (3,) against gravity.
-        forward_in_world: (3,) a direction that is not vertical.
+        forward_in_world: (3,) a direction; InputError if it is vertical.
         heading_deg: its azimuth, from north through east.
-
-    Raises:
-        InputError: the direction is vertical.
     """
     up = up_in_world / np.linalg.norm(up_in_world)
     level = forward_in_world - (forward_in_world @ up) * up
@@ -138,9 +129,8 @@ def _holds_at(crs: str, geographic: Array) -> bool:
     if area is None:
         return True
     lon, lat = geographic[:, 0], geographic[:, 1]
-    within_lon = (lon >= area.west - _MARGIN_DEG) & (lon <= area.east + _MARGIN_DEG)
-    if area.west > area.east:  # across the date line
-        within_lon = (lon >= area.west - _MARGIN_DEG) | (lon <= area.east + _MARGIN_DEG)
+    west, east = lon >= area.west - _MARGIN_DEG, lon <= area.east + _MARGIN_DEG
+    within_lon = west | east if area.west > area.east else west & east  # across the date line
     return bool(np.all(within_lon & (lat >= area.south - _MARGIN_DEG) & (lat <= area.north + _MARGIN_DEG)))
 
 

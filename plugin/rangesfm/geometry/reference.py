@@ -12,7 +12,16 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
-from rangesfm.files.tables import Table, has_columns, header_names, read_head, read_table, read_text, write_table
+from rangesfm.files.tables import (
+    Table,
+    has_columns,
+    header_names,
+    read_head,
+    read_table,
+    read_text,
+    repeated,
+    write_table,
+)
 from rangesfm.geometry.trajectory import ROUNDING_S, Trajectory
 
 POSITION_COLUMNS = ("x_m", "y_m", "z_m")
@@ -48,7 +57,15 @@ class Reference:
         return len(self.positions_m)
 
     def positions_at(self, trajectory: Trajectory, max_gap_s: float = 0.05) -> tuple[Array, Array | None]:
-        """Reference poses of the keyframes.
+        """``poses`` of the keyframes; InputError if the reference is by time and the trajectory has no times."""
+        if self.image_names is None and trajectory.timestamps_s is None:
+            raise InputError("the reference is by time, but the photos have no times (images.csv)")
+        return self.poses(trajectory.image_names, trajectory.timestamps_s, max_gap_s)
+
+    def poses(
+        self, image_names: Sequence[str] | None, times_s: Array | None, max_gap_s: float
+    ) -> tuple[Array, Array | None]:
+        """Reference poses of n photos, or at (n,) times: whichever the reference has.
 
         By photo: those of the same name. By time: interpolated linearly (rotations on the
         shortest arc) between two samples at most ``max_gap_s`` apart; in longer gaps and at
@@ -56,41 +73,29 @@ class Reference:
 
         Returns:
             (n, 3) positions, NaN where unknown, and (n, 3, 3) rotations likewise; None if the reference has none.
-
-        Raises:
-            InputError: the reference is by time and the trajectory has no times.
         """
         if self.image_names is not None:
-            return self.poses_of(trajectory.image_names)
-        if trajectory.timestamps_s is None:
-            raise InputError("the reference is by time, but the photos have no times (images.csv)")
-        return self.poses_at(trajectory.timestamps_s, max_gap_s)
-
-    def poses_of(self, image_names: Sequence[str]) -> tuple[Array, Array | None]:
-        """Poses of n photos, NaN where unknown, as ``positions_at`` returns them; only of a reference by photo."""
-        assert self.image_names is not None
-        index_of = {name: i for i, name in enumerate(self.image_names)}
-        return self._at_index(np.array([index_of.get(name, -1) for name in image_names], dtype=np.int64))
-
-    def poses_at(self, times: Array, max_gap_s: float) -> tuple[Array, Array | None]:
-        """Poses at (n,) times, as ``positions_at`` finds them; only of a reference by time."""
+            assert image_names is not None
+            index_of = {name: i for i, name in enumerate(self.image_names)}
+            return self._at_index(np.array([index_of.get(name, -1) for name in image_names], dtype=np.int64))
+        assert times_s is not None
         assert self.timestamps_s is not None
         known = self.timestamps_s
-        after = np.clip(np.searchsorted(known, times, side="right"), 1, max(len(known) - 1, 1))
+        after = np.clip(np.searchsorted(known, times_s, side="right"), 1, max(len(known) - 1, 1))
         after = np.minimum(after, len(known) - 1)
         before = np.maximum(after - 1, 0)
-        nearest = np.where(times - known[before] <= known[after] - times, before, after)
-        nearest[np.abs(times - known[nearest]) > MAX_TIME_DIFFERENCE_S] = -1
+        nearest = np.where(times_s - known[before] <= known[after] - times_s, before, after)
+        nearest[np.abs(times_s - known[nearest]) > MAX_TIME_DIFFERENCE_S] = -1
         positions, rotations = self._at_index(nearest)
 
         gap = known[after] - known[before]
-        between = (gap > 0) & (gap <= max_gap_s + ROUNDING_S) & (times >= known[before]) & (times <= known[after])
-        weight = ((times - known[before])[between] / gap[between])[:, None]
+        between = (gap > 0) & (gap <= max_gap_s + ROUNDING_S) & (times_s >= known[before]) & (times_s <= known[after])
+        weight = ((times_s - known[before])[between] / gap[between])[:, None]
         start_m, end_m = self.positions_m[before[between]], self.positions_m[after[between]]
         positions[between] = (1 - weight) * start_m + weight * end_m
         if rotations is not None and between.any():
             assert self.world_from_cam is not None
-            rotations[between] = Slerp(known, Rotation.from_matrix(self.world_from_cam))(times[between]).as_matrix()
+            rotations[between] = Slerp(known, Rotation.from_matrix(self.world_from_cam))(times_s[between]).as_matrix()
         return positions, rotations
 
     def why_nothing_is_known(
@@ -190,12 +195,11 @@ def _from_table(table: Table, key: str) -> Reference:
         raise InputError("no pose in the file, only its header row", table.path)
     positions = np.column_stack([table.numbers(column) for column in POSITION_COLUMNS])
     rotations = _rotations(table)
+    if again := repeated(table.text(key) if key == "image_name" else table.numbers(key).tolist()):
+        raise table.error(again[0], key, "one not said before")
     if key == "image_name":
-        names = table.text(key)
-        _refuse_repeated(table, key, names)
-        return Reference(positions, image_names=tuple(names), world_from_cam=rotations)
+        return Reference(positions, image_names=tuple(table.text(key)), world_from_cam=rotations)
     times = table.numbers(key)
-    _refuse_repeated(table, key, times.tolist())
     order = np.argsort(times)
     turns = None if rotations is None else rotations[order]
     return Reference(positions[order], timestamps_s=times[order], world_from_cam=turns)
@@ -218,14 +222,6 @@ def _rotations(table: Table) -> Array | None:
         raise InputError(message, table.path, int(table.line[wrong[0]]))
     rotations: Array = Rotation.from_quat(quaternions).as_matrix()
     return rotations
-
-
-def _refuse_repeated(table: Table, column: str, keys: Sequence[str] | Sequence[float]) -> None:
-    seen: set[object] = set()
-    for row, key in enumerate(keys):
-        if key in seen:
-            raise table.error(row, column, "one not said before")
-        seen.add(key)
 
 
 def _rows(values: Array, index: npt.NDArray[np.int64]) -> Array:

@@ -21,11 +21,7 @@ class Similarity:
 
     def __matmul__(self, inner: Similarity) -> Similarity:
         """``(a_from_b @ b_from_c)`` is ``a_from_c``."""
-        return Similarity(
-            self.scale * inner.scale,
-            self.rotation @ inner.rotation,
-            self.apply(inner.translation),
-        )
+        return Similarity(self.scale * inner.scale, self.rotation @ inner.rotation, self.apply(inner.translation))
 
     def apply(self, points: Array) -> Array:
         """Map points of shape (..., 3)."""
@@ -73,7 +69,7 @@ def off_origin(centers: Array) -> npt.NDArray[np.bool_]:
     return is_off
 
 
-def align_points(source: Array, target: Array, weights: Array | None = None, *, with_scale: bool = True) -> Similarity:
+def align_points(source: Array, target: Array, *, with_scale: bool = True) -> Similarity:
     """The similarity (or rigid motion) target_from_source with least squared error.
 
     Umeyama, "Least-squares estimation of transformation parameters between two point
@@ -81,11 +77,9 @@ def align_points(source: Array, target: Array, weights: Array | None = None, *, 
 
     Args:
         source, target: (n, 3) corresponding points, n >= 3 for a unique answer.
-        weights: (n,) of the squared errors; None for equal ones.
         with_scale: False keeps the scale at 1, as do points that are all in one place.
     """
-    w = np.ones(len(source)) if weights is None else weights
-    w = w / w.sum()
+    w = np.ones(len(source)) / len(source)
     mean_source, mean_target = w @ source, w @ target
     centered_source, centered_target = source - mean_source, target - mean_target
     u, singular_values, vt = np.linalg.svd((centered_target * w[:, None]).T @ centered_source)
@@ -100,8 +94,7 @@ def align_points(source: Array, target: Array, weights: Array | None = None, *, 
 def align_most(source: Array, target: Array, start: Similarity) -> Similarity:
     """``align_points`` without the points that lie elsewhere than most: a few that moved on their own have no say.
 
-    Args:
-        start: about how most of the points lie to each other.
+    ``start``: about how most of the points lie to each other.
     """
     found = start
     for _ in range(_NUM_TRIMMINGS):
@@ -172,10 +165,9 @@ _MAX_RADIUS = 2.0
 
 
 def path_kind(points: Array) -> str:
-    """ "straight", "circular" (and flat), "flat", "spherical" or "general": the symmetries that ranges cannot see past.
+    """The symmetries of (n, 3) points, n >= 1, that ranges cannot see past.
 
-    Args:
-        points: (n, 3), n >= 1.
+    It is "straight", "circular" (and flat), "flat", "spherical" or "general".
     """
     shape = path_shape(points)
     if shape.stddevs[1] <= NEARLY_STRAIGHT * shape.stddevs[0]:

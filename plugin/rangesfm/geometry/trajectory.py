@@ -59,13 +59,8 @@ class Trajectory:
         known = [row for row, name in enumerate(self.image_names) if name in timestamps_s]
         rows = sorted(known, key=lambda row: timestamps_s[self.image_names[row]])
         names = tuple(self.image_names[row] for row in rows)
-        return Trajectory(
-            self.frame_ids[rows],
-            names,
-            np.array([timestamps_s[name] for name in names], dtype=np.float64),
-            self.centers[rows],
-            self.world_from_cam[rows],
-        )
+        times = np.array([timestamps_s[name] for name in names], dtype=np.float64)
+        return Trajectory(self.frame_ids[rows], names, times, self.centers[rows], self.world_from_cam[rows])
 
     def resized(self, factor: float, frame: str) -> Trajectory:
         """The path with another scale, otherwise placed as it is.
@@ -115,13 +110,9 @@ def trajectory_from_reconstruction(
 
 
 def joined_trajectory(parts: Sequence[Trajectory]) -> tuple[Trajectory, list[npt.NDArray[np.int64]]]:
-    """One path of several parts in one world, in the order of ``trajectory_from_reconstruction``.
+    """One path of several parts in one world, and for each part where its keyframes are in it.
 
-    Args:
-        parts: all with times, or none.
-
-    Returns:
-        the path, and for each part where its keyframes are in it.
+    All parts have times, or none; the order is that of ``trajectory_from_reconstruction``.
     """
     names = np.array([name for part in parts for name in part.image_names], dtype=object)
     times = [part.timestamps_s for part in parts if part.timestamps_s is not None]

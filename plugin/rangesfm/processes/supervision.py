@@ -17,14 +17,16 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import IO, Any, TextIO
 
 import psutil
 
-from rangesfm.errors import failure_of
+from rangesfm.errors import ReconstructionError, failure_of
 
 _PR_SET_PDEATHSIG = 1
 _UPDATE_INTERVAL_S = 0.5
@@ -60,11 +62,9 @@ class MessagesToParent:
 
 
 def work_for_parent(work: Callable[[Any, MessagesToParent], Any]) -> None:
-    """Do what a process is there for.
+    """Do what a process is there for: ``work``, called with what the process is given.
 
-    Args:
-        work: called with what the process is given; what it returns (plain values), or the error that it raises, is
-            the process's last message.
+    What that returns (plain values), or the error that it raises, is the process's last message.
     """
     # It may have been started where Ctrl-C is ignored, and by a command that waits for SIGTERM in its own way.
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -153,7 +153,7 @@ def supervise(
         )
         try:
             watched = _Watched(process, memory_limit_bytes, is_stopped)
-            last = _talk(process, given, listen, watched)
+            last = _talk(watched, given, listen)
         finally:
             process.kill()  # no harm if it has ended
             process.wait()
@@ -161,36 +161,97 @@ def supervise(
         return Ended(last, died_of, watched.needed_bytes, watched.stopped_at is not None, _last_line(errors))
 
 
-class _Watched:
-    """Interrupts or kills a process where that is due."""
+def run_children(
+    module: str, given: Iterable[object], num_at_once: int, update: Callable[[int], None]
+) -> Generator[None, None, None]:
+    """Have pieces of work done, each by a process; yields once for each that is done, in their order.
 
-    def __init__(
-        self, process: subprocess.Popen[bytes], memory_limit_bytes: int | None, is_stopped: Callable[[], bool]
-    ):
-        self._process = process
-        self._limit = memory_limit_bytes
-        self._is_stopped = is_stopped
-        self.needed_bytes: int | None = None
-        self.stopped_at: float | None = None
+    Leaving the iteration (``contextlib.closing``) interrupts the processes, and waits for their end.
+
+    Args:
+        module: what they run, by ``work_for_parent``; it ends with the number of items that it has done.
+        given: what each process is given. Not taken from before there is need of it: no more than one waits.
+        update: called several times a second with the number of items that all of them have done.
+
+    Raises:
+        ReconstructionError: a process failed; the others were interrupted.
+    """
+    stop, num_done = threading.Event(), list[int]()
+    pending: deque[Future[None]] = deque()
+
+    def run(place: int, work: bytes) -> None:
+        def listen(message: dict[str, Any]) -> None:
+            num_done[place] = message.get("num_done", num_done[place])
+
+        if stop.is_set():
+            return
+        environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+        ended = supervise(
+            child_command(module),
+            work,
+            listen,
+            environment=environment,
+            memory_limit_bytes=None,
+            is_stopped=stop.is_set,
+        )
+        last = ended.last or {}
+        if "done" in last:
+            num_done[place] = last["done"]
+        elif not ended.stopped:
+            raise ReconstructionError(last["failed"]["message"] if "failed" in last else ended.how)
+
+    def wait_for_first() -> None:
+        while not wait([pending[0]], timeout=_POLL_INTERVAL_S).done:
+            update(sum(num_done))
+            for future in pending:
+                if future.done():
+                    future.result()
+        pending.popleft().result()
+        update(sum(num_done))
+
+    with ThreadPoolExecutor(num_at_once, thread_name_prefix="child") as executor:
+        try:
+            for place, work in enumerate(given):
+                num_done.append(0)
+                pending.append(executor.submit(run, place, pickle.dumps(work)))
+                if len(pending) > num_at_once:
+                    wait_for_first()
+                    yield
+            while pending:
+                wait_for_first()
+                yield
+        except BaseException:
+            stop.set()
+            raise
+
+
+@dataclass
+class _Watched:
+    """A process that is interrupted or killed where that is due."""
+
+    process: subprocess.Popen[bytes]
+    memory_limit_bytes: int | None
+    is_stopped: Callable[[], bool]
+    needed_bytes: int | None = None
+    stopped_at: float | None = None
 
     def look(self) -> None:
-        if self._limit is not None and self.needed_bytes is None:
+        if self.memory_limit_bytes is not None and self.needed_bytes is None:
             with suppress(psutil.Error):  # it has ended
-                used = psutil.Process(self._process.pid).memory_info().rss
-                if used > self._limit:
+                used = psutil.Process(self.process.pid).memory_info().rss
+                if used > self.memory_limit_bytes:
                     self.needed_bytes = used
-                    self._process.kill()
-        if self.stopped_at is None and self._is_stopped():
+                    self.process.kill()
+        if self.stopped_at is None and self.is_stopped():
             self.stopped_at = time.monotonic()
-            self._process.send_signal(signal.SIGINT)
+            self.process.send_signal(signal.SIGINT)
         if self.stopped_at is not None and time.monotonic() - self.stopped_at > _MAX_STOP_S:
-            self._process.kill()
+            self.process.kill()
 
 
-def _talk(
-    process: subprocess.Popen[bytes], given: bytes, listen: Callable[[dict[str, Any]], None], watched: _Watched
-) -> dict[str, Any] | None:
+def _talk(watched: _Watched, given: bytes, listen: Callable[[dict[str, Any]], None]) -> dict[str, Any] | None:
     """Hand over and listen until the process closes its stdout; returns its last message."""
+    process = watched.process
     assert process.stdin is not None
     assert process.stdout is not None
     lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()

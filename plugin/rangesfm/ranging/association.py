@@ -1,4 +1,4 @@
-"""Puts every range at its place on the camera's path."""
+"""Puts every range at its place on the camera's path, or on a known one."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
+from rangesfm.geometry.reference import Reference
 from rangesfm.geometry.trajectory import ROUNDING_S, Trajectory
 from rangesfm.options import AssociationOptions
 from rangesfm.ranging.errors.noise import robust_stddev
@@ -66,7 +67,10 @@ def associate(
     options = options or AssociationOptions()
     status = np.full(len(log), RangeStatus.USED, dtype=np.int8)
     if log.image_name is not None:
-        before, after, weight = _places_by_name(log.image_name, trajectory, status)
+        index_of = {name: index for index, name in enumerate(trajectory.image_names)}
+        before = after = np.array([index_of.get(name, -1) for name in log.image_name], dtype=np.int64)
+        weight = np.zeros(len(log))
+        status[before < 0] = RangeStatus.UNKNOWN_IMAGE
     elif trajectory.timestamps_s is not None:
         times = log.timestamp_s + time_offset_s if log.timestamp_s is not None else np.empty(0)
         before, after, weight = _places_by_time(log, times, trajectory.timestamps_s, options, status)
@@ -82,17 +86,51 @@ def associate(
     return _observe(log, trajectory, tags, status, before, after, weight, options)
 
 
+def tag_positions(
+    log: RangeLog,
+    path: Reference,
+    tag_in_cam_m: npt.ArrayLike = (0.0, 0.0, 0.0),
+    *,
+    time_offset_s: float = 0.0,
+    max_gap_s: float,
+) -> Array:
+    """The tag's antenna at each range, interpolated between the known positions.
+
+    Args:
+        log: n ranges, by time or by photo (or any name of a place) as the path.
+        path: positions of the tag's antenna; or of the camera, with rotations, if ``tag_in_cam_m`` is given.
+        tag_in_cam_m: (3,) the antenna in the frame whose positions are known.
+        time_offset_s: time of the path = time of the range + offset.
+        max_gap_s: between known positions further apart nothing is interpolated.
+
+    Returns:
+        (n, 3) metres, NaN where the path does not say.
+
+    Raises:
+        InputError: one is by time and the other by name, a lever arm without rotations, or nothing in common.
+    """
+    if (log.image_name is None) != (path.image_names is None):
+        ours, theirs = ("name", "time") if path.image_names is None else ("time", "name")
+        raise InputError(f"the ranges are by {ours} and the positions by {theirs}, expected both alike", log.source)
+    times_s = None if log.timestamp_s is None else log.timestamp_s + time_offset_s
+    positions, rotations = path.poses(log.image_name, times_s, max_gap_s)
+    lever = np.asarray(tag_in_cam_m, dtype=np.float64)
+    if np.any(lever != 0):
+        if rotations is None:
+            raise InputError("a lever arm needs the rotations qx,qy,qz,qw beside the positions")
+        positions = positions + rotations @ lever
+    if len(log) and not np.isfinite(positions).any():
+        raise InputError(path.why_nothing_is_known("ranges", log.image_name, times_s, max_gap_s), log.source)
+    return positions
+
+
 def is_too_long(gaps_s: npt.ArrayLike, options: AssociationOptions) -> Mask:
     """(n,) gaps between keyframes across which no pose is interpolated; photos every 2 s are 2 s apart at any date."""
     return np.asarray(gaps_s) > options.max_interpolation_gap_s + ROUNDING_S
 
 
 def lever_arms(log: RangeLog, tag_in_cam_m: npt.ArrayLike) -> Array:
-    """(num_tags, 3) in the order of ``log.tag_ids``, from one lever arm for all or one for each.
-
-    Raises:
-        InputError: it is neither.
-    """
+    """(num_tags, 3) in the order of ``log.tag_ids``, from one lever arm for all or one for each; else InputError."""
     given = np.asarray(tag_in_cam_m, dtype=np.float64)
     num_tags = len(log.tag_ids)
     if given.shape not in ((3,), (num_tags, 3)):
@@ -101,15 +139,6 @@ def lever_arms(log: RangeLog, tag_in_cam_m: npt.ArrayLike) -> Array:
             log.source,
         )
     return np.broadcast_to(given, (num_tags, 3))
-
-
-def _places_by_name(
-    image_names: tuple[str, ...], trajectory: Trajectory, status: npt.NDArray[np.int8]
-) -> tuple[Indices, Indices, Array]:
-    index_of = {name: index for index, name in enumerate(trajectory.image_names)}
-    keyframe = np.array([index_of.get(name, -1) for name in image_names], dtype=np.int64)
-    status[keyframe < 0] = RangeStatus.UNKNOWN_IMAGE
-    return keyframe, keyframe, np.zeros(len(keyframe))
 
 
 def _places_by_time(
@@ -127,8 +156,9 @@ def _places_by_time(
 
     at_keyframe = distance <= options.max_time_difference_s
     interpolated = inside & ~is_too_long(gap, options)
-    of_camera = log.kind == RangeKind.TAG_ANCHOR
-    lonely = of_camera & ~interpolated & _keyframe_is_isolated(keyframe_times, options)[nearest]
+    # Only at a keyframe with a gap on both sides can standing still matter.
+    long_gap = np.concatenate([[True], is_too_long(np.diff(keyframe_times), options), [True]])
+    lonely = (log.kind == RangeKind.TAG_ANCHOR) & ~interpolated & (long_gap[:-1] & long_gap[1:])[nearest]
     still = lonely & _camera_is_still(log, nearest, distance, times, lonely, keyframe_times)
     same_time = distance <= min(_SAME_TIME_S, options.max_time_difference_s)
     snapped = same_time | ((at_keyframe | still) & ~interpolated)
@@ -138,12 +168,6 @@ def _places_by_time(
     no_place = ~(snapped | interpolated)
     status[no_place] = np.where(inside[no_place], RangeStatus.NO_KEYFRAME_NEAR, RangeStatus.OUTSIDE_PATH)
     return before, after, weight
-
-
-def _keyframe_is_isolated(keyframe_times: Array, options: AssociationOptions) -> Mask:
-    """(n,) keyframes with a gap on both sides: only there can standing still matter."""
-    long_gap = np.concatenate([[True], is_too_long(np.diff(keyframe_times), options), [True]])
-    return np.asarray(long_gap[:-1] & long_gap[1:])
 
 
 def _camera_is_still(
@@ -168,9 +192,8 @@ def _camera_is_still(
     for burst in np.split(log.range_m[order], starts[1:]):
         if len(burst) >= 6:
             early, late = np.array_split(burst, 2)
-            noise = robust_stddev(np.concatenate([_deviations(early), _deviations(late)]))
             drifts.append((np.median(late) - np.median(early)) * np.sqrt(len(burst) / 4))
-            noises.append(noise)
+            noises.append(robust_stddev(np.concatenate([_deviations(early), _deviations(late)])))
     if not drifts:
         return still
     # 1.25 is the price of a median over a mean.
@@ -270,10 +293,14 @@ def _spline_error(times: Array, centers: Array) -> float:
     """Stddev (each coordinate) half-way between keyframes, from how well every second one predicts the others."""
     if len(times) < 8:
         return 0.0
-    missed = _median_miss(times, centers)
-    gain = _MAX_HALVING_GAIN
+    missed, gain = _median_miss(times, centers), _MAX_HALVING_GAIN
     if len(times) >= 16:
-        gain = _halving_gain(_median_miss(times[::2], centers[::2]), missed)
+        # All keyframes gain over every second one what these gain over every fourth, as long as the motion lasts longer
+        # than the gaps. Where already every second keyframe says little of the others, these tell no more than that it
+        # is between nothing and the most: the mean of the two (of logarithms) is within a factor of about two.
+        gain = _median_miss(times[::2], centers[::2]) / max(missed, 1e-300)
+        is_telling = gain >= _MIN_TELLING_GAIN
+        gain = min(gain, _MAX_HALVING_GAIN) if is_telling else float(np.sqrt(_MAX_HALVING_GAIN * max(gain, 1.0)))
     return missed / (_MEDIAN_LENGTH * gain)
 
 
@@ -282,16 +309,3 @@ def _median_miss(times: Array, centers: Array) -> float:
     missed = CubicSpline(times[::2], centers[::2])(times[1:-1:2]) - centers[1:-1:2]
     # Of lengths, so that it does not depend on how the world's axes lie.
     return float(np.median(np.linalg.norm(missed, axis=1)))
-
-
-def _halving_gain(missed_by_fourth: float, missed_by_second: float) -> float:
-    """What all keyframes gain over every second one, from what these gain over every fourth.
-
-    Both gain the same as long as the motion lasts longer than the gaps. Where already every second
-    keyframe says little of the others, these tell no more than that it is between nothing and the
-    most: the mean of the two (of logarithms) is within a factor of about two.
-    """
-    ratio = missed_by_fourth / max(missed_by_second, 1e-300)
-    if ratio >= _MIN_TELLING_GAIN:
-        return min(ratio, _MAX_HALVING_GAIN)
-    return float(np.sqrt(_MAX_HALVING_GAIN * max(ratio, 1.0)))

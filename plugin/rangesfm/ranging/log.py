@@ -31,13 +31,8 @@ class RangeKind(IntEnum):
 
 
 class PeerRanges(NamedTuple):
-    """k ranges between two anchors, or between two tags.
-
-    Attributes:
-        rows: (k,) which ranges of the log these are.
-        ends: (k, 2) int, the two nodes, into the log's ``anchor_ids`` or ``tag_ids``.
-        end_ids: k pairs of their ids.
-    """
+    """k ranges between two anchors, or between two tags: (k,) rows of the log, and the (k, 2) two nodes of each, into
+    the log's ``anchor_ids`` or ``tag_ids``."""
 
     rows: Indices
     ends: Indices
@@ -116,16 +111,9 @@ class RangeLog:
 
     @property
     def own_order(self) -> Indices:
-        """(n,) the rows by anchor, time, tag and range.
-
-        The order in which the log has them has no say in what is made of them then, not by random draws and not by how
-        sums are rounded.
-        """
-        when = (
-            np.unique(np.array(self.image_name or (), dtype=str), return_inverse=True)[1]
-            if self.timestamp_s is None
-            else self.timestamp_s
-        )
+        """(n,) the rows by anchor, time, tag and range: the log's order has no say then, be it by draws or rounding."""
+        names = np.array(self.image_name or (), dtype=str)
+        when = np.unique(names, return_inverse=True)[1] if self.timestamp_s is None else self.timestamp_s
         return np.lexsort((self.range_m, self.peer_index, self.tag_index, when, self.anchor_index))
 
     @property

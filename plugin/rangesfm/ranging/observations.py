@@ -91,8 +91,7 @@ class RangeObservations:
 def hold_out(observations: RangeObservations, checks: CheckOptions, seed: int) -> RangeObservations:
     """Set usable ranges aside as checks: of some anchors, of a stretch of time, and a random share of the rest.
 
-    Raises:
-        InputError: an anchor to be held out is not in the log, or a stretch of time holds no range.
+    InputError for an anchor that is not in the log, or a stretch of time that holds no range.
     """
     log, status = observations.log, observations.status.copy()
     chosen = np.zeros(len(log), dtype=bool)
@@ -148,28 +147,19 @@ def each_on_one_path(parts: Sequence[RangeObservations]) -> list[RangeObservatio
     return exclusive
 
 
-def path_of_each(parts: Sequence[RangeObservations]) -> Indices:
-    """(n,) the part in which each range has a place; -1: in none."""
-    number = np.full(len(parts[0].log), -1, dtype=np.int64)
-    for k, part in enumerate(parts):
-        number[(number < 0) & _is_placed(part)] = k
-    return number
-
-
 def joined_observations(
     parts: Sequence[RangeObservations], joined_from_part: Sequence[Similarity], keyframes: Sequence[Indices]
 ) -> RangeObservations:
-    """All ranges on the joined path.
+    """All ranges on the joined path, each with a place on one path at most.
 
-    Args:
-        parts: of one log, each range with a place on one path at most.
-        joined_from_part: world of each path to that of the joined one.
-        keyframes: where the keyframes of each path are in the joined one.
+    ``joined_from_part``: from the world of each path; ``keyframes``: where those of each path are in the joined one.
     """
-    number = path_of_each(parts)
+    is_free = np.ones(len(parts[0].log), dtype=bool)
     joined: dict[str, Any] = {"status": np.min([part.status for part in parts], axis=0)}
-    for k, (part, similarity, keyframe) in enumerate(zip(parts, joined_from_part, keyframes, strict=True)):
-        rows = number == k
+    for part, similarity, keyframe in zip(parts, joined_from_part, keyframes, strict=True):
+        # With a place that counts, be it only as a check.
+        rows = is_free & (part.before >= 0) & (part.has_place | (part.status == RangeStatus.CHECK))
+        is_free &= ~rows
         moved: dict[str, npt.NDArray[Any]] = {
             "status": part.status,
             "before": keyframe[part.before],
@@ -183,8 +173,3 @@ def joined_observations(
         for name, values in moved.items():
             joined.setdefault(name, getattr(part, name).copy())[rows] = values[rows]
     return RangeObservations(parts[0].log, **joined)
-
-
-def _is_placed(part: RangeObservations) -> Mask:
-    """(n,) with a place that counts, be it only as a check."""
-    return np.asarray((part.before >= 0) & (part.has_place | (part.status == RangeStatus.CHECK)))

@@ -19,8 +19,7 @@ class LinkSummary:
     Attributes:
         kind: "tag-anchor", "anchor-anchor" or "tag-tag".
         ids: the anchor, or both ends.
-        num: ranges.
-        min_m, median_m, max_m: of them.
+        num, min_m, median_m, max_m: of the ranges.
         largest_gap_s: longest time without any; None without times or between two of a kind, like the next.
         noise_stddev_m: estimated from the log itself, at least that of its rounding; None of too few ranges, too.
     """
@@ -40,7 +39,6 @@ class RangeSummary:
     """A log as a whole; times are None where it has image names instead.
 
     Attributes:
-        num: ranges.
         num_no_measurement: records that said that there was none.
         num_duplicates: ranges that stand in the log already: same time, tag, anchor and range.
         num_out_of_order: ranges that are earlier than the one before them.

@@ -68,8 +68,7 @@ def single_sided_range(
 ) -> Array:
     """Range from A's poll (tx1, rx1) and B's answer (tx2, rx2), (n,) metres.
 
-    Args:
-        rate_of_a: how fast A's clock runs, in B's seconds; its error times B's delay goes into the range.
+    ``rate_of_a``: how fast A's clock runs, in B's seconds; its error times B's delay goes into the range.
     """
     round_trip_s = options.interval_s(rx2, tx1) - np.asarray(rate_of_a) * options.interval_s(tx2, rx1)
     return _range(round_trip_s, options)

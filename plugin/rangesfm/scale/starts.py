@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import IDENTITY, Similarity, path_shape, round_middle, rounding_of
-from rangesfm.ranging.anchors.multilateration import multilaterate
+from rangesfm.ranging.anchors.point_fit import multilaterate
 from rangesfm.ranging.errors.noise import robust_stddevs
 from rangesfm.ranging.errors.robust_loss import SAME_COST
 from rangesfm.scale.consensus import consensus_scales

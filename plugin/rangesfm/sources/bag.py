@@ -1,24 +1,35 @@
-"""The images of a bag: one topic of them, with the stamps of their headers."""
+"""The images of a bag: one topic of them, with the stamps of their headers.
+
+Raw pixels in the usual encodings, and whole files of JPEG or PNG.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import io
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rangesfm.colmap.opencv_camera import colmap_camera
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+from scipy.ndimage import convolve
+
+from rangesfm.colmap.calibration import colmap_camera
 from rangesfm.errors import InputError
-from rangesfm.files.bags import open_bag, type_name
-from rangesfm.sources.pixels import image_file, opened, raw_image
+from rangesfm.files.bags import messages_of, open_bag, stamp_s, type_name
 from rangesfm.sources.source import MAX_SIDE_PX, Frame, Source
 
 if TYPE_CHECKING:
-    from PIL.Image import Image
     from rosbags.highlevel import AnyReader
 
 _RAW, _COMPRESSED, _CAMERA = "Image", "CompressedImage", "CameraInfo"
+_Pixels = npt.NDArray[np.uint8]
+_BEGINS = {b"\xff\xd8\xff": ".jpg", b"\x89PNG": ".png"}
+# Of the neighbours that have a colour, for a pixel that has not.
+_WEIGHTS = ((1, 2, 1), (2, 4, 2), (1, 2, 1))
 
 
 def has_images(path: Path) -> bool:
@@ -29,14 +40,7 @@ def has_images(path: Path) -> bool:
 
 
 def open_images(path: Path, topic: str | None) -> Source:
-    """What the images of a bag are.
-
-    Args:
-        topic: of them, if there are several such; None: there is one.
-
-    Raises:
-        InputError: the bag cannot be read or has no images, or nothing tells which are meant.
-    """
+    """What the images of a bag are, by their topic if there are several; InputError as ``open_source`` has it."""
     with open_bag(path) as bag:
         num_by_topic = _num_by_topic(bag)
         topic = _chosen(num_by_topic, topic, path)
@@ -44,11 +48,11 @@ def open_images(path: Path, topic: str | None) -> Source:
         if first is None:
             raise InputError(f"there is no image of {topic} in this bag", path)
         kind, message, _ = first
-        image = opened(image_file(message, path)[0], path) if kind == _COMPRESSED else raw_image(message, path)
+        image = _opened(_image_file(message, path)[0], path) if kind == _COMPRESSED else _raw_image(message, path)
         size_px = image.size
         camera, notes = _camera(bag, topic, kind, size_px, path)
         duration_s = bag.duration * 1e-9
-    is_stamped = _stamp_s(message) > 0
+    is_stamped = stamp_s(message) > 0
     clock = "the stamps of their headers" if is_stamped else "when they arrived, as their headers have no stamps"
     what = f"{num_by_topic[topic]} images of {topic}, {size_px[0]} x {size_px[1]} pixels"
     frames = partial(_frames, path, topic, is_stamped)
@@ -76,17 +80,16 @@ def _chosen(num_by_topic: dict[str, int], topic: str | None, path: Path) -> str:
 def _messages(bag: AnyReader, topic: str) -> Iterator[tuple[str, Any, float]]:
     """Type, content and time of arrival of each message of a topic."""
     connections = [item for item in bag.connections if item.topic == topic]
-    for connection, received_ns, data in bag.messages(connections):
-        yield type_name(connection.msgtype), bag.deserialize(data, connection.msgtype), received_ns * 1e-9
+    return ((type_name(kind), message, received_s) for kind, message, received_s in messages_of(bag, connections))
 
 
 def _frames(path: Path, topic: str, is_stamped: bool) -> Iterator[Frame]:
     with open_bag(path) as bag:
         for number, (kind, message, received_s) in enumerate(_messages(bag, topic)):
-            time_s = _stamp_s(message) if is_stamped else received_s
+            time_s = stamp_s(message) if is_stamped else received_s
             if kind == _COMPRESSED:
-                content, suffix = image_file(message, path)
-                grey = partial(opened, content, path, reduced_to_px=MAX_SIDE_PX)
+                content, suffix = _image_file(message, path)
+                grey = partial(_opened, content, path, reduced_to_px=MAX_SIDE_PX)
                 yield Frame(number, time_s, suffix, grey, partial(_write_file, content))
             else:
                 yield Frame(number, time_s, ".png", partial(_grey, message, path), partial(_write, message, path))
@@ -120,18 +123,88 @@ def _camera(
         return None, (f"{info_topic} is not taken as the camera: {error}",)
 
 
-def _stamp_s(message: Any) -> float:
-    """0 for a stamp that nobody set."""
-    return float(message.header.stamp.sec + message.header.stamp.nanosec * 1e-9)
-
-
-def _grey(message: Any, path: Path) -> Image:
-    return raw_image(message, path).convert("L")
+def _grey(message: Any, path: Path) -> Image.Image:
+    return _raw_image(message, path).convert("L")
 
 
 def _write(message: Any, path: Path, photo_path: Path) -> None:
-    raw_image(message, path).save(photo_path, compress_level=1)
+    _raw_image(message, path).save(photo_path, compress_level=1)
 
 
 def _write_file(content: bytes, path: Path) -> None:
     path.write_bytes(content)
+
+
+def _image_file(message: Any, path: Path) -> tuple[bytes, str]:
+    """Content and suffix of the file that a CompressedImage holds."""
+    content = bytes(message.data)
+    suffix = next((suffix for begin, suffix in _BEGINS.items() if content.startswith(begin)), None)
+    if suffix is None:
+        raise InputError(f"an image compressed as '{message.format}', expected jpeg or png", path)
+    return content, suffix
+
+
+def _opened(content: bytes, path: Path, *, reduced_to_px: int | None = None) -> Image.Image:
+    """The picture of such a file, in grey and of about that size if one is given, as JPEG decodes it quickest."""
+    try:
+        image: Image.Image = Image.open(io.BytesIO(content))
+        if reduced_to_px is not None:
+            image.draft("L", (reduced_to_px, reduced_to_px))
+            image = image.convert("L")
+        image.load()
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(f"a compressed image that cannot be read ({error})", path) from None
+    return image
+
+
+def _raw_image(message: Any, path: Path) -> Image.Image:
+    """The picture of an Image, in grey or in colour; InputError for an unknown encoding or too few bytes."""
+    height, width, encoding = message.height, message.width, message.encoding
+    if encoding not in _READERS:
+        raise InputError(f"an image in the encoding '{encoding}', expected one of {', '.join(_READERS)}", path)
+    num_bytes, read = _READERS[encoding]
+    data = np.asarray(message.data, np.uint8)
+    if not (width and height) or message.step < width * num_bytes or len(data) < height * message.step:
+        raise InputError(f"an image of {width} x {height} pixels in {encoding} with only {len(data)} bytes", path)
+    rows = data[: height * message.step].reshape(height, message.step)[:, : width * num_bytes]
+    return Image.fromarray(np.ascontiguousarray(read(rows.reshape(height, width, num_bytes))))
+
+
+def _luma_and_colours(luma: int, pixels: _Pixels) -> _Pixels:
+    """Of an even number of pixels a row, that have a luma each, and a colour together with their neighbour."""
+    colours = pixels[:, : pixels.shape[1] // 2 * 2, 1 - luma]
+    bands = [pixels[:, : colours.shape[1], luma], *(np.repeat(colours[:, k::2], 2, axis=1) for k in (0, 1))]
+    merged = Image.merge("YCbCr", [Image.fromarray(np.ascontiguousarray(band)) for band in bands])
+    return np.asarray(merged.convert("RGB"))
+
+
+def _colours_of_mosaic(red: tuple[int, int], pixels: _Pixels) -> _Pixels:
+    """Of pixels behind red, green and blue filters; those two colours that one lacks are of its neighbours.
+
+    ``red``: row and column of a red one in the first 2 x 2 pixels; blue is across from it.
+    """
+    has_red, has_blue = (np.zeros(pixels.shape[:2], bool) for _ in range(2))
+    has_red[red[0] :: 2, red[1] :: 2] = has_blue[1 - red[0] :: 2, 1 - red[1] :: 2] = True
+    values, mixed = pixels[..., 0].astype(np.float32), np.empty((*has_red.shape, 3), np.uint8)
+    for channel, has in enumerate((has_red, ~(has_red | has_blue), has_blue)):
+        weights = convolve(has.astype(np.float32), _WEIGHTS, mode="constant")
+        mean = convolve(values * has, _WEIGHTS, mode="constant") / weights
+        mixed[..., channel] = np.where(has, values, np.rint(mean))
+    return mixed
+
+
+# By encoding: bytes of a pixel, and how (height, width, bytes) become grey or red, green and blue.
+_READERS: dict[str, tuple[int, Callable[[_Pixels], _Pixels]]] = {
+    **dict.fromkeys(("mono8", "8UC1"), (1, lambda pixels: pixels[..., 0])),
+    "mono16": (2, lambda pixels: pixels[..., 1]),  # the upper byte of two
+    "rgb8": (3, lambda pixels: pixels),
+    **dict.fromkeys(("bgr8", "8UC3"), (3, lambda pixels: pixels[..., ::-1])),
+    "rgba8": (4, lambda pixels: pixels[..., :3]),
+    "bgra8": (4, lambda pixels: pixels[..., 2::-1]),
+    **dict.fromkeys(("yuv422", "uyvy"), (2, partial(_luma_and_colours, 1))),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, partial(_luma_and_colours, 0))),
+    "bayer_rggb8": (1, partial(_colours_of_mosaic, (0, 0))),
+    "bayer_grbg8": (1, partial(_colours_of_mosaic, (0, 1))),
+    "bayer_gbrg8": (1, partial(_colours_of_mosaic, (1, 0))),
+    "bayer_bggr8": (1, partial(_colours_of_mosaic, (1, 1))),
+}

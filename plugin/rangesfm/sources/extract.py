@@ -41,10 +41,10 @@ class TakenPhotos(Record):
     camera: tuple[str, tuple[float, ...]] | None = None
     notes: tuple[str, ...] = ()
 
-    def is_alike(self, other: TakenPhotos) -> bool:
-        """Whether they are the same photos, whatever the source's state."""
-        sha256, others = ({name: content[1] for name, content in one.files.items()} for one in (self, other))
-        return (sha256, self.rate_hz, self.topic) == (others, other.rate_hz, other.topic)
+    @property
+    def choice(self) -> tuple[object, ...]:
+        """What is the same where the photos are, whatever the source's state."""
+        return {name: sha256 for name, (_, sha256) in self.files.items()}, self.rate_hz, self.topic
 
     def are_in(self, folder: Path) -> bool:
         """Whether nobody took one of them away."""
@@ -69,7 +69,7 @@ def take_photos(
     with suppress(InputError):
         earlier = TakenPhotos.read(folder / RECORD_NAME)
     wanted = TakenPhotos(files=_files(path, earlier), rate_hz=rate_hz, topic=topic)
-    if earlier is not None and not restart and wanted.is_alike(earlier) and earlier.are_in(folder):
+    if earlier is not None and not restart and wanted.choice == earlier.choice and earlier.are_in(folder):
         progress.message("photos: taken over from an earlier run")
         return earlier
     progress.stage("photos")

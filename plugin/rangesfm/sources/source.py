@@ -86,11 +86,8 @@ def is_source(path: Path) -> bool:
 def open_source(path: Path, topic: str | None) -> Source:
     """What is known of it before its pictures are looked at.
 
-    Args:
-        topic: of the images in a bag that has several such; None: it has one.
-
-    Raises:
-        InputError: it cannot be read, or nothing tells which images are meant.
+    ``topic`` is of the images in a bag; None: it has one such. InputError if nothing tells which are meant, or the
+    source cannot be read.
     """
     from rangesfm.sources.bag import open_images
     from rangesfm.sources.video import open_video

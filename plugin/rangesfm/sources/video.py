@@ -27,11 +27,7 @@ _CREATION_FORMS = ("%Y-%m-%dT%H:%M:%S%z", "%Y-%m-%dT%H:%M:%S.%f%z")
 
 
 def open_video(path: Path) -> Source:
-    """What a video is; its photos are turned as players turn it.
-
-    Raises:
-        InputError: it cannot be read, or the package av is not installed.
-    """
+    """What a video is; its photos are turned as players turn it. InputError if it cannot be read, or without av."""
     with _reading(path) as video:
         first = next(video.decode(video=0), None)
         if first is None:

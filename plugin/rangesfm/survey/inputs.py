@@ -18,8 +18,7 @@ from rangesfm.files.folders import walk
 from rangesfm.geometry.reference import Reference, read_reference
 from rangesfm.geometry.trajectory import photos_by_frame
 from rangesfm.options import LogOptions
-from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.anchors.anchor_file import default_anchor_frame, read_anchors
+from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame, read_anchors
 from rangesfm.ranging.anchors.site import Site, local_site
 from rangesfm.ranging.errors.error_curve import correct_ranges, read_error_curve
 from rangesfm.ranging.log import RangeKind, RangeLog

@@ -181,7 +181,7 @@ class Survey(BaseModel):
 
     def input_paths(self) -> Iterator[InputPath]:
         """Every path that is read: what must be there, what is hashed and what no result may overwrite."""
-        from rangesfm.ranging.readers.several import files_of_log  # numpy, which --help needs not
+        from rangesfm.ranging.readers import files_of_log  # numpy, which --help needs not
 
         for dotted_key, role in _ROLE_OF_PATH.items():
             table, _, name = dotted_key.partition(".")

@@ -10,7 +10,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.geometry.similarity import Similarity, align_points
-from rangesfm.ranging.anchors.multilateration import multilaterate
+from rangesfm.ranging.anchors.point_fit import multilaterate
 from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.scale.range_equation import RangeProblem, RangeState, predicted_ranges, solve
 from rangesfm.scale.starts import spread_rows

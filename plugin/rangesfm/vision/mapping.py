@@ -14,7 +14,7 @@ from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import OptionError, ReconstructionError
 from rangesfm.files.atomic import new_folder, scratch_folder
 from rangesfm.options import CameraOptions, MapperOptions
-from rangesfm.processes.children import run_children
+from rangesfm.processes.supervision import run_children
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import num_matching_pairs

@@ -18,8 +18,7 @@ from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.join.models import PathOfModel
 from rangesfm.progress import Journal, Progress
-from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.anchors.anchor_file import default_anchor_frame, read_anchors
+from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame, read_anchors
 from rangesfm.ranging.anchors.site import local_site
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog

@@ -11,8 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rangesfm.errors import InputError
-from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.anchors.anchor_file import default_anchor_frame, read_anchors, write_anchors
+from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame, read_anchors, write_anchors
 
 HEADER = "anchor_id,x_m,y_m,z_m"
 FULL_HEADER = HEADER + ",position_stddev_m,range_bias_m,range_bias_stddev_m"

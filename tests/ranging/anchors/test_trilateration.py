@@ -10,8 +10,7 @@ from tests.simulated.path import loop_path
 from tests.studies import anchor_initialization
 
 from rangesfm.errors import GeometryError
-from rangesfm.ranging.anchors.anchor_survey import trilaterate_anchors
-from rangesfm.ranging.anchors.trilateration import Trilateration, TrilaterationOptions, trilaterate
+from rangesfm.ranging.anchors.trilateration import Trilateration, TrilaterationOptions, trilaterate, trilaterate_anchors
 from rangesfm.ranging.errors.cells import cells
 from rangesfm.ranging.errors.components import COMPONENTS
 from rangesfm.ranging.log import RangeLog

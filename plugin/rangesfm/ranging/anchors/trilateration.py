@@ -6,7 +6,7 @@ its own, and what ranges get wrong is learnt from those of all anchors together.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,10 +16,18 @@ import numpy.typing as npt
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import PathShape, oriented, path_shape
-from rangesfm.ranging.anchors.fit_errors import FitErrors, errors_of_fits
-from rangesfm.ranging.anchors.point_fit import PointFit, PointProblem, fit_with_own_noise, improve
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.point_fit import (
+    FitErrors,
+    PointFit,
+    PointProblem,
+    errors_of_fits,
+    fit_with_own_noise,
+    improve,
+)
 from rangesfm.ranging.errors.noise import short_range_stddev
 from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE, SAME_COST
+from rangesfm.ranging.log import RangeLog
 
 # Three numbers, and one range more to see that they fit.
 MIN_NUM_RANGES = 4
@@ -120,17 +128,18 @@ class AnchorRanges:
         return np.concatenate([[0.0], np.cumsum(steps_m)])
 
     @property
+    def tags(self) -> Indices:
+        """(n,)"""
+        return np.zeros(len(self.range_m), dtype=np.int64) if self.tag_index is None else self.tag_index
+
+    @property
     def shape(self) -> PathShape:
         """Of the tag's positions about their mean; of a level one where the height is known: only that counts."""
         centred = self.tag_positions_m - self.tag_positions_m.mean(axis=0)
         return path_shape(centred if self.height_m is None else centred * [1.0, 1.0, 0.0])
 
     def fit(self, options: TrilaterationOptions) -> PointFit:
-        """The most likely place, as if the ranges erred independently.
-
-        Raises:
-            GeometryError: too few ranges.
-        """
+        """The most likely place, as if the ranges erred independently; GeometryError for too few ranges."""
         num = len(self.range_m)
         if num < MIN_NUM_RANGES:
             raise GeometryError(f"{num} ranges at known positions of the tag, {MIN_NUM_RANGES} are needed")
@@ -166,17 +175,9 @@ class _Found:
         problem = replace(fit.problem, prior=fit.problem.prior * inflation)
         return cls(replace(fit, problem=problem, x=improve(problem, fit.x)), errors, inflation)
 
-    @property
-    def problem(self) -> PointProblem:
-        return self.fit.problem
-
-    @property
-    def x(self) -> Array:
-        return self.fit.x
-
     def judged_by(self, inflation: float) -> PointProblem:
         """The problem with costs in which errors that go together count for what they are."""
-        problem = self.problem
+        problem = self.fit.problem
         return replace(problem, stddev_m=inflation * problem.stddev_m, prior=problem.prior / self.inflation)
 
 
@@ -202,7 +203,6 @@ def trilaterate(
         GeometryError: too few ranges, positions on a line or all close together, or else an anchor less
             certain than ``options.max_position_stddev_m``.
     """
-
     positions, ranges = (np.asarray(values, dtype=np.float64) for values in (tag_positions_m, range_m))
     arrays: dict[str, Any] = {
         name: None if values is None else np.asarray(values, dtype=np.float64) for name, values in known.items()
@@ -212,6 +212,74 @@ def trilaterate(
     if isinstance(found, GeometryError):
         raise found
     return found
+
+
+@dataclass(frozen=True)
+class AnchorPlacement:
+    """What trilateration says of one anchor.
+
+    Attributes:
+        num_ranges: its ranges at known positions of the tag.
+        found: where it stands; None if that is not determined, for the reason ``why_not``.
+    """
+
+    anchor_id: str
+    num_ranges: int
+    found: Trilateration | None
+    why_not: str | None
+
+    @property
+    def anchor(self) -> Anchor:
+        """For an anchors' file: without a position if there is none, or if there are two."""
+        if self.found is None:
+            return Anchor(self.anchor_id)
+        bias = (self.found.range_bias_m, self.found.range_bias_stddev_m)
+        if self.found.mirror_position_m is not None:
+            return Anchor(self.anchor_id, None, 0.0, *bias)
+        return Anchor(self.anchor_id, self.found.position_m, self.found.position_stddev_m, *bias)
+
+
+def trilaterate_anchors(
+    log: RangeLog,
+    tag_positions_m: Array,
+    *,
+    toward: Mapping[str, Sequence[float]] | None = None,
+    height_m: Mapping[str, float] | None = None,
+    options: TrilaterationOptions | None = None,
+) -> tuple[AnchorPlacement, ...]:
+    """Place every anchor of a log; what the ranges get wrong is learnt from all of them together.
+
+    Args:
+        log: n ranges.
+        tag_positions_m: (n, 3) where the tag was at each; NaN where unknown (see ``tag_positions``).
+        toward: by anchor, the direction in which it lies of two places that fit alike (see ``trilaterate``).
+        height_m: by anchor, its z where that is known.
+
+    Returns:
+        one placement for each anchor, in the order of the log.
+    """
+    known = np.isfinite(tag_positions_m).all(axis=1)
+    rows = [np.flatnonzero(known & (log.anchor_index == k)) for k in range(len(log.anchor_ids))]
+    anchors = [
+        AnchorRanges(
+            tag_positions_m[own],
+            log.range_m[own],
+            range_stddev_m=log.range_stddev_m[own],
+            shared_stddev_m=None if log.shared_stddev_m is None else log.shared_stddev_m[own],
+            timestamp_s=None if log.timestamp_s is None else log.timestamp_s[own],
+            tag_index=log.tag_index[own],
+            toward=None if toward is None or anchor_id not in toward else np.asarray(toward[anchor_id], np.float64),
+            height_m=None if height_m is None else height_m.get(anchor_id),
+        )
+        for anchor_id, own in zip(log.anchor_ids, rows, strict=True)
+    ]
+    results = trilaterate_together(anchors, options or TrilaterationOptions())
+    return tuple(
+        AnchorPlacement(anchor_id, len(own), None, str(found))
+        if isinstance(found, GeometryError)
+        else AnchorPlacement(anchor_id, len(own), found, None)
+        for anchor_id, own, found in zip(log.anchor_ids, rows, results, strict=True)
+    )
 
 
 def trilaterate_together(
@@ -225,24 +293,16 @@ def trilaterate_together(
             fits[k] = anchor.fit(options)
         except GeometryError as error:
             results[k] = error
-    errors = _errors([anchors[k] for k in fits], list(fits.values()))
+    fitted = [anchors[k] for k in fits]
+    times_s, tags = [anchor.times_s for anchor in fitted], [anchor.tags for anchor in fitted]
+    is_calibrated = all(anchor.shared_stddev_m is not None for anchor in fitted)
+    errors = errors_of_fits([*fits.values()], times_s, tags, is_calibrated=is_calibrated) if fits else []
     for (k, fit), of_fit in zip(fits.items(), errors, strict=True):
         try:
             results[k] = _conclude(anchors[k], _Found.of(fit, of_fit), options)
         except GeometryError as error:
             results[k] = error
     return [results[k] for k in range(len(anchors))]
-
-
-def _errors(anchors: Sequence[AnchorRanges], fits: Sequence[PointFit]) -> list[FitErrors]:
-    if not fits:
-        return []
-    tags = [
-        np.zeros(len(anchor.range_m), dtype=np.int64) if anchor.tag_index is None else anchor.tag_index
-        for anchor in anchors
-    ]
-    is_calibrated = all(anchor.shared_stddev_m is not None for anchor in anchors)
-    return errors_of_fits(fits, [anchor.times_s for anchor in anchors], tags, is_calibrated=is_calibrated)
 
 
 def _conclude(anchor: AnchorRanges, found: _Found, options: TrilaterationOptions) -> Trilateration:
@@ -253,20 +313,20 @@ def _conclude(anchor: AnchorRanges, found: _Found, options: TrilaterationOptions
     across = shape.axes[:, 2] if anchor.height_m is None else oriented(level[:, None])[:, 0]
     mirror = _mirror(found, covariance, shape.centroid, across)
     if mirror is not None:
-        apart = (mirror - found.x)[:3]
+        apart = (mirror - found.fit.x)[:3]
         told = None if anchor.toward is None else _unless_along_plane(anchor.toward, apart)
         # Where no range tells the two apart, rounding would choose.
         is_free = told is not None or abs(_gap(found, mirror)) < SAME_COST
         if is_free and apart @ (across if told is None else told) > 0:
-            found, mirror = replace(found, fit=replace(found.fit, x=mirror)), found.x
+            found, mirror = replace(found, fit=replace(found.fit, x=mirror)), found.fit.x
             covariance = _covariance(found)
         mirror = mirror if told is None else None
     middle = anchor.tag_positions_m.mean(axis=0)
     return Trilateration(
-        position_m=middle + found.x[:3],
+        position_m=middle + found.fit.x[:3],
         covariance_m2=covariance[:3, :3],
         mirror_position_m=None if mirror is None else middle + mirror[:3],
-        range_bias_m=float(found.x[3]),
+        range_bias_m=float(found.fit.x[3]),
         range_bias_stddev_m=float(np.sqrt(covariance[3, 3])) if options.range_bias_stddev_m > 0 else 0.0,
         noise_stddev_m=found.fit.noise_m,
         residuals_m=found.fit.residuals_m,
@@ -280,8 +340,8 @@ def _covariance(found: _Found) -> Array:
     Huber and Ronchetti, "Robust Statistics" (2009), section 6.3: the sandwich of the covariance of the gradient between
     inverses of the information. The weakest direction by the cost itself.
     """
-    problem, weights = found.problem, found.fit.weights
-    jacobian = problem.jacobian(found.x)
+    problem, weights = found.fit.problem, found.fit.weights
+    jacobian = problem.jacobian(found.fit.x)
     of_prior = problem.prior.T @ problem.prior
     inverse = _inverse((jacobian * weights[:, None]).T @ jacobian + of_prior)
     influence = inverse @ (jacobian * (weights / problem.stddev_m)[:, None]).T
@@ -304,8 +364,8 @@ def _with_weak_direction(found: _Found, sandwich: Array, formal: Array) -> Array
     along = np.append(axes[:, 2], 0.0)
     # The other numbers follow along as they do where the curvature holds.
     tied = formal @ along / variances[2]
-    inflation = found.errors.inflation(found.fit, found.problem.slopes(found.x) @ tied)
-    if inflation * np.sqrt(variances[2]) < _NONLINEAR * float(np.median(found.problem.range_m)):
+    inflation = found.errors.inflation(found.fit, found.fit.problem.slopes(found.fit.x) @ tied)
+    if inflation * np.sqrt(variances[2]) < _NONLINEAR * float(np.median(found.fit.problem.range_m)):
         return sandwich
     rest = np.eye(4) - np.outer(tied, along)
     changed: Array = rest @ sandwich @ rest.T + _profile_stddev(found, along, inflation) ** 2 * np.outer(tied, tied)
@@ -314,11 +374,11 @@ def _with_weak_direction(found: _Found, sandwich: Array, formal: Array) -> Array
 
 def _profile_stddev(found: _Found, along: Array, inflation: float) -> float:
     """How far the point moves ``along`` (4,) until the cost, all else adapted, has risen by that of one stddev."""
-    num = len(found.problem.range_m)
+    num = len(found.fit.problem.range_m)
     rows = np.linspace(0, num - 1, min(num, _MAX_RANGES_OF_PROFILE)).astype(np.int64)
     part = found.judged_by(inflation).subset(rows)
     hold = np.vstack([part.prior, _HOLD * np.sqrt(np.sum(part.stddev_m**-2)) * along])
-    best = improve(part, found.x)
+    best = improve(part, found.fit.x)
     allowed = part.cost(best) + 0.5 * len(rows) / num
 
     def is_far(step: float) -> bool:
@@ -353,9 +413,9 @@ def _refuse_uncertain(covariance: Array, shape: PathShape, options: Trilateratio
 
 def _mirror(found: _Found, covariance: Array, centroid: Array, across: Array) -> Array | None:
     """(4,) the place on the other side of the tag's positions, if it is another one and fits as well."""
-    height = float((found.x[:3] - centroid) @ across)
-    other = improve(found.problem, found.x - 2 * height * np.append(across, 0.0))
-    apart = (other - found.x)[:3]
+    height = float((found.fit.x[:3] - centroid) @ across)
+    other = improve(found.fit.problem, found.fit.x - 2 * height * np.append(across, 0.0))
+    apart = (other - found.fit.x)[:3]
     distance = float(np.linalg.norm(apart))
     stddev = float(np.sqrt(apart @ covariance[:3, :3] @ apart)) / max(distance, 1e-12)
     return other if distance > 2 * stddev and _gap(found, other) < _MIN_COST_GAP else None
@@ -366,10 +426,10 @@ def _gap(found: _Found, mirror: Array) -> float:
 
     By a bounded loss: outliers cost the same wherever the point is.
     """
-    problem = found.problem
+    problem = found.fit.problem
     inflation = found.errors.inflation(found.fit, problem.residuals_m(mirror) - found.fit.residuals_m)
     judged = found.judged_by(inflation)
-    return judged.cost(mirror, GEMAN_MCCLURE) - judged.cost(found.x, GEMAN_MCCLURE)
+    return judged.cost(mirror, GEMAN_MCCLURE) - judged.cost(found.fit.x, GEMAN_MCCLURE)
 
 
 def _unless_along_plane(direction: Array, across: Array) -> Array | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import glob
+import re
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,17 +18,15 @@ from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.noise_of_log import find_quantization_m, quantization_stddev_m
 from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.readers import canonical, ros
-from rangesfm.ranging.readers.canonical import write_ranges_csv
-from rangesfm.ranging.readers.printed_formats import PRINTED
-from rangesfm.ranging.readers.reader import Reader, ReadOptions
-from rangesfm.ranging.readers.roles import tell_roles
-from rangesfm.ranging.readers.several import files_of_log, join_logs
-from rangesfm.ranging.readers.table import MAPPED, PRESETS, TABLE, table_reader
+from rangesfm.ranging.readers import ros
+from rangesfm.ranging.readers.printed import PRINTED
+from rangesfm.ranging.readers.reader import Reader, ReadOptions, tell_roles
+from rangesfm.ranging.readers.table import CANONICAL, MAPPED, PRESETS, TABLE, table_reader, write_ranges_csv
 
-__all__ = ["find_log_reader", "read_anchors_in_log", "read_ranges", "reader_names", "write_ranges_csv"]
+__all__ = ["files_of_log", "find_log_reader", "read_anchors_in_log", "read_ranges", "reader_names", "write_ranges_csv"]
 
-_READERS = (ros.READER, canonical.READER, *PRESETS, MAPPED, TABLE, *PRINTED)
+_READERS = (ros.READER, CANONICAL, *PRESETS, MAPPED, TABLE, *PRINTED)
+_NOTHING_SAID = ReadOptions()
 
 
 def reader_names() -> tuple[str, ...]:
@@ -68,25 +68,20 @@ def read_ranges(
     chosen = _choose_readers(paths, reading, reading.format or ("mapped" if reading.columns else None))
     logs = [reader.read(file, reading) for file, reader in chosen]
     source = paths[0] if len(paths) == 1 else paths[0].parent
-    log = logs[0] if len(logs) == 1 else join_logs(logs, source)
+    log = logs[0] if len(logs) == 1 else _join_logs(logs, source)
     log = tell_roles(log, chosen[0][1].sides, known_anchor_ids=anchor_ids, known_tag_ids=tag_ids)
-    return _not_better_than_rounding(log)
+    step_m = None if np.all(np.isnan(log.range_stddev_m)) else find_quantization_m(log.range_m)
+    least_m = 0.0 if step_m is None else quantization_stddev_m(step_m)
+    return replace(log, range_stddev_m=np.maximum(log.range_stddev_m, least_m))
 
 
 def read_anchors_in_log(path: str | Path | Sequence[str | Path], *, format: str | None = None) -> tuple[Anchor, ...]:
-    """The anchors whose positions a log tells beside its ranges, as those of the DWM1001 do.
+    """The anchors whose positions a log tells beside its ranges, as those of the DWM1001 do; none if it tells none.
 
-    Args:
-        format: one of ``reader_names()``; None: recognised by content.
-
-    Returns:
-        Each at the median of its positions, unknown where several share a place (nobody set them up);
-        empty if the format tells none.
-
-    Raises:
-        InputError: for a file that is missing, empty or of no known format.
+    Each is at the median of its positions, unknown where several share a place (nobody set them up). ``format`` is one
+    of ``reader_names()``; None: recognised by content. InputError for a file that is missing, empty or of no known one.
     """
-    chosen = _choose_readers(_paths(path), ReadOptions(), format)
+    chosen = _choose_readers(_paths(path), _NOTHING_SAID, format)
     return tuple(anchor for file, reader in chosen for anchor in reader.read_anchors(file))
 
 
@@ -97,13 +92,6 @@ def _paths(path: str | Path | Sequence[str | Path]) -> list[Path]:
     return [*map(Path, paths)]
 
 
-def _not_better_than_rounding(log: RangeLog) -> RangeLog:
-    step_m = None if np.all(np.isnan(log.range_stddev_m)) else find_quantization_m(log.range_m)
-    if step_m is None:
-        return log
-    return replace(log, range_stddev_m=np.maximum(log.range_stddev_m, quantization_stddev_m(step_m)))
-
-
 def _choose_readers(paths: Sequence[Path], options: ReadOptions, format: str | None) -> list[tuple[Path, Reader]]:
     """Every file of the log with its reader; what else is in a folder is left out."""
     files = [file for path in paths for file in files_of_log(path)]
@@ -112,7 +100,7 @@ def _choose_readers(paths: Sequence[Path], options: ReadOptions, format: str | N
     refused: InputError | None = None
     for file in files:
         try:
-            chosen.append((file, _choose_reader(file, options, format)))
+            chosen.append((file, find_log_reader(file, options, format)))
         except InputError as error:
             if not is_folder:
                 raise
@@ -128,7 +116,51 @@ def _choose_readers(paths: Sequence[Path], options: ReadOptions, format: str | N
     return chosen
 
 
-def _choose_reader(path: Path, options: ReadOptions, format: str | None) -> Reader:
+def _join_logs(logs: Sequence[RangeLog], source: Path) -> RangeLog:
+    """All ranges in the order of their times, each between the tag and the anchor of its record."""
+    by_time = {log.timestamp_s is not None for log in logs}
+    if len(by_time) > 1:
+        raise InputError("some of the files have times and others have names of photos, expected all alike", source)
+    ends = [log.end_ids() for log in logs]
+    times = (
+        np.concatenate([log.timestamp_s for log in logs if log.timestamp_s is not None]) if True in by_time else None
+    )
+    num = sum(map(len, logs))
+    joined = RangeLog.from_arrays(
+        [anchor_id for _, anchor_ids in ends for anchor_id in anchor_ids],
+        np.concatenate([log.range_m for log in logs]),
+        timestamp_s=times,
+        image_name=None if times is not None else [name for log in logs for name in log.image_name or ()],
+        range_stddev_m=np.concatenate([log.range_stddev_m for log in logs]),
+        tag_id=[tag_id for tag_ids, _ in ends for tag_id in tag_ids],
+        los=np.concatenate([log.los for log in logs]),
+        line=np.concatenate([log.line for log in logs]),
+        source=source,
+        format=logs[0].format,
+        num_no_measurement=sum(log.num_no_measurement for log in logs),
+        notes=(f"{len(logs)} files as one log", *dict.fromkeys(note for log in logs for note in log.notes)),
+    )
+    return joined.subset(np.argsort(times, kind="stable") if times is not None else np.arange(num))
+
+
+def files_of_log(path: Path) -> list[Path]:
+    """The files of a log: the path itself, all in a folder, or those of a pattern as ``uwb_*.csv``; or InputError."""
+    text = str(path)
+    if "\0" in text:
+        raise InputError("no file has such a name", path)
+    if path.is_dir() and not is_bag_folder(path):
+        found = [file for file in path.iterdir() if file.is_file() and not file.name.startswith(".")]
+    elif glob.has_magic(text) and not path.exists():
+        found = [Path(name) for name in glob.glob(text)]
+    else:
+        return [path]
+    if not found:
+        raise InputError("no file there, expected the files of a log", path)
+    return sorted(found, key=lambda file: [part.zfill(20) for part in re.split(r"(\d+)", file.name)])
+
+
+def find_log_reader(path: Path, options: ReadOptions = _NOTHING_SAID, format: str | None = None) -> Reader:
+    """The reader of a file; InputError, with advice for tables, if it is no log for sure."""
     if format is not None and format != TABLE.name:
         named = next((reader for reader in _READERS if reader.name == format), None)
         if named is None:
@@ -145,12 +177,3 @@ def _choose_reader(path: Path, options: ReadOptions, format: str | None) -> Read
     if "\0" in head:
         raise InputError("is neither text nor a bag: unpack it, or save it as UTF-8 text", path)
     return table_reader(path, options)
-
-
-def find_log_reader(path: Path) -> Reader:
-    """The reader of a file of which nothing is said.
-
-    Raises:
-        InputError: it is no radio's log, or not for sure; a table that may be one has advice.
-    """
-    return _choose_reader(path, ReadOptions(), None)

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from rangesfm.arrays import Array
-from rangesfm.errors import InputError
 from rangesfm.files.tables import Categories, Table, read_table
 from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.layout import MISSING, Layout
-from rangesfm.ranging.readers.reader import ReadOptions, far_above_all, no_usable_range, told_far
+from rangesfm.ranging.readers.reader import ReadOptions, which_are_measured
 from rangesfm.ranging.readers.times import (
     CIVIL_TIME,
     CIVIL_UNITS,
@@ -27,7 +26,7 @@ from rangesfm.ranging.readers.times import (
     date_order,
     is_zoned,
 )
-from rangesfm.ranging.readers.units import UNITS_PER_METRE, UnclearUnitError, days_before_1970, range_unit, time_unit
+from rangesfm.ranging.readers.units import UNITS_PER_METRE, Ask, days_before_1970, range_unit, time_unit
 from rangesfm.ranging.twr import StampOptions, double_sided_range, single_sided_range
 
 STAMPS = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
@@ -37,7 +36,6 @@ QUANTITIES = (
 )
 
 _MAX_TIME_S = 1e11  # three thousand years
-_NOTHING = 1e-12  # in any unit
 _TEXTS = ("image_name", "date", "anchor_id", "tag_id", "antenna")
 
 
@@ -91,39 +89,37 @@ def read_columns(path: Path, columns: Columns, options: ReadOptions, format: str
             table = table.where([cell != "" for cell in table.text(named["range"], empty="")])
     name = {key: column for key, column in named.items() if column in table}
     units = layout.units if layout else {}
-    with _asking("timestamp", path, options):
-        timestamps = _timestamps(table, name, units, options.timestamp_unit, notes) if "timestamp" in name else None
+    timestamps = _timestamps(table, name, units, options, notes) if "timestamp" in name else None
     image_name = table.text(name["image_name"]) if timestamps is None else None
     num_ends = max(1, len(columns.wide))
     row = np.repeat(np.arange(len(table)), num_ends)
     anchor, tag = _anchors(table, name, columns), _tags(table, name, columns)
     ranges = _ranges(table, name, columns, options)
-    far = far_above_all(ranges)
-    measured = (ranges > _NOTHING) & (ranges < far)
-    notes += [] if np.isinf(far) else [told_far(int(np.sum(ranges == far)), far)]
-    if not np.any(measured):
-        raise no_usable_range(len(ranges), path)
+    measured, of_far = which_are_measured(ranges, path)
+    notes += of_far
     row, ranges, anchor = row[measured], ranges[measured], anchor.subset(measured)
     tag = None if tag is None else tag.subset(measured)
     times = None if timestamps is None else timestamps[row]
-    unit: str | None = "m"
+    unit = "m"
     if "range" in name or columns.wide:
-        with _asking("range", path, options):
-            pair = anchor.index if tag is None else anchor.index * len(tag.names) + tag.index
-            column = name.get("range") or next(iter(columns.wide))
-            column = f"{column} {units.get(column, '')}".strip()
-            unit = options.range_unit or _noted(notes, range_unit(column, ranges, times, pair))
-    per_metre = UNITS_PER_METRE[unit or "m"]
-    stddevs = _stddevs(table, name["range_stddev"], per_metre) if "range_stddev" in name else None
-    los = _line_of_sight(table, name) if {"los", "nlos"} & set(name) else None
+        pair = anchor.index if tag is None else anchor.index * len(tag.names) + tag.index
+        column = name.get("range") or next(iter(columns.wide))
+        column = f"{column} {units.get(column, '')}".strip()
+        ask = partial(options.which_unit, path, "range")
+        unit = options.range_unit or range_unit(column, ranges, times, pair, notes, ask)
+    per_metre = UNITS_PER_METRE[unit]
+    stddevs, los = np.full(len(table), np.nan), _line_of_sight(table, name)
+    if "range_stddev" in name:
+        expected = "a positive number or nothing"
+        stddevs = table.numbers(name["range_stddev"], empty=np.nan, expected=expected, above=0.0) / per_metre
     return RangeLog.from_arrays(
         anchor,
         ranges / per_metre,
         timestamp_s=times,
         image_name=None if image_name is None else [image_name[k] for k in row.tolist()],
-        range_stddev_m=None if stddevs is None else stddevs[row],
+        range_stddev_m=stddevs[row],
         tag_id=tag,
-        los=None if los is None else los[row],
+        los=los[row],
         line=table.line[row],
         source=path,
         format=format,
@@ -132,32 +128,23 @@ def read_columns(path: Path, columns: Columns, options: ReadOptions, format: str
     )
 
 
-@contextmanager
-def _asking(quantity: str, path: Path, options: ReadOptions) -> Iterator[None]:
-    """Ask the user for a unit that may be one or another, with the commands that say it."""
-    try:
-        yield
-    except UnclearUnitError as doubt:
-        flag = f"{quantity}_unit"
-        units = " or ".join(doubt.units)
-        message = f"the {quantity} has {doubt}, which may be {units}; say which by --{flag} (in a survey file: {flag})"
-        raise InputError(
-            message, path, advice=[options.command(path, **{flag: unit}) for unit in doubt.units]
-        ) from None
-
-
-def _noted(notes: list[str], unit_and_note: tuple[str, str | None]) -> str:
-    unit, note = unit_and_note
-    notes += [] if note is None else [note]
-    return unit
-
-
 def _anchors(table: Table, name: Mapping[str, str], columns: Columns) -> Categories:
-    if columns.wide:
-        return _of_wide([anchor_id for anchor_id, _ in columns.wide.values()], table, columns)
-    if "anchor_id" not in name:
-        return _repeated([columns.anchor_id or ""], len(table))
-    return _ids(table, name["anchor_id"], columns, None)
+    """Of each range, row after row: the same in each row, or what a column says."""
+    if not columns.wide:
+        if "anchor_id" not in name:
+            return _repeated([columns.anchor_id or ""], len(table))
+        return _ids(table, name["anchor_id"], columns, None)
+    anchor_ids = [anchor_id for anchor_id, _ in columns.wide.values()]
+    if not any(map(column_of_anchor, anchor_ids)):
+        return _repeated(anchor_ids, len(table))
+    each = [
+        _ids(table, said, columns, "") if (said := column_of_anchor(anchor_id)) else _repeated([anchor_id], len(table))
+        for anchor_id in anchor_ids
+    ]
+    names = Categories.of([name for one in each for name in one.names])
+    first = np.cumsum([0, *(len(one.names) for one in each)])
+    index = np.column_stack([names.index[one.index + start] for one, start in zip(each, first)])
+    return Categories(names.names, index.ravel())
 
 
 def _tags(table: Table, name: Mapping[str, str], columns: Columns) -> Categories | None:
@@ -173,20 +160,6 @@ def _tags(table: Table, name: Mapping[str, str], columns: Columns) -> Categories
     if tag is not None and columns.wide:
         return Categories(tag.names, np.repeat(tag.index, len(columns.wide)))
     return tag
-
-
-def _of_wide(anchor_ids: list[str], table: Table, columns: Columns) -> Categories:
-    """Those of columns of ranges, row after row: the same in each, or what another column says."""
-    if not any(map(column_of_anchor, anchor_ids)):
-        return _repeated(anchor_ids, len(table))
-    each = [
-        _ids(table, said, columns, "") if (said := column_of_anchor(anchor_id)) else _repeated([anchor_id], len(table))
-        for anchor_id in anchor_ids
-    ]
-    names = Categories.of([name for one in each for name in one.names])
-    first = np.cumsum([0, *(len(one.names) for one in each)])
-    index = np.column_stack([names.index[one.index + start] for one, start in zip(each, first)])
-    return Categories(names.names, index.ravel())
 
 
 def column_of_anchor(anchor_id: str) -> str | None:
@@ -236,27 +209,27 @@ def _ranges_by_stamps(table: Table, name: Mapping[str, str], options: StampOptio
 
 
 def _timestamps(
-    table: Table, name: Mapping[str, str], units: Mapping[str, str], unit: str | None, notes: list[str]
+    table: Table, name: Mapping[str, str], units: Mapping[str, str], options: ReadOptions, notes: list[str]
 ) -> Array:
-    column = name["timestamp"]
-    if unit in CIVIL_UNITS or "date" in name or (unit is None and not table.begins_with_number(column)):
-        return _civil_times(table, name, unit, notes)
-    times = table.numbers(column, expected=f"a time in {unit or 's'}")
-    if unit is None:
-        unit = _noted(notes, time_unit(f"{column} {units.get(column, '')}".strip(), times))
+    column, said = name["timestamp"], options.timestamp_unit
+    ask = partial(options.which_unit, table.path, "timestamp")
+    if said in CIVIL_UNITS or "date" in name or (said is None and not table.begins_with_number(column)):
+        return _civil_times(table, name, said, notes, ask)
+    times = table.numbers(column, expected=f"a time in {said or 's'}")
+    unit = said or time_unit(f"{column} {units.get(column, '')}".strip(), times, notes, ask)
     seconds = (times - (days_before_1970(times) if unit == "d" else 0.0)) * SECONDS_PER_UNIT[unit]
     table.refuse(np.abs(seconds) > _MAX_TIME_S, column, f"a time in {unit}")
     return seconds + 1e-9 * table.numbers(name["nanoseconds"]) if "nanoseconds" in name else seconds
 
 
-def _civil_times(table: Table, name: Mapping[str, str], unit: str | None, notes: list[str]) -> Array:
+def _civil_times(table: Table, name: Mapping[str, str], unit: str | None, notes: list[str], ask: Ask) -> Array:
     texts = table.text(name["timestamp"])
     if "date" in name:
         texts = [f"{date} {time}" for date, time in zip(table.text(name["date"]), texts)]
     dates = [match[1] for text in texts if (match := CIVIL_TIME.fullmatch(text))]
     order = unit if unit in DATE_ORDERS else date_order(dates) if dates else "ymd"
     if order is None:
-        raise UnclearUnitError([*DATE_ORDERS], f"dates as {dates[0]}")
+        raise ask(DATE_ORDERS, f"dates as {dates[0]}")
     clock, seconds = CivilClock(order), np.empty(len(table))
     for row, text in enumerate(texts):
         try:
@@ -271,15 +244,10 @@ def _civil_times(table: Table, name: Mapping[str, str], unit: str | None, notes:
     return seconds
 
 
-def _stddevs(table: Table, column: str, per_metre: float) -> Array:
-    expected = "a positive number or nothing"
-    stddevs = table.numbers(column, empty=np.nan, expected=expected) / per_metre
-    table.refuse(stddevs <= 0, column, expected)
-    return stddevs
-
-
 def _line_of_sight(table: Table, name: Mapping[str, str]) -> npt.NDArray[np.int8]:
-    column = name.get("los") or name["nlos"]
+    column = name.get("los") or name.get("nlos")
+    if column is None:
+        return np.full(len(table), -1, np.int8)
     expected = "1 (line of sight), 0 (none) or nothing"
     los = table.numbers(column, empty=-1.0, expected=expected)
     wrong = ~np.isin(los, (0.0, 1.0)) & (np.array(table.text(column, empty="")) != "")

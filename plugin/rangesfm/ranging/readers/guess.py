@@ -6,37 +6,16 @@ A name that says it, or values that admit one reading only, make a guess sure. E
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import count, pairwise, product, takewhile
 
 import numpy as np
 
 from rangesfm.arrays import Array
+from rangesfm.ranging.readers import vocabulary as terms
 from rangesfm.ranging.readers.layout import Column, Layout
-from rangesfm.ranging.readers.roles import Sides
-from rangesfm.ranging.readers.vocabulary import (
-    ANCHOR,
-    ANTENNA,
-    ANY_ID,
-    ASKED,
-    ID,
-    IN_WIDE,
-    LENGTH_UNIT,
-    NANOSECONDS,
-    NO_RANGE,
-    NO_TIME,
-    PLAIN,
-    RANGE,
-    RANGE_IN_SHORT,
-    ROLES,
-    SECOND_RANGE,
-    SECOND_TIME,
-    TAG,
-    TIME,
-    TIME_IN_SHORT,
-    words_of,
-)
+from rangesfm.ranging.readers.reader import Sides
 
 _MAX_NUM_IDS = 64
 _SAME_SPOT_M = 1.5  # tags on one rig are not further apart, nor does their range to an anchor differ by more
@@ -47,12 +26,9 @@ class Guess:
     """What a table seems to hold.
 
     Attributes:
-        columns: name in the file of each quantity.
+        columns: name in the file of each quantity; those that could not be found at all are ``missing``.
         wide: columns of ranges, each with its anchor and tag.
-        sides: what the columns of ids mean.
-        notes: what was taken as what.
         doubts: why it is no more than a guess; none: it is sure.
-        missing: quantities that could not be found at all.
         span: ``wide`` in a few words, where its columns have no names: quantity and columns.
     """
 
@@ -67,9 +43,7 @@ class Guess:
     @property
     def told(self) -> dict[str, str]:
         """All of it as the user would say it."""
-        wide = {
-            f"range:{anchor}:{tag}" if tag else f"range:{anchor}": name for name, (anchor, tag) in self.wide.items()
-        }
+        wide = {f"range:{anchor}" + f":{tag}" * bool(tag): name for name, (anchor, tag) in self.wide.items()}
         columns = dict(sorted(self.columns.items(), key=lambda item: item[0] != "timestamp"))
         return {**columns, **(dict([self.span]) if self.span else wide)}
 
@@ -85,41 +59,38 @@ def guess_columns(layout: Layout) -> Guess:
 
 
 def _find_time(free: list[Column], guess: Guess) -> list[Column]:
-    found = sorted((_time_rank(column), k, column) for k, column in enumerate(free) if _time_rank(column) is not None)
-    photos = [
-        column for column in free if all(cell.lower().endswith((".jpg", ".jpeg", ".png")) for cell in column.cells)
-    ]
-    if not found:
+    ranked = sorted((rank, k) for k, column in enumerate(free) if (rank := _time_rank(column)) is not None)
+    if not ranked:
+        ends = (".jpg", ".jpeg", ".png")
+        photos = [column for column in free if all(cell.lower().endswith(ends) for cell in column.cells)]
         guess.columns |= {"image_name": photos[0].name} if photos else {}
         return [column for column in free if column not in photos]
-    time = found[0][2]
+    time, *others = (free[k] for _, k in ranked)
     guess.columns["timestamp"] = time.name
-    parts = {column.name: column for column in free}
     dates = [column for column in free if column.kind == "dates"]
-    fractions = [column for column in free if NANOSECONDS & {*column.words} and column.is_whole]
+    fractions = [column for column in free if terms.NANOSECONDS & {*column.words} and column.is_whole]
     if time.kind == "times" and dates and ":" in time.cells[0][:3]:
         guess.columns["date"] = dates[0].name
     elif time.is_whole and fractions and float(np.median(time.numbers)) < 1e11:
         guess.columns["nanoseconds"] = fractions[0].name
-    if others := [column.name for _, _, column in found[1:] if column not in fractions]:
-        guess.notes.append(f"the times are those of {time.name}; there are also {', '.join(others)}")
-    taken = {time.name, *(column.name for _, _, column in found), *(column.name for column in (*dates, *fractions))}
-    return [column for name, column in parts.items() if name not in taken]
+    if also := [column for column in others if column not in fractions]:
+        guess.notes.append(f"the times are those of {time.name}; there are also {_names(also)}")
+    return [column for column in free if column not in (time, *others, *dates, *fractions)]
 
 
 def _time_rank(column: Column) -> tuple[float, int] | None:
     """Smaller for a better column of times; None for none."""
-    words = [word for word in column.words if word not in PLAIN]
-    if column.kind not in ("numbers", "times") or NO_TIME & {*words} or NANOSECONDS & {*words}:
+    words = [word for word in column.words if word not in terms.PLAIN]
+    if column.kind not in ("numbers", "times") or terms.NO_TIME & {*words} or terms.NANOSECONDS & {*words}:
         return None
-    is_in_short = bool(words) and {*words} <= TIME_IN_SHORT
-    is_named = bool(TIME & {*words}) or is_in_short or column.kind == "times"
+    is_in_short = bool(words) and {*words} <= terms.TIME_IN_SHORT
+    is_named = bool(terms.TIME & {*words}) or is_in_short or column.kind == "times"
     stands_still = len(column.numbers) > 2 and bool(np.all(column.numbers == column.numbers[0]))
     if not is_named or stands_still:
         return None
     # rostopic's %time and its like are when a message arrived; the stamp in it is when it was measured.
-    is_arrival = column.name.startswith(("%", "__")) or bool(SECOND_TIME & {*words})
-    return is_arrival + 0.5 * (not TIME & {*words}), len({*words} - TIME - TIME_IN_SHORT)
+    is_arrival = column.name.startswith(("%", "__")) or bool(terms.SECOND_TIME & {*words})
+    return is_arrival + 0.5 * (not terms.TIME & {*words}), len({*words} - terms.TIME - terms.TIME_IN_SHORT)
 
 
 def _find_pairs(free: list[Column], guess: Guess) -> list[Column]:
@@ -142,7 +113,15 @@ def _take_pairs(pairs: Sequence[tuple[Column, Column]], guess: Guess) -> None:
 
 def _names_anchor(column: Column) -> bool:
     words = {*_without_numbers(column)}
-    return bool(words) and words <= ANCHOR | ANY_ID | ASKED | ID and (column.kind == "text" or column.is_whole)
+    return (
+        bool(words)
+        and words <= terms.ANCHOR | terms.ANY_ID | terms.ASKED | terms.ID
+        and (column.kind == "text" or column.is_whole)
+    )
+
+
+def _names(columns: Iterable[Column]) -> str:
+    return ", ".join(column.name for column in columns)
 
 
 def _numbers(column: Column) -> tuple[str, ...]:
@@ -150,34 +129,29 @@ def _numbers(column: Column) -> tuple[str, ...]:
 
 
 def _without_numbers(column: Column) -> tuple[str, ...]:
-    return tuple(word for word in column.words if not word.isdigit() and word not in PLAIN)
+    return tuple(word for word in column.words if not word.isdigit() and word not in terms.PLAIN)
 
 
 def _find_range(free: list[Column], guess: Guess) -> list[Column]:
     if guess.wide:
         return free
-    numbers = [column for column in free if column.kind == "numbers" and not NO_RANGE & {*column.words}]
+    numbers = [column for column in free if column.kind == "numbers" and not terms.NO_RANGE & {*column.words}]
     named = [column for column in numbers if _is_range(column)]
-    stamps = {
-        word: column.name for column in free for word in (column.name.lower(),) if word in ("tx1", "rx1", "tx2", "rx2")
-    }
+    stamps = {name: column.name for column in free if (name := column.name.lower()) in ("tx1", "rx1", "tx2", "rx2")}
     groups = [group for group in _groups(numbers) if all(map(_may_be_wide, group))]
     in_groups = {column.name for group in groups for column, _ in group}
-    groups = [group for group in groups if not SECOND_RANGE & {*group[0][0].words}] or groups
+    groups = [group for group in groups if not terms.SECOND_RANGE & {*group[0][0].words}] or groups
     single = [column for column in named if column.name not in in_groups]
-    first = [column for column in single if not SECOND_RANGE & {*column.words}] or single
-    if len(first) == 1:
+    first = [column for column in single if not terms.SECOND_RANGE & {*column.words}] or single
+    if first:
         guess.columns["range"] = first[0].name
-        if others := [column.name for column in single if column not in first]:
-            guess.notes.append(f"the ranges are those of {first[0].name}; there are also {', '.join(others)}")
-    elif first:
-        guess.columns["range"] = first[0].name
-        guess.doubts.append(f"any of {', '.join(column.name for column in first)} may be the ranges")
-    elif len(groups) == 1:
-        _take_wide(groups[0], guess)
+        if len(first) > 1:
+            guess.doubts.append(f"any of {_names(first)} may be the ranges")
+        elif others := [column for column in single if column not in first]:
+            guess.notes.append(f"the ranges are those of {first[0].name}; there are also {_names(others)}")
     elif groups:
         _take_wide(groups[0], guess)
-        guess.doubts.append("there are several groups of columns that may be ranges")
+        guess.doubts += ["there are several groups of columns that may be ranges"] * (len(groups) > 1)
     elif len(stamps) == 4:
         guess.notes.append("there are no ranges but the time stamps of two-way ranging: these are used")
         guess.columns |= stamps
@@ -187,60 +161,59 @@ def _find_range(free: list[Column], guess: Guess) -> list[Column]:
 def _is_range(column: Column) -> bool:
     """Whether the name is that of one range; ``d`` and ``r`` only where nothing else is said."""
     words = {*_without_numbers(column)}
-    if column.kind != "numbers" or NO_RANGE & words:
+    if column.kind != "numbers" or terms.NO_RANGE & words:
         return False
-    return bool(words & RANGE) or (bool(words) and words <= RANGE_IN_SHORT | LENGTH_UNIT)
+    return bool(words & terms.RANGE) or (bool(words) and words <= terms.RANGE_IN_SHORT | terms.LENGTH_UNIT)
 
 
 def _groups(columns: Sequence[Column]) -> list[list[tuple[Column, list[int]]]]:
     """Columns whose names differ in ids only, and which of their words these are."""
     groups: dict[tuple[str, ...], list[tuple[Column, list[int]]]] = defaultdict(list)
     for column in columns:
-        ids = [k for k, word in enumerate(column.words) if word[0].isdigit() or _is_letter(word, k, column.words)]
-        ids += [
-            k for k, word in enumerate(column.words) if len(word) == 4 and word.upper() in column.name and k not in ids
+        ids = [
+            k
+            for k, word in enumerate(column.words)
+            if word[0].isdigit()
+            or _is_letter(word, k, column.words)
+            or (len(word) == 4 and word.upper() in column.name)
         ]
         if ids:
-            groups[tuple("#" if k in ids else word for k, word in enumerate(column.words))].append(
-                (column, sorted(ids))
-            )
+            alike = tuple("#" if k in ids else word for k, word in enumerate(column.words))
+            groups[alike].append((column, ids))
     return [group for group in groups.values() if len(group) > 1]
 
 
 def _is_letter(word: str, k: int, words: list[str]) -> bool:
     """Whether a single letter at the end is an id, as in dist_A."""
-    return len(word) == 1 and k == len(words) - 1 > 0 and bool(RANGE & {*words}) and word not in LENGTH_UNIT
+    return len(word) == 1 and k == len(words) - 1 > 0 and bool(terms.RANGE & {*words}) and word not in terms.LENGTH_UNIT
 
 
 def _may_be_wide(member: tuple[Column, list[int]]) -> bool:
     column, ids = member
-    others = {word for k, word in enumerate(column.words) if k not in ids} - PLAIN
-    return others <= IN_WIDE and bool(others & (RANGE | RANGE_IN_SHORT | ANCHOR | {"a", "b"}))
+    others = {word for k, word in enumerate(column.words) if k not in ids} - terms.PLAIN
+    return others <= terms.IN_WIDE and bool(others & (terms.RANGE | terms.RANGE_IN_SHORT | terms.ANCHOR | {"a", "b"}))
 
 
 def _take_wide(group: list[tuple[Column, list[int]]], guess: Guess) -> None:
     for column, ids in group:
-        tags = [k for k in ids if k and column.words[k - 1] in TAG | {"t"} and len(ids) > 1]
+        tags = [k for k in ids if k and column.words[k - 1] in terms.TAG | {"t"} and len(ids) > 1]
         anchors = [k for k in ids if k not in tags]
-        guess.wide[column.name] = (
-            "_".join(_id_at(column.words, k, column.name) for k in anchors),
-            "_".join(_id_at(column.words, k, column.name) for k in tags),
-        )
+        anchor, tag = ("_".join(_id_at(column.words, k, column.name) for k in each) for each in (anchors, tags))
+        guess.wide[column.name] = (anchor, tag)
     words = {word for column, _ in group for word in column.words}
-    guess.notes.append(
-        f"a column an anchor: {', '.join(column.name for column, _ in group[:4])}{', ..' * (len(group) > 4)}"
-    )
+    first = _names(column for column, _ in group[:4])
+    guess.notes.append(f"a column an anchor: {first}{', ..' * (len(group) > 4)}")
     if any(len(ids) - bool(guess.wide[column.name][1]) > 1 for column, ids in group):
         guess.doubts.append("the names of the columns hold two ids, and do not say which is the anchor's")
     elif not any(tag for _, tag in guess.wide.values()) and not words & (
-        RANGE | RANGE_IN_SHORT | (ANCHOR - {"an", "bs", "node", "base"})
+        terms.RANGE | terms.RANGE_IN_SHORT | (terms.ANCHOR - {"an", "bs", "node", "base"})
     ):
         guess.doubts.append("the names of the columns do not say that they are ranges")
 
 
 def _id_at(words: list[str], k: int, name: str) -> str:
     """The id, with the one or two letters that stand before it (A0), as the file spells it."""
-    before = words[k - 1] if k and len(words[k - 1]) <= 2 and words[k - 1] not in RANGE_IN_SHORT else ""
+    before = words[k - 1] if k and len(words[k - 1]) <= 2 and words[k - 1] not in terms.RANGE_IN_SHORT else ""
     text = before + words[k]
     at = name.lower().find(text)
     return name[at : at + len(text)] if at >= 0 else words[k]
@@ -252,12 +225,11 @@ def _find_nodes(free: list[Column], guess: Guess) -> list[Column]:
     # What stands in the same record as the range tells its anchor, what stands around it the tag.
     within = guess.columns.get("range", "").rpartition(".")[0] + "."
     for column in free:
-        words = {word for word in words_of(column.name.removeprefix(within)) if not word.isdigit()} - PLAIN
-        words -= RANGE if column.kind == "text" else set()
-        role = next(
-            (role for role, own in ROLES.items() if words & own and words <= own | ID | ANTENNA | {"node"}), None
-        )
-        if role is not None and column.kind in ("numbers", "text") and (column.kind == "text" or column.is_whole):
+        words = {word for word in terms.words_of(column.name.removeprefix(within)) if not word.isdigit()} - terms.PLAIN
+        words -= terms.RANGE if column.kind == "text" else set()
+        besides = terms.ID | terms.ANTENNA | {"node"}
+        role = next((role for role, own in terms.ROLES.items() if words & own and words <= own | besides), None)
+        if role is not None and (column.kind == "text" or column.is_whole):
             ids[role].append(column)
     anchor, tag = ids["anchor"] or ids["asked"], ids["tag"] or ids["asking"]
     nameless = ids["any"]
@@ -274,14 +246,10 @@ def _find_nodes(free: list[Column], guess: Guess) -> list[Column]:
         if columns and not (guess.wide and role == "anchor_id"):
             guess.columns[role] = columns[0].name
             if len(columns) > 1:
-                guess.doubts.append(f"any of {', '.join(column.name for column in columns)} may be the {role}")
-    if not (guess.wide or anchor) and (
-        others := [
-            column
-            for column in free
-            if _is_id(column) and column.num_distinct > 1 and not (NO_RANGE - ANY_ID) & {*column.words}
-        ]
-    ):
+                guess.doubts.append(f"any of {_names(columns)} may be the {role}")
+    unlike = terms.NO_RANGE - terms.ANY_ID
+    others = [column for column in free if _is_id(column) and column.num_distinct > 1 and not unlike & {*column.words}]
+    if others and not (guess.wide or anchor):
         guess.columns["anchor_id"] = others[0].name
         guess.doubts.append(f"{others[0].name} may be the anchor")
     if "antenna" in guess.columns and ids["antenna"][0].num_distinct > 1:
@@ -318,11 +286,11 @@ def _find_by_values(free: list[Column], guess: Guess, has_names: bool) -> None:
     if len(pairs) > 1:
         _take_pairs(pairs, guess)
         if 2 * len(pairs) < len(free) or len({node.cells[0] for node, _ in pairs}) < len(pairs):
-            guess.doubts.append(f"{', '.join(node.name for node, _ in pairs)} may be the anchors")
+            guess.doubts.append(f"{_names(node for node, _ in pairs)} may be the anchors")
         return
     ids = [column for column in free if _is_id(column)]
     reals = [column for column in free if column.kind == "numbers" and column not in ids and _is_positive(column)]
-    reals = [column for column in reals if not NO_RANGE & {*column.words} and column.num_distinct > 1] or reals
+    reals = [column for column in reals if not terms.NO_RANGE & {*column.words} and column.num_distinct > 1] or reals
     if alike := sorted(_groups(reals), key=len):
         reals = [column for column, _ in alike[-1]] if has_names else reals
     # A column of whole numbers beside one of decimals is no range but a count, or a power.
@@ -361,7 +329,7 @@ def _ids_by_values(ids: list[Column], guess: Guess) -> None:
     *others, anchor = sorted(ids, key=lambda column: column.num_distinct)
     tag = others[-1] if others else None
     if len(others) > 1:
-        guess.doubts.append(f"any of {', '.join(column.name for column in ids)} may be the anchor or the tag")
+        guess.doubts.append(f"any of {_names(ids)} may be the anchor or the tag")
     guess.columns["anchor_id"] = anchor.name
     if tag is not None:
         guess.columns["tag_id"] = tag.name
@@ -399,11 +367,8 @@ def _wide_by_values(columns: list[Column], guess: Guess) -> None:
     ids = ids if are_numbered or num_tags > 1 else [(name, "") for name in names]
     guess.wide = dict(zip(names, ids))
     if are_numbered and int(names[-1]) - int(names[0]) == len(names) - 1:
-        anchors = f"0-{num - 1}"
-        guess.span = (
-            f"range:{anchors}:T0-T{num_tags - 1}" if num_tags > 1 else f"range:{anchors}",
-            f"{names[0]}-{names[-1]}",
-        )
+        of_tags = f":T0-T{num_tags - 1}" * (num_tags > 1)
+        guess.span = (f"range:0-{num - 1}{of_tags}", f"{names[0]}-{names[-1]}")
     tags = f", each for {num_tags} tags, whose ranges are nearly the same" if num_tags > 1 else ""
     guess.doubts.append(f"columns {names[0]} to {names[-1]} may be ranges to {num} anchors{tags}")
 

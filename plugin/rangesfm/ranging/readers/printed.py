@@ -1,4 +1,4 @@
-"""Logs of lines that a radio prints, in which each range is a phrase of its own.
+"""Logs of lines that a radio prints, in which each range is a phrase of its own, and the formats of such lines.
 
 Serial lines lose and double characters. So the phrases are found one by one, wherever they stand: what
 is whole in a damaged line survives, and what was begun and is not whole counts as no measurement.
@@ -8,22 +8,21 @@ from __future__ import annotations
 
 import math
 import re
+from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from rangesfm.errors import InputError
 from rangesfm.files.tables import read_text
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.log import DEFAULT_TAG_ID
-from rangesfm.ranging.readers.reader import Reader, Reading, ReadOptions, reader_of_readings
-from rangesfm.ranging.readers.roles import Sides
+from rangesfm.ranging.readers.reader import Reader, Reading, ReadOptions, Sides, reader_of_readings
 from rangesfm.ranging.readers.times import HostClock
 
-ReadPhrase = Callable[["re.Match[str]", float, int], Iterable[Reading]]
-LOST = Reading(0.0, "", math.nan)
+_LOST = Reading(0.0, "", math.nan)
 
 
 def _one_range(phrase: re.Match[str], timestamp_s: float, line: int) -> Iterator[Reading]:
@@ -33,65 +32,230 @@ def _one_range(phrase: re.Match[str], timestamp_s: float, line: int) -> Iterator
     yield Reading(timestamp_s, phrase["anchor_id"], float(phrase["range"]), line, tag_id, stddev_m)
 
 
-@dataclass(frozen=True)
-class _Phrases:
-    """How a radio prints its ranges.
+def _reader(
+    name: str,
+    *,
+    begin: str,
+    each: str,
+    whole: str,
+    ranges: Callable[[re.Match[str], float, int], Iterable[Reading]] = _one_range,
+    sides: Sides = Sides.TOLD,
+) -> Reader:
+    """The reader of lines with phrases, given as patterns of ASCII.
 
-    Attributes:
+    Args:
         begin: begins a line's first range; the host's time stands before it.
         each: begins each range.
         whole: all of it; groups x, y and z, if there are any, are where the anchor stands, in metres; a group time
             is the time of the range, which stands in no other place then.
         ranges: of such a phrase, its time in seconds and its line.
     """
+    first, begun, phrase = (re.compile(pattern, re.ASCII | re.MULTILINE) for pattern in (begin, each, whole))
+    has_time = "time" in phrase.groupindex
 
-    begin: re.Pattern[str]
-    each: re.Pattern[str]
-    whole: re.Pattern[str]
-    ranges: ReadPhrase
-
-    def begins(self, head: str) -> bool:
-        return self.begin.search(head) is not None
-
-    def readings(self, path: Path, options: ReadOptions) -> Iterator[Reading]:
+    def readings(path: Path, options: ReadOptions) -> Iterator[Reading]:
         clock = HostClock(path, options)
-        has_time = "time" in self.whole.groupindex
         for line, text in _numbered_lines(path):
-            num_begun = len(self.each.findall(text))
-            begin = self.begin.search(text) if num_begun else None
-            if begin is None:
+            num_begun = len(begun.findall(text))
+            at = first.search(text) if num_begun else None
+            if at is None:
                 continue
-            timestamp_s = 0.0 if has_time else clock.seconds(text[: begin.start()], line)
-            whole = list(self.whole.finditer(text))
-            for phrase in whole:
-                yield from self.ranges(phrase, clock.seconds(phrase["time"], line) if has_time else timestamp_s, line)
-            yield from [LOST] * (num_begun - len(whole))
+            timestamp_s = 0.0 if has_time else clock.seconds(text[: at.start()], line)
+            found = list(phrase.finditer(text))
+            for one in found:
+                yield from ranges(one, clock.seconds(one["time"], line) if has_time else timestamp_s, line)
+            yield from [_LOST] * (num_begun - len(found))
 
-    def read_anchors(self, path: Path) -> tuple[Anchor, ...]:
-        """At the median of what was said of each; those that share a place were never set up: unknown."""
-        positions: dict[str, list[tuple[float, float, float]]] = {}
-        for _, text in _numbered_lines(path) if "x" in self.whole.groupindex else ():
-            for phrase in self.whole.finditer(text):
-                if phrase["z"] is not None:  # a place in the plane does not say how high
-                    position = (float(phrase["x"]), float(phrase["y"]), float(phrase["z"]))
-                    positions.setdefault(phrase["anchor_id"], []).append(position)
-        medians = {anchor_id: np.median(said, axis=0) for anchor_id, said in positions.items()}
-        places = [tuple(median.tolist()) for median in medians.values()]
-        return tuple(
-            Anchor(anchor_id, position_m=median if places.count(tuple(median.tolist())) == 1 else None)
-            for anchor_id, median in medians.items()
-        )
+    def recognizes(head: str) -> bool:
+        return first.search(head) is not None
+
+    return reader_of_readings(name, recognizes, readings, partial(_anchors_said, phrase), sides)
 
 
-def printed_reader(
-    name: str, *, begin: str, each: str, whole: str, ranges: ReadPhrase = _one_range, sides: Sides = Sides.TOLD
-) -> Reader:
-    """The reader of lines with such phrases, given as patterns of ASCII."""
-    compiled = partial(re.compile, flags=re.ASCII | re.MULTILINE)
-    phrases = _Phrases(compiled(begin), compiled(each), compiled(whole), ranges)
-    return reader_of_readings(name, phrases.begins, phrases.readings, phrases.read_anchors, sides)
+def _anchors_said(phrase: re.Pattern[str], path: Path) -> tuple[Anchor, ...]:
+    """At the median of what was said of each; those that share a place were never set up: unknown."""
+    positions: dict[str, list[tuple[float, float, float]]] = {}
+    for _, text in _numbered_lines(path) if "x" in phrase.groupindex else ():
+        for one in phrase.finditer(text):
+            if one["z"] is not None:  # a place in the plane does not say how high
+                positions.setdefault(one["anchor_id"], []).append((float(one["x"]), float(one["y"]), float(one["z"])))
+    medians = {anchor_id: np.median(said, axis=0) for anchor_id, said in positions.items()}
+    places = [tuple(median.tolist()) for median in medians.values()]
+    return tuple(
+        Anchor(anchor_id, position_m=median if places.count(tuple(median.tolist())) == 1 else None)
+        for anchor_id, median in medians.items()
+    )
 
 
 def _numbered_lines(path: Path) -> Iterator[tuple[int, str]]:
     """Every line with its 1-based number; bytes that are no text, as serial lines have them, are replaced."""
     return enumerate(read_text(path, errors="replace").split("\n"), 1)
+
+
+# DWM1001, MDEK1001, LEAPS and PANS PRO: what the shell commands lec, les and their like print; LEAPS and PANS PRO print
+# a quality in percent after each anchor's position. Always two decimals: a number with fewer was cut off.
+_DECIMALS = r"-?\d{1,6}\.\d\d(?![\d.])"
+_XYZ = rf"(?P<x>{_DECIMALS}),(?P<y>{_DECIMALS}),(?P<z>{_DECIMALS})"
+_RANGE = rf"(?P<range>{_DECIMALS})"
+_QUALITY = r"\d{1,3}"
+_ANCHOR = r"(?P<anchor_id>[0-9A-F]{4})"
+_ALONE = r"(?<![0-9A-Za-z])"
+_DWM1001 = (
+    _reader(  # POS,..,MEAS,4,AN0,8EAA,5.14,-2.16,0.00,100,1.41,..
+        "leaps_meas",
+        begin=r"(?:POS,[-\d.,]{0,60})?MEAS,\d{1,2},AN\d",
+        each=r"AN\d{1,2},",
+        whole=rf"AN\d{{1,2}},{_ANCHOR},{_XYZ},{_QUALITY},{_RANGE}",
+    ),
+    _reader(  # 8EAA[5.14,-2.16,0.00,100]=1.41 ..
+        "leaps_lea",
+        begin=rf"(?:POS\[[-\d.,]{{0,60}}\]\s*)?{_ALONE}[0-9A-F]{{4}}\[{_XYZ},{_QUALITY}\]",
+        each=rf"{_ALONE}[0-9A-F]{{4}}\[",
+        whole=rf"{_ALONE}{_ANCHOR}\[{_XYZ},{_QUALITY}\]={_RANGE}",
+    ),
+    _reader(  # DIST,4,AN0,022E,7.94,8.03,0.00,3.44,..
+        "dwm1001_lec",
+        begin=rf"(?:DIST,\d{{1,2}},)?{_ALONE}AN\d{{1,2}},[0-9A-F]{{4}},",
+        each=r"AN\d{1,2},",
+        whole=rf"AN\d{{1,2}},{_ANCHOR},{_XYZ},{_RANGE}",
+    ),
+    _reader(  # 022E[7.94,8.03,0.00]=3.38 ..
+        "dwm1001_les",
+        begin=rf"{_ALONE}[0-9A-F]{{4}}\[-?\d{{1,6}}\.\d\d,",
+        each=rf"{_ALONE}[0-9A-F]{{4}}\[",
+        whole=rf"{_ALONE}{_ANCHOR}\[{_XYZ}\]={_RANGE}",
+    ),
+)
+
+# Inputs of solvers of factor graphs, in which a line's first word says what it holds: libRSF and PyFactorGraph.
+_NUMBER = r"-?\d{1,19}(?:\.\d{0,20})?(?:[eE][-+]?\d{1,3})?"
+_TIME_AND = rf"(?P<time>{_NUMBER}) "
+_RANGE_AND_VARIANCE = rf"(?P<range>{_NUMBER}) (?P<variance>{_NUMBER})"
+# A12 is where the robot A was at its twelfth pose; L3 is a landmark, and has no other name.
+_ROBOT_OR_LANDMARK = r"L\d{1,9}|[A-KM-Za-z](?=\d{1,9} )"
+_FACTOR_GRAPHS = (
+    _reader(  # range2 TIME RANGE VARIANCE X Y ID SNR, or range3
+        "librsf",
+        begin=rf"^range[23] {_NUMBER} ",
+        each=r"^range[23] ",
+        whole=(
+            rf"^range[23] {_TIME_AND}{_RANGE_AND_VARIANCE} (?P<x>{_NUMBER}) (?P<y>{_NUMBER}) "
+            rf"(?:(?P<z>{_NUMBER}) )?(?P<anchor_id>\w{{1,16}}) {_NUMBER}\s*$"
+        ),
+    ),
+    _reader(  # EDGE_RANGE TIME POSE LANDMARK RANGE VARIANCE
+        "pyfg",
+        begin=rf"^(?:EDGE_RANGE|VERTEX_SE2|VERTEX_SE3:QUAT) {_NUMBER} [A-Za-z]",
+        each=r"^EDGE_RANGE ",
+        whole=(
+            rf"^EDGE_RANGE {_TIME_AND}(?P<tag_id>[A-KM-Za-z])\d{{1,9}} (?P<anchor_id>{_ROBOT_OR_LANDMARK})\d{{0,9}} "
+            rf"{_RANGE_AND_VARIANCE}\s*$"
+        ),
+    ),
+)
+
+
+def _mauwb_ranges(record: re.Match[str], timestamp_s: float, line: int) -> Iterator[Reading]:
+    """Of the slots that say that they hold one: by their anchor's id, or by the mask of old firmware."""
+    ranges_cm = list(map(int, record["range"].split(",")))
+    if record["rest"]:
+        anchor_ids = list(map(int, record["anchor_id"].split(","))) if record["anchor_id"] else []
+    else:
+        anchor_ids = [slot if int(record["mask"], 16) >> slot & 1 else -1 for slot in range(len(ranges_cm))]
+    if len(anchor_ids) != len(ranges_cm):  # damaged: whose ranges these are is lost
+        yield from [_LOST] * len(ranges_cm)
+        return
+    for range_cm, anchor_id in zip(ranges_cm, anchor_ids):
+        if anchor_id >= 0:
+            yield Reading(timestamp_s, str(anchor_id), range_cm / 100, line, record["tag_id"])
+
+
+# Qorvo DWM3001CDK and QM33 shell: SESSION_INFO_NTF: {..} over several lines, and the older {"Block":1, "results":[..]}.
+_DEFAULT_RANGING_INTERVAL_S = 0.2
+_QORVO_BEGIN = re.compile(r'SESSION_INFO_NTF:?\s{0,9}\{|\{\s{0,9}"Block"\s{0,9}:', re.ASCII)
+_QORVO_END = re.compile(r"\]\s{0,9}\}")
+_QORVO_COUNTERS = tuple(
+    re.compile(rf"{name}\s{{0,9}}[=:]\s{{0,9}}(\d{{1,18}})(?!\d)", re.ASCII)
+    for name in ("block_index", "sequence_number", '"Block"')
+)
+_QORVO_EACH = re.compile(r'mac_address=|"Addr"')
+_QORVO_MEASUREMENT = re.compile(
+    r'mac_address=(?P<id>0x[0-9A-Fa-f]{1,16}), status="SUCCESS", distance\[cm\]=(?P<cm>-?\d{1,9})(?=[],])'
+    r'|"Addr"\s*:\s*"(?P<json_id>(?:0x)?[0-9A-Fa-f]{1,16})"\s*,\s*"Status"\s*:\s*"(?:Ok|SUCCESS)"\s*,'
+    r'\s*"D_cm"\s*:\s*(?P<json_cm>-?\d{1,9})(?=[,}])',
+    re.ASCII,
+)
+
+
+def _qorvo_readings(path: Path, options: ReadOptions) -> Iterator[Reading]:
+    """At the host's time before a record; in a log without any, by the radio's count of ranging intervals."""
+    text, clock = read_text(path, errors="replace"), HostClock(path, options)
+    interval_s = options.ranging_interval_s or _DEFAULT_RANGING_INTERVAL_S
+    has_host_time, count = None, -1
+    begins = list(_QORVO_BEGIN.finditer(text))
+    line_starts = [0, *(end.end() for end in re.finditer("\n", text))]
+    for begin, stop in zip(begins, [*(begin.start() for begin in begins[1:]), len(text)]):
+        end = _QORVO_END.search(text, begin.end(), stop)
+        body = text[begin.start() : stop if end is None else end.end()]
+        line = bisect_right(line_starts, begin.start())
+        prefix = text[line_starts[line - 1] : begin.start()]
+        if has_host_time is None:
+            has_host_time = clock.find_seconds(prefix) is not None
+        if has_host_time:
+            timestamp_s = clock.seconds(prefix, line)
+        else:
+            count = _qorvo_count(body, count, path, line)
+            timestamp_s = count * interval_s
+        measurements = list(_QORVO_MEASUREMENT.finditer(body))
+        for found in measurements:
+            anchor_id, range_cm = found["id"] or found["json_id"], found["cm"] or found["json_cm"]
+            yield Reading(timestamp_s, anchor_id, int(range_cm) / 100, line)
+        yield from [_LOST] * (len(_QORVO_EACH.findall(body)) - len(measurements))
+
+
+def _qorvo_count(body: str, last: int, path: Path, line: int) -> int:
+    found = next(filter(None, (counter.search(body) for counter in _QORVO_COUNTERS)), None)
+    if found is None:
+        raise InputError("neither a time before the record nor a block_index in it, expected one", path, line)
+    count = int(found[1])
+    if count < last:
+        raise InputError(
+            f"the radio's count goes back from {last} to {count}: it was restarted; split the log "
+            "there, or record it with the host's time before each record",
+            path,
+            line,
+        )
+    return count
+
+
+PRINTED = (
+    *_FACTOR_GRAPHS,
+    *_DWM1001,
+    reader_of_readings("qorvo", lambda head: _QORVO_BEGIN.search(head) is not None, _qorvo_readings),
+    _reader(  # DW3000 with AT commands: AT+RANGE=tid:0,mask:03,seq:182,range:(232,401,..),ancid:(0,1,..)
+        "mauwb",
+        begin=r"AT\+RANGE=tid:",
+        each=r"AT\+RANGE=tid:",
+        whole=(
+            r"AT\+RANGE=tid:(?P<tag_id>\d{1,9}),mask:(?P<mask>[0-9A-Fa-f]{1,16}),seq:\d{1,9},"
+            r"range:\((?P<range>-?\d{1,9}(?:,-?\d{1,9}){0,63})\)(?:,rssi:\([^()]{0,999}\))?"
+            r"(?P<rest>,ancid:(?:\((?P<anchor_id>-?\d{1,9}(?:,-?\d{1,9}){0,63})\))?)?"
+        ),
+        ranges=_mauwb_ranges,
+        sides=Sides.APART,
+    ),
+    _reader(  # Arduino sketches for the DW1000, as Makerfabs ships them: from: D325 Range: 29.40 m ..
+        "arduino",
+        begin=r"from:\s{0,9}[0-9A-Fa-f]{1,16}\s{1,9}Range:",
+        each=r"from:",
+        whole=r"from:\s{0,9}(?P<anchor_id>[0-9A-Fa-f]{1,16})\s{1,9}Range:\s{0,9}(?P<range>-?\d{1,6}\.\d{1,4}) ?m\b",
+    ),
+    _reader(  # {"links":[{"A":"1782","R":"1.2"},..]}
+        "makerfabs_json",
+        begin=r'\{\s*"links"\s*:\s*\[\s*\{\s*"A"',
+        each=r'"A"',
+        whole=(
+            r'"A"\s*:\s*"(?P<anchor_id>[0-9A-Fa-f]{1,16})"\s*,\s*"R"\s*:\s*"?(?P<range>-?\d{1,6}(?:\.\d{1,4})?)"?\s*\}'
+        ),
+    ),
+)

@@ -3,50 +3,33 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rangesfm.errors import InputError
-from rangesfm.files.bags import SQLITE_HEAD, open_bag, type_name
-from rangesfm.ranging.readers.reader import Reading, ReadOptions, reader_of_readings
-from rangesfm.ranging.readers.roles import Sides
-
-if TYPE_CHECKING:
-    from rosbags.highlevel import AnyReader
+from rangesfm.files.bags import SQLITE_HEAD, messages_of, open_bag, stamp_s, type_name
+from rangesfm.ranging.readers.reader import Reading, ReadOptions, Sides, reader_of_readings
 
 _BEGINS = ("#ROSBAG V", SQLITE_HEAD)
 _MCAP = "MCAP0"
 _LED_NO_LINE_OF_SIGHT = 16
 
 
-def _recognizes(head: str) -> bool:
-    return head.startswith(_BEGINS) or head[1:6] == _MCAP
-
-
 def _readings(path: Path, options: ReadOptions) -> Iterator[Reading]:
-    with open_bag(path) as bag:
-        yield from _in_bag(bag, path)
-
-
-def _in_bag(bag: AnyReader, path: Path) -> Iterator[Reading]:
     """The ranges in all messages that hold any, each with the 1-based number of its message as its line."""
-    connections = [connection for connection in bag.connections if type_name(connection.msgtype) in _RANGES_IN]
-    if not connections:
-        found = ", ".join(sorted({connection.msgtype for connection in bag.connections})) or "no messages"
-        raise InputError(f"no ranges in this bag; it has {found}, expected one of {', '.join(_RANGES_IN)}", path)
-    for number, (connection, received_ns, data) in enumerate(bag.messages(connections), 1):
-        message = bag.deserialize(data, connection.msgtype)
-        try:
-            readings = list(_RANGES_IN[type_name(connection.msgtype)](message))
-        except AttributeError as error:
-            raise InputError(f"a {connection.msgtype} has another definition than expected ({error})", path) from None
-        for reading in readings:
-            yield reading._replace(timestamp_s=reading.timestamp_s or received_ns * 1e-9, line=number)
-
-
-def _range_stamped(message: Any) -> Iterator[Reading]:
-    yield _stamped(message, message.to_id, message.range, message.from_id, _root(message.covariance))
+    with open_bag(path) as bag:
+        connections = [connection for connection in bag.connections if type_name(connection.msgtype) in _RANGES_IN]
+        if not connections:
+            found = ", ".join(sorted({connection.msgtype for connection in bag.connections})) or "no messages"
+            raise InputError(f"no ranges in this bag; it has {found}, expected one of {', '.join(_RANGES_IN)}", path)
+        for number, (kind, message, received_s) in enumerate(messages_of(bag, connections), 1):
+            try:
+                readings = list(_RANGES_IN[type_name(kind)](message))
+            except AttributeError as error:
+                raise InputError(f"a {kind} has another definition than expected ({error})", path) from None
+            for reading in readings:
+                yield reading._replace(timestamp_s=reading.timestamp_s or received_s, line=number)
 
 
 def _two_way_range_stamped(message: Any) -> Iterator[Reading]:
@@ -74,8 +57,8 @@ def _linktrack_tagframe(message: Any) -> Iterator[Reading]:
 
 
 # By the last part of the type's name: any package may define it. A time of 0 is none, that of receiving counts.
-_RANGES_IN: dict[str, Callable[[Any], Iterator[Reading]]] = {
-    "RangeStamped": _range_stamped,
+_RANGES_IN: dict[str, Callable[[Any], Iterable[Reading]]] = {
+    "RangeStamped": lambda each: [_stamped(each, each.to_id, each.range, each.from_id, _root(each.covariance))],
     "TwoWayRangeStamped": _two_way_range_stamped,
     "UwbRange": _uwb_range,
     "LinktrackNodeframe2": _linktrack_nodeframe,
@@ -85,10 +68,7 @@ _RANGES_IN: dict[str, Callable[[Any], Iterator[Reading]]] = {
 
 
 def _stamped(message: Any, anchor_id: Any, range_m: Any, tag_id: Any, stddev_m: Any, los: int = -1) -> Reading:
-    """At the time of the header, 0 if nobody set it."""
-    stamp = message.header.stamp
-    time_s = float(stamp.sec + stamp.nanosec * 1e-9)
-    return Reading(time_s, str(anchor_id), float(range_m), 0, str(tag_id), float(stddev_m), los)
+    return Reading(stamp_s(message), str(anchor_id), float(range_m), 0, str(tag_id), float(stddev_m), los)
 
 
 def _root(variance: float) -> float:
@@ -99,4 +79,6 @@ def _character(value: int | str) -> str:
     return value if isinstance(value, str) else chr(value)
 
 
-READER = reader_of_readings("ros", _recognizes, _readings, sides=Sides.ASKED)
+READER = reader_of_readings(
+    "ros", lambda head: head.startswith(_BEGINS) or head[1:6] == _MCAP, _readings, sides=Sides.ASKED
+)

@@ -1,4 +1,8 @@
-"""Any table: by the columns that the user names, by those of a known data set, or by what its names and values say."""
+"""Any table: by the columns that the user names, by those of a known data set, or by what its names and values say.
+
+The canonical CSV is ``timestamp_s,anchor_id,range_m[,tag_id,range_stddev_m,los]``. ``image_name`` may take the place of
+``timestamp_s``; where both stand, the time counts.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +12,22 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from rangesfm.errors import InputError, printable
-from rangesfm.files.tables import header_names, read_head
-from rangesfm.ranging.log import RangeLog
+from rangesfm.files.tables import header_names, read_head, write_user_table
+from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.columns import QUANTITIES, STAMPS, Columns, read_columns
 from rangesfm.ranging.readers.guess import Guess, described, guess_columns
 from rangesfm.ranging.readers.layout import Layout, find_layout, layout_without_header
-from rangesfm.ranging.readers.reader import Reader, ReadOptions
-from rangesfm.ranging.readers.roles import Sides
-from rangesfm.ranging.readers.several import anchor_of_file
+from rangesfm.ranging.readers.reader import Reader, ReadOptions, Sides
 
+_BY_TIME = Columns(
+    required={"timestamp": "timestamp_s", "anchor_id": "anchor_id", "range": "range_m"},
+    optional={"tag_id": "tag_id", "range_stddev": "range_stddev_m", "los": "los"},
+    is_strict=True,
+)
+_BY_IMAGE = replace(_BY_TIME, required={"image_name": "image_name", "anchor_id": "anchor_id", "range": "range_m"})
 _PRESETS = {
     "starloc": {"timestamp": "time_s", "range": "range", "tag_id": "from_id", "anchor_id": "to_id"},
     "miluv": {"timestamp": "timestamp", "range": "range", "tag_id": "from_id", "anchor_id": "to_id"},
@@ -28,6 +38,7 @@ _INROLS_COLUMNS = ("index", "timestamp", "anchor_id", "r")
 _INROLS_COMMENT = re.compile(
     r"\s{0,99}#[ \t]{0,9}index[ \t]{1,9}timestamp[ \t]{1,9}anchor_id[ \t]{1,9}r[ \t]{0,9}(?:\n|$)"
 )
+_ID_IN_NAME = re.compile(r"(?:.*[^0-9A-Za-z])?([A-Za-z]{0,2}\d{1,3}|(?=[A-F]*\d)[0-9A-F]{4})", re.ASCII)
 _SPAN = re.compile(r"(\D*)(\d{1,4})-(\D*)(\d{1,4})", re.ASCII)
 _POSITIONS_ONLY = (
     "holds positions that the radio computed and not the ranges they came from; "
@@ -46,30 +57,37 @@ _NO_RANGES = (
 )
 
 
+def _anchor_of_file(path: Path) -> str:
+    """The anchor that the name of a file stands for: A5 of ``run_3_A5.csv``, else all of the name before its ending."""
+    stem = path.name.split(".")[0]
+    found = _ID_IN_NAME.fullmatch(stem)
+    return found[1] if found else stem
+
+
 def table_reader(path: Path, options: ReadOptions) -> Reader:
-    """The reader of one table that nobody described, if it can be understood.
+    """The reader of one table that nobody described.
 
     Raises:
-        InputError: it cannot, or not for sure; with what was found, the closest guess and what to type.
+        InputError: it is not understood for sure; with what was found, the closest guess and what to type.
     """
     layout = find_layout(path, options.separator)
     guess = None if layout is None else guess_columns(layout)
     if layout is None or guess is None or guess.missing or guess.doubts:
         raise _question(path, options, layout, guess)
     notes = tuple(_notes(path, layout, guess))
-    columns = Columns({**guess.columns}, {}, guess.wide, anchor_of_file(path), layout, notes=notes)
-    read = partial(read_columns, columns=columns, format=TABLE.name)
-    return replace(TABLE, read=lambda path, options: read(path, options=options), sides=guess.sides)
+    columns = Columns({**guess.columns}, {}, guess.wide, _anchor_of_file(path), layout, notes=notes)
+    return replace(
+        TABLE, read=lambda path, options: read_columns(path, columns, options, TABLE.name), sides=guess.sides
+    )
 
 
 def _notes(path: Path, layout: Layout, guess: Guess) -> Iterable[str]:
     said = ", ".join(f"{quantity} = {name}" for quantity, name in guess.columns.items())
-    yield f"columns taken: {said}" + (
-        "" if layout.has_names else " (by their numbers and values: the table has no names)"
-    )
+    by_values = "" if layout.has_names else " (by their numbers and values: the table has no names)"
+    yield f"columns taken: {said}{by_values}"
     yield from guess.notes
     if "anchor_id" not in guess.columns and not guess.wide:
-        yield f"no column says which anchor it was: it is called '{anchor_of_file(path)}', as the file"
+        yield f"no column says which anchor it was: it is called '{_anchor_of_file(path)}', as the file"
 
 
 def _question(path: Path, options: ReadOptions, layout: Layout | None, guess: Guess | None) -> InputError:
@@ -116,18 +134,18 @@ def _read(path: Path, options: ReadOptions, *, format: str) -> RangeLog:
     layout = find_layout(path, options.separator) if format == MAPPED.name else None
     if format == "inrol":
         layout = layout_without_header(path, _INROLS_COLUMNS, " ")
-    elif layout is not None and not {*columns.values(), *wide} <= {*layout.header}:
+    elif layout is not None and not {*columns.values(), *wide} <= layout.units.keys():
         layout = None
     third_message = {}
     if "range" not in columns and not wide:
-        names = layout.header if layout else header_names(read_head(path), options.separator)
+        names = [*layout.units] if layout else header_names(read_head(path), options.separator)
         stamps = {stamp: columns.get(stamp, stamp) for stamp in STAMPS}
         if not {*(stamps[stamp] for stamp in STAMPS[:4])} <= set(names):
             wanted, found = ", ".join(STAMPS[:4]), printable(", ".join(names))
             raise InputError(f"columns name no column range, nor the time stamps {wanted}; found {found}", path)
         columns = {**{stamp: stamps[stamp] for stamp in STAMPS[:4]}, **columns}
         third_message = {stamp: stamps[stamp] for stamp in STAMPS[4:]}
-    return read_columns(path, Columns(columns, third_message, wide, anchor_of_file(path), layout), options, format)
+    return read_columns(path, Columns(columns, third_message, wide, _anchor_of_file(path), layout), options, format)
 
 
 def _wide(told: Mapping[str, str], path: Path) -> dict[str, tuple[str, str]]:
@@ -153,6 +171,41 @@ def _spanned(text: str) -> list[str]:
     return [f"{span[1]}{number}" for number in range(int(span[2]), int(span[4]) + 1)]
 
 
+def write_ranges_csv(log: RangeLog, path: str | Path) -> None:
+    """Write ``log`` as canonical CSV, optional columns only where the log says anything; or InputError.
+
+    Of a range between two of a kind, the peer stands in the column of the tag (or of the anchor).
+    """
+    columns: dict[str, Iterable[str]] = {}
+    if log.timestamp_s is not None:
+        columns["timestamp_s"] = map(repr, log.timestamp_s.tolist())
+    else:
+        columns["image_name"] = log.image_name or ()
+    tag_id, columns["anchor_id"] = log.end_ids()
+    columns["range_m"] = map(repr, log.range_m.tolist())
+    if set(tag_id) != {DEFAULT_TAG_ID}:
+        columns["tag_id"] = tag_id
+    if not np.all(np.isnan(log.range_stddev_m)):
+        columns["range_stddev_m"] = ("" if np.isnan(stddev) else repr(stddev) for stddev in log.range_stddev_m.tolist())
+    if np.any(log.los >= 0):
+        columns["los"] = ("" if los < 0 else str(los) for los in log.los)
+    write_user_table(Path(path), [*columns], zip(*columns.values()))
+
+
+def _recognizes_canonical(head: str) -> bool:
+    names = {*header_names(head)}
+    return {"anchor_id", "range_m"} <= names and not names.isdisjoint({"timestamp_s", "image_name"})
+
+
+def _read_canonical(path: Path, options: ReadOptions) -> RangeLog:
+    if options.columns or options.timestamp_unit not in (None, "s") or options.range_unit not in (None, "m"):
+        raise InputError("the canonical CSV has fixed columns in seconds and metres; use format 'mapped'", path)
+    names = header_names(read_head(path), options.separator)
+    columns = _BY_IMAGE if "image_name" in names and "timestamp_s" not in names else _BY_TIME
+    return read_columns(path, columns, options.changed(timestamp_unit=None, range_unit=None), CANONICAL.name)
+
+
+CANONICAL = Reader("canonical", _recognizes_canonical, _read_canonical)
 PRESETS = tuple(
     Reader(
         name,

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.errors import InputError
 from rangesfm.ranging.readers.times import SECONDS_PER_UNIT, unit_by_digits
 from rangesfm.ranging.readers.vocabulary import LENGTHS, TIMES, words_of
 
@@ -25,37 +28,36 @@ _NEAR_M, _NEAR_WITH_DECIMALS_M = 0.6, 2.0
 _MAX_SHARE_OF_JUMPS = 0.25
 
 
-class UnclearUnitError(Exception):
-    """Values that may be in several units: ``units``."""
-
-    def __init__(self, units: list[str], why: str):
-        super().__init__(why)
-        self.units = units
+Ask = Callable[[Sequence[str], str], InputError]
+"""Makes the question which of several units it is, and why it may be any of them."""
 
 
-def time_unit(name: str, times: Array) -> tuple[str, str | None]:
-    """The unit of a column of numbers, and what to say of it where the name does not; or UnclearUnitError."""
+def time_unit(name: str, times: Array, notes: list[str], ask: Ask) -> str:
+    """The unit of a column of numbers, with a note where the name does not say it; asks where it may be several."""
     named, distinct = _named(name, TIMES), np.unique(times)
     by_digits = unit_by_digits(float(np.median(times))) if len(times) else None
     step = float(np.median(np.diff(distinct))) if len(distinct) > 1 else 0.0
     is_so = by_digits is not None and step * SECONDS_PER_UNIT[by_digits] <= _SLOWEST_S
     # A name may well say a finer unit, of a clock that began later than 1970.
     if by_digits is not None and (is_so if named is None else SECONDS_PER_UNIT[named] > SECONDS_PER_UNIT[by_digits]):
-        return by_digits, f"{name} has as many digits as {by_digits} since 1970: taken as {by_digits}"
+        notes.append(f"{name} has as many digits as {by_digits} since 1970: taken as {by_digits}")
+        return by_digits
     if named is not None or len(distinct) < _MIN_NUM:
-        return named or "s", None
+        return named or "s"
     mean_step = float(distinct[-1] - distinct[0]) / len(times)
     if mean_step < _FASTEST_ON_AVERAGE_S:
         slow = [unit for unit in ("min", "h", "d") if mean_step * SECONDS_PER_UNIT[unit] <= _SLOWEST_S]
         if not days_before_1970(distinct):
-            raise UnclearUnitError(slow, f"steps of {mean_step:.2g} between its numbers")
-        return "d", f"{name} looks like days (steps of {mean_step:.2g}): taken as such"
+            raise ask(slow, f"steps of {mean_step:.2g} between its numbers")
+        notes.append(f"{name} looks like days (steps of {mean_step:.2g}): taken as such")
+        return "d"
     can_be = [unit for unit, least in _FASTEST_S.items() if least <= step * SECONDS_PER_UNIT[unit] <= _SLOWEST_S]
     if can_be == ["s"] or _SECONDS_SINCE_1970[0] <= distinct[0] < _SECONDS_SINCE_1970[1]:
-        return "s", None
+        return "s"
     if len(can_be) != 1:
-        raise UnclearUnitError(can_be or [*_FASTEST_S], f"steps of {step:g} between its numbers")
-    return can_be[0], f"{name} looks like {can_be[0]} (steps of {step:g}): taken as such"
+        raise ask(can_be or [*_FASTEST_S], f"steps of {step:g} between its numbers")
+    notes.append(f"{name} looks like {can_be[0]} (steps of {step:g}): taken as such")
+    return can_be[0]
 
 
 def days_before_1970(days: Array) -> float:
@@ -64,11 +66,11 @@ def days_before_1970(days: Array) -> float:
     return next((first for (low, high), first in _DAYS_OF_1970.items() if low < middle < high), 0.0)
 
 
-def range_unit(name: str, ranges: Array, times: Array | None, pair: Indices) -> tuple[str, str | None]:
+def range_unit(name: str, ranges: Array, times: Array | None, pair: Indices, notes: list[str], ask: Ask) -> str:
     """As ``time_unit``, of positive ranges between some pairs of nodes; ``times`` in seconds."""
     named = _named(name, LENGTHS)
     if named is not None or len(ranges) < _MIN_NUM:
-        return named or "m", None
+        return named or "m"
     most, are_whole = float(np.percentile(ranges, 95)), bool(np.all(ranges == np.round(ranges)))
     can_be = [
         unit
@@ -79,11 +81,12 @@ def range_unit(name: str, ranges: Array, times: Array | None, pair: Indices) -> 
         and _share_of_jumps(ranges / per_metre, times, pair, _NOISE_M[unit]) <= _MAX_SHARE_OF_JUMPS
     ]
     if can_be == ["m"]:
-        return "m", None
+        return "m"
     kind = f"{'whole' if are_whole else 'decimal'} numbers, most of them up to {most:g}"
     if len(can_be) != 1:
-        raise UnclearUnitError(can_be or [*_LARGEST_M], kind)
-    return can_be[0], f"{name} looks like {can_be[0]} ({kind}): taken as such"
+        raise ask(can_be or [*_LARGEST_M], kind)
+    notes.append(f"{name} looks like {can_be[0]} ({kind}): taken as such")
+    return can_be[0]
 
 
 def _share_of_jumps(ranges_m: Array, times: Array | None, pair: Indices, noise_m: float) -> float:
