@@ -15,6 +15,7 @@ from rangesfm.arrays import Array
 from rangesfm.ceres.linear_solver import dense_is_faster, max_num_images_direct, overlaps_in
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import SolverError
+from rangesfm.geometry.trajectory import pose_of
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.errors.noise import robust_stddev
 from rangesfm.refine.stillness import Stillness, farthest, keyframe_centers
@@ -170,7 +171,8 @@ def solve_until_still(
 ) -> tuple[list[Solution], bool]:
     """Solve again from where the solver stopped, with its trust region opened, until keyframes stay where they are.
 
-    A solver whose steps have become small says that it has converged; whether it has, a free step tells.
+    A solver whose steps have become small says that it has converged; whether it has, a free step tells. What often
+    keeps steps small is an unknown anchor far from where the ranges want it: it is put there first, the map held.
 
     Args:
         before: the solution so far. num_left: iterations after which to give up.
@@ -182,6 +184,7 @@ def solve_until_still(
     is_over = is_still = before.is_still
     centers = keyframe_centers(problem.metric)
     while not is_over and num_left > 0:
+        _settle_radio(problem)
         solutions.append(found := solve(problem, tolerance_m))
         num_left -= max(found.num_iterations, 1)
         last, centers = centers, keyframe_centers(problem.metric)
@@ -189,6 +192,23 @@ def solve_until_still(
         is_over = found.is_still or is_at_rest
         is_still = is_over and (found.is_still or not found.is_stuck)
     return solutions, is_still
+
+
+def _settle_radio(problem: BundleAdjustment) -> None:
+    """Solve for what is estimated beside the map alone."""
+    metric, ceres_problem = problem.metric, problem.adjuster.problem
+    blocks = [pose_of(metric.frame(frame_id)).params for frame_id in metric.reg_frame_ids()]
+    blocks += [pose.params for rig in metric.rigs.values() for pose in rig.non_ref_sensors.values() if pose is not None]
+    blocks += [camera.params for camera in metric.cameras.values()]
+    blocks += [point.xyz for point in metric.points3D.values()]
+    held = [
+        b for b in blocks if ceres_problem.has_parameter_block(b) and not ceres_problem.is_parameter_block_constant(b)
+    ]
+    for block in held:
+        ceres_problem.set_parameter_block_constant(block)
+    ceres.solve(problem.adjuster, lambda _: False)
+    for block in held:
+        ceres_problem.set_parameter_block_variable(block)
 
 
 def _bundle_adjuster(
@@ -208,8 +228,6 @@ def _bundle_adjuster(
     # Steps are compared with all parameters, of which points on the horizon may be millions of metres.
     solver.gradient_tolerance = solver.parameter_tolerance = 0.0
     solver.max_num_iterations = max_num_iterations
-    # A turn of the whole world is no straight line to its points: left where a step takes them, they refuse it.
-    solver.use_inner_iterations = True
     solver.num_threads = num_threads
     ba.ceres.solver_options = solver
     ba.ceres.min_num_residuals_for_cpu_multi_threading = _MIN_NUM_RESIDUALS_FOR_THREADS

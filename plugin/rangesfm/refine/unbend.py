@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 from scipy.spatial.transform import Rotation
 
@@ -26,7 +25,12 @@ from rangesfm.refine.keyframe_graph import (
     solve_graph,
 )
 from rangesfm.refine.problem import RefinementProblem
-from rangesfm.refine.vision_information import Observations, Poses, model_poses, vision_information
+from rangesfm.refine.vision_information import (
+    Observations,
+    Poses,
+    model_poses,
+    vision_information,
+)
 
 _MAX_NUM_ROUNDS = 12
 # Relative; the noise itself is not known better from some hundred ranges.
@@ -56,47 +60,81 @@ class Unbent:
     num_steps: int
 
 
-def unbend(
-    problem: RefinementProblem, rays: Observations, misplaced: npt.NDArray[np.bool_], errors: RangeErrors
-) -> Unbent:
-    """Solve the keyframe graph and move the model after it, in place: as a whole, to which the photos are indifferent,
-    or, where it bends, keyframe by keyframe.
+def unbend(problem: RefinementProblem, rays: Observations, errors: RangeErrors) -> Unbent:
+    """Solve the keyframe graph and move the model after it, in place.
 
     The errors are estimated anew with every solution. While drift is large, so are residuals and with them the
     stddevs: the robust loss, which counts in stddevs, tightens as the map straightens and takes no drift for an
     outlier. From there a bounded loss, which is that of the scale and of the full problem, sets aside what is one.
 
     Args:
-        rays: all that the photos see, in the problem's frames. misplaced: the points that hold nothing together.
-        errors: of the ranges that take part.
+        rays: all that the photos see. errors: of the ranges that take part.
     """
-    metric, frame_ids, ranges = problem.metric, problem.frame_ids, problem.ranges
-    if not len(ranges.rows):  # a few lengths bend no map
+    if not len(problem.ranges.rows):  # a few lengths bend no map
         return Unbent(errors, 0.0, problem.anchors, 0.0, 0)
-    before = model_poses(metric, frame_ids)
-    graph = KeyframeGraph(
-        vision=vision_information(rays.of_points(~misplaced), before),
-        antennas=ranges.antennas.subset(ranges.rows),
-        range_m=ranges.observations.log.range_m[ranges.rows],
-        errors=errors,
-        anchors=problem.anchors,
-        held_frame=0 if problem.first_pose_is_fixed else None,
-        gravity=problem.gravity,
-    )
-    fit = _solve_with_own_errors(graph)
-    after = fit.state.poses
-    whole = _as_a_whole(before, after, graph.held_frame)
-    if rmse(after.centers - whole.apply(before.centers)) > _MIN_BEND * float(np.median(fit.errors.stddev_m)):
-        carry_model(metric, frame_ids, rays, before, after, local_scales(graph.vision, after))
-    else:
-        _move(metric, whole, None if graph.held_frame is None else int(frame_ids[graph.held_frame]))
+    bound = _Bound.of(problem, rays, errors, problem.anchors)
+    fit = _solve_with_own_errors(bound.graph)
+    bound.move(problem, fit.state, fit.errors)
     return Unbent(
         errors=fit.errors,
         num_absorbed=fit.num_absorbed,
         anchors=moved_anchors(problem.anchors, fit.state),
-        bend_m=_bend(before.centers, after.centers),
+        bend_m=_bend(bound.graph.vision.origin.centers, fit.state.poses.centers),
         num_steps=fit.num_steps,
     )
+
+
+def unbend_again(
+    problem: RefinementProblem, rays: Observations, errors: RangeErrors, anchors: tuple[AnchorEstimate, ...]
+) -> tuple[AnchorEstimate, ...]:
+    """Likewise, with errors that are known by now, and from where the model and these anchors are; the moved anchors.
+
+    Where the errors change, the whole map turns by a little: nothing here, and tens of refused steps in the full
+    problem, whose points follow a turn along straight lines.
+    """
+    bound = _Bound.of(problem, rays, errors, anchors)
+    state = solve_graph(bound.graph, bound.graph.start(), tolerance_m=_tolerance_m(errors)).state
+    bound.move(problem, state, errors)
+    return moved_anchors(anchors, state)
+
+
+@dataclass(frozen=True)
+class _Bound:
+    """The keyframe graph of a model, and all that the photos see in it, by which it moves."""
+
+    rays: Observations
+    graph: KeyframeGraph
+
+    @classmethod
+    def of(
+        cls,
+        problem: RefinementProblem,
+        rays: Observations,
+        errors: RangeErrors,
+        anchors: tuple[AnchorEstimate, ...],
+    ) -> _Bound:
+        ranges = problem.ranges
+        takes_part = ~np.isin(rays.point_ids, list(problem.left_out_ids))
+        graph = KeyframeGraph(
+            vision=vision_information(rays.of_points(takes_part), model_poses(problem.metric, problem.frame_ids)),
+            antennas=ranges.antennas.subset(ranges.rows),
+            range_m=ranges.observations.log.range_m[ranges.rows],
+            errors=errors,
+            anchors=anchors,
+            held_frame=0 if problem.first_pose_is_fixed else None,
+            gravity=problem.gravity,
+        )
+        return cls(rays, graph)
+
+    def move(self, problem: RefinementProblem, state: GraphState, errors: RangeErrors) -> None:
+        """As a whole, to which the photos are indifferent, or, where it bends, keyframe by keyframe."""
+        before, after, held = self.graph.vision.origin, state.poses, self.graph.held_frame
+        whole = _as_a_whole(before, after, held)
+        if rmse(after.centers - whole.apply(before.centers)) > _MIN_BEND * float(np.median(errors.stddev_m)):
+            scales = local_scales(self.graph.vision, after)
+            carry_model(problem.metric, problem.frame_ids, self.rays, before, after, scales)
+        else:
+            _move(problem.metric, whole, None if held is None else int(problem.frame_ids[held]))
 
 
 def _as_a_whole(before: Poses, after: Poses, held_frame: int | None) -> Similarity:
@@ -149,8 +187,8 @@ def _alternate(graph: KeyframeGraph, errors: RangeErrors, start: GraphState) -> 
 
     def fit(errors: RangeErrors, before: GraphSolution | None) -> GraphSolution:
         nonlocal num_steps
-        state, tolerance_m = start if before is None else before.state, _TOLERANCE * float(errors.stddev_m.min())
-        solution = solve_graph(replace(graph, errors=errors), state, tolerance_m=tolerance_m)
+        state = start if before is None else before.state
+        solution = solve_graph(replace(graph, errors=errors), state, tolerance_m=_tolerance_m(errors))
         num_steps += solution.num_steps
         return solution
 
@@ -162,6 +200,10 @@ def _alternate(graph: KeyframeGraph, errors: RangeErrors, start: GraphState) -> 
         is_last=lambda used, shown, _: used.change(shown) < SAME_ERRORS,
     )
     return _Fit(solution.state, seen, solution.num_absorbed, num_steps)
+
+
+def _tolerance_m(errors: RangeErrors) -> float:
+    return _TOLERANCE * float(errors.stddev_m.min())
 
 
 def _move(metric: pycolmap.Reconstruction, whole: Similarity, held_frame_id: int | None) -> None:

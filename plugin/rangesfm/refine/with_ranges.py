@@ -30,7 +30,7 @@ from rangesfm.refine.bundle_adjustment import BundleAdjustment, Solution, solve,
 from rangesfm.refine.distances import MeasuredDistances, add_marker_points, remove_marker_points
 from rangesfm.refine.problem import AddedBlocks, RefinementProblem
 from rangesfm.refine.radio import RadioEstimate, RadioRanges
-from rangesfm.refine.unbend import SAME_ERRORS, Unbent, unbend
+from rangesfm.refine.unbend import SAME_ERRORS, Unbent, unbend, unbend_again
 from rangesfm.refine.vision_information import misplaced_points, model_observations, model_poses
 
 # Solutions of the full problem, with the weights of ranges and pixels estimated anew in between.
@@ -192,8 +192,7 @@ def _refine(problem: RefinementProblem, errors: RangeErrors) -> RefineSummary:
     misplaced = misplaced_points(rays, model_poses(problem.metric, frame_ids))
     problem = replace(problem, left_out_ids=frozenset(rays.point_ids[misplaced].tolist()))
     bundle = problem.of_photos(problem.options.max_num_iterations)
-    start = unbend(problem, rays.with_pixel_stddev(bundle.pixel_stddev), misplaced, errors)
-    return _adjust(problem, bundle, start)
+    return _adjust(problem, bundle, unbend(problem, rays.with_pixel_stddev(bundle.pixel_stddev), errors))
 
 
 @dataclass(frozen=True)
@@ -214,6 +213,9 @@ def _adjust(problem: RefinementProblem, bundle: BundleAdjustment, start: Unbent)
         if before is None:
             before = _Round(RadioEstimate(start.anchors, problem.tags_in_cam_m), (), problem.options.max_num_iterations)
         else:
+            rays = model_observations(problem.metric, problem.frame_ids).with_pixel_stddev(bundle.pixel_stddev)
+            anchors = unbend_again(problem, rays, errors, before.radio.anchors)
+            before = replace(before, radio=replace(before.radio, anchors=anchors))
             bundle = problem.of_photos(before.num_left)
         added = problem.add_to(bundle, errors, before.radio)
         solution = solve(bundle, _tolerance_m(problem, errors))
