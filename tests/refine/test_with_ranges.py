@@ -37,7 +37,11 @@ from rangesfm.ranging.errors.noise import shared_stddev
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
+from rangesfm.refine import with_ranges
+from rangesfm.refine.problem import RefinementProblem
 from rangesfm.refine.radio import predicted_ranges
+from rangesfm.refine.unbend import Unbent, unbend_again
+from rangesfm.refine.vision_information import Observations
 from rangesfm.refine.with_ranges import RefineSummary, refine_with_ranges
 from rangesfm.scale.initialize import initialize_scale
 
@@ -151,6 +155,10 @@ def make_survey(
         from_world.apply(model.centers_m),
         {name: from_world.apply(np.array(position)) for name, position in anchors_m.items()},
     )
+
+
+def unbend_with_known_errors(problem: RefinementProblem, rays: Observations, errors: RangeErrors) -> Unbent:
+    return Unbent(errors, 0.0, unbend_again(problem, rays, errors, problem.anchors), 0.0, 0)
 
 
 def adjust_by_colmap(sfm: pycolmap.Reconstruction) -> None:
@@ -618,7 +626,13 @@ class TestWithNoise:
         assert moved["weighed"] < 0.003
         assert moved["alike"] > 0.01
 
-    def test_a_map_that_stands_a_little_askew_is_turned_at_once(self) -> None:
+    @pytest.mark.parametrize("errors_are_known", [False, True])
+    def test_a_map_that_stands_a_little_askew_is_turned_at_once(
+        self, errors_are_known: bool, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """As it does when its ranges are weighed anew, too."""
+        if errors_are_known:
+            monkeypatch.setattr(with_ranges, "unbend", unbend_with_known_errors)
         stddev_m = 0.3
         survey = make_survey(pixel_stddev=0.5, radio=Radio(range_stddev_m=stddev_m), num_epochs=4)
         turn = Rotation.from_rotvec(np.deg2rad([0.5, -0.3, 0.4])).as_matrix()
