@@ -626,14 +626,13 @@ class TestWithNoise:
         assert moved["weighed"] < 0.003
         assert moved["alike"] > 0.01
 
-    @pytest.mark.parametrize("errors_are_known", [False, True])
+    @pytest.mark.parametrize(("stddev_m", "errors_are_known"), [(0.3, False), (0.15, True)])
     def test_a_map_that_stands_a_little_askew_is_turned_at_once(
-        self, errors_are_known: bool, monkeypatch: pytest.MonkeyPatch
+        self, stddev_m: float, errors_are_known: bool, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        """As it does when its ranges are weighed anew, too."""
+        """Also after its ranges were weighed anew."""
         if errors_are_known:
             monkeypatch.setattr(with_ranges, "unbend", unbend_with_known_errors)
-        stddev_m = 0.3
         survey = make_survey(pixel_stddev=0.5, radio=Radio(range_stddev_m=stddev_m), num_epochs=4)
         turn = Rotation.from_rotvec(np.deg2rad([0.5, -0.3, 0.4])).as_matrix()
         askew = replace(
