@@ -235,7 +235,7 @@ def _bundle_adjuster(
     if num > ba.ceres.max_num_images_direct_dense_cpu_solver:
         overlaps, limit = overlaps_in(metric), ba.ceres.max_num_images_direct_sparse_cpu_solver
         ba.ceres.max_num_images_direct_sparse_cpu_solver = limit = max_num_images_direct(overlaps, limit)
-        if num <= limit and dense_is_faster(overlaps):
+        if num < limit and dense_is_faster(overlaps):  # COLMAP wants the one below the other
             ba.ceres.max_num_images_direct_dense_cpu_solver = num
     apply_options(ba, options.bundle_adjustment, "refine.bundle_adjustment")
 
