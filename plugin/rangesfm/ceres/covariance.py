@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 from scipy import linalg
 from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix, diags
 from scipy.spatial.transform import Rotation
 
-from rangesfm.arrays import Array, Mask
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.ceres import num_columns, tangent_jacobian
 from rangesfm.ceres.factored import SingularError, factor
 from rangesfm.errors import GeometryError
@@ -41,7 +40,7 @@ class ResidualErrors:
         covariance: (m, m) of these errors: all that the residuals have.
     """
 
-    rows: npt.NDArray[np.int64]
+    rows: Indices
     by_error: csr_matrix
     covariance: Array
 
@@ -63,7 +62,7 @@ class JointCovariance:
             constant have covariance 0.
     """
 
-    frame_ids: npt.NDArray[np.int64]
+    frame_ids: Indices
     rig_from_world: Array
     centers: Array
     anchors: Array
@@ -137,11 +136,11 @@ class _Columns:
         index_of: place in ``variable`` by address.
     """
 
-    frames: npt.NDArray[np.int64]
+    frames: Indices
     poses: list[Array]
     variable: list[Array]
     kinds: list[str]
-    starts: npt.NDArray[np.int64]
+    starts: Indices
     index_of: dict[int, int]
 
     @classmethod
@@ -226,7 +225,7 @@ def _address(block: Array) -> int:
     return int(block.__array_interface__["data"][0])
 
 
-def _schur_complement(jacobian: csc_matrix, columns: _Columns) -> tuple[csc_matrix, npt.NDArray[np.int64]]:
+def _schur_complement(jacobian: csc_matrix, columns: _Columns) -> tuple[csc_matrix, Indices]:
     """Normal equations of what is kept once the points are eliminated, and which columns are kept."""
     first = columns.num_kept_columns
     stays = np.repeat(_tied_points(jacobian[:, first:]), 3)
@@ -286,8 +285,7 @@ def _free_motions(jacobian: csc_matrix, motions: Array) -> Array:
     moves = alone > _FREE_MOTION * alone.max()
     scaled = motions[:, moves] / alone[moves]
     _, strengths, directions = np.linalg.svd(jacobian @ scaled, full_matrices=False)
-    free: Array = scaled @ directions[strengths < _FREE_MOTION].T
-    return free
+    return np.asarray(scaled @ directions[strengths < _FREE_MOTION].T)
 
 
 class _Inverse:
@@ -308,8 +306,7 @@ class _Inverse:
         """(size, k) for (size, k)."""
         right = right - self._free @ (self._free.T @ right)
         solution = self._scale * self._solve_scaled(self._scale * right)
-        projected: Array = solution - self._free @ (self._free.T @ solution)
-        return projected
+        return np.asarray(solution - self._free @ (self._free.T @ solution))
 
     def diagonal_blocks(self, spans: Sequence[slice]) -> list[Array]:
         """The blocks of the covariance at these rows and columns."""
@@ -328,8 +325,7 @@ class _Inverse:
     def of_functions(self, gradients: Array) -> Array:
         """(k, k) of the linear functions with these (size, k) gradients."""
         solution = self.solve(gradients)
-        covariance: Array = gradients.T @ solution + self._excess.between(solution, solution)
-        return covariance
+        return gradients.T @ solution + self._excess.between(solution, solution)
 
 
 def _solver(normal: csc_matrix, columns: _Columns) -> Callable[[Array], Array]:
@@ -369,11 +365,9 @@ def _similarity_covariance(columns: _Columns, inverse: _Inverse, num_rows: int) 
 def _center_from_step(pose: Array) -> Array:
     """(3, 6) how the centre -R^T t moves with a step in the tangent space of Ceres, which turns by twice the step."""
     rotation = _matrix(pose)
-    moved: Array = -rotation.T @ np.column_stack([2.0 * cross_matrices(pose[4:]), np.eye(3)])
-    return moved
+    return -rotation.T @ np.column_stack([2.0 * cross_matrices(pose[4:]), np.eye(3)])
 
 
 def _matrix(pose: Array) -> Array:
     """(3, 3) rotation of [qx qy qz qw tx ty tz]."""
-    matrix: Array = Rotation.from_quat(pose[:4]).as_matrix()
-    return matrix
+    return np.asarray(Rotation.from_quat(pose[:4]).as_matrix())

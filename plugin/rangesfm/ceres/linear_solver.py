@@ -75,8 +75,7 @@ def _envelope_widths(overlaps: csr_array) -> Indices:
     ordered = overlaps[order][:, order].tocoo()
     leftmost = np.arange(overlaps.shape[0])
     np.minimum.at(leftmost, ordered.row, ordered.col)
-    widths: Indices = np.arange(overlaps.shape[0]) - leftmost
-    return widths
+    return np.arange(overlaps.shape[0]) - leftmost
 
 
 def _cost(widths: Indices) -> float:

@@ -113,8 +113,7 @@ def add_ranges(
     for rows in groups:
         cost = _cost(ranges, rows, blocks, model)
         adder.add(cost, None, _blocks_of_group(ranges, int(rows[0]), blocks))
-    rows_of_ranges: Indices = first + np.argsort(np.concatenate([np.zeros(0, dtype=np.int64), *groups]))
-    return rows_of_ranges
+    return np.asarray(first + np.argsort(np.concatenate([np.zeros(0, dtype=np.int64), *groups])))
 
 
 def _groups(ranges: PlacedRanges) -> list[Indices]:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
+from rangesfm.arrays import Array
 from rangesfm.ceres.compatibility import check_compatibility
 
 if TYPE_CHECKING:
@@ -74,12 +74,12 @@ def solve(adjuster: pycolmap.CeresBundleAdjuster, is_enough: Callable[[Step], bo
     return summary
 
 
-def num_columns(problem: Any, block: npt.NDArray[np.float64]) -> int:
+def num_columns(problem: Any, block: Array) -> int:
     """Of a block in ``tangent_jacobian``: its tangent size, without the padding of ``keep_from_elimination``."""
     return min(int(problem.parameter_block_tangent_size(block)), len(block))
 
 
-def tangent_jacobian(problem: Any, blocks: Sequence[npt.NDArray[np.float64]]) -> csr_matrix:
+def tangent_jacobian(problem: Any, blocks: Sequence[Array]) -> csr_matrix:
     """(num_residuals, sum of ``num_columns``): robust losses applied, columns in the order of the blocks.
 
     Args:

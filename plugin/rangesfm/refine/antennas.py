@@ -36,8 +36,7 @@ class Antennas:
             for ends in (self.before, self.after)
         )
         weight = self.weight[:, None]
-        positions: Array = (1 - weight) * before + weight * after + self.offset_in_world_m
-        return positions
+        return np.asarray((1 - weight) * before + weight * after + self.offset_in_world_m)
 
     def subset(self, rows: Indices) -> Antennas:
         """Of some of the ranges."""

@@ -15,7 +15,6 @@ from rangesfm.arrays import Array
 from rangesfm.ceres.linear_solver import dense_is_faster, max_num_images_direct, overlaps_in
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import SolverError
-from rangesfm.geometry.trajectory import pose_of
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.errors.noise import robust_stddev
 from rangesfm.refine.stillness import Stillness, farthest, keyframe_centers

@@ -83,5 +83,4 @@ def _triangulated(observations: Observations, poses: Poses, start: Array) -> Arr
 def _costs(observations: Observations, poses: Poses, points: Array, adder: sparse.csr_array) -> Array:
     """(p,) robust cost of each point; infinite for one behind a camera that sees it."""
     residuals = ray_residuals(observations, project(observations, poses, points)[1])
-    costs: Array = adder @ np.log1p(np.sum(residuals**2, axis=1))
-    return costs
+    return np.asarray(adder @ np.log1p(np.sum(residuals**2, axis=1)))

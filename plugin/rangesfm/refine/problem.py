@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
 from rangesfm import ceres
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.ceres.covariance import ResidualErrors
 from rangesfm.geometry.gravity import UP_IN_SITE, Gravity
 from rangesfm.geometry.trajectory import pose_of
@@ -28,7 +27,7 @@ class AddedBlocks:
     """What came into a problem of the photos: parameter blocks, and where the residuals of the ranges are."""
 
     blocks: RadioBlocks
-    residual_rows: npt.NDArray[np.int64]
+    residual_rows: Indices
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ class RefinementProblem:
     left_out_ids: frozenset[int] = frozenset()
 
     @property
-    def frame_ids(self) -> npt.NDArray[np.int64]:
+    def frame_ids(self) -> Indices:
         """Those of the trajectory, then those without a time."""
         timed = self.ranges.trajectory.frame_ids
         return np.concatenate([timed, np.setdiff1d(np.array(self.metric.reg_frame_ids(), dtype=np.int64), timed)])

@@ -84,8 +84,7 @@ class RadioRanges:
         tags = radio.tags_in_cam_m[self.observations.log.tag_index]
         path = self.trajectory.as_in(metric)
         at = replace(self.antennas, tag_in_cam_m=tags, weight=weight).positions(path.centers, path.world_from_cam)
-        from_anchor: Array = at - np.array([a.position_m for a in radio.anchors]).reshape(-1, 3)[index]
-        return from_anchor
+        return np.asarray(at - np.array([a.position_m for a in radio.anchors]).reshape(-1, 3)[index])
 
     def predicted_m(self, metric: pycolmap.Reconstruction, radio: RadioEstimate) -> Array:
         """(n,) ranges that a metric model predicts, as the residuals do; NaN without a place."""

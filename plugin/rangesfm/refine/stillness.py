@@ -77,5 +77,4 @@ def farthest(before: Array, after: Array) -> float:
 def keyframe_centers(metric: pycolmap.Reconstruction) -> Array:
     """(n, 3) origins of the rig frames in the world."""
     poses = np.array([pose_of(metric.frame(frame_id)).params for frame_id in metric.reg_frame_ids()])
-    centers: Array = -Rotation.from_quat(poses[:, :4]).inv().apply(poses[:, 4:])
-    return centers
+    return np.asarray(-Rotation.from_quat(poses[:, :4]).inv().apply(poses[:, 4:]))

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Mask
 from rangesfm.colmap.transform import transform
 from rangesfm.geometry.similarity import Similarity, align_points, are_apart, rmse
 from rangesfm.geometry.trajectory import pose_of
@@ -56,9 +55,7 @@ class Unbent:
     num_steps: int
 
 
-def unbend(
-    problem: RefinementProblem, rays: Observations, misplaced: npt.NDArray[np.bool_], errors: RangeErrors
-) -> Unbent:
+def unbend(problem: RefinementProblem, rays: Observations, misplaced: Mask, errors: RangeErrors) -> Unbent:
     """Solve the keyframe graph and move the model after it, in place: as a whole, to which the photos are indifferent,
     or, where it bends, keyframe by keyframe.
 

@@ -119,14 +119,12 @@ class _Pair:
 
     def difference(self, motion: Similarity, side: tuple[int, int]) -> Array:
         """(3,) source moved minus target."""
-        difference: Array = motion.apply(self.source.places_m[side[1]]) - self.target.places_m[side[0]]
-        return difference
+        return np.asarray(motion.apply(self.source.places_m[side[1]]) - self.target.places_m[side[0]])
 
     def information(self, motion: Similarity) -> Array:
         """(3, 3) of the difference."""
         turned = motion.rotation @ self.source.covariance_m2 @ motion.rotation.T
-        information: Array = np.asarray(np.linalg.inv(self.target.covariance_m2 + turned), dtype=np.float64)
-        return information
+        return np.asarray(np.linalg.inv(self.target.covariance_m2 + turned), dtype=np.float64)
 
 
 @dataclass(frozen=True)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import off_origin
 from rangesfm.scale.range_equation import RangeProblem
@@ -36,7 +35,7 @@ def consensus_scales(problem: RangeProblem) -> list[float]:
     return _hilltops(*local_maxima(starts, ends))
 
 
-def _hilltops(scales: Array, counts: npt.NDArray[np.int64]) -> list[float]:
+def _hilltops(scales: Array, counts: Indices) -> list[float]:
     """Best first: scales with no better one in their cell of the grid or in the two beside it."""
     cells = np.floor(np.log(scales) / _LOG_CELL).astype(np.int64)
     first = np.flatnonzero(np.diff(cells, prepend=cells[0] - 1))
@@ -78,7 +77,7 @@ def agreeing_intervals(centers: Array, offset: Array, ranges: Array, tolerance: 
     return starts[keep], ends[keep]
 
 
-def _roots(a: Array, b: Array, c: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+def _roots(a: Array, b: Array, c: Array) -> tuple[Array, Array, Mask]:
     """Roots of ``a x^2 + 2 b x + c``, and where they are real. Without motion (a = 0) there are none."""
     discriminant = b**2 - a * c
     real = (discriminant > 0) & (a > 0)
@@ -87,7 +86,7 @@ def _roots(a: Array, b: Array, c: Array) -> tuple[Array, Array, npt.NDArray[np.b
     return (-b - root) / safe, (-b + root) / safe, real
 
 
-def local_maxima(starts: Array, ends: Array) -> tuple[Array, npt.NDArray[np.int64]]:
+def local_maxima(starts: Array, ends: Array) -> tuple[Array, Indices]:
     """Where more of the closed intervals overlap than just before and just after: the stretches' middles, and counts.
 
     Such a stretch lies between a start and the next end, without another start between them. O(n log n); starts and

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
+from rangesfm.arrays import Indices
 from rangesfm.scale.estimate import CutoffTest
 from rangesfm.scale.range_equation import RangeProblem, solve
 from rangesfm.scale.solution import Solution
@@ -58,7 +58,7 @@ def scale_drift(tests: tuple[CutoffTest, ...]) -> CutoffTest | None:
     return max(drifted, key=lambda pair: pair[0], default=(0.0, None))[1]
 
 
-def _enough(problem: RangeProblem, rows: npt.NDArray[np.int64]) -> bool:
+def _enough(problem: RangeProblem, rows: Indices) -> bool:
     heard = np.bincount(problem.anchor_index, minlength=problem.num_anchors) > 0
     left = np.bincount(problem.anchor_index[rows], minlength=problem.num_anchors)
     return bool(len(rows) >= _MIN_SHARE * len(problem.range_m) and np.all(left[heard] >= _MIN_RANGES_PER_ANCHOR))

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.scale.consensus import TOLERANCE_STDDEVS, agreeing_intervals
 from rangesfm.scale.estimate import ScaleEstimate
@@ -29,10 +28,10 @@ class ScaleDiagnostics:
         num_agreeing: (m,) ranges that agree with each.
     """
 
-    candidate_rows: npt.NDArray[np.int64]
+    candidate_rows: Indices
     candidates: Array
     curve_scales: Array
-    num_agreeing: npt.NDArray[np.int64]
+    num_agreeing: Indices
 
 
 def scale_diagnostics(estimate: ScaleEstimate, trajectory: Trajectory) -> ScaleDiagnostics:
@@ -55,8 +54,8 @@ def scale_diagnostics(estimate: ScaleEstimate, trajectory: Trajectory) -> ScaleD
 
 
 def _candidates(
-    estimate: ScaleEstimate, trajectory: Trajectory, rows: npt.NDArray[np.int64], anchor_m: Array
-) -> tuple[npt.NDArray[np.int64], Array]:
+    estimate: ScaleEstimate, trajectory: Trajectory, rows: Indices, anchor_m: Array
+) -> tuple[Indices, Array]:
     """As in the paper: the first camera is the origin."""
     centers, tags, anchors = _about(estimate, trajectory.centers[0], rows, anchor_m)
     table = two_candidate(centers, tags, anchors, estimate.observations.log.range_m[rows])
@@ -66,8 +65,8 @@ def _candidates(
 
 
 def _num_agreeing(
-    estimate: ScaleEstimate, trajectory: Trajectory, rows: npt.NDArray[np.int64], anchor_m: Array, scales: Array
-) -> npt.NDArray[np.int64]:
+    estimate: ScaleEstimate, trajectory: Trajectory, rows: Indices, anchor_m: Array, scales: Array
+) -> Indices:
     """The path stretches about what holds it: in a site its middle, else the first camera."""
     held = trajectory.centers.mean(axis=0) if estimate.frame == "site" else trajectory.centers[0]
     centers, tags, anchors = _about(estimate, held, rows, anchor_m)
@@ -79,9 +78,7 @@ def _num_agreeing(
     return np.asarray(begun - np.searchsorted(np.sort(ends), scales, side="left"))
 
 
-def _about(
-    estimate: ScaleEstimate, held: Array, rows: npt.NDArray[np.int64], anchor_m: Array
-) -> tuple[Array, Array, Array]:
+def _about(estimate: ScaleEstimate, held: Array, rows: Indices, anchor_m: Array) -> tuple[Array, Array, Array]:
     """Centres in SfM units, lever arms and anchors in metres, all along the metric axes about a place of the path."""
     placed, observations = estimate.metric_from_sfm, estimate.observations
     centers = (observations.centers[rows] - held) @ placed.rotation.T

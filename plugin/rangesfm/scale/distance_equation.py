@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.ranging.range_gradient import RangeGradient
 
 
 def distance_residuals(distances: LocatedDistances, scale: float, anchors_m: Array) -> Array:
     """(k,) in stddevs."""
-    residuals: Array = (distances.lengths_m(scale, anchors_m) - distances.distance_m) / distances.stddev_m
-    return residuals
+    return (distances.lengths_m(scale, anchors_m) - distances.distance_m) / distances.stddev_m
 
 
 def distance_jacobian(
     distances: LocatedDistances,
     scale: float,
     anchors_m: Array,
-    anchor_column: npt.NDArray[np.int64],
+    anchor_column: Indices,
     num_columns: int,
 ) -> Array:
     """(k, p) of the residuals.

@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy import special
 
 from rangesfm.arrays import Array, Indices, Mask
@@ -60,8 +59,7 @@ class LengthScale:
     @property
     def statistic(self) -> Array:
         """(m,) squared, in stddevs."""
-        squared: Array = (self.too_long_m / self.stddev_m) ** 2
-        return squared
+        return (self.too_long_m / self.stddev_m) ** 2
 
     def beside_ranges(self, distances: LocatedDistances, *, with_bending: bool = False) -> LocatedDistances:
         """The distances with all lengths between points as the one that says the same of the scale.
@@ -138,7 +136,7 @@ class _Lengths:
     of_bending: Array
 
     @classmethod
-    def of(cls, distances: LocatedDistances, rows: npt.NDArray[np.int64], extent: float) -> _Lengths:
+    def of(cls, distances: LocatedDistances, rows: Indices, extent: float) -> _Lengths:
         model, stddev_m, printed = distances.model_length[rows], distances.stddev_m[rows], distances.is_printed[rows]
         if not np.all(model > 1e-9 * extent):
             raise GeometryError("a measured length has both its ends in one place of the map")
@@ -203,8 +201,7 @@ class _Lengths:
 
 
 def _total(parts: Mapping[str, Array]) -> Array:
-    total: Array = np.sum(list(parts.values()), axis=0)
-    return total
+    return np.asarray(np.sum(list(parts.values()), axis=0))
 
 
 def _unlikeliness(covariance: Array, model: Array, metric: Array) -> float:

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.distances.ends import LocatedDistances, distances_by_radio, surveyed_distances
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.gravity import Gravity
@@ -48,7 +47,7 @@ class ScaleProblem:
     ranges: RangeProblem
     errors: RangeErrors
     center_stddev: Array
-    rows: npt.NDArray[np.int64]
+    rows: Indices
     first_camera_from_sfm: Similarity
     frame: str
     anchors_are_known: bool
@@ -144,7 +143,7 @@ def _all_distances(
     return by_radio if taped is None else taped.joined(by_radio)
 
 
-def _control(distances: LocatedDistances, has_place: npt.NDArray[np.bool_]) -> LocatedDistances | None:
+def _control(distances: LocatedDistances, has_place: Mask) -> LocatedDistances | None:
     """Those that are to be kept to, between points or anchors that take part; None if there are none."""
     takes_part = np.append(has_place, True)[distances.anchor_pair].all(axis=1) & ~distances.is_check
     return distances.subset(takes_part) if takes_part.any() else None
@@ -166,9 +165,7 @@ def _bias_stddev(anchor: Anchor, range_model: RangeModelOptions) -> float:
     return range_model.range_bias_stddev_m if anchor.range_bias_stddev_m is None else anchor.range_bias_stddev_m
 
 
-def _usable_ranges(
-    observations: RangeObservations, given: npt.NDArray[np.bool_]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+def _usable_ranges(observations: RangeObservations, given: Mask) -> tuple[Indices, Mask]:
     """Rows that take part, and (m,) anchors that have enough of them."""
     rows = observations.placed_rows
     index = observations.log.anchor_index
@@ -189,11 +186,10 @@ def _centers_in_first_camera(centers: Array, trajectory: Trajectory) -> Array:
     """(k, 3) of the first camera itself exactly 0, and not what rounding leaves: no scale moves it."""
     off = centers - trajectory.centers[0]
     off[np.linalg.norm(off, axis=1) <= rounding_of(trajectory.centers)] = 0.0
-    in_first_camera: Array = off @ trajectory.world_from_cam[0]
-    return in_first_camera
+    return np.asarray(off @ trajectory.world_from_cam[0])
 
 
-def _require_enough(observations: RangeObservations, rows: npt.NDArray[np.int64]) -> None:
+def _require_enough(observations: RangeObservations, rows: Indices) -> None:
     keyframes = np.union1d(observations.before[rows], observations.after[rows])
     if len(rows) < _MIN_RANGES or len(keyframes) < _MIN_KEYFRAMES:
         raise GeometryError(
@@ -203,8 +199,8 @@ def _require_enough(observations: RangeObservations, rows: npt.NDArray[np.int64]
 
 
 def _usable_positions(
-    anchors: Sequence[Anchor], given: npt.NDArray[np.bool_], anchor_frame: str, gravity_is_known: bool
-) -> tuple[npt.NDArray[np.bool_], list[str]]:
+    anchors: Sequence[Anchor], given: Mask, anchor_frame: str, gravity_is_known: bool
+) -> tuple[Mask, list[str]]:
     """(m,) anchors whose given positions can be used in this frame, and why others cannot."""
     num = int(given.sum())
     if anchor_frame != "site" or num == 0:
@@ -225,7 +221,7 @@ def _usable_positions(
 
 
 def _with_surveyed(
-    distances: LocatedDistances | None, anchors: Sequence[Anchor], given: npt.NDArray[np.bool_]
+    distances: LocatedDistances | None, anchors: Sequence[Anchor], given: Mask
 ) -> LocatedDistances | None:
     """The distances between anchors with given positions as well, which hold in any frame."""
     ids = [anchor.anchor_id for anchor in anchors]

@@ -16,11 +16,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.rotations import left_jacobian
@@ -53,7 +52,7 @@ class RangeProblem:
 
     centers: Array
     tag_from_center: Array
-    anchor_index: npt.NDArray[np.int64]
+    anchor_index: Indices
     range_m: Array
     stddev_m: Array
     anchor_mean_m: Array
@@ -76,7 +75,7 @@ class RangeProblem:
         return len(self.anchor_stddev_m)
 
     @cached_property
-    def uncertain(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    def uncertain(self) -> tuple[Indices, Indices]:
         """Anchors, and biases, of which something is known, but not exactly."""
         anchors, biases = (np.flatnonzero((s > 0) & np.isfinite(s)) for s in (self.anchor_stddev_m, self.bias_stddev_m))
         return anchors, biases
@@ -86,7 +85,7 @@ class RangeProblem:
         """As ``noise.bias_whitening``, of the uncertain biases; asked for at every step of a solve."""
         return bias_whitening(self.bias_stddev_m[self.uncertain[1]], self.common_bias_stddev_m)
 
-    def subset(self, rows: npt.NDArray[np.int64]) -> RangeProblem:
+    def subset(self, rows: Indices) -> RangeProblem:
         """The same problem with some of its ranges."""
         return replace(
             self,
@@ -193,8 +192,8 @@ class Columns:
 
     scale: int
     frame: int
-    anchor: npt.NDArray[np.int64]
-    bias: npt.NDArray[np.int64]
+    anchor: Indices
+    bias: Indices
     num: int
 
 
@@ -227,8 +226,7 @@ def range_gradient(problem: RangeProblem, state: RangeState) -> RangeGradient:
 
 def predicted_ranges(problem: RangeProblem, state: RangeState) -> Array:
     """(n,) metres."""
-    predicted: Array = range_gradient(problem, state).distance_m + state.bias_m[problem.anchor_index]
-    return predicted
+    return range_gradient(problem, state).distance_m + state.bias_m[problem.anchor_index]
 
 
 # Of solutions that are kept; those to choose among need not be at the very bottom.
@@ -446,5 +444,4 @@ def invert_information(information: Array) -> Array:
     """Inverse with unit-free conditioning; an undetermined direction gets a huge variance."""
     diagonal = np.sqrt(np.maximum(np.diag(information), 1e-200))
     values, vectors = np.linalg.eigh(information / np.outer(diagonal, diagonal))
-    inverse: Array = (vectors / np.maximum(values, 1e-14)) @ vectors.T / np.outer(diagonal, diagonal)
-    return inverse
+    return np.asarray((vectors / np.maximum(values, 1e-14)) @ vectors.T / np.outer(diagonal, diagonal))

@@ -10,10 +10,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import IDENTITY, Similarity, path_shape, round_middle, rounding_of
 from rangesfm.ranging.anchors.multilateration import multilaterate
@@ -42,7 +41,7 @@ def spread_subset(problem: RangeProblem, max_num_per_anchor: int) -> RangeProble
     return problem.subset(spread_rows(problem, max_num_per_anchor))
 
 
-def spread_rows(problem: RangeProblem, max_num_per_anchor: int) -> npt.NDArray[np.int64]:
+def spread_rows(problem: RangeProblem, max_num_per_anchor: int) -> Indices:
     """Which ranges these are, ascending."""
     rows = []
     for k in range(problem.num_anchors):
@@ -185,8 +184,7 @@ def mirrored(problem: RangeProblem, state: RangeState, k: int) -> Array:
     """(3,) anchor k on the other side of the path's plane."""
     shape = path_shape(state.metric_from_model.apply(problem.centers))
     normal = shape.axes[:, 2]
-    other: Array = state.anchors_m[k] - 2 * ((state.anchors_m[k] - shape.centroid) @ normal) * normal
-    return other
+    return np.asarray(state.anchors_m[k] - 2 * ((state.anchors_m[k] - shape.centroid) @ normal) * normal)
 
 
 def complete_unknown_anchors(problem: RangeProblem, state: RangeState) -> RangeState:

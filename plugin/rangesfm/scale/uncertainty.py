@@ -230,15 +230,13 @@ def _by_what_was_given(solution: Solution) -> Array:
     biases = fit.columns[0].bias[fit.columns[0].bias >= 0]
     given[biases] = given[:, biases] = 0.0
     inverse = _inverse(fit)
-    covariance: Array = solution.errors.inflation**2 * inverse @ given @ inverse.T
-    return covariance
+    return solution.errors.inflation**2 * inverse @ given @ inverse.T
 
 
 def parameter_covariance(solution: Solution, learned: LearnedErrors) -> Array:
     """(p, p) of all that a fit estimates, in the parameters of its columns, by what ranges get wrong and was given."""
     of_cells = parameter_influence(solution.fit, solution.problem, learned)
-    covariance: Array = of_cells @ learned.covariance_m2 @ of_cells.T + _by_what_was_given(solution)
-    return covariance
+    return of_cells @ learned.covariance_m2 @ of_cells.T + _by_what_was_given(solution)
 
 
 def parameter_influence(fit: RangeFit, problem: RangeProblem, learned: LearnedErrors) -> Array:
@@ -249,8 +247,7 @@ def parameter_influence(fit: RangeFit, problem: RangeProblem, learned: LearnedEr
 
 def scale_influence(fit: RangeFit, problem: RangeProblem) -> Array:
     """(n,) relative change of the scale for each metre by which a range is longer."""
-    influence: Array = fit.gradients @ _inverse(fit)[0] / problem.stddev_m
-    return influence
+    return np.asarray(fit.gradients @ _inverse(fit)[0] / problem.stddev_m)
 
 
 def _inverse(fit: RangeFit) -> Array:

@@ -130,8 +130,7 @@ def _knots(distance: Array) -> Array:
         raise GeometryError(
             f"the ranges are {ends[0]:.2f} to {ends[1]:.2f} m long: a curve needs ranges of different lengths"
         )
-    knots: Array = np.exp(np.linspace(low, high, int(np.ceil((high - low) / _LOG_SPACING)) + 1))
-    return knots
+    return np.exp(np.linspace(low, high, int(np.ceil((high - low) / _LOG_SPACING)) + 1))
 
 
 def _problem(log: RangeLog, used: Indices, distance: Array, error: Array, index: Indices, knots: Array) -> _Problem:
@@ -212,8 +211,7 @@ def _spread_by_anchor(problem: _Problem, index: Indices, num_knots: int) -> Arra
         part = _Problem(problem.design[rest], problem.error_m[rest], problem.prior, problem.groups[rest])
         curves.append(_fit(part)[0].values[:num_knots])
     num = len(present)
-    spread: Array = np.sqrt((num - 1) / num * np.sum((np.array(curves) - np.mean(curves, axis=0)) ** 2, axis=0))
-    return spread
+    return np.asarray(np.sqrt((num - 1) / num * np.sum((np.array(curves) - np.mean(curves, axis=0)) ** 2, axis=0)))
 
 
 def _noise_by_knot(problem: _Problem, residuals: Array, num_knots: int, noise: float) -> Array:

@@ -117,8 +117,7 @@ def noisiness(anchor_index: Indices, residuals_m: Array, num_anchors: int) -> Ar
     if np.isnan(scatter).all():
         return np.ones(num_anchors)
     relative = scatter / np.sqrt(np.nanmedian(scatter**2))
-    clipped: Array = np.clip(np.nan_to_num(relative, nan=1.0), _MIN_NOISINESS, _MAX_NOISINESS)
-    return clipped
+    return np.asarray(np.clip(np.nan_to_num(relative, nan=1.0), _MIN_NOISINESS, _MAX_NOISINESS))
 
 
 def _labels(anchor_index: Indices, tag_index: Indices, since_s: Array, max_num: int) -> Indices:
@@ -134,5 +133,4 @@ def _labels(anchor_index: Indices, tag_index: Indices, since_s: Array, max_num: 
 
 
 def _unit(vectors: Array) -> Array:
-    units: Array = vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-9)[:, None]
-    return units
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-9)[:, None])

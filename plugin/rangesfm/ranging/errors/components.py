@@ -56,13 +56,11 @@ class Component:
 
 
 def _same(labels: Indices) -> Array:
-    alike: Array = (labels[:, None] == labels).astype(np.float64)
-    return alike
+    return np.asarray((labels[:, None] == labels).astype(np.float64))
 
 
 def _same_link(cells: Cells) -> Array:
-    alike: Array = _same(cells.anchor_index) * _same(cells.tag_index)
-    return alike
+    return _same(cells.anchor_index) * _same(cells.tag_index)
 
 
 def _apart(values: Array) -> Array:
@@ -70,24 +68,20 @@ def _apart(values: Array) -> Array:
 
 
 def _in_time(cells: Cells) -> Array:
-    together: Array = np.exp(-_apart(cells.time_s) / _TIME_S) * _same_link(cells)
-    return together
+    return np.exp(-_apart(cells.time_s) / _TIME_S) * _same_link(cells)
 
 
 def _drifting(cells: Cells) -> Array:
-    together: Array = np.exp(-_apart(cells.time_s) / _DRIFT_S) * _same(cells.tag_index)
-    return together
+    return np.exp(-_apart(cells.time_s) / _DRIFT_S) * _same(cells.tag_index)
 
 
 def _in_place(cells: Cells) -> Array:
     places_m = cells.distance_m[:, None] * cells.from_anchor
-    together: Array = np.exp(-cdist(places_m, places_m) / _PLACE_M) * _same_link(cells)
-    return together
+    return np.asarray(np.exp(-cdist(places_m, places_m) / _PLACE_M) * _same_link(cells))
 
 
 def _in_view(cells: Cells) -> Array:
-    together: Array = np.exp((cells.in_cam @ cells.in_cam.T - 1) / _LOBE) * _same_link(cells)
-    return together
+    return np.exp((cells.in_cam @ cells.in_cam.T - 1) / _LOBE) * _same_link(cells)
 
 
 def _log_distance(distance_m: Array) -> Array:
@@ -96,8 +90,7 @@ def _log_distance(distance_m: Array) -> Array:
 
 def alike_by_distance(distance_m: Array) -> Array:
     """(c, c) of a random function, smooth in the logarithm of (c,) distances."""
-    alike: Array = np.exp(-0.5 * (_apart(_log_distance(distance_m)) / _SMOOTH) ** 2)
-    return alike
+    return np.exp(-0.5 * (_apart(_log_distance(distance_m)) / _SMOOTH) ** 2)
 
 
 def _smooth(cells: Cells) -> Array:
@@ -105,8 +98,7 @@ def _smooth(cells: Cells) -> Array:
 
 
 def _rough(cells: Cells) -> Array:
-    alike: Array = np.exp(-_apart(_log_distance(cells.distance_m)) / _ROUGH)
-    return alike
+    return np.exp(-_apart(_log_distance(cells.distance_m)) / _ROUGH)
 
 
 def _short(cells: Cells) -> Array:
@@ -117,8 +109,7 @@ def _short(cells: Cells) -> Array:
 def alike_by_direction(directions: Array) -> Array:
     """Of a random polynomial of the direction, half of its variance linear and half quadratic in the unit vector."""
     cosine = directions @ directions.T
-    alike: Array = cosine / 2 + (3 * cosine**2 - 1) / 4
-    return alike
+    return cosine / 2 + (3 * cosine**2 - 1) / 4
 
 
 def _white(cells: Cells) -> Array:
@@ -143,14 +134,12 @@ def _off_axis(cells: Cells) -> Array:
     facing = same @ cells.from_anchor
     cosine = np.sum(cells.from_anchor * facing, axis=1) / np.maximum(np.linalg.norm(facing, axis=1), 1e-9)
     angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-    alike: Array = np.exp(-0.5 * (_apart(angle) / _OFF_AXIS_RAD) ** 2)
-    return alike
+    return np.exp(-0.5 * (_apart(angle) / _OFF_AXIS_RAD) ** 2)
 
 
 def _bending(cells: Cells) -> Array:
     length_s = max(_BEND * float(np.ptp(cells.time_s)), 1e-9)
-    alike: Array = (cells.from_anchor @ cells.from_anchor.T) * np.exp(-_apart(cells.time_s) / length_s)
-    return alike
+    return (cells.from_anchor @ cells.from_anchor.T) * np.exp(-_apart(cells.time_s) / length_s)
 
 
 def components(expected: Mapping[str, tuple[float, float]]) -> tuple[Component, ...]:

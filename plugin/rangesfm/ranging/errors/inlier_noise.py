@@ -72,8 +72,7 @@ def _densities(residuals: Array, stddev: float, means: Array, shares: Array) -> 
     gaussian = np.exp(-0.5 * (residuals / stddev) ** 2) / (np.sqrt(2 * np.pi) * stddev)
     sides = np.array([residuals > 0, residuals < 0])
     outlying = sides * np.exp(-np.abs(residuals) / means[:, None]) / means[:, None]
-    densities: Array = shares[:, None] * np.concatenate([gaussian[None], outlying])
-    return densities
+    return np.asarray(shares[:, None] * np.concatenate([gaussian[None], outlying]))
 
 
 def _gaussian(residuals: Array) -> InlierNoise:

@@ -46,8 +46,7 @@ class LearnedErrors:
     @property
     def covariance_m2(self) -> Array:
         """(c, c) of all of them."""
-        together: Array = self.covariances_m2.sum(axis=0)
-        return together
+        return np.asarray(self.covariances_m2.sum(axis=0))
 
     @property
     def stddev_of_component(self) -> dict[str, float]:
@@ -250,8 +249,7 @@ class _Likelihood:
         found = minimize(
             self._negative_with_gradient, self.log_medians, jac=True, method="L-BFGS-B", bounds=bounds, options=options
         )
-        logs: Array = found.x
-        return logs
+        return np.asarray(found.x)
 
     def _negative_with_gradient(self, logs: Array) -> tuple[float, Array]:
         lower, inverse = self._factored(logs)
@@ -279,8 +277,7 @@ class _Likelihood:
         seen = (inverse - whitened @ spread @ whitened.T) @ self.of_components
         # Expected information of restricted likelihood (Patterson and Thompson), about logarithms of stddevs.
         information = 2 * np.einsum("kij,lji->kl", seen, seen, optimize=True) * np.exp(2 * np.add.outer(logs, logs))
-        stddevs: Array = np.exp(logs + np.diag(np.linalg.inv(information + np.diag(self.spreads**-2))))
-        return stddevs
+        return np.asarray(np.exp(logs + np.diag(np.linalg.inv(information + np.diag(self.spreads**-2)))))
 
     def _factored(self, logs: Array) -> tuple[Array, Array]:
         """(c, c) lower factor and inverse of the covariance."""

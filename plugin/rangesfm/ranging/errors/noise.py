@@ -39,8 +39,7 @@ def robust_stddevs(residuals: Array) -> Array:
 
 def short_range_stddev(range_m: Array) -> Array:
     """(n,) how far a range of this length may be off for being short, metres."""
-    stddev: Array = _SHORT_RANGE_STDDEV_M * np.exp(-range_m / SHORT_RANGE_LENGTH_M)
-    return stddev
+    return _SHORT_RANGE_STDDEV_M * np.exp(-range_m / SHORT_RANGE_LENGTH_M)
 
 
 def shared_stddev(log: RangeLog) -> Array:
@@ -55,16 +54,14 @@ def bias_whitening(own_stddev_m: Array, common_stddev_m: float) -> Array:
         own_stddev_m: (m,) more than 0.
     """
     covariance = np.diag(own_stddev_m**2) + common_stddev_m**2
-    whitening: Array = np.linalg.inv(np.linalg.cholesky(covariance)) if len(own_stddev_m) else np.zeros((0, 0))
-    return whitening
+    return np.linalg.inv(np.linalg.cholesky(covariance)) if len(own_stddev_m) else np.zeros((0, 0))
 
 
 def stretch_labels(times_s: Array, length_s: float) -> Indices:
     """(n,) labels of stretches of time, in which errors may go together: at least eight."""
     since = times_s - times_s.min()
     length_s = max(min(length_s, float(since.max()) / _MIN_NUM_STRETCHES), 1e-9)
-    labels: Indices = np.floor(since / length_s).astype(np.int64)
-    return labels
+    return np.asarray(np.floor(since / length_s).astype(np.int64))
 
 
 def correlation_inflation(

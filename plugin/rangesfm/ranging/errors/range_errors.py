@@ -111,8 +111,7 @@ class RangeErrors:
     @property
     def group(self) -> Indices:
         """(n,) label of the stretch of one anchor's ranges that err together."""
-        groups: Indices = self.block * (self.anchor_index.max() + 1) + self.anchor_index
-        return groups
+        return np.asarray(self.block * (self.anchor_index.max() + 1) + self.anchor_index)
 
     @property
     def is_estimated(self) -> Mask:
