@@ -63,12 +63,6 @@ def overlaps_in(model: pycolmap.Reconstruction) -> csr_array:
     return csr_array(sees @ sees.T)
 
 
-def overlaps_of(pairs: Indices, num: int) -> csr_array:
-    """(n, n) of (k, 2) pairs of photos, each pair once."""
-    ones = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(num, num))
-    return csr_array(ones + ones.T)
-
-
 def _envelope_widths(overlaps: csr_array) -> Indices:
     """(n,) how far each row reaches to the left of its diagonal, in an order that keeps neighbours together."""
     order = reverse_cuthill_mckee(overlaps, symmetric_mode=True)

@@ -1,24 +1,27 @@
-"""Residuals into a bundle adjuster's problem."""
+"""Residuals into a bundle adjuster's problem: one, or those of a whole log of ranges in few residual blocks."""
 
 from __future__ import annotations
 
+import math
 import weakref
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.arrays import Array
-from rangesfm.ceres.compatibility import check_compatibility
+from rangesfm.arrays import Array, Indices
+from rangesfm.ceres.doctor import check_compatibility
 
 if TYPE_CHECKING:
     import pyceres
     import pycolmap
 
-
 _NUM_POSE_PARAMS = 7
 _NUM_POSE_COLUMNS = 6
+# What residuals refer to. The problem refers to its adjuster, so only a weak key lets the two go in the end.
+_used_by_adjuster: weakref.WeakKeyDictionary[pycolmap.CeresBundleAdjuster, list[Any]] = weakref.WeakKeyDictionary()
 
 
 def add_residual_block(
@@ -44,7 +47,26 @@ def add_residual_block(
     Raises:
         ValueError: a block is no such array, or given twice, or not of the cost's size.
     """
-    ResidualAdder(adjuster).add(cost, loss, blocks)
+    _add(adjuster.problem, _used_by_adjuster.setdefault(adjuster, []), cost, loss, blocks)
+
+
+def _add(
+    problem: Any,
+    used: list[Any],
+    cost: pyceres.CostFunction,
+    loss: pyceres.LossFunction | None,
+    blocks: Sequence[Array],
+) -> None:
+    for block in blocks:
+        if block.dtype != np.float64 or not block.flags.carray:
+            raise ValueError("the solver works in place: a block must be a contiguous, writeable float64 array")
+    if len({block.__array_interface__["data"][0] for block in blocks}) < len(blocks):
+        raise ValueError("a block is given twice: the blocks of one residual must be different ones")
+    held = [b for b in blocks if b.size == _NUM_POSE_PARAMS and not problem.has_parameter_block(b)]
+    problem.add_residual_block(cost, loss, list(blocks))
+    for pose in held:
+        problem.set_parameter_block_constant(pose)
+    used.append((cost, loss, blocks))
 
 
 def add_normal_prior(
@@ -98,27 +120,147 @@ def keep_from_elimination(adjuster: pycolmap.CeresBundleAdjuster, block: Array, 
         _used_by_adjuster[adjuster].append(manifold)
 
 
-class ResidualAdder:
-    """What ``add_residual_block`` does, for one residual after the other into the same problem."""
+@dataclass(frozen=True)
+class PlacedRanges:
+    """n ranges, each at a keyframe (``before == after``) or between two.
 
-    def __init__(self, adjuster: pycolmap.CeresBundleAdjuster) -> None:
-        self._problem = adjuster.problem
-        self._used = _used_by_adjuster.setdefault(adjuster, [])
+    Attributes:
+        range_m: (n,) measured, positive.
+        stddev_m: (n,) noise, positive.
+        before, after: (n,) keyframes by their index in ``RangeBlocks.poses``.
+        weight: (n,) from 0 (at ``before``) to 1 (at ``after``).
+        offset_in_world_m: (n, 3) what a curved path has beyond the straight line.
+        anchor_index: (n,) in ``RangeBlocks.anchors``.
+        tag_index: (n,) in ``RangeBlocks.tags_in_cam``.
+        interval_s: (n,) time from ``before`` to ``after``; needed only for a time shift.
+        share: (n,) by how much each counts beside its noise, positive; None: 1.
+    """
 
-    def add(self, cost: pyceres.CostFunction, loss: pyceres.LossFunction | None, blocks: Sequence[Array]) -> None:
-        """See ``add_residual_block``."""
-        for block in blocks:
-            if block.dtype != np.float64 or not block.flags.carray:
-                raise ValueError("the solver works in place: a block must be a contiguous, writeable float64 array")
-        if len({block.__array_interface__["data"][0] for block in blocks}) < len(blocks):
-            raise ValueError("a block is given twice: the blocks of one residual must be different ones")
-        problem = self._problem
-        held = [b for b in blocks if b.size == _NUM_POSE_PARAMS and not problem.has_parameter_block(b)]
-        problem.add_residual_block(cost, loss, list(blocks))
-        for pose in held:
-            problem.set_parameter_block_constant(pose)
-        self._used.append((cost, loss, blocks))
+    range_m: Array
+    stddev_m: Array
+    before: Indices
+    after: Indices
+    weight: Array
+    offset_in_world_m: Array
+    anchor_index: Indices
+    tag_index: Indices
+    interval_s: Array | None = None
+    share: Array | None = None
 
 
-# What residuals refer to. The problem refers to its adjuster, so only a weak key lets the two go in the end.
-_used_by_adjuster: weakref.WeakKeyDictionary[pycolmap.CeresBundleAdjuster, list[Any]] = weakref.WeakKeyDictionary()
+@dataclass(frozen=True)
+class RangeBlocks:
+    """The parameter blocks that ranges act on; the solver changes them in place.
+
+    Attributes:
+        poses: rig_from_world (7,) of each keyframe.
+        anchors: (3,) each, in the world.
+        biases: (1,) of each anchor: what its ranges read too long.
+        tags_in_cam: (3,) of each tag: its antenna in the rig frame; blocks only if ``lever_arms_are_free``.
+        lever_arms_are_free: whether the tags' places are estimated.
+        time_shift: (1,) seconds that the ranges were taken later than thought; None: taken as they are. It
+            acts on ranges between two keyframes, also on those with a weight of 0 or 1.
+        amplitude: (1,) of what short ranges read too long; given exactly where ``short_range_length_m`` is.
+    """
+
+    poses: Sequence[Array]
+    anchors: Sequence[Array]
+    biases: Sequence[Array]
+    tags_in_cam: Sequence[Array]
+    lever_arms_are_free: bool = False
+    time_shift: Array | None = None
+    amplitude: Array | None = None
+
+
+def add_ranges(
+    adjuster: pycolmap.CeresBundleAdjuster,
+    ranges: PlacedRanges,
+    blocks: RangeBlocks,
+    *,
+    short_range_length_m: float | None = None,
+    loss_scale: float = math.inf,
+    loss_is_bounded: bool = False,
+) -> Indices:
+    """Add ranges to a bundle adjuster's problem: those of one place, anchor and tag as one residual block.
+
+    The solver's work grows with the blocks and with the pairs of blocks that share a residual, much less with
+    the residuals in one; and each block takes some microseconds to add. A robust loss acts on each range all the same.
+
+    Args:
+        adjuster: as in ``add_residual_block``, which says what is held and what lives how long.
+        ranges: n, in any order.
+        blocks: of which those that no range refers to do not become part of the problem.
+        short_range_length_m, loss_scale, loss_is_bounded: as in ``range_cost``.
+
+    Returns:
+        (n,) where each range's residual is among the problem's.
+
+    Raises:
+        ValueError: as ``range_cost`` and ``add_residual_block``; a time shift without intervals; an amplitude without
+            ``short_range_length_m``, or that without an amplitude.
+        SolverError: see ``check_compatibility``.
+    """
+    if (blocks.amplitude is None) != (short_range_length_m is None):
+        raise ValueError("of short_range_length_m and its amplitude one is given without the other")
+    if blocks.time_shift is not None and ranges.interval_s is None:
+        raise ValueError("a time shift needs interval_s, the time between the keyframes of each range")
+    check_compatibility()
+    # Looked up once: a log has thousands of blocks.
+    problem, used = adjuster.problem, _used_by_adjuster.setdefault(adjuster, [])
+    first = problem.num_residuals()
+    model = {
+        "short_range_length_m": short_range_length_m,
+        "loss_scale": loss_scale,
+        "loss_is_bounded": loss_is_bounded,
+    }
+    groups = _groups(ranges)
+    for rows in groups:
+        cost = _cost(ranges, rows, blocks, model)
+        _add(problem, used, cost, None, _blocks_of_group(ranges, int(rows[0]), blocks))
+    return np.asarray(first + np.argsort(np.concatenate([np.zeros(0, dtype=np.int64), *groups])))
+
+
+def _groups(ranges: PlacedRanges) -> list[Indices]:
+    """Rows of the ranges that share keyframes, anchor and tag."""
+    keys = np.stack([ranges.before, ranges.after, ranges.anchor_index, ranges.tag_index])
+    order = np.lexsort(keys[::-1])
+    starts = np.flatnonzero(np.any(np.diff(keys[:, order]) != 0, axis=0)) + 1
+    return np.split(order, starts) if len(order) else []
+
+
+def _cost(ranges: PlacedRanges, rows: Indices, blocks: RangeBlocks, model: Mapping[str, Any]) -> pyceres.CostFunction:
+    from rangesfm import _cpp
+
+    measured = {
+        "range_m": ranges.range_m[rows],
+        "stddev_m": ranges.stddev_m[rows],
+        "share": np.ones(len(rows)) if ranges.share is None else ranges.share[rows],
+        "tag_in_cam_m": None if blocks.lever_arms_are_free else blocks.tags_in_cam[ranges.tag_index[rows[0]]],
+        **model,
+    }
+    if ranges.before[rows[0]] == ranges.after[rows[0]]:
+        return _cpp.range_cost(**measured)
+    return _cpp.interpolated_range_cost(
+        **measured,
+        weight=ranges.weight[rows],
+        offset_in_world_m=ranges.offset_in_world_m[rows],
+        interval_s=None if blocks.time_shift is None else ranges.interval_s[rows[0]],  # type: ignore[index]
+    )
+
+
+def _blocks_of_group(ranges: PlacedRanges, row: int, blocks: RangeBlocks) -> list[Array]:
+    """In the order of the costs."""
+    before, after, anchor, tag = (
+        int(index[row]) for index in (ranges.before, ranges.after, ranges.anchor_index, ranges.tag_index)
+    )
+    found = [blocks.poses[before]]
+    if before != after:
+        found.append(blocks.poses[after])
+    found += [blocks.anchors[anchor], blocks.biases[anchor]]
+    if blocks.lever_arms_are_free:
+        found.append(blocks.tags_in_cam[tag])
+    if blocks.time_shift is not None and before != after:
+        found.append(blocks.time_shift)
+    if blocks.amplitude is not None:
+        found.append(blocks.amplitude)
+    return found

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from rangesfm.arrays import Array
-from rangesfm.ceres.compatibility import check_compatibility
+from rangesfm.ceres.doctor import check_compatibility
 
 if TYPE_CHECKING:
     import pycolmap

@@ -73,26 +73,10 @@ class Observations:
     points: Array
     point_ids: Indices
 
-    def of_points(self, taken: Mask) -> Observations:
-        """Those of some of the points; the others are there still, seen by nobody."""
-        return self.subset(np.flatnonzero(taken[self.point]))
-
-    def with_pixel_stddev(self, pixel_stddev: float) -> Observations:
-        """Of features whose coordinates are known to so many of what they were taken to be known to."""
-        return replace(self, weight=self.weight / pixel_stddev)
-
     def subset(self, rows: Indices) -> Observations:
-        """Some of the observations, of all points."""
-        return Observations(
-            self.frame[rows],
-            self.point[rows],
-            self.ray[rows],
-            self.weight[rows],
-            self.cam_from_rig_rotation[rows],
-            self.cam_from_rig_translation[rows],
-            self.points,
-            self.point_ids,
-        )
+        """Some of the observations; points of the others are there still, seen by nobody."""
+        of_each = ("frame", "point", "ray", "weight", "cam_from_rig_rotation", "cam_from_rig_translation")
+        return replace(self, **{name: getattr(self, name)[rows] for name in of_each})
 
 
 @dataclass(frozen=True)

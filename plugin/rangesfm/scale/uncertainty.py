@@ -12,7 +12,7 @@ from scipy.special import chndtrix
 from rangesfm.arrays import Array
 from rangesfm.ranging.errors.cells import MAX_NUM_CELLS, Cells, cells, noisiness
 from rangesfm.ranging.errors.components import CLOCKS, GIVEN, REWEIGHTING
-from rangesfm.ranging.errors.learned import ROUNDING, LearnedErrors, learn_errors, usual_errors
+from rangesfm.ranging.errors.learned import ROUNDING, ExpectedErrors, LearnedErrors, learn_errors
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.estimate import NORMAL_95, ScaleUncertainty
 from rangesfm.scale.problem import ScaleProblem
@@ -111,12 +111,11 @@ def errors_to_expect(
         max_num_cells: fewer are coarser, and sooner computed.
     """
     taken_off = observations.log.shared_stddev_m
-    return usual_errors(
+    return ExpectedErrors.of(
         _cells(posed, solution, observations, model_from_cam, max_num_cells),
-        curve_stddev_m=None if taken_off is None else taken_off[posed.rows],
-        ruled_out=ruled_out(solution.problem),
-        stddevs=stddevs,
-    )
+        None if taken_off is None else taken_off[posed.rows],
+        ruled_out(solution.problem),
+    ).usual(stddevs)
 
 
 def ruled_out(problem: RangeProblem) -> list[str]:

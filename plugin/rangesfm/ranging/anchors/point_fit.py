@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.similarity import path_shape
 from rangesfm.ranging.anchors.multilateration import multilaterate
-from rangesfm.ranging.errors.inlier_noise import inlier_noise
+from rangesfm.ranging.errors.noise import inlier_noise
 from rangesfm.ranging.errors.robust_loss import CAUCHY, RobustLoss
 from rangesfm.ranging.range_gradient import RangeGradient
 

@@ -14,11 +14,9 @@ from rangesfm.options import AssociationOptions
 from rangesfm.progress import Progress, SilentProgress
 from rangesfm.ranging.association import associate, is_too_long, lever_arms
 from rangesfm.ranging.clock.bursts import Bursts, curve_of, find_bursts, offsets_that_keep, pair_bursts
-from rangesfm.ranging.clock.drift import drift_note, fit_clocks
-from rangesfm.ranging.clock.fit import refine_offset
-from rangesfm.ranging.clock.path import moving_path
+from rangesfm.ranging.clock.fit import drift_note, fit_clocks, refine_offset
 from rangesfm.ranging.clock.rivals import REMEDY, Rival, likely_fits, likely_offsets
-from rangesfm.ranging.clock.search import CostCurve, TimedRanges, ranges_on_path, scan_offsets
+from rangesfm.ranging.clock.search import CostCurve, TimedRanges, moving_path, ranges_on_path, scan_offsets
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.observations import RangeStatus
 

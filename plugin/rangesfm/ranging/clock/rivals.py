@@ -10,7 +10,7 @@ import numpy as np
 from rangesfm.arrays import Indices
 from rangesfm.errors import GeometryError
 from rangesfm.ranging.clock.fit import OffsetFit
-from rangesfm.ranging.clock.path import PathSamples
+from rangesfm.ranging.clock.search import PathSamples
 
 REMEDY = "give the time offset (--ranges_time_offset)"
 # Less likely offsets than this are not.

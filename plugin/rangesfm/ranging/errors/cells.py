@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -93,17 +93,12 @@ def cells(
         in_cam=towards[first],
         noisiness=noise_of_anchor[anchor_index[first]],
     )
-    return Cells(
-        of_range=of_range,
-        weight=weight,
-        worth=begun.worth,
-        anchor_index=begun.anchor_index,
-        tag_index=begun.tag_index,
+    return replace(
+        begun,
         time_s=begun.mean(since),
         distance_m=begun.mean(distance),
         from_anchor=_unit(begun.mean(towards)),
         in_cam=_unit(begun.mean(np.einsum("nij,nj->ni", cam_from_world, towards))),
-        noisiness=begun.noisiness,
     )
 
 
