@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array
 from rangesfm.scale.estimate import CutoffTest, ScaleSensitivity
-from rangesfm.scale.range_equation import RangeProblem, predicted_ranges, range_gradient, solve
+from rangesfm.scale.range_equation import predicted_ranges, range_gradient, solve
 from rangesfm.scale.solution import Solution
 from rangesfm.scale.starts import spread_subset
 from rangesfm.scale.uncertainty import scale_influence
@@ -65,10 +65,13 @@ def cutoff_test(solution: Solution) -> tuple[CutoffTest, ...]:
     thinning = len(solution.problem.range_m) / len(problem.range_m)
     # Thinned ranges are less correlated by as much as there are fewer of them.
     inflation = max(solution.errors.inflation / np.sqrt(thinning), 1.0)
+    heard = np.unique(problem.anchor_index)
     tests: list[CutoffTest] = []
     for cutoff in _CUTOFFS_M:
         rows = np.flatnonzero(problem.range_m >= cutoff)
-        if tests and (len(rows) == len(problem.range_m) or not _enough(problem, rows)):
+        left = np.bincount(problem.anchor_index[rows], minlength=problem.num_anchors)
+        is_enough = len(rows) >= _MIN_SHARE * len(problem.range_m) and np.all(left[heard] >= _MIN_RANGES_PER_ANCHOR)
+        if tests and (len(rows) == len(problem.range_m) or not is_enough):
             continue
         fit = solve(problem.subset(rows), solution.fit.state, tolerance=1e-8)
         scale = fit.state.metric_from_model.scale
@@ -89,9 +92,3 @@ def scale_drift(tests: tuple[CutoffTest, ...]) -> CutoffTest | None:
         if change > _SIGNIFICANT * np.sqrt(variance):
             drifted.append((change, test))
     return max(drifted, key=lambda pair: pair[0], default=(0.0, None))[1]
-
-
-def _enough(problem: RangeProblem, rows: Indices) -> bool:
-    heard = np.bincount(problem.anchor_index, minlength=problem.num_anchors) > 0
-    left = np.bincount(problem.anchor_index[rows], minlength=problem.num_anchors)
-    return bool(len(rows) >= _MIN_SHARE * len(problem.range_m) and np.all(left[heard] >= _MIN_RANGES_PER_ANCHOR))

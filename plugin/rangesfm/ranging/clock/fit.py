@@ -137,13 +137,8 @@ class OffsetFit:
 
 
 def refine_offset(ranges: TimedRanges, path: PathSamples, offset_s: float) -> OffsetFit:
-    """Descend from an offset to the nearest one that explains the ranges best (Gauss-Newton).
-
-    Args:
-        ranges: (nearly) all are on the path at that offset.
-        path: of a moving camera.
-        offset_s: to start from.
-    """
+    """Descend from an offset, at which (nearly) all ranges are on the path, to the nearest one that explains them best
+    (Gauss-Newton)."""
     found = fit_at_offset(ranges, path, offset_s)
     for num_steps in range(_MAX_NUM_STEPS):
         own = found.squares.unexplained(found.rates[:, None])[:, 0]
@@ -213,10 +208,7 @@ def _jackknife_variances(own: Array, residuals: Array, squares: SquaresFit, time
 
     Args:
         own: (n, k) columns of the unknowns in question, which nothing else explains.
-        residuals: (n,) weighted, metres.
-        squares: the fit.
-        times: (n,)
-        num_blocks: of equal length.
+        residuals: (n,) weighted, metres, of the fit ``squares``.
     """
     columns = np.column_stack([squares.basis, own / np.linalg.norm(own, axis=0)])
     curved = columns * (2 * squares.weights - 1)[:, None]
@@ -237,12 +229,7 @@ def _jackknife_variances(own: Array, residuals: Array, squares: SquaresFit, time
 
 
 def fit_clocks(ranges: TimedRanges, path: PathSamples, offset_s: float) -> tuple[OffsetFit, Timing, float, float]:
-    """Descend to the offset; if the ranges then show a drift beyond doubt, to both.
-
-    Args:
-        ranges: (nearly) all are on the path at ``offset_s``.
-        path: of the moving camera.
-        offset_s: to start from.
+    """``refine_offset``; if the ranges then show a drift beyond doubt, offset and drift.
 
     Returns:
         the fit at the offset, of ranges whose times are freed of the drift that is followed; what it says of the offset

@@ -80,8 +80,6 @@ class PathSamples:
         """Where the antenna of a tag is at known times, and how it moves.
 
         Args:
-            times_s: (n,)
-            tag: (n,) which one.
             scale: metres per model unit; infinite to leave the lever arm out.
 
         Returns:
@@ -169,9 +167,7 @@ def scan_offsets(ranges: TimedRanges, path: PathSamples, weights: Array | None =
     """Try every offset at which log and path overlap; the lever arm changes little at this resolution.
 
     Args:
-        ranges: of all anchors, in any order.
-        path: with some pose known.
-        weights: (n,) of the ranges; None: all weigh the same.
+        path: with some pose known. weights: (n,) of the ranges, in any order; None: all weigh the same.
     """
     weights = np.ones(len(ranges.range_m)) if weights is None else weights
     scanned: list[tuple[Array, Array, Array, Array]] = []

@@ -44,7 +44,6 @@ class Calibration:
         noise_stddev_m: scatter of a range about the curve and its anchor's bias.
         outlier_share: ranges that do not fit, as those without line of sight.
         anchor_bias_m: what each anchor reads too long beyond the curve.
-        correlation_inflation: by how much the errors' correlation in time widens stddevs.
         distance_m, error_m: (n,) of each range: true length, and measured minus true.
     """
 
@@ -53,7 +52,6 @@ class Calibration:
     noise_stddev_m: float
     outlier_share: float
     anchor_bias_m: dict[str, float]
-    correlation_inflation: float
     distance_m: Array
     error_m: Array
 
@@ -106,7 +104,7 @@ def calibrate_ranges(log: RangeLog, tags_m: Array, anchors: Sequence[Anchor]) ->
     curve = ErrorCurve(knots, fitted.values[: len(knots)], stddev, noise)
     biases = dict(zip(log.anchor_ids, fitted.values[len(knots) :].tolist(), strict=True))
     outliers = float(np.mean(fitted.weights < 0.1))
-    return Calibration(curve, len(used), scatter.noise_m, outliers, biases, scatter.inflation, distance, error)
+    return Calibration(curve, len(used), scatter.noise_m, outliers, biases, distance, error)
 
 
 def _errors(log: RangeLog, tags_m: Array, anchors: Sequence[Anchor]) -> tuple[Array, Array]:

@@ -147,13 +147,14 @@ class ExpectedErrors:
     ) -> ExpectedErrors:
         """As of ``learn_errors``."""
         components = tuple(component for component in COMPONENTS if component.name not in ruled_out)
-        of_components = np.array([_covariance(component, cells) for component in components])
+        of_anchor = np.outer(cells.noisiness, cells.noisiness)
+        of_components = [c.correlation(cells) * (of_anchor if c.is_of_anchor else 1.0) for c in components]
         known = dict(others_m2 or {})
         if curve_stddev_m is not None:
             stddev = cells.mean(curve_stddev_m)
             smooth = next(component for component in COMPONENTS if component.name == "curve")
             known[LEARNT_CURVE] = np.outer(stddev, stddev) * smooth.correlation(cells)
-        return cls(cells, components, of_components, known, curve_stddev_m is not None)
+        return cls(cells, components, np.array(of_components), known, curve_stddev_m is not None)
 
     def usual(self, stddevs: Mapping[str, float]) -> LearnedErrors:
         """Roots of the mean variances over radios, or by name what is known better."""
@@ -200,12 +201,6 @@ def _median(component: Component, is_calibrated: bool) -> float:
     if is_calibrated and component.calibrated_median is not None:
         return component.calibrated_median
     return component.median
-
-
-def _covariance(component: Component, cells: Cells) -> Array:
-    """(c, c) for a stddev of 1."""
-    covariance = component.correlation(cells)
-    return covariance * np.outer(cells.noisiness, cells.noisiness) if component.is_of_anchor else covariance
 
 
 @dataclass(frozen=True)

@@ -46,12 +46,6 @@ class RobustLoss:
         root = np.sqrt(rho)
         return np.where(root > 0, first * np.abs(scaled_residuals) / np.maximum(root, 1e-300), 1.0)
 
-    def curvatures(self, scaled_residuals: Array) -> Array:
-        """(n,) second derivative of half the loss by the residual."""
-        squared = scaled_residuals**2
-        _, first, second = self.rho(squared)
-        return np.asarray(first + 2 * squared * second)
-
 
 # Of this width the efficiency under Gaussian noise is 95 %. For first rounds, and where a start may be far off.
 CAUCHY = RobustLoss(2.385, is_bounded=False)
