@@ -8,12 +8,7 @@ from scipy.sparse import csr_array
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import sequence_path
 
-from rangesfm.ceres.linear_solver import (
-    dense_is_faster,
-    inverse_is_affordable,
-    max_num_images_direct,
-    overlaps_in,
-)
+from rangesfm.ceres.linear_solver import dense_is_faster, inverse_is_affordable, max_num_images_direct, overlaps_in
 from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.refine.bundle_adjustment import bundle_adjustment

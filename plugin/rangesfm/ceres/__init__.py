@@ -22,12 +22,15 @@ from rangesfm.ceres.doctor import check_compatibility
 from rangesfm.ceres.problem import (
     PlacedRanges,
     RangeBlocks,
+    Step,
     add_normal_prior,
     add_ranges,
     add_residual_block,
     keep_from_elimination,
+    num_columns,
+    solve,
+    tangent_jacobian,
 )
-from rangesfm.ceres.solving import Step, num_columns, solve, tangent_jacobian
 
 if TYPE_CHECKING:
     from rangesfm._cpp import direction_cost, distance_cost, interpolated_range_cost, joint_prior_cost, range_cost

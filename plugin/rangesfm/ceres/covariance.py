@@ -14,11 +14,13 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.ceres import num_columns, tangent_jacobian
-from rangesfm.ceres.factored import SingularError, factor
+from rangesfm.ceres.linear_solver import SingularError, factor
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.geometry.trajectory import pose_of
+
+_Between = Callable[[Array, Array], Array]
 
 # A motion of the whole world that changes the residuals by less than this part of what its parts would do alone
 # changes nothing: rounding leaves some 1e-15, a single weak range some 1e-5.
@@ -199,26 +201,15 @@ class _Columns:
         return f"{kind} number {self.kinds[:index].count(kind)}"
 
 
-class _Excess:
-    """J^T (S - 1) J, in the columns that are kept."""
-
-    def __init__(self, independent: csc_matrix, by_error: csc_matrix, covariance: Array) -> None:
-        self._independent, self._by_error, self._covariance = independent, by_error, covariance
-
-    def between(self, left: Array, right: Array) -> Array:
-        """(a, b) left^T (...) right, of (size, a) and (size, b)."""
-        of_left, of_right = self._by_error.T @ left, self._by_error.T @ right
-        shared: Array = of_left.T @ (self._covariance @ of_right)
-        shared -= left.T @ (self._independent @ right)
-        return shared
-
-
-def _excess(kept: csc_matrix, errors: ResidualErrors | None) -> _Excess:
+def _excess(kept: csc_matrix, errors: ResidualErrors | None) -> _Between:
+    """(a, b) left^T J^T (S - 1) J right, of (size, a) and (size, b) in the columns that are kept."""
     if errors is None:
-        size = kept.shape[1]
-        return _Excess(csc_matrix((size, size)), csc_matrix((size, 0)), np.zeros((0, 0)))
+        return lambda left, right: np.zeros((left.shape[1], right.shape[1]))
     rows = csr_matrix(kept)[errors.rows]
-    return _Excess(csc_matrix(rows.T @ rows), csc_matrix(rows.T @ errors.by_error), errors.covariance)
+    independent, by_error = csc_matrix(rows.T @ rows), csc_matrix(rows.T @ errors.by_error)
+    return lambda left, right: np.asarray(
+        (by_error.T @ left).T @ (errors.covariance @ (by_error.T @ right)) - left.T @ (independent @ right)
+    )
 
 
 def _address(block: Array) -> int:
@@ -291,7 +282,9 @@ def _free_motions(jacobian: csc_matrix, motions: Array) -> Array:
 class _Inverse:
     """The pseudo-inverse of the normal equations, orthogonal to the free motions."""
 
-    def __init__(self, normal: csc_matrix, free: Array, columns: _Columns, excess: _Excess) -> None:
+    def __init__(
+        self, normal: csc_matrix, free: Array, columns: _Columns, excess: Callable[[Array, Array], Array]
+    ) -> None:
         self._excess = excess
         self._free = linalg.orth(free) if free.shape[1] else free
         scale = 1.0 / np.sqrt(np.maximum(normal.diagonal(), 1e-300))
@@ -319,13 +312,13 @@ class _Inverse:
             solution = self.solve(right)
             for span in some:
                 of_block = solution[:, span.start - start : span.stop - start]
-                blocks.append(of_block[span] + self._excess.between(of_block, of_block))
+                blocks.append(of_block[span] + self._excess(of_block, of_block))
         return blocks
 
     def of_functions(self, gradients: Array) -> Array:
         """(k, k) of the linear functions with these (size, k) gradients."""
         solution = self.solve(gradients)
-        return gradients.T @ solution + self._excess.between(solution, solution)
+        return gradients.T @ solution + self._excess(solution, solution)
 
 
 def _solver(normal: csc_matrix, columns: _Columns) -> Callable[[Array], Array]:

@@ -14,7 +14,7 @@ from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.ceres.factored import Factored, SingularError, factor
+from rangesfm.ceres.linear_solver import Factored, SingularError, factor
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import rounding_of

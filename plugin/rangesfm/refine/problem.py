@@ -21,7 +21,7 @@ from rangesfm.refine.bundle_adjustment import BundleAdjustment, bundle_adjustmen
 from rangesfm.refine.distances import MeasuredDistances, add_distances
 from rangesfm.refine.radio import RadioBlocks, RadioEstimate, RadioRanges, add_radio_priors, add_ranges
 
-_STEP = 1e-6
+_PARAMETER_STEP = 1e-6
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ def parameter_stddevs(camera: pycolmap.Camera, focal_length_stddev_px: float) ->
 def _shift_px(camera: pycolmap.Camera, points_in_cam: Array, index: int) -> float:
     """How far a parameter moves the image of a point, pixels per unit."""
     other = pycolmap.Camera(camera.todict())
-    other.params[index] += _STEP * max(1.0, abs(camera.params[index]))
+    other.params[index] += _PARAMETER_STEP * max(1.0, abs(camera.params[index]))
     step = other.params[index] - camera.params[index]
     found = [np.asarray(one.img_from_cam(points_in_cam)) for one in (camera, other)]
     return float(np.linalg.norm(found[1] - found[0]) / abs(step))

@@ -16,13 +16,7 @@ from rangesfm.geometry.trajectory import pose_of
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors
 from rangesfm.ranging.errors.robust_loss import wider
-from rangesfm.refine.keyframe_graph import (
-    GraphSolution,
-    GraphState,
-    KeyframeGraph,
-    local_scales,
-    solve_graph,
-)
+from rangesfm.refine.keyframe_graph import GraphSolution, GraphState, KeyframeGraph, local_scales, solve_graph
 from rangesfm.refine.problem import RefinementProblem
 from rangesfm.refine.radio import moved_anchors
 from rangesfm.refine.vision_information import (
