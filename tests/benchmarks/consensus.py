@@ -10,8 +10,8 @@ import time
 
 import numpy as np
 
-from rangesfm.scale.consensus import consensus_scales
 from rangesfm.scale.range_equation import RangeProblem
+from rangesfm.scale.starts import consensus_scales
 
 _NUM_REPETITIONS = 5
 _SCALE = 2.0

@@ -271,7 +271,7 @@ def test_large_problems_are_solved_sparsely_with_the_same_answer(monkeypatch: py
     survey = joint(model(num_frames=20), hold_anchors=True)
     answers = []
     for dense_from in (0.0, 1.0):
-        monkeypatch.setattr("rangesfm.ceres.factored._DENSE_FROM", dense_from)
+        monkeypatch.setattr("rangesfm.ceres.linear_solver._DENSE_FROM", dense_from)
         monkeypatch.setattr("rangesfm.ceres.covariance._BLOCKS_AT_ONCE", 7)
         answers.append(
             joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases)

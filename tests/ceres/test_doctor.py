@@ -51,7 +51,7 @@ def test_a_compiled_part_that_does_not_fit_is_reported_and_not_raised(monkeypatc
 
 
 def test_two_versions_of_ceres_do_not_go_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "pyceres_ceres_version", lambda: "2.3.0")
+    monkeypatch.setattr("pyceres.__ceres_version__", "2.3.0")
     check = check_named("Ceres")
     assert not check.ok
     assert check.found == "2.2.0 in pycolmap, 2.3.0 in pyceres"

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rangesfm.ranging.errors.noise_of_log import estimate_noise_m, find_quantization_m
+from rangesfm.ranging.errors.noise import estimate_noise_m, find_quantization_m
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.summary import summarize_ranges
 

@@ -9,7 +9,7 @@ from tests.refine.test_with_ranges import Survey, make_survey
 
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.refine.bundle_adjustment import bundle_adjustment
-from rangesfm.refine.calibration import add_calibration, parameter_stddevs
+from rangesfm.refine.problem import add_calibration, parameter_stddevs
 
 
 @pytest.fixture(scope="module")

@@ -17,8 +17,8 @@ from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE
 from rangesfm.refine import keyframe_graph
-from rangesfm.refine.antennas import Antennas
 from rangesfm.refine.keyframe_graph import KeyframeGraph, local_scales, solve_graph
+from rangesfm.refine.radio import Antennas
 from rangesfm.refine.vision_information import Poses, vision_information
 
 Array = npt.NDArray[np.float64]

@@ -6,7 +6,7 @@ import pytest
 from tests.simulated.model import SyntheticModel
 
 from rangesfm.ceres import Step
-from rangesfm.refine.stillness import Stillness
+from rangesfm.refine.bundle_adjustment import Stillness
 
 FREE, TIMID = 1e10, 1e2
 

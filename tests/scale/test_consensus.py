@@ -11,8 +11,8 @@ import pytest
 
 from rangesfm.demo.ranges import Radio
 from rangesfm.errors import GeometryError
-from rangesfm.scale.consensus import agreeing_intervals, consensus_scales, local_maxima
 from rangesfm.scale.range_equation import RangeProblem
+from rangesfm.scale.starts import agreeing_intervals, consensus_scales, local_maxima
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey

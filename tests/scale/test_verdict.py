@@ -11,9 +11,9 @@ import pytest
 from rangesfm.demo.ranges import Radio
 from rangesfm.errors import GeometryError
 from rangesfm.options import ScaleOptions
-from rangesfm.scale.cutoff import scale_drift
 from rangesfm.scale.estimate import CutoffTest
 from rangesfm.scale.initialize import initialize_scale
+from rangesfm.scale.sensitivity import scale_drift
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey

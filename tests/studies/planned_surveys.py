@@ -30,7 +30,7 @@ from rangesfm.planning.expected import Expected, expect
 from rangesfm.planning.paths import path_through
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.errors.population import stddevs_in
+from rangesfm.ranging.errors.components import stddevs_in
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.problem import ScaleProblem, scale_problem
 from rangesfm.scale.range_equation import RangeState

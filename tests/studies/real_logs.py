@@ -36,9 +36,8 @@ from rangesfm.options import AssociationOptions, ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor, read_anchors
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.errors.calibration import calibrate_ranges
-from rangesfm.ranging.errors.components import components
+from rangesfm.ranging.errors.components import components, population
 from rangesfm.ranging.errors.error_curve import ErrorCurve, correct_ranges
-from rangesfm.ranging.errors.population import population
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.ranging.readers import read_ranges

@@ -4,7 +4,7 @@ Run: python -m tests.studies.scale_coverage --rows FILE [--num_seeds 300] [--sur
 
 Started again with the same file it goes on where it was stopped.
 
-Each survey has a radio of its own, drawn from the population (``rangesfm.ranging.errors.population``), and with it
+Each survey has a radio of its own, drawn from the population (``rangesfm.ranging.errors.components``), and with it
 errors that are drawn as functions of time, place, distance and direction, and a bend of its map. In the calibrated
 cases the error curve is known to 0.01 m; in those by photo ranges name the photo next to them instead of a time. Prints
 for each case of anchors the share of intervals that cover the true scale with its standard error, the median half

@@ -3,7 +3,7 @@
 Run: python -m tests.studies.shown_errors --data FOLDER
 
 Learnt as a survey learns them, but at the true scale and from the same start for all logs: the columns of the table in
-``rangesfm/ranging/errors/population.py``. The logs are those of ``real_logs.json``.
+``rangesfm/ranging/errors/components.py``. The logs are those of ``real_logs.json``.
 """
 
 from __future__ import annotations

@@ -11,8 +11,7 @@ import pytest
 
 from rangesfm.errors import GeometryError
 from rangesfm.join.models import PathOfModel
-from rangesfm.ranging.clock.estimate import TimeOffset
-from rangesfm.ranging.clock.rivals import Rival
+from rangesfm.ranging.clock.estimate import Rival, TimeOffset
 from rangesfm.ranging.clock.search import CostCurve
 from rangesfm.ranging.log import RangeLog
 from rangesfm.workflows import metric_map

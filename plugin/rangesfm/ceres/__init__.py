@@ -18,10 +18,19 @@ pycolmap, pyceres and the compiled part exchange C++ objects, which works only b
 
 from typing import TYPE_CHECKING, Any
 
-from rangesfm.ceres.compatibility import check_compatibility, compiled_part_version, pyceres_ceres_version
-from rangesfm.ceres.many_ranges import PlacedRanges, RangeBlocks, add_ranges
-from rangesfm.ceres.problem import add_normal_prior, add_residual_block, keep_from_elimination
-from rangesfm.ceres.solving import Step, num_columns, solve, tangent_jacobian
+from rangesfm.ceres.doctor import check_compatibility
+from rangesfm.ceres.problem import (
+    PlacedRanges,
+    RangeBlocks,
+    Step,
+    add_normal_prior,
+    add_ranges,
+    add_residual_block,
+    keep_from_elimination,
+    num_columns,
+    solve,
+    tangent_jacobian,
+)
 
 if TYPE_CHECKING:
     from rangesfm._cpp import direction_cost, distance_cost, interpolated_range_cost, joint_prior_cost, range_cost
@@ -34,14 +43,12 @@ __all__ = [
     "add_ranges",
     "add_residual_block",
     "check_compatibility",
-    "compiled_part_version",
     "direction_cost",
     "distance_cost",
     "interpolated_range_cost",
     "joint_prior_cost",
     "keep_from_elimination",
     "num_columns",
-    "pyceres_ceres_version",
     "range_cost",
     "solve",
     "tangent_jacobian",

@@ -7,19 +7,20 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 from scipy import linalg
 from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix, diags
 from scipy.spatial.transform import Rotation
 
-from rangesfm.arrays import Array, Mask
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.ceres import num_columns, tangent_jacobian
-from rangesfm.ceres.factored import SingularError, factor
+from rangesfm.ceres.linear_solver import SingularError, factor
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.geometry.trajectory import pose_of
+
+_Between = Callable[[Array, Array], Array]
 
 # A motion of the whole world that changes the residuals by less than this part of what its parts would do alone
 # changes nothing: rounding leaves some 1e-15, a single weak range some 1e-5.
@@ -41,7 +42,7 @@ class ResidualErrors:
         covariance: (m, m) of these errors: all that the residuals have.
     """
 
-    rows: npt.NDArray[np.int64]
+    rows: Indices
     by_error: csr_matrix
     covariance: Array
 
@@ -63,7 +64,7 @@ class JointCovariance:
             constant have covariance 0.
     """
 
-    frame_ids: npt.NDArray[np.int64]
+    frame_ids: Indices
     rig_from_world: Array
     centers: Array
     anchors: Array
@@ -137,11 +138,11 @@ class _Columns:
         index_of: place in ``variable`` by address.
     """
 
-    frames: npt.NDArray[np.int64]
+    frames: Indices
     poses: list[Array]
     variable: list[Array]
     kinds: list[str]
-    starts: npt.NDArray[np.int64]
+    starts: Indices
     index_of: dict[int, int]
 
     @classmethod
@@ -200,33 +201,22 @@ class _Columns:
         return f"{kind} number {self.kinds[:index].count(kind)}"
 
 
-class _Excess:
-    """J^T (S - 1) J, in the columns that are kept."""
-
-    def __init__(self, independent: csc_matrix, by_error: csc_matrix, covariance: Array) -> None:
-        self._independent, self._by_error, self._covariance = independent, by_error, covariance
-
-    def between(self, left: Array, right: Array) -> Array:
-        """(a, b) left^T (...) right, of (size, a) and (size, b)."""
-        of_left, of_right = self._by_error.T @ left, self._by_error.T @ right
-        shared: Array = of_left.T @ (self._covariance @ of_right)
-        shared -= left.T @ (self._independent @ right)
-        return shared
-
-
-def _excess(kept: csc_matrix, errors: ResidualErrors | None) -> _Excess:
+def _excess(kept: csc_matrix, errors: ResidualErrors | None) -> _Between:
+    """(a, b) left^T J^T (S - 1) J right, of (size, a) and (size, b) in the columns that are kept."""
     if errors is None:
-        size = kept.shape[1]
-        return _Excess(csc_matrix((size, size)), csc_matrix((size, 0)), np.zeros((0, 0)))
+        return lambda left, right: np.zeros((left.shape[1], right.shape[1]))
     rows = csr_matrix(kept)[errors.rows]
-    return _Excess(csc_matrix(rows.T @ rows), csc_matrix(rows.T @ errors.by_error), errors.covariance)
+    independent, by_error = csc_matrix(rows.T @ rows), csc_matrix(rows.T @ errors.by_error)
+    return lambda left, right: np.asarray(
+        (by_error.T @ left).T @ (errors.covariance @ (by_error.T @ right)) - left.T @ (independent @ right)
+    )
 
 
 def _address(block: Array) -> int:
     return int(block.__array_interface__["data"][0])
 
 
-def _schur_complement(jacobian: csc_matrix, columns: _Columns) -> tuple[csc_matrix, npt.NDArray[np.int64]]:
+def _schur_complement(jacobian: csc_matrix, columns: _Columns) -> tuple[csc_matrix, Indices]:
     """Normal equations of what is kept once the points are eliminated, and which columns are kept."""
     first = columns.num_kept_columns
     stays = np.repeat(_tied_points(jacobian[:, first:]), 3)
@@ -286,14 +276,15 @@ def _free_motions(jacobian: csc_matrix, motions: Array) -> Array:
     moves = alone > _FREE_MOTION * alone.max()
     scaled = motions[:, moves] / alone[moves]
     _, strengths, directions = np.linalg.svd(jacobian @ scaled, full_matrices=False)
-    free: Array = scaled @ directions[strengths < _FREE_MOTION].T
-    return free
+    return np.asarray(scaled @ directions[strengths < _FREE_MOTION].T)
 
 
 class _Inverse:
     """The pseudo-inverse of the normal equations, orthogonal to the free motions."""
 
-    def __init__(self, normal: csc_matrix, free: Array, columns: _Columns, excess: _Excess) -> None:
+    def __init__(
+        self, normal: csc_matrix, free: Array, columns: _Columns, excess: Callable[[Array, Array], Array]
+    ) -> None:
         self._excess = excess
         self._free = linalg.orth(free) if free.shape[1] else free
         scale = 1.0 / np.sqrt(np.maximum(normal.diagonal(), 1e-300))
@@ -308,8 +299,7 @@ class _Inverse:
         """(size, k) for (size, k)."""
         right = right - self._free @ (self._free.T @ right)
         solution = self._scale * self._solve_scaled(self._scale * right)
-        projected: Array = solution - self._free @ (self._free.T @ solution)
-        return projected
+        return np.asarray(solution - self._free @ (self._free.T @ solution))
 
     def diagonal_blocks(self, spans: Sequence[slice]) -> list[Array]:
         """The blocks of the covariance at these rows and columns."""
@@ -322,14 +312,13 @@ class _Inverse:
             solution = self.solve(right)
             for span in some:
                 of_block = solution[:, span.start - start : span.stop - start]
-                blocks.append(of_block[span] + self._excess.between(of_block, of_block))
+                blocks.append(of_block[span] + self._excess(of_block, of_block))
         return blocks
 
     def of_functions(self, gradients: Array) -> Array:
         """(k, k) of the linear functions with these (size, k) gradients."""
         solution = self.solve(gradients)
-        covariance: Array = gradients.T @ solution + self._excess.between(solution, solution)
-        return covariance
+        return gradients.T @ solution + self._excess(solution, solution)
 
 
 def _solver(normal: csc_matrix, columns: _Columns) -> Callable[[Array], Array]:
@@ -369,11 +358,9 @@ def _similarity_covariance(columns: _Columns, inverse: _Inverse, num_rows: int) 
 def _center_from_step(pose: Array) -> Array:
     """(3, 6) how the centre -R^T t moves with a step in the tangent space of Ceres, which turns by twice the step."""
     rotation = _matrix(pose)
-    moved: Array = -rotation.T @ np.column_stack([2.0 * cross_matrices(pose[4:]), np.eye(3)])
-    return moved
+    return -rotation.T @ np.column_stack([2.0 * cross_matrices(pose[4:]), np.eye(3)])
 
 
 def _matrix(pose: Array) -> Array:
     """(3, 3) rotation of [qx qy qz qw tx ty tz]."""
-    matrix: Array = Rotation.from_quat(pose[:4]).as_matrix()
-    return matrix
+    return np.asarray(Rotation.from_quat(pose[:4]).as_matrix())

@@ -1,18 +1,28 @@
-"""What solving for all photos at once costs: cheap wherever each sees what few others see."""
+"""Normal equations, factored dense or sparse; and what solving for all photos at once costs.
+
+It is cheap wherever each photo sees what few others see.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
 import pycolmap
-from scipy.sparse import csr_array
+from scipy import linalg
+from scipy.sparse import csc_array, csc_matrix, csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
+from scipy.sparse.linalg import splu
 
-from rangesfm.arrays import Indices
+from rangesfm.arrays import Array, Indices
 
 # Of an entry of a sparse factor, in time, against one of a dense factor.
 _SPARSE_SLOWDOWN = 8
 # Of a multiplication, where whole blocks of photos are eliminated at once.
 _BLOCKWISE_SLOWDOWN = 2
+# From this share of nonzeros on, a dense factor is faster than a sparse one.
+_DENSE_FROM = 0.15
 
 
 def max_num_images_direct(overlaps: csr_array, limit: int) -> int:
@@ -63,22 +73,67 @@ def overlaps_in(model: pycolmap.Reconstruction) -> csr_array:
     return csr_array(sees @ sees.T)
 
 
-def overlaps_of(pairs: Indices, num: int) -> csr_array:
-    """(n, n) of (k, 2) pairs of photos, each pair once."""
-    ones = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(num, num))
-    return csr_array(ones + ones.T)
-
-
 def _envelope_widths(overlaps: csr_array) -> Indices:
     """(n,) how far each row reaches to the left of its diagonal, in an order that keeps neighbours together."""
     order = reverse_cuthill_mckee(overlaps, symmetric_mode=True)
     ordered = overlaps[order][:, order].tocoo()
     leftmost = np.arange(overlaps.shape[0])
     np.minimum.at(leftmost, ordered.row, ordered.col)
-    widths: Indices = np.arange(overlaps.shape[0]) - leftmost
-    return widths
+    return np.arange(overlaps.shape[0]) - leftmost
 
 
 def _cost(widths: Indices) -> float:
     """Multiplications of a Cholesky factorisation, but for a factor."""
     return float(np.sum(widths.astype(np.float64) ** 2))
+
+
+class SingularError(Exception):
+    """A column depends on others.
+
+    Attributes:
+        column: which one, as far as it shows.
+    """
+
+    def __init__(self, column: int) -> None:
+        super().__init__(f"column {column} depends on others")
+        self.column = column
+
+
+@dataclass(frozen=True)
+class Factored:
+    """A factor of a symmetric positive definite matrix.
+
+    Attributes:
+        solve: gives (size, k) for a right side of (size, k), or (size,) for (size,).
+        pivots: (size,) by column.
+    """
+
+    solve: Callable[[Array], Array]
+    pivots: Array
+
+
+def factor(normal: csc_matrix | csc_array) -> Factored:
+    """Factor normal equations.
+
+    Raises:
+        SingularError: they are singular, by rounding or exactly.
+    """
+    return _dense(normal) if normal.nnz > _DENSE_FROM * normal.shape[0] ** 2 else _sparse(normal)
+
+
+def _dense(normal: csc_matrix | csc_array) -> Factored:
+    try:
+        lower = linalg.cho_factor(normal.toarray(), lower=True, overwrite_a=True, check_finite=False)
+    except linalg.LinAlgError as error:
+        raise SingularError(int(str(error).split("-th")[0]) - 1) from error
+    return Factored(
+        lambda right: np.asarray(linalg.cho_solve(lower, right, check_finite=False)), np.square(np.diag(lower[0]))
+    )
+
+
+def _sparse(normal: csc_matrix | csc_array) -> Factored:
+    try:
+        lu = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    except RuntimeError as error:  # exactly singular
+        raise SingularError(int(np.argmin(normal.diagonal()))) from error
+    return Factored(lambda right: np.asarray(lu.solve(right)), np.abs(lu.U.diagonal())[lu.perm_c])

@@ -1,24 +1,28 @@
-"""Residuals into a bundle adjuster's problem."""
+"""A bundle adjuster's problem: residuals into it, its solution, and its Jacobian as a sparse matrix."""
 
 from __future__ import annotations
 
+import math
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csr_matrix
 
-from rangesfm.arrays import Array
-from rangesfm.ceres.compatibility import check_compatibility
+from rangesfm.arrays import Array, Indices
+from rangesfm.ceres.doctor import check_compatibility
 
 if TYPE_CHECKING:
     import pyceres
     import pycolmap
 
-
 _NUM_POSE_PARAMS = 7
 _NUM_POSE_COLUMNS = 6
+# What residuals refer to. The problem refers to its adjuster, so only a weak key lets the two go in the end.
+_used_by_adjuster: weakref.WeakKeyDictionary[pycolmap.CeresBundleAdjuster, list[Any]] = weakref.WeakKeyDictionary()
 
 
 def add_residual_block(
@@ -44,7 +48,26 @@ def add_residual_block(
     Raises:
         ValueError: a block is no such array, or given twice, or not of the cost's size.
     """
-    ResidualAdder(adjuster).add(cost, loss, blocks)
+    _add(adjuster.problem, _used_by_adjuster.setdefault(adjuster, []), cost, loss, blocks)
+
+
+def _add(
+    problem: Any,
+    used: list[Any],
+    cost: pyceres.CostFunction,
+    loss: pyceres.LossFunction | None,
+    blocks: Sequence[Array],
+) -> None:
+    for block in blocks:
+        if block.dtype != np.float64 or not block.flags.carray:
+            raise ValueError("the solver works in place: a block must be a contiguous, writeable float64 array")
+    if len({block.__array_interface__["data"][0] for block in blocks}) < len(blocks):
+        raise ValueError("a block is given twice: the blocks of one residual must be different ones")
+    held = [b for b in blocks if b.size == _NUM_POSE_PARAMS and not problem.has_parameter_block(b)]
+    problem.add_residual_block(cost, loss, list(blocks))
+    for pose in held:
+        problem.set_parameter_block_constant(pose)
+    used.append((cost, loss, blocks))
 
 
 def add_normal_prior(
@@ -98,27 +121,232 @@ def keep_from_elimination(adjuster: pycolmap.CeresBundleAdjuster, block: Array, 
         _used_by_adjuster[adjuster].append(manifold)
 
 
-class ResidualAdder:
-    """What ``add_residual_block`` does, for one residual after the other into the same problem."""
+@dataclass(frozen=True)
+class PlacedRanges:
+    """n ranges, each at a keyframe (``before == after``) or between two.
 
-    def __init__(self, adjuster: pycolmap.CeresBundleAdjuster) -> None:
-        self._problem = adjuster.problem
-        self._used = _used_by_adjuster.setdefault(adjuster, [])
+    Attributes:
+        range_m: (n,) measured, positive.
+        stddev_m: (n,) noise, positive.
+        before, after: (n,) keyframes by their index in ``RangeBlocks.poses``.
+        weight: (n,) from 0 (at ``before``) to 1 (at ``after``).
+        offset_in_world_m: (n, 3) what a curved path has beyond the straight line.
+        anchor_index: (n,) in ``RangeBlocks.anchors``.
+        tag_index: (n,) in ``RangeBlocks.tags_in_cam``.
+        interval_s: (n,) time from ``before`` to ``after``; needed only for a time shift.
+        share: (n,) by how much each counts beside its noise, positive; None: 1.
+    """
 
-    def add(self, cost: pyceres.CostFunction, loss: pyceres.LossFunction | None, blocks: Sequence[Array]) -> None:
-        """See ``add_residual_block``."""
-        for block in blocks:
-            if block.dtype != np.float64 or not block.flags.carray:
-                raise ValueError("the solver works in place: a block must be a contiguous, writeable float64 array")
-        if len({block.__array_interface__["data"][0] for block in blocks}) < len(blocks):
-            raise ValueError("a block is given twice: the blocks of one residual must be different ones")
-        problem = self._problem
-        held = [b for b in blocks if b.size == _NUM_POSE_PARAMS and not problem.has_parameter_block(b)]
-        problem.add_residual_block(cost, loss, list(blocks))
-        for pose in held:
-            problem.set_parameter_block_constant(pose)
-        self._used.append((cost, loss, blocks))
+    range_m: Array
+    stddev_m: Array
+    before: Indices
+    after: Indices
+    weight: Array
+    offset_in_world_m: Array
+    anchor_index: Indices
+    tag_index: Indices
+    interval_s: Array | None = None
+    share: Array | None = None
 
 
-# What residuals refer to. The problem refers to its adjuster, so only a weak key lets the two go in the end.
-_used_by_adjuster: weakref.WeakKeyDictionary[pycolmap.CeresBundleAdjuster, list[Any]] = weakref.WeakKeyDictionary()
+@dataclass(frozen=True)
+class RangeBlocks:
+    """The parameter blocks that ranges act on; the solver changes them in place.
+
+    Attributes:
+        poses: rig_from_world (7,) of each keyframe.
+        anchors: (3,) each, in the world.
+        biases: (1,) of each anchor: what its ranges read too long.
+        tags_in_cam: (3,) of each tag: its antenna in the rig frame; blocks only if ``lever_arms_are_free``.
+        lever_arms_are_free: whether the tags' places are estimated.
+        time_shift: (1,) seconds that the ranges were taken later than thought; None: taken as they are. It
+            acts on ranges between two keyframes, also on those with a weight of 0 or 1.
+        amplitude: (1,) of what short ranges read too long; given exactly where ``short_range_length_m`` is.
+    """
+
+    poses: Sequence[Array]
+    anchors: Sequence[Array]
+    biases: Sequence[Array]
+    tags_in_cam: Sequence[Array]
+    lever_arms_are_free: bool = False
+    time_shift: Array | None = None
+    amplitude: Array | None = None
+
+
+def add_ranges(
+    adjuster: pycolmap.CeresBundleAdjuster,
+    ranges: PlacedRanges,
+    blocks: RangeBlocks,
+    *,
+    short_range_length_m: float | None = None,
+    loss_scale: float = math.inf,
+    loss_is_bounded: bool = False,
+) -> Indices:
+    """Add ranges to a bundle adjuster's problem: those of one place, anchor and tag as one residual block.
+
+    The solver's work grows with the blocks and with the pairs of blocks that share a residual, much less with
+    the residuals in one; and each block takes some microseconds to add. A robust loss acts on each range all the same.
+
+    Args:
+        adjuster: as in ``add_residual_block``, which says what is held and what lives how long.
+        ranges: n, in any order.
+        blocks: of which those that no range refers to do not become part of the problem.
+        short_range_length_m, loss_scale, loss_is_bounded: as in ``range_cost``.
+
+    Returns:
+        (n,) where each range's residual is among the problem's.
+
+    Raises:
+        ValueError: as ``range_cost`` and ``add_residual_block``; a time shift without intervals; an amplitude without
+            ``short_range_length_m``, or that without an amplitude.
+        SolverError: see ``check_compatibility``.
+    """
+    if (blocks.amplitude is None) != (short_range_length_m is None):
+        raise ValueError("of short_range_length_m and its amplitude one is given without the other")
+    if blocks.time_shift is not None and ranges.interval_s is None:
+        raise ValueError("a time shift needs interval_s, the time between the keyframes of each range")
+    check_compatibility()
+    # Looked up once: a log has thousands of blocks.
+    problem, used = adjuster.problem, _used_by_adjuster.setdefault(adjuster, [])
+    first = problem.num_residuals()
+    model = {
+        "short_range_length_m": short_range_length_m,
+        "loss_scale": loss_scale,
+        "loss_is_bounded": loss_is_bounded,
+    }
+    groups = _groups(ranges)
+    for rows in groups:
+        cost = _cost(ranges, rows, blocks, model)
+        _add(problem, used, cost, None, _blocks_of_group(ranges, int(rows[0]), blocks))
+    return np.asarray(first + np.argsort(np.concatenate([np.zeros(0, dtype=np.int64), *groups])))
+
+
+def _groups(ranges: PlacedRanges) -> list[Indices]:
+    """Rows of the ranges that share keyframes, anchor and tag."""
+    keys = np.stack([ranges.before, ranges.after, ranges.anchor_index, ranges.tag_index])
+    order = np.lexsort(keys[::-1])
+    starts = np.flatnonzero(np.any(np.diff(keys[:, order]) != 0, axis=0)) + 1
+    return np.split(order, starts) if len(order) else []
+
+
+def _cost(ranges: PlacedRanges, rows: Indices, blocks: RangeBlocks, model: Mapping[str, Any]) -> pyceres.CostFunction:
+    from rangesfm import _cpp
+
+    measured = {
+        "range_m": ranges.range_m[rows],
+        "stddev_m": ranges.stddev_m[rows],
+        "share": np.ones(len(rows)) if ranges.share is None else ranges.share[rows],
+        "tag_in_cam_m": None if blocks.lever_arms_are_free else blocks.tags_in_cam[ranges.tag_index[rows[0]]],
+        **model,
+    }
+    if ranges.before[rows[0]] == ranges.after[rows[0]]:
+        return _cpp.range_cost(**measured)
+    return _cpp.interpolated_range_cost(
+        **measured,
+        weight=ranges.weight[rows],
+        offset_in_world_m=ranges.offset_in_world_m[rows],
+        interval_s=None if blocks.time_shift is None else ranges.interval_s[rows[0]],  # type: ignore[index]
+    )
+
+
+def _blocks_of_group(ranges: PlacedRanges, row: int, blocks: RangeBlocks) -> list[Array]:
+    """In the order of the costs."""
+    before, after, anchor, tag = (
+        int(index[row]) for index in (ranges.before, ranges.after, ranges.anchor_index, ranges.tag_index)
+    )
+    found = [blocks.poses[before]]
+    if before != after:
+        found.append(blocks.poses[after])
+    found += [blocks.anchors[anchor], blocks.biases[anchor]]
+    if blocks.lever_arms_are_free:
+        found.append(blocks.tags_in_cam[tag])
+    if blocks.time_shift is not None and before != after:
+        found.append(blocks.time_shift)
+    if blocks.amplitude is not None:
+        found.append(blocks.amplitude)
+    return found
+
+
+@dataclass(frozen=True)
+class Step:
+    """What the solver just did.
+
+    Attributes:
+        is_successful: whether the parameters moved. trust_region_radius: with which the step was found.
+        cost: after it. gain: by how much it fell. expected_gain: by how much it would have, were all residuals linear.
+    """
+
+    is_successful: bool
+    trust_region_radius: float
+    cost: float
+    gain: float
+    expected_gain: float
+
+
+def solve(adjuster: pycolmap.CeresBundleAdjuster, is_enough: Callable[[Step], bool]) -> Any:
+    """Solve as ``adjuster.solve`` does, asking after each step whether that is enough.
+
+    Args:
+        is_enough: called with the parameters where the step left them; True ends the solve. What it raises ends it
+            too, and is raised here.
+
+    Returns:
+        Ceres' summary, a ``pyceres.SolverSummary``.
+    """
+    check_compatibility()
+    import pyceres
+
+    class AfterStep(pyceres.IterationCallback):  # type: ignore[misc]
+        def __init__(self) -> None:
+            super().__init__()
+            self.radius = 0.0
+            self.error: BaseException | None = None
+
+        def __call__(self, summary: Any) -> Any:
+            # An exception must not pass through the solver.
+            try:
+                gain, share = summary.cost_change, summary.relative_decrease
+                expected = gain / share if share else 0.0
+                step = Step(summary.step_is_successful, self.radius, summary.cost, gain, expected)
+                self.radius = summary.trust_region_radius
+                if summary.iteration == 0 or not is_enough(step):
+                    return pyceres.CallbackReturnType.SOLVER_CONTINUE
+                return pyceres.CallbackReturnType.SOLVER_TERMINATE_SUCCESSFULLY
+            except BaseException as error:
+                self.error = error
+                return pyceres.CallbackReturnType.SOLVER_ABORT
+
+    after_step, summary = AfterStep(), pyceres.SolverSummary()
+    options = pyceres.SolverOptions(adjuster.options.ceres.create_solver_options(adjuster.config, adjuster.problem))
+    options.callbacks, options.update_state_every_iteration = [after_step], True
+    pyceres.solve(options, adjuster.problem, summary)
+    if after_step.error is not None:
+        raise after_step.error
+    return summary
+
+
+def num_columns(problem: Any, block: Array) -> int:
+    """Of a block in ``tangent_jacobian``: its tangent size, without the padding of ``keep_from_elimination``."""
+    return min(int(problem.parameter_block_tangent_size(block)), len(block))
+
+
+def tangent_jacobian(problem: Any, blocks: Sequence[Array]) -> csr_matrix:
+    """(num_residuals, sum of ``num_columns``): robust losses applied, columns in the order of the blocks.
+
+    Args:
+        problem: an adjuster's.
+        blocks: parts of the problem that are not constant; all others are taken as constant.
+    """
+    import pyceres
+
+    options = pyceres.EvaluateOptions()
+    options.set_parameter_blocks(list(blocks))
+    jacobian = problem.evaluate_jacobian(options)
+    shape = jacobian.num_rows, jacobian.num_cols
+    padded = csr_matrix(
+        (np.asarray(jacobian.values), np.asarray(jacobian.cols), np.asarray(jacobian.rows)), shape=shape
+    )
+    sizes = np.array([problem.parameter_block_tangent_size(block) for block in blocks], dtype=np.int64)
+    wanted = np.minimum(sizes, [len(block) for block in blocks])
+    in_block = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    return padded[:, in_block < np.repeat(wanted, sizes)] if (wanted < sizes).any() else padded

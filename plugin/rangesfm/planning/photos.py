@@ -22,8 +22,8 @@ from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.association import lever_arms
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.observations import RangeObservations
-from rangesfm.refine.antennas import antennas
 from rangesfm.refine.keyframe_graph import KeyframeGraph, linear_functions
+from rangesfm.refine.radio import antennas
 from rangesfm.refine.vision_information import Observations, Poses, VisionInformation, vision_information
 from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.solution import Solution

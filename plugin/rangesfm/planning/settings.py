@@ -19,8 +19,7 @@ from rangesfm.planning.photos import MAX_NUM_PHOTOS, PlannedPhotos, ascending
 from rangesfm.planning.placement import places_in_box, places_on_walls, spread_anchors
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor, read_anchors
-from rangesfm.ranging.errors.components import COMPONENTS
-from rangesfm.ranging.errors.population import LOGS, stddevs_in
+from rangesfm.ranging.errors.components import COMPONENTS, LOGS, stddevs_in
 from rangesfm.survey.settings import parse_toml, refuse_unknown_tables
 
 _Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesfm.arrays import Array, Mask
-from rangesfm.ranging.errors.noise_of_log import estimate_noise_m, find_quantization_m, quantization_stddev_m
+from rangesfm.ranging.errors.noise import estimate_noise_m, find_quantization_m, quantization_stddev_m
 from rangesfm.ranging.log import RangeKind, RangeLog
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
@@ -29,8 +29,8 @@ class MeasuredDistances:
     """
 
     by_radio: LocatedDistances
-    tape: Tape = field(default_factory=Tape)
-    marker_ids: Mapping[str, int] = field(default_factory=dict)
+    tape: Tape
+    marker_ids: Mapping[str, int]
 
 
 def add_marker_points(model: pycolmap.Reconstruction, tape: Tape) -> dict[str, int]:

@@ -7,22 +7,21 @@ whose points have to follow every turn of the world, takes only in many.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.ceres.factored import Factored, SingularError, factor
+from rangesfm.ceres.linear_solver import Factored, SingularError, factor
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import rounding_of
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_gradient import RangeGradient
-from rangesfm.refine.antennas import Antennas
+from rangesfm.refine.radio import Antennas
 from rangesfm.refine.vision_information import Poses, VisionInformation
 
 _MAX_NUM_STEPS = 60
@@ -365,11 +364,3 @@ def _num_absorbed(terms: _Terms, layout: _Layout) -> float:
     back = whitened.T @ probes
     solved = _factor(terms.hessian, layout, 0.0).solve(np.ascontiguousarray(back))
     return float(np.sum(back * solved) / _NUM_PROBES)
-
-
-def moved_anchors(anchors: Sequence[AnchorEstimate], state: GraphState) -> tuple[AnchorEstimate, ...]:
-    """The anchors where the graph has them."""
-    return tuple(
-        replace(anchor, position_m=position, range_bias_m=float(bias))
-        for anchor, position, bias in zip(anchors, state.anchors_m, state.biases_m, strict=True)
-    )

@@ -2,33 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
+from scipy.sparse import csr_matrix
 
 from rangesfm import ceres
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.ceres.covariance import ResidualErrors
+from rangesfm.colmap.calibration import Size, calibrated_cameras
 from rangesfm.geometry.gravity import UP_IN_SITE, Gravity
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.refine.bundle_adjustment import BundleAdjustment, bundle_adjustment
-from rangesfm.refine.calibration import add_calibration
 from rangesfm.refine.distances import MeasuredDistances, add_distances
 from rangesfm.refine.radio import RadioBlocks, RadioEstimate, RadioRanges, add_radio_priors, add_ranges
-from rangesfm.refine.residual_errors import residual_errors
 
-
-@dataclass(frozen=True)
-class AddedBlocks:
-    """What came into a problem of the photos: parameter blocks, and where the residuals of the ranges are."""
-
-    blocks: RadioBlocks
-    residual_rows: npt.NDArray[np.int64]
+_PARAMETER_STEP = 1e-6
 
 
 @dataclass(frozen=True)
@@ -56,7 +49,7 @@ class RefinementProblem:
     left_out_ids: frozenset[int] = frozenset()
 
     @property
-    def frame_ids(self) -> npt.NDArray[np.int64]:
+    def frame_ids(self) -> Indices:
         """Those of the trajectory, then those without a time."""
         timed = self.ranges.trajectory.frame_ids
         return np.concatenate([timed, np.setdiff1d(np.array(self.metric.reg_frame_ids(), dtype=np.int64), timed)])
@@ -78,16 +71,16 @@ class RefinementProblem:
             left_out_ids=self.left_out_ids - set(self.distances.marker_ids.values()),
         )
 
-    def add_to(self, bundle: BundleAdjustment, errors: RangeErrors, radio: RadioEstimate) -> AddedBlocks:
+    def add_to(self, bundle: BundleAdjustment, errors: RangeErrors, radio: RadioEstimate) -> RadioBlocks:
         """All else that was measured, from an estimate; ``errors`` are those of the ranges that take part."""
         blocks = RadioBlocks.at(radio, self.options)
-        residual_rows = add_ranges(bundle, self.ranges, errors, blocks, self.options)
+        rows = add_ranges(bundle, self.ranges, errors, blocks, self.options)
         blocks.others.extend(add_distances(bundle, self.distances, radio.anchors, blocks.positions, errors))
         add_radio_priors(bundle, radio, self.tags_in_cam_m, errors.common_bias_stddev_m, blocks, self.options)
         add_calibration(bundle, self.camera)
         if self.gravity is not None:
             self._add_gravity(bundle, self.gravity)
-        return AddedBlocks(blocks, residual_rows)
+        return replace(blocks, residual_rows=rows)
 
     def _add_gravity(self, bundle: BundleAdjustment, gravity: Gravity) -> None:
         """What the first camera saw of the vertical; the stddev in the unit of pixels."""
@@ -99,13 +92,66 @@ class RefinementProblem:
         pose = pose_of(bundle.metric.frame(self.first_frame_id)).params
         ceres.add_residual_block(bundle.adjuster, cost, None, [pose])
 
-    def residual_errors(self, added: AddedBlocks, errors: RangeErrors) -> ResidualErrors | None:
-        """How the residuals of the ranges err; None where nobody has learnt it."""
-        if errors.learned is None:
+    def residual_errors(self, added: RadioBlocks, errors: RangeErrors) -> ResidualErrors | None:
+        """How the residuals of the k ranges that took part err; the scale's uncertainty counts the same errors.
+
+        None where nobody has learnt what they get wrong together.
+        """
+        if (learned := errors.learned) is None:
             return None
-        radio = added.blocks.estimate(RadioEstimate(self.anchors, self.tags_in_cam_m))
-        return residual_errors(errors, errors.learned, added.residual_rows, self.residuals_m(radio)[self.ranges.rows])
+        radio = added.estimate(RadioEstimate(self.anchors, self.tags_in_cam_m))
+        scaled = self.residuals_m(radio)[self.ranges.rows] / errors.stddev_m
+        in_residuals = np.sqrt(errors.weight) * errors.loss.slopes(scaled) / errors.stddev_m
+        covariance_m2, has_cell = learned.covariance_m2, np.flatnonzero(learned.of_range >= 0)
+        places = (has_cell, learned.of_range[has_cell])
+        of_cells = csr_matrix((in_residuals[has_cell], places), shape=(len(scaled), len(covariance_m2)))
+        return ResidualErrors(added.residual_rows, of_cells, covariance_m2)
 
     def residuals_m(self, radio: RadioEstimate) -> Array:
         """(n,) predicted minus measured; NaN without a place."""
         return self.ranges.predicted_m(self.metric, radio) - self.ranges.observations.log.range_m
+
+
+def add_calibration(bundle: BundleAdjustment, options: CameraOptions) -> None:
+    """Draw each camera of a given model to its parameters, where the adjustment refines it at all."""
+    metric, problem = bundle.metric, bundle.adjuster.problem
+    of_camera: dict[int, CameraOptions] = {}
+    sizes: dict[int, list[Size]] = {}  # of each table's photos
+    for image_id in metric.reg_image_ids():
+        image = metric.image(image_id)
+        table = of_camera.setdefault(image.camera_id, options.of_photo(image.name))
+        camera = metric.camera(image.camera_id)
+        sizes.setdefault(id(table), []).append((camera.width, camera.height))
+    for camera_id, table in of_camera.items():
+        camera = metric.camera(camera_id)
+        if table.model is None or table.params is None or not problem.has_parameter_block(camera.params):
+            continue
+        given = calibrated_cameras(table.model, table.params, sizes[id(table)]).get((camera.width, camera.height))
+        if given is None or camera.model != given.model or problem.is_parameter_block_constant(camera.params):
+            continue
+        stddev = parameter_stddevs(given, table.calibration_stddev_px(given.mean_focal_length()))
+        ceres.add_normal_prior(bundle.adjuster, camera.params, given.params, stddev / bundle.pixel_stddev)
+
+
+def parameter_stddevs(camera: pycolmap.Camera, focal_length_stddev_px: float) -> Array:
+    """(n,) of each parameter: at the photo's edge it moves a feature as far as the focal length's own stddev does.
+
+    A calibration that is off somewhere near the edge leaves open by which of its parameters.
+    """
+    edge = np.array([[0.5 * camera.width / camera.mean_focal_length(), 0.0, 1.0]])
+    edge[0, 1] = 0.5 * camera.height / camera.mean_focal_length()
+    shifts_px = np.array([_shift_px(camera, edge, index) for index in range(len(camera.params))])
+    of_focal_lengths = np.linalg.norm(shifts_px[list(camera.focal_length_idxs())])
+    smallest = 1e-12 * of_focal_lengths  # one that moves nothing is as good as free
+    stddevs: Array = focal_length_stddev_px * of_focal_lengths / np.maximum(shifts_px, smallest)
+    stddevs[list(camera.focal_length_idxs())] = focal_length_stddev_px
+    return stddevs
+
+
+def _shift_px(camera: pycolmap.Camera, points_in_cam: Array, index: int) -> float:
+    """How far a parameter moves the image of a point, pixels per unit."""
+    other = pycolmap.Camera(camera.todict())
+    other.params[index] += _PARAMETER_STEP * max(1.0, abs(camera.params[index]))
+    step = other.params[index] - camera.params[index]
+    found = [np.asarray(one.img_from_cam(points_in_cam)) for one in (camera, other)]
+    return float(np.linalg.norm(found[1] - found[0]) / abs(step))

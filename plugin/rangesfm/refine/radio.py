@@ -1,9 +1,9 @@
-"""Ranges as residuals of the full problem, and what is estimated with them beside the map."""
+"""Ranges as residuals of the full problem: where the antenna was, and what is estimated with them beside the map."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -19,8 +19,64 @@ from rangesfm.ranging.association import lever_arms
 from rangesfm.ranging.errors.noise import SHORT_RANGE_LENGTH_M, bias_whitening
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.observations import RangeObservations
-from rangesfm.refine.antennas import Antennas, antennas
 from rangesfm.refine.bundle_adjustment import BundleAdjustment
+
+
+@dataclass(frozen=True)
+class Antennas:
+    """The antenna of n ranges: ``(1 - weight) * p_before + weight * p_after + offset``, ``p = c + R tag_in_cam``.
+
+    Attributes:
+        before, after: (n,) keyframes of the trajectory; -1 without a place.
+        weight: (n,) in [0, 1].
+        tag_in_cam_m: (n, 3).
+        offset_in_world_m: (n, 3) what the curved path has beyond the straight line; it stays as the map bends.
+    """
+
+    before: Indices
+    after: Indices
+    weight: Array
+    tag_in_cam_m: Array
+    offset_in_world_m: Array
+
+    def positions(self, centers: Array, world_from_cam: Array) -> Array:
+        """(n, 3) in the world of (k, 3) centres and (k, 3, 3) rotations."""
+        before, after = (
+            centers[ends] + np.einsum("nij,nj->ni", world_from_cam[ends], self.tag_in_cam_m)
+            for ends in (self.before, self.after)
+        )
+        weight = self.weight[:, None]
+        return np.asarray((1 - weight) * before + weight * after + self.offset_in_world_m)
+
+    def subset(self, rows: Indices) -> Antennas:
+        """Of some of the ranges."""
+        return Antennas(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+
+def antennas(
+    trajectory: Trajectory, observations: RangeObservations, metric_from_sfm: Similarity, tags_in_cam_m: Array
+) -> Antennas:
+    """Antennas of all ranges.
+
+    Args:
+        trajectory, observations: of the unscaled model.
+        metric_from_sfm: to the world of the poses that will be asked for.
+        tags_in_cam_m: (num_tags, 3), in the order of the log's tags.
+    """
+    tags_in_cam = tags_in_cam_m[observations.log.tag_index]
+    turns, weight = trajectory.world_from_cam, observations.weight[:, None]
+    before, after = (
+        np.einsum("nij,nj->ni", turns[ends], tags_in_cam) for ends in (observations.before, observations.after)
+    )
+    on_line = (1 - weight) * before + weight * after
+    beyond = metric_from_sfm.scale * observations.center_offsets + observations.tag_from_center - on_line
+    return Antennas(
+        observations.before,
+        observations.after,
+        observations.weight,
+        tags_in_cam,
+        beyond @ metric_from_sfm.rotation.T,
+    )
 
 
 @dataclass(frozen=True)
@@ -47,25 +103,16 @@ class RadioRanges:
     Attributes:
         observations, trajectory: of the unscaled model.
         antennas: of all ranges, by the lever arms as given.
-        rows: (k,) ranges that take part.
     """
 
     observations: RangeObservations
     trajectory: Trajectory
     antennas: Antennas
-    rows: Indices
 
-    @classmethod
-    def of(
-        cls,
-        trajectory: Trajectory,
-        observations: RangeObservations,
-        metric_from_sfm: Similarity,
-        tags_in_cam_m: Array,
-    ) -> RadioRanges:
-        """All that have a place; arguments as for ``antennas``."""
-        placed = antennas(trajectory, observations, metric_from_sfm, tags_in_cam_m)
-        return cls(observations, trajectory, placed, observations.placed_rows)
+    @property
+    def rows(self) -> Indices:
+        """(k,) ranges that take part: all that have a place."""
+        return self.observations.placed_rows
 
     @property
     def interval_s(self) -> Array:
@@ -75,8 +122,8 @@ class RadioRanges:
             return np.zeros(len(self.antennas.before))
         return times[self.antennas.after] - times[self.antennas.before]
 
-    def from_anchor_m(self, metric: pycolmap.Reconstruction, radio: RadioEstimate) -> Array:
-        """(n, 3) from the anchor to the tag in a metric model; without meaning where a range has no place."""
+    def predicted_m(self, metric: pycolmap.Reconstruction, radio: RadioEstimate) -> Array:
+        """(n,) ranges that a metric model predicts, as the residuals do; NaN without a place."""
         index = self.observations.log.anchor_index
         weight, between = self.antennas.weight.copy(), self.antennas.before != self.antennas.after
         if radio.time_shift_s:
@@ -84,13 +131,8 @@ class RadioRanges:
         tags = radio.tags_in_cam_m[self.observations.log.tag_index]
         path = self.trajectory.as_in(metric)
         at = replace(self.antennas, tag_in_cam_m=tags, weight=weight).positions(path.centers, path.world_from_cam)
-        from_anchor: Array = at - np.array([a.position_m for a in radio.anchors]).reshape(-1, 3)[index]
-        return from_anchor
-
-    def predicted_m(self, metric: pycolmap.Reconstruction, radio: RadioEstimate) -> Array:
-        """(n,) ranges that a metric model predicts, as the residuals do; NaN without a place."""
-        index = self.observations.log.anchor_index
-        distance = np.linalg.norm(self.from_anchor_m(metric, radio), axis=1)
+        from_anchor = at - np.array([a.position_m for a in radio.anchors]).reshape(-1, 3)[index]
+        distance = np.linalg.norm(from_anchor, axis=1)
         predicted = distance + np.array([a.range_bias_m for a in radio.anchors])[index]
         predicted += radio.short_range_error_m * np.exp(-distance / SHORT_RANGE_LENGTH_M)
         return np.where(self.observations.before >= 0, predicted, np.nan)
@@ -109,15 +151,18 @@ def predicted_ranges(
     Arguments as for ``refine_with_ranges``.
     """
     tags_in_cam_m = lever_arms(observations.log, tag_in_cam_m)
-    ranges = RadioRanges.of(trajectory, observations, metric_from_sfm, tags_in_cam_m)
-    return ranges.predicted_m(metric, RadioEstimate(tuple(anchors), tags_in_cam_m))
+    placed = antennas(trajectory, observations, metric_from_sfm, tags_in_cam_m)
+    return RadioRanges(observations, trajectory, placed).predicted_m(
+        metric, RadioEstimate(tuple(anchors), tags_in_cam_m)
+    )
 
 
 @dataclass(frozen=True)
 class RadioBlocks:
     """The same as parameter blocks, which the solver changes in place; one that is not wanted is None.
 
-    ``others`` are blocks of further residuals.
+    ``others`` are blocks of further residuals; ``residual_rows``: (k,) where the residuals of the ranges that take part
+    are among the problem's.
     """
 
     positions: list[Array]
@@ -126,6 +171,7 @@ class RadioBlocks:
     time_shift: Array | None
     short_range_error: Array | None
     others: list[Array] = field(default_factory=list)
+    residual_rows: Indices = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     @property
     def all_but_positions(self) -> list[Array]:
@@ -146,9 +192,8 @@ class RadioBlocks:
 
     def estimate(self, before: RadioEstimate) -> RadioEstimate:
         """As the solver left them."""
-        anchors = zip(before.anchors, self.positions, self.biases, strict=True)
         return RadioEstimate(
-            tuple(replace(a, position_m=position, range_bias_m=float(bias[0])) for a, position, bias in anchors),
+            moved_anchors(before.anchors, self.positions, [bias[0] for bias in self.biases]),
             np.array(self.tags_in_cam).reshape(-1, 3),
             before.time_shift_s if self.time_shift is None else float(self.time_shift[0]),
             before.short_range_error_m if self.short_range_error is None else float(self.short_range_error[0]),
@@ -250,3 +295,13 @@ def _add_prior(bundle: BundleAdjustment, block: Array | None, mean: Array | None
     if mean is not None:
         ceres.add_normal_prior(bundle.adjuster, block, mean, stddev / bundle.pixel_stddev)
     bundle.keep_from_elimination(block)
+
+
+def moved_anchors(
+    anchors: Sequence[AnchorEstimate], positions_m: Iterable[Array], biases_m: Iterable[float]
+) -> tuple[AnchorEstimate, ...]:
+    """The anchors where they have been found."""
+    return tuple(
+        replace(anchor, position_m=position, range_bias_m=float(bias))
+        for anchor, position, bias in zip(anchors, positions_m, biases_m, strict=True)
+    )

@@ -6,29 +6,26 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
+from scipy import sparse
 from scipy.spatial.transform import Rotation
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.colmap.transform import transform
 from rangesfm.geometry.similarity import Similarity, align_points, are_apart, rmse
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors
 from rangesfm.ranging.errors.robust_loss import wider
-from rangesfm.refine.carry import carry_model
-from rangesfm.refine.keyframe_graph import (
-    GraphSolution,
-    GraphState,
-    KeyframeGraph,
-    local_scales,
-    moved_anchors,
-    solve_graph,
-)
+from rangesfm.refine.keyframe_graph import GraphSolution, GraphState, KeyframeGraph, local_scales, solve_graph
 from rangesfm.refine.problem import RefinementProblem
+from rangesfm.refine.radio import moved_anchors
 from rangesfm.refine.vision_information import (
     Observations,
     Poses,
     model_poses,
+    project,
+    ray_residuals,
+    robust_root_weights,
     vision_information,
 )
 
@@ -40,6 +37,7 @@ SAME_ERRORS = 0.05
 _TOLERANCE = 0.001
 # Likewise. The same goes for a part of the map that turns about a weak link.
 _MIN_BEND = 0.05
+_NUM_TRIANGULATIONS = 5
 
 
 @dataclass(frozen=True)
@@ -73,12 +71,12 @@ def unbend(problem: RefinementProblem, rays: Observations, errors: RangeErrors) 
     if not len(problem.ranges.rows):  # a few lengths bend no map
         return Unbent(errors, 0.0, problem.anchors, 0.0, 0)
     bound = _Bound.of(problem, rays, errors, problem.anchors)
-    fit = _solve_with_own_errors(bound.graph)
-    bound.move(problem, fit.state, fit.errors)
+    fit, errors = _solve_with_own_errors(bound.graph)
+    bound.move(problem, fit.state, errors)
     return Unbent(
-        errors=fit.errors,
+        errors=errors,
         num_absorbed=fit.num_absorbed,
-        anchors=moved_anchors(problem.anchors, fit.state),
+        anchors=moved_anchors(problem.anchors, fit.state.anchors_m, fit.state.biases_m),
         bend_m=_bend(bound.graph.vision.origin.centers, fit.state.poses.centers),
         num_steps=fit.num_steps,
     )
@@ -95,7 +93,7 @@ def unbend_again(
     bound = _Bound.of(problem, rays, errors, anchors)
     state = solve_graph(bound.graph, bound.graph.start(), tolerance_m=_tolerance_m(errors)).state
     bound.move(problem, state, errors)
-    return moved_anchors(anchors, state)
+    return moved_anchors(anchors, state.anchors_m, state.biases_m)
 
 
 @dataclass(frozen=True)
@@ -114,9 +112,10 @@ class _Bound:
         anchors: tuple[AnchorEstimate, ...],
     ) -> _Bound:
         ranges = problem.ranges
-        takes_part = ~np.isin(rays.point_ids, list(problem.left_out_ids))
+        takes_part = ~np.isin(rays.point_ids, list(problem.left_out_ids))[rays.point]
+        seen = rays.subset(np.flatnonzero(takes_part))
         graph = KeyframeGraph(
-            vision=vision_information(rays.of_points(takes_part), model_poses(problem.metric, problem.frame_ids)),
+            vision=vision_information(seen, model_poses(problem.metric, problem.frame_ids)),
             antennas=ranges.antennas.subset(ranges.rows),
             range_m=ranges.observations.log.range_m[ranges.rows],
             errors=errors,
@@ -151,38 +150,28 @@ def _as_a_whole(before: Poses, after: Poses, held_frame: int | None) -> Similari
     return Similarity(scale, turn, end - scale * turn @ start)
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """A map, the errors that its residuals show, and what it took to find them."""
-
-    state: GraphState
-    errors: RangeErrors
-    num_absorbed: float
-    num_steps: int
-
-
-def _solve_with_own_errors(graph: KeyframeGraph) -> _Fit:
-    """With the wide loss, then with the bounded.
+def _solve_with_own_errors(graph: KeyframeGraph) -> tuple[GraphSolution, RangeErrors]:
+    """A map and the errors that its residuals show: with the wide loss, then with the bounded.
 
     Where so many ranges are wrong that the wide loss follows them, the map as it came is likelier, and the bounded one
     starts from there, with the errors as they came.
     """
     errors, start = graph.errors, graph.start()
-    wide = _alternate(graph, replace(errors, loss=wider(errors.loss)), start)
+    wide, shown = _alternate(graph, replace(errors, loss=wider(errors.loss)), start)
     seen, reached = (
         errors.noise_of_estimated(graph.residuals_m(state)).log_likelihood for state in (start, wide.state)
     )
     if reached >= seen:
         state, residuals_m = wide.state, graph.residuals_m(wide.state)
-        errors = replace(wide.errors, loss=errors.loss).seen_by_bending_map(residuals_m, wide.num_absorbed)
+        errors = replace(shown, loss=errors.loss).seen_by_bending_map(residuals_m, wide.num_absorbed)
     else:
         state, errors = start, replace(errors, log_likelihood=seen)
-    bounded = _alternate(graph, errors, state)
-    return replace(bounded, num_steps=wide.num_steps + bounded.num_steps)
+    bounded, errors = _alternate(graph, errors, state)
+    return replace(bounded, num_steps=wide.num_steps + bounded.num_steps), errors
 
 
-def _alternate(graph: KeyframeGraph, errors: RangeErrors, start: GraphState) -> _Fit:
-    """Between the map and the errors that its residuals show."""
+def _alternate(graph: KeyframeGraph, errors: RangeErrors, start: GraphState) -> tuple[GraphSolution, RangeErrors]:
+    """Between the map and the errors that its residuals show, with the steps of all rounds."""
     num_steps = 0
 
     def fit(errors: RangeErrors, before: GraphSolution | None) -> GraphSolution:
@@ -199,7 +188,7 @@ def _alternate(graph: KeyframeGraph, errors: RangeErrors, start: GraphState) -> 
         max_num_rounds=_MAX_NUM_ROUNDS,
         is_last=lambda used, shown, _: used.change(shown) < SAME_ERRORS,
     )
-    return _Fit(solution.state, seen, solution.num_absorbed, num_steps)
+    return replace(solution, num_steps=num_steps), seen
 
 
 def _tolerance_m(errors: RangeErrors) -> float:
@@ -217,3 +206,69 @@ def _move(metric: pycolmap.Reconstruction, whole: Similarity, held_frame_id: int
 def _bend(before: Array, after: Array) -> float:
     """RMS distance that no similarity explains; of a path too short for one, nothing does not."""
     return rmse(align_points(before, after).apply(before) - after) if len(before) > 2 else 0.0
+
+
+def carry_model(
+    metric: pycolmap.Reconstruction,
+    frame_ids: Indices,
+    observations: Observations,
+    before: Poses,
+    after: Poses,
+    local_scale: Array,
+) -> None:
+    """Move frames and points of a model, in place: a solver that works on its arrays sees it.
+
+    Args:
+        frame_ids: (n,) of the poses. observations: of the model's points in them.
+        before, after: poses of the frames as the model has them, and as it shall.
+        local_scale: (n,) by how much the map grows around each frame.
+    """
+    points = _triangulated(observations, after, _carried(observations, before, after, local_scale))
+    quaternions = Rotation.from_matrix(np.swapaxes(after.world_from_rig, 1, 2)).as_quat()
+    translations = -np.einsum("nji,nj->ni", after.world_from_rig, after.centers)
+    moved = np.any(after.centers != before.centers, axis=1) | np.any(
+        after.world_from_rig != before.world_from_rig, axis=(1, 2)
+    )
+    for k in np.flatnonzero(moved):
+        pose_of(metric.frame(int(frame_ids[k]))).params[:] = [*quaternions[k], *translations[k]]
+    for point_id, point in zip(observations.point_ids, points, strict=True):
+        metric.point3D(int(point_id)).xyz[:] = point
+
+
+def _carried(observations: Observations, before: Poses, after: Poses, local_scale: Array) -> Array:
+    """(p, 3) points, each moved rigidly and in scale with the first keyframe that sees it."""
+    points = observations.points.copy()
+    seen, first = np.unique(observations.point, return_index=True)
+    frame = observations.frame[first]
+    in_rig = np.einsum("nji,nj->ni", before.world_from_rig[frame], points[seen] - before.centers[frame])
+    in_rig *= local_scale[frame][:, None]
+    points[seen] = after.centers[frame] + np.einsum("nij,nj->ni", after.world_from_rig[frame], in_rig)
+    return points
+
+
+def _triangulated(observations: Observations, poses: Poses, start: Array) -> Array:
+    """(p, 3) points that fit the rays best, by damped Gauss-Newton steps that are taken where they help."""
+    n, num_points = len(observations.frame), len(start)
+    adder = sparse.csr_array((np.ones(n), (observations.point, np.arange(n))), shape=(num_points, n))
+    points, cost = start, _costs(observations, poses, start, adder)
+    for _ in range(_NUM_TRIANGULATIONS):
+        _, in_cam, derivative = project(observations, poses, points)
+        residuals = np.nan_to_num(ray_residuals(observations, in_cam), posinf=0.0)
+        root = robust_root_weights(residuals)
+        to_rig = np.nan_to_num(derivative) @ observations.cam_from_rig_rotation
+        to_point = root[:, None, None] * to_rig @ np.swapaxes(poses.world_from_rig[observations.frame], 1, 2)
+        normal = (adder @ np.einsum("nai,naj->nij", to_point, to_point).reshape(n, 9)).reshape(-1, 3, 3)
+        gradient = adder @ np.einsum("nai,na->ni", to_point, root[:, None] * residuals)
+        ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-200
+        trial = points - np.linalg.solve(normal + ridge * np.eye(3), gradient[:, :, None])[:, :, 0]
+        trial_cost = _costs(observations, poses, trial, adder)
+        better = trial_cost < cost
+        points = np.where(better[:, None], trial, points)
+        cost = np.where(better, trial_cost, cost)
+    return points
+
+
+def _costs(observations: Observations, poses: Poses, points: Array, adder: sparse.csr_array) -> Array:
+    """(p,) robust cost of each point; infinite for one behind a camera that sees it."""
+    residuals = ray_residuals(observations, project(observations, poses, points)[1])
+    return np.asarray(adder @ np.log1p(np.sum(residuals**2, axis=1)))

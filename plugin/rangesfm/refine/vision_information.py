@@ -16,7 +16,7 @@ import numpy.typing as npt
 import pycolmap
 from scipy import sparse
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import SolverError
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.trajectory import pose_of
@@ -73,26 +73,14 @@ class Observations:
     points: Array
     point_ids: Indices
 
-    def of_points(self, taken: npt.NDArray[np.bool_]) -> Observations:
-        """Those of some of the points; the others are there still, seen by nobody."""
-        return self.subset(np.flatnonzero(taken[self.point]))
-
     def with_pixel_stddev(self, pixel_stddev: float) -> Observations:
         """Of features whose coordinates are known to so many of what they were taken to be known to."""
         return replace(self, weight=self.weight / pixel_stddev)
 
     def subset(self, rows: Indices) -> Observations:
-        """Some of the observations, of all points."""
-        return Observations(
-            self.frame[rows],
-            self.point[rows],
-            self.ray[rows],
-            self.weight[rows],
-            self.cam_from_rig_rotation[rows],
-            self.cam_from_rig_translation[rows],
-            self.points,
-            self.point_ids,
-        )
+        """Some of the observations; points of the others are there still, seen by nobody."""
+        of_each = ("frame", "point", "ray", "weight", "cam_from_rig_rotation", "cam_from_rig_translation")
+        return replace(self, **{name: getattr(self, name)[rows] for name in of_each})
 
 
 @dataclass(frozen=True)
@@ -170,7 +158,7 @@ def project(observations: Observations, poses: Poses, points: Array) -> tuple[Ar
     return in_rig, in_cam, derivative * observations.weight[:, None, None]
 
 
-def misplaced_points(observations: Observations, poses: Poses) -> npt.NDArray[np.bool_]:
+def misplaced_points(observations: Observations, poses: Poses) -> Mask:
     """(p,) whether a point lies in or behind a camera that sees it, or far nearer to it than to another: what a mapper
     makes, now and then, of wrong matches.
 
@@ -181,7 +169,7 @@ def misplaced_points(observations: Observations, poses: Poses) -> npt.NDArray[np
     farthest = np.zeros(len(observations.points))
     np.maximum.at(farthest, observations.point, depth)
     least = np.maximum(_MIN_DEPTH * np.median(np.abs(depth)), farthest[observations.point] / _MAX_DEPTH_RATIO)
-    misplaced: npt.NDArray[np.bool_] = np.zeros(len(observations.points), dtype=np.bool_)
+    misplaced: Mask = np.zeros(len(observations.points), dtype=np.bool_)
     misplaced[observations.point[~(depth >= least)]] = True
     return misplaced
 
@@ -195,8 +183,7 @@ def ray_residuals(observations: Observations, in_cam: Array) -> Array:
 
 def robust_root_weights(residuals: Array) -> Array:
     """(n,) roots of Cauchy weights of (n, 2) residuals in stddevs."""
-    weights: Array = 1 / np.sqrt(1 + np.sum(residuals**2, axis=1) / _ROBUST_WIDTH**2)
-    return weights
+    return np.asarray(1 / np.sqrt(1 + np.sum(residuals**2, axis=1) / _ROBUST_WIDTH**2))
 
 
 def vision_information(observations: Observations, poses: Poses) -> VisionInformation:

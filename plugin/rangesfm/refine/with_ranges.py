@@ -22,14 +22,13 @@ from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.association import lever_arms
-from rangesfm.ranging.errors.misfits import misfits
-from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors
+from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors, misfits
 from rangesfm.ranging.errors.robust_loss import RobustLoss
 from rangesfm.ranging.observations import RangeObservations, status_by_weight
 from rangesfm.refine.bundle_adjustment import BundleAdjustment, Solution, solve, solve_until_still
 from rangesfm.refine.distances import MeasuredDistances, add_marker_points, remove_marker_points
-from rangesfm.refine.problem import AddedBlocks, RefinementProblem
-from rangesfm.refine.radio import RadioEstimate, RadioRanges
+from rangesfm.refine.problem import RefinementProblem
+from rangesfm.refine.radio import RadioBlocks, RadioEstimate, RadioRanges, antennas
 from rangesfm.refine.unbend import SAME_ERRORS, Unbent, unbend, unbend_again
 from rangesfm.refine.vision_information import misplaced_points, model_observations, model_poses
 
@@ -142,11 +141,11 @@ def refine_with_ranges(
     tape = (tape or Tape()).control()
     marker_ids = add_marker_points(metric, tape)
     tags_in_cam_m = lever_arms(observations.log, tag_in_cam_m)
-    ranges = RadioRanges.of(trajectory, observations, metric_from_sfm, tags_in_cam_m)
+    placed = antennas(trajectory, observations, metric_from_sfm, tags_in_cam_m)
     problem = RefinementProblem(
         metric,
         tuple(anchors),
-        ranges,
+        RadioRanges(observations, trajectory, placed),
         tags_in_cam_m,
         MeasuredDistances(_between_anchors(observations, anchors, errors), tape, marker_ids),
         camera or CameraOptions(),
@@ -206,7 +205,7 @@ class _Round:
 
 def _adjust(problem: RefinementProblem, bundle: BundleAdjustment, start: Unbent) -> RefineSummary:
     """Alternate between the full problem and the errors that its residuals show."""
-    added: AddedBlocks
+    added: RadioBlocks
 
     def fit(errors: RangeErrors, before: _Round | None) -> _Round:
         nonlocal bundle, added
@@ -220,7 +219,7 @@ def _adjust(problem: RefinementProblem, bundle: BundleAdjustment, start: Unbent)
         added = problem.add_to(bundle, errors, before.radio)
         solution = solve(bundle, _tolerance_m(problem, errors))
         num_left = before.num_left - solution.num_iterations
-        return _Round(added.blocks.estimate(before.radio), (*before.solutions, solution), num_left)
+        return _Round(added.estimate(before.radio), (*before.solutions, solution), num_left)
 
     def is_last(errors: RangeErrors, seen: RangeErrors, done: _Round) -> bool:
         return errors.change(seen) < SAME_ERRORS or not done.solutions[-1].converged or done.num_left <= 0
@@ -235,7 +234,7 @@ def _adjust(problem: RefinementProblem, bundle: BundleAdjustment, start: Unbent)
         is_last=is_last,
     )
     more, is_still = solve_until_still(bundle, last.solutions[-1], _tolerance_m(problem, errors), last.num_left)
-    last = replace(last, radio=added.blocks.estimate(last.radio), solutions=(*last.solutions, *more))
+    last = replace(last, radio=added.estimate(last.radio), solutions=(*last.solutions, *more))
     covariance = _covariance(problem, bundle, added, errors)
     problem.metric.update_point_3d_errors()
     return _summary(problem, start, bundle, last, errors, covariance, is_still=is_still)
@@ -247,7 +246,7 @@ def _tolerance_m(problem: RefinementProblem, errors: RangeErrors) -> float:
 
 
 def _covariance(
-    problem: RefinementProblem, bundle: BundleAdjustment, added: AddedBlocks, errors: RangeErrors
+    problem: RefinementProblem, bundle: BundleAdjustment, added: RadioBlocks, errors: RangeErrors
 ) -> JointCovariance | None:
     metric, limit = problem.metric, _MAX_NUM_IMAGES_FOR_COVARIANCE
     if not problem.options.covariance:
@@ -258,8 +257,8 @@ def _covariance(
         return joint_covariance(
             bundle.adjuster.problem,
             metric,
-            anchors=added.blocks.positions,
-            others=added.blocks.all_but_positions,
+            anchors=added.positions,
+            others=added.all_but_positions,
             residual_stddev=bundle.pixel_stddev,
             errors=problem.residual_errors(added, errors),
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import Similarity, align_points, path_shape, rmse
 from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.scale.anchor_plane import is_line
+from rangesfm.scale.starts import each_once
 
 # Anchors of which triples are tried, the best placed ones: more make it slow, and no better.
 _MAX_NUM_TRIED = 8
@@ -45,60 +46,15 @@ class PlacedAnchor:
         """Of each coordinate, on average."""
         return float(np.trace(self.covariance_m2)) / 3
 
+    @property
+    def rank(self) -> tuple[int, float]:
+        """Better placed anchors first: those without a mirror image, then by variance."""
+        return len(self.places_m), self.variance_m2
+
     def moved(self, motion: Similarity) -> PlacedAnchor:
         """The same in another frame."""
         turned = motion.rotation @ self.covariance_m2 @ motion.rotation.T
         return PlacedAnchor(motion.apply(self.places_m), turned)
-
-    def at(self, side: int) -> PlacedAnchor:
-        """At one of its places only."""
-        return replace(self, places_m=self.places_m[side : side + 1])
-
-
-@dataclass(frozen=True)
-class AnchorAlignment:
-    """A motion, and what it makes of the anchors.
-
-    Attributes:
-        target_from_source: rigid.
-        sides: by anchor id, which of its places in the target and in the source fit, 0 or 1.
-        elsewhere_m: by id, of anchors that do not fit, how far they are from where they should be.
-    """
-
-    target_from_source: Similarity
-    sides: dict[str, tuple[int, int]]
-    elsewhere_m: dict[str, float]
-
-
-def align_by_anchors(
-    target: Mapping[str, PlacedAnchor], source: Mapping[str, PlacedAnchor], source_path_m: Array
-) -> list[AnchorAlignment]:
-    """Find the motions that bring the anchors together, best first: robust, weighted by their covariances.
-
-    Both frames are right-handed, so that three anchors not on a line are enough; of an anchor with a mirror image
-    either place may be the true one.
-
-    Args:
-        target, source: anchors by id.
-        source_path_m: (n, 3) places along the path that is to be carried over: motions that do the same to it are one.
-
-    Raises:
-        GeometryError: the anchors are too few, or on a line.
-    """
-    ids = sorted(set(target) & set(source))
-    pairs = [_Pair(target[id_], source[id_]) for id_ in ids]
-    _refuse_too_few(ids, pairs)
-    fits = _distinct(pairs, source_path_m)
-    return [_alignment(ids, pairs, fit) for fit in fits if fit.cost - fits[0].cost < _MAX_COST_GAP]
-
-
-def _alignment(ids: Sequence[str], pairs: Sequence[_Pair], fit: _Fit) -> AnchorAlignment:
-    elsewhere_m = {
-        id_: float(np.linalg.norm(pair.difference(fit.motion, side)))
-        for id_, pair, side, squared in zip(ids, pairs, fit.sides, fit.squared, strict=True)
-        if squared > _ELSEWHERE_STDDEVS**2
-    }
-    return AnchorAlignment(fit.motion, dict(zip(ids, fit.sides, strict=True)), elsewhere_m)
 
 
 @dataclass(frozen=True)
@@ -119,74 +75,97 @@ class _Pair:
 
     def difference(self, motion: Similarity, side: tuple[int, int]) -> Array:
         """(3,) source moved minus target."""
-        difference: Array = motion.apply(self.source.places_m[side[1]]) - self.target.places_m[side[0]]
-        return difference
+        return np.asarray(motion.apply(self.source.places_m[side[1]]) - self.target.places_m[side[0]])
 
     def information(self, motion: Similarity) -> Array:
         """(3, 3) of the difference."""
         turned = motion.rotation @ self.source.covariance_m2 @ motion.rotation.T
-        information: Array = np.asarray(np.linalg.inv(self.target.covariance_m2 + turned), dtype=np.float64)
-        return information
+        return np.asarray(np.linalg.inv(self.target.covariance_m2 + turned), dtype=np.float64)
 
 
 @dataclass(frozen=True)
-class _Fit:
-    """A motion, for each anchor the places that it brings together best, and their squared distance in stddevs."""
+class AnchorAlignment:
+    """A motion, and what it makes of the anchors.
 
-    motion: Similarity
-    sides: tuple[tuple[int, int], ...]
+    Attributes:
+        target_from_source: rigid.
+        sides: by anchor id, which of its places in the target and in the source fit better, 0 or 1.
+        squared: of each anchor, the squared distance of these in stddevs.
+        elsewhere_m: by id, of anchors that do not fit, how far they are from where they should be.
+    """
+
+    target_from_source: Similarity
+    sides: dict[str, tuple[int, int]]
     squared: Array
+    elsewhere_m: dict[str, float]
 
     @property
     def cost(self) -> float:
         return 0.5 * float(np.sum(CAUCHY.rho(self.squared)[0]))
 
     @classmethod
-    def of(cls, pairs: Sequence[_Pair], motion: Similarity) -> _Fit:
-        sides, squared = [], []
-        for pair in pairs:
+    def of(cls, pairs: Mapping[str, _Pair], motion: Similarity) -> AnchorAlignment:
+        sides, squared, elsewhere_m = {}, [], {}
+        for id_, pair in pairs.items():
             information = pair.information(motion)
             differences = {side: pair.difference(motion, side) for side in pair.sides}
             distances = {side: float(d @ information @ d) for side, d in differences.items()}
-            sides.append(min(distances, key=distances.__getitem__))
-            squared.append(distances[sides[-1]])
-        return cls(motion, tuple(sides), np.array(squared))
+            sides[id_] = side = min(distances, key=distances.__getitem__)
+            squared.append(distances[side])
+            if distances[side] > _ELSEWHERE_STDDEVS**2:
+                elsewhere_m[id_] = float(np.linalg.norm(differences[side]))
+        return cls(motion, sides, np.array(squared), elsewhere_m)
 
 
-def _refuse_too_few(ids: Sequence[str], pairs: Sequence[_Pair]) -> None:
+def align_by_anchors(
+    target: Mapping[str, PlacedAnchor], source: Mapping[str, PlacedAnchor], source_path_m: Array
+) -> list[AnchorAlignment]:
+    """Find the motions that bring the anchors together, best first: robust, weighted by their covariances.
+
+    Both frames are right-handed, so that three anchors not on a line are enough; of an anchor with a mirror image
+    either place may be the true one.
+
+    Args:
+        target, source: anchors by id.
+        source_path_m: (n, 3) places along the path that is to be carried over: motions that do the same to it are one.
+
+    Raises:
+        GeometryError: the anchors are too few, or on a line.
+    """
+    pairs = {id_: _Pair(target[id_], source[id_]) for id_ in sorted(set(target) & set(source))}
+    _refuse_too_few(pairs)
+    fits = _distinct(pairs, source_path_m)
+    return [fit for fit in fits if fit.cost - fits[0].cost < _MAX_COST_GAP]
+
+
+def _refuse_too_few(pairs: Mapping[str, _Pair]) -> None:
     """Of two anchors or of a line nothing fixes the turn, whatever their sides."""
-    names = ", ".join(ids)
+    ids, names = list(pairs), ", ".join(pairs)
     if not ids:
         raise GeometryError("it shares no anchor with the others")
     if len(ids) < 3:
         about = f"anchor {names}" if len(ids) == 1 else f"the line through {' and '.join(ids)}"
         raise GeometryError(f"of its anchors only {names} also belong to others: every turn about {about} fits")
-    for places_m in ([pair.target.places_m for pair in pairs], [pair.source.places_m for pair in pairs]):
+    for places_m in ([p.target.places_m for p in pairs.values()], [p.source.places_m for p in pairs.values()]):
         if all(is_line(path_shape(np.array(some))) for some in itertools.product(*places_m[:_MAX_NUM_TRIED])):
             raise GeometryError(f"the anchors that it shares ({names}) are on a line: every turn about it fits")
 
 
-def _distinct(pairs: Sequence[_Pair], path_m: Array) -> list[_Fit]:
+def _distinct(pairs: Mapping[str, _Pair], path_m: Array) -> list[AnchorAlignment]:
     """Refined fits from triples of anchors, best first, each once."""
     tolerance = _SAME_SHARE * float(np.linalg.norm(path_shape(path_m).stddevs))
 
-    def differ(first: _Fit, second: _Fit) -> bool:
-        return rmse(first.motion.apply(path_m) - second.motion.apply(path_m)) > tolerance
+    def best(fits: Iterable[AnchorAlignment]) -> list[AnchorAlignment]:
+        return each_once(sorted(fits, key=lambda fit: fit.cost), are_same, 2 * _NUM_BEST)
 
-    starts = sorted((_Fit.of(pairs, motion) for motion in _triple_motions(pairs)), key=lambda fit: fit.cost)
-    begun = _each_once(starts, differ)[:_NUM_BEST]
-    return _each_once(sorted((_refined(pairs, fit) for fit in begun), key=lambda fit: fit.cost), differ)
+    def are_same(first: AnchorAlignment, second: AnchorAlignment) -> bool:
+        return rmse(first.target_from_source.apply(path_m) - second.target_from_source.apply(path_m)) <= tolerance
 
-
-def _each_once(fits: Sequence[_Fit], differ: Callable[[_Fit, _Fit], bool]) -> list[_Fit]:
-    kept: list[_Fit] = []
-    for fit in fits:
-        if len(kept) < 2 * _NUM_BEST and all(differ(fit, other) for other in kept):
-            kept.append(fit)
-    return kept
+    begun = best(AnchorAlignment.of(pairs, motion) for motion in _triple_motions(pairs.values()))
+    return best(_refined(pairs, fit) for fit in begun[:_NUM_BEST])
 
 
-def _triple_motions(pairs: Sequence[_Pair]) -> Iterator[Similarity]:
+def _triple_motions(pairs: Iterable[_Pair]) -> Iterator[Similarity]:
     tried = sorted(pairs, key=lambda pair: pair.variance_m2)[:_MAX_NUM_TRIED]
     for triple in itertools.combinations(tried, 3):
         for sides in itertools.product(*(pair.sides for pair in triple)):
@@ -196,15 +175,16 @@ def _triple_motions(pairs: Sequence[_Pair]) -> Iterator[Similarity]:
                 yield align_points(source, target, with_scale=False)
 
 
-def _refined(pairs: Sequence[_Pair], fit: _Fit) -> _Fit:
+def _refined(pairs: Mapping[str, _Pair], fit: AnchorAlignment) -> AnchorAlignment:
     """Reweighted Gauss-Newton steps, each anchor at the places that fit better."""
     for _ in range(_NUM_ROUNDS):
-        middle = np.mean([fit.motion.apply(pair.source.places_m[0]) for pair in pairs], axis=0)
+        middle = np.mean([fit.target_from_source.apply(pair.source.places_m[0]) for pair in pairs.values()], axis=0)
         normal, right = 1e-12 * np.eye(6), np.zeros(6)
         weights = CAUCHY.rho(fit.squared)[1]
-        for pair, side, weight in zip(pairs, fit.sides, weights, strict=True):
-            weighted = weight * pair.information(fit.motion)
-            difference = pair.difference(fit.motion, side)
+        for (id_, pair), weight in zip(pairs.items(), weights, strict=True):
+            side = fit.sides[id_]
+            weighted = weight * pair.information(fit.target_from_source)
+            difference = pair.difference(fit.target_from_source, side)
             place = difference + pair.target.places_m[side[0]] - middle
             jacobian = np.hstack([-cross_matrices(place), np.eye(3)])  # by a small turn and a shift
             normal = normal + jacobian.T @ weighted @ jacobian
@@ -212,7 +192,7 @@ def _refined(pairs: Sequence[_Pair], fit: _Fit) -> _Fit:
         step = np.linalg.solve(normal, right)
         turn = Similarity(1.0, Rotation.from_rotvec(step[:3]).as_matrix(), np.zeros(3))
         shift = middle + step[3:] - turn.rotation @ middle
-        better = _Fit.of(pairs, replace(turn, translation=shift) @ fit.motion)
+        better = AnchorAlignment.of(pairs, replace(turn, translation=shift) @ fit.target_from_source)
         if not better.cost < fit.cost:
             break
         fit = better

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.geometry.similarity import IDENTITY, Similarity
+from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE
 from rangesfm.scale.range_equation import RangeProblem, RangeState, solve
@@ -26,37 +26,23 @@ def scale_per_anchor(solution: Solution, anchor_ids: tuple[str, ...]) -> dict[st
     A known anchor stretches the path about its centre (about the first camera where that is
     the frame's origin); an unknown one is estimated along with the scale.
     """
-    scales = {}
+    problem, state, scales = solution.problem, solution.fit.state, {}
+    middle = problem.centers.mean(axis=0) if problem.frame_is_free else np.zeros(3)
+    placed = replace(state.metric_from_model, translation=state.metric_from_model.apply(middle))
     for k, anchor_id in enumerate(anchor_ids):
-        problem, start = _one_anchor(solution, k)
-        if len(problem.range_m) < _MIN_RANGES_ALONE:
+        part = problem.of_anchor(k)
+        alone = spread_subset(replace(part, centers=part.centers - middle), _MAX_RANGES_ALONE)
+        if len(alone.range_m) < _MIN_RANGES_ALONE:
             continue
-        fit = solve(problem, start, loss=GEMAN_MCCLURE)
+        start = RangeState(placed, state.anchors_m[k : k + 1], state.bias_m[k : k + 1])
+        fit = solve(alone, start, loss=GEMAN_MCCLURE)
         if fit.log_scale_stddev * solution.errors.inflation < _MAX_LOG_SCALE_STDDEV:
             scales[anchor_id] = fit.state.metric_from_model.scale
     return scales
 
 
-def _one_anchor(solution: Solution, k: int) -> tuple[RangeProblem, RangeState]:
-    problem, state = solution.problem, solution.fit.state
-    placed = state.metric_from_model
-    middle = problem.centers.mean(axis=0) if problem.frame_is_free else np.zeros(3)
-    part = problem.of_anchor(k)
-    alone = replace(part, centers=part.centers - middle)
-    start = RangeState(
-        Similarity(placed.scale, placed.rotation, placed.apply(middle)),
-        state.anchors_m[k : k + 1],
-        state.bias_m[k : k + 1],
-    )
-    return spread_subset(alone, _MAX_RANGES_ALONE), start
-
-
 def anchor_estimates(solution: Solution, anchor_ids: tuple[str, ...], covariance: Array) -> tuple[AnchorEstimate, ...]:
-    """All anchors of the log, and mirror places.
-
-    Args:
-        covariance: (p, p) of all that the fit estimates.
-    """
+    """All anchors of the log, and mirror places; by the (p, p) covariance of all that the fit estimates."""
     problem, state = solution.problem, solution.fit.state
     of_anchors = solution.fit.of_anchors(covariance)
     stddev = np.sqrt(np.trace(of_anchors, axis1=1, axis2=2) / 3)

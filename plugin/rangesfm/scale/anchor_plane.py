@@ -113,5 +113,4 @@ def on_side(problem: RangeProblem, fits: list[RangeFit], camera_side: str | None
 
 
 def _reflection(normal: Array) -> Array:
-    reflection: Array = np.eye(3) - 2 * np.outer(normal, normal)
-    return reflection
+    return np.eye(3) - 2 * np.outer(normal, normal)

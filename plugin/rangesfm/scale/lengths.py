@@ -1,4 +1,4 @@
-"""The scale by measured lengths alone, and which of them do not go with the others.
+"""The scale by measured lengths alone, which of them do not go with the others, and their residuals beside ranges.
 
 A length d between two points of a model, l apart there, errs by its measurement, by the marks of its ends and by the
 map's bending: the scale of a map varies from place to place, smoothly, and a length has its mean along the way. How
@@ -11,13 +11,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy import special
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import path_shape
+from rangesfm.ranging.range_gradient import RangeGradient
 
 # By how much the scale of a map varies, and the stddev of the logarithm of that from map to map; within how much of
 # the path's extent it is alike. Of a room mapped from a hand-held camera, lengths of 0.5 to 5 m against the truth.
@@ -60,8 +60,7 @@ class LengthScale:
     @property
     def statistic(self) -> Array:
         """(m,) squared, in stddevs."""
-        squared: Array = (self.too_long_m / self.stddev_m) ** 2
-        return squared
+        return (self.too_long_m / self.stddev_m) ** 2
 
     def beside_ranges(self, distances: LocatedDistances, *, with_bending: bool = False) -> LocatedDistances:
         """The distances with all lengths between points as the one that says the same of the scale.
@@ -91,7 +90,9 @@ def scale_by_lengths(distances: LocatedDistances | None, centers: Array) -> Leng
     if not len(rows):
         return None
     lengths = _Lengths.of(distances, rows, float(np.linalg.norm(path_shape(centers).stddevs)))
-    threshold = _threshold(len(rows))
+    # Of a squared Student's t, as the bending is learnt from the other lengths and the spread of maps.
+    degrees_of_freedom = 1 / (2 * _BENDING_SPREAD**2) + max(len(rows) - 2, 0)
+    threshold = float(special.stdtrit(degrees_of_freedom, FALSE_ALARMS / (2 * len(rows))) ** 2)
     kept = np.ones(len(rows), dtype=bool)
     ratios = np.log(lengths.metric / lengths.model)
     while kept.sum() > 2 and (~kept).sum() + 1 < len(rows) / 2:
@@ -109,12 +110,6 @@ def scale_by_lengths(distances: LocatedDistances | None, centers: Array) -> Leng
     by_metre[kept] = fit.gains / fit.scale
     components = {name: float(np.sqrt(fit.gains @ part @ fit.gains)) / fit.scale for name, part in fit.parts.items()}
     return LengthScale(fit.scale, components, rows, kept, too_long_m, stddev_m, by_metre, threshold)
-
-
-def _threshold(num: int) -> float:
-    """Of a squared Student's t, as the bending is learnt from the other lengths and the spread of maps."""
-    degrees_of_freedom = 1 / (2 * _BENDING_SPREAD**2) + max(num - 2, 0)
-    return float(special.stdtrit(degrees_of_freedom, FALSE_ALARMS / (2 * num)) ** 2)
 
 
 @dataclass(frozen=True)
@@ -138,7 +133,7 @@ class _Lengths:
     of_bending: Array
 
     @classmethod
-    def of(cls, distances: LocatedDistances, rows: npt.NDArray[np.int64], extent: float) -> _Lengths:
+    def of(cls, distances: LocatedDistances, rows: Indices, extent: float) -> _Lengths:
         model, stddev_m, printed = distances.model_length[rows], distances.stddev_m[rows], distances.is_printed[rows]
         if not np.all(model > 1e-9 * extent):
             raise GeometryError("a measured length has both its ends in one place of the map")
@@ -203,8 +198,7 @@ class _Lengths:
 
 
 def _total(parts: Mapping[str, Array]) -> Array:
-    total: Array = np.sum(list(parts.values()), axis=0)
-    return total
+    return np.asarray(np.sum(list(parts.values()), axis=0))
 
 
 def _unlikeliness(covariance: Array, model: Array, metric: Array) -> float:
@@ -213,3 +207,34 @@ def _unlikeliness(covariance: Array, model: Array, metric: Array) -> float:
     (information, right), (_, square) = whitened.T @ whitened
     determinant = np.linalg.slogdet(covariance)[1]
     return float(0.5 * (determinant + np.log(information) + square - right**2 / information))
+
+
+def distance_residuals(distances: LocatedDistances, scale: float, anchors_m: Array) -> Array:
+    """(k,) in stddevs."""
+    return (distances.lengths_m(scale, anchors_m) - distances.distance_m) / distances.stddev_m
+
+
+def distance_jacobian(
+    distances: LocatedDistances,
+    scale: float,
+    anchors_m: Array,
+    anchor_column: Indices,
+    num_columns: int,
+) -> Array:
+    """(k, p) of the residuals.
+
+    Args:
+        anchor_column: (m,) where the three columns of each anchor begin; -1 where it is held.
+        num_columns: p; the first column is the logarithm of the scale.
+    """
+    jacobian = np.zeros((len(distances), num_columns))
+    between_points = distances.anchor_pair[:, 0] < 0
+    jacobian[between_points, 0] = (scale * distances.model_length / distances.stddev_m)[between_points]
+    rows = np.flatnonzero(~between_points)
+    first, second = distances.anchor_pair[rows].T
+    by = RangeGradient.of(anchors_m[first] - anchors_m[second])
+    for anchor, slopes in ((first, by.by_tag), (second, by.by_anchor)):
+        free = anchor_column[anchor] >= 0
+        columns = anchor_column[anchor[free], None] + np.arange(3)
+        jacobian[rows[free, None], columns] = slopes[free] / distances.stddev_m[rows[free], None]
+    return jacobian

@@ -129,7 +129,7 @@ class _World:
         self.metric_from_sfm = dict(zip((*self.metric_from_sfm, k), fit.state.similarities, strict=True))
         for id_, anchor in anchors.items():
             known = self.anchors.get(id_)
-            if known is None or _rank(anchor) < _rank(known):
+            if known is None or anchor.rank < known.rank:
                 self.anchors[id_] = anchor.moved(rigid)
         self.notes += [f"anchor {id_} is {off:.2g} m elsewhere by another model" for id_, off in elsewhere_m.items()]
 
@@ -246,31 +246,22 @@ def _problem(model: ScaledModel, anchors: Sequence[AnchorEstimate]) -> RangeProb
 
 def _placed_anchors(model: ScaledModel) -> dict[str, PlacedAnchor]:
     path_m = model.estimate.metric_from_sfm.apply(model.trajectory.centers)
-    relative = model.estimate.uncertainty.empirical
-    return {
-        anchor.anchor_id: _placed(anchor, relative * (anchor.position_m - path_m.mean(axis=0)))
-        for anchor in model.estimate.anchors
-        if np.isfinite(anchor.position_m).all()
-    }
-
-
-def _placed(anchor: AnchorEstimate, by_scale_m: Array) -> PlacedAnchor:
-    """An anchor that was not surveyed may be off along with the model's scale."""
-    covariance = _MIN_STDDEV_M**2 * np.eye(3)
-    if anchor.position_covariance_m2 is not None:
-        covariance = covariance + anchor.position_covariance_m2
-    if anchor.prior_position_m is None:
-        covariance = covariance + np.outer(by_scale_m, by_scale_m)
-    mirror = anchor.mirror_position_m
-    places = [anchor.position_m] if mirror is None else [anchor.position_m, mirror]
-    return PlacedAnchor(np.array(places), covariance)
+    relative, placed = model.estimate.uncertainty.empirical, {}
+    for anchor in model.estimate.anchors:
+        if not np.isfinite(anchor.position_m).all():
+            continue
+        covariance = _MIN_STDDEV_M**2 * np.eye(3)
+        if anchor.position_covariance_m2 is not None:
+            covariance = covariance + anchor.position_covariance_m2
+        if anchor.prior_position_m is None:  # it may be off along with the model's scale
+            by_scale_m = relative * (anchor.position_m - path_m.mean(axis=0))
+            covariance = covariance + np.outer(by_scale_m, by_scale_m)
+        mirror = anchor.mirror_position_m
+        places = [anchor.position_m] if mirror is None else [anchor.position_m, mirror]
+        placed[anchor.anchor_id] = PlacedAnchor(np.array(places), covariance)
+    return placed
 
 
 def _chosen(anchors: Mapping[str, PlacedAnchor], sides: Mapping[str, int] | None = None) -> dict[str, Array]:
     """(3,) place of each, the first unless told otherwise."""
     return {id_: anchor.places_m[(sides or {}).get(id_, 0)] for id_, anchor in anchors.items()}
-
-
-def _rank(anchor: PlacedAnchor) -> tuple[int, float]:
-    """Better placed anchors first: those without a mirror image, then by variance."""
-    return len(anchor.places_m), anchor.variance_m2

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.distances.ends import LocatedDistances, distances_by_radio, surveyed_distances
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.gravity import Gravity
@@ -48,7 +48,7 @@ class ScaleProblem:
     ranges: RangeProblem
     errors: RangeErrors
     center_stddev: Array
-    rows: npt.NDArray[np.int64]
+    rows: Indices
     first_camera_from_sfm: Similarity
     frame: str
     anchors_are_known: bool
@@ -86,13 +86,17 @@ def scale_problem(
     rows, heard = _usable_ranges(observations, given)
     known, notes = _usable_positions(in_log, given & heard, anchor_frame, gravity is not None)
     known &= not place_is_open
-    if anchor_frame == "site" and not known.any():
-        distances = _with_surveyed(distances, in_log, given & heard)
     # A surveyed anchor whose ranges are all held out keeps its place, to check them against.
     placed = known | (given & known.any())
     left_out = tuple(a.anchor_id for a, k in zip(in_log, heard | placed, strict=True) if not k)
     first_camera_from_sfm = first_camera_from(trajectory)
-    noise = range_model.range_stddev_m or START_STDDEV_M
+    bias_m = np.array([a.range_bias_m for a in in_log])
+    bias_stddev_m = np.array([_bias_stddev(a, range_model) for a in in_log])
+    measured = [] if distances is None else [distances]
+    if anchor_frame == "site" and not known.any():
+        measured += _between_surveyed(in_log, given & heard)
+    noise_m, common_stddev_m = range_model.range_stddev_m or START_STDDEV_M, range_model.common_bias_stddev_m
+    measured.append(distances_by_radio(log, noise_m, bias_m, bias_stddev_m, common_stddev_m))
     errors = RangeErrors.begin(observations, rows, range_model)
     ranges = RangeProblem(
         centers=_centers_in_first_camera(observations.centers[rows], trajectory),
@@ -104,11 +108,11 @@ def scale_problem(
             [_position(a) if k else np.full(3, np.nan) for a, k in zip(in_log, placed, strict=True)]
         ),
         anchor_stddev_m=np.where(heard, np.where(known, np.array([a.position_stddev_m for a in in_log]), np.inf), 0.0),
-        bias_mean_m=np.array([a.range_bias_m for a in in_log]),
-        bias_stddev_m=np.where(heard, np.array([_bias_stddev(a, range_model) for a in in_log]), 0.0),
-        common_bias_stddev_m=range_model.common_bias_stddev_m,
+        bias_mean_m=bias_m,
+        bias_stddev_m=np.where(heard, bias_stddev_m, 0.0),
+        common_bias_stddev_m=common_stddev_m,
         frame_is_free=anchor_frame == "site" and bool(known.any()),
-        distances=_control(_all_distances(observations, in_log, range_model, distances, noise), heard | placed),
+        distances=_control(functools.reduce(LocatedDistances.joined, measured), heard | placed),
         gravity=gravity if anchor_frame == "site" and bool(known.any()) else None,
     )
     frame = "site" if ranges.frame_is_free else "first_camera"
@@ -126,25 +130,7 @@ def scale_problem(
     )
 
 
-def _all_distances(
-    observations: RangeObservations,
-    anchors: Sequence[Anchor],
-    range_model: RangeModelOptions,
-    taped: LocatedDistances | None,
-    noise_m: float,
-) -> LocatedDistances:
-    """The taped ones, and those between anchors that the radios measured."""
-    by_radio = distances_by_radio(
-        observations.log,
-        noise_m,
-        np.array([a.range_bias_m for a in anchors]),
-        np.array([_bias_stddev(a, range_model) for a in anchors]),
-        range_model.common_bias_stddev_m,
-    )
-    return by_radio if taped is None else taped.joined(by_radio)
-
-
-def _control(distances: LocatedDistances, has_place: npt.NDArray[np.bool_]) -> LocatedDistances | None:
+def _control(distances: LocatedDistances, has_place: Mask) -> LocatedDistances | None:
     """Those that are to be kept to, between points or anchors that take part; None if there are none."""
     takes_part = np.append(has_place, True)[distances.anchor_pair].all(axis=1) & ~distances.is_check
     return distances.subset(takes_part) if takes_part.any() else None
@@ -166,16 +152,19 @@ def _bias_stddev(anchor: Anchor, range_model: RangeModelOptions) -> float:
     return range_model.range_bias_stddev_m if anchor.range_bias_stddev_m is None else anchor.range_bias_stddev_m
 
 
-def _usable_ranges(
-    observations: RangeObservations, given: npt.NDArray[np.bool_]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+def _usable_ranges(observations: RangeObservations, given: Mask) -> tuple[Indices, Mask]:
     """Rows that take part, and (m,) anchors that have enough of them."""
     rows = observations.placed_rows
     index = observations.log.anchor_index
     counts = np.bincount(index[rows], minlength=len(given))
     heard = counts >= np.where(given, 1, _MIN_RANGES_OF_UNKNOWN)
     rows = rows[heard[index[rows]]]
-    _require_enough(observations, rows)
+    keyframes = np.union1d(observations.before[rows], observations.after[rows])
+    if len(rows) < _MIN_RANGES or len(keyframes) < _MIN_KEYFRAMES:
+        raise GeometryError(
+            f"the scale is not determined: {len(rows)} of {len(observations.log)} ranges lie on the path, near "
+            f"{len(keyframes)} keyframes; {_MIN_RANGES} near {_MIN_KEYFRAMES} are needed (do the clocks agree?)"
+        )
     return rows, heard
 
 
@@ -189,22 +178,12 @@ def _centers_in_first_camera(centers: Array, trajectory: Trajectory) -> Array:
     """(k, 3) of the first camera itself exactly 0, and not what rounding leaves: no scale moves it."""
     off = centers - trajectory.centers[0]
     off[np.linalg.norm(off, axis=1) <= rounding_of(trajectory.centers)] = 0.0
-    in_first_camera: Array = off @ trajectory.world_from_cam[0]
-    return in_first_camera
-
-
-def _require_enough(observations: RangeObservations, rows: npt.NDArray[np.int64]) -> None:
-    keyframes = np.union1d(observations.before[rows], observations.after[rows])
-    if len(rows) < _MIN_RANGES or len(keyframes) < _MIN_KEYFRAMES:
-        raise GeometryError(
-            f"the scale is not determined: {len(rows)} of {len(observations.log)} ranges lie on the path, near "
-            f"{len(keyframes)} keyframes; {_MIN_RANGES} near {_MIN_KEYFRAMES} are needed (do the clocks agree?)"
-        )
+    return np.asarray(off @ trajectory.world_from_cam[0])
 
 
 def _usable_positions(
-    anchors: Sequence[Anchor], given: npt.NDArray[np.bool_], anchor_frame: str, gravity_is_known: bool
-) -> tuple[npt.NDArray[np.bool_], list[str]]:
+    anchors: Sequence[Anchor], given: Mask, anchor_frame: str, gravity_is_known: bool
+) -> tuple[Mask, list[str]]:
     """(m,) anchors whose given positions can be used in this frame, and why others cannot."""
     num = int(given.sum())
     if anchor_frame != "site" or num == 0:
@@ -224,17 +203,10 @@ def _usable_positions(
     return np.zeros(len(anchors), dtype=bool), [note]
 
 
-def _with_surveyed(
-    distances: LocatedDistances | None, anchors: Sequence[Anchor], given: npt.NDArray[np.bool_]
-) -> LocatedDistances | None:
-    """The distances between anchors with given positions as well, which hold in any frame."""
+def _between_surveyed(anchors: Sequence[Anchor], given: Mask) -> list[LocatedDistances]:
+    """The distances between anchors with given positions, which hold in any frame; none where there are none."""
     ids = [anchor.anchor_id for anchor in anchors]
     pairs = surveyed_distances([anchor for anchor, k in zip(anchors, given, strict=True) if k])
-    if not pairs:
-        return distances
-    surveyed = LocatedDistances.of(
-        np.array([pair.distance_m for pair in pairs]),
-        np.array([pair.stddev_m for pair in pairs]),
-        anchor_pair=np.array([[ids.index(end) for end in pair.ends] for pair in pairs]),
-    )
-    return surveyed if distances is None else distances.joined(surveyed)
+    lengths_m, stddevs_m = np.array([[pair.distance_m, pair.stddev_m] for pair in pairs]).reshape(-1, 2).T
+    ends = np.array([[ids.index(end) for end in pair.ends] for pair in pairs])
+    return [LocatedDistances.of(lengths_m, stddevs_m, anchor_pair=ends)] if pairs else []

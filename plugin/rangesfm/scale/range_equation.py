@@ -16,11 +16,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.rotations import left_jacobian
@@ -28,7 +27,7 @@ from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.errors.noise import bias_whitening
 from rangesfm.ranging.errors.robust_loss import CAUCHY, RobustLoss
 from rangesfm.ranging.range_gradient import RangeGradient
-from rangesfm.scale.distance_equation import distance_jacobian, distance_residuals
+from rangesfm.scale.lengths import distance_jacobian, distance_residuals
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ class RangeProblem:
 
     centers: Array
     tag_from_center: Array
-    anchor_index: npt.NDArray[np.int64]
+    anchor_index: Indices
     range_m: Array
     stddev_m: Array
     anchor_mean_m: Array
@@ -67,16 +66,11 @@ class RangeProblem:
     share: Array | None = None
 
     @property
-    def share_or_1(self) -> Array:
-        """(n,)"""
-        return np.ones(len(self.range_m)) if self.share is None else self.share
-
-    @property
     def num_anchors(self) -> int:
         return len(self.anchor_stddev_m)
 
     @cached_property
-    def uncertain(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    def uncertain(self) -> tuple[Indices, Indices]:
         """Anchors, and biases, of which something is known, but not exactly."""
         anchors, biases = (np.flatnonzero((s > 0) & np.isfinite(s)) for s in (self.anchor_stddev_m, self.bias_stddev_m))
         return anchors, biases
@@ -86,7 +80,7 @@ class RangeProblem:
         """As ``noise.bias_whitening``, of the uncertain biases; asked for at every step of a solve."""
         return bias_whitening(self.bias_stddev_m[self.uncertain[1]], self.common_bias_stddev_m)
 
-    def subset(self, rows: npt.NDArray[np.int64]) -> RangeProblem:
+    def subset(self, rows: Indices) -> RangeProblem:
         """The same problem with some of its ranges."""
         return replace(
             self,
@@ -142,13 +136,11 @@ class RangeFit:
         residuals_m: (n,) predicted minus measured.
         weights: (n,) of the robust loss, 1 for a range that fits.
         pulls: (n,) the same times the ranges' shares.
-        curvatures: (n,) its second derivative times the shares; negative for outliers.
         cost: half the robust sum of squares, priors included.
         information: (p, p) Gauss-Newton approximation with the robust weights, in the parameters of ``columns``.
         gradients: (n, p) of each range's weighted residual, for resampling.
         prior_information: (p, p) the part of ``information`` that comes from priors.
-        scaled_residuals: (n,) residuals in stddevs.
-        prior_gradient: (p,) of the priors at the estimate.
+        gradient: (p,) of the cost, which is 0 at the bottom.
         columns: which of the p parameters is what, for each model; the very first is the logarithm of the scale.
     """
 
@@ -156,13 +148,11 @@ class RangeFit:
     residuals_m: Array
     weights: Array
     pulls: Array
-    curvatures: Array
     cost: float
     information: Array
     gradients: Array
-    scaled_residuals: Array
+    gradient: Array
     prior_information: Array
-    prior_gradient: Array
     columns: tuple[Columns, ...]
 
     @property
@@ -193,8 +183,8 @@ class Columns:
 
     scale: int
     frame: int
-    anchor: npt.NDArray[np.int64]
-    bias: npt.NDArray[np.int64]
+    anchor: Indices
+    bias: Indices
     num: int
 
 
@@ -227,8 +217,7 @@ def range_gradient(problem: RangeProblem, state: RangeState) -> RangeGradient:
 
 def predicted_ranges(problem: RangeProblem, state: RangeState) -> Array:
     """(n,) metres."""
-    predicted: Array = range_gradient(problem, state).distance_m + state.bias_m[problem.anchor_index]
-    return predicted
+    return range_gradient(problem, state).distance_m + state.bias_m[problem.anchor_index]
 
 
 # Of solutions that are kept; those to choose among need not be at the very bottom.
@@ -256,11 +245,12 @@ def solve(
         loss: of the ranges.
         tolerance: relative change of cost and of parameters at which it stops.
     """
-    system = _System((problem, *others), columns_of((problem, *others)), start, loss)
+    columns = columns_of((problem, *others))
+    system = _System((problem, *others), columns, start, loss)
     result = least_squares(
-        lambda x: np.concatenate(system.residuals(system.state_after(x))),
-        np.zeros(system.columns[0].num),
-        jac=lambda x: np.concatenate(system.jacobian(system.state_after(x))),
+        lambda x: np.concatenate(system.residuals(state_after(columns, start, x))),
+        np.zeros(columns[0].num),
+        jac=lambda x: np.concatenate(system.jacobian(state_after(columns, start, x))),
         loss=system.rho_with_derivatives,
         x_scale="jac",
         method="trf",
@@ -270,7 +260,7 @@ def solve(
         max_nfev=max_num_evaluations,
     )
     x = _settled(system, result.x) if tolerance <= _TIGHT else result.x
-    return system.fit(system.state_after(x), float(result.cost))
+    return system.fit(state_after(columns, start, x), float(result.cost))
 
 
 def fit_at(problem: RangeProblem, state: RangeState, weights: Array) -> RangeFit:
@@ -289,10 +279,9 @@ def _settled(system: _System, x: Array) -> Array:
     digit of any input decides.
     """
     for _ in range(_MAX_NUM_SETTLING):
-        fit = system.fit(system.state_after(x), np.nan)
-        gradient = fit.gradients.T @ fit.scaled_residuals + fit.prior_gradient
-        step = np.linalg.lstsq(fit.information, gradient, rcond=1e-12)[0]
-        gain = float(gradient @ step)
+        fit = system.fit(state_after(system.columns, system.start, x), np.nan)
+        step = np.linalg.lstsq(fit.information, fit.gradient, rcond=1e-12)[0]
+        gain = float(fit.gradient @ step)
         if not _NO_GAIN < gain < _NEAR_BOTTOM:
             break
         x = x - step
@@ -308,12 +297,9 @@ class _System:
     start: RangeState
     loss: RobustLoss
 
-    def state_after(self, x: Array) -> RangeState:
-        return state_after(self.columns, self.start, x)
-
     @property
     def share(self) -> Array:
-        return np.concatenate([part.share_or_1 for part in self.parts])
+        return np.concatenate([np.ones(len(p.range_m)) if p.share is None else p.share for p in self.parts])
 
     def rho_with_derivatives(self, z: Array) -> Array:
         # Priors are believed as they are; only ranges have outliers.
@@ -339,18 +325,17 @@ class _System:
         (scaled, off_priors), (jacobian, of_priors) = self.residuals(state), self.jacobian(state)
         weights, share = self.loss.weights(scaled) if weights is None else weights, self.share
         pulls, prior_information = share * weights, of_priors.T @ of_priors
+        gradients = jacobian * pulls[:, None]
         return RangeFit(
             state=state,
             residuals_m=scaled * np.concatenate([part.stddev_m for part in self.parts]),
             weights=weights,
             pulls=pulls,
-            curvatures=share * self.loss.curvatures(scaled),
             cost=cost,
-            information=(jacobian * pulls[:, None]).T @ jacobian + prior_information,
-            gradients=jacobian * pulls[:, None],
-            scaled_residuals=scaled,
+            information=gradients.T @ jacobian + prior_information,
+            gradients=gradients,
+            gradient=gradients.T @ scaled + of_priors.T @ off_priors,
             prior_information=prior_information,
-            prior_gradient=of_priors.T @ off_priors,
             columns=self.columns,
         )
 
@@ -446,5 +431,4 @@ def invert_information(information: Array) -> Array:
     """Inverse with unit-free conditioning; an undetermined direction gets a huge variance."""
     diagonal = np.sqrt(np.maximum(np.diag(information), 1e-200))
     values, vectors = np.linalg.eigh(information / np.outer(diagonal, diagonal))
-    inverse: Array = (vectors / np.maximum(values, 1e-14)) @ vectors.T / np.outer(diagonal, diagonal)
-    return inverse
+    return np.asarray((vectors / np.maximum(values, 1e-14)) @ vectors.T / np.outer(diagonal, diagonal))

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import NEARLY_STRAIGHT, Similarity, path_kind, path_shape
 from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors
@@ -25,6 +24,7 @@ from rangesfm.scale.range_equation import (
 )
 from rangesfm.scale.starts import (
     complete_unknown_anchors,
+    each_once,
     first_camera_starts,
     site_starts,
     sphere_swaps,
@@ -107,7 +107,9 @@ def solve_scale(posed: ScaleProblem, *, camera_side: str | None, seed: int) -> S
     starts = [fit.state for fit in fits]
     if posed.anchors_are_known and not problem.frame_is_free:
         starts += _consensus_states(problem)
-    solutions = [solution_from(posed, start) for start in _likeliest_each_once(problem, errors, starts)]
+    starts.sort(key=lambda state: _unlikeliness(problem, errors, state))
+    likeliest = each_once(starts, lambda *both: _are_same(problem, *both), _NUM_ALTERNATIVES)
+    solutions = [solution_from(posed, start) for start in likeliest]
     solutions.sort(key=lambda solution: _unlikeliness(problem, errors, solution.fit.state))
     on_side(problem, [solutions[0].fit], camera_side)
     refuse_ambiguity(solutions[0], [solution.fit.state for solution in solutions[1:]], camera_side)
@@ -126,12 +128,6 @@ def _consensus_states(problem: RangeProblem) -> list[RangeState]:
     if np.isinf(problem.anchor_stddev_m).any():
         return [complete_unknown_anchors(problem, start) for start in starts]
     return starts
-
-
-def _likeliest_each_once(problem: RangeProblem, errors: RangeErrors, states: list[RangeState]) -> list[RangeState]:
-    """The likeliest states, best first, of each map one."""
-    ranked = sorted(states, key=lambda state: _unlikeliness(problem, errors, state))
-    return [ranked[i] for i in _first_of_each_map(problem, ranked)]
 
 
 def _distinct_fits(problem: RangeProblem, anchors_are_known: bool, seed: int) -> list[RangeFit]:
@@ -161,44 +157,31 @@ def _distinct_fits(problem: RangeProblem, anchors_are_known: bool, seed: int) ->
 def _each_once(problem: RangeProblem, fits: list[RangeFit]) -> list[RangeFit]:
     """The best fits, best first, of each map one."""
     ranked = sorted(fits, key=lambda f: f.cost)
-    return [ranked[i] for i in _first_of_each_map(problem, [fit.state for fit in ranked])]
-
-
-def _first_of_each_map(problem: RangeProblem, states: list[RangeState]) -> list[int]:
-    """Where each different map comes first; of so many maps as are followed."""
-    firsts: list[int] = []
-    for i, state in enumerate(states):
-        if all(_differ(problem, state, states[first]) for first in firsts) and len(firsts) < _NUM_ALTERNATIVES:
-            firsts.append(i)
-    return firsts
+    return each_once(ranked, lambda a, b: _are_same(problem, a.state, b.state), _NUM_ALTERNATIVES)
 
 
 def _known_only(problem: RangeProblem) -> RangeProblem:
     """Ranges to anchors with a given position; the others rest where they are."""
-    known = np.isfinite(problem.anchor_stddev_m)
+    known, distances = np.isfinite(problem.anchor_stddev_m), problem.distances
     part = problem.subset(np.flatnonzero(known[problem.anchor_index]))
     return replace(
         part,
         anchor_stddev_m=np.where(known, problem.anchor_stddev_m, 0.0),
         bias_stddev_m=np.where(known, problem.bias_stddev_m, 0.0),
-        distances=_between_points(problem.distances),
+        distances=None if distances is None else distances.subset(distances.is_between_points),
     )
 
 
-def _between_points(distances: LocatedDistances | None) -> LocatedDistances | None:
-    return None if distances is None else distances.subset(distances.anchor_pair[:, 0] < 0)
-
-
-def _differ(problem: RangeProblem, first: RangeState, second: RangeState) -> bool:
-    """Whether two states are different maps, not the same one twice."""
+def _are_same(problem: RangeProblem, first: RangeState, second: RangeState) -> bool:
+    """Whether two states are one map, not different ones."""
     a, b = first.metric_from_model, second.metric_from_model
     scales_differ = bool(abs(np.log(a.scale / b.scale)) > _SAME_LOG_SCALE)
     if scales_differ or not problem.frame_is_free:
-        return scales_differ
+        return not scales_differ
     turn = np.rad2deg(Rotation.from_matrix(a.rotation.T @ b.rotation).magnitude())
     shape = path_shape(problem.centers)
     shift = np.linalg.norm(a.apply(shape.centroid) - b.apply(shape.centroid)) / np.linalg.norm(a.scale * shape.stddevs)
-    return bool(turn > _SAME_ROTATION_DEG or shift > _SAME_SHIFT)
+    return not (turn > _SAME_ROTATION_DEG or shift > _SAME_SHIFT)
 
 
 def solution_from(posed: ScaleProblem, start: RangeState) -> Solution:
@@ -250,7 +233,7 @@ def refuse_ambiguity(solution: Solution, rivals: Sequence[RangeState], camera_si
     for rival in rivals:
         other = solve(solution.problem, rival, loss=solution.errors.loss, tolerance=1e-8)
         is_elsewhere = camera_side is not None and camera_side_of(problem, other.state) not in (camera_side, None)
-        if is_elsewhere or not _differ(solution.problem, other.state, solution.fit.state):
+        if is_elsewhere or _are_same(problem, other.state, solution.fit.state):
             continue
         gap = (other.cost - solution.fit.cost) / solution.errors.inflation**2
         if gap < MIN_COST_GAP:

@@ -2,25 +2,28 @@
 
 Squared and for a given scale, the range equation is linear in what places the anchors or the
 path, so a sweep over scales (and rotations) with a small robust linear solve at each finds
-every basin without a first guess.
+every basin without a first guess. For anchors known in the frame of the path, maximum consensus over the scale
+is exact.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError
-from rangesfm.geometry.similarity import IDENTITY, Similarity, path_shape, round_middle, rounding_of
+from rangesfm.geometry.similarity import IDENTITY, Similarity, off_origin, path_shape, round_middle, rounding_of
 from rangesfm.ranging.anchors.point_fit import multilaterate
 from rangesfm.ranging.errors.noise import robust_stddevs
 from rangesfm.ranging.errors.robust_loss import SAME_COST
-from rangesfm.scale.consensus import consensus_scales
 from rangesfm.scale.range_equation import RangeProblem, RangeState, solve, tag_positions
+
+_T = TypeVar("_T")
 
 _NUM_SCALES = 80
 _SCALE_SPAN = 200.0
@@ -35,6 +38,12 @@ _BASIN_LOG_SCALE = 0.3
 _BASIN_ROTATION_RAD = 0.6
 # In radii: an anchor this near to the middle of a sphere has no distance from it that could be a radius.
 _IN_MIDDLE = 1e-6
+# A range agrees with a scale if it fits to this many stddevs of noise and bias together.
+TOLERANCE_STDDEVS = 2.5
+# Hills of agreement are told apart on a logarithmic grid of the scale; only those at least so high beside the best.
+_LOG_CELL = 0.02
+_MIN_SHARE_OF_BEST = 0.5
+_MAX_CANDIDATES = 12
 
 
 def spread_subset(problem: RangeProblem, max_num_per_anchor: int) -> RangeProblem:
@@ -42,7 +51,7 @@ def spread_subset(problem: RangeProblem, max_num_per_anchor: int) -> RangeProble
     return problem.subset(spread_rows(problem, max_num_per_anchor))
 
 
-def spread_rows(problem: RangeProblem, max_num_per_anchor: int) -> npt.NDArray[np.int64]:
+def spread_rows(problem: RangeProblem, max_num_per_anchor: int) -> Indices:
     """Which ranges these are, ascending."""
     rows = []
     for k in range(problem.num_anchors):
@@ -77,7 +86,10 @@ def scale_candidates(problem: RangeProblem) -> Array:
 
 def first_camera_starts(problem: RangeProblem) -> list[RangeState]:
     """Starts where all anchors are known in the frame of the model: exact consensus over the scale."""
-    return [_at_scale(problem, scale) for scale in consensus_scales(problem)]
+    return [
+        RangeState(replace(IDENTITY, scale=scale), problem.anchor_mean_m.copy(), problem.bias_mean_m.copy())
+        for scale in consensus_scales(problem)
+    ]
 
 
 def unknown_anchor_starts(problem: RangeProblem) -> list[RangeState]:
@@ -86,8 +98,8 @@ def unknown_anchor_starts(problem: RangeProblem) -> list[RangeState]:
     scales = scale_candidates(problem)
     anchors, costs = _multilaterate_all(small, scales)
     best = dict.fromkeys(i for kind in costs for i in _lowest_minima(kind))
-    placed = [Similarity(scale, np.eye(3), np.zeros(3)) for scale in scales]
-    return [choose_sides(small, RangeState(placed[i], anchors[i], problem.bias_mean_m.copy()))[0] for i in best]
+    starts = [RangeState(replace(IDENTITY, scale=scales[i]), anchors[i], problem.bias_mean_m.copy()) for i in best]
+    return [choose_sides(small, start)[0] for start in starts]
 
 
 def _lowest_minima(costs: Array) -> list[int]:
@@ -118,19 +130,23 @@ def site_starts(problem: RangeProblem, seed: int = 0) -> list[RangeState]:
             similarity = Similarity(float(scale), rotations[int(i)].as_matrix(), translations[i])
             trials.append((float(costs[i]), similarity))
     anchors = np.where(np.isfinite(problem.anchor_mean_m), problem.anchor_mean_m, 0.0)
-    return [RangeState(similarity, anchors.copy(), problem.bias_mean_m.copy()) for similarity in _apart(trials)]
+    ranked = [trial for _, trial in sorted(trials, key=lambda trial: trial[0])]
+    found = each_once(ranked, _in_one_basin, _NUM_STARTS)
+    return [RangeState(similarity, anchors.copy(), problem.bias_mean_m.copy()) for similarity in found]
 
 
-def _apart(trials: list[tuple[float, Similarity]]) -> list[Similarity]:
-    """The best trials, each basin about once."""
-    kept: list[Similarity] = []
-    for _, trial in sorted(trials, key=lambda trial: trial[0]):
-        if len(kept) < _NUM_STARTS and not any(
-            abs(np.log(trial.scale / other.scale)) < _BASIN_LOG_SCALE
-            and np.trace(trial.rotation.T @ other.rotation) > 1 + 2 * np.cos(_BASIN_ROTATION_RAD)
-            for other in kept
-        ):
-            kept.append(trial)
+def _in_one_basin(one: Similarity, other: Similarity) -> bool:
+    turn = np.trace(one.rotation.T @ other.rotation)
+    is_near = abs(np.log(one.scale / other.scale)) < _BASIN_LOG_SCALE
+    return bool(is_near and turn > 1 + 2 * np.cos(_BASIN_ROTATION_RAD))
+
+
+def each_once(ranked: Iterable[_T], are_same: Callable[[_T, _T], bool], max_num: int) -> list[_T]:
+    """The first of all that are the same, at most so many."""
+    kept: list[_T] = []
+    for each in ranked:
+        if len(kept) < max_num and not any(are_same(each, other) for other in kept):
+            kept.append(each)
     return kept
 
 
@@ -185,8 +201,7 @@ def mirrored(problem: RangeProblem, state: RangeState, k: int) -> Array:
     """(3,) anchor k on the other side of the path's plane."""
     shape = path_shape(state.metric_from_model.apply(problem.centers))
     normal = shape.axes[:, 2]
-    other: Array = state.anchors_m[k] - 2 * ((state.anchors_m[k] - shape.centroid) @ normal) * normal
-    return other
+    return np.asarray(state.anchors_m[k] - 2 * ((state.anchors_m[k] - shape.centroid) @ normal) * normal)
 
 
 def complete_unknown_anchors(problem: RangeProblem, state: RangeState) -> RangeState:
@@ -213,12 +228,6 @@ def anchor_alone(problem: RangeProblem, k: int, metric_from_model: Similarity) -
     )
 
 
-def _at_scale(problem: RangeProblem, scale: float) -> RangeState:
-    return RangeState(
-        Similarity(float(scale), np.eye(3), np.zeros(3)), problem.anchor_mean_m.copy(), problem.bias_mean_m.copy()
-    )
-
-
 def _multilaterate_all(problem: RangeProblem, scales: Array) -> tuple[Array, Array]:
     """(s, m, 3) each anchor from the tag's positions at given scales; (2, s) the mean of robust residuals, two ways.
 
@@ -226,7 +235,7 @@ def _multilaterate_all(problem: RangeProblem, scales: Array) -> tuple[Array, Arr
     on a sphere, which leaves the linear equation free to fit at any scale.
     """
     anchors, costs = np.zeros((len(scales), problem.num_anchors, 3)), np.zeros((2, len(scales)))
-    unit = _residual_unit(problem)
+    unit = 3 * float(np.median(problem.stddev_m))
     for k in np.unique(problem.anchor_index):
         part = problem.of_anchor(int(k))
         tags = scales[:, None, None] * part.centers + part.tag_from_center
@@ -235,10 +244,6 @@ def _multilaterate_all(problem: RangeProblem, scales: Array) -> tuple[Array, Arr
         off = np.linalg.norm(tags - anchors[:, k, None], axis=-1) - ranges
         costs += np.sum(np.log1p((np.stack([residuals, off]) / unit) ** 2), axis=-1)
     return anchors, costs / len(problem.range_m)
-
-
-def _residual_unit(problem: RangeProblem) -> float:
-    return 3 * float(np.median(problem.stddev_m))
 
 
 def _translations(problem: RangeProblem, scale: float, rotations: Array) -> tuple[Array, Array]:
@@ -267,3 +272,92 @@ def _translations(problem: RangeProblem, scale: float, rotations: Array) -> tupl
     off = np.abs(np.sqrt(np.einsum("rin,rin->rn", from_path, from_path)) - ranges)
     costs = np.mean(np.minimum(off, 3 * np.median(off, axis=1, keepdims=True)), axis=1)
     return translation[..., 0], costs
+
+
+def consensus_scales(problem: RangeProblem) -> list[float]:
+    """Scales that most ranges agree on, best first; the first is the exact maximum.
+
+    The others are the tops of lower hills: local maxima of the number of ranges that agree.
+
+    Raises:
+        GeometryError: no positive scale explains any range.
+    """
+    bias_stddev = np.where(np.isfinite(problem.bias_stddev_m), problem.bias_stddev_m, 0.0)[problem.anchor_index]
+    tolerance = TOLERANCE_STDDEVS * np.hypot(problem.stddev_m, bias_stddev)
+    ranges = problem.range_m - problem.bias_mean_m[problem.anchor_index]
+    offset = problem.tag_from_center - problem.anchor_mean_m[problem.anchor_index]
+    starts, ends = agreeing_intervals(problem.centers, offset, ranges, tolerance)
+    if not len(starts):
+        raise GeometryError("no scale explains any range: are the anchors given in the first camera's frame?")
+    return _hilltops(*local_maxima(starts, ends))
+
+
+def _hilltops(scales: Array, counts: Indices) -> list[float]:
+    """Best first: scales with no better one in their cell of the grid or in the two beside it."""
+    cells = np.floor(np.log(scales) / _LOG_CELL).astype(np.int64)
+    first = np.flatnonzero(np.diff(cells, prepend=cells[0] - 1))
+    best = np.maximum.reduceat(counts, first)
+    if len(first) == 1:
+        return [float(scales[np.argmax(counts)])]
+    beside = np.diff(cells[first]) == 1
+    lower = np.concatenate([[0], np.where(beside, best[:-1], 0)])
+    higher = np.concatenate([np.where(beside, best[1:], 0), [0]])
+    # Of equal neighbours the first is the top.
+    tops = np.flatnonzero((best > lower) & (best >= higher) & (best >= _MIN_SHARE_OF_BEST * best.max()))
+    tops = tops[np.argsort(-best[tops], kind="stable")][:_MAX_CANDIDATES]
+    ends = np.append(first[1:], len(scales))
+    return [float(scales[first[top] + np.argmax(counts[first[top] : ends[top]])]) for top in tops]
+
+
+def agreeing_intervals(centers: Array, offset: Array, ranges: Array, tolerance: Array) -> tuple[Array, Array]:
+    """Positive scales for which ``| ||scale c + offset|| - range | <= tolerance``, range by range.
+
+    The squared distance is a parabola in the scale, so the set is one interval, or two where
+    the path comes nearer to the anchor than the range and leaves again.
+
+    Args:
+        centers, offset: (n, 3). ranges, tolerance: (n,).
+
+    Returns:
+        interval starts and ends, up to 2 n, in no particular order.
+    """
+    a = np.where(off_origin(centers), np.sum(centers**2, axis=1), 0.0)
+    b = np.sum(centers * offset, axis=1)
+    d = np.sum(offset**2, axis=1)
+    outer_low, outer_high, reaches = _roots(a, b, d - (ranges + tolerance) ** 2)
+    inner_low, inner_high, enters = _roots(a, b, d - np.maximum(ranges - tolerance, 0.0) ** 2)
+    enters &= ranges > tolerance
+    starts = np.concatenate([outer_low[reaches], inner_high[reaches & enters]])
+    ends = np.concatenate([np.where(enters, inner_low, outer_high)[reaches], outer_high[reaches & enters]])
+    starts = np.maximum(starts, 0.0)
+    keep = ends > starts
+    return starts[keep], ends[keep]
+
+
+def _roots(a: Array, b: Array, c: Array) -> tuple[Array, Array, Mask]:
+    """Roots of ``a x^2 + 2 b x + c``, and where they are real. Without motion (a = 0) there are none."""
+    discriminant = b**2 - a * c
+    real = (discriminant > 0) & (a > 0)
+    root = np.sqrt(np.where(real, discriminant, 0.0))
+    safe = np.where(a > 0, a, 1.0)
+    return (-b - root) / safe, (-b + root) / safe, real
+
+
+def local_maxima(starts: Array, ends: Array) -> tuple[Array, Indices]:
+    """Where more of the closed intervals overlap than just before and just after: the stretches' middles, and counts.
+
+    Such a stretch lies between a start and the next end, without another start between them. O(n log n); starts and
+    ends are sorted apart, as sorting numbers is many times faster than sorting an index to them.
+
+    Args:
+        starts, ends: (n,) n > 0.
+
+    Returns:
+        (k,) ascending middles, and how many intervals hold each.
+    """
+    starts, ends = np.sort(starts), np.sort(ends)
+    num_ended = np.searchsorted(ends, starts, side="left")
+    next_start = np.append(starts[1:], np.inf)
+    tops = np.flatnonzero(ends[num_ended] < next_start)
+    counts = tops + 1 - num_ended[tops]
+    return 0.5 * (starts[tops] + ends[num_ended[tops]]), counts

@@ -11,9 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.similarity import off_origin
 
 # Of what a discriminant is the difference of: less may be its rounding.
@@ -46,7 +45,7 @@ class TwoCandidate:
     chosen: str
     scale: float
     duplets: Array
-    rows: npt.NDArray[np.int64]
+    rows: Indices
     num_without_root: int
 
 

@@ -12,7 +12,7 @@ from scipy.special import chndtrix
 from rangesfm.arrays import Array
 from rangesfm.ranging.errors.cells import MAX_NUM_CELLS, Cells, cells, noisiness
 from rangesfm.ranging.errors.components import CLOCKS, GIVEN, REWEIGHTING
-from rangesfm.ranging.errors.learned import ROUNDING, LearnedErrors, learn_errors, usual_errors
+from rangesfm.ranging.errors.learned import ROUNDING, ExpectedErrors, LearnedErrors, learn_errors
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.estimate import NORMAL_95, ScaleUncertainty
 from rangesfm.scale.problem import ScaleProblem
@@ -111,12 +111,11 @@ def errors_to_expect(
         max_num_cells: fewer are coarser, and sooner computed.
     """
     taken_off = observations.log.shared_stddev_m
-    return usual_errors(
+    return ExpectedErrors.of(
         _cells(posed, solution, observations, model_from_cam, max_num_cells),
-        curve_stddev_m=None if taken_off is None else taken_off[posed.rows],
-        ruled_out=ruled_out(solution.problem),
-        stddevs=stddevs,
-    )
+        None if taken_off is None else taken_off[posed.rows],
+        ruled_out(solution.problem),
+    ).usual(stddevs)
 
 
 def ruled_out(problem: RangeProblem) -> list[str]:
@@ -230,15 +229,13 @@ def _by_what_was_given(solution: Solution) -> Array:
     biases = fit.columns[0].bias[fit.columns[0].bias >= 0]
     given[biases] = given[:, biases] = 0.0
     inverse = _inverse(fit)
-    covariance: Array = solution.errors.inflation**2 * inverse @ given @ inverse.T
-    return covariance
+    return solution.errors.inflation**2 * inverse @ given @ inverse.T
 
 
 def parameter_covariance(solution: Solution, learned: LearnedErrors) -> Array:
     """(p, p) of all that a fit estimates, in the parameters of its columns, by what ranges get wrong and was given."""
     of_cells = parameter_influence(solution.fit, solution.problem, learned)
-    covariance: Array = of_cells @ learned.covariance_m2 @ of_cells.T + _by_what_was_given(solution)
-    return covariance
+    return of_cells @ learned.covariance_m2 @ of_cells.T + _by_what_was_given(solution)
 
 
 def parameter_influence(fit: RangeFit, problem: RangeProblem, learned: LearnedErrors) -> Array:
@@ -249,8 +246,7 @@ def parameter_influence(fit: RangeFit, problem: RangeProblem, learned: LearnedEr
 
 def scale_influence(fit: RangeFit, problem: RangeProblem) -> Array:
     """(n,) relative change of the scale for each metre by which a range is longer."""
-    influence: Array = fit.gradients @ _inverse(fit)[0] / problem.stddev_m
-    return influence
+    return np.asarray(fit.gradients @ _inverse(fit)[0] / problem.stddev_m)
 
 
 def _inverse(fit: RangeFit) -> Array:

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.similarity import NEARLY_FLAT, NEARLY_STRAIGHT, path_kind, path_shape
 from rangesfm.options import ScaleOptions
-from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.scale.cutoff import scale_drift
+from rangesfm.ranging.anchors.anchor import Anchor, AnchorEstimate
 from rangesfm.scale.estimate import NORMAL_95, CutoffTest, ScaleUncertainty
 from rangesfm.scale.lengths import LengthScale
 from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import RangeFit
+from rangesfm.scale.sensitivity import scale_drift
 from rangesfm.scale.solution import WHY_SCALE_IS_OPEN, Solution
 
 # Half of the 95 % interval of the scale, relative, from which it is called doubtful.
@@ -46,8 +48,7 @@ class Verdict:
     advice: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class _Doubt:
+class _Doubt(NamedTuple):
     reason: str
     advice: str = ""
 
@@ -67,18 +68,17 @@ def judge(
         GeometryError: refused, as the scale is less certain than ``options.max_relative_stddev``.
     """
     half_width = uncertainty.half_width_95
-    doubts = [
-        *_weakness_doubts(solution, half_width),
-        *(_Doubt(note, "survey three anchors or more that are not on one line") for note in problem.notes),
-        *_left_out_doubts(problem.left_out),
-        *_path_doubts(solution),
-        *_range_doubts(solution.fit),
-        *_anchor_doubts(per_anchor),
-    ]
+    doubts = [*_doubts_of_survey(problem, solution, half_width), *_doubts_of_ranges(solution.fit, per_anchor)]
     remarks = _remarks(solution, anchors)
-    if drift := _drift(cutoff_tests):
-        is_out = abs(drift.scale / cutoff_tests[0].scale - 1) > half_width
-        (doubts if is_out else remarks).append(_drift_in_words(drift, cutoff_tests[0]))
+    if (drift := scale_drift(cutoff_tests)) is not None:
+        change = drift.scale / cutoff_tests[0].scale - 1
+        if abs(change) >= _MIN_DRIFT:
+            reason = (
+                f"short ranges disagree with long ones: without those under {drift.min_range_m:g} m the scale would "
+                f"change by {100 * change:+.1f} %"
+            )
+            doubt = _Doubt(reason, f"{CALIBRATE}, or put the anchors farther from the path")
+            (doubts if abs(change) > half_width else remarks).append(doubt)
     return _verdict(doubts, remarks, half_width, options)
 
 
@@ -114,37 +114,43 @@ def _verdict(doubts: list[_Doubt], remarks: list[_Doubt], half_width: float, opt
     return Verdict("doubtful", reasons, advice)
 
 
-def _left_out_doubts(anchor_ids: tuple[str, ...]) -> list[_Doubt]:
-    if not anchor_ids:
-        return []
-    which = f"anchor {anchor_ids[0]} has" if len(anchor_ids) == 1 else f"anchors {', '.join(anchor_ids)} have"
-    return [
-        _Doubt(f"{which} too few ranges on the path to be placed: left out", "range more often, or survey them all")
-    ]
-
-
-def _weakness_doubts(solution: Solution, half_width: float) -> list[_Doubt]:
-    """Why the scale is uncertain, where a longer walk of the same shape would not help."""
+def _doubts_of_survey(posed: ScaleProblem, solution: Solution, half_width: float) -> Iterator[_Doubt]:
+    """Of what was walked and where the anchors are."""
     problem = solution.problem
     kind, heard = path_kind(problem.centers), np.unique(problem.anchor_index)
     is_round = kind in ("circular", "spherical") and not np.isfinite(problem.anchor_stddev_m[heard]).any()
+    # Why the scale is uncertain, where a longer walk of the same shape would not help.
     if half_width > DOUBTFUL_ABOVE and is_round:
-        reason, advice = WHY_SCALE_IS_OPEN[kind]
-        return [_Doubt(reason, advice)]
-    if half_width > NORMAL_95 * _NOTHING_KNOWN:
-        return [_Doubt("the ranges do not show that the camera moved", "walk a loop of several metres")]
-    return []
-
-
-def _path_doubts(solution: Solution) -> list[_Doubt]:
-    stddevs = path_shape(solution.problem.centers).stddevs
+        yield _Doubt(*WHY_SCALE_IS_OPEN[kind])
+    elif half_width > NORMAL_95 * _NOTHING_KNOWN:
+        yield _Doubt("the ranges do not show that the camera moved", "walk a loop of several metres")
+    for note in posed.notes:
+        yield _Doubt(note, "survey three anchors or more that are not on one line")
+    if ids := posed.left_out:
+        which = f"anchor {ids[0]} has" if len(ids) == 1 else f"anchors {', '.join(ids)} have"
+        reason = f"{which} too few ranges on the path to be placed: left out"
+        yield _Doubt(reason, "range more often, or survey them all")
+    stddevs = path_shape(problem.centers).stddevs
     if stddevs[1] < NEARLY_STRAIGHT * stddevs[0]:
-        if np.isinf(solution.problem.anchor_stddev_m).any():
-            reason = "the path is nearly straight: an unknown anchor may stand anywhere on a circle around it"
-            return [_Doubt(reason)]
-        if solution.problem.frame_is_free:
-            return [_Doubt("the path is nearly straight: how far the map is rolled about it is uncertain")]
-    return []
+        if np.isinf(problem.anchor_stddev_m).any():
+            yield _Doubt("the path is nearly straight: an unknown anchor may stand anywhere on a circle around it")
+        elif problem.frame_is_free:
+            yield _Doubt("the path is nearly straight: how far the map is rolled about it is uncertain")
+
+
+def _doubts_of_ranges(fit: RangeFit, per_anchor: dict[str, float]) -> Iterator[_Doubt]:
+    if len(fit.weights) < _FEW_RANGES:
+        reason = f"only {len(fit.weights)} ranges lie on the path"
+        yield _Doubt(reason, "range more often, and all along the path")
+    outliers = float(np.mean(fit.weights < 0.1))
+    if outliers > _MANY_OUTLIERS:
+        reason = f"{100 * outliers:.0f} % of the ranges do not fit the map: blocked, reflected, or of another anchor"
+        yield _Doubt(reason, "place the anchors where nothing stands between them and the path")
+    if len(per_anchor) > 1:
+        spread = float(np.std(np.log(np.array(list(per_anchor.values()))), ddof=1))
+        if spread > _MAX_ANCHOR_SPREAD:
+            reason = f"the anchors disagree: the scales found with each of them alone scatter by {100 * spread:.1f} %"
+            yield _Doubt(reason, "check the anchors' positions and antenna delays, and place them in the open")
 
 
 def _remarks(solution: Solution, anchors: Sequence[AnchorEstimate]) -> list[_Doubt]:
@@ -158,38 +164,26 @@ def _remarks(solution: Solution, anchors: Sequence[AnchorEstimate]) -> list[_Dou
     return [_Doubt(reason, "raise and lower the camera on the way, or survey the anchors")]
 
 
-def _range_doubts(fit: RangeFit) -> list[_Doubt]:
-    doubts = []
-    if len(fit.weights) < _FEW_RANGES:
-        reason = f"only {len(fit.weights)} ranges lie on the path"
-        doubts.append(_Doubt(reason, "range more often, and all along the path"))
-    outliers = float(np.mean(fit.weights < 0.1))
-    if outliers > _MANY_OUTLIERS:
-        reason = f"{100 * outliers:.0f} % of the ranges do not fit the map: blocked, reflected, or of another anchor"
-        doubts.append(_Doubt(reason, "place the anchors where nothing stands between them and the path"))
-    return doubts
+def levelled_places(gravity: Gravity, surveyed: Sequence[Anchor], found: Sequence[AnchorEstimate]) -> tuple[str, ...]:
+    """In words, what gravity adds where the site's anchors do not fix the map's heading.
 
-
-def _anchor_doubts(per_anchor: dict[str, float]) -> list[_Doubt]:
-    """Anchors that disagree on the scale."""
-    if len(per_anchor) < 2:
-        return []
-    spread = float(np.std(np.log(np.array(list(per_anchor.values()))), ddof=1))
-    if spread <= _MAX_ANCHOR_SPREAD:
-        return []
-    reason = f"the anchors disagree: the scales found with each of them alone scatter by {100 * spread:.1f} %"
-    return [_Doubt(reason, "check the anchors' positions and antenna delays, and place them in the open")]
-
-
-def _drift(tests: tuple[CutoffTest, ...]) -> CutoffTest | None:
-    """A scale that moves as short ranges are left out, by more than is news to a surveyor."""
-    drift = scale_drift(tests)
-    return None if drift is None or abs(drift.scale / tests[0].scale - 1) < _MIN_DRIFT else drift
-
-
-def _drift_in_words(drift: CutoffTest, with_all: CutoffTest) -> _Doubt:
-    reason = (
-        f"short ranges disagree with long ones: without those under {drift.min_range_m:g} m the scale would change by "
-        f"{100 * (drift.scale / with_all.scale - 1):+.1f} %"
-    )
-    return _Doubt(reason, f"{CALIBRATE}, or put the anchors farther from the path")
+    Args:
+        surveyed: in the site frame. found: in the first camera's frame.
+    """
+    height_of = {anchor.anchor_id: anchor.position_m[2] for anchor in surveyed if anchor.position_m is not None}
+    texts = []
+    for anchor in found:
+        if anchor.anchor_id not in height_of or not np.isfinite(anchor.position_m).all():
+            continue
+        wheres = []
+        for place in (anchor.position_m, anchor.mirror_position_m):
+            if place is not None:
+                rise = float(place @ gravity.up_in_first_camera)
+                away = float(np.linalg.norm(place - rise * gravity.up_in_first_camera))
+                wheres.append(f"at site height {height_of[anchor.anchor_id] - rise:.2f} m, {away:.2f} m horizontally")
+        # On the path's plane an anchor is its own mirror image.
+        where = " or ".join(dict.fromkeys(wheres))
+        texts.append(
+            f"the first camera was {where} from anchor {anchor.anchor_id}; in which direction is not determined"
+        )
+    return tuple(texts)

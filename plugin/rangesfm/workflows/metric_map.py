@@ -19,8 +19,7 @@ from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruct
 from rangesfm.join.models import ModelVerdict, PathOfModel, join_models
 from rangesfm.progress import Journal
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.clock.estimate import TimeOffset, estimate_time_offset
-from rangesfm.ranging.clock.rivals import REMEDY
+from rangesfm.ranging.clock.estimate import REMEDY, TimeOffset, estimate_time_offset
 from rangesfm.ranging.errors.components import CLOCKS
 from rangesfm.ranging.log import RangeKind
 from rangesfm.ranging.observations import RangeObservations, RangeStatus, hold_out

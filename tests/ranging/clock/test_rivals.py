@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rangesfm.errors import GeometryError
-from rangesfm.ranging.clock.rivals import likely_offsets
+from rangesfm.ranging.clock.estimate import likely_offsets
 
 
 def test_offsets_come_with_their_probabilities_the_likeliest_first_and_without_the_unlikely() -> None:

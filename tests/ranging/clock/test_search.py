@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rangesfm.ranging.clock.path import PathSamples
-from rangesfm.ranging.clock.search import TimedRanges, scan_offsets
+from rangesfm.ranging.clock.search import PathSamples, TimedRanges, scan_offsets
 
 
 @pytest.mark.parametrize("rounding", [0.0, 1e-15])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rangesfm.ranging.errors.inlier_noise import inlier_noise
+from rangesfm.ranging.errors.noise import inlier_noise
 
 
 def spoilt(num: int, share: float, side: float, seed: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:

@@ -10,7 +10,7 @@ import pytest
 
 from rangesfm.ranging.errors.cells import MAX_NUM_CELLS, Cells, cells
 from rangesfm.ranging.errors.components import COMPONENTS
-from rangesfm.ranging.errors.learned import LearnedErrors, learn_errors, usual_errors
+from rangesfm.ranging.errors.learned import ExpectedErrors, LearnedErrors, learn_errors
 
 Array = npt.NDArray[np.float64]
 
@@ -79,7 +79,7 @@ def test_anchors_that_are_all_late_towards_where_they_do_not_face_are_seen_to_be
 
 def test_noise_alone_leaves_the_rest_at_what_radios_let_expect_or_less(walked: Cells) -> None:
     off_m = 0.05 * np.random.default_rng(2).standard_normal(len(walked))
-    found, usual = stddevs(learn(walked, off_m)), stddevs(usual_errors(walked))
+    found, usual = stddevs(learn(walked, off_m)), stddevs(ExpectedErrors.of(walked).usual({}))
     assert found.pop("white") == pytest.approx(0.05, rel=0.15)
     for name, stddev in found.items():
         assert stddev < 1.2 * usual[name], name
@@ -89,7 +89,7 @@ def test_what_a_survey_does_not_show_counts_with_the_mean_of_its_variance_over_r
     slope = next(each for each in COMPONENTS if each.name == "slope")
     of_radios = slope.median * np.exp(slope.spread * np.random.default_rng(6).standard_normal(200_000))
     expected = np.sqrt(np.mean(of_radios**2))
-    assert stddevs(usual_errors(walked))["slope"] == pytest.approx(expected, rel=0.02)
+    assert stddevs(ExpectedErrors.of(walked).usual({}))["slope"] == pytest.approx(expected, rel=0.02)
     distance_m = walked.distance_m[walked.of_range]  # a scale that is free takes up all of it
     scaled_free = learn_errors(walked, np.zeros(len(walked)), distance_m[:, None], NO_MAP, 0.05)
     assert stddevs(scaled_free)["slope"] == pytest.approx(expected, rel=0.02)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from tests.ranging.errors.test_range_errors import NUM_EACH, make_errors, noise
 
-from rangesfm.ranging.errors.misfits import misfits
+from rangesfm.ranging.errors.range_errors import misfits
 from rangesfm.ranging.errors.robust_loss import CAUCHY
 
 

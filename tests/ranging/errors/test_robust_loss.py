@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from rangesfm.ranging.errors.robust_loss import CAUCHY, GEMAN_MCCLURE, RobustLoss
@@ -19,11 +20,17 @@ def test_derivatives_are_those_of_the_loss(loss: RobustLoss) -> None:
     np.testing.assert_allclose(second, (higher[1] - lower[1]) / (2 * step), rtol=1e-5, atol=1e-9)
 
 
+def curvatures(loss: RobustLoss, residuals: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Second derivative of half the loss by the residual."""
+    _, first, second = loss.rho(residuals**2)
+    return np.asarray(first + 2 * residuals**2 * second)
+
+
 @BOTH
 def test_curvature_is_the_slope_of_the_weighted_residual(loss: RobustLoss) -> None:
     residuals, step = np.linspace(-8.0, 8.0, 100), 1e-5
     slope = [(residuals + h) * loss.weights(residuals + h) for h in (step, -step)]
-    np.testing.assert_allclose(loss.curvatures(residuals), (slope[0] - slope[1]) / (2 * step), atol=1e-7)
+    np.testing.assert_allclose(curvatures(loss, residuals), (slope[0] - slope[1]) / (2 * step), atol=1e-7)
 
 
 @BOTH
@@ -38,7 +45,7 @@ def test_slope_is_that_of_the_root_of_the_loss(loss: RobustLoss) -> None:
 def test_under_gaussian_noise_it_is_nearly_as_good_as_least_squares(loss: RobustLoss) -> None:
     z, step = np.linspace(-9.0, 9.0, 20_001, retstep=True)
     density = np.exp(-0.5 * z**2) / np.sqrt(2 * np.pi) * step
-    efficiency = (density @ loss.curvatures(z)) ** 2 / (density @ (z * loss.weights(z)) ** 2)
+    efficiency = (density @ curvatures(loss, z)) ** 2 / (density @ (z * loss.weights(z)) ** 2)
     assert 0.93 < efficiency < 0.96
 
 

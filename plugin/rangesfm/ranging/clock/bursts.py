@@ -101,12 +101,7 @@ def find_bursts(ranges: TimedRanges, photo_times_s: Array) -> Bursts | None:
 
 
 def pair_bursts(bursts: Bursts, trajectory: Trajectory, tags_in_cam_m: Array) -> list[Pairing]:
-    """Every way to lay the bursts on the photos that pairs most of them; the best first.
-
-    Args:
-        bursts, trajectory: of the same survey.
-        tags_in_cam_m: (num_tags, 3) lever arms, metres.
-    """
+    """Every way to lay the bursts on the photos that pairs most of them; the best first. (num_tags, 3) lever arms."""
     photo_times = trajectory.timestamps_s
     assert photo_times is not None, "a path in time needs times"
     reach_s = _REACH_SHARE * float(np.median(np.diff(photo_times)))

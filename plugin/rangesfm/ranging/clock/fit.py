@@ -1,4 +1,4 @@
-"""The robust fit of ranges to the path at one offset of the clocks, and how well it fixes the offset."""
+"""The robust fit of ranges to the path at one offset of the clocks, how well it fixes the offset, and their drift."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import numpy as np
 from scipy import special
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.ranging.clock.path import PathSamples
-from rangesfm.ranging.clock.search import TimedRanges
+from rangesfm.ranging.clock.search import PathSamples, TimedRanges
 from rangesfm.ranging.clock.squares import SquaresFit, fit_squares, residual_stddev, rows_by_anchor
 
 # Ranges to one anchor within a second say much the same where people carry the camera.
@@ -37,6 +36,10 @@ _RANGE_BIAS_STDDEV_M = 0.05
 # The path explains the ranges if they are likelier on it by this many stddevs, as blocks of time have them: the best
 # of some hundred offsets of a log of another walk reaches 6, of Student's distribution with a dozen blocks.
 _MIN_GAIN_STDDEVS = 7.0
+# A drift of fewer stddevs than this may be chance and is left alone.
+_MIN_STDDEVS = 3.0
+_MAX_NUM_DRIFTS = 6
+_CONVERGED_STDDEVS = 0.05
 
 
 class Timing(NamedTuple):
@@ -134,13 +137,8 @@ class OffsetFit:
 
 
 def refine_offset(ranges: TimedRanges, path: PathSamples, offset_s: float) -> OffsetFit:
-    """Descend from an offset to the nearest one that explains the ranges best (Gauss-Newton).
-
-    Args:
-        ranges: (nearly) all are on the path at that offset.
-        path: of a moving camera.
-        offset_s: to start from.
-    """
+    """Descend from an offset, at which (nearly) all ranges are on the path, to the nearest one that explains them best
+    (Gauss-Newton)."""
     found = fit_at_offset(ranges, path, offset_s)
     for num_steps in range(_MAX_NUM_STEPS):
         own = found.squares.unexplained(found.rates[:, None])[:, 0]
@@ -210,10 +208,7 @@ def _jackknife_variances(own: Array, residuals: Array, squares: SquaresFit, time
 
     Args:
         own: (n, k) columns of the unknowns in question, which nothing else explains.
-        residuals: (n,) weighted, metres.
-        squares: the fit.
-        times: (n,)
-        num_blocks: of equal length.
+        residuals: (n,) weighted, metres, of the fit ``squares``.
     """
     columns = np.column_stack([squares.basis, own / np.linalg.norm(own, axis=0)])
     curved = columns * (2 * squares.weights - 1)[:, None]
@@ -231,3 +226,35 @@ def _jackknife_variances(own: Array, residuals: Array, squares: SquaresFit, time
     quantile = float(special.stdtrit(num - 1, 0.975) / special.ndtri(0.975)) if num > 1 else np.inf
     variances = (num - 1) / num * np.sum((changes / np.linalg.norm(own, axis=0)) ** 2, axis=0)
     return np.asarray(quantile**2 * variances)
+
+
+def fit_clocks(ranges: TimedRanges, path: PathSamples, offset_s: float) -> tuple[OffsetFit, Timing, float, float]:
+    """``refine_offset``; if the ranges then show a drift beyond doubt, offset and drift.
+
+    Returns:
+        the fit at the offset, of ranges whose times are freed of the drift that is followed; what it says of the offset
+        and of the drift that is left; what camera time gains on radio time, seconds a second, where it is beyond doubt,
+        else 0; and the radio's time at which the offset holds.
+    """
+    reference_s = float(ranges.times_s.mean())
+    fit = refine_offset(ranges, path, offset_s)
+    timing, followed, least_stddevs = fit.timing(), 0.0, _MIN_STDDEVS
+    for _ in range(_MAX_NUM_DRIFTS):
+        if not abs(timing.drift) > least_stddevs * timing.drift_stddev:
+            break
+        followed, least_stddevs = followed + timing.drift, _CONVERGED_STDDEVS
+        # Of a radio clock that runs like the camera's.
+        times_s = ranges.times_s + followed * (ranges.times_s - reference_s)
+        fit = refine_offset(ranges._replace(times_s=times_s), path, fit.offset_s)
+        timing = fit.timing()
+    return fit, timing, followed, reference_s
+
+
+def drift_note(drift: float, stddev: float, times_s: Array) -> str:
+    """What a user should know of a drift that was found."""
+    half_span_s = float(np.ptp(times_s)) / 2
+    return (
+        f"the clocks drift: the camera's gains {1e6 * drift:+.0f} ppm on the radio's (stddev {1e6 * stddev:.0f} ppm); "
+        f"this is corrected for: the time offset differs by {drift * half_span_s:+.3f} s at the end of the log from "
+        f"that in its middle"
+    )

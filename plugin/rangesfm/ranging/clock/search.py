@@ -17,9 +17,17 @@ from scipy.ndimage import maximum_filter1d
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.geometry.similarity import rounding_of
-from rangesfm.ranging.clock.path import PathSamples
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.options import AssociationOptions
+from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock.squares import MIN_RANGE_M, rows_by_anchor
+from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.observations import RangeStatus
 
+# Between samples this close a straight line is off by less than a millimetre, even at 10 m/s^2.
+_SAMPLE_STEP_S = 0.025
+# Photos of more than seven hours are sampled more coarsely.
+_MAX_NUM_SAMPLES = 1 << 20
 # An offset that puts fewer ranges on the path than this share of the most possible is not tried.
 _MIN_COVERAGE = 0.5
 # A twentieth of what a walker's motion needs to change; less than that for logs of more than seven hours.
@@ -40,6 +48,67 @@ class TimedRanges(NamedTuple):
 
     def take(self, rows: Indices | Mask) -> TimedRanges:
         return TimedRanges(self.times_s[rows], self.range_m[rows], self.anchor[rows], self.tag[rows])
+
+
+@dataclass(frozen=True)
+class PathSamples:
+    """m camera poses, ``step_s`` apart, from ``start_s`` on (camera's clock).
+
+    Attributes:
+        centers: (m, 3) camera centres, model units; 0 where unknown.
+        tag_from_center: (num_tags, m, 3) lever arms turned into the world, metres.
+        is_known: (m,) whether the camera's pose is known then.
+    """
+
+    start_s: float
+    step_s: float
+    centers: Array
+    tag_from_center: Array
+    is_known: Mask
+
+    def __len__(self) -> int:
+        return len(self.is_known)
+
+    def knows(self, times_s: Array) -> Mask:
+        """(n,) times at which the pose is known."""
+        place = (times_s - self.start_s) / self.step_s
+        inside = (place >= 0) & (place < len(self) - 1)
+        before = np.where(inside, place, 0).astype(np.int64)
+        return np.asarray(inside & self.is_known[before] & self.is_known[np.minimum(before + 1, len(self) - 1)])
+
+    def tag(self, times_s: Array, tag: Indices, scale: float) -> tuple[Array, Array]:
+        """Where the antenna of a tag is at known times, and how it moves.
+
+        Args:
+            scale: metres per model unit; infinite to leave the lever arm out.
+
+        Returns:
+            (n, 3) positions, model units; (n, 3) velocities, model units a second.
+        """
+        place = (times_s - self.start_s) / self.step_s
+        before = np.clip(place, 0, len(self) - 2).astype(np.int64)
+        points = self.centers + self.tag_from_center / scale
+        here = points[tag, before]
+        step = points[tag, before + 1] - here
+        return here + (place - before)[:, None] * step, step / self.step_s
+
+
+def moving_path(trajectory: Trajectory, tags_in_cam_m: Array, options: AssociationOptions) -> PathSamples:
+    """The path where ranges would be interpolated between keyframes; ``tags_in_cam_m``: (num_tags, 3)."""
+    assert trajectory.timestamps_s is not None, "a path in time needs times"
+    start_s = float(trajectory.timestamps_s[0])
+    span_s = float(trajectory.timestamps_s[-1]) - start_s
+    step_s = max(_SAMPLE_STEP_S, span_s / _MAX_NUM_SAMPLES)
+    times = start_s + step_s * np.arange(int(span_s / step_s) + 1)
+    probe = RangeLog.from_arrays(["probe"] * len(times), np.ones(len(times)), timestamp_s=times)
+    # A negative tolerance: a sample next to a keyframe is interpolated like all others.
+    options = options.model_copy(update={"max_time_difference_s": -1.0})
+    by_tag = [associate(probe, trajectory, tag_in_cam_m, options=options) for tag_in_cam_m in tags_in_cam_m]
+    places = by_tag[0]
+    is_known = (places.status == RangeStatus.USED) & (places.before != places.after)
+    known = is_known[:, None]
+    tag_from_center = np.stack([np.where(known, places_of_tag.tag_from_center, 0.0) for places_of_tag in by_tag])
+    return PathSamples(start_s, step_s, np.where(known, places.centers, 0.0), tag_from_center, is_known)
 
 
 def ranges_on_path(ranges: TimedRanges, path: PathSamples, offset_s: float, max_num: int) -> TimedRanges:
@@ -98,9 +167,7 @@ def scan_offsets(ranges: TimedRanges, path: PathSamples, weights: Array | None =
     """Try every offset at which log and path overlap; the lever arm changes little at this resolution.
 
     Args:
-        ranges: of all anchors, in any order.
-        path: with some pose known.
-        weights: (n,) of the ranges; None: all weigh the same.
+        path: with some pose known. weights: (n,) of the ranges, in any order; None: all weigh the same.
     """
     weights = np.ones(len(ranges.range_m)) if weights is None else weights
     scanned: list[tuple[Array, Array, Array, Array]] = []

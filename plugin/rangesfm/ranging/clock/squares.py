@@ -13,13 +13,12 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.errors.noise import robust_stddev
+from rangesfm.ranging.errors.robust_loss import CAUCHY
 
 # Ranges shorter than this say as little of the squared distance as one of this length.
 MIN_RANGE_M = 0.3
 # A residual below this is as good as none (radios resolve a centimetre).
 MIN_RESIDUAL_M = 1e-3
-# Of 95 % efficiency on Gaussian noise.
-_CAUCHY_LOSS_SCALE = 2.385
 _NUM_REWEIGHTINGS = 6
 # The curvature of |p|^2 must be seen this clearly before it tells the scale.
 _MIN_CURVATURE_STDDEVS = 5.0
@@ -66,13 +65,11 @@ class SquaresFit:
         return np.asarray(left - np.outer(curvature, curvature @ left) / max(float(curvature @ curvature), 1e-300))
 
 
-def fit_squares(points: Array, range_m: Array, anchor: Indices, loss_scale: float = _CAUCHY_LOSS_SCALE) -> SquaresFit:
+def fit_squares(points: Array, range_m: Array, anchor: Indices, loss_scale: float = CAUCHY.width) -> SquaresFit:
     """Iteratively reweighted least squares from equal weights.
 
     Args:
-        points: (n, 3) antenna, model units.
-        range_m: (n,)
-        anchor: (n,) number of each one's anchor.
+        points: (n, 3) antenna, model units. range_m: (n,). anchor: (n,) number of each one's anchor.
         loss_scale: in stddevs, from which a residual is down-weighted.
     """
     middle = points.mean(axis=0)

@@ -44,7 +44,6 @@ class Calibration:
         noise_stddev_m: scatter of a range about the curve and its anchor's bias.
         outlier_share: ranges that do not fit, as those without line of sight.
         anchor_bias_m: what each anchor reads too long beyond the curve.
-        correlation_inflation: by how much the errors' correlation in time widens stddevs.
         distance_m, error_m: (n,) of each range: true length, and measured minus true.
     """
 
@@ -53,7 +52,6 @@ class Calibration:
     noise_stddev_m: float
     outlier_share: float
     anchor_bias_m: dict[str, float]
-    correlation_inflation: float
     distance_m: Array
     error_m: Array
 
@@ -106,7 +104,7 @@ def calibrate_ranges(log: RangeLog, tags_m: Array, anchors: Sequence[Anchor]) ->
     curve = ErrorCurve(knots, fitted.values[: len(knots)], stddev, noise)
     biases = dict(zip(log.anchor_ids, fitted.values[len(knots) :].tolist(), strict=True))
     outliers = float(np.mean(fitted.weights < 0.1))
-    return Calibration(curve, len(used), scatter.noise_m, outliers, biases, scatter.inflation, distance, error)
+    return Calibration(curve, len(used), scatter.noise_m, outliers, biases, distance, error)
 
 
 def _errors(log: RangeLog, tags_m: Array, anchors: Sequence[Anchor]) -> tuple[Array, Array]:
@@ -130,8 +128,7 @@ def _knots(distance: Array) -> Array:
         raise GeometryError(
             f"the ranges are {ends[0]:.2f} to {ends[1]:.2f} m long: a curve needs ranges of different lengths"
         )
-    knots: Array = np.exp(np.linspace(low, high, int(np.ceil((high - low) / _LOG_SPACING)) + 1))
-    return knots
+    return np.exp(np.linspace(low, high, int(np.ceil((high - low) / _LOG_SPACING)) + 1))
 
 
 def _problem(log: RangeLog, used: Indices, distance: Array, error: Array, index: Indices, knots: Array) -> _Problem:
@@ -212,8 +209,7 @@ def _spread_by_anchor(problem: _Problem, index: Indices, num_knots: int) -> Arra
         part = _Problem(problem.design[rest], problem.error_m[rest], problem.prior, problem.groups[rest])
         curves.append(_fit(part)[0].values[:num_knots])
     num = len(present)
-    spread: Array = np.sqrt((num - 1) / num * np.sum((np.array(curves) - np.mean(curves, axis=0)) ** 2, axis=0))
-    return spread
+    return np.asarray(np.sqrt((num - 1) / num * np.sum((np.array(curves) - np.mean(curves, axis=0)) ** 2, axis=0)))
 
 
 def _noise_by_knot(problem: _Problem, residuals: Array, num_knots: int, noise: float) -> Array:

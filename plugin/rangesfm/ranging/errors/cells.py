@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -93,17 +93,12 @@ def cells(
         in_cam=towards[first],
         noisiness=noise_of_anchor[anchor_index[first]],
     )
-    return Cells(
-        of_range=of_range,
-        weight=weight,
-        worth=begun.worth,
-        anchor_index=begun.anchor_index,
-        tag_index=begun.tag_index,
+    return replace(
+        begun,
         time_s=begun.mean(since),
         distance_m=begun.mean(distance),
         from_anchor=_unit(begun.mean(towards)),
         in_cam=_unit(begun.mean(np.einsum("nij,nj->ni", cam_from_world, towards))),
-        noisiness=begun.noisiness,
     )
 
 
@@ -117,8 +112,7 @@ def noisiness(anchor_index: Indices, residuals_m: Array, num_anchors: int) -> Ar
     if np.isnan(scatter).all():
         return np.ones(num_anchors)
     relative = scatter / np.sqrt(np.nanmedian(scatter**2))
-    clipped: Array = np.clip(np.nan_to_num(relative, nan=1.0), _MIN_NOISINESS, _MAX_NOISINESS)
-    return clipped
+    return np.asarray(np.clip(np.nan_to_num(relative, nan=1.0), _MIN_NOISINESS, _MAX_NOISINESS))
 
 
 def _labels(anchor_index: Indices, tag_index: Indices, since_s: Array, max_num: int) -> Indices:
@@ -134,5 +128,4 @@ def _labels(anchor_index: Indices, tag_index: Indices, since_s: Array, max_num: 
 
 
 def _unit(vectors: Array) -> Array:
-    units: Array = vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-9)[:, None]
-    return units
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-9)[:, None])

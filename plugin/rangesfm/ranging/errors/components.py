@@ -6,6 +6,7 @@ learns its own stddevs on top of what the population shows.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
@@ -14,7 +15,6 @@ from scipy.spatial.distance import cdist
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.errors.cells import Cells
-from rangesfm.ranging.errors.population import population
 
 _SHORT_M = 1.0
 _TIME_S = 3.0
@@ -29,6 +29,30 @@ _SMOOTH, _ROUGH = 1.0, 0.5
 _MIN_DISTANCE_M = 0.05
 # Of the time a path takes, within which it bends one way.
 _BEND = 0.125
+# Metres (slope: share of the distance), as learnt against the true distances from one start for all, by
+# ``python -m tests.studies.shown_errors``. The logs are those of ``examples/radios.md``.
+_SHOWN = """
+log         room_env1 room_calibration starloc_s5 rcv_sequence1 rcv_sequence3 lias_mid plaza1 starloc_fast_s1
+radio       room      room             starloc    rcv           rcv           lias     plaza  starloc_fast
+white       0.057     0.030            0.043      0.025         0.037         0.084    0.353  0.089
+time        0.011     0.026            0.010      0.006         0.004         0.007    0.003  0.007
+drift       0.015     0.008            0.006      0.007         0.005         0.005    0.002  0.017
+place       0.015     0.025            0.011      0.050         0.046         0.017    0.003  0.009
+view        0.038     0.043            0.024      0.053         0.023         0.009    0.002  0.042
+bias        0.034     0.024            0.029      0.040         0.027         0.047    0.012  0.034
+common_bias 0.143     0.139            0.154      0.207         0.203         0.169    0.125  0.193
+short       0.260     0.243            0.171      0.154         0.174         0.207    0.200  0.174
+curve       0.034     0.040            0.045      0.040         0.035         0.032    0.018  0.038
+rough_curve 0.009     0.011            0.007      0.012         0.013         0.009    0.004  0.014
+slope       0.0044    0.0040           0.0044     0.0040        0.0040        0.0036   0.0032 0.0047
+antenna     0.035     0.048            0.024      0.025         0.023         0.025    0.005  0.029
+off_axis    0.080     0.053            0.040      0.040         0.042         0.040    0.020  0.039
+tag_antenna 0.033     0.029            0.021      0.024         0.019         0.045    0.008  0.025
+bending     0.004     0.008            0.005      0.004         0.004         0.004    0.010  0.009
+"""
+LOGS = tuple(_SHOWN.split()[1:9])
+# Of the logarithms: eight logs do not show how alike other radios are.
+_LEAST_SPREAD = 0.5
 
 
 @dataclass(frozen=True)
@@ -56,57 +80,30 @@ class Component:
 
 
 def _same(labels: Indices) -> Array:
-    alike: Array = (labels[:, None] == labels).astype(np.float64)
-    return alike
+    return np.asarray((labels[:, None] == labels).astype(np.float64))
 
 
 def _same_link(cells: Cells) -> Array:
-    alike: Array = _same(cells.anchor_index) * _same(cells.tag_index)
-    return alike
+    return _same(cells.anchor_index) * _same(cells.tag_index)
 
 
-def _apart(values: Array) -> Array:
-    return np.abs(values[:, None] - values)
+def _fading(values: Array, within: float) -> Array:
+    """(c, c) of a random function of (c,) values, rough at any scale."""
+    return np.exp(-np.abs(values[:, None] - values) / within)
 
 
-def _in_time(cells: Cells) -> Array:
-    together: Array = np.exp(-_apart(cells.time_s) / _TIME_S) * _same_link(cells)
-    return together
+def _smooth(values: Array, within: float) -> Array:
+    """The same of a smooth one."""
+    return np.exp(-0.5 * (np.abs(values[:, None] - values) / within) ** 2)
 
 
-def _drifting(cells: Cells) -> Array:
-    together: Array = np.exp(-_apart(cells.time_s) / _DRIFT_S) * _same(cells.tag_index)
-    return together
+def _log_distance(cells: Cells) -> Array:
+    return np.log(np.maximum(cells.distance_m, _MIN_DISTANCE_M))
 
 
 def _in_place(cells: Cells) -> Array:
     places_m = cells.distance_m[:, None] * cells.from_anchor
-    together: Array = np.exp(-cdist(places_m, places_m) / _PLACE_M) * _same_link(cells)
-    return together
-
-
-def _in_view(cells: Cells) -> Array:
-    together: Array = np.exp((cells.in_cam @ cells.in_cam.T - 1) / _LOBE) * _same_link(cells)
-    return together
-
-
-def _log_distance(distance_m: Array) -> Array:
-    return np.log(np.maximum(distance_m, _MIN_DISTANCE_M))
-
-
-def alike_by_distance(distance_m: Array) -> Array:
-    """(c, c) of a random function, smooth in the logarithm of (c,) distances."""
-    alike: Array = np.exp(-0.5 * (_apart(_log_distance(distance_m)) / _SMOOTH) ** 2)
-    return alike
-
-
-def _smooth(cells: Cells) -> Array:
-    return alike_by_distance(cells.distance_m)
-
-
-def _rough(cells: Cells) -> Array:
-    alike: Array = np.exp(-_apart(_log_distance(cells.distance_m)) / _ROUGH)
-    return alike
+    return np.asarray(np.exp(-cdist(places_m, places_m) / _PLACE_M) * _same_link(cells))
 
 
 def _short(cells: Cells) -> Array:
@@ -114,27 +111,10 @@ def _short(cells: Cells) -> Array:
     return np.outer(shortness, shortness)
 
 
-def alike_by_direction(directions: Array) -> Array:
+def _by_direction(directions: Array) -> Array:
     """Of a random polynomial of the direction, half of its variance linear and half quadratic in the unit vector."""
     cosine = directions @ directions.T
-    alike: Array = cosine / 2 + (3 * cosine**2 - 1) / 4
-    return alike
-
-
-def _white(cells: Cells) -> Array:
-    return np.diag(1 / np.maximum(cells.worth, 1e-6))
-
-
-def _proportional(cells: Cells) -> Array:
-    return np.outer(cells.distance_m, cells.distance_m)
-
-
-def _antenna(cells: Cells) -> Array:
-    return _same(cells.anchor_index) * alike_by_direction(cells.from_anchor)
-
-
-def _tag_antenna(cells: Cells) -> Array:
-    return _same(cells.tag_index) * alike_by_direction(cells.in_cam)
+    return cosine / 2 + (3 * cosine**2 - 1) / 4
 
 
 def _off_axis(cells: Cells) -> Array:
@@ -142,15 +122,12 @@ def _off_axis(cells: Cells) -> Array:
     same = _same(cells.anchor_index)
     facing = same @ cells.from_anchor
     cosine = np.sum(cells.from_anchor * facing, axis=1) / np.maximum(np.linalg.norm(facing, axis=1), 1e-9)
-    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-    alike: Array = np.exp(-0.5 * (_apart(angle) / _OFF_AXIS_RAD) ** 2)
-    return alike
+    return _smooth(np.arccos(np.clip(cosine, -1.0, 1.0)), _OFF_AXIS_RAD)
 
 
 def _bending(cells: Cells) -> Array:
     length_s = max(_BEND * float(np.ptp(cells.time_s)), 1e-9)
-    alike: Array = (cells.from_anchor @ cells.from_anchor.T) * np.exp(-_apart(cells.time_s) / length_s)
-    return alike
+    return (cells.from_anchor @ cells.from_anchor.T) * _fading(cells.time_s, length_s)
 
 
 def components(expected: Mapping[str, tuple[float, float]]) -> tuple[Component, ...]:
@@ -158,32 +135,71 @@ def components(expected: Mapping[str, tuple[float, float]]) -> tuple[Component, 
 
     def of(
         name: str,
-        correlation: Callable[[Cells], Array],
         words: str,
+        correlation: Callable[[Cells], Array],
         *,
         is_of_anchor: bool = False,
         calibrated_median: float | None = None,
     ) -> Component:
-        median, spread = expected[name]
-        return Component(name, median, spread, calibrated_median, is_of_anchor, correlation, words)
+        return Component(name, *expected[name], calibrated_median, is_of_anchor, correlation, words)
 
+    of_anchor = functools.partial(of, is_of_anchor=True)
     return (
-        of("white", _white, "noise of single ranges", is_of_anchor=True),
-        of("time", _in_time, "errors that last for seconds", is_of_anchor=True),
-        of("drift", _drifting, "slow drift of the radio, alike to all anchors"),
-        of("place", _in_place, "errors that belong to a place: echoes", is_of_anchor=True),
-        of("view", _in_view, "lobes of the tag's antenna towards each anchor", is_of_anchor=True),
-        of("bias", lambda c: _same(c.anchor_index), "each anchor's own bias", is_of_anchor=True),
-        of("common_bias", lambda c: np.ones((len(c), len(c))), "the bias of all ranges", calibrated_median=0.04),
-        of("short", _short, "short ranges", calibrated_median=0.08),
-        of("curve", _smooth, "the radio's error curve", calibrated_median=0.02),
-        of("rough_curve", _rough, "unevenness of the error curve", calibrated_median=0.005),
-        of("slope", _proportional, "ranges long by a share", calibrated_median=0.003),
-        of("antenna", _antenna, "anchors' antennas by direction", is_of_anchor=True),
-        of("off_axis", _off_axis, "anchors' antennas, alike, away from the path's middle"),
-        of("tag_antenna", _tag_antenna, "the tag's antenna by direction"),
-        of("bending", _bending, "the map's own bending"),
+        of_anchor("white", "noise of single ranges", lambda c: np.diag(1 / np.maximum(c.worth, 1e-6))),
+        of_anchor("time", "errors that last for seconds", lambda c: _fading(c.time_s, _TIME_S) * _same_link(c)),
+        of(
+            "drift",
+            "slow drift of the radio, alike to all anchors",
+            lambda c: _fading(c.time_s, _DRIFT_S) * _same(c.tag_index),
+        ),
+        of_anchor("place", "errors that belong to a place: echoes", _in_place),
+        of_anchor(
+            "view",
+            "lobes of the tag's antenna towards each anchor",
+            lambda c: np.exp((c.in_cam @ c.in_cam.T - 1) / _LOBE) * _same_link(c),
+        ),
+        of_anchor("bias", "each anchor's own bias", lambda c: _same(c.anchor_index)),
+        of("common_bias", "the bias of all ranges", lambda c: np.ones((len(c), len(c))), calibrated_median=0.04),
+        of("short", "short ranges", _short, calibrated_median=0.08),
+        of("curve", "the radio's error curve", lambda c: _smooth(_log_distance(c), _SMOOTH), calibrated_median=0.02),
+        of(
+            "rough_curve",
+            "unevenness of the error curve",
+            lambda c: _fading(_log_distance(c), _ROUGH),
+            calibrated_median=0.005,
+        ),
+        of("slope", "ranges long by a share", lambda c: np.outer(c.distance_m, c.distance_m), calibrated_median=0.003),
+        of_anchor(
+            "antenna",
+            "anchors' antennas by direction",
+            lambda c: _same(c.anchor_index) * _by_direction(c.from_anchor),
+        ),
+        of("off_axis", "anchors' antennas, alike, away from the path's middle", _off_axis),
+        of("tag_antenna", "the tag's antenna by direction", lambda c: _same(c.tag_index) * _by_direction(c.in_cam)),
+        of("bending", "the map's own bending", _bending),
     )
+
+
+def stddevs_in(log: str) -> dict[str, float]:
+    """Of each component, as one of LOGS shows it."""
+    _, _, *components = (line.split() for line in _SHOWN.strip().splitlines())
+    return {name: float(sizes[LOGS.index(log)]) for name, *sizes in components}
+
+
+def population(without: str | None = None) -> dict[str, tuple[float, float]]:
+    """Median of each component's stddev, and stddev of its logarithm, over the logs.
+
+    Args:
+        without: a log; all of its radio are left out.
+    """
+    logs, radios, *components = (line.split() for line in _SHOWN.strip().splitlines())
+    left_out = None if without is None else radios[logs.index(without)]
+    kept = [i for i, radio in enumerate(radios) if i > 0 and radio != left_out]
+    of_components = {}
+    for name, *sizes in components:
+        shown = np.log([float(sizes[i - 1]) for i in kept])
+        of_components[name] = float(np.exp(shown.mean())), max(float(shown.std(ddof=1)), _LEAST_SPREAD)
+    return of_components
 
 
 COMPONENTS = components(population())

@@ -46,8 +46,7 @@ class LearnedErrors:
     @property
     def covariance_m2(self) -> Array:
         """(c, c) of all of them."""
-        together: Array = self.covariances_m2.sum(axis=0)
-        return together
+        return np.asarray(self.covariances_m2.sum(axis=0))
 
     @property
     def stddev_of_component(self) -> dict[str, float]:
@@ -101,7 +100,6 @@ def learn_errors(
     curve_stddev_m: Array | None = None,
     ruled_out: Collection[str] = (),
     others_m2: Mapping[str, Array] | None = None,
-    most_unusual: float = np.inf,
 ) -> LearnedErrors:
     """Restricted maximum likelihood (Patterson and Thompson, 1971) with lognormal priors on the stddevs.
 
@@ -113,27 +111,9 @@ def learn_errors(
         curve_stddev_m: (n,) of a learnt error curve that has been taken off; None if none has.
         ruled_out: components that the user knows not to be there.
         others_m2: (c, c) covariances of what else there is, by name, of which nothing is to be learnt.
-        most_unusual: how far above its median any stddev may be, in spreads over radios.
     """
     expected = ExpectedErrors.of(cells, curve_stddev_m, ruled_out, others_m2)
-    return expected.learnt(cells.mean(off_m), cells.mean(design), prior_design, noise_m, most_unusual)
-
-
-def usual_errors(
-    cells: Cells,
-    *,
-    curve_stddev_m: Array | None = None,
-    ruled_out: Collection[str] = (),
-    stddevs: Mapping[str, float] | None = None,
-    others_m2: Mapping[str, Array] | None = None,
-) -> LearnedErrors:
-    """What radios let expect before anything is measured: roots of the mean variances, or what is known better.
-
-    Args:
-        curve_stddev_m, ruled_out, others_m2: as of ``learn_errors``.
-        stddevs: of some components, by name, in place of these.
-    """
-    return ExpectedErrors.of(cells, curve_stddev_m, ruled_out, others_m2).usual(stddevs or {})
+    return expected.learnt(cells.mean(off_m), cells.mean(design), prior_design, noise_m)
 
 
 def usual_stddevs(*, is_calibrated: bool) -> dict[str, float]:
@@ -161,26 +141,35 @@ class ExpectedErrors:
     def of(
         cls,
         cells: Cells,
-        curve_stddev_m: Array | None,
-        ruled_out: Collection[str],
-        others_m2: Mapping[str, Array] | None,
+        curve_stddev_m: Array | None = None,
+        ruled_out: Collection[str] = (),
+        others_m2: Mapping[str, Array] | None = None,
     ) -> ExpectedErrors:
         """As of ``learn_errors``."""
         components = tuple(component for component in COMPONENTS if component.name not in ruled_out)
-        of_components = np.array([_covariance(component, cells) for component in components])
-        known = _known(cells, curve_stddev_m, others_m2)
-        return cls(cells, components, of_components, known, curve_stddev_m is not None)
+        of_anchor = np.outer(cells.noisiness, cells.noisiness)
+        of_components = [c.correlation(cells) * (of_anchor if c.is_of_anchor else 1.0) for c in components]
+        known = dict(others_m2 or {})
+        if curve_stddev_m is not None:
+            stddev = cells.mean(curve_stddev_m)
+            smooth = next(component for component in COMPONENTS if component.name == "curve")
+            known[LEARNT_CURVE] = np.outer(stddev, stddev) * smooth.correlation(cells)
+        return cls(cells, components, np.array(of_components), known, curve_stddev_m is not None)
 
     def usual(self, stddevs: Mapping[str, float]) -> LearnedErrors:
-        """As most radios have them, some of them as given by name."""
+        """Roots of the mean variances over radios, or by name what is known better."""
         usual = usual_stddevs(is_calibrated=self.is_calibrated) | dict(stddevs)
         sizes = np.array([usual[component.name] for component in self.components])
         return self._of(sizes, sizes[:, None, None] ** 2 * self.of_components)
 
     def learnt(
-        self, off_m: Array, design: Array, prior_design: Array, noise_m: float, most_unusual: float
+        self, off_m: Array, design: Array, prior_design: Array, noise_m: float, most_unusual: float = np.inf
     ) -> LearnedErrors:
-        """As of ``learn_errors``, with (c,) and (c, p) of cells."""
+        """As of ``learn_errors``, with (c,) and (c, p) of cells.
+
+        Args:
+            most_unusual: how far above its median any stddev may be, in spreads over radios.
+        """
         # A map bends no more for a bad radio, and the noise says itself how large it is.
         widening = max(1.0, noise_m / _USUAL_NOISE_M) ** _WIDENING_POWER
         widened = [1.0 if c.name in ("bending", "white") else widening**2 for c in self.components]
@@ -214,22 +203,6 @@ def _median(component: Component, is_calibrated: bool) -> float:
     return component.median
 
 
-def _covariance(component: Component, cells: Cells) -> Array:
-    """(c, c) for a stddev of 1."""
-    covariance = component.correlation(cells)
-    return covariance * np.outer(cells.noisiness, cells.noisiness) if component.is_of_anchor else covariance
-
-
-def _known(cells: Cells, curve_stddev_m: Array | None, others_m2: Mapping[str, Array] | None) -> dict[str, Array]:
-    """(c, c) covariances that nothing is to be learnt of."""
-    known = dict(others_m2 or {})
-    if curve_stddev_m is not None:
-        stddev = cells.mean(curve_stddev_m)
-        smooth = next(component for component in COMPONENTS if component.name == "curve")
-        known[LEARNT_CURVE] = np.outer(stddev, stddev) * smooth.correlation(cells)
-    return known
-
-
 @dataclass(frozen=True)
 class _Likelihood:
     """Of the logarithms of k stddevs, given c cells."""
@@ -250,8 +223,7 @@ class _Likelihood:
         found = minimize(
             self._negative_with_gradient, self.log_medians, jac=True, method="L-BFGS-B", bounds=bounds, options=options
         )
-        logs: Array = found.x
-        return logs
+        return np.asarray(found.x)
 
     def _negative_with_gradient(self, logs: Array) -> tuple[float, Array]:
         lower, inverse = self._factored(logs)
@@ -279,8 +251,7 @@ class _Likelihood:
         seen = (inverse - whitened @ spread @ whitened.T) @ self.of_components
         # Expected information of restricted likelihood (Patterson and Thompson), about logarithms of stddevs.
         information = 2 * np.einsum("kij,lji->kl", seen, seen, optimize=True) * np.exp(2 * np.add.outer(logs, logs))
-        stddevs: Array = np.exp(logs + np.diag(np.linalg.inv(information + np.diag(self.spreads**-2))))
-        return stddevs
+        return np.asarray(np.exp(logs + np.diag(np.linalg.inv(information + np.diag(self.spreads**-2)))))
 
     def _factored(self, logs: Array) -> tuple[Array, Array]:
         """(c, c) lower factor and inverse of the covariance."""

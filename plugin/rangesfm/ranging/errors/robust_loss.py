@@ -38,22 +38,13 @@ class RobustLoss:
 
     def weights(self, scaled_residuals: Array) -> Array:
         """(n,) in (0, 1]: of the weighted least squares with the same gradient."""
-        weights: Array = self.rho(scaled_residuals**2)[1]
-        return weights
+        return np.asarray(self.rho(scaled_residuals**2)[1])
 
     def slopes(self, scaled_residuals: Array) -> Array:
         """(n,) derivative of the root of the loss by the residual: of residuals whose squares are the loss."""
         rho, first, _ = self.rho(scaled_residuals**2)
         root = np.sqrt(rho)
-        slopes: Array = np.where(root > 0, first * np.abs(scaled_residuals) / np.maximum(root, 1e-300), 1.0)
-        return slopes
-
-    def curvatures(self, scaled_residuals: Array) -> Array:
-        """(n,) second derivative of half the loss by the residual."""
-        squared = scaled_residuals**2
-        _, first, second = self.rho(squared)
-        curvatures: Array = first + 2 * squared * second
-        return curvatures
+        return np.where(root > 0, first * np.abs(scaled_residuals) / np.maximum(root, 1e-300), 1.0)
 
 
 # Of this width the efficiency under Gaussian noise is 95 %. For first rounds, and where a start may be far off.

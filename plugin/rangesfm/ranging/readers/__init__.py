@@ -16,7 +16,7 @@ from rangesfm.files.bags import is_bag_folder
 from rangesfm.files.tables import read_head
 from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.errors.noise_of_log import find_quantization_m, quantization_stddev_m
+from rangesfm.ranging.errors.noise import find_quantization_m, quantization_stddev_m
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers import ros
 from rangesfm.ranging.readers.printed import PRINTED
