@@ -24,8 +24,10 @@ from rangesfm.geometry.trajectory import pose_of
 # A long track is cut into overlapping pieces: what lies further apart hangs together through what is between.
 _MAX_PIECE = 8
 _PIECE_STEP = 4
-# More pieces say nothing new about neighbouring keyframes; a share of them, weighing as much, is enough.
-_MAX_NUM_PIECES = 20000
+# More pieces of a keyframe say nothing new about its neighbours; a share of them, weighing as much, is enough. Of fewer
+# in all none is spared, and of many keyframes no more are taken.
+_NUM_PIECES_OF_KEYFRAME = 40
+_ENOUGH_PIECES, _MAX_NUM_PIECES = 8000, 20000
 _BATCH = 2000
 # In stddevs: from here on an observation has half the say.
 _ROBUST_WIDTH = 3.0
@@ -191,7 +193,7 @@ def vision_information(observations: Observations, poses: Poses) -> VisionInform
     in_rig, in_cam, derivative = project(observations, poses, observations.points)
     root_weight = robust_root_weights(ray_residuals(observations, in_cam))
     to_rig = root_weight[:, None, None] * np.nan_to_num(derivative) @ observations.cam_from_rig_rotation
-    pieces, share = _thinned(_pieces(observations.point))
+    pieces, share = _thinned(_pieces(observations.point), len(poses))
     n = len(poses)
     added: list[tuple[Indices, Array]] = []
     for rows in pieces:
@@ -233,10 +235,10 @@ def _pieces(point: Indices) -> dict[int, Indices]:
     return pieces
 
 
-def _thinned(pieces: dict[int, Indices]) -> tuple[Iterator[Indices], float]:
+def _thinned(pieces: dict[int, Indices], num_keyframes: int) -> tuple[Iterator[Indices], float]:
     """The pieces by length, evenly thinned where there are very many, and the share that is left."""
     num = sum(len(rows) for rows in pieces.values())
-    step = max(-(-num // _MAX_NUM_PIECES), 1)
+    step = max(-(-num // min(max(_NUM_PIECES_OF_KEYFRAME * num_keyframes, _ENOUGH_PIECES), _MAX_NUM_PIECES)), 1)
     return (rows[::step] for rows in pieces.values() if len(rows)), 1 / step
 
 
