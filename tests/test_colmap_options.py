@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -24,10 +24,11 @@ from rangesfm.progress import SilentProgress
 from rangesfm.refine.bundle_adjustment import bundle_adjustment
 from rangesfm.vision.camera import cameras_of_photos
 from rangesfm.vision.features import feature_options
-from rangesfm.vision.mapping import pipeline_options
+from rangesfm.vision.mapping import mapping_options, pipeline_options
 from rangesfm.vision.matching import matching_options
 from rangesfm.vision.own_process import MatchingShare
 from rangesfm.vision.photos import Photos
+from rangesfm.vision.rigs import NO_RIGS
 
 SEED = 3
 KNOWN_CAMERA = CameraOptions(model="SIMPLE_PINHOLE", params=(240.0, 128.0, 96.0))
@@ -106,6 +107,46 @@ def test_models_are_mapped_as_colmap_maps_them(
     assert changes(pipeline_options(CameraOptions(), mapper, SEED)) == threads | from_the_start
     kept = KNOWN_CAMERA.changed(refine_intrinsics=False)
     assert changes(pipeline_options(kept, mapper, SEED)) == threads | from_the_start | as_given
+
+
+def database_of(path: Path, *sizes: tuple[int, int]) -> Path:
+    """A photo of each of these cameras, which COLMAP calls 1, 2, ..."""
+    with pycolmap.Database.open(path) as database:
+        for number, (width, height) in enumerate(sizes, 1):
+            camera = pycolmap.Camera.create_from_model_name(number, "SIMPLE_PINHOLE", 240.0, width, height)
+            database.write_camera(camera, use_camera_id=True)
+            database.write_image(pycolmap.Image(f"{number}.jpg", image_id=number, camera_id=number))
+    return path
+
+
+@pytest.mark.parametrize(("method", "named"), [("incremental", lambda changes: changes), ("hierarchical", of_clusters)])
+def test_a_calibration_holds_until_the_map_is_whole(
+    method: str, named: Callable[[dict[str, Any]], dict[str, Any]], tmp_path: Path
+) -> None:
+    mapper = MapperOptions(num_threads=3).changed(method=method)
+    options = mapping_options(KNOWN_CAMERA, mapper, NO_RIGS, SEED, database_of(tmp_path / "database.db", (256, 192)))
+    threads = {"num_threads": 3}
+    assert changes(options.growing) == threads | named(SEEDS | AS_GIVEN | {"constant_cameras": {1}})
+    assert options.whole is not None
+    assert changes(options.whole) == threads | SEEDS
+
+
+def test_a_camera_that_is_guessed_beside_a_calibrated_one_is_refined_from_the_start(tmp_path: Path) -> None:
+    database = database_of(tmp_path / "database.db", (256, 192), (256, 192), (300, 300))
+    options = mapping_options(KNOWN_CAMERA, MapperOptions(num_threads=3), NO_RIGS, SEED, database)
+    assert changes(options.growing) == {"num_threads": 3, "constant_cameras": {1, 2}} | SEEDS
+    assert options.whole is not None
+    assert changes(options.whole) == {"num_threads": 3} | SEEDS
+
+
+@pytest.mark.parametrize("camera", [CameraOptions(), KNOWN_CAMERA.changed(refine_intrinsics=True)])
+def test_what_nobody_knows_is_refined_from_the_start_and_nothing_is_left_to_do(
+    camera: CameraOptions, tmp_path: Path
+) -> None:
+    database = database_of(tmp_path / "database.db", (256, 192))
+    options = mapping_options(camera, MapperOptions(num_threads=3), NO_RIGS, SEED, database)
+    assert options.whole is None
+    assert changes(options.growing) == {"num_threads": 3} | SEEDS
 
 
 def test_a_camera_is_guessed_as_colmap_guesses_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -124,8 +124,9 @@ class CameraOptions(Options):
     """Of the focal lengths in params, a calibration, which mapping and refinement refine where the photos know better;
     the other parameters' follow from it (default: 0.5 % of the focal length). 0 keeps them all to the digit."""
     refine_intrinsics: bool | None = None
-    """Whether mapping and refinement adjust them at all (default: mapping does; the refinement does to given ones, by
-    their stddev, and else keeps what it finds, so that it does the same to a model just mapped and one brought)."""
+    """Whether mapping and refinement adjust them at all (default: mapping does, to given ones once the map is whole;
+    the refinement does to given ones, by their stddev, and else keeps what it finds, so that it does the same to a
+    model just mapped and one brought)."""
 
     others: Annotated[tuple[CameraOptions, ...], Told(is_key=False)] = ()
     """Those of the other tables, each with its pattern; this one is for photos of which none is."""
@@ -143,8 +144,11 @@ class CameraOptions(Options):
         return found[0] if found else self
 
     @property
-    def mapping_refines_intrinsics(self) -> bool:
-        return self.focal_length_stddev_px != 0 if self.refine_intrinsics is None else self.refine_intrinsics
+    def intrinsics_in_mapping(self) -> Literal["kept", "refined last", "refined"]:
+        """A calibration holds while the map grows: few photos know less of a lens, and what they take it for lasts."""
+        if self.refine_intrinsics is None and self.params is not None:
+            return "kept" if self.focal_length_stddev_px == 0 else "refined last"
+        return "kept" if self.refine_intrinsics is False else "refined"
 
     @property
     def refinement_refines_intrinsics(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,9 +18,10 @@ from tests.simulated.model import synthetic_model
 from tests.simulated.path import loop_path
 from tests.studies.simulated_database import write_database
 
+from rangesfm.geometry.similarity import align_points, rmse
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.vision.mapping import pipeline_options
-from rangesfm.vision.mapping_loop import incremental_mapping
+from rangesfm.vision.mapping_loop import adjust_whole, incremental_mapping
 
 
 def walk(num_photos: int, max_track_length: int) -> pycolmap.Reconstruction:
@@ -83,6 +85,11 @@ def adjust(request: pytest.FixtureRequest) -> Callable[[pycolmap.Reconstruction]
 
 def centers(model: pycolmap.Reconstruction) -> npt.NDArray[np.float64]:
     return np.array([model.image(image_id).projection_center() for image_id in sorted(model.reg_image_ids())])
+
+
+def off_by(model: pycolmap.Reconstruction, true: pycolmap.Reconstruction) -> float:
+    """RMSE of the photos' centres after the best similarity."""
+    return rmse(align_points(centers(model), centers(true)).apply(centers(model)) - centers(true))
 
 
 def assert_they_are_colmaps_models(
@@ -152,6 +159,39 @@ def test_the_adjustment_is_the_last_to_move_the_map(
     # COLMAP normalises the map in between: a similarity without rotation.
     ratio = np.ptp(last, axis=0) / np.ptp(bent[-1], axis=0)
     assert ratio == pytest.approx(np.full(3, ratio.mean()), rel=1e-9)
+
+
+def test_a_whole_map_finds_out_a_calibration_that_it_grew_with(
+    tmp_path: Path, options: pycolmap.IncrementalPipelineOptions
+) -> None:
+    true = walk(16, max_track_length=6)
+    database = write_matches(tmp_path / "database.db", true)
+    with pycolmap.Database.open(database) as opened:
+        (camera,) = opened.read_all_cameras()
+        focal_length_px, camera.params = camera.params[0], [*(1.03 * camera.params[:2]), *camera.params[2:]]
+        opened.update_camera(camera)
+    whole, options.constant_cameras = copy.deepcopy(options), {camera.camera_id}
+    (model,) = mapped(database, options, None)
+    errors_m = [off_by(model, true)]
+    assert model.camera(camera.camera_id).params[0] == pytest.approx(1.03 * focal_length_px, rel=1e-12)
+    adjust_whole(database, model, options=whole)
+    errors_m.append(off_by(model, true))
+    assert model.camera(camera.camera_id).params[0] == pytest.approx(focal_length_px, rel=0.002)
+    assert errors_m[1] < 0.5 * errors_m[0]
+
+
+def test_the_adjustment_of_a_whole_map_may_be_ones_own(
+    database: Path, options: pycolmap.IncrementalPipelineOptions
+) -> None:
+    taken: list[pycolmap.Reconstruction] = []
+
+    def take(found: pycolmap.Reconstruction) -> bool:
+        taken.append(found)
+        return True
+
+    model, _ = mapped(database, options, None)
+    adjust_whole(database, model, options=options, adjustment=Adjustment(take))
+    assert taken
 
 
 def test_cancelled_mapping_ends_with_the_photo_at_hand(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rangesfm.errors import InputError
+from rangesfm.options import CameraOptions
 
 if TYPE_CHECKING:
     import pycolmap
@@ -61,3 +62,27 @@ def calibrated_cameras(model: str, params: Sequence[float], sizes: Iterable[Size
             cameras[width, height] = pycolmap.Camera(given.todict())
             cameras[width, height].rescale(width, height)
     return cameras
+
+
+def cameras_as_given(
+    options: CameraOptions, camera_of_photo: Iterable[tuple[str, pycolmap.Camera]]
+) -> dict[int, tuple[CameraOptions, pycolmap.Camera]]:
+    """By id, those whose parameters are known: the table that they are in, and the camera with just these.
+
+    Args:
+        camera_of_photo: each photo's name and camera.
+    """
+    found: dict[int, tuple[CameraOptions, pycolmap.Camera]] = {}
+    sizes: dict[int, list[Size]] = {}  # of each table's photos
+    for name, camera in camera_of_photo:
+        table, _ = found.setdefault(camera.camera_id, (options.of_photo(name), camera))
+        sizes.setdefault(id(table), []).append((camera.width, camera.height))
+    given = {}
+    for camera_id, (table, camera) in found.items():
+        if table.model is not None and table.params is not None:
+            same_size = calibrated_cameras(table.model, table.params, sizes[id(table)]).get(
+                (camera.width, camera.height)
+            )
+            if same_size is not None and same_size.model == camera.model:
+                given[camera_id] = table, same_size
+    return given

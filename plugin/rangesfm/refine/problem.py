@@ -11,7 +11,7 @@ from scipy.sparse import csr_matrix
 from rangesfm import ceres
 from rangesfm.arrays import Array, Indices
 from rangesfm.ceres.covariance import ResidualErrors
-from rangesfm.colmap.calibration import Size, calibrated_cameras
+from rangesfm.colmap.calibration import cameras_as_given
 from rangesfm.geometry.gravity import UP_IN_SITE, Gravity
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.options import CameraOptions, RefineOptions
@@ -115,22 +115,13 @@ class RefinementProblem:
 def add_calibration(bundle: BundleAdjustment, options: CameraOptions) -> None:
     """Draw each camera of a given model to its parameters, where the adjustment refines it at all."""
     metric, problem = bundle.metric, bundle.adjuster.problem
-    of_camera: dict[int, CameraOptions] = {}
-    sizes: dict[int, list[Size]] = {}  # of each table's photos
-    for image_id in metric.reg_image_ids():
-        image = metric.image(image_id)
-        table = of_camera.setdefault(image.camera_id, options.of_photo(image.name))
-        camera = metric.camera(image.camera_id)
-        sizes.setdefault(id(table), []).append((camera.width, camera.height))
-    for camera_id, table in of_camera.items():
-        camera = metric.camera(camera_id)
-        if table.model is None or table.params is None or not problem.has_parameter_block(camera.params):
-            continue
-        given = calibrated_cameras(table.model, table.params, sizes[id(table)]).get((camera.width, camera.height))
-        if given is None or camera.model != given.model or problem.is_parameter_block_constant(camera.params):
-            continue
-        stddev = parameter_stddevs(given, table.calibration_stddev_px(given.mean_focal_length()))
-        ceres.add_normal_prior(bundle.adjuster, camera.params, given.params, stddev / bundle.pixel_stddev)
+    images = [metric.image(image_id) for image_id in metric.reg_image_ids()]
+    as_given = cameras_as_given(options, ((image.name, metric.camera(image.camera_id)) for image in images))
+    for camera_id, (table, given) in as_given.items():
+        params = metric.camera(camera_id).params
+        if problem.has_parameter_block(params) and not problem.is_parameter_block_constant(params):
+            stddev = parameter_stddevs(given, table.calibration_stddev_px(given.mean_focal_length()))
+            ceres.add_normal_prior(bundle.adjuster, params, given.params, stddev / bundle.pixel_stddev)
 
 
 def parameter_stddevs(camera: pycolmap.Camera, focal_length_stddev_px: float) -> Array:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import copy
 import shutil
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 
 import pycolmap
 
+from rangesfm.colmap.calibration import cameras_as_given
 from rangesfm.colmap.log import append_log
 from rangesfm.colmap.model_files import read_model, write_binary_model
 from rangesfm.colmap.passthrough import apply_options
@@ -18,13 +21,26 @@ from rangesfm.processes.supervision import run_children
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import num_matching_pairs
-from rangesfm.vision.mapping_loop import GlobalAdjustment, incremental_mapping
+from rangesfm.vision.mapping_loop import GlobalAdjustment, adjust_whole, incremental_mapping
 from rangesfm.vision.own_process import MODULE, WholeMapping, WholePipelineOptions
 from rangesfm.vision.photos import Photos
 from rangesfm.vision.rigs import Rigs
 from rangesfm.vision.snapshots import Snapshots, newest_snapshot
 
 PipelineOptions = pycolmap.IncrementalPipelineOptions | WholePipelineOptions
+
+
+@dataclass(frozen=True)
+class MappingOptions:
+    """How photos become models.
+
+    Attributes:
+        growing: of the mapper. whole: of one more adjustment of each model, with intrinsics that were held till then;
+            None: none were.
+    """
+
+    growing: PipelineOptions
+    whole: pycolmap.IncrementalPipelineOptions | None
 
 
 def pipeline_options(camera: CameraOptions, mapper: MapperOptions, seed: int) -> PipelineOptions:
@@ -36,52 +52,65 @@ def pipeline_options(camera: CameraOptions, mapper: MapperOptions, seed: int) ->
     if mapper.ranges_in_mapping and mapper.method != "incremental":
         message = f"[mapper] ranges_in_mapping is true, expected false beside method '{mapper.method}'"
         raise OptionError(message, "mapper", "ranges_in_mapping")
-    refines = [table.mapping_refines_intrinsics for table in camera.tables]
+    keeps = [table.intrinsics_in_mapping == "kept" for table in camera.tables]
     options: PipelineOptions
     if mapper.method == "global":
         options = pycolmap.GlobalPipelineOptions(num_threads=mapper.num_threads, random_seed=seed)
-        if not all(refines):
+        if any(keeps):
             adjustment = options.mapper.bundle_adjustment
             adjustment.refine_focal_length = adjustment.refine_extra_params = False
     elif mapper.method == "hierarchical":
         options = pycolmap.HierarchicalPipelineOptions(num_threads=mapper.num_threads, num_workers=mapper.num_cores)
         # Each cluster is mapped by one thread: with several the search for an initial pair is a race.
         options.incremental_options.num_threads = 1
-        _set_incremental(options.incremental_options, any(refines), seed)
+        _set_incremental(options.incremental_options, all(keeps), seed)
     else:
         options = pycolmap.IncrementalPipelineOptions(num_threads=mapper.num_threads)
-        _set_incremental(options, any(refines), seed)
+        _set_incremental(options, all(keeps), seed)
     apply_options(options, mapper.pipeline, "mapper.pipeline")
     return options
 
 
-def _set_incremental(options: pycolmap.IncrementalPipelineOptions, refines_intrinsics: bool, seed: int) -> None:
+def _set_incremental(options: pycolmap.IncrementalPipelineOptions, keeps_intrinsics: bool, seed: int) -> None:
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
-    if not refines_intrinsics:
-        options.ba_refine_focal_length = options.ba_refine_extra_params = False
-        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    if keeps_intrinsics:
+        _keep_intrinsics(options)
 
 
-def hold_what_is_known(
-    options: PipelineOptions, camera: CameraOptions, mapper: MapperOptions, rigs: Rigs, database_path: Path
-) -> None:
-    """Have the mapping keep the intrinsics of some cameras, and the rigs of whose cameras all places are configured.
+def _keep_intrinsics(options: pycolmap.IncrementalPipelineOptions) -> None:
+    options.ba_refine_focal_length = options.ba_refine_extra_params = False
+    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+
+
+def mapping_options(
+    camera: CameraOptions, mapper: MapperOptions, rigs: Rigs, seed: int, database_path: Path
+) -> MappingOptions:
+    """Have the mapping hold the intrinsics that are known, and the rigs of whose cameras all places are configured.
 
     The global mapper keeps the intrinsics of all cameras, or of none; and it begins with the rigs that are known and
     refines them: with rigs held, COLMAP 4.2's global positioning ends in a map without sense, of perfect matches too.
     """
+    growing = pipeline_options(camera, mapper, seed)
+    if isinstance(growing, pycolmap.GlobalPipelineOptions):
+        return MappingOptions(growing, None)
+    options = growing
     if isinstance(options, pycolmap.HierarchicalPipelineOptions):
         options = options.incremental_options
-    if isinstance(options, pycolmap.GlobalPipelineOptions):
-        return
-    if len({table.mapping_refines_intrinsics for table in camera.tables}) > 1:
-        with pycolmap.Database.open(database_path) as database:
-            images = database.read_all_images()
-        options.constant_cameras = {
-            image.camera_id for image in images if not camera.of_photo(image.name).mapping_refines_intrinsics
-        }
     if any(rigs.are_known) and "ba_refine_sensor_from_rig" not in mapper.pipeline:
         options.constant_rigs = rigs.ids_of_known(database_path)
+    with pycolmap.Database.open(database_path) as database:
+        cameras = {found.camera_id: found for found in database.read_all_cameras()}
+        camera_of_photo = [(image.name, cameras[image.camera_id]) for image in database.read_all_images()]
+    kept = {found.camera_id for name, found in camera_of_photo if camera.of_photo(name).intrinsics_in_mapping == "kept"}
+    as_given = cameras_as_given(camera, camera_of_photo)
+    until_whole = {id_ for id_, (table, _) in as_given.items() if table.intrinsics_in_mapping == "refined last"}
+    options.constant_cameras |= kept
+    whole = copy.deepcopy(options)
+    whole.num_threads = mapper.num_threads
+    options.constant_cameras |= until_whole
+    if options.constant_cameras >= set(cameras):
+        _keep_intrinsics(options)
+    return MappingOptions(growing, whole if until_whole else None)
 
 
 def map_photos(
@@ -89,7 +118,7 @@ def map_photos(
     photos: Photos,
     models_path: Path,
     snapshots_path: Path,
-    options: PipelineOptions,
+    options: MappingOptions,
     log: Path,
     progress: Progress,
     adjustment: GlobalAdjustment | None = None,
@@ -103,10 +132,14 @@ def map_photos(
     Raises:
         ReconstructionError: there is not a single model, or COLMAP failed.
     """
-    if isinstance(options, pycolmap.IncrementalPipelineOptions):
-        models = _map_incrementally(database_path, photos, models_path, snapshots_path, options, progress, adjustment)
+    growing, whole = options.growing, options.whole
+    if isinstance(growing, pycolmap.IncrementalPipelineOptions):
+        models = _map_incrementally(database_path, photos, models_path, snapshots_path, growing, progress, adjustment)
     else:
-        models = _map_at_once(database_path, photos.folder, options, log, progress)
+        models = _map_at_once(database_path, photos.folder, growing, log, progress)
+    if whole is not None:
+        for model in models:
+            adjust_whole(database_path, model, options=whole, adjustment=adjustment)
     if not models:
         with pycolmap.Database.open(database_path) as database:
             num_matching = num_matching_pairs(database)

@@ -18,7 +18,7 @@ from rangesfm.progress import Progress, SilentProgress
 from rangesfm.vision.camera import PhotoCameras, cameras_of_photos, check_camera
 from rangesfm.vision.features import extract_features, feature_options
 from rangesfm.vision.given_database import GivenDatabase, opened
-from rangesfm.vision.mapping import PipelineOptions, hold_what_is_known, map_photos, pipeline_options, read_models
+from rangesfm.vision.mapping import MappingOptions, map_photos, mapping_options, pipeline_options, read_models
 from rangesfm.vision.mapping_loop import GlobalAdjustment
 from rangesfm.vision.matching import MatchingOptions, match_features, matching_options, verify_matches
 from rangesfm.vision.photos import Photos, contents_of_masks, usable_photos
@@ -86,10 +86,10 @@ def reconstruct(
     """
     progress = progress or SilentProgress()
     space = Workspace(Path(output_path), progress, before_change)
-    options = pipeline_options(camera, mapper, seed)
+    pipeline_options(camera, mapper, seed)  # what COLMAP does not take is refused before anything is computed
     photos, of_matches = match_photos(Path(image_path), image_names, camera, mapper, rigs, seed, space, restart=restart)
-    refines = [table.mapping_refines_intrinsics for table in camera.tables]
-    inputs = [of_matches, mapper.method, mapper.pipeline, *refines]
+    intrinsics = [table.intrinsics_in_mapping for table in camera.tables]
+    inputs = [of_matches, mapper.method, mapper.pipeline, *intrinsics]
     if adjustment is not None:
         inputs.append(adjustment.inputs)
     with space.logged():
@@ -99,9 +99,11 @@ def reconstruct(
                 fingerprint(*inputs),
                 space.database,
                 lambda: rigs.apply(space.database),
-                lambda: _place_cameras(photos, rigs, pipeline_options(camera, mapper, seed), space),
+                lambda: _place_cameras(
+                    photos, rigs, mapping_options(camera, mapper, NO_RIGS, seed, space.database), space
+                ),
             )
-        hold_what_is_known(options, camera, mapper, rigs, space.database)
+        options = mapping_options(camera, mapper, rigs, seed, space.database)
         space.steps.run(
             "mapping",
             fingerprint(*inputs),
@@ -119,7 +121,7 @@ def reconstruct(
     return ReconstructionSummary(found, len(image_names), found[0].num_reg_images(), space.steps.seconds, space.log)
 
 
-def _place_cameras(photos: Photos, rigs: Rigs, options: PipelineOptions, space: Workspace) -> None:
+def _place_cameras(photos: Photos, rigs: Rigs, options: MappingOptions, space: Workspace) -> None:
     """Map the photos as if there were no rigs, and enter in the database where their cameras sit in that model.
 
     Places that are known say what its unit is, so that all go together.

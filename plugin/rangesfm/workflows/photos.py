@@ -264,7 +264,7 @@ class AdjustmentWithRanges:
         if inputs.anchor_frame == "first_camera" and path.image_names[0] != self._first_keyframe:
             inputs = replace(inputs, anchor_frame="unknown")
         estimate = estimate_scale(survey, inputs, PathOfModel("", model, path, self._observations(path)))
-        refine_intrinsics = survey.camera.mapping_refines_intrinsics
+        refine_intrinsics = survey.camera.intrinsics_in_mapping != "kept"
         asked = survey.changed({"camera.refine_intrinsics": refine_intrinsics, "refine.covariance": False})
         scaled = rescale(model, estimate.metric_from_sfm)
         refined, _ = refine_by_survey(asked, inputs, scaled, path, estimate, tape=None)
