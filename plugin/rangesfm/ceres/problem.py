@@ -342,10 +342,8 @@ def tangent_jacobian(problem: Any, blocks: Sequence[Array]) -> csr_matrix:
     options = pyceres.EvaluateOptions()
     options.set_parameter_blocks(list(blocks))
     jacobian = problem.evaluate_jacobian(options)
-    shape = jacobian.num_rows, jacobian.num_cols
-    padded = csr_matrix(
-        (np.asarray(jacobian.values), np.asarray(jacobian.cols), np.asarray(jacobian.rows)), shape=shape
-    )
+    rows, columns, values = jacobian.to_tuple()
+    padded = csr_matrix((values, (rows, columns)), shape=(jacobian.num_rows, jacobian.num_cols))
     sizes = np.array([problem.parameter_block_tangent_size(block) for block in blocks], dtype=np.int64)
     wanted = np.minimum(sizes, [len(block) for block in blocks])
     in_block = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
