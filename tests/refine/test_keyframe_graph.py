@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.optimize import approx_fprime
+from scipy.spatial.transform import Rotation
 from tests.refine.conftest import bent, poses_and_rays
 from tests.simulated.model import SyntheticModel
 
@@ -145,6 +146,28 @@ def test_ranges_unbend_a_drifted_chain(chain: SyntheticModel, anchors_are_free: 
         assert rmse(centers - truth.centers) < 0.5 * drift
     if held_frame is not None:
         np.testing.assert_array_equal(centers[0], drifted.centers[0])
+
+
+@pytest.mark.parametrize("held_frame", [None, 0])
+def test_a_free_map_turns_on_arcs_and_a_keyframe_that_is_held_stays(
+    chain: SyntheticModel, held_frame: int | None
+) -> None:
+    truth, _ = poses_and_rays(chain)
+    graph = make_graph(chain, truth, stddev_m=0.3, held_frame=held_frame)
+    layout = keyframe_graph._Layout.of(graph)
+    turn = np.deg2rad([4.0, -2.0, 6.0])
+    arms = truth.centers - truth.centers.mean(axis=0)
+    steps = np.concatenate([truth.world_from_rig.transpose(0, 2, 1) @ turn, np.cross(turn, arms)], axis=1)
+    step = np.zeros(layout.num)
+    step[: layout.first_anchor] = steps.ravel()
+    moved = keyframe_graph._moved(graph.start(), layout, step[layout.free]).poses
+    if held_frame is None:
+        rotation = Rotation.from_rotvec(turn).as_matrix()
+        np.testing.assert_allclose(moved.centers - truth.centers.mean(axis=0), arms @ rotation.T, atol=1e-12)
+        np.testing.assert_allclose(moved.world_from_rig, rotation @ truth.world_from_rig, atol=1e-12)
+    else:
+        np.testing.assert_array_equal(moved.centers[0], truth.centers[0])
+        np.testing.assert_array_equal(moved.world_from_rig[0], truth.world_from_rig[0])
 
 
 def aligned(poses: Poses, truth: Poses) -> Poses:

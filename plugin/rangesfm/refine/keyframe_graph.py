@@ -152,7 +152,7 @@ class _Layout:
     """Columns: 6 for each pose (turn in its own frame, shift of its centre), 3 for each anchor, biases, their common.
 
     Attributes:
-        num: of all. free: which take part.
+        num: of all. free: which take part. world_is_free: whether no keyframe is held.
         order, starts: of the ranges, those between the same keyframes to the same anchor together: their derivatives
             have the same columns.
     """
@@ -160,6 +160,7 @@ class _Layout:
     num_frames: int
     num_anchors: int
     free: Indices
+    world_is_free: bool
     order: Indices
     starts: Indices
 
@@ -190,7 +191,7 @@ class _Layout:
         ends = np.column_stack([graph.antennas.before, graph.antennas.after, graph.errors.anchor_index])
         order = np.lexsort(ends.T)
         starts = np.flatnonzero(np.diff(ends[order], axis=0, prepend=-1).any(axis=1))
-        return cls(n, m, np.flatnonzero(is_free), order, starts)
+        return cls(n, m, np.flatnonzero(is_free), graph.held_frame is None, order, starts)
 
     def squares(self, rows: sparse.csr_array) -> sparse.coo_array:
         """J^T J of the derivatives of the ranges, dense among those alike."""
@@ -349,11 +350,25 @@ def _factor(hessian: sparse.csc_array, layout: _Layout, damping: float) -> Facto
 def _moved(state: GraphState, layout: _Layout, free_step: Array) -> GraphState:
     step = np.zeros(layout.num)
     step[layout.free] = free_step
-    poses = step[: layout.first_anchor].reshape(-1, 6)
-    turns = Rotation.from_rotvec(poses[:, :3]).as_matrix()
-    moved = Poses(state.poses.world_from_rig @ turns, state.poses.centers + poses[:, 3:])
+    turns, shifts = np.split(step[: layout.first_anchor].reshape(-1, 6), 2, axis=1)
+    moved = _turned(state.poses, turns, shifts, is_free=layout.world_is_free)
     anchors = state.anchors_m + step[layout.first_anchor : layout.first_bias].reshape(-1, 3)
     return GraphState(moved, anchors, state.biases_m + step[layout.first_bias : -1], state.common_bias_m + step[-1])
+
+
+def _turned(poses: Poses, turns: Array, shifts: Array, *, is_free: bool) -> Poses:
+    """Poses after (n, 3) turns, each in its own frame, and shifts.
+
+    A map that is free goes round on arcs, by what all of its poses turn in the mean: the photos are indifferent to a
+    turn of the whole world, and refuse its straight lines.
+    """
+    in_world = np.einsum("nij,nj->ni", poses.world_from_rig, turns)
+    common = in_world.mean(axis=0) if is_free else np.zeros(3)
+    arms = poses.centers - poses.centers.mean(axis=0)
+    around = Rotation.from_rotvec(common).as_matrix()
+    own = Rotation.from_rotvec(in_world - common).as_matrix()
+    arcs = arms @ (around - np.eye(3)).T - np.cross(common, arms)
+    return Poses(around @ own @ poses.world_from_rig, poses.centers + shifts + arcs)
 
 
 def _num_absorbed(terms: _Terms, layout: _Layout) -> float:

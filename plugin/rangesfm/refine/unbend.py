@@ -35,6 +35,8 @@ SAME_ERRORS = 0.05
 # Of the ranges' stddev. A turn of the whole world by centimetres takes the full problem, of which all points have to
 # follow it, tens of iterations; here it takes one step.
 _TOLERANCE = 0.001
+# Likewise, for the residuals to show the errors.
+_ROUGH_TOLERANCE = 0.05
 # Likewise. The same goes for a part of the map that turns about a weak link.
 _MIN_BEND = 0.05
 _NUM_TRIANGULATIONS = 5
@@ -151,7 +153,7 @@ def _as_a_whole(before: Poses, after: Poses, held_frame: int | None) -> Similari
 
 
 def _solve_with_own_errors(graph: KeyframeGraph) -> tuple[GraphSolution, RangeErrors]:
-    """A map and the errors that its residuals show: with the wide loss, then with the bounded.
+    """A map and the errors that its residuals show: roughly, with the wide loss, then the bounded; at last precisely.
 
     Where so many ranges are wrong that the wide loss follows them, the map as it came is likelier, and the bounded one
     starts from there, with the errors as they came.
@@ -167,7 +169,8 @@ def _solve_with_own_errors(graph: KeyframeGraph) -> tuple[GraphSolution, RangeEr
     else:
         state, errors = start, replace(errors, log_likelihood=seen)
     bounded, errors = _alternate(graph, errors, state)
-    return replace(bounded, num_steps=wide.num_steps + bounded.num_steps), errors
+    settled = solve_graph(replace(graph, errors=errors), bounded.state, tolerance_m=_tolerance_m(errors))
+    return replace(settled, num_steps=wide.num_steps + bounded.num_steps + settled.num_steps), errors
 
 
 def _alternate(graph: KeyframeGraph, errors: RangeErrors, start: GraphState) -> tuple[GraphSolution, RangeErrors]:
@@ -177,7 +180,7 @@ def _alternate(graph: KeyframeGraph, errors: RangeErrors, start: GraphState) -> 
     def fit(errors: RangeErrors, before: GraphSolution | None) -> GraphSolution:
         nonlocal num_steps
         state = start if before is None else before.state
-        solution = solve_graph(replace(graph, errors=errors), state, tolerance_m=_tolerance_m(errors))
+        solution = solve_graph(replace(graph, errors=errors), state, tolerance_m=_tolerance_m(errors, _ROUGH_TOLERANCE))
         num_steps += solution.num_steps
         return solution
 
@@ -191,8 +194,8 @@ def _alternate(graph: KeyframeGraph, errors: RangeErrors, start: GraphState) -> 
     return replace(solution, num_steps=num_steps), seen
 
 
-def _tolerance_m(errors: RangeErrors) -> float:
-    return _TOLERANCE * float(errors.stddev_m.min())
+def _tolerance_m(errors: RangeErrors, share: float = _TOLERANCE) -> float:
+    return share * float(errors.stddev_m.min())
 
 
 def _move(metric: pycolmap.Reconstruction, whole: Similarity, held_frame_id: int | None) -> None:
