@@ -67,3 +67,11 @@ class Journal:
         for text in texts:
             self.warnings.append(text)
             self.progress.message(text)
+
+
+def duration(seconds: float) -> str:
+    """As hours, minutes and seconds, no finer than needed."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, TextIO
 
 from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.cli.survey_flags import add_flags, add_restart_argument, overrides_from_arguments
-from rangesfm.cli.terminal import Screen, counts, duration
+from rangesfm.cli.terminal import Screen, counts
 from rangesfm.errors import InputError
-from rangesfm.progress import Progress
+from rangesfm.progress import Progress, duration
 
 if TYPE_CHECKING:
     from rangesfm.batch.course import Course, SurveyState

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, TextIO
 
 from rangesfm.errors import one_line
+from rangesfm.progress import duration
 
 if TYPE_CHECKING:
     from rich.live import Live
@@ -120,11 +121,3 @@ def counts(num_done: int, num_total: int | None, seconds: float = 0.0) -> str:
     if seconds > 0 and 0 < num_done < num_total:
         text += f", {duration(seconds * (num_total - num_done) / num_done)} left"
     return text
-
-
-def duration(seconds: float) -> str:
-    """As hours, minutes and seconds, no finer than needed."""
-    if seconds < 60:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"

@@ -9,6 +9,8 @@ from typing import Any
 
 from markupsafe import Markup
 
+from rangesfm import progress
+
 NOTHING = "–"
 
 
@@ -64,13 +66,7 @@ def decimals_for(stddev: float | None, *, default: int) -> int:
 def duration(seconds: float | None) -> str:
     """As hours, minutes and seconds, no finer than needed."""
     number = _known(seconds)
-    if number is None:
-        return NOTHING
-    if number < 60:
-        return f"{number:.1f}\u00a0s"
-    minutes, rest = divmod(round(number), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}\u00a0h {minutes:02d}\u00a0min" if hours else f"{minutes}\u00a0min {rest:02d}\u00a0s"
+    return NOTHING if number is None else progress.duration(number).replace(" ", "\u00a0")
 
 
 def sentence(text: str) -> str:
