@@ -9,7 +9,7 @@ from tests.simulated.model import SyntheticModel
 
 from rangesfm.colmap.transform import rescale
 from rangesfm.geometry.similarity import Similarity
-from rangesfm.refine.vision_information import misplaced_points, model_observations, model_poses
+from rangesfm.refine.vision_information import _pieces, misplaced_points, model_observations, model_poses
 
 
 def misplaced_ids(model: pycolmap.Reconstruction) -> list[int]:
@@ -42,3 +42,19 @@ def test_it_is_found_by_its_depth_whatever_the_unit(
     point_id = put_to_depth(model, depth_m)
     elsewhere = rescale(model, Similarity(scale, np.eye(3), np.array([3.0, -2.0, 5.0])))
     assert misplaced_ids(elsewhere) == ([point_id] if is_misplaced else [])
+
+
+def test_a_track_is_one_piece_a_long_one_overlapping_pieces_of_eight() -> None:
+    lengths = np.arange(1, 21)
+    point = np.repeat(np.arange(len(lengths)), lengths)
+    of_track: dict[int, list[list[int]]] = {int(length): [] for length in lengths}
+    for size, rows in _pieces(point).items():
+        for piece in rows.tolist():
+            assert len(piece) == size
+            first = int(np.searchsorted(point, point[piece[0]]))
+            of_track[int(lengths[point[piece[0]]])].append([row - first for row in piece])
+    assert of_track[1] == []
+    assert all(of_track[length] == [list(range(length))] for length in range(2, 9))
+    assert of_track[9] == [list(range(8)), list(range(1, 9))]
+    assert of_track[16] == [list(range(start, start + 8)) for start in (0, 4, 8)]
+    assert of_track[18] == [list(range(start, start + 8)) for start in (0, 4, 8, 10)]
