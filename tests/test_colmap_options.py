@@ -77,6 +77,7 @@ def test_a_vocabulary_tree_is_the_users(matching: str) -> None:
 
 SEEDS = {"random_seed": SEED, "mapper.random_seed": SEED, "triangulation.random_seed": SEED}
 AS_GIVEN = {
+    "constant_cameras": {1},
     "ba_refine_focal_length": False,
     "ba_refine_extra_params": False,
     "mapper.abs_pose_refine_focal_length": False,
@@ -92,23 +93,6 @@ def of_clusters(changes: dict[str, Any]) -> dict[str, Any]:
     return {"num_workers": 3} | {f"incremental_options.{k}": v for k, v in ({"num_threads": 1} | changes).items()}
 
 
-@pytest.mark.parametrize(
-    ("method", "from_the_start", "as_given"),
-    [
-        ("incremental", SEEDS, AS_GIVEN),
-        ("global", {"random_seed": SEED}, GLOBALLY_AS_GIVEN),
-        ("hierarchical", of_clusters(SEEDS), of_clusters(AS_GIVEN)),
-    ],
-)
-def test_models_are_mapped_as_colmap_maps_them(
-    method: str, from_the_start: dict[str, Any], as_given: dict[str, Any]
-) -> None:
-    mapper, threads = MapperOptions(num_threads=3).changed(method=method), {"num_threads": 3}
-    assert changes(pipeline_options(CameraOptions(), mapper, SEED)) == threads | from_the_start
-    kept = KNOWN_CAMERA.changed(refine_intrinsics=False)
-    assert changes(pipeline_options(kept, mapper, SEED)) == threads | from_the_start | as_given
-
-
 def database_of(path: Path, *sizes: tuple[int, int]) -> Path:
     """A photo of each of these cameras, which COLMAP calls 1, 2, ..."""
     with pycolmap.Database.open(path) as database:
@@ -119,6 +103,25 @@ def database_of(path: Path, *sizes: tuple[int, int]) -> Path:
     return path
 
 
+@pytest.mark.parametrize(
+    ("method", "from_the_start", "as_given"),
+    [
+        ("incremental", SEEDS, AS_GIVEN),
+        ("global", {"random_seed": SEED}, GLOBALLY_AS_GIVEN),
+        ("hierarchical", of_clusters(SEEDS), of_clusters(AS_GIVEN)),
+    ],
+)
+def test_models_are_mapped_as_colmap_maps_them(
+    method: str, from_the_start: dict[str, Any], as_given: dict[str, Any], tmp_path: Path
+) -> None:
+    mapper, threads = MapperOptions(num_threads=3).changed(method=method), {"num_threads": 3}
+    database = database_of(tmp_path / "database.db", (256, 192))
+    assert changes(pipeline_options(CameraOptions(), mapper, SEED)) == threads | from_the_start
+    kept = mapping_options(KNOWN_CAMERA.changed(refine_intrinsics=False), mapper, NO_RIGS, SEED, database)
+    assert changes(kept.growing) == threads | from_the_start | as_given
+    assert kept.whole is None
+
+
 @pytest.mark.parametrize(("method", "named"), [("incremental", lambda changes: changes), ("hierarchical", of_clusters)])
 def test_a_calibration_holds_until_the_map_is_whole(
     method: str, named: Callable[[dict[str, Any]], dict[str, Any]], tmp_path: Path
@@ -126,17 +129,22 @@ def test_a_calibration_holds_until_the_map_is_whole(
     mapper = MapperOptions(num_threads=3).changed(method=method)
     options = mapping_options(KNOWN_CAMERA, mapper, NO_RIGS, SEED, database_of(tmp_path / "database.db", (256, 192)))
     threads = {"num_threads": 3}
-    assert changes(options.growing) == threads | named(SEEDS | AS_GIVEN | {"constant_cameras": {1}})
+    assert changes(options.growing) == threads | named(SEEDS | AS_GIVEN)
     assert options.whole is not None
     assert changes(options.whole) == threads | SEEDS
 
 
-def test_a_camera_that_is_guessed_beside_a_calibrated_one_is_refined_from_the_start(tmp_path: Path) -> None:
+@pytest.mark.parametrize("refines", [None, False])
+def test_a_camera_that_is_guessed_beside_a_calibrated_one_is_refined_from_the_start(
+    refines: bool | None, tmp_path: Path
+) -> None:
     database = database_of(tmp_path / "database.db", (256, 192), (256, 192), (300, 300))
-    options = mapping_options(KNOWN_CAMERA, MapperOptions(num_threads=3), NO_RIGS, SEED, database)
+    camera = KNOWN_CAMERA.changed(refine_intrinsics=refines)
+    options = mapping_options(camera, MapperOptions(num_threads=3), NO_RIGS, SEED, database)
     assert changes(options.growing) == {"num_threads": 3, "constant_cameras": {1, 2}} | SEEDS
-    assert options.whole is not None
-    assert changes(options.whole) == {"num_threads": 3} | SEEDS
+    assert (options.whole is None) == (refines is False)
+    if options.whole is not None:
+        assert changes(options.whole) == {"num_threads": 3} | SEEDS
 
 
 @pytest.mark.parametrize("camera", [CameraOptions(), KNOWN_CAMERA.changed(refine_intrinsics=True)])

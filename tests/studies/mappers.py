@@ -36,8 +36,9 @@ from rangesfm.geometry.reference import Reference, read_reference, write_referen
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.readers import write_ranges_csv
-from rangesfm.vision.mapping import MappingOptions, map_photos, pipeline_options, read_models
+from rangesfm.vision.mapping import map_photos, mapping_options, read_models
 from rangesfm.vision.photos import Photos
+from rangesfm.vision.rigs import NO_RIGS
 
 TAG_IN_CAM_M = (0.03, -0.12, -0.05)
 _STEP_M = 0.5
@@ -106,7 +107,7 @@ def map_database(folder: Path, method: str, leaf_size: int) -> None:
         "hierarchical": {"incremental_options": no_colors, **clusters},
     }
     mapper = MapperOptions(pipeline=pipelines[method], num_threads=1).changed(method=method)
-    options = MappingOptions(pipeline_options(camera, mapper, seed=0), whole=None)
+    options = mapping_options(camera, mapper, NO_RIGS, 0, database)
     photos = Photos(folder, names, ((known.width, known.height),) * len(names), {})
     map_photos(
         database, photos, folder / method, folder / "snapshots", options, folder / "mapper.log", SilentProgress()

@@ -52,34 +52,26 @@ def pipeline_options(camera: CameraOptions, mapper: MapperOptions, seed: int) ->
     if mapper.ranges_in_mapping and mapper.method != "incremental":
         message = f"[mapper] ranges_in_mapping is true, expected false beside method '{mapper.method}'"
         raise OptionError(message, "mapper", "ranges_in_mapping")
-    keeps = [table.intrinsics_in_mapping == "kept" for table in camera.tables]
     options: PipelineOptions
     if mapper.method == "global":
         options = pycolmap.GlobalPipelineOptions(num_threads=mapper.num_threads, random_seed=seed)
-        if any(keeps):
+        if any(table.intrinsics_in_mapping == "kept" for table in camera.tables):
             adjustment = options.mapper.bundle_adjustment
             adjustment.refine_focal_length = adjustment.refine_extra_params = False
     elif mapper.method == "hierarchical":
         options = pycolmap.HierarchicalPipelineOptions(num_threads=mapper.num_threads, num_workers=mapper.num_cores)
         # Each cluster is mapped by one thread: with several the search for an initial pair is a race.
         options.incremental_options.num_threads = 1
-        _set_incremental(options.incremental_options, all(keeps), seed)
+        _set_seed(options.incremental_options, seed)
     else:
         options = pycolmap.IncrementalPipelineOptions(num_threads=mapper.num_threads)
-        _set_incremental(options, all(keeps), seed)
+        _set_seed(options, seed)
     apply_options(options, mapper.pipeline, "mapper.pipeline")
     return options
 
 
-def _set_incremental(options: pycolmap.IncrementalPipelineOptions, keeps_intrinsics: bool, seed: int) -> None:
+def _set_seed(options: pycolmap.IncrementalPipelineOptions, seed: int) -> None:
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
-    if keeps_intrinsics:
-        _keep_intrinsics(options)
-
-
-def _keep_intrinsics(options: pycolmap.IncrementalPipelineOptions) -> None:
-    options.ba_refine_focal_length = options.ba_refine_extra_params = False
-    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
 
 
 def mapping_options(
@@ -101,16 +93,22 @@ def mapping_options(
     with pycolmap.Database.open(database_path) as database:
         cameras = {found.camera_id: found for found in database.read_all_cameras()}
         camera_of_photo = [(image.name, cameras[image.camera_id]) for image in database.read_all_images()]
-    kept = {found.camera_id for name, found in camera_of_photo if camera.of_photo(name).intrinsics_in_mapping == "kept"}
     as_given = cameras_as_given(camera, camera_of_photo)
-    until_whole = {id_ for id_, (table, _) in as_given.items() if table.intrinsics_in_mapping == "refined last"}
-    options.constant_cameras |= kept
+    held: dict[str, set[int]] = {"kept": set(), "refined last": set(), "refined": set()}
+    for name, found in camera_of_photo:
+        table = camera.of_photo(name)
+        # What COLMAP guesses for photos of another shape than the calibrated ones is no calibration.
+        if found.camera_id in as_given or table.params is None:
+            held[table.intrinsics_in_mapping].add(found.camera_id)
+    options.constant_cameras |= held["kept"]
     whole = copy.deepcopy(options)
     whole.num_threads = mapper.num_threads
-    options.constant_cameras |= until_whole
+    options.constant_cameras |= held["refined last"]
     if options.constant_cameras >= set(cameras):
-        _keep_intrinsics(options)
-    return MappingOptions(growing, whole if until_whole else None)
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+        # Registering a photo by its matches alone asks for nothing else.
+        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    return MappingOptions(growing, whole if held["refined last"] else None)
 
 
 def map_photos(
