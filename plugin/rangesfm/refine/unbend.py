@@ -35,10 +35,10 @@ SAME_ERRORS = 0.05
 # Of the ranges' stddev. A turn of the whole world by centimetres takes the full problem, of which all points have to
 # follow it, tens of iterations; here it takes one step.
 _TOLERANCE = 0.001
-# Likewise, for the residuals to show the errors.
-_ROUGH_TOLERANCE = 0.05
 # Likewise. The same goes for a part of the map that turns about a weak link.
 _MIN_BEND = 0.05
+# Likewise, as a tolerance: from here on the residuals show the same errors.
+_ROUGH_TOLERANCE = 0.05
 _NUM_TRIANGULATIONS = 5
 
 
