@@ -8,6 +8,7 @@ whose points have to follow every turn of the world, takes only in many.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import sparse
@@ -93,7 +94,7 @@ class GraphSolution:
 
     Attributes:
         state: the estimate. num_steps: accepted and not.
-        num_absorbed: how many of the ranges' degrees of freedom the parameters take up.
+        num_absorbed: how many of the ranges' degrees of freedom the parameters take up, at the start of the last step.
     """
 
     state: GraphState
@@ -109,10 +110,11 @@ def solve_graph(graph: KeyframeGraph, start: GraphState, *, tolerance_m: float) 
     """
     layout = _Layout.of(graph)
     state, damping = start, _INITIAL_DAMPING
-    terms = _Terms.at(graph, layout, state)
+    terms = solved = _Terms.at(graph, layout, state)
     step_count = 0
     while step_count < _MAX_NUM_STEPS and damping < _MAX_DAMPING:
         step_count += 1
+        solved = terms
         step = _factor(terms.hessian, layout, damping).solve(-terms.gradient[layout.free])
         trial = _moved(state, layout, step)
         trial_terms = _Terms.at(graph, layout, trial)
@@ -123,7 +125,7 @@ def solve_graph(graph: KeyframeGraph, start: GraphState, *, tolerance_m: float) 
         state, terms, damping = trial, trial_terms, max(damping / 10, 1e-12)
         if movement < tolerance_m:
             break
-    return GraphSolution(state, step_count, _num_absorbed(terms, layout))
+    return GraphSolution(state, step_count, _num_absorbed(solved, layout))
 
 
 def linear_functions(graph: KeyframeGraph, gradients: Array) -> tuple[Array, Array]:
@@ -207,13 +209,18 @@ class _Terms:
     """Cost (half the sum of squares, robust), gradient and Gauss-Newton Hessian over all columns.
 
     Attributes:
+        seen: derivative of the relative poses. vision: their information.
         whitened: (k, columns) derivative of the ranges' residuals, robust weights included.
+        prior: derivative of the priors' residuals.
     """
 
     cost: float
     gradient: Array
-    hessian: sparse.csc_array
+    layout: _Layout
+    seen: sparse.bsr_array
+    vision: sparse.bsr_array
     whitened: sparse.csr_array
+    prior: sparse.csr_array
 
     @classmethod
     def at(cls, graph: KeyframeGraph, layout: _Layout, state: GraphState) -> _Terms:
@@ -222,8 +229,6 @@ class _Terms:
         cost = 0.5 * float(residuals @ bound)
         gradient = np.zeros(layout.num)
         gradient[: layout.first_anchor] = jacobian.T @ bound
-        hessian = (jacobian.T @ (graph.vision.matrix @ jacobian)).tocsr()
-        hessian.resize(layout.num, layout.num)
 
         scaled, derivative = _range_rows(graph, layout, state)
         rho, weights, _ = graph.errors.weight * graph.errors.loss.rho(scaled**2)
@@ -234,8 +239,15 @@ class _Terms:
         off, prior = _prior_rows(graph, layout, state)
         cost += 0.5 * float(off @ off)
         gradient = gradient + prior.T @ off
-        hessian = hessian + layout.squares(derivative) + prior.T @ prior
-        return cls(cost, gradient, hessian.T, derivative)  # symmetric: its transpose has it by columns
+        return cls(cost, gradient, layout, jacobian, graph.vision.matrix, derivative, prior)
+
+    @cached_property
+    def hessian(self) -> sparse.csc_array:
+        """Only of states from which a step is taken."""
+        of_photos = (self.seen.T @ (self.vision @ self.seen)).tocsr()
+        of_photos.resize(self.layout.num, self.layout.num)
+        total = of_photos + self.layout.squares(self.whitened) + self.prior.T @ self.prior
+        return total.T  # symmetric: its transpose has it by columns
 
 
 def _relative_poses(vision: VisionInformation, poses: Poses) -> tuple[Array, sparse.bsr_array]:

@@ -166,12 +166,13 @@ def _offset_of_motion(
     # In one random order, so that different offsets are judged by the same ranges.
     ranges = ranges.take(np.random.default_rng(seed).permutation(len(ranges.times_s)))
     candidates = scanned.peaks(_CANDIDATE_SEPARATION_S, _MAX_NUM_CANDIDATES)
-    fits = []
+    fits: list[OffsetFit] = []
     for num_done, offset_s in enumerate(candidates):
         progress.update(num_done, len(candidates))
         near = ranges_on_path(ranges, path, offset_s, _NUM_RANGES_PER_CANDIDATE)
         if len(near.range_m):
-            fits.append(refine_offset(near, path, offset_s))
+            best = max((fit for fit in fits if fit.is_testable), key=lambda fit: fit.score, default=None)
+            fits.append(refine_offset(near, path, offset_s, best))
     progress.update(len(candidates), len(candidates))
     if not any(fit.is_testable for fit in fits):
         raise GeometryError(f"too few ranges along the camera's path to find the time offset by: {REMEDY}")

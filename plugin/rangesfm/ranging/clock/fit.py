@@ -15,9 +15,11 @@ from rangesfm.ranging.clock.squares import SquaresFit, fit_squares, residual_std
 
 # Ranges to one anchor within a second say much the same where people carry the camera.
 _CELL_S = 1.0
-_MAX_NUM_STEPS = 12
+_MIN_NUM_STEPS, _MAX_NUM_STEPS = 2, 12
 _MAX_STEP_S = 1.0
 _CONVERGED_STEP_S = 1e-4
+# Twice the residuals, and what that makes of the log of the odds.
+_FAR_BEHIND, _HOPELESS = float(np.log(2)), 30.0
 # A descent that leaves more of its ranges than this off the path leads nowhere.
 _MIN_KEPT_SHARE = 0.5
 # If the other unknowns explain all but this share of the ranges' rate of change, the rest is round-off.
@@ -113,6 +115,11 @@ class OffsetFit:
         least = _MIN_GAIN_STDDEVS * np.sqrt(_variance_of_mean(self.gains, self.ranges.times_s))
         return bool(self.score > least)
 
+    def is_hopeless_beside(self, rival: OffsetFit) -> bool:
+        """Whether its residuals are so much larger that what is left of a descent makes no difference."""
+        behind = rival.score - self.score
+        return behind > _FAR_BEHIND and behind * min(self.num_independent, rival.num_independent) > _HOPELESS
+
     def timing(self) -> Timing:
         """Offset and drift with stddevs that allow for residuals correlated within blocks of time."""
         times = self.ranges.times_s - self.ranges.times_s.mean()
@@ -136,17 +143,25 @@ class OffsetFit:
         return np.asarray(np.mean(by_chance, axis=0) + by_bias**2)
 
 
-def refine_offset(ranges: TimedRanges, path: PathSamples, offset_s: float) -> OffsetFit:
+def refine_offset(
+    ranges: TimedRanges, path: PathSamples, offset_s: float, rival: OffsetFit | None = None
+) -> OffsetFit:
     """Descend from an offset, at which (nearly) all ranges are on the path, to the nearest one that explains them best
-    (Gauss-Newton)."""
+    (Gauss-Newton).
+
+    Args:
+        rival: far behind which it is not worth going on; None: there is none.
+    """
     found = fit_at_offset(ranges, path, offset_s)
     for num_steps in range(_MAX_NUM_STEPS):
+        if rival is not None and num_steps >= _MIN_NUM_STEPS and found.is_hopeless_beside(rival):
+            break
         own = found.squares.unexplained(found.rates[:, None])[:, 0]
         if not _is_determined(own, found.rates):
             break
         step_s = float(own @ found.squares.weighted_residuals / (own @ own))
         # The first steps also bring in the lever arm, which needs the scale.
-        if abs(step_s) < _CONVERGED_STEP_S and num_steps >= 2:
+        if abs(step_s) < _CONVERGED_STEP_S and num_steps >= _MIN_NUM_STEPS:
             break
         offset_s = found.offset_s + float(np.clip(step_s, -_MAX_STEP_S, _MAX_STEP_S))
         if np.mean(path.knows(ranges.times_s + offset_s)) < _MIN_KEPT_SHARE:
