@@ -179,3 +179,16 @@ def test_a_share_of_two_is_the_same_range_twice(rng: np.random.Generator) -> Non
     assert weighted.cost == pytest.approx(repeated.cost, rel=1e-9)
     assert weighted.state.metric_from_model.scale == pytest.approx(repeated.state.metric_from_model.scale, rel=1e-9)
     np.testing.assert_allclose(weighted.information, repeated.information, rtol=1e-6, atol=1e-6)
+
+
+def test_some_ranges_stand_for_those_of_their_anchor_that_are_left_out(rng: np.random.Generator) -> None:
+    truth = random_state(rng)
+    problem = replace(random_problem(rng, truth), anchor_mean_m=truth.anchors_m, anchor_stddev_m=np.zeros(NUM_ANCHORS))
+    problem = replace(problem, range_m=problem.range_m + problem.stddev_m * rng.standard_normal(NUM_RANGES))
+    num_alike = np.array([1, 2, 5])[problem.anchor_index]
+    all_of_them = problem.subset(np.repeat(np.arange(NUM_RANGES), num_alike))
+    one_of_each = np.cumsum(num_alike) - 1
+    by_all, by_some = solve(all_of_them, truth), solve(all_of_them.by_some(one_of_each), truth)
+    assert len(by_some.residuals_m) == NUM_RANGES
+    assert by_some.cost == pytest.approx(by_all.cost, rel=1e-9)
+    np.testing.assert_allclose(by_some.information, by_all.information, rtol=1e-6, atol=1e-6)

@@ -28,7 +28,7 @@ _PIECE_STEP = 4
 # in all none is spared, and of many keyframes no more are taken.
 _NUM_PIECES_OF_KEYFRAME = 40
 _ENOUGH_PIECES, _MAX_NUM_PIECES = 8000, 20000
-_BATCH = 2000
+_BATCH = 500
 # In stddevs: from here on an observation has half the say.
 _ROBUST_WIDTH = 3.0
 # Of the median depth: no lens shows sharply what is so near.

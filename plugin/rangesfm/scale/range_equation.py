@@ -92,6 +92,15 @@ class RangeProblem:
             share=None if self.share is None else self.share[rows],
         )
 
+    def by_some(self, rows: Indices) -> RangeProblem:
+        """The same problem by some of its ranges, of each anchor at least one: they stand for the others too."""
+        num, taken = (
+            np.bincount(index, minlength=self.num_anchors) for index in (self.anchor_index, self.anchor_index[rows])
+        )
+        part = self.subset(rows)
+        share = np.ones(len(rows)) if part.share is None else part.share
+        return replace(part, share=share * (num / np.maximum(taken, 1))[part.anchor_index])
+
     def of_anchor(self, k: int) -> RangeProblem:
         """The ranges to one anchor alone, in a frame that stays."""
         part, one = self.subset(np.flatnonzero(self.anchor_index == k)), slice(k, k + 1)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import NEARLY_STRAIGHT, Similarity, path_kind, path_shape
 from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors
@@ -28,11 +29,14 @@ from rangesfm.scale.starts import (
     first_camera_starts,
     site_starts,
     sphere_swaps,
+    spread_rows,
     spread_subset,
     unknown_anchor_starts,
 )
 
 _SUBSET_PER_ANCHOR = 300
+# So many ranges of an anchor, spread over all, tell maps apart and show what ranges get wrong as well as more do.
+_ENOUGH_OF_ANCHOR = 1000
 _NUM_NOISE_ROUNDS = 3
 _NUM_ALTERNATIVES = 4
 _SAME_LOG_SCALE = 0.03
@@ -131,7 +135,7 @@ def _consensus_states(problem: RangeProblem) -> list[RangeState]:
 
 
 def _distinct_fits(problem: RangeProblem, anchors_are_known: bool, seed: int) -> list[RangeFit]:
-    """Local minima, best first, each different map once: found on a thinned problem, ranked on all ranges."""
+    """Local minima, best first, each different map once: found on a thinned problem, ranked on one less thinned."""
     small = spread_subset(problem, _SUBSET_PER_ANCHOR)
     if not anchors_are_known:
         starts = unknown_anchor_starts(problem)
@@ -151,7 +155,8 @@ def _distinct_fits(problem: RangeProblem, anchors_are_known: bool, seed: int) ->
     if not anchors_are_known:
         swapped = [solve(small, state, tolerance=1e-8) for state in sphere_swaps(small, distinct[0].state)]
         distinct = _each_once(small, distinct + swapped)
-    return _each_once(problem, [solve(problem, fit.state, tolerance=1e-8) for fit in distinct])
+    enough = spread_subset(problem, _ENOUGH_OF_ANCHOR)
+    return _each_once(enough, [solve(enough, fit.state, tolerance=1e-8) for fit in distinct])
 
 
 def _each_once(problem: RangeProblem, fits: list[RangeFit]) -> list[RangeFit]:
@@ -185,26 +190,30 @@ def _are_same(problem: RangeProblem, first: RangeState, second: RangeState) -> b
 
 
 def solution_from(posed: ScaleProblem, start: RangeState) -> Solution:
-    """Alternate between the fit and the errors it shows, from one start only."""
+    """Alternate between the fit and the errors it shows, from one start only; all ranges have a say in the last fit."""
     given = posed.ranges
+    rows = spread_rows(given, _ENOUGH_OF_ANCHOR)
+
+    def residuals_m(state: RangeState) -> Array:
+        return predicted_ranges(given, state) - given.range_m
 
     def seen(errors: RangeErrors, state: RangeState) -> RangeErrors:
         placed = state.metric_from_model
         errors = errors.at(tag_positions(given, placed), placed.scale * posed.center_stddev)
-        return errors.seen_by_rigid_map(predicted_ranges(given, state) - given.range_m, prior_cost(given, state))
+        return errors.seen_by_rigid_map(residuals_m(state), prior_cost(given, state))
+
+    def shown(errors: RangeErrors, fitted: RangeFit) -> RangeErrors:
+        return seen(errors.inflated(residuals_m(fitted.state)), fitted.state)
 
     def fit(errors: RangeErrors, before: RangeFit | None) -> RangeFit:
         state = start if before is None else before.state
-        return solve(weighted(given, errors), state, loss=errors.loss)
+        return solve(weighted(given, errors).by_some(rows), state, loss=errors.loss)
 
-    fitted, used, shown = fit_with_own_errors(
-        fit,
-        lambda errors, fitted: seen(errors.inflated(fitted.residuals_m), fitted.state),
-        seen(posed.errors, start),
-        max_num_rounds=_NUM_NOISE_ROUNDS,
-    )
-    errors = replace(used, inflation=shown.inflation)
-    return Solution(weighted(given, used), fitted, errors, shown.noise_m)
+    rough, _, used = fit_with_own_errors(fit, shown, seen(posed.errors, start), max_num_rounds=_NUM_NOISE_ROUNDS - 1)
+    problem = weighted(given, used)
+    fitted = solve(problem, rough.state, loss=used.loss)
+    last = shown(used, fitted)
+    return Solution(problem, fitted, replace(used, inflation=last.inflation), last.noise_m)
 
 
 def weighted(problem: RangeProblem, errors: RangeErrors) -> RangeProblem:

@@ -260,13 +260,14 @@ def _translations(problem: RangeProblem, scale: float, rotations: Array) -> tupl
     weights = 1 / np.maximum(2 * ranges, 1e-3)
     robust = np.ones_like(squared)
     ridge = 1e-9 * np.eye(4)
-    for _ in range(4):
+    for num_left in reversed(range(4)):
         weighted = design * (weights**2 * robust)[:, None]
         normal = weighted @ np.swapaxes(design, 1, 2)
         normal = normal + ridge * np.trace(normal, axis1=1, axis2=2)[:, None, None]
         solution = np.linalg.solve(normal, weighted @ squared[..., None])
-        residuals = weights * ((np.swapaxes(solution, 1, 2) @ design)[:, 0] - squared)
-        robust = 1 / (1 + (residuals / (2 * robust_stddevs(residuals))) ** 2)
+        if num_left:
+            residuals = weights * ((np.swapaxes(solution, 1, 2) @ design)[:, 0] - squared)
+            robust = 1 / (1 + (residuals / (2 * robust_stddevs(residuals))) ** 2)
     translation = solution[:, :3]
     from_path = q - translation
     off = np.abs(np.sqrt(np.einsum("rin,rin->rn", from_path, from_path)) - ranges)

@@ -143,9 +143,7 @@ class OffsetFit:
         return np.asarray(np.mean(by_chance, axis=0) + by_bias**2)
 
 
-def refine_offset(
-    ranges: TimedRanges, path: PathSamples, offset_s: float, rival: OffsetFit | None = None
-) -> OffsetFit:
+def refine_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, rival: OffsetFit | None = None) -> OffsetFit:
     """Descend from an offset, at which (nearly) all ranges are on the path, to the nearest one that explains them best
     (Gauss-Newton).
 

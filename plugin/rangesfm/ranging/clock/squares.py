@@ -8,6 +8,7 @@ its coefficients is not used, so that there is one solution and no need of a sta
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -51,7 +52,7 @@ class SquaresFit:
         """(n,) metres."""
         return np.asarray(np.sqrt(self.weights) * self.residuals_m)
 
-    @property
+    @cached_property
     def basis(self) -> Array:
         """(n, p) orthonormal weighted columns of all that the fit adjusts."""
         curvature = self._columns.curvature

@@ -1,0 +1,43 @@
+"""The descent to an offset of the clocks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rangesfm.ranging.clock.fit import refine_offset
+from rangesfm.ranging.clock.search import PathSamples, TimedRanges
+
+STEP_S = 0.025
+NUM_SAMPLES = 8000
+
+
+@pytest.fixture
+def path() -> PathSamples:
+    """A walk of 200 s that never repeats itself."""
+    rng = np.random.default_rng(0)
+    speed = np.apply_along_axis(np.convolve, 0, rng.normal(size=(NUM_SAMPLES, 3)), np.hanning(80), "same")
+    centers = STEP_S * speed.cumsum(axis=0)
+    return PathSamples(0.0, STEP_S, centers, np.zeros((1, NUM_SAMPLES, 3)), np.ones(NUM_SAMPLES, dtype=bool))
+
+
+def ranges_at(path: PathSamples, offset_s: float, noise_m: float) -> TimedRanges:
+    """Of clocks with an offset, in the middle of the walk."""
+    rng = np.random.default_rng(1)
+    times_s = np.sort(rng.uniform(40.0, 160.0, 1500))
+    zero = np.zeros(len(times_s), dtype=np.int64)
+    points, _ = path.tag(times_s + offset_s, zero, np.inf)
+    distances_m = np.linalg.norm(points - np.array([4.0, -6.0, 2.0]), axis=1)
+    return TimedRanges(times_s, distances_m + noise_m * rng.standard_normal(len(times_s)), zero, zero)
+
+
+def test_descents_end_soon_where_they_are_far_behind_and_go_on_where_they_are_not(path: PathSamples) -> None:
+    ranges = ranges_at(path, 0.0, 0.02)
+    best = refine_offset(ranges, path, 0.3)
+    assert best.offset_s == pytest.approx(0.0, abs=0.01)
+    alone, behind = refine_offset(ranges, path, -20.0), refine_offset(ranges, path, -20.0, best)
+    assert behind.is_hopeless_beside(best)
+    assert not best.is_hopeless_beside(behind)
+    assert abs(behind.offset_s + 20.0) < abs(alone.offset_s + 20.0)  # it ended on the way
+    again = refine_offset(ranges, path, 0.3, behind)
+    assert again.offset_s == best.offset_s
