@@ -78,6 +78,21 @@ def test_the_components_add_as_variances_and_are_never_less_than_the_formal_stdd
     assert ScaleUncertainty(0.001, {"a": 0.003, "b": 0.004}).half_width_95 == pytest.approx(1.96 * 0.005)
 
 
+def test_the_interval_leans_and_reaches_a_stddev_beyond_the_estimate() -> None:
+    parts = {"a": 0.003, "b": 0.004}
+    for lean, ends in ((0.002, (0.002 - 0.0098, 0.002 + 0.0098)), (0.03, (-0.005, 0.03 + 0.0098))):
+        found = ScaleUncertainty(0.001, {**parts, "reweighting": lean}, lean)
+        assert found.interval_95 == pytest.approx(ends)
+        assert found.half_width_95 == pytest.approx((ends[1] - ends[0]) / 2)
+        assert found.empirical == pytest.approx(np.hypot(0.005, lean))
+        mirrored = ScaleUncertainty(0.001, {**parts, "reweighting": lean}, -lean)
+        assert mirrored.interval_95 == pytest.approx((-ends[1], -ends[0]))
+        # The scales that rivals of the clocks' offset give are about the estimate, not about where it leans to.
+        low, high = found.beside("clocks", 0.02).interval_95
+        assert low <= -1.96 * 0.02
+        assert high > lean + 1.96 * 0.02
+
+
 def test_four_times_the_ranges_halve_what_is_noise(make_survey: MakeSurvey) -> None:
     few, many = (
         make_survey(anchors_m=FAR_ANCHORS_M, radio=Radio(range_stddev_m=0.1), num_epochs=num).scale(
@@ -122,7 +137,7 @@ def test_a_map_that_bends_is_not_known_as_well_as_one_that_does_not(make_survey:
     assert abs(bent.relative_error(wrong)) < wrong.uncertainty.half_width_95
 
 
-def test_best_weights_that_disagree_by_more_than_chance_widen_no_further(make_survey: MakeSurvey) -> None:
+def test_best_weights_that_disagree_by_more_than_chance_are_followed_no_further(make_survey: MakeSurvey) -> None:
     found = make_survey(radio=Radio(range_stddev_m=0.05)).scale("first_camera", "ABCDE")
     assert found.errors.learned is not None
     assert found.problem is not None
@@ -131,10 +146,11 @@ def test_best_weights_that_disagree_by_more_than_chance_widen_no_further(make_su
     for share in (1.0, 1e-6):
         told = replace(learned, covariances_m2=share * learned.covariances_m2)
         summed = expected_scale_uncertainty(found.solution, told).components
-        stated = scale_uncertainty(found.problem, found.solution, told).components
+        uncertainty = scale_uncertainty(found.problem, found.solution, told)
+        stated = uncertainty.components
         best = np.array([stated[name] for name in stated if name != "reweighting"])
         chance = np.sqrt(np.sum(np.square(list(summed.values()))) - np.sum(best**2))
-        assert stated["reweighting"] < 1.345 * chance
+        assert stated["reweighting"] == abs(uncertainty.lean) <= 1.345 * chance * (1 + 1e-9)
     # Of errors a thousandth as large nothing that the best weights say is chance any more.
     assert stated["reweighting"] > 0.5 * chance
 

@@ -81,10 +81,13 @@ def main() -> None:
                     found.append(one_survey(name, case, observations, given))
     known = np.array([row for row in found if row is not None])
     if len(known):
-        pulls = 1.96 * known[:, 0] / known[:, 1]
+        errors, low, high = known.T
+        half_widths = (high - low) / 2
+        from_middle = 1.96 * (errors + (low + high) / 2) / half_widths
         print(
-            f"{len(known)} of {len(found)}: {100 * np.mean(np.abs(pulls) < 1.96):.0f} % covered, errors in their "
-            f"stddevs {np.sqrt(np.mean(pulls**2)):.2f} (rms), median half width {100 * np.median(known[:, 1]):.2f} %"
+            f"{len(known)} of {len(found)}: {100 * np.mean((low <= -errors) & (-errors <= high)):.0f} % covered, the "
+            f"truth from the middle in stddevs {np.sqrt(np.mean(from_middle**2)):.2f} (rms), median half width "
+            f"{100 * np.median(half_widths):.2f} %"
         )
 
 
@@ -170,8 +173,10 @@ def curve_of(data: Path, described: dict[str, Any]) -> ErrorCurve:
     return calibrate_ranges(observations.log, tags_m, anchors).curve
 
 
-def one_survey(name: str, case: Case, observations: RangeObservations, path: Trajectory) -> tuple[float, float] | None:
-    """Error and half width of the logarithm of the scale; None if refused."""
+def one_survey(
+    name: str, case: Case, observations: RangeObservations, path: Trajectory
+) -> tuple[float, float, float] | None:
+    """Error of the logarithm of the scale, and the ends of its interval about the estimate; None if refused."""
     began = time.process_time()
     options = ScaleOptions(max_relative_stddev=1.0)
     try:
@@ -179,15 +184,15 @@ def one_survey(name: str, case: Case, observations: RangeObservations, path: Tra
     except GeometryError as refusal:
         print(f"{name:16}{case.name:10} refused: {refusal}", flush=True)
         return None
-    error, half_width = float(np.log(found.value / FACTOR)), found.uncertainty.half_width_95
+    error, (low, high) = float(np.log(found.value / FACTOR)), found.uncertainty.interval_95
     largest = sorted(found.uncertainty.components.items(), key=lambda part: -part[1])[:3]
     print(
-        f"{name:16}{case.name:10}{100 * error:+7.2f} % +-{100 * half_width:6.2f} % "
-        f"{'covered' if abs(error) <= half_width else 'MISSED '} {found.verdict:9}"
+        f"{name:16}{case.name:10}{100 * error:+7.2f} %, truth within {100 * low:+6.2f} to {100 * high:+6.2f} % "
+        f"{'covered' if low <= -error <= high else 'MISSED '} {found.verdict:9}"
         f"{time.process_time() - began:5.1f} s  {', '.join(f'{part} {196 * stddev:.1f}' for part, stddev in largest)}",
         flush=True,
     )
-    return error, half_width
+    return error, low, high
 
 
 if __name__ == "__main__":

@@ -85,8 +85,8 @@ def main() -> None:
 
 def summary(rows: list[Row]) -> str:
     """Of surveys that were not refused."""
-    widths, errors, stddevs = (np.array([row[name] for row in rows]) for name in ("half_width", "error", "stddev"))
-    covered = float(np.mean(np.abs(errors) <= widths))
+    errors, low, high, stddevs = (np.array([row[name] for row in rows]) for name in ("error", "low", "high", "stddev"))
+    covered, widths = float(np.mean((low <= -errors) & (-errors <= high))), (high - low) / 2
     return (
         f"{100 * covered:7.1f} +-{100 * np.sqrt(0.95 * 0.05 / len(rows)):3.1f} %{100 * np.median(widths):10.2f} %"
         f"{100 * np.median(np.abs(errors)):10.2f} %{100 * np.abs(errors).max():6.2f} %"
@@ -95,7 +95,7 @@ def summary(rows: list[Row]) -> str:
 
 
 def one_survey(case: Case, seed: int) -> Row:
-    """Error of the scale's logarithm, half width of its interval and stated stddev; nothing if refused."""
+    """Error of the scale's logarithm, ends of its interval about the estimate, stated stddev; nothing if refused."""
     planned = PlannedSurvey(
         along(loop_path(DURATION_S, unsteadiness_m=0.3, seed=seed), KEYFRAME_RATE_HZ),
         tuple(Anchor(name, np.array(ANCHORS_M[name])) for name in case.heard),
@@ -117,9 +117,11 @@ def one_survey(case: Case, seed: int) -> Row:
         )
     except GeometryError:
         return {}
+    low, high = found.uncertainty.interval_95
     return {
         "error": float(np.log(found.value / METRES_PER_UNIT)),
-        "half_width": found.uncertainty.half_width_95,
+        "low": low,
+        "high": high,
         "stddev": found.uncertainty.empirical,
     }
 

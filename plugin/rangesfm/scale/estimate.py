@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.errors.components import CLOCKS, REWEIGHTING
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.lengths import LengthScale
@@ -27,15 +28,20 @@ class ScaleUncertainty:
     Attributes:
         formal: from the Jacobian, as if every range erred on its own (Cramer-Rao).
         components: what each component of the ranges' errors does, by its name.
+        lean: towards which side, and how far, the truth is likelier: of the scale's logarithm.
     """
 
     formal: float
     components: dict[str, float]
+    lean: float = 0.0
 
     @property
     def empirical(self) -> float:
         """The honest one: all components together, and never less than the formal one."""
-        return max(float(np.linalg.norm(list(self.components.values()))), self.formal)
+        return self._together(self.components)
+
+    def _together(self, names: Iterable[str]) -> float:
+        return max(float(np.linalg.norm([self.components[name] for name in names])), self.formal)
 
     def beside(self, name: str, stddev: float) -> ScaleUncertainty:
         """With more of a component."""
@@ -44,9 +50,21 @@ class ScaleUncertainty:
         )
 
     @property
+    def interval_95(self) -> tuple[float, float]:
+        """Between which the logarithm of the true scale over the estimate is: about where it leans to.
+
+        As what makes it lean need not be true, it reaches a stddev beyond the estimate in any case; and as far as the
+        scales that other offsets of the clocks give.
+        """
+        stddev = self._together(name for name in self.components if name != REWEIGHTING)
+        reach, least = NORMAL_95 * stddev, max(stddev, NORMAL_95 * self.components.get(CLOCKS, 0.0))
+        return min(self.lean - reach, -least), max(self.lean + reach, least)
+
+    @property
     def half_width_95(self) -> float:
-        """Of the 95 % interval of the scale's logarithm."""
-        return NORMAL_95 * self.empirical
+        """Of that interval."""
+        low, high = self.interval_95
+        return (high - low) / 2
 
 
 @dataclass(frozen=True)
@@ -161,5 +179,5 @@ class ScaleEstimate:
     @property
     def interval_95(self) -> tuple[float, float]:
         """Metres per SfM unit between which the scale is with 95 % probability."""
-        half_width = self.uncertainty.half_width_95
-        return self.value * float(np.exp(-half_width)), self.value * float(np.exp(half_width))
+        low, high = self.uncertainty.interval_95
+        return self.value * float(np.exp(low)), self.value * float(np.exp(high))

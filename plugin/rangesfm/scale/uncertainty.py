@@ -7,14 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.special import chndtrix
 
 from rangesfm.arrays import Array
 from rangesfm.ranging.errors.cells import MAX_NUM_CELLS, Cells, cells, noisiness
 from rangesfm.ranging.errors.components import CLOCKS, GIVEN, REWEIGHTING
 from rangesfm.ranging.errors.learned import ROUNDING, ExpectedErrors, LearnedErrors, learn_errors
 from rangesfm.ranging.observations import RangeObservations
-from rangesfm.scale.estimate import NORMAL_95, ScaleUncertainty
+from rangesfm.scale.estimate import ScaleUncertainty
 from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import (
     RangeFit,
@@ -162,10 +161,9 @@ def scale_uncertainty(
     """Relative stddevs of the scale.
 
     Its robust weights do not make the most of what is learnt of the errors. The best ones do (Gauss-Markov): the truth
-    is where they find it, give or take their stddev, and so it lies about the scale at hand within a quantile of a
-    folded normal distribution. That holds as far as the errors are what they are taken for. By how much the best
-    weights change the scale says whether they are (Hausman, "Specification tests in econometrics", 1978): its variance
-    is that by which theirs is less. What is more than chance of it speaks against them, not against the scale.
+    is where they find it, give or take their stddev, as far as the errors are what they are taken for. By how much the
+    best weights change the scale says whether they are (Hausman, "Specification tests in econometrics", 1978): its
+    variance is that by which theirs is less. What is more than chance of it speaks against them, not against the scale.
 
     Args:
         posed: measured lengths in it as uncertain as the map's bending makes them.
@@ -184,11 +182,10 @@ def scale_uncertainty(
     summed = expected_scale_uncertainty(solution, learned, bending_of_lengths).components
     best, of_sum = (float(np.linalg.norm(list(each.values()))) for each in (components, summed))
     chance = np.sqrt(max(of_sum**2 - best**2, 0.0))
-    change = min(abs(float(of_cells @ off_m + of_priors @ linear.prior_off)), _MAX_CHANCE * chance)
-    # The square of a normal variable of another mean is noncentral chi-square.
-    half_width = best * np.sqrt(chndtrix(0.95, 1, (change / best) ** 2))
-    components[REWEIGHTING] = float(np.sqrt(max((half_width / NORMAL_95) ** 2 - best**2, 0.0)))
-    return ScaleUncertainty(solution.fit.log_scale_stddev, components)
+    change = float(of_cells @ off_m + of_priors @ linear.prior_off)
+    lean = float(np.clip(change, -_MAX_CHANCE * chance, _MAX_CHANCE * chance))
+    components[REWEIGHTING] = abs(lean)
+    return ScaleUncertainty(solution.fit.log_scale_stddev, components, lean)
 
 
 def expected_scale_uncertainty(
