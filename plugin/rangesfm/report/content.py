@@ -9,10 +9,10 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
 from rangesfm.arrays import Array
+from rangesfm.export.metric_map import points_of
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.result.folder import ResultFolder
 from rangesfm.result.tables import RangesAsUsed
@@ -73,7 +73,7 @@ class Content:
             None if model is None else trajectory_from_reconstruction(model, result.timestamps_s) for model in models
         )
         self.final = self.refined or self.scaled
-        self.points_m, self.points_rgb = points_of(refined or scaled)
+        self.points_m, self.points_rgb = points_of(refined or scaled or pycolmap.Reconstruction())
         self.cameras = tuple(_cameras(scaled, refined))
         reference = result.read_reference()
         self.reference_m = None if reference is None else reference.positions_m
@@ -104,13 +104,6 @@ class Content:
 def _title(folder: Path) -> str:
     """The folder's name; that of the survey around it where the folder has the name that all results have."""
     return folder.parent.name if folder.name == DEFAULT_FOLDER and folder.parent.name else folder.name
-
-
-def points_of(model: pycolmap.Reconstruction | None) -> tuple[Array, npt.NDArray[np.uint8]]:
-    """(m, 3) positions and (m, 3) colours of a model's points; of none without a model."""
-    points = [] if model is None else list(model.points3D.values())
-    positions = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
-    return positions, np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
 
 
 def _cameras(

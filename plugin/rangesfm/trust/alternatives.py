@@ -98,17 +98,15 @@ def _of_labels(on_map: RangesOnMap, given: _Anchors) -> Iterator[_AlternativeAnc
 
 def _of_coordinates(given: _Anchors) -> Iterator[_AlternativeAnchors]:
     """Other axes; feet, and ranges that are twice as long."""
+    remedy = "compare the anchors' file with a sketch of the site"
     for axes_words, axes in _AXES_OF_ANCHORS.items() if len(given) > 2 else ():
-        words, remedy = (
-            f"in the anchors' coordinates {axes_words}",
-            "compare the anchors' file with a sketch of the site",
-        )
+        words = f"in the anchors' coordinates {axes_words}"
         yield "anchors' axes", "", words, remedy, {name: axes @ at for name, at in given.items()}
     if len(given) < 2:
         return
     middle = np.mean(list(given.values()), axis=0)
+    remedy = "check the unit of ranges and anchors' file against a taped distance between two of them"
     for words, metres in _UNITS_M.items():
-        remedy = "check the unit of ranges and anchors' file against a taped distance between two of them"
         anchors_m = {name: middle + metres * (at - middle) for name, at in given.items()}
         yield "anchors' unit", "", words, remedy, anchors_m
 
