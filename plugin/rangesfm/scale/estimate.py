@@ -18,7 +18,7 @@ from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.solution import Solution
 from rangesfm.scale.two_candidate import TwoCandidate
 
-NORMAL_95 = 1.96
+NORMAL_95, NORMAL_95_TO_ONE_SIDE = 1.96, 1.645
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,12 @@ class ScaleUncertainty:
     def interval_95(self) -> tuple[float, float]:
         """Between which the logarithm of the true scale over the estimate is: about where it leans to.
 
-        As what makes it lean need not be true, it reaches a stddev beyond the estimate in any case; and as far as the
-        scales that other offsets of the clocks give.
+        As what makes it lean need not be true, it reaches a one-sided 95 % beyond the estimate in any case; and as far
+        as the scales that other offsets of the clocks give.
         """
         stddev = self._together(name for name in self.components if name != REWEIGHTING)
-        reach, least = NORMAL_95 * stddev, max(stddev, NORMAL_95 * self.components.get(CLOCKS, 0.0))
+        reach = NORMAL_95 * stddev
+        least = max(NORMAL_95_TO_ONE_SIDE * stddev, NORMAL_95 * self.components.get(CLOCKS, 0.0))
         return min(self.lean - reach, -least), max(self.lean + reach, least)
 
     @property
