@@ -10,7 +10,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.errors.components import CLOCKS, REWEIGHTING
+from rangesfm.ranging.errors.components import REWEIGHTING
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.lengths import LengthScale
@@ -18,7 +18,7 @@ from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.solution import Solution
 from rangesfm.scale.two_candidate import TwoCandidate
 
-NORMAL_95, NORMAL_95_TO_ONE_SIDE = 1.96, 1.645
+NORMAL_95 = 1.96
 
 
 @dataclass(frozen=True)
@@ -51,15 +51,13 @@ class ScaleUncertainty:
 
     @property
     def interval_95(self) -> tuple[float, float]:
-        """Between which the logarithm of the true scale over the estimate is: about where it leans to.
+        """Between which the logarithm of the true scale over the estimate is.
 
-        As what makes it lean need not be true, it reaches a one-sided 95 % beyond the estimate in any case; and as far
-        as the scales that other offsets of the clocks give.
+        It is as wide about where the estimate leans to as about the estimate, and holds both, as what makes it lean
+        need not be true.
         """
-        stddev = self._together(name for name in self.components if name != REWEIGHTING)
-        reach = NORMAL_95 * stddev
-        least = max(NORMAL_95_TO_ONE_SIDE * stddev, NORMAL_95 * self.components.get(CLOCKS, 0.0))
-        return min(self.lean - reach, -least), max(self.lean + reach, least)
+        reach = NORMAL_95 * self._together(name for name in self.components if name != REWEIGHTING)
+        return min(self.lean, 0.0) - reach, max(self.lean, 0.0) + reach
 
     @property
     def half_width_95(self) -> float:
