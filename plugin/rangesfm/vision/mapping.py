@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import shutil
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,6 +94,22 @@ def mapping_options(
     with pycolmap.Database.open(database_path) as database:
         cameras = {found.camera_id: found for found in database.read_all_cameras()}
         camera_of_photo = [(image.name, cameras[image.camera_id]) for image in database.read_all_images()]
+    kept, refined_last = _held_cameras(camera, camera_of_photo)
+    options.constant_cameras |= kept
+    whole = copy.deepcopy(options)
+    whole.num_threads = mapper.num_threads
+    options.constant_cameras |= refined_last
+    if options.constant_cameras >= set(cameras):
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+        # Registering a photo by its matches alone asks for nothing else.
+        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    return MappingOptions(growing, whole if refined_last else None)
+
+
+def _held_cameras(
+    camera: CameraOptions, camera_of_photo: Sequence[tuple[str, pycolmap.Camera]]
+) -> tuple[set[int], set[int]]:
+    """Ids of cameras that are held throughout, and of those that are held while the map grows."""
     as_given = cameras_as_given(camera, camera_of_photo)
     held: dict[str, set[int]] = {"kept": set(), "refined last": set(), "refined": set()}
     for name, found in camera_of_photo:
@@ -100,15 +117,7 @@ def mapping_options(
         # What COLMAP guesses for photos of another shape than the calibrated ones is no calibration.
         if found.camera_id in as_given or table.params is None:
             held[table.intrinsics_in_mapping].add(found.camera_id)
-    options.constant_cameras |= held["kept"]
-    whole = copy.deepcopy(options)
-    whole.num_threads = mapper.num_threads
-    options.constant_cameras |= held["refined last"]
-    if options.constant_cameras >= set(cameras):
-        options.ba_refine_focal_length = options.ba_refine_extra_params = False
-        # Registering a photo by its matches alone asks for nothing else.
-        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
-    return MappingOptions(growing, whole if held["refined last"] else None)
+    return held["kept"], held["refined last"]
 
 
 def map_photos(
@@ -136,6 +145,7 @@ def map_photos(
     else:
         models = _map_at_once(database_path, photos.folder, growing, log, progress)
     if whole is not None:
+        progress.message("mapping: the given intrinsics are refined, with all photos")
         for model in models:
             adjust_whole(database_path, model, options=whole, adjustment=adjustment)
     if not models:
