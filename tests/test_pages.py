@@ -195,7 +195,7 @@ def test_flags_in_the_text_exist() -> None:
 
 
 OF_OTHER_PROGRAMS = {"--auto_scale_poses", "--center_method", "--csv", "--ref_images_path", "--transform_path"}
-OF_STUDIES = {"--calibrated", "--data", "--leave_radio_out"}
+OF_STUDIES = {"--by_photo", "--calibrated", "--data", "--leave_radio_out"}
 
 
 def test_the_survey_file_on_its_page_is_one(tmp_path: Path) -> None:

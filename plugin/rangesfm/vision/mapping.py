@@ -145,7 +145,6 @@ def map_photos(
     else:
         models = _map_at_once(database_path, photos.folder, growing, log, progress)
     if whole is not None:
-        progress.message("mapping: the given intrinsics are refined, with all photos")
         for model in models:
             adjust_whole(database_path, model, options=whole, adjustment=adjustment)
     if not models:
