@@ -90,7 +90,7 @@ GLOBALLY_AS_GIVEN = {
 
 
 def of_clusters(changes: dict[str, Any]) -> dict[str, Any]:
-    return {"num_workers": 3} | {f"incremental_options.{k}": v for k, v in ({"num_threads": 1} | changes).items()}
+    return {"num_workers": 3, "num_threads": 1} | {f"incremental_options.{k}": v for k, v in changes.items()}
 
 
 def database_of(path: Path, *sizes: tuple[int, int]) -> Path:

@@ -46,7 +46,7 @@ def test_holds_every_photo_at_its_place_says_so_and_comes_again(
     room: Room, done: ReconstructionSummary, output: Path, listener: Listener, method: str, other: dict[str, Any]
 ) -> None:
     before = dump(output / "database.db")
-    asked = MAPPER.changed(method=method)
+    asked = MAPPER.changed(method=method, num_threads=16)  # so many threads would hardly ever end twice in one order
     summaries = [
         reconstruct(room.folder, room.names, output, camera=room.camera, mapper=mapper, seed=0, progress=listener)
         for mapper in (asked, asked.changed(pipeline=other), asked)

@@ -60,9 +60,9 @@ def pipeline_options(camera: CameraOptions, mapper: MapperOptions, seed: int) ->
             adjustment = options.mapper.bundle_adjustment
             adjustment.refine_focal_length = adjustment.refine_extra_params = False
     elif mapper.method == "hierarchical":
-        options = pycolmap.HierarchicalPipelineOptions(num_threads=mapper.num_threads, num_workers=mapper.num_cores)
-        # Each cluster is mapped by one thread: with several the search for an initial pair is a race.
-        options.incremental_options.num_threads = 1
+        # Each cluster is mapped by one thread: with several the search for an initial pair is a race. COLMAP 4.2 hands
+        # this number on to the clusters, whatever their own options say.
+        options = pycolmap.HierarchicalPipelineOptions(num_threads=1, num_workers=mapper.num_cores)
         _set_seed(options.incremental_options, seed)
     else:
         options = pycolmap.IncrementalPipelineOptions(num_threads=mapper.num_threads)
