@@ -15,7 +15,7 @@ from rangesfm.trust.hypothesis import Hypothesis
 from rangesfm.trust.linearized import Linearized
 from rangesfm.trust.mistakes import find_mistakes
 from rangesfm.trust.scanning import SCANNING
-from rangesfm.trust.testing import FALSE_ALARMS, Factorization, noncentrality
+from rangesfm.trust.testing import FALSE_ALARMS, Factorization, noncentrality, row_of
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +59,17 @@ def test_the_smallest_detectable_mistake_raises_the_statistic_as_it_must(problem
             assert found.statistic == pytest.approx(noncentrality(1), rel=1e-4)
             moved = Factorization(made).step()[0]
             assert abs(moved) == pytest.approx(found.effect_on_log_scale, rel=1e-3, abs=1e-9)
+
+
+def test_the_size_of_one_number_keeps_its_sign_and_that_of_more_is_their_length(problem: Linearized) -> None:
+    silent = without_noise(problem)
+    for each in hypotheses(problem):
+        size = -np.arange(1.0, each.num + 1)
+        made = replace(silent, residual_m=each.effect.columns @ size, prior_residual=each.effect.priors @ size)
+        [test] = Factorization(made).test([each], 0)
+        if np.isfinite(test.smallest_detectable):
+            told = row_of(test).size
+            assert told == pytest.approx(-1.0 if each.num == 1 else np.linalg.norm(size), rel=1e-4)
 
 
 def test_baardas_number() -> None:
