@@ -36,8 +36,7 @@ from rangesfm.scale.starts import (
 
 _SUBSET_PER_ANCHOR = 300
 # So many ranges of an anchor, spread over all, tell maps apart and show what ranges get wrong as well as more do.
-_ENOUGH_OF_ANCHOR = 1000
-_NUM_NOISE_ROUNDS = 3
+_ENOUGH_OF_ANCHOR, _NUM_ROUNDS = 1000, 2
 _NUM_ALTERNATIVES = 4
 _SAME_LOG_SCALE = 0.03
 _SAME_ROTATION_DEG = 5.0
@@ -209,7 +208,7 @@ def solution_from(posed: ScaleProblem, start: RangeState) -> Solution:
         state = start if before is None else before.state
         return solve(weighted(given, errors).by_some(rows), state, loss=errors.loss)
 
-    rough, _, used = fit_with_own_errors(fit, shown, seen(posed.errors, start), max_num_rounds=_NUM_NOISE_ROUNDS - 1)
+    rough, _, used = fit_with_own_errors(fit, shown, seen(posed.errors, start), max_num_rounds=_NUM_ROUNDS)
     problem = weighted(given, used)
     fitted = solve(problem, rough.state, loss=used.loss)
     last = shown(used, fitted)

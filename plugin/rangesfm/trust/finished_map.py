@@ -97,11 +97,7 @@ def _of_fit(
     for misfit in () if summary is None else summary.misfits:
         yield Doubt(f"after the refinement {misfit}", "check clocks, lever arm and anchors")
     low, high = estimate.interval_95
-    # The estimate itself may be at one end, and the refined scale a little beyond.
-    is_near = (
-        refined_scale is not None and abs(np.log(refined_scale / estimate.value)) < estimate.uncertainty.half_width_95
-    )
-    if refined_scale is not None and not is_near and not low <= refined_scale <= high:
+    if refined_scale is not None and not low <= refined_scale <= high:
         reason = (
             f"the refined scale, {refined_scale:.5g}, lies outside the scale's own interval, {low:.5g} to {high:.5g}"
         )
