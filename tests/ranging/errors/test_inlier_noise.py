@@ -53,3 +53,10 @@ def test_the_likelihood_without_outliers_is_that_of_gaussian_noise(num: int) -> 
     residuals = spoilt(num, 0.0, 1.0, seed=1)
     gaussian = -0.5 * np.sum((residuals / 0.1) ** 2) - num * np.log(0.1 * np.sqrt(2 * np.pi))
     assert inlier_noise(residuals).log_likelihood == pytest.approx(gaussian, rel=0.02)
+
+
+def test_of_few_residuals_it_is_that_of_gaussian_noise_of_their_own_size() -> None:
+    residuals = spoilt(15, 0.0, 1.0, seed=1)
+    found = inlier_noise(residuals)
+    gaussian = -0.5 * np.sum((residuals / found.stddev) ** 2) - 15 * np.log(found.stddev * np.sqrt(2 * np.pi))
+    assert found.log_likelihood == pytest.approx(gaussian, rel=1e-12)
