@@ -115,7 +115,7 @@ def solve_graph(graph: KeyframeGraph, start: GraphState, *, tolerance_m: float) 
     while step_count < _MAX_NUM_STEPS and damping < _MAX_DAMPING:
         step_count += 1
         solved = terms
-        step = _factor(terms.hessian, layout, damping).solve(-terms.gradient[layout.free])
+        step = _factor(terms, damping).solve(-terms.gradient[layout.free])
         trial = _moved(state, layout, step)
         trial_terms = _Terms.at(graph, layout, trial)
         if not trial_terms.cost < terms.cost:
@@ -125,7 +125,7 @@ def solve_graph(graph: KeyframeGraph, start: GraphState, *, tolerance_m: float) 
         state, terms, damping = trial, trial_terms, max(damping / 10, 1e-12)
         if movement < tolerance_m:
             break
-    return GraphSolution(state, step_count, _num_absorbed(solved, layout))
+    return GraphSolution(state, step_count, _num_absorbed(solved))
 
 
 def linear_functions(graph: KeyframeGraph, gradients: Array) -> tuple[Array, Array]:
@@ -142,7 +142,7 @@ def linear_functions(graph: KeyframeGraph, gradients: Array) -> tuple[Array, Arr
     terms = _Terms.at(graph, layout, graph.start())
     gradient = np.zeros((layout.num, gradients.shape[1]))
     gradient[: layout.first_anchor] = gradients
-    solved = _factor(terms.hessian, layout, 0.0).solve(gradient[layout.free])
+    solved = _factor(terms, 0.0).solve(gradient[layout.free])
     by_stddev = terms.whitened[:, layout.free] @ solved
     by_prior = _prior_rows(graph, layout, graph.start())[1][:, layout.free] @ solved
     by_metre = (np.sqrt(graph.errors.weight) / graph.errors.stddev_m)[:, None] * by_stddev
@@ -345,9 +345,9 @@ def _prior_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tup
     return np.array(residuals), sparse.coo_array((values, (rows, columns)), shape=shape).tocsr()
 
 
-def _factor(hessian: sparse.csc_array, layout: _Layout, damping: float) -> Factored:
+def _factor(terms: _Terms, damping: float) -> Factored:
     """With more damping where rounding makes it indefinite, as it does in a map without sense."""
-    part = hessian[layout.free][:, layout.free]
+    part = terms.hessian[terms.layout.free][:, terms.layout.free]
     diagonal = part.diagonal()
     # The floor keeps a pose that nothing holds in place.
     damped = part + sparse.diags_array(damping * diagonal + 1e-12 * diagonal.max())
@@ -356,7 +356,7 @@ def _factor(hessian: sparse.csc_array, layout: _Layout, damping: float) -> Facto
     except SingularError:
         if damping > _MAX_DAMPING:  # then it is not of numbers
             raise
-        return _factor(hessian, layout, max(10 * damping, _INITIAL_DAMPING))
+        return _factor(terms, max(10 * damping, _INITIAL_DAMPING))
 
 
 def _moved(state: GraphState, layout: _Layout, free_step: Array) -> GraphState:
@@ -383,11 +383,11 @@ def _turned(poses: Poses, turns: Array, shifts: Array, *, is_free: bool) -> Pose
     return Poses(around @ own @ poses.world_from_rig, poses.centers + shifts + arcs)
 
 
-def _num_absorbed(terms: _Terms, layout: _Layout) -> float:
+def _num_absorbed(terms: _Terms) -> float:
     """Trace of the ranges' hat matrix, by random probes (Hutchinson 1990)."""
     rng = np.random.default_rng(0)
-    whitened = terms.whitened[:, layout.free]
+    whitened = terms.whitened[:, terms.layout.free]
     probes = rng.choice([-1.0, 1.0], (whitened.shape[0], _NUM_PROBES))
     back = whitened.T @ probes
-    solved = _factor(terms.hessian, layout, 0.0).solve(np.ascontiguousarray(back))
+    solved = _factor(terms, 0.0).solve(np.ascontiguousarray(back))
     return float(np.sum(back * solved) / _NUM_PROBES)

@@ -94,10 +94,8 @@ class RangeProblem:
 
     def by_some(self, rows: Indices) -> RangeProblem:
         """The same problem by some of its ranges, of each anchor at least one: they stand for the others too."""
-        num, taken = (
-            np.bincount(index, minlength=self.num_anchors) for index in (self.anchor_index, self.anchor_index[rows])
-        )
         part = self.subset(rows)
+        num, taken = (np.bincount(each.anchor_index, minlength=self.num_anchors) for each in (self, part))
         share = np.ones(len(rows)) if part.share is None else part.share
         return replace(part, share=share * (num / np.maximum(taken, 1))[part.anchor_index])
 
