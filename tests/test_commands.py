@@ -618,9 +618,15 @@ class TestRunOnPhotos:
             again.centers("sparse_metric"), first_run.centers("sparse_metric"), rtol=0, atol=1e-9
         )
 
-    def test_refine_of_the_unscaled_model_gives_the_runs_answer(
-        self, photo_run: PhotoRun, first_run: Left, rangesfm_command: Command, tmp_path: Path
+    def test_refine_of_the_unscaled_model_gives_the_runs_answer_in_one_thread_too(
+        self,
+        photo_run: PhotoRun,
+        first_run: Left,
+        rangesfm_command: Command,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
     ) -> None:
+        monkeypatch.setenv("OMP_NUM_THREADS", "1")
         flags = ["--input_path", str(photo_run.output_path / "sparse" / "0"), "--output_path", str(tmp_path / "out")]
         done = rangesfm_command("refine", *photo_run.flags, *flags, cwd=photo_run.survey.folder)
         again = Left(tmp_path / "out", done.stdout, done.stderr)

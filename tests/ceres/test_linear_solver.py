@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_array
+import pytest
+from scipy.sparse import bsr_array, csr_array
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import sequence_path
 
-from rangesfm.ceres.linear_solver import dense_is_faster, inverse_is_affordable, max_num_images_direct, overlaps_in
+from rangesfm.ceres.linear_solver import dense_is_faster, inverse_is_affordable, max_num_images_direct, normal_matrix
 from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.refine.bundle_adjustment import bundle_adjustment
@@ -74,12 +75,15 @@ def test_the_inverse_is_affordable_along_a_path_but_not_of_photos_that_all_see_t
     assert not inverse_is_affordable(csr_array(np.ones((101, 101))), 100)
 
 
-def test_photos_overlap_by_the_points_they_have_in_common() -> None:
-    model = walk(20, 60).reconstruction
-    points = [{point.point3D_id for point in model.image(i).get_observation_points2D()} for i in model.reg_image_ids()]
-    common = [[len(a & b) for b in points] for a in points]
-    np.testing.assert_array_equal(overlaps_in(model).toarray(), common)
-    assert np.count_nonzero(common) < 20**2
+@pytest.mark.parametrize("num_rows", [0, 1, 3, 50])
+@pytest.mark.parametrize("has_information", [False, True])
+def test_normal_equations_are_the_product(num_rows: int, *, has_information: bool) -> None:
+    rng = np.random.default_rng(num_rows)
+    dense = rng.normal(size=(2 * num_rows, 12)) * np.kron(rng.random((num_rows, 4)) < 0.4, np.ones((2, 3)))
+    information = rng.normal(size=(2 * num_rows, 2 * num_rows)) if has_information else np.eye(2 * num_rows)
+    given = (bsr_array(information, blocksize=(2, 2)),) if has_information else ()
+    found = normal_matrix(bsr_array(dense, blocksize=(2, 3)), *given)
+    np.testing.assert_allclose(found.toarray(), dense.T @ information @ dense, rtol=0, atol=1e-12)
 
 
 def test_the_refinement_of_a_long_path_is_direct() -> None:

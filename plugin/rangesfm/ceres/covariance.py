@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pycolmap
 from scipy import linalg
-from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix, diags
+from scipy.sparse import bsr_array, csc_matrix, csr_array, csr_matrix, diags
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.ceres import num_columns, tangent_jacobian
-from rangesfm.ceres.linear_solver import SingularError, factor
+from rangesfm.ceres.linear_solver import SingularError, factor, normal_matrix
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import similarity_motions
@@ -222,21 +222,21 @@ def _schur_complement(jacobian: csc_matrix, columns: _Columns) -> tuple[csc_matr
     stays = np.repeat(_tied_points(jacobian[:, first:]), 3)
     kept_columns = np.concatenate([np.arange(first), first + np.flatnonzero(stays)])
     kept, points = jacobian[:, kept_columns], jacobian[:, first + np.flatnonzero(~stays)]
-    num_points = points.shape[1] // 3
-    squares = (points.T @ points).tocoo()
+    kept_rows, num_points = kept.tocsr(), points.shape[1] // 3
+    squares = (points.T @ points.tocsr()).tocoo()
     blocks = np.zeros((num_points, 3, 3))
     blocks[squares.row // 3, squares.row % 3, squares.col % 3] = squares.data
     # A point on the horizon has no depth to speak of; so little holds it without being felt elsewhere.
     blocks += 1e-12 * np.maximum(np.trace(blocks, axis1=1, axis2=2), 1e-300)[:, None, None] * np.eye(3)
     whitener = np.swapaxes(np.linalg.inv(np.linalg.cholesky(blocks)), 1, 2)
     indices = np.arange(num_points)
-    whiten = bsr_matrix((whitener, indices, np.arange(num_points + 1)), shape=(3 * num_points, 3 * num_points))
-    coupling = csr_matrix(kept.T @ points)
-    coupling.resize(-(-len(kept_columns) // 6) * 6, points.shape[1])
-    coupling = coupling.tobsr((6, 3)) @ whiten  # blocks of poses and points multiply faster than numbers
-    eliminated = (coupling @ coupling.T).tocsr()
+    whiten = bsr_array((whitener, indices, np.arange(num_points + 1)), shape=(3 * num_points, 3 * num_points))
+    coupling = csr_array(points.T @ kept_rows)
+    coupling.resize(points.shape[1], -(-len(kept_columns) // 6) * 6)
+    coupling = whiten.T @ coupling.tobsr((3, 6))  # blocks of poses and points multiply faster than numbers
+    eliminated = normal_matrix(coupling).tocsr()
     eliminated.resize(kept.shape[1], kept.shape[1])
-    return csc_matrix(kept.T @ kept - eliminated), kept_columns
+    return csc_matrix(kept.T @ kept_rows - eliminated), kept_columns
 
 
 def _tied_points(points: csc_matrix) -> Mask:

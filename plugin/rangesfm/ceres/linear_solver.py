@@ -5,17 +5,20 @@ It is cheap wherever each photo sees what few others see.
 
 from __future__ import annotations
 
+import functools
+import itertools
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 from scipy import linalg
-from scipy.sparse import csc_array, csc_matrix, csr_array
+from scipy.sparse import bsr_array, csc_array, csc_matrix, csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.sparse.linalg import splu
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.processes.threads import side_by_side
 
 # Of an entry of a sparse factor, in time, against one of a dense factor.
 _SPARSE_SLOWDOWN = 8
@@ -23,6 +26,8 @@ _SPARSE_SLOWDOWN = 8
 _BLOCKWISE_SLOWDOWN = 2
 # From this share of nonzeros on, a dense factor is faster than a sparse one.
 _DENSE_FROM = 0.15
+# Of normal equations, so that their sums are the same on all machines.
+_NUM_STRIPS = 4
 
 
 def max_num_images_direct(overlaps: csr_array, limit: int) -> int:
@@ -60,19 +65,6 @@ def inverse_is_affordable(overlaps: csr_array, limit: int) -> bool:
     return num <= limit or num * num_entries <= limit * limit * (limit + 1) // 2
 
 
-def overlaps_in(model: pycolmap.Reconstruction) -> csr_array:
-    """(n, n) number of points that two of the n photos of a model have in common."""
-    index = {image_id: k for k, image_id in enumerate(model.reg_image_ids())}
-    seen = [
-        (index[element.image_id], row)
-        for row, point in enumerate(model.points3D.values())
-        for element in point.track.elements
-    ]
-    photo, point = np.array(seen, dtype=np.int64).reshape(-1, 2).T
-    sees = csr_array((np.ones(len(seen)), (photo, point)), shape=(len(index), len(model.points3D)))
-    return csr_array(sees @ sees.T)
-
-
 def _envelope_widths(overlaps: csr_array) -> Indices:
     """(n,) how far each row reaches to the left of its diagonal, in an order that keeps neighbours together."""
     order = reverse_cuthill_mckee(overlaps, symmetric_mode=True)
@@ -85,6 +77,27 @@ def _envelope_widths(overlaps: csr_array) -> Indices:
 def _cost(widths: Indices) -> float:
     """Multiplications of a Cholesky factorisation, but for a factor."""
     return float(np.sum(widths.astype(np.float64) ** 2))
+
+
+def normal_matrix(rows: bsr_array, information: bsr_array | None = None) -> bsr_array:
+    """``rows.T @ information @ rows``, strips of rows side by side; None: of residuals in stddevs."""
+
+    def strip(ends: tuple[int, int]) -> bsr_array:
+        part = _strip(rows, *ends)
+        return part.T @ (part if information is None else _strip(information, *ends) @ rows)
+
+    starts = (rows if information is None else information).indptr
+    cuts = np.searchsorted(starts, np.linspace(0, starts[-1], _NUM_STRIPS + 1)[1:-1])
+    strips = side_by_side(strip, itertools.pairwise([0, *cuts.tolist(), len(starts) - 1]))
+    return functools.reduce(operator.add, strips)
+
+
+def _strip(rows: bsr_array, first: int, last: int) -> bsr_array:
+    """From one row of blocks up to another."""
+    starts = rows.indptr[first : last + 1]
+    entries = slice(starts[0], starts[-1])
+    shape = (rows.blocksize[0] * (last - first), rows.shape[1])
+    return bsr_array((rows.data[entries], rows.indices[entries], starts - starts[0]), shape=shape)
 
 
 class SingularError(Exception):

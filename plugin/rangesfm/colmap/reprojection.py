@@ -8,6 +8,7 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array
+from rangesfm.colmap.observations import seen_in
 
 # COLMAP itself keeps no observation that is farther off (IncrementalPipelineOptions.filter_max_reproj_error).
 _MAX_ERROR_PX = 4.0
@@ -59,11 +60,11 @@ def photo_errors_px(model: pycolmap.Reconstruction) -> dict[str, float]:
     xyz = {point_id: point.xyz for point_id, point in model.points3D.items()}
     for image_id in sorted(model.reg_image_ids()):
         image = model.image(image_id)
-        seen = image.get_observation_points2D()
-        if not seen:
+        ids, xy = seen_in(image)
+        if not len(ids):
             continue
-        in_cam = image.cam_from_world() * np.array([xyz[point.point3D_id] for point in seen])
+        in_cam = image.cam_from_world() * np.array([xyz[point_id] for point_id in ids.tolist()])
         pixels = np.asarray(model.camera(image.camera_id).img_from_cam(in_cam), dtype=np.float64)
-        off_px = np.linalg.norm(pixels - np.array([point.xy for point in seen]), axis=1)
+        off_px = np.linalg.norm(pixels - xy, axis=1)
         medians[image.name] = float(np.median(np.where((in_cam[:, 2] > 0) & np.isfinite(off_px), off_px, np.inf)))
     return medians

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm import ceres
 from rangesfm.arrays import Array
-from rangesfm.ceres.linear_solver import dense_is_faster, max_num_images_direct, overlaps_in
+from rangesfm.ceres.linear_solver import dense_is_faster, max_num_images_direct
+from rangesfm.colmap.observations import overlaps_in
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import SolverError
 from rangesfm.geometry.trajectory import pose_of
@@ -301,7 +302,8 @@ class Stillness:
             return False
         before, self._centers = self._centers, keyframe_centers(self._metric)
         moved_m, gain = farthest(before, self._centers), step.gain / self._residual_stddev**2
-        is_near = _left(moved_m, self._last_m) <= self._tolerance_m or _left(gain, self._last_gain) <= _MAX_GAIN_LEFT
+        is_still = still_to_come(moved_m, self._last_m) <= self._tolerance_m
+        is_near = is_still or still_to_come(gain, self._last_gain) <= _MAX_GAIN_LEFT
         self._last_m, self._last_gain = moved_m, gain
         self._promise -= gain
         is_over = is_near and step.gain <= _MAX_LAST_GAIN * step.cost
@@ -309,7 +311,7 @@ class Stillness:
         return is_over
 
 
-def _left(now: float, last: float) -> float:
+def still_to_come(now: float, last: float) -> float:
     """What a series adds up to from here on."""
     num = now / (last - now) if now < last else np.inf
     return now * float(np.clip(num, *_NUM_STEPS_LEFT))

@@ -15,13 +15,14 @@ from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.ceres.linear_solver import Factored, SingularError, factor
+from rangesfm.ceres.linear_solver import Factored, SingularError, factor, normal_matrix
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import rounding_of
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_gradient import RangeGradient
+from rangesfm.refine.bundle_adjustment import farthest, still_to_come
 from rangesfm.refine.radio import Antennas
 from rangesfm.refine.vision_information import Poses, VisionInformation
 
@@ -30,8 +31,6 @@ _INITIAL_DAMPING = 1e-8
 _MAX_DAMPING = 1e6
 # For the number of parameters that the ranges determine: random vectors to estimate a trace with.
 _NUM_PROBES = 12
-# Columns that a range depends on: two poses, an anchor, its bias.
-_IN_ROW = 16
 
 
 @dataclass(frozen=True)
@@ -106,26 +105,28 @@ def solve_graph(graph: KeyframeGraph, start: GraphState, *, tolerance_m: float) 
     """Levenberg-Marquardt on the graph.
 
     Args:
-        tolerance_m: it stops once no keyframe moves further in a step that succeeds.
+        tolerance_m: it stops once no keyframe moves further in a step that succeeds, or in all that are to come.
     """
     layout = _Layout.of(graph)
     state, damping = start, _INITIAL_DAMPING
     terms = solved = _Terms.at(graph, layout, state)
-    step_count = 0
+    factored, used, step_count, movement = None, damping, 0, 0.0
     while step_count < _MAX_NUM_STEPS and damping < _MAX_DAMPING:
         step_count += 1
-        solved = terms
-        step = _factor(terms, damping).solve(-terms.gradient[layout.free])
+        solved, used, factored = terms, damping, _factor(terms, damping)
+        step = factored.solve(-terms.gradient[layout.free])
         trial = _moved(state, layout, step)
         trial_terms = _Terms.at(graph, layout, trial)
         if not trial_terms.cost < terms.cost:
             damping *= 10
             continue
-        movement = np.linalg.norm(trial.poses.centers - state.poses.centers, axis=1).max()
+        last, movement = movement, farthest(trial.poses.centers, state.poses.centers)
         state, terms, damping = trial, trial_terms, max(damping / 10, 1e-12)
-        if movement < tolerance_m:
+        if min(movement, still_to_come(movement, last)) < tolerance_m:
             break
-    return GraphSolution(state, step_count, _num_absorbed(solved))
+    if factored is None or used > _INITIAL_DAMPING:  # more would hide what the ranges determine
+        factored = _factor(solved, 0.0)
+    return GraphSolution(state, step_count, _num_absorbed(solved, factored))
 
 
 def linear_functions(graph: KeyframeGraph, gradients: Array) -> tuple[Array, Array]:
@@ -155,6 +156,7 @@ class _Layout:
 
     Attributes:
         num: of all. free: which take part. world_is_free: whether no keyframe is held.
+        of_ranges: (k, 16) on which each range depends: two poses, an anchor, its bias.
         order, starts: of the ranges, those between the same keyframes to the same anchor together: their derivatives
             have the same columns.
     """
@@ -163,6 +165,7 @@ class _Layout:
     num_anchors: int
     free: Indices
     world_is_free: bool
+    of_ranges: Indices
     order: Indices
     starts: Indices
 
@@ -190,16 +193,19 @@ class _Layout:
         is_free[6 * n : 6 * n + 3 * m] = np.repeat(anchor_is_free, 3)
         is_free[6 * n + 3 * m : -1] = bias_is_free
         is_free[-1] = graph.errors.common_bias_stddev_m > 0 and bool(bias_is_free.any())
-        ends = np.column_stack([graph.antennas.before, graph.antennas.after, graph.errors.anchor_index])
-        order = np.lexsort(ends.T)
-        starts = np.flatnonzero(np.diff(ends[order], axis=0, prepend=-1).any(axis=1))
-        return cls(n, m, np.flatnonzero(is_free), graph.held_frame is None, order, starts)
+        before, after, anchor = graph.antennas.before, graph.antennas.after, graph.errors.anchor_index
+        firsts = ((6 * before, 6), (6 * after, 6), (6 * n + 3 * anchor, 3), (6 * n + 3 * m + anchor, 1))
+        of_ranges = np.concatenate([first[:, None] + np.arange(num) for first, num in firsts], axis=1)
+        key = (anchor * n + after) * n + before
+        order = np.argsort(key, kind="stable")
+        starts = np.flatnonzero(np.diff(key[order], prepend=-1))
+        return cls(n, m, np.flatnonzero(is_free), graph.held_frame is None, of_ranges, order, starts)
 
     def squares(self, rows: sparse.csr_array) -> sparse.coo_array:
         """J^T J of the derivatives of the ranges, dense among those alike."""
-        values, columns = (array.reshape(-1, _IN_ROW) for array in (rows.data, rows.indices))
-        blocks = np.array([alike.T @ alike for alike in np.split(values[self.order], self.starts[1:])])
-        column = columns[self.order[self.starts]]
+        values = rows.data.reshape(self.of_ranges.shape)[self.order]
+        blocks = np.array([alike.T @ alike for alike in np.split(values, self.starts[1:])])
+        column = self.of_ranges[self.order[self.starts]]
         places = np.broadcast_to(column[:, :, None], blocks.shape), np.broadcast_to(column[:, None], blocks.shape)
         return sparse.coo_array((blocks.ravel(), tuple(place.ravel() for place in places)), shape=(self.num, self.num))
 
@@ -234,7 +240,7 @@ class _Terms:
         rho, weights, _ = graph.errors.weight * graph.errors.loss.rho(scaled**2)
         cost += 0.5 * float(rho.sum())
         gradient = gradient + derivative.T @ (weights * scaled)
-        derivative.data *= np.repeat(np.sqrt(weights), _IN_ROW)
+        derivative.data *= np.repeat(np.sqrt(weights), layout.of_ranges.shape[1])
 
         off, prior = _prior_rows(graph, layout, state)
         cost += 0.5 * float(off @ off)
@@ -244,7 +250,7 @@ class _Terms:
     @cached_property
     def hessian(self) -> sparse.csc_array:
         """Only of states from which a step is taken."""
-        of_photos = (self.seen.T @ (self.vision @ self.seen)).tocsr()
+        of_photos = normal_matrix(self.seen, self.vision).tocsr()
         of_photos.resize(self.layout.num, self.layout.num)
         total = of_photos + self.layout.squares(self.whitened) + self.prior.T @ self.prior
         return total.T  # symmetric: its transpose has it by columns
@@ -304,16 +310,17 @@ def _range_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tup
     antennas, index, stddev_m = graph.antennas, graph.errors.anchor_index, graph.errors.stddev_m
     by = state.range_gradient(antennas, index)
     residuals = (by.distance_m + state.biases_m[index] - graph.range_m) / stddev_m
-    values, columns = [], []
-    for frame, weight in ((antennas.before, 1 - antennas.weight), (antennas.after, antennas.weight)):
-        turned = by.by_turn_of_cam(antennas.tag_in_cam_m, state.poses.world_from_rig[frame])
-        values.append(weight[:, None] * np.concatenate([turned, by.by_tag], axis=1))
-        columns.append(6 * frame[:, None] + np.arange(6))
-    values += [by.by_anchor, np.ones((len(index), 1))]
-    columns += [layout.first_anchor + 3 * index[:, None] + np.arange(3), layout.first_bias + index[:, None]]
-    value, column = np.concatenate(values, axis=1) / stddev_m[:, None], np.concatenate(columns, axis=1)
-    starts = np.arange(0, value.size + 1, _IN_ROW)
-    return residuals, sparse.csr_array((value.ravel(), column.ravel(), starts), shape=(len(value), layout.num))
+    value = np.empty((len(residuals), 16))
+    for first, frame, weight in ((0, antennas.before, 1 - antennas.weight), (6, antennas.after, antennas.weight)):
+        value[:, first : first + 3] = by.by_turn_of_cam(antennas.tag_in_cam_m, state.poses.world_from_rig[frame])
+        value[:, first + 3 : first + 6] = by.by_tag
+        value[:, first : first + 6] *= weight[:, None]
+    value[:, 12:15] = by.by_anchor
+    value[:, 15] = 1.0
+    value /= stddev_m[:, None]
+    starts = np.arange(0, value.size + 1, value.shape[1])
+    shape = (len(value), layout.num)
+    return residuals, sparse.csr_array((value.ravel(), layout.of_ranges.ravel(), starts), shape=shape)
 
 
 def _prior_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tuple[Array, sparse.csr_array]:
@@ -383,11 +390,11 @@ def _turned(poses: Poses, turns: Array, shifts: Array, *, is_free: bool) -> Pose
     return Poses(around @ own @ poses.world_from_rig, poses.centers + shifts + arcs)
 
 
-def _num_absorbed(terms: _Terms) -> float:
+def _num_absorbed(terms: _Terms, factored: Factored) -> float:
     """Trace of the ranges' hat matrix, by random probes (Hutchinson 1990)."""
     rng = np.random.default_rng(0)
     whitened = terms.whitened[:, terms.layout.free]
     probes = rng.choice([-1.0, 1.0], (whitened.shape[0], _NUM_PROBES))
     back = whitened.T @ probes
-    solved = _factor(terms, 0.0).solve(np.ascontiguousarray(back))
+    solved = factored.solve(np.ascontiguousarray(back))
     return float(np.sum(back * solved) / _NUM_PROBES)

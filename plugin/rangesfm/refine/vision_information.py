@@ -17,9 +17,11 @@ import pycolmap
 from scipy import sparse
 
 from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.colmap.observations import seen_in
 from rangesfm.errors import SolverError
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.trajectory import pose_of
+from rangesfm.processes.threads import side_by_side
 
 # A long track is cut into overlapping pieces: what lies further apart hangs together through what is between.
 _MAX_PIECE = 8
@@ -120,17 +122,17 @@ def model_observations(metric: pycolmap.Reconstruction, frame_ids: Indices) -> O
     columns: list[tuple[npt.NDArray[Any], ...]] = []
     for image_id in metric.reg_image_ids():
         image = metric.image(image_id)
-        seen = [(point.point3D_id, point.xy) for point in image.get_observation_points2D()]
-        if image.frame_id not in index_of_frame or not seen:
+        ids, xy = seen_in(image)
+        if image.frame_id not in index_of_frame or not len(ids):
             continue
         camera = metric.camera(image.camera_id)
-        rays = np.asarray(camera.cam_from_img(np.array([xy for _, xy in seen])), dtype=np.float64)
+        rays = np.asarray(camera.cam_from_img(xy), dtype=np.float64)
         cam_from_rig = image.cam_from_world() * pose_of(metric.frame(image.frame_id)).inverse()
-        n = len(seen)
+        n = len(ids)
         columns.append(
             (
                 np.full(n, index_of_frame[image.frame_id]),
-                np.searchsorted(point_ids, [point_id for point_id, _ in seen]),
+                np.searchsorted(point_ids, ids),
                 rays,
                 np.full(n, camera.mean_focal_length()),
                 np.tile(cam_from_rig.rotation.matrix(), (n, 1, 1)),
@@ -195,12 +197,12 @@ def vision_information(observations: Observations, poses: Poses) -> VisionInform
     to_rig = root_weight[:, None, None] * np.nan_to_num(derivative) @ observations.cam_from_rig_rotation
     pieces, share = _thinned(_pieces(observations.point), len(poses))
     n = len(poses)
-    added: list[tuple[Indices, Array]] = []
-    for rows in pieces:
-        for batch in np.array_split(rows, max(len(rows) // _BATCH, 1)):
-            key, block = _eliminate(batch, observations.frame, in_rig, to_rig, poses)
-            added.append(_added(key, block))
-    key, values = _added(*(np.concatenate(parts) for parts in zip(*added, strict=True)))
+    batches = [batch for rows in pieces for batch in np.array_split(rows, max(len(rows) // _BATCH, 1))]
+    added = side_by_side(lambda rows: _added(*_eliminate(rows, observations.frame, in_rig, to_rig, poses)), batches)
+    key = np.unique(np.concatenate([some for some, _ in added]))
+    values = np.zeros((len(key), 6, 6))
+    for some, blocks in added:
+        values[np.searchsorted(key, some)] += blocks
     reference, first, second = key // n**2, key // n % n, key % n
     pairs, place = np.unique(np.concatenate([reference * n + first, reference * n + second]), return_inverse=True)
     starts = np.searchsorted(place[: len(key)], np.arange(len(pairs) + 1))

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import IDENTITY, Similarity, off_origin, path_shape, round_middle, rounding_of
+from rangesfm.processes.threads import side_by_side
 from rangesfm.ranging.anchors.point_fit import multilaterate
 from rangesfm.ranging.errors.noise import robust_stddevs
 from rangesfm.ranging.errors.robust_loss import SAME_COST
@@ -123,12 +124,12 @@ def site_starts(problem: RangeProblem, seed: int = 0) -> list[RangeState]:
         rotations = Rotation.concatenate([Rotation.identity(), rotations])
     else:
         rotations = problem.gravity.level_rotations(_NUM_HEADINGS)
+    turns, scales = rotations.as_matrix(), scale_candidates(problem)[::2].tolist()
     trials: list[tuple[float, Similarity]] = []
-    for scale in scale_candidates(problem)[::2]:
-        translations, costs = _translations(small, float(scale), rotations.as_matrix())
+    placed = side_by_side(lambda scale: _translations(small, scale, turns), scales)
+    for scale, (translations, costs) in zip(scales, placed, strict=True):
         for i in np.argsort(costs)[:_NUM_STARTS]:
-            similarity = Similarity(float(scale), rotations[int(i)].as_matrix(), translations[i])
-            trials.append((float(costs[i]), similarity))
+            trials.append((float(costs[i]), Similarity(scale, turns[i], translations[i])))
     anchors = np.where(np.isfinite(problem.anchor_mean_m), problem.anchor_mean_m, 0.0)
     ranked = [trial for _, trial in sorted(trials, key=lambda trial: trial[0])]
     found = each_once(ranked, _in_one_basin, _NUM_STARTS)

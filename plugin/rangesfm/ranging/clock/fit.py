@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -135,10 +136,8 @@ class OffsetFit:
     def _variances(self, own: Array, residuals: Array, times: Array) -> Array:
         """(k,) of the unknowns with columns ``own``, from chance and from a constant bias of all ranges."""
         span_s = float(np.ptp(times))
-        by_chance = [
-            _jackknife_variances(own, residuals, self.squares, times, max(num, round(num * span_s / _LONG_LOG_S)))
-            for num in _JACKKNIFE_NUM_BLOCKS
-        ]
+        num_blocks = [max(num, round(num * span_s / _LONG_LOG_S)) for num in _JACKKNIFE_NUM_BLOCKS]
+        by_chance = _jackknife_variances(own, residuals, self.squares, [_blocks(times, num) for num in num_blocks])
         by_bias = np.linalg.lstsq(own, _RANGE_BIAS_STDDEV_M * np.sqrt(self.squares.weights), rcond=None)[0]
         return np.asarray(np.mean(by_chance, axis=0) + by_bias**2)
 
@@ -211,8 +210,8 @@ def _blocks(times: Array, num_blocks: int) -> Indices:
     return np.unique(np.minimum((times - times.min()) // length_s, num_blocks - 1), return_inverse=True)[1]
 
 
-def _jackknife_variances(own: Array, residuals: Array, squares: SquaresFit, times: Array, num_blocks: int) -> Array:
-    """(k,) variances of an M-estimate whose residuals are correlated within blocks of time.
+def _jackknife_variances(own: Array, residuals: Array, squares: SquaresFit, blocks: Sequence[Indices]) -> list[Array]:
+    """(k,) variances of an M-estimate whose residuals are correlated within blocks of time, for each way to cut it.
 
     The delete-one-block jackknife, each time by one Newton step with everything that the fit adjusts
     (Bell and McCaffrey, Survey Methodology 2002). Sums of residuals over blocks, without the step, are
@@ -222,23 +221,26 @@ def _jackknife_variances(own: Array, residuals: Array, squares: SquaresFit, time
     Args:
         own: (n, k) columns of the unknowns in question, which nothing else explains.
         residuals: (n,) weighted, metres, of the fit ``squares``.
+        blocks: (n,) number of the block of each range.
     """
-    columns = np.column_stack([squares.basis, own / np.linalg.norm(own, axis=0)])
+    sizes = np.linalg.norm(own, axis=0)
+    columns = np.column_stack([squares.basis, own / sizes])
     curved = columns * (2 * squares.weights - 1)[:, None]
     gradients = columns * residuals[:, None]
     curvature = columns.T @ curved
-    block = _blocks(times, num_blocks)
-    num = int(block.max()) + 1
-    changes = np.zeros((num, own.shape[1]))
-    for number in range(num):
-        rows = np.flatnonzero(block == number)
-        left = curvature - columns[rows].T @ curved[rows]
-        if np.linalg.eigvalsh(left)[0] < _MIN_LEFT_CURVATURE:
-            return np.full(own.shape[1], np.inf)
-        changes[number] = np.linalg.solve(left, gradients[rows].sum(axis=0))[-own.shape[1] :]
-    quantile = float(special.stdtrit(num - 1, 0.975) / special.ndtri(0.975)) if num > 1 else np.inf
-    variances = (num - 1) / num * np.sum((changes / np.linalg.norm(own, axis=0)) ** 2, axis=0)
-    return np.asarray(quantile**2 * variances)
+
+    def variances(block: Indices) -> Array:
+        changes = []
+        for rows in np.split(np.argsort(block, kind="stable"), np.cumsum(np.bincount(block))[:-1]):
+            left = curvature - columns[rows].T @ curved[rows]
+            if np.linalg.eigvalsh(left)[0] < _MIN_LEFT_CURVATURE:
+                return np.full(len(sizes), np.inf)
+            changes.append(np.linalg.solve(left, gradients[rows].sum(axis=0))[-len(sizes) :] / sizes)
+        num = len(changes)
+        quantile = float(special.stdtrit(num - 1, 0.975) / special.ndtri(0.975)) if num > 1 else np.inf
+        return np.asarray(quantile**2 * (num - 1) / num * np.sum(np.square(changes), axis=0))
+
+    return [variances(block) for block in blocks]
 
 
 def fit_clocks(ranges: TimedRanges, path: PathSamples, offset_s: float) -> tuple[OffsetFit, Timing, float, float]:

@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cho_solve
+from scipy.linalg import lapack
 from scipy.optimize import minimize
 
 from rangesfm.arrays import Array, Indices
@@ -258,8 +258,8 @@ class _Likelihood:
         covariance = np.tensordot(np.exp(2 * logs), self.of_components, axes=1) + self.known
         covariance[np.diag_indices_from(covariance)] += ROUNDING * np.trace(covariance)
         lower = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
-        inverse: Array = cho_solve((lower, True), np.eye(len(covariance)))
-        return lower, inverse
+        below = np.tril(lapack.dpotri(lower, lower=True)[0])
+        return lower, below + np.tril(below, -1).T
 
     def _unknowns(self, inverse: Array) -> tuple[Array, Array, float]:
         """(c, p) whitened design, (p, p) covariance, and the logarithm of the determinant of its inverse."""
