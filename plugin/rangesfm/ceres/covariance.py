@@ -19,6 +19,7 @@ from rangesfm.errors import GeometryError
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.geometry.trajectory import pose_of
+from rangesfm.processes.threads import side_by_side
 
 _Between = Callable[[Array, Array], Array]
 
@@ -222,7 +223,15 @@ def _schur_complement(jacobian: csc_matrix, columns: _Columns) -> tuple[csc_matr
     stays = np.repeat(_tied_points(jacobian[:, first:]), 3)
     kept_columns = np.concatenate([np.arange(first), first + np.flatnonzero(stays)])
     kept, points = jacobian[:, kept_columns], jacobian[:, first + np.flatnonzero(~stays)]
-    kept_rows, num_points = kept.tocsr(), points.shape[1] // 3
+    rows = kept.tocsr()
+    products: tuple[Callable[[], csr_array], ...] = (lambda: kept.T @ rows, lambda: _explained_by(points, rows))
+    own, explained = side_by_side(lambda product: product(), products)
+    return csc_matrix(own - explained), kept_columns
+
+
+def _explained_by(points: csc_matrix, kept: csr_matrix) -> csr_array:
+    """What the points take from the normal equations of what is kept."""
+    num_points = points.shape[1] // 3
     squares = (points.T @ points.tocsr()).tocoo()
     blocks = np.zeros((num_points, 3, 3))
     blocks[squares.row // 3, squares.row % 3, squares.col % 3] = squares.data
@@ -231,12 +240,12 @@ def _schur_complement(jacobian: csc_matrix, columns: _Columns) -> tuple[csc_matr
     whitener = np.swapaxes(np.linalg.inv(np.linalg.cholesky(blocks)), 1, 2)
     indices = np.arange(num_points)
     whiten = bsr_array((whitener, indices, np.arange(num_points + 1)), shape=(3 * num_points, 3 * num_points))
-    coupling = csr_array(points.T @ kept_rows)
-    coupling.resize(points.shape[1], -(-len(kept_columns) // 6) * 6)
+    coupling = csr_array(points.T @ kept)
+    coupling.resize(points.shape[1], -(-kept.shape[1] // 6) * 6)
     coupling = whiten.T @ coupling.tobsr((3, 6))  # blocks of poses and points multiply faster than numbers
-    eliminated = normal_matrix(coupling).tocsr()
-    eliminated.resize(kept.shape[1], kept.shape[1])
-    return csc_matrix(kept.T @ kept_rows - eliminated), kept_columns
+    explained = normal_matrix(coupling).tocsr()
+    explained.resize(kept.shape[1], kept.shape[1])
+    return explained
 
 
 def _tied_points(points: csc_matrix) -> Mask:

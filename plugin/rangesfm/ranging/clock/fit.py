@@ -225,17 +225,17 @@ def _jackknife_variances(own: Array, residuals: Array, squares: SquaresFit, bloc
     """
     sizes = np.linalg.norm(own, axis=0)
     columns = np.column_stack([squares.basis, own / sizes])
-    curved = columns * (2 * squares.weights - 1)[:, None]
-    gradients = columns * residuals[:, None]
-    curvature = columns.T @ curved
+    curving = (2 * squares.weights - 1)[:, None]
+    curvature = columns.T @ (curving * columns)
 
     def variances(block: Indices) -> Array:
         changes = []
         for rows in np.split(np.argsort(block, kind="stable"), np.cumsum(np.bincount(block))[:-1]):
-            left = curvature - columns[rows].T @ curved[rows]
+            some = columns[rows]
+            left = curvature - some.T @ (curving[rows] * some)
             if np.linalg.eigvalsh(left)[0] < _MIN_LEFT_CURVATURE:
                 return np.full(len(sizes), np.inf)
-            changes.append(np.linalg.solve(left, gradients[rows].sum(axis=0))[-len(sizes) :] / sizes)
+            changes.append(np.linalg.solve(left, some.T @ residuals[rows])[-len(sizes) :] / sizes)
         num = len(changes)
         quantile = float(special.stdtrit(num - 1, 0.975) / special.ndtri(0.975)) if num > 1 else np.inf
         return np.asarray(quantile**2 * (num - 1) / num * np.sum(np.square(changes), axis=0))
