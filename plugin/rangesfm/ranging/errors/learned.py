@@ -21,6 +21,8 @@ _MAX_NUM_ITERATIONS = 25
 _TOLERANCE = 1e-6
 # Logarithms of stddevs, beside the median: farther away the likelihood is flat.
 _FARTHEST_BELOW, _FARTHEST_ABOVE = 5.0, 4.0
+# Of unknowns, of unit length: what a combination of them changes less than this changes nothing.
+_DEPENDENT = 1e-7
 # Of the trace of a covariance, which rounding may leave singular.
 ROUNDING = 1e-12
 
@@ -179,8 +181,7 @@ class ExpectedErrors:
             np.array([component.spread for component in self.components]),
             np.sum([*self.known.values(), np.zeros((len(self.cells), len(self.cells)))], axis=0),
             off_m,
-            design,
-            prior_design,
+            *_independent(design, prior_design),
         )
         stddevs = likelihood.mean_stddevs(likelihood.most_likely(most_unusual))
         return self._of(stddevs, stddevs[:, None, None] ** 2 * likelihood.of_components)
@@ -258,16 +259,30 @@ class _Likelihood:
         covariance = np.tensordot(np.exp(2 * logs), self.of_components, axes=1) + self.known
         covariance[np.diag_indices_from(covariance)] += ROUNDING * np.trace(covariance)
         lower = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
-        below = np.tril(lapack.dpotri(lower, lower=True)[0])
-        return lower, below + np.tril(below, -1).T
+        return lower, _inverse_of(lower)
 
     def _unknowns(self, inverse: Array) -> tuple[Array, Array, float]:
         """(c, p) whitened design, (p, p) covariance, and the logarithm of the determinant of its inverse."""
         whitened = inverse @ self.design
-        information = self.design.T @ whitened + self.prior_design.T @ self.prior_design
-        # Directions that nothing determines are as if they were determined a little, always alike.
-        scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-200))
-        values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
-        values = np.maximum(values, 1e-13)
-        spread = (vectors / values) @ vectors.T * np.outer(scale, scale)
-        return whitened, spread, float(np.log(values).sum() - 2 * np.log(scale).sum())
+        information: Array = self.design.T @ whitened + self.prior_design.T @ self.prior_design
+        lower = np.asarray(np.linalg.cholesky(information), dtype=np.float64)
+        return whitened, _inverse_of(lower), 2 * float(np.log(np.diag(lower)).sum())
+
+
+def _inverse_of(lower: Array) -> Array:
+    """(n, n) of what (n, n) is the lower Cholesky factor of."""
+    below = np.tril(lapack.dpotri(lower, lower=True)[0])
+    return np.asarray(below + np.tril(below, -1).T)
+
+
+def _independent(design: Array, prior_design: Array) -> tuple[Array, Array]:
+    """The same functions of the unknowns, by as many unknowns as they depend on.
+
+    Where several explain the same, as a map that turns and its anchors, normal equations would be singular but for
+    rounding, and what they say noise.
+    """
+    stacked = np.vstack([design, prior_design])
+    lengths = np.linalg.norm(stacked, axis=0)
+    basis, strengths, _ = np.linalg.svd(stacked[:, lengths > 0] / lengths[lengths > 0], full_matrices=False)
+    independent = basis[:, strengths > _DEPENDENT * strengths.max(initial=0.0)]
+    return independent[: len(design)], independent[len(design) :]
