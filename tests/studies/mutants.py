@@ -4,9 +4,9 @@
     python -m tests.studies.mutants --num 60 --seed 0 [--first 31]
 
 Draws mutants (another operator, a number one off, a condition turned round, ...) at random from the packages, puts each
-into a copy of the checkout, and runs the tests that mirror its file: its own, then those of its folder, those of the
-folders that use it, and those of the workflows. One that all of these pass has survived. Type hints and
-``frozen=True`` are left as they are: no run depends on them.
+into a copy of the checkout, and runs the tests that mirror its file: its own, then the results of small surveys, the
+tests of its folder, of the folders that use it, and of the workflows. One that all of these pass has survived. Type
+hints and ``frozen=True`` are left as they are: no run depends on them.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def test_commands(path: Path) -> list[list[str]]:
     tests = Path("tests") / folder
     own = tests / f"test_{path.stem}.py"
     commands = [[str(own)]] if own.is_file() else []
-    commands.append([str(tests), f"--ignore={own}"])
+    commands += [["tests/test_same_results.py"], [str(tests), f"--ignore={own}"]]
     return commands + [[str(Path("tests") / user)] for user in (*USED_BY.get(str(folder), ()), "workflows")]
 
 

@@ -55,6 +55,18 @@ def test_every_component_is_a_covariance(component, walked: Cells) -> None:  # t
     assert np.linalg.eigvalsh(correlation).min() > -1e-9 * len(walked)
 
 
+def test_unknowns_that_say_the_same_twice_change_nothing(walked: Cells) -> None:
+    """Not by rounding either, which would decide how much such a direction may explain."""
+    rng = np.random.default_rng(3)
+    design, prior = rng.standard_normal((len(walked), 6)), np.eye(2, 6)
+    off_m = 0.1 * rng.standard_normal(len(walked)) + design @ rng.standard_normal(6)
+    mixture = rng.standard_normal((6, 9)) @ np.diag(10.0 ** -np.arange(9))
+    once = learn_errors(walked, off_m, design, prior, 0.05)
+    for many in (np.hstack([np.eye(6), mixture]), np.hstack([mixture, np.zeros((6, 2)), np.eye(6)])):
+        twice = learn_errors(walked, off_m, design @ many, prior @ many, 0.05)
+        np.testing.assert_allclose(twice.stddevs, once.stddevs, rtol=1e-6)
+
+
 @pytest.mark.parametrize("name", ["antenna", "off_axis", "bending", "time", "place", "view", "bias"])
 def test_errors_ten_times_as_large_as_usual_are_seen_whatever_they_are_taken_for(name: str, walked: Cells) -> None:
     component = next(each for each in COMPONENTS if each.name == name)

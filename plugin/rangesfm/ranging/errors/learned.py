@@ -17,8 +17,8 @@ from rangesfm.ranging.errors.components import COMPONENTS, LEARNT_CURVE, Compone
 # faster than in proportion: an old one with five times the noise reads 7 % long, where the others are right to a
 # percent.
 _USUAL_NOISE_M, _WIDENING_POWER = 0.1, 1.5
-_MAX_NUM_ITERATIONS = 25
-_TOLERANCE = 1e-6
+_MAX_NUM_ITERATIONS = 100
+_TOLERANCE = 1e-9
 # Logarithms of stddevs, beside the median: farther away the likelihood is flat.
 _FARTHEST_BELOW, _FARTHEST_ABOVE = 5.0, 4.0
 # Of unknowns, of unit length: what a combination of them changes less than this changes nothing.
