@@ -105,7 +105,7 @@ CASES = {
     "some unknown": Case("scale", ("--anchors", "some.csv"), erring),
     "by photo": Case("refine", SITE, by_photo),
     "a step": Case("scale", SITE, stepping),
-    "a stretch": Case("scale", (*SITE, "--adopt"), stretched),
+    "a stretch": Case("scale", SITE, stretched),
     "a slipped clock": Case("scale", SITE, slipping),
     "an anchor typed wrong": Case("refine", ("--anchors", "typed.csv"), erring),
     "two candidates": Case("scale", (*IN_CAMERA, "--scale_method", "two-candidate"), erring),
