@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rangesfm.arrays import Array
 from rangesfm.scale.range_equation import RangeState, state_after
 from rangesfm.trust.alternatives import Alternative, Refits, alternatives
 from rangesfm.trust.catalogue import STANDING
@@ -24,6 +25,8 @@ _AS_LIKELY = 6.0
 _SAME = 0.95
 _MAX_NUM_RIVALS = 2
 _NUM_SETTLING, _SETTLED = 6, 0.05
+# Of what is not linear.
+_SHARES_OF_STEP = (1.0, 0.5, 0.25, 0.125)
 
 
 @dataclass(frozen=True)
@@ -134,27 +137,53 @@ def _is_rival(best: Cause, other: Cause) -> bool:
 
 def _settled_test(problem: Linearized, hypothesis: Hypothesis) -> tuple[Test, float, RangeState]:
     """The test of a hypothesis and its deviance, with the errors that it leaves and, if not linear, at the state."""
-    original, sizes, at = hypothesis, np.zeros(hypothesis.num), problem
+    at, there, sizes, is_settled = (_linear_settled if hypothesis.is_linear else _settled_in_steps)(problem, hypothesis)
+    factorized = Factorization(_learnt(at, [there]))
+    [test] = factorized.estimates([there])
+    # What a step promises counts only where steps keep what they promise.
+    reached = replace(test, hypothesis=hypothesis, sizes=sizes + test.sizes if is_settled else sizes)
+    return reached, factorized.deviance(test if is_settled else None), at.on_map.state
+
+
+def _linear_settled(problem: Linearized, hypothesis: Hypothesis) -> tuple[Linearized, Hypothesis, Array, bool]:
+    """At the likeliest state if the mistake was made, of whatever size it has there."""
+    at, before = problem, np.zeros(hypothesis.num)
     for _ in range(_NUM_SETTLING):
         factorized = Factorization(at)
         [test] = factorized.estimates([hypothesis])
-        change = np.linalg.norm(test.sizes - sizes if original.is_linear else test.sizes)
-        sizes = test.sizes if original.is_linear else sizes + test.sizes
-        if change < _SETTLED * np.linalg.norm(sizes):
+        if np.linalg.norm(test.sizes - before) < _SETTLED * np.linalg.norm(test.sizes):
             break
-        state = state_after((at.columns,), at.on_map.state, factorized.step((hypothesis.effect, test.sizes)))
-        moved = replace(problem.on_map, state=state)
-        if original.is_linear:
-            at = at_state(at, moved)
-            continue
-        at = at_state(at, corrected(moved, original.correction(sizes)))
-        there = (each for of_kind in STANDING for h in of_kind(at) for each in (h, *h.narrower))
-        found = next((each for each in there if each.key == original.key), None)
-        hypothesis = found or original.at_size(at, sizes)
-    factorized = Factorization(_learnt(at, [hypothesis]))
-    [test] = factorized.estimates([hypothesis])
-    sizes = test.sizes if original.is_linear else sizes + test.sizes
-    return replace(test, hypothesis=original, sizes=sizes), factorized.deviance(test), at.on_map.state
+        at, before = at_state(at, _stepped(at, factorized, hypothesis, test.sizes)), test.sizes
+    return at, hypothesis, np.zeros(hypothesis.num), True
+
+
+def _settled_in_steps(problem: Linearized, original: Hypothesis) -> tuple[Linearized, Hypothesis, Array, bool]:
+    """Where the ranges are corrected by the likeliest size, the hypothesis as it is there, the size, and whether all
+    steps to it are made: each is as long as the ranges become likelier, and none where they do not.
+    """
+    at, hypothesis, sizes = problem, original, np.zeros(original.num)
+    for _ in range(_NUM_SETTLING):
+        factorized = Factorization(at)
+        [test] = factorized.estimates([hypothesis])
+        if np.linalg.norm(test.sizes) < _SETTLED * np.linalg.norm(sizes + test.sizes):
+            return at, hypothesis, sizes, True
+        for step in (share * test.sizes for share in _SHARES_OF_STEP):
+            moved = replace(problem.on_map, state=_stepped(at, factorized, hypothesis, step).state)
+            there = at_state(at, corrected(moved, original.correction(sizes + step)))
+            if Factorization(there).deviance() < factorized.deviance():
+                break
+        else:
+            return at, hypothesis, sizes, False
+        at, sizes = there, sizes + step
+        found = (each for of_kind in STANDING for h in of_kind(at) for each in (h, *h.narrower))
+        hypothesis = next((each for each in found if each.key == original.key), None) or original.at_size(at, sizes)
+    return at, hypothesis, sizes, False
+
+
+def _stepped(at: Linearized, factorized: Factorization, hypothesis: Hypothesis, sizes: Array) -> RangesOnMap:
+    """The ranges with the map as it is likeliest if a mistake of some size was made."""
+    step = factorized.step((hypothesis.effect, sizes))
+    return replace(at.on_map, state=state_after((at.columns,), at.on_map.state, step))
 
 
 def _narrowed(problem: Linearized, cause: Cause, before: float) -> Cause:
