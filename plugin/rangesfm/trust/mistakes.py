@@ -26,7 +26,7 @@ _SAME = 0.95
 _MAX_NUM_RIVALS = 2
 _NUM_SETTLING, _SETTLED = 6, 0.05
 # Of what is not linear.
-_SHARES_OF_STEP = (1.0, 0.5, 0.25, 0.125)
+_NUM_STEPS = 10
 
 
 @dataclass(frozen=True)
@@ -158,23 +158,18 @@ def _linear_settled(problem: Linearized, hypothesis: Hypothesis) -> tuple[Linear
 
 
 def _settled_in_steps(problem: Linearized, original: Hypothesis) -> tuple[Linearized, Hypothesis, Array, bool]:
-    """Where the ranges are corrected by the likeliest size, the hypothesis as it is there, the size, and whether all
-    steps to it are made: each is as long as the ranges become likelier, and none where they do not.
+    """Where the ranges are corrected by the likeliest size, the hypothesis as it is there, the size, and whether steps
+    came to an end: where little holds a mistake, they may grow instead.
     """
     at, hypothesis, sizes = problem, original, np.zeros(original.num)
-    for _ in range(_NUM_SETTLING):
+    for _ in range(_NUM_STEPS):
         factorized = Factorization(at)
         [test] = factorized.estimates([hypothesis])
         if np.linalg.norm(test.sizes) < _SETTLED * np.linalg.norm(sizes + test.sizes):
             return at, hypothesis, sizes, True
-        for step in (share * test.sizes for share in _SHARES_OF_STEP):
-            moved = replace(problem.on_map, state=_stepped(at, factorized, hypothesis, step).state)
-            there = at_state(at, corrected(moved, original.correction(sizes + step)))
-            if Factorization(there).deviance() < factorized.deviance():
-                break
-        else:
-            return at, hypothesis, sizes, False
-        at, sizes = there, sizes + step
+        sizes = sizes + test.sizes
+        moved = replace(problem.on_map, state=_stepped(at, factorized, hypothesis, test.sizes).state)
+        at = at_state(at, corrected(moved, original.correction(sizes)))
         found = (each for of_kind in STANDING for h in of_kind(at) for each in (h, *h.narrower))
         hypothesis = next((each for each in found if each.key == original.key), None) or original.at_size(at, sizes)
     return at, hypothesis, sizes, False
