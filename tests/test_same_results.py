@@ -124,8 +124,8 @@ def write_log(path: Path, log: Log) -> None:
 
 
 def write_anchors(path: Path, **changed: tuple[float, float, float] | None) -> None:
-    """With their places changed; None: of one that is not listed."""
-    places = {name: at for name, at in (ANCHORS_M | changed).items() if at is not None}
+    """With their places changed; None: of one that nobody knows."""
+    places = {name: at or ("", "", "") for name, at in (ANCHORS_M | changed).items()}
     rows = [f"{name},{x},{y},{z},0.02\n" for name, (x, y, z) in places.items()]
     path.write_text("anchor_id,x_m,y_m,z_m,position_stddev_m\n" + "".join(rows))
 
@@ -133,7 +133,7 @@ def write_anchors(path: Path, **changed: tuple[float, float, float] | None) -> N
 @pytest.fixture
 def survey(own_survey: WalkedSurvey) -> WalkedSurvey:
     folder = own_survey.folder
-    write_anchors(folder / "some.csv", A4=("", "", ""))
+    write_anchors(folder / "some.csv", A4=None)
     write_anchors(folder / "typed.csv", A3=(6.0, 5.6, 0.7))
     write_anchors(folder / "flat.csv", **{name: (x, y, 0.5) for name, (x, y, _) in ANCHORS_M.items()})
     (folder / "taped.csv").write_text("from,to,distance_m,stddev_m\nA1,A2,12.17,0.02\n")
