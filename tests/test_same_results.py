@@ -42,7 +42,7 @@ class Case(NamedTuple):
 
     command: str
     flags: Sequence[str]
-    change: Callable[[Log], None] = lambda log: None
+    change: Callable[[Log], None]
 
 
 def erring(log: Log) -> None:
