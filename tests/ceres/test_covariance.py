@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 from tests.simulated.model import synthetic_model
 from tests.simulated.path import orbit_path
@@ -185,7 +185,7 @@ def test_residuals_that_err_together_count_as_their_covariance_says() -> None:
     # Each on its own with a variance of 1.7, and three errors that they share.
     by_error = np.hstack([np.eye(num_ranges), rng.standard_normal((num_ranges, 3))])
     of_errors = np.diag(np.concatenate([np.full(num_ranges, 1.7), np.ones(3)]))
-    errors = ResidualErrors(rows, csr_matrix(by_error), of_errors)
+    errors = ResidualErrors(rows, csr_array(by_error), of_errors)
     found = joint_covariance(
         survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases, errors=errors
     )

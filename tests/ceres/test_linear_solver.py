@@ -9,7 +9,13 @@ from scipy.sparse import bsr_array, csr_array
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import sequence_path
 
-from rangesfm.ceres.linear_solver import dense_is_faster, inverse_is_affordable, max_num_images_direct, normal_matrix
+from rangesfm.ceres.linear_solver import (
+    dense_is_faster,
+    inverse_is_affordable,
+    max_num_images_direct,
+    normal_matrix,
+    resized,
+)
 from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.refine.bundle_adjustment import bundle_adjustment
@@ -84,6 +90,17 @@ def test_normal_equations_are_the_product(num_rows: int, *, has_information: boo
     given = (bsr_array(information, blocksize=(2, 2)),) if has_information else ()
     found = normal_matrix(bsr_array(dense, blocksize=(2, 3)), *given)
     np.testing.assert_allclose(found.toarray(), dense.T @ information @ dense, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("is_full", [False, True])
+@pytest.mark.parametrize("size", [10, 12, 14])
+def test_a_resized_matrix_is_cut_or_gets_empty_columns_full_or_not(size: int, *, is_full: bool) -> None:
+    given = np.arange(1.0, 145.0).reshape(12, 12) if is_full else np.diag(np.arange(1.0, 13.0))
+    found = resized(bsr_array(given, blocksize=(1, 1)), size)
+    assert isinstance(found, csr_array) != is_full
+    expected = np.zeros((14, 14))
+    expected[:12, :12] = given
+    np.testing.assert_array_equal(csr_array(found).toarray(), expected[:size, :size])
 
 
 def test_the_refinement_of_a_long_path_is_direct() -> None:

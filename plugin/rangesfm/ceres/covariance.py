@@ -9,19 +9,19 @@ from typing import Any
 import numpy as np
 import pycolmap
 from scipy import linalg
-from scipy.sparse import bsr_array, csc_matrix, csr_array, csr_matrix, diags
+from scipy.sparse import bsr_array, csc_array, csr_array, diags_array
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.ceres import num_columns, tangent_jacobian
-from rangesfm.ceres.linear_solver import SingularError, factor, normal_matrix
+from rangesfm.ceres.linear_solver import SingularError, factor, normal_matrix, resized
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.processes.threads import side_by_side
 
-_Between = Callable[[Array, Array], Array]
+_Product = Callable[[Array], Array]
 
 # A motion of the whole world that changes the residuals by less than this part of what its parts would do alone
 # changes nothing: rounding leaves some 1e-15, a single weak range some 1e-5.
@@ -44,7 +44,7 @@ class ResidualErrors:
     """
 
     rows: Indices
-    by_error: csr_matrix
+    by_error: csr_array
     covariance: Array
 
 
@@ -106,7 +106,7 @@ def joint_covariance(
         GeometryError: residuals do not determine some block.
     """
     columns = _Columns.of(problem, reconstruction, anchors, others)
-    jacobian = tangent_jacobian(problem, columns.variable).tocsc()
+    jacobian = tangent_jacobian(problem, columns.variable)
     normal, kept = _schur_complement(jacobian, columns)
     free = _free_motions(jacobian, _world_motions(columns))[kept]
     inverse = _Inverse(normal, free, columns, _excess(jacobian[:, kept], errors))
@@ -202,34 +202,32 @@ class _Columns:
         return f"{kind} number {self.kinds[:index].count(kind)}"
 
 
-def _excess(kept: csc_matrix, errors: ResidualErrors | None) -> _Between:
-    """(a, b) left^T J^T (S - 1) J right, of (size, a) and (size, b) in the columns that are kept."""
+def _excess(kept: csc_array, errors: ResidualErrors | None) -> _Product:
+    """J^T (S - 1) J times (size, k), in the columns that are kept."""
     if errors is None:
-        return lambda left, right: np.zeros((left.shape[1], right.shape[1]))
-    rows = csr_matrix(kept)[errors.rows]
-    independent, by_error = csc_matrix(rows.T @ rows), csc_matrix(rows.T @ errors.by_error)
-    return lambda left, right: np.asarray(
-        (by_error.T @ left).T @ (errors.covariance @ (by_error.T @ right)) - left.T @ (independent @ right)
-    )
+        return np.zeros_like
+    rows = csr_array(kept)[errors.rows]
+    independent, by_error = csr_array(rows.T @ rows), csr_array(rows.T @ errors.by_error)
+    return lambda right: np.asarray(by_error @ (errors.covariance @ (by_error.T @ right)) - independent @ right)
 
 
 def _address(block: Array) -> int:
     return int(block.__array_interface__["data"][0])
 
 
-def _schur_complement(jacobian: csc_matrix, columns: _Columns) -> tuple[csc_matrix, Indices]:
+def _schur_complement(jacobian: csc_array, columns: _Columns) -> tuple[Array | csr_array, Indices]:
     """Normal equations of what is kept once the points are eliminated, and which columns are kept."""
     first = columns.num_kept_columns
     stays = np.repeat(_tied_points(jacobian[:, first:]), 3)
     kept_columns = np.concatenate([np.arange(first), first + np.flatnonzero(stays)])
     kept, points = jacobian[:, kept_columns], jacobian[:, first + np.flatnonzero(~stays)]
     rows = kept.tocsr()
-    products: tuple[Callable[[], csr_array], ...] = (lambda: kept.T @ rows, lambda: _explained_by(points, rows))
+    products: tuple[Callable[[], Array | csr_array], ...] = (lambda: kept.T @ rows, lambda: _explained_by(points, rows))
     own, explained = side_by_side(lambda product: product(), products)
-    return csc_matrix(own - explained), kept_columns
+    return own - explained, kept_columns
 
 
-def _explained_by(points: csc_matrix, kept: csr_matrix) -> csr_array:
+def _explained_by(points: csc_array, kept: csr_array) -> Array | csr_array:
     """What the points take from the normal equations of what is kept."""
     num_points = points.shape[1] // 3
     squares = (points.T @ points.tocsr()).tocoo()
@@ -243,16 +241,14 @@ def _explained_by(points: csc_matrix, kept: csr_matrix) -> csr_array:
     coupling = csr_array(points.T @ kept)
     coupling.resize(points.shape[1], -(-kept.shape[1] // 6) * 6)
     coupling = whiten.T @ coupling.tobsr((3, 6))  # blocks of poses and points multiply faster than numbers
-    explained = normal_matrix(coupling).tocsr()
-    explained.resize(kept.shape[1], kept.shape[1])
-    return explained
+    return resized(normal_matrix(coupling), kept.shape[1])
 
 
-def _tied_points(points: csc_matrix) -> Mask:
+def _tied_points(points: csc_array) -> Mask:
     """(num_points,) which share a residual with another, as two markers with a taped distance do."""
     entries = points.tocoo()
     shape = points.shape[0], points.shape[1] // 3
-    meets = csr_matrix((np.ones(entries.nnz), (entries.row, entries.col // 3)), shape=shape)
+    meets = csr_array((np.ones(entries.nnz), (entries.row, entries.col // 3)), shape=shape)
     tied = np.zeros(shape[1], dtype=bool)
     of_row = np.repeat(np.diff(meets.indptr), np.diff(meets.indptr))
     tied[meets.indices[of_row > 1]] = True
@@ -279,7 +275,7 @@ def _world_motions(columns: _Columns) -> Array:
     return motions
 
 
-def _free_motions(jacobian: csc_matrix, motions: Array) -> Array:
+def _free_motions(jacobian: csc_array, motions: Array) -> Array:
     """(num_columns, k) a basis of the motions of the world that change no residual."""
     alone = np.sqrt(np.square(abs(jacobian) @ np.abs(motions)).sum(axis=0))
     moves = alone > _FREE_MOTION * alone.max()
@@ -291,16 +287,14 @@ def _free_motions(jacobian: csc_matrix, motions: Array) -> Array:
 class _Inverse:
     """The pseudo-inverse of the normal equations, orthogonal to the free motions."""
 
-    def __init__(
-        self, normal: csc_matrix, free: Array, columns: _Columns, excess: Callable[[Array, Array], Array]
-    ) -> None:
+    def __init__(self, normal: Array | csr_array, free: Array, columns: _Columns, excess: _Product) -> None:
         self._excess = excess
         self._free = linalg.orth(free) if free.shape[1] else free
         scale = 1.0 / np.sqrt(np.maximum(normal.diagonal(), 1e-300))
         # Holding as many coordinates as there are free motions makes the rest regular; which ones makes no difference.
         held = np.zeros(len(scale))
         held[linalg.qr(self._free.T, mode="r", pivoting=True)[1][: free.shape[1]]] = 1.0
-        scaled = csc_matrix(diags(scale) @ normal @ diags(scale) + diags(held))
+        scaled = diags_array(scale) @ normal @ diags_array(scale) + diags_array(held)
         self._scale = scale[:, None]
         self._solve_scaled = _solver(scaled, columns)
 
@@ -319,18 +313,19 @@ class _Inverse:
             right = np.zeros((len(self._scale), stop - start))
             right[np.arange(start, stop), np.arange(stop - start)] = 1.0
             solution = self.solve(right)
+            excess = self._excess(solution)
             for span in some:
-                of_block = solution[:, span.start - start : span.stop - start]
-                blocks.append(of_block[span] + self._excess(of_block, of_block))
+                of_block = slice(span.start - start, span.stop - start)
+                blocks.append(solution[span, of_block] + solution[:, of_block].T @ excess[:, of_block])
         return blocks
 
     def of_functions(self, gradients: Array) -> Array:
         """(k, k) of the linear functions with these (size, k) gradients."""
         solution = self.solve(gradients)
-        return gradients.T @ solution + self._excess(solution, solution)
+        return np.asarray(gradients.T @ solution + solution.T @ self._excess(solution))
 
 
-def _solver(normal: csc_matrix, columns: _Columns) -> Callable[[Array], Array]:
+def _solver(normal: Array | csr_array, columns: _Columns) -> Callable[[Array], Array]:
     try:
         factored = factor(normal)
     except SingularError as error:

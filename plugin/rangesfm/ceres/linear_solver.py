@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import linalg
-from scipy.sparse import bsr_array, csc_array, csc_matrix, csr_array
+from scipy.sparse import bsr_array, csc_array, csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.sparse.linalg import splu
 
@@ -92,6 +92,21 @@ def normal_matrix(rows: bsr_array, information: bsr_array | None = None) -> bsr_
     return functools.reduce(operator.add, strips)
 
 
+def resized(normal: bsr_array, size: int) -> Array | csr_array:
+    """(size, size), new columns empty; dense where it is so full that adding to it and factoring it is faster so."""
+    if not _is_full(normal):
+        rows = normal.tocsr()
+        rows.resize(size, size)
+        return rows
+    dense, kept = np.zeros((size, size)), min(size, normal.shape[0])
+    dense[:kept, :kept] = normal.toarray()[:kept, :kept]
+    return dense
+
+
+def _is_full(normal: bsr_array | csc_array | csr_array) -> bool:
+    return bool(normal.nnz > _DENSE_FROM * normal.shape[0] ** 2)
+
+
 def _strip(rows: bsr_array, first: int, last: int) -> bsr_array:
     """From one row of blocks up to another."""
     starts = rows.indptr[first : last + 1]
@@ -125,18 +140,20 @@ class Factored:
     pivots: Array
 
 
-def factor(normal: csc_matrix | csc_array) -> Factored:
+def factor(normal: Array | csr_array) -> Factored:
     """Factor normal equations.
 
     Raises:
         SingularError: they are singular, by rounding or exactly.
     """
-    return _dense(normal) if normal.nnz > _DENSE_FROM * normal.shape[0] ** 2 else _sparse(normal)
+    if isinstance(normal, np.ndarray):
+        return _dense(normal)
+    return _dense(normal.toarray()) if _is_full(normal) else _sparse(normal.T)  # by columns, as it is symmetric
 
 
-def _dense(normal: csc_matrix | csc_array) -> Factored:
+def _dense(normal: Array) -> Factored:
     try:
-        lower = linalg.cho_factor(normal.toarray(), lower=True, overwrite_a=True, check_finite=False)
+        lower = linalg.cho_factor(normal, lower=True, check_finite=False)
     except linalg.LinAlgError as error:
         raise SingularError(int(str(error).split("-th")[0]) - 1) from error
     return Factored(
@@ -144,7 +161,7 @@ def _dense(normal: csc_matrix | csc_array) -> Factored:
     )
 
 
-def _sparse(normal: csc_matrix | csc_array) -> Factored:
+def _sparse(normal: csc_array) -> Factored:
     try:
         lu = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     except RuntimeError as error:  # exactly singular

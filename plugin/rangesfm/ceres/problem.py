@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix
+from scipy.sparse import csc_array, csr_array
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.ceres.doctor import check_compatibility
+from rangesfm.processes.threads import num_threads
 
 if TYPE_CHECKING:
     import pyceres
@@ -330,7 +331,7 @@ def num_columns(problem: Any, block: Array) -> int:
     return min(int(problem.parameter_block_tangent_size(block)), len(block))
 
 
-def tangent_jacobian(problem: Any, blocks: Sequence[Array]) -> csr_matrix:
+def tangent_jacobian(problem: Any, blocks: Sequence[Array]) -> csc_array:
     """(num_residuals, sum of ``num_columns``): robust losses applied, columns in the order of the blocks.
 
     Args:
@@ -341,10 +342,12 @@ def tangent_jacobian(problem: Any, blocks: Sequence[Array]) -> csr_matrix:
 
     options = pyceres.EvaluateOptions()
     options.set_parameter_blocks(list(blocks))
+    options.num_threads = num_threads()  # each entry is one thread's own: the same whatever their number
     jacobian = problem.evaluate_jacobian(options)
     rows, columns, values = jacobian.to_tuple()
-    padded = csr_matrix((values, (rows, columns)), shape=(jacobian.num_rows, jacobian.num_cols))
+    starts = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=jacobian.num_rows))])
+    padded = csr_array((values, columns, starts), shape=(jacobian.num_rows, jacobian.num_cols)).tocsc()
     sizes = np.array([problem.parameter_block_tangent_size(block) for block in blocks], dtype=np.int64)
     wanted = np.minimum(sizes, [len(block) for block in blocks])
     in_block = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    return padded[:, in_block < np.repeat(wanted, sizes)] if (wanted < sizes).any() else padded
+    return padded[:, in_block < np.repeat(wanted, sizes)]

@@ -15,7 +15,7 @@ from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.ceres.linear_solver import Factored, SingularError, factor, normal_matrix
+from rangesfm.ceres.linear_solver import Factored, SingularError, factor, normal_matrix, resized
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import rounding_of
@@ -248,12 +248,10 @@ class _Terms:
         return cls(cost, gradient, layout, jacobian, graph.vision.matrix, derivative, prior)
 
     @cached_property
-    def hessian(self) -> sparse.csc_array:
+    def hessian(self) -> Array | sparse.csr_array:
         """Only of states from which a step is taken."""
-        of_photos = normal_matrix(self.seen, self.vision).tocsr()
-        of_photos.resize(self.layout.num, self.layout.num)
-        total = of_photos + self.layout.squares(self.whitened) + self.prior.T @ self.prior
-        return total.T  # symmetric: its transpose has it by columns
+        of_photos = resized(normal_matrix(self.seen, self.vision), self.layout.num)
+        return of_photos + self.layout.squares(self.whitened) + self.prior.T @ self.prior
 
 
 def _relative_poses(vision: VisionInformation, poses: Poses) -> tuple[Array, sparse.bsr_array]:
@@ -359,7 +357,7 @@ def _factor(terms: _Terms, damping: float) -> Factored:
     # The floor keeps a pose that nothing holds in place.
     damped = part + sparse.diags_array(damping * diagonal + 1e-12 * diagonal.max())
     try:
-        return factor(damped.tocsc())
+        return factor(damped)
     except SingularError:
         if damping > _MAX_DAMPING:  # then it is not of numbers
             raise

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_array
 
 from rangesfm import ceres
 from rangesfm.arrays import Array, Indices
@@ -104,7 +104,7 @@ class RefinementProblem:
         in_residuals = np.sqrt(errors.weight) * errors.loss.slopes(scaled) / errors.stddev_m
         covariance_m2, has_cell = learned.covariance_m2, np.flatnonzero(learned.of_range >= 0)
         places = (has_cell, learned.of_range[has_cell])
-        of_cells = csr_matrix((in_residuals[has_cell], places), shape=(len(scaled), len(covariance_m2)))
+        of_cells = csr_array((in_residuals[has_cell], places), shape=(len(scaled), len(covariance_m2)))
         return ResidualErrors(added.residual_rows, of_cells, covariance_m2)
 
     def residuals_m(self, radio: RadioEstimate) -> Array:
