@@ -19,7 +19,7 @@ from rangesfm.errors import GeometryError
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.geometry.trajectory import pose_of
-from rangesfm.processes.threads import side_by_side
+from rangesfm.processes.threads import both
 
 _Product = Callable[[Array], Array]
 
@@ -222,8 +222,7 @@ def _schur_complement(jacobian: csc_array, columns: _Columns) -> tuple[Array | c
     kept_columns = np.concatenate([np.arange(first), first + np.flatnonzero(stays)])
     kept, points = jacobian[:, kept_columns], jacobian[:, first + np.flatnonzero(~stays)]
     rows = kept.tocsr()
-    products: tuple[Callable[[], Array | csr_array], ...] = (lambda: kept.T @ rows, lambda: _explained_by(points, rows))
-    own, explained = side_by_side(lambda product: product(), products)
+    own, explained = both(lambda: kept.T @ rows, lambda: _explained_by(points, rows))
     return own - explained, kept_columns
 
 

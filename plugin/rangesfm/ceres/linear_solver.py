@@ -141,7 +141,7 @@ class Factored:
 
 
 def factor(normal: Array | csr_array) -> Factored:
-    """Factor normal equations.
+    """Factor normal equations; dense ones are overwritten.
 
     Raises:
         SingularError: they are singular, by rounding or exactly.
@@ -153,7 +153,8 @@ def factor(normal: Array | csr_array) -> Factored:
 
 def _dense(normal: Array) -> Factored:
     try:
-        lower = linalg.cho_factor(normal, lower=True, check_finite=False)
+        # Symmetric: transposed, columns lie as LAPACK wants them, and nothing is copied.
+        lower = linalg.cho_factor(normal.T, lower=True, overwrite_a=True, check_finite=False)
     except linalg.LinAlgError as error:
         raise SingularError(int(str(error).split("-th")[0]) - 1) from error
     return Factored(

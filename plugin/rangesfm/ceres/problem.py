@@ -344,10 +344,11 @@ def tangent_jacobian(problem: Any, blocks: Sequence[Array]) -> csc_array:
     options.set_parameter_blocks(list(blocks))
     options.num_threads = num_threads()  # each entry is one thread's own: the same whatever their number
     jacobian = problem.evaluate_jacobian(options)
-    rows, columns, values = jacobian.to_tuple()
-    starts = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=jacobian.num_rows))])
-    padded = csr_array((values, columns, starts), shape=(jacobian.num_rows, jacobian.num_cols)).tocsc()
+    _, columns, values = jacobian.to_tuple()
     sizes = np.array([problem.parameter_block_tangent_size(block) for block in blocks], dtype=np.int64)
     wanted = np.minimum(sizes, [len(block) for block in blocks])
-    in_block = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    return padded[:, in_block < np.repeat(wanted, sizes)]
+    is_padding = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes) >= np.repeat(wanted, sizes)
+    place = np.empty(len(is_padding), dtype=columns.dtype)
+    place[np.argsort(is_padding, kind="stable")] = np.arange(len(place))  # padding goes last, where it is cut off
+    shape = jacobian.num_rows, jacobian.num_cols
+    return csr_array((values, place[columns], jacobian.rows), shape=shape).tocsc()[:, : wanted.sum()]

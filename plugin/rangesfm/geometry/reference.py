@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
@@ -95,7 +95,9 @@ class Reference:
         positions[between] = (1 - weight) * start_m + weight * end_m
         if rotations is not None and between.any():
             assert self.world_from_cam is not None
-            rotations[between] = Slerp(known, Rotation.from_matrix(self.world_from_cam))(times_s[between]).as_matrix()
+            start, end = (Rotation.from_matrix(self.world_from_cam[index[between]]) for index in (before, after))
+            turned = start * Rotation.from_rotvec(weight * (start.inv() * end).as_rotvec())
+            rotations[between] = turned.as_matrix()
         return positions, rotations
 
     def why_nothing_is_known(

@@ -9,6 +9,8 @@ from typing import TypeVar
 
 _Part = TypeVar("_Part")
 _Done = TypeVar("_Done")
+_First = TypeVar("_First")
+_Second = TypeVar("_Second")
 
 
 def num_threads() -> int:
@@ -24,3 +26,12 @@ def side_by_side(function: Callable[[_Part], _Done], parts: Iterable[_Part]) -> 
     """
     with ThreadPoolExecutor(num_threads()) as pool:
         return list(pool.map(function, parts))
+
+
+def both(first: Callable[[], _First], second: Callable[[], _Second]) -> tuple[_First, _Second]:
+    """What two computations give that do not need each other; where both fail, what the first raises is raised."""
+    if num_threads() == 1:
+        return first(), second()
+    with ThreadPoolExecutor(1) as pool:
+        beside = pool.submit(second)
+        return first(), beside.result()

@@ -14,6 +14,7 @@ from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import RangeModelOptions, ScaleOptions
+from rangesfm.processes.threads import both
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.range_errors import RangeErrors
@@ -75,15 +76,16 @@ def initialize_scale(
         solution = solution_from(problem, error.in_first_camera)
     table = _paper_table(solution)
     rotations = model_from_cam(observations, trajectory, problem)
-    learned = learned_errors(
-        problem, solution, observations, rotations, camera_velocities(observations, trajectory, problem)
+    learned, (per_anchor, tests) = both(
+        lambda: learned_errors(
+            problem, solution, observations, rotations, camera_velocities(observations, trajectory, problem)
+        ),
+        lambda: (scale_per_anchor(solution, observations.log.anchor_ids), cutoff_test(solution)),
     )
     posed = problem if lengths is None else _bent(problem, lengths)
     uncertainty = scale_uncertainty(posed, solution, learned, lengths.components["bending"] if lengths else 0.0)
-    per_anchor = scale_per_anchor(solution, observations.log.anchor_ids)
     covariance = parameter_covariance(solution, learned)
     found = anchor_estimates(solution, observations.log.anchor_ids, covariance)
-    tests = cutoff_test(solution)
     judged = judge(problem, solution, uncertainty, per_anchor, found, tests, options)
     verdict, reasons = judged.verdict, (*judged.reasons, *open_place)
     if gravity is not None and problem.frame == "first_camera" and anchor_frame == "site":

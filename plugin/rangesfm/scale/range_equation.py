@@ -280,15 +280,15 @@ def fit_at(problem: RangeProblem, state: RangeState, weights: Array) -> RangeFit
 
 
 def _settled(system: _System, x: Array) -> Array:
-    """The bottom itself, by reweighted steps, which go by the gradient alone.
+    """The bottom itself, by steps that go by the gradient alone.
 
     The trust region ends where rounding hides what a step gains: some 1e-9 beside the bottom, on a side that the last
     digit of any input decides.
     """
     for _ in range(_MAX_NUM_SETTLING):
-        fit = system.fit(state_after(system.columns, system.start, x), np.nan)
-        step = np.linalg.lstsq(fit.information, fit.gradient, rcond=1e-12)[0]
-        gain = float(fit.gradient @ step)
+        gradient, curvature = system.slope(state_after(system.columns, system.start, x))
+        step = np.linalg.lstsq(curvature, gradient, rcond=1e-12)[0]
+        gain = float(gradient @ step)
         if not _NO_GAIN < gain < _NEAR_BOTTOM:
             break
         x = x - step
@@ -326,6 +326,14 @@ class _System:
         of_parts = zip(self.parts, self.columns, self.start.of_models, state.of_models, strict=True)
         priors = prior_jacobian(self.parts[0], self.columns[0], self.start, state)
         return np.concatenate([range_jacobian(*each) for each in of_parts]), priors
+
+    def slope(self, state: RangeState) -> tuple[Array, Array]:
+        """(p,) gradient and (p, p) curvature of the cost; a range beyond the loss's inflection has none, as scipy has
+        it."""
+        (scaled, off_priors), (jacobian, of_priors) = self.residuals(state), self.jacobian(state)
+        _, first, second = self.rho_with_derivatives(scaled**2)
+        curvature = (jacobian * np.maximum(first + 2 * second * scaled**2, 0.0)[:, None]).T @ jacobian
+        return jacobian.T @ (first * scaled) + of_priors.T @ off_priors, curvature + of_priors.T @ of_priors
 
     def fit(self, state: RangeState, cost: float, weights: Array | None = None) -> RangeFit:
         """``weights``: (n,) None: by the loss."""
