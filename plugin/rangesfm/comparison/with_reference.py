@@ -67,7 +67,8 @@ def reference_in_frame(path: Trajectory, reference: Reference, *, frame: str | N
     Returns:
         None where it knows none of them, or the frames cannot be tied (see ``compare``).
     """
-    known, positions = _known_in_frame(path, reference, frame)
+    known, target, world_from_cam = known_keyframes(path, reference)
+    positions = _in_frame(path, known, target, world_from_cam, frame)
     if positions is None or len(known) == 0:
         return None
     return Reference(positions, image_names=tuple(path.image_names[i] for i in known))
@@ -80,25 +81,28 @@ def known_keyframes(path: Trajectory, reference: Reference) -> tuple[npt.NDArray
     return known, positions[known], None if world_from_cam is None else world_from_cam[known]
 
 
-def _known_in_frame(
-    path: Trajectory, reference: Reference, frame: str | None
-) -> tuple[npt.NDArray[np.int64], Array | None]:
-    """Rows and positions of ``known_keyframes``, the latter in the path's world; None if it cannot be tied."""
-    known, positions, world_from_cam = known_keyframes(path, reference)
+def _in_frame(
+    path: Trajectory,
+    known: npt.NDArray[np.int64],
+    positions: Array,
+    world_from_cam: Array | None,
+    frame: str | None,
+) -> Array | None:
+    """Positions of ``known_keyframes`` in the path's world; None if it cannot be tied."""
     if frame == "site":
-        return known, positions
+        return positions
     if frame != "first_camera" or world_from_cam is None or len(known) == 0:
-        return known, None
+        return None
     path_from_reference = path.world_from_cam[known[0]] @ world_from_cam[0].T
-    return known, (positions - positions[0]) @ path_from_reference.T + path.centers[known[0]]
+    return np.asarray((positions - positions[0]) @ path_from_reference.T + path.centers[known[0]])
 
 
 def _compare_path(name: str, path: Trajectory, reference: Reference, frame: str | None) -> ComparisonRow:
-    known, target, _ = known_keyframes(path, reference)
+    known, target, world_from_cam = known_keyframes(path, reference)
     if len(known) == 0:
         raise InputError(reference.why_nothing_is_known("keyframes", path.image_names, path.timestamps_s))
     source = path.centers[known]
-    _, in_frame = _known_in_frame(path, reference, frame)
+    in_frame = _in_frame(path, known, target, world_from_cam, frame)
     is_aligned = len(source) >= MIN_NUM_ALIGNED
     scale = _scale_to(source, target)
     return ComparisonRow(
