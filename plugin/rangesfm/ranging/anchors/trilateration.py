@@ -139,10 +139,8 @@ class AnchorRanges:
         return path_shape(centred if self.height_m is None else centred * [1.0, 1.0, 0.0])
 
     def fit(self, options: TrilaterationOptions) -> PointFit:
-        """The most likely place, as if the ranges erred independently; GeometryError for too few ranges."""
+        """The most likely place, as if the ranges erred independently."""
         num = len(self.range_m)
-        if num < MIN_NUM_RANGES:
-            raise GeometryError(f"{num} ranges at known positions of the tag, {MIN_NUM_RANGES} are needed")
         middle = self.tag_positions_m.mean(axis=0)
         mean = np.array([0.0, 0.0, 0.0, options.range_bias_m])
         prior = np.array([[0.0, 0.0, 0.0, 1 / max(options.range_bias_stddev_m, _KNOWN_BIAS_STDDEV_M)]])
@@ -208,10 +206,10 @@ def trilaterate(
         name: None if values is None else np.asarray(values, dtype=np.float64) for name, values in known.items()
     }
     anchor = AnchorRanges(positions, ranges, height_m=height_m, **arrays)
-    (found,) = trilaterate_together([anchor], options or TrilaterationOptions())
-    if isinstance(found, GeometryError):
-        raise found
-    return found
+    (placement,) = _trilaterate_together({"": anchor}, options or TrilaterationOptions())
+    if placement.found is None:
+        raise GeometryError(str(placement.why_not))
+    return placement.found
 
 
 @dataclass(frozen=True)
@@ -260,8 +258,8 @@ def trilaterate_anchors(
     """
     known = np.isfinite(tag_positions_m).all(axis=1)
     rows = [np.flatnonzero(known & (log.anchor_index == k)) for k in range(len(log.anchor_ids))]
-    anchors = [
-        AnchorRanges(
+    anchors = {
+        anchor_id: AnchorRanges(
             tag_positions_m[own],
             log.range_m[own],
             range_stddev_m=log.range_stddev_m[own],
@@ -272,37 +270,30 @@ def trilaterate_anchors(
             height_m=None if height_m is None else height_m.get(anchor_id),
         )
         for anchor_id, own in zip(log.anchor_ids, rows, strict=True)
-    ]
-    results = trilaterate_together(anchors, options or TrilaterationOptions())
-    return tuple(
-        AnchorPlacement(anchor_id, len(own), None, str(found))
-        if isinstance(found, GeometryError)
-        else AnchorPlacement(anchor_id, len(own), found, None)
-        for anchor_id, own, found in zip(log.anchor_ids, rows, results, strict=True)
-    )
+    }
+    return _trilaterate_together(anchors, options or TrilaterationOptions())
 
 
-def trilaterate_together(
-    anchors: Sequence[AnchorRanges], options: TrilaterationOptions
-) -> list[Trilateration | GeometryError]:
-    """Find anchors of one radio, whose ranges err alike; of each the reason instead if it is not determined."""
-    fits: dict[int, PointFit] = {}
-    results: dict[int, Trilateration | GeometryError] = {}
-    for k, anchor in enumerate(anchors):
-        try:
-            fits[k] = anchor.fit(options)
-        except GeometryError as error:
-            results[k] = error
-    fitted = [anchors[k] for k in fits]
+def _trilaterate_together(
+    anchors: Mapping[str, AnchorRanges], options: TrilaterationOptions
+) -> tuple[AnchorPlacement, ...]:
+    """Find anchors of one radio, whose ranges err alike."""
+    fits = {name: anchor.fit(options) for name, anchor in anchors.items() if len(anchor.range_m) >= MIN_NUM_RANGES}
+    fitted = [anchors[name] for name in fits]
     times_s, tags = [anchor.times_s for anchor in fitted], [anchor.tags for anchor in fitted]
     is_calibrated = all(anchor.shared_stddev_m is not None for anchor in fitted)
     errors = errors_of_fits([*fits.values()], times_s, tags, is_calibrated=is_calibrated) if fits else []
-    for (k, fit), of_fit in zip(fits.items(), errors, strict=True):
-        try:
-            results[k] = _conclude(anchors[k], _Found.of(fit, of_fit), options)
-        except GeometryError as error:
-            results[k] = error
-    return [results[k] for k in range(len(anchors))]
+    errors_of, placements = dict(zip(fits, errors, strict=True)), []
+    for name, anchor in anchors.items():
+        num, found = len(anchor.range_m), None
+        why_not: str | None = f"{num} ranges at known positions of the tag, {MIN_NUM_RANGES} are needed"
+        if name in fits:
+            try:
+                found, why_not = _conclude(anchor, _Found.of(fits[name], errors_of[name]), options), None
+            except GeometryError as error:
+                why_not = str(error)
+        placements.append(AnchorPlacement(name, num, found, why_not))
+    return tuple(placements)
 
 
 def _conclude(anchor: AnchorRanges, found: _Found, options: TrilaterationOptions) -> Trilateration:
