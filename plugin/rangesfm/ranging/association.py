@@ -81,9 +81,25 @@ def associate(
         status[(status == RangeStatus.USED) & np.isin(log.anchor_index, unwanted)] = RangeStatus.UNKNOWN_ANCHOR
     status[log.kind == RangeKind.ANCHOR_ANCHOR] = RangeStatus.ANCHOR_ANCHOR
     status[log.kind == RangeKind.TAG_TAG] = RangeStatus.TAG_TAG
+    placed = np.isin(status, (RangeStatus.USED, RangeStatus.UNKNOWN_ANCHOR))
+    before, after = np.where(placed, before, -1), np.where(placed, after, -1)
+    weight = np.where(placed, weight, 0.0)
     # The last entry stands for the index of no tag.
-    tags = np.vstack([lever_arms(log, tag_in_cam_m), np.full(3, np.nan)])[log.tag_index]
-    return _observe(log, trajectory, tags, status, before, after, weight, options)
+    tags_in_cam_m = np.vstack([lever_arms(log, tag_in_cam_m), np.full(3, np.nan)])[log.tag_index]
+    centers, lever = np.full((len(log), 3), np.nan), np.full((len(log), 3), np.nan)
+    offsets, stddev = np.zeros((len(log), 3)), np.zeros(len(log))
+
+    b, a, w = before[placed], after[placed], weight[placed]
+    lever[placed] = _turned_lever_arms(trajectory, tags_in_cam_m[placed], b, w)
+    if trajectory.timestamps_s is not None:
+        curved = np.flatnonzero(placed)[(w > 0) & (a != b)]
+        offsets[curved], stddev[curved] = _curve_beyond_line(
+            trajectory.timestamps_s, trajectory.centers, before[curved], weight[curved], options
+        )
+        stddev[placed] = np.hypot(stddev[placed], _timing_stddev(log, trajectory, b, a, w, options))
+    linear = (1 - w)[:, None] * trajectory.centers[b] + w[:, None] * trajectory.centers[a]
+    centers[placed] = linear + offsets[placed]
+    return RangeObservations(log, status, before, after, weight, centers, offsets, lever, stddev)
 
 
 def tag_positions(
@@ -206,38 +222,6 @@ def _camera_is_still(
 def _deviations(values: Array) -> Array:
     """Absolute, from the median; the value that is the median says nothing of the noise, and of few that is much."""
     return np.sort(np.abs(values - np.median(values)))[len(values) % 2 :]
-
-
-def _observe(
-    log: RangeLog,
-    trajectory: Trajectory,
-    tags_in_cam_m: Array,
-    status: npt.NDArray[np.int8],
-    before: Indices,
-    after: Indices,
-    weight: Array,
-    options: AssociationOptions,
-) -> RangeObservations:
-    """Evaluate the path at the places found; ``tags_in_cam_m``: (n, 3)."""
-    n = len(log)
-    placed = np.isin(status, (RangeStatus.USED, RangeStatus.UNKNOWN_ANCHOR))
-    before, after = np.where(placed, before, -1), np.where(placed, after, -1)
-    weight = np.where(placed, weight, 0.0)
-    centers, lever = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
-    offsets, stddev = np.zeros((n, 3)), np.zeros(n)
-
-    b, a, w = before[placed], after[placed], weight[placed]
-    linear = (1 - w)[:, None] * trajectory.centers[b] + w[:, None] * trajectory.centers[a]
-    lever[placed] = _turned_lever_arms(trajectory, tags_in_cam_m[placed], b, w)
-    curved = np.flatnonzero(placed)[(w > 0) & (a != b)]
-    if len(curved) and trajectory.timestamps_s is not None:
-        offsets[curved], stddev[curved] = _curve_beyond_line(
-            trajectory.timestamps_s, trajectory.centers, before[curved], weight[curved], options
-        )
-    if trajectory.timestamps_s is not None:
-        stddev[placed] = np.hypot(stddev[placed], _timing_stddev(log, trajectory, b, a, w, options))
-    centers[placed] = linear + offsets[placed]
-    return RangeObservations(log, status, before, after, weight, centers, offsets, lever, stddev)
 
 
 def _turned_lever_arms(trajectory: Trajectory, tags_in_cam_m: Array, before: Indices, weight: Array) -> Array:

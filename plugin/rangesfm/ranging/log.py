@@ -125,9 +125,7 @@ class RangeLog:
         times = self.timestamp_s
         if times is None or len(self) < 2:
             return 0.0
-        link = self._link
-        order = np.lexsort((times, link))
-        steps = np.diff(times[order])[np.diff(link[order]) == 0]
+        steps = self._steps_of_links(times, np.argsort(times, kind="stable"))
         if not len(steps) or np.mean(steps == 0) < _MIN_REPEATED_SHARE:
             return 0.0
         between = np.diff(np.unique(times))
@@ -138,15 +136,16 @@ class RangeLog:
         """How often times between one tag and one anchor jump back by a quarter of the log; 0 of a log in no order."""
         if self.timestamp_s is None or len(self) < 2:
             return 0
-        order = np.argsort(self._link, kind="stable")
-        steps = np.diff(self.timestamp_s[order])[np.diff(self._link[order]) == 0]
+        steps = self._steps_of_links(self.timestamp_s, np.arange(len(self)))
         if np.count_nonzero(steps < 0) > _MOST_GOING_BACK * len(steps):
             return 0
         return int(np.count_nonzero(steps < -0.25 * np.ptp(self.timestamp_s)))
 
-    @property
-    def _link(self) -> Indices:
-        return self.tag_index * len(self.anchor_ids) + self.anchor_index
+    def _steps_of_links(self, times: Array, order: Indices) -> Array:
+        """From each range to the next one between the same tag and anchor, as the rows come in ``order``."""
+        link = self.tag_index * len(self.anchor_ids) + self.anchor_index
+        order = order[np.argsort(link[order], kind="stable")]
+        return np.asarray(np.diff(times[order])[np.diff(link[order]) == 0])
 
     def peer_ranges(self, kind: RangeKind) -> PeerRanges:
         """The ranges between two anchors, distances that do not depend on the camera; or those between two tags."""

@@ -129,14 +129,12 @@ def offsets_that_keep(pairing: Pairing, bursts: Bursts, trajectory: Trajectory) 
 
 def curve_of(pairings: list[Pairing], bursts: Bursts, trajectory: Trajectory) -> CostCurve:
     """What all pairings cost: each the same wherever its bursts stay nearest to their photos."""
-    offsets, costs = [], []
-    for pairing in sorted(pairings, key=lambda pairing: pairing.offset_s):
+    points: list[tuple[float, float]] = []
+    for pairing in pairings:
         earliest_s, latest_s = offsets_that_keep(pairing, bursts, trajectory)
         plateau = {earliest_s, pairing.offset_s, latest_s} if earliest_s < latest_s else {pairing.offset_s}
-        offsets += sorted(plateau)
-        costs += [float(np.sqrt(pairing.variance))] * len(plateau)
-    order = np.argsort(offsets, kind="stable")
-    return CostCurve(np.array(offsets)[order], np.array(costs)[order])
+        points += [(offset_s, float(np.sqrt(pairing.variance))) for offset_s in plateau]
+    return CostCurve(*np.array(sorted(points)).T)
 
 
 def _offsets(burst_times: Array, photo_times: Array, reach_s: float) -> list[float]:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import AssociationOptions
@@ -79,12 +79,12 @@ class TimeOffset:
     value_s: float
     stddev_s: float
     curve: CostCurve
-    offset_matters: bool
-    drift: float
-    drift_stddev: float
-    drift_is_followed: bool
-    reference_s: float
-    note: str | None
+    offset_matters: bool = True
+    drift: float = 0.0
+    drift_stddev: float = np.inf
+    drift_is_followed: bool = False
+    reference_s: float = 0.0
+    note: str | None = None
     probability: float = 1.0
     rivals: tuple[Rival, ...] = ()
     is_certain: bool = True
@@ -176,8 +176,7 @@ def _offset_of_motion(
     progress.update(len(candidates), len(candidates))
     if not any(fit.is_testable for fit in fits):
         raise GeometryError(f"too few ranges along the camera's path to find the time offset by: {REMEDY}")
-    num_on_path = np.array([np.count_nonzero(path.knows(ranges.times_s + fit.offset_s)) for fit in fits])
-    (best, probability), *rivals = likely_fits(fits, num_on_path, path)
+    (best, probability), *rivals = _likely_fits(fits, ranges, path)
     if not best.explains():
         raise GeometryError(
             "at no time offset do the ranges follow the camera's path (it hardly moves, its photos are "
@@ -197,7 +196,6 @@ def _offset_of_motion(
         value_s=final.offset_s,
         stddev_s=timing.stddev_s,
         curve=weighed.around(final.offset_s, max(_FINE_REACH_S, _FINE_REACH_STDDEVS * timing.stddev_s)),
-        offset_matters=True,
         drift=drift or timing.drift,
         drift_stddev=timing.drift_stddev,
         drift_is_followed=drift != 0,
@@ -234,9 +232,6 @@ def _offset_of_bursts(
         stddev_s=(latest_s - earliest_s) / np.sqrt(12),
         curve=curve_of(pairings, bursts, trajectory),
         offset_matters=False,
-        drift=0.0,
-        drift_stddev=np.inf,
-        drift_is_followed=False,
         reference_s=float(np.mean(bursts.middle_s)),
         note=f"the camera stands still at every photo: any time offset from {earliest_s:+.2f} s to {latest_s:+.2f} s "
         f"gives the same result; {value_s:+.2f} s centres the ranges on the photos",
@@ -272,16 +267,17 @@ def likely_offsets(offsets_s: Sequence[float], log_likelihoods: Sequence[float])
     return list(zip(likely.tolist(), probabilities.tolist()))
 
 
-def likely_fits(fits: list[OffsetFit], num_on_path: Indices, path: PathSamples) -> list[tuple[OffsetFit, float]]:
+def _likely_fits(fits: list[OffsetFit], ranges: TimedRanges, path: PathSamples) -> list[tuple[OffsetFit, float]]:
     """The fits that cannot be ruled out with their probabilities, the likeliest first.
 
     Args:
         fits: at least one of them testable.
-        num_on_path: ranges of the whole log that the offset of each fit puts on the path.
+        ranges: of the whole log.
 
     Raises:
         GeometryError: they are too many to be of use.
     """
+    num_on_path = np.array([np.count_nonzero(path.knows(ranges.times_s + fit.offset_s)) for fit in fits])
     order = [k for k in np.argsort([-fit.score for fit in fits] * num_on_path) if fits[k].is_testable]
     best, most = fits[order[0]], num_on_path[order[0]]
     same_s = max(_SAME_OFFSET_S, _SAME_OFFSET_STDDEVS * min(best.timing().stddev_s, 1.0))

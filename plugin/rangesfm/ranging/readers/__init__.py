@@ -118,29 +118,26 @@ def _choose_readers(paths: Sequence[Path], options: ReadOptions, format: str | N
 
 def _join_logs(logs: Sequence[RangeLog], source: Path) -> RangeLog:
     """All ranges in the order of their times, each between the tag and the anchor of its record."""
-    by_time = {log.timestamp_s is not None for log in logs}
-    if len(by_time) > 1:
+    if len({log.timestamp_s is None for log in logs}) > 1:
         raise InputError("some of the files have times and others have names of photos, expected all alike", source)
     ends = [log.end_ids() for log in logs]
-    times = (
-        np.concatenate([log.timestamp_s for log in logs if log.timestamp_s is not None]) if True in by_time else None
-    )
-    num = sum(map(len, logs))
+    times = [log.timestamp_s for log in logs if log.timestamp_s is not None]
+    columns = {
+        name: np.concatenate([getattr(log, name) for log in logs])
+        for name in ("range_m", "range_stddev_m", "los", "line")
+    }
     joined = RangeLog.from_arrays(
         [anchor_id for _, anchor_ids in ends for anchor_id in anchor_ids],
-        np.concatenate([log.range_m for log in logs]),
-        timestamp_s=times,
-        image_name=None if times is not None else [name for log in logs for name in log.image_name or ()],
-        range_stddev_m=np.concatenate([log.range_stddev_m for log in logs]),
+        timestamp_s=np.concatenate(times) if times else None,
+        image_name=None if times else [name for log in logs for name in log.image_name or ()],
         tag_id=[tag_id for tag_ids, _ in ends for tag_id in tag_ids],
-        los=np.concatenate([log.los for log in logs]),
-        line=np.concatenate([log.line for log in logs]),
         source=source,
         format=logs[0].format,
         num_no_measurement=sum(log.num_no_measurement for log in logs),
         notes=(f"{len(logs)} files as one log", *dict.fromkeys(note for log in logs for note in log.notes)),
+        **columns,
     )
-    return joined.subset(np.argsort(times, kind="stable") if times is not None else np.arange(num))
+    return joined if joined.timestamp_s is None else joined.subset(np.argsort(joined.timestamp_s, kind="stable"))
 
 
 def files_of_log(path: Path) -> list[Path]:

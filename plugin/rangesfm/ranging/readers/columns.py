@@ -24,7 +24,6 @@ from rangesfm.ranging.readers.times import (
     TIME_OF_DAY,
     CivilClock,
     date_order,
-    is_zoned,
 )
 from rangesfm.ranging.readers.units import UNITS_PER_METRE, Ask, days_before_1970, range_unit, time_unit
 from rangesfm.ranging.twr import StampOptions, double_sided_range, single_sided_range
@@ -226,7 +225,8 @@ def _civil_times(table: Table, name: Mapping[str, str], unit: str | None, notes:
     texts = table.text(name["timestamp"])
     if "date" in name:
         texts = [f"{date} {time}" for date, time in zip(table.text(name["date"]), texts)]
-    dates = [match[1] for text in texts if (match := CIVIL_TIME.fullmatch(text))]
+    civil = [match for text in texts if (match := CIVIL_TIME.fullmatch(text))]
+    dates = [match[1] for match in civil]
     order = unit if unit in DATE_ORDERS else date_order(dates) if dates else "ymd"
     if order is None:
         raise ask(DATE_ORDERS, f"dates as {dates[0]}")
@@ -239,7 +239,7 @@ def _civil_times(table: Table, name: Mapping[str, str], unit: str | None, notes:
             raise table.error(row, name["timestamp"], expected) from None
     if texts and TIME_OF_DAY.fullmatch(texts[0]):
         notes.append("times of day without a date: counted from the midnight before the first")
-    elif any(text and not is_zoned(text) for text in texts):
+    elif len(civil) < len(texts) or any(match[5] is None for match in civil):
         notes.append("civil times without a zone are read as UTC")
     return seconds
 

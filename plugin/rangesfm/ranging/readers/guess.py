@@ -113,11 +113,7 @@ def _take_pairs(pairs: Sequence[tuple[Column, Column]], guess: Guess) -> None:
 
 def _names_anchor(column: Column) -> bool:
     words = {*_without_numbers(column)}
-    return (
-        bool(words)
-        and words <= terms.ANCHOR | terms.ANY_ID | terms.ASKED | terms.ID
-        and (column.kind == "text" or column.is_whole)
-    )
+    return bool(words) and words <= terms.ANCHOR | terms.ASKED | terms.ID and (column.kind == "text" or column.is_whole)
 
 
 def _names(columns: Iterable[Column]) -> str:
@@ -349,12 +345,9 @@ def _is_positive(column: Column) -> bool:
 
 
 def _is_id(column: Column) -> bool:
+    is_word = column.num_distinct == 1 and not any(map(str.isdigit, column.cells[0]))  # in each row, as "range:" or "m"
     few = column.num_distinct <= min(_MAX_NUM_IDS, max(2, len(column.cells) // 4))
-    if column.num_distinct == 1 and not any(
-        map(str.isdigit, column.cells[0])
-    ):  # a word in each row, as "range:" or "m"
-        return False
-    return few and (column.kind == "text" or (column.is_whole and bool(np.all(column.numbers >= 0))))
+    return few and not is_word and (column.kind == "text" or (column.is_whole and bool(np.all(column.numbers >= 0))))
 
 
 def _wide_by_values(columns: list[Column], guess: Guess) -> None:

@@ -74,12 +74,6 @@ def _seconds_from_civil(text: str, order: str) -> float:
     return seconds - (-1 if zone[0] == "-" else 1) * (hours * 3600.0 + minutes * 60.0)
 
 
-def is_zoned(text: str) -> bool:
-    """Whether a civil time says its zone."""
-    match = CIVIL_TIME.fullmatch(text)
-    return match is not None and match[5] is not None
-
-
 class CivilClock:
     """Reads civil times one after the other; a time of day goes on counting after midnight."""
 
