@@ -96,12 +96,11 @@ def read_columns(path: Path, columns: Columns, options: ReadOptions, format: str
     ranges = _ranges(table, name, columns, options)
     measured, of_far = which_are_measured(ranges, path)
     notes += of_far
-    row, ranges, anchor = row[measured], ranges[measured], anchor.subset(measured)
-    tag = None if tag is None else tag.subset(measured)
+    row, ranges, anchor, tag = row[measured], ranges[measured], anchor.subset(measured), tag.subset(measured)
     times = None if timestamps is None else timestamps[row]
     unit = "m"
     if "range" in name or columns.wide:
-        pair = anchor.index if tag is None else anchor.index * len(tag.names) + tag.index
+        pair = anchor.index * len(tag.names) + tag.index
         column = name.get("range") or next(iter(columns.wide))
         column = f"{column} {units.get(column, '')}".strip()
         ask = partial(options.which_unit, path, "range")
@@ -133,12 +132,9 @@ def _anchors(table: Table, name: Mapping[str, str], columns: Columns) -> Categor
         if "anchor_id" not in name:
             return _repeated([columns.anchor_id or ""], len(table))
         return _ids(table, name["anchor_id"], columns, None)
-    anchor_ids = [anchor_id for anchor_id, _ in columns.wide.values()]
-    if not any(map(column_of_anchor, anchor_ids)):
-        return _repeated(anchor_ids, len(table))
     each = [
         _ids(table, said, columns, "") if (said := column_of_anchor(anchor_id)) else _repeated([anchor_id], len(table))
-        for anchor_id in anchor_ids
+        for anchor_id, _ in columns.wide.values()
     ]
     names = Categories.of([name for one in each for name in one.names])
     first = np.cumsum([0, *(len(one.names) for one in each)])
@@ -146,19 +142,18 @@ def _anchors(table: Table, name: Mapping[str, str], columns: Columns) -> Categor
     return Categories(names.names, index.ravel())
 
 
-def _tags(table: Table, name: Mapping[str, str], columns: Columns) -> Categories | None:
-    """Tags with several antennas are one for each."""
-    if columns.wide and "tag_id" not in name:
-        return _repeated([tag_id or DEFAULT_TAG_ID for _, tag_id in columns.wide.values()], len(table))
-    tag = _ids(table, name["tag_id"], columns, DEFAULT_TAG_ID) if "tag_id" in name else None
-    if tag is not None and "antenna" in name:
+def _tags(table: Table, name: Mapping[str, str], columns: Columns) -> Categories:
+    """Of each range, as ``_anchors``; tags with several antennas are one for each."""
+    if "tag_id" not in name:
+        tag_ids = [tag_id or DEFAULT_TAG_ID for _, tag_id in columns.wide.values()]
+        return _repeated(tag_ids or [DEFAULT_TAG_ID], len(table))
+    tag = _ids(table, name["tag_id"], columns, DEFAULT_TAG_ID)
+    if "antenna" in name:
         antenna = _ids(table, name["antenna"], columns, "")
         if len(antenna.names) > 1:
             pairs = zip(tag.index.tolist(), antenna.index.tolist())
             tag = Categories.of([f"{tag.names[one]}/{antenna.names[other]}" for one, other in pairs])
-    if tag is not None and columns.wide:
-        return Categories(tag.names, np.repeat(tag.index, len(columns.wide)))
-    return tag
+    return Categories(tag.names, np.repeat(tag.index, max(1, len(columns.wide))))
 
 
 def column_of_anchor(anchor_id: str) -> str | None:
