@@ -10,8 +10,7 @@ from rangesfm.comparison.models import ModelsComparison, carried_by
 from rangesfm.export.metric_map import points_of
 from rangesfm.files.atomic import sole_writer
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.report.chart import page_charts
-from rangesfm.report.page import render, write_page
+from rangesfm.report.page import Section, render, write_page
 from rangesfm.report.plot import WIDE_SIZE, Figure, Series, equal_view, figure_of, from_zero, views_of
 from rangesfm.report.scene import Scene, ScenePath, view_of
 
@@ -28,6 +27,7 @@ def write_comparison(comparison: ModelsComparison, folder: Path) -> Path:
     aligned = [carried_by(row.base_from_model, model.path) for model, row in zip(comparison.models, comparison.rows)]
     title = f"{len(comparison.models)} models of {len(base.path)} photos"
     frame = "first_camera" if base.result is None else base.result.summary.frame
+    similarity, *lengths = comparison.tables
     figures = [*_moved_figure(comparison), _path_figure(comparison, aligned, frame)]
     with sole_writer(folder):
         page = render(
@@ -35,9 +35,11 @@ def write_comparison(comparison: ModelsComparison, folder: Path) -> Path:
             title=f"{title} – rangesfm comparison",
             heading=title,
             view=view_of(_scene(comparison, aligned, frame)),
-            figures=figures,
-            charts=page_charts(figures),
-            tables=comparison.tables,
+            sections=[
+                Section("models", "Models", tables=[similarity]),
+                Section("moved-section", "What moved where", figures),
+                Section("distances", "Distances", tables=lengths),
+            ],
         )
         write_page(page, path)
     return path

@@ -21,26 +21,11 @@ from rangesfm.files.records import write_json
 
 _POINTS_NAME = "transforms_points.ply"
 _FLIP_Y_AND_Z = np.diag([1.0, -1.0, -1.0, 1.0])
-# By COLMAP's camera model: what the parameters after focal lengths and principal point are.
-_DISTORTION: dict[str, tuple[str, ...]] = {
-    "SIMPLE_PINHOLE": (),
-    "PINHOLE": (),
-    "SIMPLE_RADIAL": ("k1",),
-    "RADIAL": ("k1", "k2"),
-    "OPENCV": ("k1", "k2", "p1", "p2"),
-    "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-    "SIMPLE_RADIAL_FISHEYE": ("k1",),
-    "RADIAL_FISHEYE": ("k1", "k2"),
-    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
-}
-# The programs' names of these models.
-_NERFSTUDIO = {
-    name: "OPENCV_FISHEYE" if "FISHEYE" in name else "OPENCV" for name in _DISTORTION if name != "FULL_OPENCV"
-}
-_OPENSFM = {
-    **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), "brown"),
-    "OPENCV_FISHEYE": "fisheye_opencv",
-}
+# COLMAP's camera models that the programs know, and what they call them.
+_PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+_FISHEYE = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
+_NERFSTUDIO = dict.fromkeys(_PERSPECTIVE, "OPENCV") | dict.fromkeys(_FISHEYE, "OPENCV_FISHEYE")
+_OPENSFM = dict.fromkeys(_PERSPECTIVE, "brown") | {"OPENCV_FISHEYE": "fisheye_opencv"}
 _ALL_OF_OPENSFM = {"brown": ("k1", "k2", "k3", "p1", "p2"), "fisheye_opencv": ("k1", "k2", "k3", "k4")}
 _NUM_CONSTRAINTS = 10
 _MIN_TRACK_LENGTH = 3
@@ -53,9 +38,10 @@ def _distortion(camera: pycolmap.Camera, program: str, known: Mapping[str, str])
     name = camera.model.name
     if name not in known:
         raise InputError(f"{program} does not know the camera model {name}, expected one of: {', '.join(known)}")
-    named = {*camera.focal_length_idxs(), *camera.principal_point_idxs()}
-    values = [float(value) for index, value in enumerate(camera.params) if index not in named]
-    return known[name], dict(zip(_DISTORTION[name], values, strict=True))
+    # A model with one coefficient calls it k.
+    names = ["k1" if parameter == "k" else parameter for parameter in camera.params_info.split(", ")]
+    distortion = {names[index]: float(camera.params[index]) for index in camera.extra_params_idxs()}
+    return known[name], distortion
 
 
 def write_nerfstudio(map_: MetricMap, folder: Path) -> Path:

@@ -7,7 +7,7 @@ from pathlib import Path
 from rangesfm.files.atomic import sole_writer
 from rangesfm.report.chart import write_pictures
 from rangesfm.report.content import Content
-from rangesfm.report.page import figures_of, render_report, write_page
+from rangesfm.report.page import render_report, sections_of, write_page
 from rangesfm.result.folder import read_result_folder
 
 __all__ = ["write_report", "write_report_pictures"]
@@ -43,4 +43,5 @@ def write_report_pictures(result_folder: Path) -> list[Path]:
     """
     result = read_result_folder(result_folder)
     with sole_writer(result_folder):
-        return write_pictures(figures_of(Content(result)), result_folder / "figures")
+        figures = [figure for section in sections_of(Content(result)) for figure in section.figures]
+        return write_pictures(figures, result_folder / "figures")

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -29,47 +28,32 @@ CONTENT_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; 
 
 
 class Section(NamedTuple):
-    """A card of the report, which leaves it out if it has neither a figure nor a table."""
+    """A card of a page, which leaves it out if there is neither a figure nor a table with rows in it."""
 
     id: str
     title: str
-    figures: tuple[Callable[[Content], Figure | None], ...]
-    tables: tuple[Callable[[Content], tables.Table], ...]
+    figures: Sequence[Figure] = ()
+    tables: Sequence[tables.Table] = ()
 
 
-SECTIONS = (
-    Section(
-        "path",
-        "Path",
-        (figures_path.trajectory_views, figures_path.map_views, figures_path.local_scale),
-        (tables.comparison,),
+# Of the report: a section's title, and what makes its figures and tables.
+_SECTIONS: dict[str, tuple[Callable[[Content], Figure | tables.Table | None], ...]] = {
+    "Path": (figures_path.trajectory_views, figures_path.map_views, figures_path.local_scale, tables.comparison),
+    "Scale": (
+        *(figures_scale.scale_per_anchor, figures_scale.consensus, figures_scale.clock_curve, figures_scale.candidates),
+        *(tables.scale_by_kind, tables.error_budget, tables.two_candidates, tables.sensitivity),
     ),
-    Section(
-        "scale",
-        "Scale",
-        (
-            figures_scale.scale_per_anchor,
-            figures_scale.consensus,
-            figures_scale.clock_curve,
-            figures_scale.candidates,
-        ),
-        (tables.scale_by_kind, tables.error_budget, tables.two_candidates, tables.sensitivity),
+    "Ranges": (
+        *(figures_ranges.residuals_over_time, figures_ranges.residual_histogram, figures_ranges.absolute_errors),
+        *(tables.range_statuses, tables.ranges_per_anchor),
     ),
-    Section(
-        "ranges",
-        "Ranges",
-        (figures_ranges.residuals_over_time, figures_ranges.residual_histogram, figures_ranges.absolute_errors),
-        (tables.range_statuses, tables.ranges_per_anchor),
+    "Mistakes": (figures_mistakes.mistakes, tables.mistakes),
+    "Anchors": (tables.anchors, tables.distances),
+    "Run": (
+        *(tables.stages, tables.refinement, tables.versions),
+        *(tables.intrinsics, tables.inputs, tables.settings),
     ),
-    Section("mistakes", "Mistakes", (figures_mistakes.mistakes,), (tables.mistakes,)),
-    Section("anchors", "Anchors", (), (tables.anchors, tables.distances)),
-    Section(
-        "run",
-        "Run",
-        (),
-        (tables.stages, tables.refinement, tables.versions, tables.intrinsics, tables.inputs, tables.settings),
-    ),
-)
+}
 STYLES = ("page.css", "view.css")
 _SCRIPTS = (
     *("data", "stage", "points", "cameras", "anchors", "ranges", "grid", "picking", "measuring", "photo_panel"),
@@ -78,19 +62,21 @@ _SCRIPTS = (
 _FILTERS = (text.count, text.duration, text.fixed, text.percent, text.plain, text.sentence, text.signed)
 
 
-def figures_of(content: Content, sections: Iterable[Section] = SECTIONS) -> list[Figure]:
-    """All that there are of this result."""
-    made = (make(content) for section in sections for make in section.figures)
-    return [figure for figure in made if figure is not None]
+def sections_of(content: Content) -> list[Section]:
+    """All that the report has of a result."""
+    sections = []
+    for title, makers in _SECTIONS.items():
+        made = [make(content) for make in makers]
+        figures = [each for each in made if isinstance(each, Figure)]
+        sections.append(
+            Section(title.lower(), title, figures, [each for each in made if isinstance(each, tables.Table)])
+        )
+    return sections
 
 
 def render_report(content: Content) -> str:
     """The report of a result."""
     scene = scene_of(content)
-    sections = [
-        (section.id, section.title, figures_of(content, [section]), [make(content) for make in section.tables])
-        for section in SECTIONS
-    ]
     return render(
         "report.html",
         title=f"{content.title} – rangesfm report",
@@ -99,8 +85,7 @@ def render_report(content: Content) -> str:
         checks=quality_checks(content.summary),
         tiles=_tiles(content),
         view=None if scene is None else view_of(scene),
-        sections=sections,
-        charts=page_charts([figure for _, _, figures, _ in sections for figure in figures]),
+        sections=sections_of(content),
     )
 
 
@@ -118,18 +103,19 @@ def _tiles(content: Content) -> list[tuple[str, str, str]]:
     ]
 
 
-def render(template: str, *, charts: Mapping[str, Any] = MappingProxyType({}), **values: Any) -> str:
+def render(template: str, *, sections: Sequence[Section] = (), **values: Any) -> str:
     """A whole self-contained page.
 
     Args:
-        charts: what the page's figures are drawn from; with them comes the page's script, for its 3-D view as well.
+        sections: with figures in them comes the page's script, for its 3-D view as well.
         values: of the template; whatever is not Markup is escaped.
     """
+    charts = page_charts([figure for section in sections for figure in section.figures])
     script = _script() if charts else None
     policy = CONTENT_POLICY.format(script="'none'" if script is None else _policy_source(script))
     styles = [_asset(name) for name in STYLES]
     page = _environment().get_template(template)
-    return page.render(policy=policy, styles=styles, script=script, charts=charts, **values)
+    return page.render(policy=policy, styles=styles, script=script, charts=charts, sections=sections, **values)
 
 
 def write_page(page: str, path: Path) -> None:

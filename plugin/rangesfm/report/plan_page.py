@@ -15,8 +15,7 @@ from rangesfm.files.atomic import make_output_folder, write_text
 from rangesfm.planning.advice import Advice
 from rangesfm.planning.survey_plan import SurveyPlan
 from rangesfm.ranging.errors.components import component_words
-from rangesfm.report.chart import page_charts
-from rangesfm.report.page import render, write_page
+from rangesfm.report.page import Section, render, write_page
 from rangesfm.report.plot import Figure, Limits, Panel, Pixels, Series, View, equal_view, views_of
 from rangesfm.report.tables import Table
 from rangesfm.report.text import count, duration, fixed, percent, rough
@@ -42,21 +41,22 @@ def write_plan(plan: SurveyPlan, folder: Path) -> list[Path]:
 
 def render_plan(plan: SurveyPlan) -> str:
     """The page, which fetches nothing."""
-    figures = [accuracy_views(plan)]
     title = f"{len(plan.anchors_m)} anchors, {count(len(plan.keyframe_stddevs_m))} keyframes"
+    advice = [
+        _advice("What would gain most for the scale", plan.advice_for_scale),
+        _advice("What would gain most for the place of the keyframe known least", plan.advice_for_place),
+    ]
     return render(
         "plan.html",
         title=f"{title} – rangesfm plan",
         heading=f"Plan: {title}",
         plan=plan,
         tiles=_tiles(plan),
-        figures=figures,
-        charts=page_charts(figures),
-        advice=[
-            _advice("What would gain most for the scale", plan.advice_for_scale),
-            _advice("What would gain most for the place of the keyframe known least", plan.advice_for_place),
+        sections=[
+            Section("path", "Accuracy", [accuracy_views(plan)]),
+            Section("advice", "What to change", tables=advice),
+            Section("expected", "What to expect", tables=[_components(plan), _anchors(plan), _mistakes(plan.mistakes)]),
         ],
-        expected=[_components(plan), _anchors(plan), _mistakes(plan.mistakes)],
     )
 
 
