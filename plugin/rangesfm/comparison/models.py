@@ -13,13 +13,13 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array
 from rangesfm.colmap.model_files import read_model
 from rangesfm.comparison.ranges import ModelRanges, ranges_of_result
-from rangesfm.comparison.with_reference import MIN_NUM_ALIGNED, known_keyframes, text_or_dash
+from rangesfm.comparison.with_reference import known_keyframes, similarity_onto, text_or_dash
 from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
 from rangesfm.files.tables import align_rows
 from rangesfm.geometry.reference import read_reference
-from rangesfm.geometry.similarity import Similarity, rmse, similarity_between
+from rangesfm.geometry.similarity import Similarity, rmse
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.report.tables import Table
 from rangesfm.result.entries import rms
@@ -196,7 +196,7 @@ def _row(base: NamedModel, other: NamedModel, ranges: ModelRanges | None, onto_r
     names, ours, theirs = common_photos(base.path, other.path)
     if not names:
         raise InputError(f"it has no photo in common with {base.name}", other.name)
-    similarity = _similarity(theirs, ours)
+    similarity = similarity_onto(theirs, ours)
     return ModelRow(
         name=other.name,
         num_photos=len(other.path),
@@ -217,14 +217,10 @@ def common_photos(first: Trajectory, second: Trajectory) -> tuple[tuple[str, ...
     return tuple(first.image_names[i] for i in ours), first.centers[ours], second.centers[theirs]
 
 
-def _similarity(source: Array, target: Array) -> Similarity | None:
-    return similarity_between(source, target) if len(source) >= MIN_NUM_ALIGNED else None
-
-
 def _onto(goal: Trajectory, path: Trajectory) -> Similarity | None:
     """What carries a path onto another of the same photos."""
     _, target, source = common_photos(goal, path)
-    return _similarity(source, target)
+    return similarity_onto(source, target)
 
 
 def _range_rms(ranges: ModelRanges, model: NamedModel, onto_ranges: Similarity) -> tuple[float, float] | None:
@@ -248,27 +244,27 @@ def _taped(
     onto_ranges: Sequence[Similarity | None],
     tape: Tape,
 ) -> Iterator[TapedRow]:
-    anchors = {} if ranges is None else ranges.anchors_m
-    own = [_taped_lengths(model, tape, 1.0, anchors) for model in models]
-    placed = [
-        _taped_lengths(model, tape, None if onto is None else onto.scale, anchors)
-        for model, onto in zip(models, onto_ranges)
-    ]
-    for row, taped in enumerate(tape.distances):
-        lengths, lengths_m = (tuple(of_model[row] for of_model in all_of_it) for all_of_it in (own, placed))
+    anchors_m = {} if ranges is None else ranges.anchors_m
+    of_models = [_taped_lengths(model, tape, onto, anchors_m) for model, onto in zip(models, onto_ranges)]
+    for taped, of_row in zip(tape.distances, zip(*of_models)):
+        lengths, lengths_m = zip(*of_row)
         yield TapedRow(taped.ends, taped.distance_m, lengths, None if ranges is None else lengths_m)
 
 
 def _taped_lengths(
-    model: NamedModel, tape: Tape, scale: float | None, anchors_m: Mapping[str, Array]
-) -> list[float | None]:
-    if model.model is None or scale is None:
-        return [None] * len(tape.distances)
+    model: NamedModel, tape: Tape, onto_ranges: Similarity | None, anchors_m: Mapping[str, Array]
+) -> list[tuple[float | None, float | None]]:
+    """Of each distance, in the model's unit and carried onto the placed path."""
+    unknown = [None] * len(tape.distances)
+    if model.model is None:
+        return list(zip(unknown, unknown))
     try:
         located = locate_distances(tape, model.model, list(anchors_m))
     except InputError as error:
         raise InputError(f"{error} (model {model.name})") from None
-    return [float(length) for length in located.lengths_m(scale, np.array(list(anchors_m.values())).reshape(-1, 3))]
+    places = np.array(list(anchors_m.values())).reshape(-1, 3)
+    carried = unknown if onto_ranges is None else located.lengths_m(onto_ranges.scale, places).tolist()
+    return list(zip(located.lengths_m(1.0, places).tolist(), carried))
 
 
 def lengths_along(paths: Sequence[Trajectory]) -> tuple[Length, ...]:

@@ -117,7 +117,13 @@ def ranges_of_survey(
     path = trajectory_from_reconstruction(model, times)
     log = inputs.log
     if log.timestamp_s is not None:
-        log = replace(log, timestamp_s=log.timestamp_s + _offsets_s(survey, inputs, path))
+        offset_s: float | Array | None = survey.ranges.time_offset_s
+        if offset_s is None:
+            found = estimate_time_offset(
+                log, path, inputs.tag_in_cam_m, association=survey.ranges, seed=survey.output.seed
+            )
+            offset_s = found.at(log.timestamp_s)
+        log = replace(log, timestamp_s=log.timestamp_s + offset_s)
     observations = associate(log, path, inputs.tag_in_cam_m, options=survey.ranges)
     if not observations.has_place.any():
         raise InputError("no range is at a photo of the model: are --images and the time offset theirs?", log.source)
@@ -142,13 +148,3 @@ def ranges_of_survey(
         metric_path=path.transformed(metric.scale, metric.rotation, metric.translation + to_site),
         association=survey.ranges,
     )
-
-
-def _offsets_s(survey: Survey, inputs: RangingInputs, path: Trajectory) -> float | Array:
-    """(n,) image time minus range time, or one for all."""
-    if survey.ranges.time_offset_s is not None or inputs.log.timestamp_s is None:
-        return survey.ranges.time_offset_s or 0.0
-    offset = estimate_time_offset(
-        inputs.log, path, inputs.tag_in_cam_m, association=survey.ranges, seed=survey.output.seed
-    )
-    return offset.at(inputs.log.timestamp_s)

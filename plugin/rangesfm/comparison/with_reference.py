@@ -12,7 +12,7 @@ from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.tables import align_rows
 from rangesfm.geometry.reference import Reference
-from rangesfm.geometry.similarity import align_points, rmse, similarity_between
+from rangesfm.geometry.similarity import Similarity, align_points, rmse, similarity_between
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.result.entries import ComparisonRow
 
@@ -57,8 +57,8 @@ def with_true_scale(path: Trajectory, reference: Reference, *, frame: str = "sit
     A path whose scale the reference does not tell comes back unchanged.
     """
     known, positions, _ = known_keyframes(path, reference)
-    scale = _scale_to(path.centers[known], positions)
-    return path if scale is None else path.resized(scale, frame)
+    found = similarity_onto(path.centers[known], positions)
+    return path if found is None else path.resized(found.scale, frame)
 
 
 def reference_in_frame(path: Trajectory, reference: Reference, *, frame: str | None = "site") -> Reference | None:
@@ -103,26 +103,24 @@ def _compare_path(name: str, path: Trajectory, reference: Reference, frame: str 
         raise InputError(reference.why_nothing_is_known("keyframes", path.image_names, path.timestamps_s))
     source = path.centers[known]
     in_frame = _in_frame(path, known, target, world_from_cam, frame)
-    is_aligned = len(source) >= MIN_NUM_ALIGNED
-    scale = _scale_to(source, target)
+    found = similarity_onto(source, target)
+    aligned_m: list[float | None] = [None, None]
+    if len(source) >= MIN_NUM_ALIGNED:
+        alignments = [align_points(source, target, with_scale=with_scale) for with_scale in (False, True)]
+        aligned_m = [rmse(each.apply(source) - target) for each in alignments]
     return ComparisonRow(
         name=name,
         num_keyframes=len(source),
         rmse_m=None if in_frame is None else rmse(source - in_frame),
-        rmse_se3_m=_aligned_rmse(source, target, with_scale=False) if is_aligned else None,
-        rmse_sim3_m=_aligned_rmse(source, target, with_scale=True) if is_aligned else None,
-        scale_error_percent=None if scale is None else 100.0 * (1.0 / scale - 1.0),
+        rmse_se3_m=aligned_m[0],
+        rmse_sim3_m=aligned_m[1],
+        scale_error_percent=None if found is None else 100.0 * (1.0 / found.scale - 1.0),
     )
 
 
-def _aligned_rmse(source: Array, target: Array, *, with_scale: bool) -> float:
-    return rmse(align_points(source, target, with_scale=with_scale).apply(source) - target)
-
-
-def _scale_to(source: Array, target: Array) -> float | None:
-    """Scale of the best similarity from source to target; None where there is none."""
-    found = similarity_between(source, target) if len(source) >= MIN_NUM_ALIGNED else None
-    return None if found is None else found.scale
+def similarity_onto(source: Array, target: Array) -> Similarity | None:
+    """From source to target; None where there is none, or too few points for it to say anything."""
+    return similarity_between(source, target) if len(source) >= MIN_NUM_ALIGNED else None
 
 
 def format_table(rows: tuple[ComparisonRow, ...]) -> str:

@@ -66,11 +66,7 @@ def write_features(map_: MetricMap, path: Path, driver: str) -> Path:
     Raises:
         InputError: the map is not georeferenced, or pyogrio is not installed.
     """
-    if map_.georeference is None:
-        raise InputError(
-            f"the format {path.suffix[1:]!r} needs a georeferenced map: anchors with [anchors] crs, or origin_anchor, "
-            "origin_lat_lon_height and heading_deg"
-        )
+    georeference = map_.georeference_for(f"the format {path.suffix[1:]!r} needs a georeferenced map")
     try:
         import pyogrio.raw
     except ImportError:
@@ -79,7 +75,6 @@ def write_features(map_: MetricMap, path: Path, driver: str) -> Path:
     trajectory = map_.trajectory
     places = np.concatenate([trajectory.centers, np.array(list(anchors.values())).reshape(-1, 3)])
     is_projected = driver == "GPKG"
-    georeference = map_.georeference
     coordinates = georeference.projected(places) if is_projected else georeference.geographic(places)
     times = np.full(len(trajectory), np.nan) if trajectory.timestamps_s is None else trajectory.timestamps_s
     names = np.array([*trajectory.image_names, *anchors], dtype=object)

@@ -60,6 +60,13 @@ class MetricMap:
     def trajectory(self) -> Trajectory:
         return trajectory_from_reconstruction(self.reconstruction, self.timestamps_s)
 
+    def georeference_for(self, need: str) -> Georeference:
+        """The georeference, or InputError with what needs it and how the map comes by one."""
+        if self.georeference is None:
+            how = "anchors with [anchors] crs, or origin_anchor, origin_lat_lon_height and heading_deg"
+            raise InputError(f"{need}: {how}")
+        return self.georeference
+
 
 def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     """Those that have a pose, by their names."""
@@ -84,12 +91,7 @@ def in_frame(map_: MetricMap, options: ExportOptions) -> MetricMap:
         return map_
     if options.frame == "level":
         return moved(map_, Similarity(1.0, _level_from_world(map_, options.up), np.zeros(3)))
-    if map_.georeference is None:
-        raise InputError(
-            "the frame 'enu' needs a georeference: anchors with [anchors] crs, or origin_anchor, "
-            "origin_lat_lon_height and heading_deg"
-        )
-    return moved(map_, map_.georeference.enu_from_world)
+    return moved(map_, map_.georeference_for("the frame 'enu' needs a georeference").enu_from_world)
 
 
 def moved(map_: MetricMap, new_from_old: Similarity) -> MetricMap:

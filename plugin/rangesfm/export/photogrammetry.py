@@ -75,8 +75,7 @@ def write_nerfstudio(map_: MetricMap, folder: Path) -> Path:
 
 
 def _frame(image: pycolmap.Image) -> dict[str, Any]:
-    world_from_cam = np.eye(4)
-    world_from_cam[:3] = image.cam_from_world().inverse().matrix()
+    world_from_cam = np.vstack([image.cam_from_world().inverse().matrix(), [0, 0, 0, 1]])
     return {"file_path": f"images/{image.name}", "transform_matrix": (world_from_cam @ _FLIP_Y_AND_Z).tolist()}
 
 

@@ -54,18 +54,16 @@ def _write_vertices(
     path: Path, xyz: Array, colors: npt.ArrayLike, normals: Array | None = None, comment: str | None = None
 ) -> Path:
     """Positions as doubles, so that coordinates far from the origin keep their millimetres; (n, 3) colours or one."""
-    rgb = np.broadcast_to(np.asarray(colors, dtype=np.uint8), xyz.shape)
-    columns: list[tuple[str, str, npt.NDArray[Any]]] = [(name, "f8", xyz[:, i]) for i, name in enumerate("xyz")]
+    columns: dict[str, npt.NDArray[Any]] = dict(zip("xyz", xyz.T.astype("<f8")))
     if normals is not None:
-        columns += [(name, "f4", normals[:, i]) for i, name in enumerate(("nx", "ny", "nz"))]
-    columns += [(name, "u1", rgb[:, i]) for i, name in enumerate(("red", "green", "blue"))]
-    vertices = np.empty(len(xyz), dtype=[(name, "<" + code) for name, code, _ in columns])
-    for name, _, values in columns:
-        vertices[name] = values
+        columns |= zip(("nx", "ny", "nz"), normals.T.astype("<f4"))
+    columns |= zip(("red", "green", "blue"), np.broadcast_to(np.asarray(colors, dtype=np.uint8), xyz.shape).T)
+    kind = [(name, values.dtype) for name, values in columns.items()]
+    vertices = np.rec.fromarrays(columns.values(), dtype=kind)
     header = ["ply", "format binary_little_endian 1.0", "comment metres"]
     header += [f"comment {comment}"] if comment else []
     header += [f"element vertex {len(xyz)}"]
-    header += [f"property {PLY_TYPES[code]} {name}" for name, code, _ in columns]
+    header += [f"property {PLY_TYPES[values.dtype.str[1:]]} {name}" for name, values in columns.items()]
     with new_file(path) as temporary:
         temporary.write_bytes("\n".join([*header, "end_header\n"]).encode("ascii") + vertices.tobytes())
     return path

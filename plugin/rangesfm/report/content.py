@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -93,11 +93,25 @@ class Content:
 
     @cached_property
     def true_ranges_m(self) -> Array | None:
-        """(n,) by the reference, NaN where it says nothing; None where it says nothing at all."""
-        if self.ranges is None or self.final is None or not self.reference_by_photo:
+        """(n,) distances by the reference from the tag to the anchor, NaN where it says nothing; None: nowhere.
+
+        Only of ranges used and taken at a photo: what the camera did in between the reference may not say. The camera
+        is turned as in the final map, and anchors stand where that has them.
+        """
+        ranges, path = self.ranges, self.final
+        if ranges is None or path is None:
             return None
         anchors_m = self.result.anchor_positions_m
-        distances = true_ranges_m(self.ranges, self.final, self.reference_by_photo, anchors_m, self.tags_in_cam_m)
+        index_of = {name: i for i, name in enumerate(path.image_names)}
+        distances = np.full(len(ranges.status), np.nan)
+        for row in np.flatnonzero(np.isfinite(ranges.weight) & ranges.is_used):
+            weight = float(ranges.weight[row])
+            name = (ranges.keyframe_before if weight < 0.5 else ranges.keyframe_after)[row]
+            position, anchor = self.reference_by_photo.get(name), anchors_m.get(ranges.anchor_id[row])
+            is_at_photo = min(weight, 1 - weight) <= MAX_KEYFRAME_SHARE and name in index_of
+            if is_at_photo and position is not None and anchor is not None:
+                tag = position + path.world_from_cam[index_of[name]] @ self.tags_in_cam_m[row]
+                distances[row] = np.linalg.norm(tag - anchor)
         return distances if np.isfinite(distances).any() else None
 
 
@@ -131,29 +145,3 @@ def _range_times(ranges: RangesAsUsed, image_times_s: dict[str, float]) -> Array
     times = np.where(np.isfinite(ranges.timestamp_s), ranges.timestamp_s, of_image)
     since_first: Array = times - np.min(times, initial=np.inf, where=np.isfinite(times))
     return since_first
-
-
-def true_ranges_m(
-    ranges: RangesAsUsed,
-    path: Trajectory,
-    reference_by_photo: Mapping[str, Array],
-    anchors_m: Mapping[str, Array],
-    tags_in_cam_m: Array,
-) -> Array:
-    """(n,) distances from the tag at the reference's camera to the anchor, NaN where unknown.
-
-    Only of ranges used and taken at a photo: what the camera did in between the reference may
-    not say. The camera is turned as in ``path``, with each range's tag at ``tags_in_cam_m`` (n, 3) in its frame;
-    anchors stand where the map has them.
-    """
-    index_of = {name: i for i, name in enumerate(path.image_names)}
-    distances = np.full(len(ranges.status), np.nan)
-    for row in np.flatnonzero(np.isfinite(ranges.weight) & ranges.is_used):
-        weight = float(ranges.weight[row])
-        name = (ranges.keyframe_before if weight < 0.5 else ranges.keyframe_after)[row]
-        position, anchor = reference_by_photo.get(name), anchors_m.get(ranges.anchor_id[row])
-        is_at_photo = min(weight, 1 - weight) <= MAX_KEYFRAME_SHARE and name in index_of
-        if is_at_photo and position is not None and anchor is not None:
-            tag = position + path.world_from_cam[index_of[name]] @ tags_in_cam_m[row]
-            distances[row] = np.linalg.norm(tag - anchor)
-    return distances

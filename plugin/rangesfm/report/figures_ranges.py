@@ -39,7 +39,7 @@ _COLORS = {"measured": "rejected", "scaled": "before", "refined": "after"}
 def residuals_over_time(content: Content) -> Figure | None:
     """One panel for each anchor: residuals of its ranges before and after the refinement."""
     ranges = content.ranges
-    if ranges is None or not _has_residuals(ranges):
+    if ranges is None or not _of_used(ranges):
         return None
     panels = tuple(_residual_panel(content, ranges, anchor_id) for anchor_id in in_natural_order(ranges.anchor_id))
     caption = (
@@ -52,7 +52,7 @@ def residuals_over_time(content: Content) -> Figure | None:
 def residual_histogram(content: Content) -> Figure | None:
     """Distribution of the residuals of the ranges used, before and after."""
     ranges = content.ranges
-    if ranges is None or not _has_residuals(ranges):
+    if ranges is None or not _of_used(ranges):
         return None
     limit = _residual_limit(ranges)
     edges = np.linspace(-limit, limit, NUM_HISTOGRAM_BINS + 1)
@@ -141,10 +141,6 @@ def _of_used(ranges: RangesAsUsed) -> dict[str, Array]:
     """Residuals that are known, of the ranges used, by model."""
     used = {name: residuals[ranges.is_used] for name, residuals in ranges.residuals_by_model_m.items()}
     return {name: residuals[np.isfinite(residuals)] for name, residuals in used.items() if np.isfinite(residuals).any()}
-
-
-def _has_residuals(ranges: RangesAsUsed) -> bool:
-    return "scaled" in _of_used(ranges)
 
 
 def _residual_limit(ranges: RangesAsUsed) -> float:

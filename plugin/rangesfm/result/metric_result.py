@@ -165,10 +165,5 @@ class MetricResult:
 
 
 def _moved_anchor(anchor: AnchorEstimate, offset_m: Array) -> AnchorEstimate:
-    prior, mirror = anchor.prior_position_m, anchor.mirror_position_m
-    return replace(
-        anchor,
-        position_m=anchor.position_m + offset_m,
-        prior_position_m=None if prior is None else prior + offset_m,
-        mirror_position_m=None if mirror is None else mirror + offset_m,
-    )
+    places = {name: getattr(anchor, name) for name in ("position_m", "prior_position_m", "mirror_position_m")}
+    return replace(anchor, **{name: at + offset_m for name, at in places.items() if at is not None})
