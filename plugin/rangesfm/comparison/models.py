@@ -113,11 +113,16 @@ class ModelsComparison:
     @property
     def tables(self) -> tuple[Table, ...]:
         """All that is to be read; of what there is none, without rows."""
-        names = [model.name for model in self.models]
+        cells, names = [_cells(row) for row in self.rows], [model.name for model in self.models]
         of_row = [f"{name} after Sim(3)" for name in names] if self.taped and self.taped[0].lengths_m else []
         distances = [[f"{a} to {b}", *(f"{length:.4f}" for length in lengths)] for a, b, lengths in self.distances]
         return (
-            Table("Each model against the first", _HEADER, [_cells(row) for row in self.rows], _NOTE),
+            Table(
+                "Each model against the first",
+                [name for name, _ in cells[0]],
+                [[text for _, text in row] for row in cells],
+                _NOTE,
+            ),
             Table("Distances between photos, in each model's unit", ["distance", *names], distances),
             Table(
                 "Taped distances",
@@ -289,18 +294,6 @@ def reprojection_rms_px(reconstruction: pycolmap.Reconstruction) -> float:
     return rmse(np.concatenate(errors))
 
 
-_HEADER = (
-    "model",
-    "photos in common",
-    "scale",
-    "turn deg",
-    "moved",
-    "after Sim(3)",
-    "most",
-    "reproj. px",
-    "range RMS m",
-    "after Sim(3)",
-)
 _NOTE = (
     "Scale and turn carry a model onto the first. Moved: RMS distance of the cameras from where the first has "
     "them, as they are and after that similarity, in the first's unit. Range RMS: of the ranges used, with the "
@@ -312,18 +305,20 @@ _TAPED_NOTE = (
 )
 
 
-def _cells(row: ModelRow) -> list[str]:
-    similarity, aligned = row.base_from_model, row.moved_aligned
+def _cells(row: ModelRow) -> list[tuple[str, str]]:
+    """Each with what its column is called."""
+    similarity, aligned, range_rms_m = row.base_from_model, row.moved_aligned, row.range_rms_m or (None, None)
     return [
-        row.name,
-        f"{len(row.common_names)} of {row.num_photos}",
-        text_or_dash(None if similarity is None else similarity.scale, ".6g"),
-        text_or_dash(row.rotation_deg, ".3f"),
-        text_or_dash(rmse(row.moved[:, None]), ".4f"),
-        text_or_dash(None if aligned is None else rmse(aligned[:, None]), ".4f"),
-        text_or_dash(None if aligned is None else float(aligned.max()), ".4f"),
-        text_or_dash(row.reprojection_rms_px, ".4f"),
-        *(text_or_dash(value, ".4f") for value in row.range_rms_m or (None, None)),
+        ("model", row.name),
+        ("photos in common", f"{len(row.common_names)} of {row.num_photos}"),
+        ("scale", text_or_dash(None if similarity is None else similarity.scale, ".6g")),
+        ("turn deg", text_or_dash(row.rotation_deg, ".3f")),
+        ("moved", text_or_dash(rmse(row.moved[:, None]), ".4f")),
+        ("after Sim(3)", text_or_dash(None if aligned is None else rmse(aligned[:, None]), ".4f")),
+        ("most", text_or_dash(None if aligned is None else float(aligned.max()), ".4f")),
+        ("reproj. px", text_or_dash(row.reprojection_rms_px, ".4f")),
+        ("range RMS m", text_or_dash(range_rms_m[0], ".4f")),
+        ("after Sim(3)", text_or_dash(range_rms_m[1], ".4f")),
     ]
 
 

@@ -130,9 +130,7 @@ def format_table(rows: tuple[ComparisonRow, ...]) -> str:
         (
             row.name,
             str(row.num_keyframes),
-            text_or_dash(row.rmse_m, ".4f"),
-            text_or_dash(row.rmse_se3_m, ".4f"),
-            text_or_dash(row.rmse_sim3_m, ".4f"),
+            *(text_or_dash(length_m, ".4f") for length_m in (row.rmse_m, row.rmse_se3_m, row.rmse_sim3_m)),
             text_or_dash(row.scale_error_percent, "+.3f", " %"),
         )
         for row in rows
