@@ -21,7 +21,7 @@ from rangesfm.report.content import Content
 from rangesfm.report.plot import every_nth
 from rangesfm.report.text import count
 from rangesfm.result.entries import AnchorEntry
-from rangesfm.result.metric_result import USED
+from rangesfm.result.tables import USED_LABELS
 
 MAX_NUM_POINTS = 500_000
 MAX_NUM_RANGES = 20_000
@@ -37,7 +37,6 @@ _SEEN_QUANTILE = 0.05
 _FRUSTUM_SHAPE = (0.6, 0.4)
 _RADIUS_OF_95_PERCENT = 2.80
 """Of a three-dimensional normal distribution, in stddevs."""
-_USED = [status.label for status in USED]
 
 
 @dataclass(frozen=True)
@@ -237,7 +236,7 @@ def _ranges(content: Content, path: Trajectory) -> dict[str, Any] | None:
         "tags_in_cam_m": tags.tolist(),
         "tag": pack(tag.reshape(-1), "uint8"),
         "statuses": statuses,
-        "shown_at_first": [name in _USED for name in statuses],
+        "shown_at_first": [name in USED_LABELS for name in statuses],
         "status": pack(status[rows], "uint8"),
         "time": pack(content.range_times_s[rows], "float32"),
         "measured": pack(ranges.range_m[rows], "float32"),

@@ -91,6 +91,12 @@ def mistakes(content: Content) -> Table:
     Of a kind that was not found, as with each of the anchors, the likeliest stands for all.
     """
     tests, rows = content.summary.tests, []
+    numbers = {
+        "stddev": "stddev",
+        "smallest_detectable": "smallest found",
+        "effect_on_scale": "of the scale",
+        "effect_on_place_m": "of places m",
+    }
     likeliest: set[str] = set()
     for i, test in enumerate(tests):
         if not test.rejected and test.name in likeliest:
@@ -101,24 +107,13 @@ def mistakes(content: Content) -> Table:
         bar = Markup('<meter min="0" max="1" high="0.5" optimum="0" value="{:.3f}"></meter>').format(filled)
         unfound = "would not be found" if test.smallest_detectable is None else "not found"
         others = f" ({num_others} others like it: less evidence)" if num_others else ""
-        names = ("stddev", "smallest_detectable", "effect_on_scale", "effect_on_place_m")
-        cells = _cells(f"tests.{i}", test, dict.fromkeys(names, partial(fixed, decimals=4)))
+        cells = _cells(f"tests.{i}", test, dict.fromkeys(numbers, partial(fixed, decimals=4)))
         unit = "share" if test.unit == "1" else test.unit
         verdict = "found" if test.rejected else unfound
         rows.append([mistake(test.name, test.subject), f"{test.words}{others}", bar, verdict, unit, *cells])
     return Table(
         "Mistakes that may have been made",
-        [
-            "mistake",
-            "if it was made",
-            "evidence",
-            "",
-            "unit",
-            "stddev",
-            "smallest found",
-            "of the scale",
-            "of places m",
-        ],
+        ["mistake", "if it was made", "evidence", "", "unit", *numbers.values()],
         rows,
         f"A bar more than half full is beyond chance{_from_stddevs(tests)}. What is not found may still be there, "
         "smaller than the smallest that is found; the last two columns say what that may do, to the scale as a share "

@@ -19,6 +19,7 @@ from rangesfm.result.metric_result import USED, MetricResult
 
 _Kind = TypeVar("_Kind", bound="TableFile")
 _TEXT = "s"
+USED_LABELS = [status.label for status in USED]
 
 
 class Column(NamedTuple):
@@ -172,7 +173,7 @@ class RangesAsUsed(TableFile):
     @property
     def is_used(self) -> Mask:
         """(n,) ranges with a say in the final model, however small."""
-        return np.isin(np.array(self.status, dtype=str), [status.label for status in USED])
+        return np.isin(np.array(self.status, dtype=str), USED_LABELS)
 
 
 @dataclass(frozen=True)
