@@ -15,6 +15,7 @@ from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
+from rangesfm.trust.finished_map import MISMATCHED, points_apart
 
 # No surveyor measures the heights of three anchors to be the same to a millimetre, nor puts two into one place.
 _SAME_HEIGHT_M, _SAME_PLACE_M = 1e-3, 0.01
@@ -148,10 +149,7 @@ def notes_on_model(model: pycolmap.Reconstruction) -> Iterator[str]:
     """Of a model that was brought along."""
     errors = point_errors(model)
     if not errors.fit:
-        yield (
-            f"the model's points lie {errors.median_px:.3g} px (median) from where its photos show them, expected "
-            f"below {errors.max_median_px:.3g} px: check that model, photos and the camera's parameters belong together"
-        )
+        yield f"{points_apart('the model', errors, 'its photos')}: {MISMATCHED}"
         return
     off_px = {name: off for name, off in photo_errors_px(model).items() if off > errors.max_median_px}
     if off_px:

@@ -1,4 +1,7 @@
-"""What speaks against a finished map, whatever its scale's interval says; and how far to trust its place."""
+"""What speaks against a finished map, whatever its scale's interval says; and how far to trust its place.
+
+A refined map is first compared with the scaled one that the refinement began with: it may have broken it.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +9,19 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pycolmap
 
 from rangesfm.arrays import Array
-from rangesfm.colmap.reprojection import PointErrors
-from rangesfm.geometry.similarity import similarity_motions
+from rangesfm.colmap.reprojection import PointErrors, point_errors
+from rangesfm.geometry.similarity import IDENTITY, align_most, path_shape, similarity_motions
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
 from rangesfm.refine.with_ranges import RefineSummary
 from rangesfm.scale.estimate import NORMAL_95, ScaleEstimate
+from rangesfm.scale.verdict import DOUBTFUL_ABOVE
 
-DOUBTFUL_ABOVE = 0.04
-"""Half of the 95 % interval from which a place is called doubtful: of the site's size, or of a radian for the heading;
-the scale's own limit, so that no length in the map and no place in it is worse."""
-
+MISMATCHED = "check that model, photos and the camera's parameters belong together"
 # Prior stddevs that a coordinate may be off: by chance one in two thousand is.
 _MAX_STDDEVS = 3.5
 # Noise of UWB radios in the open is 0.02 to 0.3 m.
@@ -26,6 +29,17 @@ _MAX_NOISE_M = 0.4
 # Share of an anchor's ranges below which it had no say, and how many it takes to speak of a share.
 _MIN_USED, _MIN_RANGES = 0.5, 10
 _CHECK_ANCHOR = "measure the anchors again, and see that each stands in the open and has its own label"
+# What the solver may pay in pixels is bounded (see ``_max_growth``); that bound is of sums of squares, and compared are
+# medians, which know nothing of a few large ones.
+_OF_MEDIANS = 1.5
+# In errors typical before: of one that is large. Of so many more points, it is not a matter of a few.
+_LARGE, _MANY_MORE = 10.0, 0.05
+# Of the median distance of the points from the middle of the path.
+_MAX_POINTS_GROWTH = 2.0
+# Of the median residual of the ranges, or of their stddev: a refinement brings them nearer.
+_MAX_RESIDUAL_GROWTH = 2.0
+# Half widths of the scale's 95 % interval: beyond them it is no longer the same map.
+_MAX_HALF_WIDTHS = 3.0
 
 
 @dataclass(frozen=True)
@@ -81,16 +95,28 @@ def doubts_of_map(
     )
 
 
+def points_apart(whose: str, points: PointErrors, photos: str = "the photos") -> str:
+    """In words, how far points are that fit no photos."""
+    return (
+        f"{whose}'s points lie {points.median_px:.3g} px (median) from where {photos} show them, expected below "
+        f"{points.max_median_px:.3g} px"
+    )
+
+
+def _surveyed(anchors: Sequence[AnchorEstimate]) -> Iterator[tuple[str, Array, float]]:
+    """Of anchors that were measured, and not exactly: the id, how far each went from there (3,), and its stddev."""
+    for anchor in anchors:
+        prior_m, stddev_m = anchor.prior_position_m, anchor.prior_position_stddev_m
+        if prior_m is not None and 0 < stddev_m < np.inf:
+            yield anchor.anchor_id, anchor.position_m - prior_m, stddev_m
+
+
 def _of_fit(
     estimate: ScaleEstimate, summary: RefineSummary | None, refined_scale: float | None, points: PointErrors
 ) -> Iterator[Doubt]:
     """Of points that do not fit the photos, of the solver, and of a scale that the refinement took elsewhere."""
     if not points.fit:
-        reason = (
-            f"the map's points lie {points.median_px:.3g} px (median) from where the photos show them, expected below "
-            f"{points.max_median_px:.3g} px"
-        )
-        yield Doubt(reason, "check that model, photos and the camera's parameters belong together")
+        yield Doubt(points_apart("the map", points), MISMATCHED)
     if summary is not None and not summary.converged:
         remedy = "give it more iterations ([refine] max_num_iterations), or the map fewer wrong points"
         yield Doubt(f"the refinement stopped before it converged: {summary.message}", remedy)
@@ -115,15 +141,11 @@ def _of_say(observations: RangeObservations) -> Iterator[Doubt]:
 
 
 def _of_positions(anchors: Sequence[AnchorEstimate]) -> Iterator[Doubt]:
-    for anchor in anchors:
-        prior_m, stddev_m = anchor.prior_position_m, anchor.prior_position_stddev_m
-        if prior_m is None or not 0 < stddev_m < np.inf:
-            continue
-        moved_m = anchor.position_m - prior_m
+    for anchor_id, moved_m, stddev_m in _surveyed(anchors):
         worst = int(np.argmax(np.abs(moved_m)))
         if abs(moved_m[worst]) > _MAX_STDDEVS * stddev_m:
             reason = (
-                f"anchor {anchor.anchor_id} fits {abs(moved_m[worst]):.2f} m from where it was surveyed (along "
+                f"anchor {anchor_id} fits {abs(moved_m[worst]):.2f} m from where it was surveyed (along "
                 f"{'xyz'[worst]}), {abs(moved_m[worst]) / stddev_m:.2g} of its stddevs"
             )
             yield Doubt(reason, _CHECK_ANCHOR)
@@ -159,10 +181,8 @@ def place_of_map(
     if estimate.placement is None:
         return None
     found = None if summary is None else summary.covariance
-    if found is None:
-        of_map, of_keyframes = by_similarity(estimate.placement, centers_m)
-    else:
-        of_map, of_keyframes = found.similarity, found.centers
+    of_one_piece = by_similarity(estimate.placement, centers_m)
+    of_map, of_keyframes = of_one_piece if found is None else (found.similarity, found.centers)
     stddevs = np.sqrt(np.maximum(np.diag(of_map), 0.0))
     heading_deg = float(np.rad2deg(stddevs[3]))
     worst_m = float(np.sqrt(np.trace(of_keyframes, axis1=1, axis2=2).max()))
@@ -172,6 +192,7 @@ def place_of_map(
         f"the map's place is known to {np.linalg.norm(stddevs[4:]):.2g} m, its heading to {heading_deg:.2g} deg, each "
         f"keyframe to {worst_m:.2g} m or better (1 stddev)"
     )
+    # The scale's own limit, of the site's size and of a radian: no length in the map and no place in it is worse.
     is_wide = NORMAL_95 * worst_m > DOUBTFUL_ABOVE * size_m or NORMAL_95 * stddevs[3] > DOUBTFUL_ABOVE
     reasons = (*((summary_of_place,) if is_wide or not doubts else ()), *(doubt.reason for doubt in doubts))
     x_m, y_m, z_m = stddevs[4:].tolist()
@@ -184,3 +205,86 @@ def by_similarity(placement: Array, centers_m: Array) -> tuple[Array, Array]:
     to_middle = np.eye(7)
     to_middle[4:] = from_first.mean(axis=0)
     return to_middle @ placement @ to_middle.T, from_first @ placement @ np.swapaxes(from_first, 1, 2)
+
+
+def why_broken(
+    scaled: pycolmap.Reconstruction,
+    refined: pycolmap.Reconstruction,
+    trajectory: Trajectory,
+    estimate: ScaleEstimate,
+    summary: RefineSummary,
+    range_loss_scale: float,
+) -> tuple[str, ...]:
+    """What a refined map cannot be; empty if nothing speaks against it.
+
+    Args:
+        scaled, refined: before and after, in the same metric world.
+        trajectory: of the keyframes, in any world.
+        range_loss_scale: of the refinement's options.
+    """
+    before, after = point_errors(scaled), point_errors(refined)
+    old, new = (trajectory.as_in(model).centers for model in (scaled, refined))
+    return (
+        *_out_of_line(before, after, summary, _max_growth(scaled, summary, range_loss_scale)),
+        *_elsewhere(before.points - old.mean(axis=0), after.points - new.mean(axis=0), old, new, estimate),
+        *_apart_from_ranges(estimate, summary, old),
+    )
+
+
+def _max_growth(scaled: pycolmap.Reconstruction, summary: RefineSummary, range_loss_scale: float) -> float:
+    """By how much the typical reprojection error may grow.
+
+    The solver only goes down, and the loss of a range is bounded by half the square of its scale c: so n ranges can pay
+    for at most n c^2 in squared pixel stddevs, which spread over the 2 N coordinates of N observations.
+    """
+    num_ranges = int(np.count_nonzero(summary.observations.status <= RangeStatus.OUTLIER))
+    num_coordinates = 2 * max(scaled.compute_num_observations(), 1)
+    return _OF_MEDIANS * float(np.sqrt(1 + num_ranges * range_loss_scale**2 / num_coordinates))
+
+
+def _out_of_line(before: PointErrors, after: PointErrors, summary: RefineSummary, max_growth: float) -> Iterator[str]:
+    if not after.fit:
+        yield points_apart("the refined map", after)
+        return
+    typical_px = max(before.median_px, summary.pixel_stddev if before.fit else 0.0)
+    if after.median_px > max_growth * typical_px:
+        yield (
+            f"the reprojection error grew from {before.median_px:.2f} to {after.median_px:.2f} px (median); the ranges "
+            f"account for {max_growth:.1f} times at most"
+        )
+    shares = [float(np.mean(of.error_px > _LARGE * max_growth * typical_px)) for of in (before, after)]
+    if shares[1] > shares[0] + _MANY_MORE:
+        yield (
+            f"{100 * shares[1]:.0f} % of the points are far from where the photos show them, {100 * shares[0]:.0f} % "
+            "before"
+        )
+
+
+def _elsewhere(old_points: Array, new_points: Array, old: Array, new: Array, estimate: ScaleEstimate) -> Iterator[str]:
+    """Points, from the path's middle, and keyframes."""
+    # Those on the horizon may go where they like, half of all may not.
+    old_m, new_m = (np.median(np.linalg.norm(of, axis=1)) if len(of) else 0.0 for of in (old_points, new_points))
+    if len(old_points) and new_m > _MAX_POINTS_GROWTH * old_m:
+        yield f"the points were thrown away from the path: from {old_m:.3g} to {new_m:.3g} m (median)"
+    if len(old) < 3:
+        return
+    change = align_most(old, new, IDENTITY).scale
+    half_width = estimate.uncertainty.half_width_95
+    if not change > 0 or abs(np.log(change)) > _MAX_HALF_WIDTHS * half_width:
+        yield (
+            f"the refinement changed the scale by {100 * (change - 1):+.1f} %, where it was known to "
+            f"{100 * half_width:.1f} % (95 % interval)"
+        )
+
+
+def _apart_from_ranges(estimate: ScaleEstimate, summary: RefineSummary, path_m: Array) -> Iterator[str]:
+    """Ranges that were lost, and surveyed anchors that ended elsewhere altogether: by more than the path is large."""
+    if estimate.solution is not None:
+        old_m = float(np.median(np.abs(estimate.solution.fit.residuals_m)))
+        new_m = float(np.nanmedian(np.abs(summary.predicted_m - summary.observations.log.range_m)))
+        if new_m > _MAX_RESIDUAL_GROWTH * max(old_m, estimate.noise_stddev_m):
+            yield f"ranges and map are {new_m:.2g} m apart (median), where they were {old_m:.2g} m"
+    size_m = float(np.linalg.norm(path_shape(path_m).stddevs))
+    for anchor_id, moved_m, stddev_m in _surveyed(summary.anchors):
+        if (far_m := float(np.linalg.norm(moved_m))) > max(size_m, 10 * stddev_m):
+            yield f"anchor {anchor_id} went {far_m:.3g} m from where it was surveyed"

@@ -30,8 +30,7 @@ from rangesfm.scale.estimate import NORMAL_95, ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
-from rangesfm.trust.broken_refinement import why_broken
-from rangesfm.trust.finished_map import Doubt, doubts_of_map, place_of_map
+from rangesfm.trust.finished_map import Doubt, doubts_of_map, place_of_map, why_broken
 from rangesfm.trust.lengths import trust_in_lengths
 from rangesfm.trust.linearized import ranges_on_map
 from rangesfm.trust.verdict import TrustVerdict, sentence, trust_in
