@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.errors.cells import Cells, cells, noisiness
 from rangesfm.ranging.errors.learned import ExpectedErrors, LearnedErrors
@@ -22,7 +23,6 @@ from rangesfm.scale.range_equation import (
     columns_of,
     prior_jacobian,
     prior_residuals,
-    range_gradient,
     range_jacobian,
     tag_positions,
 )
@@ -59,7 +59,6 @@ class RangesOnMap:
         rows: (n,) of the log.
         weights: (n,) robust weights by which the estimate took them.
         curve_stddev_m: (n,) of a learnt error curve that has been taken off; None if none has.
-        ruled_out: components of the errors that the user knows not to be there.
     """
 
     problem: RangeProblem
@@ -74,7 +73,6 @@ class RangesOnMap:
     rows: Indices
     weights: Array
     curve_stddev_m: Array | None
-    ruled_out: tuple[str, ...]
 
     @property
     def world_from_cam(self) -> Array:
@@ -84,8 +82,9 @@ class RangesOnMap:
 
     @property
     def residual_m(self) -> Array:
-        """(n,) predicted minus measured, but for biases."""
-        return np.asarray(np.linalg.norm(self.from_anchor_m, axis=1) - self.problem.range_m)
+        """(n,) predicted minus measured, with biases as they are known beforehand."""
+        biases_m = self.problem.bias_mean_m[self.problem.anchor_index]
+        return np.asarray(np.linalg.norm(self.from_anchor_m, axis=1) + biases_m - self.problem.range_m)
 
     @property
     def from_anchor_m(self) -> Array:
@@ -112,7 +111,6 @@ def ranges_on_map(
         rows=rows,
         weights=solution.fit.weights,
         curve_stddev_m=None if log.shared_stddev_m is None else log.shared_stddev_m[rows],
-        ruled_out=tuple(ruled_out(posed.ranges)),
     )
 
 
@@ -184,12 +182,8 @@ def linearized(on_map: RangesOnMap, cells_of_ranges: Cells | None = None) -> Lin
         cells_of_ranges: of ranges that do not scatter; None: they are found by the residuals, of whatever is not far
             from its neighbours, however far from the map.
     """
-    scatter_m = 0.0
-    if cells_of_ranges is None:
-        problem, state = _without_biases(on_map)
-        gradient = range_gradient(problem, state)
-        cells_of_ranges, scatter_m = _cells(on_map, _residual_m(problem, state, gradient), gradient)
-    expected = ExpectedErrors.of(cells_of_ranges, on_map.curve_stddev_m, on_map.ruled_out, _wandering(cells_of_ranges))
+    found, scatter_m = _cells(on_map) if cells_of_ranges is None else (cells_of_ranges, 0.0)
+    expected = ExpectedErrors.of(found, on_map.curve_stddev_m, ruled_out(on_map.problem), _wandering(found))
     return _linearized(on_map, expected, scatter_m, expected.usual({"white": scatter_m}))
 
 
@@ -198,35 +192,30 @@ def at_state(problem: Linearized, on_map: RangesOnMap) -> Linearized:
     return _linearized(on_map, problem.expected, problem.scatter_m, problem.errors)
 
 
-def _without_biases(on_map: RangesOnMap) -> tuple[RangeProblem, RangeState]:
-    """What ranges are off by for each anchor's sake is random."""
-    problem = replace(on_map.problem, bias_stddev_m=np.zeros(on_map.problem.num_anchors))
-    return problem, replace(on_map.state, bias_m=problem.bias_mean_m)
-
-
-def _residual_m(problem: RangeProblem, state: RangeState, gradient: RangeGradient) -> Array:
-    return gradient.distance_m + state.bias_m[problem.anchor_index] - problem.range_m
-
-
 def _linearized(on_map: RangesOnMap, expected: ExpectedErrors, scatter_m: float, errors: LearnedErrors) -> Linearized:
-    problem, state = _without_biases(on_map)
-    columns, gradient = columns_of([problem])[0], range_gradient(problem, state)
-    mean, rotation = expected.cells.mean, state.metric_from_model.rotation
-    arms = tag_positions(problem, state.metric_from_model) - state.metric_from_model.translation
-    by_tag_in_model, by_time = gradient.by_tag @ rotation, None
+    # What ranges are off by for each anchor's sake is random.
+    problem = replace(on_map.problem, bias_stddev_m=np.zeros(on_map.problem.num_anchors))
+    state, placed = on_map.state, on_map.state.metric_from_model
+    columns, gradient, mean = columns_of([problem])[0], RangeGradient.of(on_map.from_anchor_m), expected.cells.mean
+    by_time = None
     if on_map.velocity is not None:
-        by_time = mean(state.metric_from_model.scale * np.einsum("ni,ni->n", by_tag_in_model, on_map.velocity))
+        by_time = mean(gradient.by_log_scale(placed.scale * on_map.velocity @ placed.rotation.T))
+    place = np.zeros((len(expected.cells), 3, columns.num))
+    place[:, :, columns.scale] = mean(placed.scale * problem.centers @ placed.rotation.T)
+    if columns.frame >= 0:
+        arms_m = mean(tag_positions(problem, placed) - placed.translation)
+        place[:, :, columns.frame : columns.frame + 6] = similarity_motions(arms_m)[:, :, 1:]
     return Linearized(
-        residual_m=mean(_residual_m(problem, state, gradient)),
+        residual_m=mean(on_map.residual_m),
         design=mean(range_jacobian(problem, columns, state, state)),
         prior_residual=prior_residuals(problem, columns, state),
         prior_design=prior_jacobian(problem, columns, state, state),
         columns=columns,
-        place=_place(mean(state.metric_from_model.scale * problem.centers @ rotation.T), mean(arms), columns),
+        place=place,
         cells=expected.cells,
         time_s=mean(on_map.time_s),
         gradient=RangeGradient(mean(gradient.distance_m), mean(gradient.by_tag)),
-        by_lever_arm=mean(np.einsum("nji,nj->ni", on_map.model_from_cam, by_tag_in_model)),
+        by_lever_arm=mean(gradient.by_tag_in_cam(on_map.world_from_cam)),
         by_time=by_time,
         on_map=on_map,
         scatter_m=scatter_m,
@@ -241,17 +230,17 @@ def _wandering(cells_of_ranges: Cells) -> dict[str, Array]:
     return {"wandering": _WANDERING_M**2 * (1.0 + (index[:, None] == index)) * together}
 
 
-def _cells(on_map: RangesOnMap, residual_m: Array, gradient: RangeGradient) -> tuple[Cells, float]:
+def _cells(on_map: RangesOnMap) -> tuple[Cells, float]:
     index = on_map.problem.anchor_index
     order = np.lexsort((on_map.time_s, on_map.tag_index, index))
-    off_m, scatter_m = _off_neighbours(residual_m[order], index[order])
+    off_m, scatter_m = _off_neighbours(on_map.residual_m[order], index[order])
     is_near = np.empty(len(order), dtype=bool)
     is_near[order] = np.abs(off_m) <= near_m(scatter_m)
     of_ranges = cells(
         index,
         on_map.tag_index,
         on_map.time_s,
-        gradient.by_tag * gradient.distance_m[:, None],
+        on_map.from_anchor_m,
         np.swapaxes(on_map.world_from_cam, 1, 2),
         np.where(is_near, 1.0, _NO_WEIGHT),
         noisiness(index[order], off_m, on_map.problem.num_anchors),
@@ -275,16 +264,3 @@ def _off_neighbours(values: Array, anchor_index: Indices) -> tuple[Array, float]
     middles = values[by_value][np.cumsum(counts) - counts + (counts - 1) // 2]
     steps = np.diff(values)[~begins[1:]]
     return values - middles[labels], max(robust_stddev(steps) / np.sqrt(2), MIN_STDDEV_M)
-
-
-def _place(scaled_m: Array, arms_m: Array, columns: Columns) -> Array:
-    """(c, 3, p) of the places of cameras that the scale stretches to (c, 3), their tags at (c, 3) from the origin."""
-    place = np.zeros((len(scaled_m), 3, columns.num))
-    place[:, :, columns.scale] = scaled_m
-    if columns.frame >= 0:
-        x, y, z = arms_m.T
-        nothing = np.zeros_like(x)
-        turn = np.array([[nothing, z, -y], [-z, nothing, x], [y, -x, nothing]])
-        place[:, :, columns.frame : columns.frame + 3] = np.moveaxis(turn, 2, 0)
-        place[:, :, columns.frame + 3 : columns.frame + 6] = np.eye(3)
-    return place
