@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -59,9 +59,10 @@ class Alternative:
 
 def alternatives(on_map: RangesOnMap) -> Iterator[Alternative]:
     """All that there are of a map."""
-    given = _given_m(on_map)
-    for name, subject, words, remedy, anchors_m in (*_of_labels(on_map, given), *_of_coordinates(given)):
-        yield Alternative(name, subject, words, remedy, Correction(anchors_m))
+    given_m, heard = on_map.problem.anchor_mean_m, np.unique(on_map.problem.anchor_index)
+    given = {on_map.anchor_ids[k]: given_m[k] for k in heard if np.isfinite(given_m[k]).all()}
+    yield from _of_labels([name for name in on_map.order_given if name in given], given)
+    yield from _of_coordinates(given)
     if on_map.velocity is not None:  # as where their order was taken from names that count down
         times = on_map.time_s
         yield Alternative(
@@ -79,36 +80,34 @@ def alternatives(on_map: RangesOnMap) -> Iterator[Alternative]:
             yield Alternative("lever arm's axes", "", f"the lever arm {words}", remedy, Correction(tag_moves_m=moves))
 
 
-_Anchors = Mapping[str, Array]
-_AlternativeAnchors = tuple[str, str, str, str, _Anchors]
-
-
-def _of_labels(on_map: RangesOnMap, given: _Anchors) -> Iterator[_AlternativeAnchors]:
+def _of_labels(names: Sequence[str], given: Mapping[str, Array]) -> Iterator[Alternative]:
     """Two anchors' labels, or their lines in the file, are swapped; or all are off by a line."""
     remedy = "compare the labels on the devices with the anchors' file"
     for one, other in combinations(given, 2):
         words = f"anchors {one} and {other} bear each other's label"
-        yield "labels swapped", f"{one}, {other}", words, remedy, {one: given[other], other: given[one]}
-    names = [name for name in on_map.order_given if name in given]
+        swapped = Correction({one: given[other], other: given[one]})
+        yield Alternative("labels swapped", f"{one}, {other}", words, remedy, swapped)
     at = [given[name] for name in names]
     for by, whose in ((1, "before"), (-1, "after")) if len(names) > 2 else ():
         words = f"each anchor has the coordinates of the one in the line {whose} it in the anchors' file"
-        yield "lines shifted", "", words, remedy, dict(zip(names, at[by:] + at[:by], strict=True))
+        shifted = Correction(dict(zip(names, at[by:] + at[:by], strict=True)))
+        yield Alternative("lines shifted", "", words, remedy, shifted)
 
 
-def _of_coordinates(given: _Anchors) -> Iterator[_AlternativeAnchors]:
+def _of_coordinates(given: Mapping[str, Array]) -> Iterator[Alternative]:
     """Other axes; feet, and ranges that are twice as long."""
     remedy = "compare the anchors' file with a sketch of the site"
     for axes_words, axes in _AXES_OF_ANCHORS.items() if len(given) > 2 else ():
         words = f"in the anchors' coordinates {axes_words}"
-        yield "anchors' axes", "", words, remedy, {name: axes @ at for name, at in given.items()}
+        turned = Correction({name: axes @ at for name, at in given.items()})
+        yield Alternative("anchors' axes", "", words, remedy, turned)
     if len(given) < 2:
         return
     middle = np.mean(list(given.values()), axis=0)
     remedy = "check the unit of ranges and anchors' file against a taped distance between two of them"
     for words, metres in _UNITS_M.items():
-        anchors_m = {name: middle + metres * (at - middle) for name, at in given.items()}
-        yield "anchors' unit", "", words, remedy, anchors_m
+        grown = Correction({name: middle + metres * (at - middle) for name, at in given.items()})
+        yield Alternative("anchors' unit", "", words, remedy, grown)
 
 
 class Refits:
@@ -183,14 +182,6 @@ def _multilaterated(problem: RangeProblem, scale: float) -> RangeState:
         rows = problem.anchor_index == k
         anchors_m[k], _ = multilaterate(tags[rows], problem.range_m[rows] - problem.bias_mean_m[k])
     return RangeState(Similarity(scale, np.eye(3), np.zeros(3)), anchors_m, problem.bias_mean_m)
-
-
-def _given_m(on_map: RangesOnMap) -> Mapping[str, Array]:
-    problem = on_map.problem
-    heard = np.unique(problem.anchor_index)
-    return {
-        on_map.anchor_ids[k]: problem.anchor_mean_m[k] for k in heard if np.isfinite(problem.anchor_mean_m[k]).all()
-    }
 
 
 def _lever_arms_m(on_map: RangesOnMap) -> Mapping[str, Array]:

@@ -227,13 +227,12 @@ def overlap(first: Test, second: Test) -> float:
     return float(np.linalg.norm(first.basis.T @ second.basis) / np.sqrt(min(first.num, second.num)))
 
 
-def row_of(test: Test, statistic: float | None = None, words: str | None = None) -> MistakeTest:
-    """As found, or with another statistic and other words."""
+def row_of(test: Test) -> MistakeTest:
     one = len(test.sizes) == 1
     return MistakeTest(
         name=test.hypothesis.name,
         subject=test.hypothesis.subject,
-        statistic=test.statistic if statistic is None else statistic,
+        statistic=test.statistic,
         threshold=test.threshold if np.isfinite(test.threshold) else 0.0,
         size=finite(float(test.sizes[0] if one else np.linalg.norm(test.sizes))),
         stddev=finite(float(test.stddevs[0] if one else np.linalg.norm(test.stddevs))),
@@ -241,7 +240,7 @@ def row_of(test: Test, statistic: float | None = None, words: str | None = None)
         smallest_detectable=finite(test.smallest_detectable),
         effect_on_scale=finite(test.effect_on_log_scale),
         effect_on_place_m=finite(test.effect_on_place_m),
-        words=test.hypothesis.words(test.sizes) if words is None else words,
+        words=test.hypothesis.words(test.sizes),
         remedy=test.hypothesis.remedy,
     )
 

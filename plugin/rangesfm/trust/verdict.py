@@ -115,7 +115,7 @@ def _row_of_cause(cause: Cause) -> MistakeTest:
     """With the statistic by which it was found: how much likelier it makes the ranges."""
     if cause.test is None:
         return MistakeTest(cause.name, cause.subject, cause.gain, cause.penalty, cause.words, cause.remedy)
-    return row_of(cause.test, max(cause.test.statistic, cause.gain), cause.words)
+    return row_of(replace(cause.test, statistic=max(cause.test.statistic, cause.gain)))
 
 
 def _evidence(problem: Linearized) -> Iterator[MistakeTest]:
