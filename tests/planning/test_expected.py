@@ -67,9 +67,9 @@ def test_ranges_that_stand_for_several_say_what_all_would() -> None:
 def test_anchors_at_the_height_of_a_level_path_leave_the_height_open() -> None:
     path = loop(height_amplitude_m=0.0)
     level = replace(path, centers=path.centers * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.6])
-    place = expect(planned(COPLANAR_M, "site", level)).place()
-    assert place is not None
-    x_m, y_m, z_m = place[0][4:]
+    of_map = expect(planned(COPLANAR_M, "site", level)).map_stddevs
+    assert of_map is not None
+    x_m, y_m, z_m = of_map[4:]
     assert max(x_m, y_m) < 0.1
     assert np.isinf(z_m)
 

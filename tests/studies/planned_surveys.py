@@ -159,8 +159,7 @@ def truth(planned: PlannedSurvey, made: Measured, posed: ScaleProblem) -> RangeS
 
 
 def worst_keyframe(expected: Expected) -> int | None:
-    place = expected.place()
-    return None if place is None else int(np.argmax(place[1]))
+    return None if expected.placement is None else int(np.argmax(expected.keyframe_stddevs_m))
 
 
 def runs_of(asked: Study, name: str, planned: PlannedSurvey, num_whole: int = 2) -> list[Row]:

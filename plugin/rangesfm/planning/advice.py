@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 
@@ -74,21 +74,19 @@ def _compared(planned: PlannedSurvey, bending: float) -> Expected | None:
     return compare(replace(planned, component_stddevs={**planned.component_stddevs, "bending": bending}))
 
 
-def best_words(advice: Iterable[Advice], *, for_scale: bool, for_place: bool) -> list[str]:
+def best_words(advice: Sequence[Advice], *, for_scale: bool, for_place: bool) -> list[str]:
     """The changes that gain most for the scale, then for the place, as far as wanted, with what each gains."""
-    advice = list(advice)
     gains: dict[str, list[str]] = {}
     for what, is_wanted in (("scale", for_scale), ("place", for_place)):
         gain = attrgetter(f"{what}_gain")
-        for each in ranked(advice, gain)[:_NUM_BEST]:
-            if is_wanted and gain(each) > _WORTH_SAYING:
-                gains.setdefault(each.words, []).append(
-                    f"the {what} would be {1 / (1 - gain(each)):.2g} times as certain"
-                )
+        for each in ranked(advice, gain)[:_NUM_BEST] if is_wanted else ():
+            if gain(each) > _WORTH_SAYING:
+                said = f"the {what} would be {1 / (1 - gain(each)):.2g} times as certain"
+                gains.setdefault(each.words, []).append(said)
     return [f"{words}: {', '.join(gained)}" for words, gained in gains.items()]
 
 
-def ranked(advice: Iterable[Advice], gain: Callable[[Advice], float]) -> list[Advice]:
+def ranked(advice: Sequence[Advice], gain: Callable[[Advice], float]) -> list[Advice]:
     """What gains most first, of each kind and subject the best; nothing that gains hardly anything."""
     worthwhile = sorted((each for each in advice if gain(each) > _LEAST_GAIN), key=gain, reverse=True)
     best: dict[tuple[str, str], Advice] = {}

@@ -90,12 +90,12 @@ class Expected:
             return str(error)
         return None
 
-    def place(self) -> tuple[Array, Array] | None:
-        """(7,) stddevs of the map about its middle, and (n,) of each keyframe's place; inf where they are open."""
+    @property
+    def map_stddevs(self) -> Array | None:
+        """(7,) of the map about its middle; inf where they are open, None without a place."""
         if self.placement is None:
             return None
-        centers = self.planned.trajectory.centers
-        return _stddevs(np.diag(by_similarity(self.placement, centers)[0])), self.keyframe_stddevs_m
+        return _stddevs(np.diag(by_similarity(self.placement, self.planned.trajectory.centers)[0]))
 
     @property
     def keyframe_stddevs_m(self) -> Array:
@@ -113,8 +113,7 @@ class Expected:
     @property
     def worst_keyframe_m(self) -> float:
         """Stddev of the place that is known least; NaN without a place."""
-        place = self.place()
-        return float("nan") if place is None else float(place[1].max())
+        return float("nan") if self.placement is None else float(self.keyframe_stddevs_m.max())
 
 
 def _stddevs(variances: Array) -> Array:
@@ -143,20 +142,17 @@ def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expect
     path, observations = planned.trajectory, planned.observations()
     posed = planned.posed(observations)
     state = planned.state(posed, observations.log.anchor_ids)
-    num_alike = np.full(len(posed.rows), float(planned.num_alike))
     tags, scale = tag_positions(posed.ranges, state.metric_from_model), state.metric_from_model.scale
     errors = posed.errors.at(tags, scale * posed.center_stddev)
-    solution = _at_the_truth(posed, errors, state, num_alike)
+    solution = _at_the_truth(posed, errors, state, planned.num_alike)
     rotations, made = model_from_cam(observations, path, posed), None
+    stddevs = usual_stddevs(is_calibrated=planned.curve_stddev_m is not None) | dict(planned.component_stddevs)
     if planned.photos is not None:
         made = PlannedMap(path, planned.photos.information(path), posed, observations, planned.tag_in_cam_m)
-    stddevs = usual_stddevs(is_calibrated=planned.curve_stddev_m is not None) | dict(planned.component_stddevs)
-    if made is not None:
         stddevs["bending"] = float(np.hypot(stddevs["bending"], made.bend_m(solution)))
     learned = errors_to_expect(posed, solution, observations, rotations, stddevs, max_num_cells)
     for _ in range(_NUM_NOISE_ROUNDS):
-        errors = _as_seen(solution, learned, num_alike)
-        solution = _at_the_truth(posed, errors, state, num_alike)
+        solution = _at_the_truth(posed, _as_seen(solution, learned), state, planned.num_alike)
     open_m2 = _undetermined(solution.fit)
     uncertainty = expected_scale_uncertainty(solution, learned, BENDING)
     placement = placement_covariance(solution, parameter_covariance(solution, learned) + open_m2)
@@ -167,14 +163,16 @@ def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expect
         scale_stddev = expected_scale_uncertainty(solution, others, BENDING).empirical
         by_ranges = np.diag([scale_stddev**2, *np.zeros(6)])
     if made is not None:
-        straightened = replace(solution, errors=_as_seen(solution, others, num_alike))
+        straightened = replace(solution, errors=_as_seen(solution, others))
         bends_m = made.bends_m(straightened, others, planned.num_alike)
     return Expected(planned, observations, posed, solution, learned, uncertainty, placement, by_ranges, bends_m)
 
 
-def _at_the_truth(posed: ScaleProblem, errors: RangeErrors, state: RangeState, num_alike: Array) -> Solution:
+def _at_the_truth(posed: ScaleProblem, errors: RangeErrors, state: RangeState, num_alike: int) -> Solution:
+    """Of ranges that stand for several each."""
     problem = weighted(posed.ranges, errors)
-    return Solution(problem, fit_at(problem, state, num_alike), errors, errors.noise_m)
+    weights = np.full(len(posed.rows), float(num_alike))
+    return Solution(problem, fit_at(problem, state, weights), errors, errors.noise_m)
 
 
 def _undetermined(fit: RangeFit) -> Array:
@@ -188,7 +186,7 @@ def _undetermined(fit: RangeFit) -> Array:
     return np.asarray(OPEN**4 * nothing @ nothing.T)
 
 
-def _as_seen(solution: Solution, learned: LearnedErrors, num_alike: Array) -> RangeErrors:
+def _as_seen(solution: Solution, learned: LearnedErrors) -> RangeErrors:
     """As ``RangeErrors.seen_by_rigid_map`` and ``inflated`` will find it, in the mean over all surveys like this one.
 
     Of the cells' covariance the fit takes its part; what single ranges scatter by about their cell comes on top.
@@ -205,7 +203,8 @@ def _as_seen(solution: Solution, learned: LearnedErrors, num_alike: Array) -> Ra
     rows = learned.of_range[ordinary] if ordinary.any() else learned.of_range
     noise_m2 = float(np.mean((together_m2 + alone_m2)[rows]))
     alike = 1 - min(float(np.mean((white_m2 * np.ones(len(cells)))[rows])) / noise_m2, 1.0)
-    share = shares_of_places(np.repeat(errors.place, int(num_alike[0])), alike)[:: int(num_alike[0])]
+    num_alike = int(solution.fit.weights[0])
+    share = shares_of_places(np.repeat(errors.place, num_alike), alike)[::num_alike]
     base = np.where(errors.is_estimated, np.sqrt(noise_m2), errors.given_m)
     stddev_m = np.sqrt(base**2 + errors.placing_m**2 + errors.shared_m**2)
     weights = cells.total(num_alike * share / stddev_m)

@@ -168,9 +168,7 @@ def _planned(
     photos: PlannedPhotos | None = None,
 ) -> PlannedSurvey:
     if tag.lever_arms_m:
-        raise OptionError(
-            "[tag] lever_arms_m is given, expected tag_in_cam_m: a plan has one tag", "tag", "lever_arms_m"
-        )
+        raise tag.refused("lever_arms_m", "is given, expected tag_in_cam_m: a plan has one tag")
     known = [component.name for component in COMPONENTS]
     if unknown := [name for name in radio.stddevs if name not in known]:
         message = f"[radio] stddevs: there is no component {unknown[0]!r}, expected some of {', '.join(known)}"
@@ -182,9 +180,7 @@ def _planned(
         anchor_frame=anchors.frame,
         rate_hz=radio.rate_hz,
         tag_in_cam_m=tag.tag_in_cam_m,
-        range_model=RangeModelOptions(
-            **{name: getattr(radio, name) for name in RangeModelOptions.model_fields if name in radio.model_fields_set}
-        ),
+        range_model=radio,
         curve_stddev_m=radio.curve_stddev_m,
         component_stddevs=({} if radio.like is None else stddevs_in(radio.like)) | radio.stddevs,
         photos=photos,
@@ -224,7 +220,7 @@ def _allowed(options: PlannedAnchorOptions) -> Array | None:
     if options.walls_m is None:
         return None if options.region_m is None else places_in_box(*options.region_m)
     if options.region_m is not None or options.heights_m is None:
-        raise OptionError("[anchors] walls_m goes with heights_m and without region_m", "anchors", "walls_m")
+        raise options.refused("walls_m", "goes with heights_m and without region_m")
     return places_on_walls(options.walls_m, options.heights_m)
 
 
@@ -233,11 +229,11 @@ def _anchors(options: PlannedAnchorOptions, allowed_m: Array | None) -> tuple[An
     if options.num_to_place is not None:
         num_allowed = 0 if allowed_m is None else len(allowed_m)
         if allowed_m is None or num_allowed < options.num_to_place:
-            message = (
-                f"[anchors] num_to_place is {options.num_to_place} and there are {num_allowed} places to choose from, "
-                "expected a larger region_m or walls_m"
+            raise options.refused(
+                "num_to_place",
+                f"is {options.num_to_place} and there are {num_allowed} places to choose from, expected a larger "
+                "region_m or walls_m",
             )
-            raise OptionError(message, "anchors", "num_to_place")
         return spread_anchors(options.num_to_place, allowed_m, options.position_stddev_m)
     if options.path is None:
         anchors = tuple(

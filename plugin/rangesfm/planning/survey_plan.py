@@ -131,10 +131,9 @@ def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
 
 
 def _place(expected: Expected) -> PlannedPlace | None:
-    place = expected.place()
-    if place is None:
+    of_map, of_keyframes = expected.map_stddevs, expected.keyframe_stddevs_m
+    if of_map is None:
         return None
-    of_map, of_keyframes = place
     x_m, y_m, z_m = of_map[4:].tolist()
     return PlannedPlace(
         stddev_m=(x_m, y_m, z_m),
