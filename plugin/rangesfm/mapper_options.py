@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import os
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -15,10 +15,8 @@ from rangesfm.option_model import Options, Told
 _LIKE_OURS = 0.85  # a key this similar to one of ours is a slip; others are pycolmap's
 
 
-class MapperOptions(Options):
+class MapperOptions(Options, table="mapper"):
     """Photos to unscaled model. Keys that are not here are of pycolmap's options of the mapper, as in pipeline."""
-
-    table: ClassVar[str] = "mapper"
 
     method: Annotated[Literal["incremental", "global", "hierarchical"], Told(flag="mapper_method")] = "incremental"
     """COLMAP's mapper: photo by photo; all at once; photo by photo in clusters, which are merged."""

@@ -66,6 +66,8 @@ class Key:
 class Options(BaseModel):
     """A table of options, or a part of one: values that hold by themselves and never change.
 
+    What is made from it says how the table is called in a survey file: ``class ScaleOptions(Options, table="scale")``.
+
     Raises:
         OptionError: an unknown key (names the nearest known one), or a value of another type or out of bounds.
     """
@@ -74,7 +76,11 @@ class Options(BaseModel):
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
 
-    table: ClassVar[str]  # its name in a survey file
+    table: ClassVar[str]
+
+    def __init_subclass__(cls, *, table: str | None = None, **config: Any):
+        super().__init_subclass__(**config)
+        cls.table = table or cls.table
 
     def __init__(self, /, **values: Any):
         try:

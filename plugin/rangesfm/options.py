@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -69,10 +69,8 @@ def _span(times: tuple[float, ...]) -> tuple[float, ...]:
     return times
 
 
-class KeyframeOptions(Options):
+class KeyframeOptions(Options, table="images"):
     """Which photos become keyframes. All that are given must hold."""
-
-    table: ClassVar[str] = "images"
 
     every_nth: _Count = 1
     """Use every n-th photo, in time order."""
@@ -105,10 +103,8 @@ class ImageOptions(KeyframeOptions):
     """Of the images, for a bag with several such topics."""
 
 
-class CameraOptions(Options):
+class CameraOptions(Options, table="camera"):
     """The cameras of the photos."""
-
-    table: ClassVar[str] = "camera"
 
     images: Annotated[str | None, Told(flag="camera_images", metavar="PATTERN")] = None
     """Of several [[camera]] tables, which photos each is of: a folder, or a pattern of their names as left*.jpg; one
@@ -161,10 +157,8 @@ class CameraOptions(Options):
         return self.focal_length_stddev_px or _CALIBRATION_STDDEV * focal_length_px
 
 
-class LogOptions(Options):
+class LogOptions(Options, table="ranges"):
     """The radio's log and how to take it."""
-
-    table: ClassVar[str] = "ranges"
 
     path: Annotated[Path | None, Told(flag="ranges", metavar="LOG", role="log")] = None
     """The radio's log: a file, a folder of them, or a pattern as uwb_*.csv."""
@@ -210,10 +204,8 @@ class LogOptions(Options):
         return None if self.time_offset == "auto" else self.time_offset
 
 
-class AssociationOptions(Options):
+class AssociationOptions(Options, table="ranges"):
     """Ranges to places on the path."""
-
-    table: ClassVar[str] = "ranges"
 
     max_interpolation_gap_s: _Duration = 2.0
     """Between keyframes further apart than this no pose is interpolated."""
@@ -221,10 +213,8 @@ class AssociationOptions(Options):
     """A range this close to a keyframe counts as taken there, where no pose can be interpolated."""
 
 
-class CheckOptions(Options):
+class CheckOptions(Options, table="ranges"):
     """Ranges held out of every estimate, to be compared with the result."""
-
-    table: ClassVar[str] = "ranges"
 
     check_share: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     """Share of the ranges held out as checks, chosen at random; neighbours in time err alike, so that this is the
@@ -237,10 +227,8 @@ class CheckOptions(Options):
     """From when to when, on the radio's clock, ranges are held out."""
 
 
-class RangeModelOptions(Options):
+class RangeModelOptions(Options, table="ranges"):
     """What is assumed of the radio."""
-
-    table: ClassVar[str] = "ranges"
 
     range_stddev_m: _Positive | None = None
     """Noise of a range (default: estimated from the residuals)."""
@@ -255,10 +243,8 @@ class RangesOptions(RangeModelOptions, CheckOptions, AssociationOptions, LogOpti
     """The radio's log, what is assumed of it, and which of its ranges are held out."""
 
 
-class AnchorOptions(Options):
+class AnchorOptions(Options, table="anchors"):
     """The anchors."""
-
-    table: ClassVar[str] = "anchors"
 
     path: Annotated[Path | None, Told(flag="anchors", role="file")] = None
     """CSV anchor_id,x_m,y_m,z_m[,position_stddev_m,range_bias_m,range_bias_stddev_m] (default: the anchors in the log,
@@ -271,10 +257,8 @@ class AnchorOptions(Options):
     """Only these anchors' ranges are used (default: all)."""
 
 
-class TagOptions(Options):
+class TagOptions(Options, table="tag"):
     """The tag on the camera, or several."""
-
-    table: ClassVar[str] = "tag"
 
     tag_in_cam_m: Annotated[_LeverArm, Told(flag="tag_in_cam", metavar="[ID:]X,Y,Z")] = (0.0, 0.0, 0.0)
     """Lever arm: the tag's antenna in the camera frame, of a rig its reference camera's, metres; of several tags, the
@@ -294,10 +278,8 @@ class TagOptions(Options):
         return self
 
 
-class ScaleOptions(Options):
+class ScaleOptions(Options, table="scale"):
     """How the scale is found, and distances taped on the site."""
-
-    table: ClassVar[str] = "scale"
 
     method: Annotated[Literal["robust", "two-candidate"], Told(flag="scale_method")] = "robust"
     """How the scale is found; two-candidate is the paper's."""
@@ -327,10 +309,8 @@ class ScaleOptions(Options):
         return self
 
 
-class MarkerOptions(Options):
+class MarkerOptions(Options, table="markers"):
     """Printed tags of known size in the photos."""
-
-    table: ClassVar[str] = "markers"
 
     dictionary: Annotated[TagDictionary | None, Told(flag="marker_dictionary")] = None
     """Which tags are looked for in the photos, by OpenCV's names: the corners of tag 7 are the markers tag7.0 (upper
@@ -348,10 +328,8 @@ class MarkerOptions(Options):
         return self
 
 
-class RefineOptions(Options):
+class RefineOptions(Options, table="refine"):
     """Bundle adjustment with the ranges."""
-
-    table: ClassVar[str] = "refine"
 
     enabled: Annotated[bool, Told(flag="refine")] = True
     """Whether the map is refined, or left as scaled."""
@@ -373,10 +351,8 @@ class RefineOptions(Options):
     """Passed through to pycolmap's BundleAdjustmentOptions."""
 
 
-class ExportOptions(Options):
+class ExportOptions(Options, table="export"):
     """The metric model in other formats, and in which frame."""
-
-    table: ClassVar[str] = "export"
 
     formats: _Texts = DEFAULT_FORMATS
     """Names of exporters; an unknown one lists them all."""
@@ -403,10 +379,8 @@ class ExportOptions(Options):
     """Azimuth in which the first camera looks, from north through east."""
 
 
-class ReportOptions(Options):
+class ReportOptions(Options, table="report"):
     """What is said of the result."""
-
-    table: ClassVar[str] = "report"
 
     reference: Annotated[Path | None, Told(metavar="FILE", role="file")] = None
     """True positions, for comparison: CSV or TUM."""
@@ -414,10 +388,8 @@ class ReportOptions(Options):
     """Whether report.html is written."""
 
 
-class OutputOptions(Options):
+class OutputOptions(Options, table="output"):
     """Where the results go."""
-
-    table: ClassVar[str] = "output"
 
     path: Annotated[Path, Told(flag="output_path", role="output")] = Path("out")
     """Folder of the results."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -52,10 +52,8 @@ def ascending(ends: tuple[float, float]) -> tuple[float, float]:
 _Distance = Annotated[float, Field(ge=0.01, le=1e4)]
 
 
-class PlannedPhotos(Options):
+class PlannedPhotos(Options, table="photos"):
     """What the camera sees, and how well; without this table the map is taken to be rigid."""
-
-    table: ClassVar[str] = "photos"
 
     field_of_view_deg: Annotated[float, Field(ge=5, le=170)] = 65.0
     """From the left edge of a photo to the right one."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field
@@ -47,10 +47,8 @@ _HEIGHTS = Told(expected="a list of 2 numbers, the larger one last")
 _Corners = Annotated[tuple[_Spot, ...], Field(strict=False), AfterValidator(_going_somewhere)]
 
 
-class PlannedAnchorOptions(Options):
+class PlannedAnchorOptions(Options, table="anchors"):
     """The anchors: where they will stand in the site, metres, z up."""
-
-    table: ClassVar[str] = "anchors"
 
     path: Annotated[Path | None, Told(role="file")] = None
     """CSV anchor_id,x_m,y_m,z_m[,position_stddev_m,range_bias_m,range_bias_stddev_m], all with a position."""
@@ -78,10 +76,8 @@ class PlannedAnchorOptions(Options):
     """Between which they may stand (default: not below the ground)."""
 
 
-class PlannedPathOptions(Options):
+class PlannedPathOptions(Options, table="path"):
     """The camera's path: waypoints, a loop, a trajectory, or a model."""
-
-    table: ClassVar[str] = "path"
 
     waypoints: Annotated[
         Annotated[tuple[_Place, ...], Field(strict=False)] | None, Told(expected="a list of lists of 3 numbers")
@@ -108,10 +104,8 @@ class PlannedPathOptions(Options):
     """Whether the camera cannot go up and down, as on a rover."""
 
 
-class PlannedRadioOptions(RangeModelOptions):
+class PlannedRadioOptions(RangeModelOptions, table="radio"):
     """The radio."""
-
-    table: ClassVar[str] = "radio"
 
     rate_hz: Annotated[float, Field(ge=1e-3, le=1e4)] = 5.0
     """Ranges to each anchor in a second."""
