@@ -25,7 +25,7 @@ import pytest
 from tests.conftest import TAG_IN_CAM_M, TIME_OFFSET_S
 from tests.simulated.path import loop_path
 
-from rangesfm.cli.arguments import COMMANDS, normalize, parse
+from rangesfm.cli.arguments import Commands, normalize, parse
 from rangesfm.planning.settings import TABLES as PLAN_TABLES
 from rangesfm.survey.settings import KEYS, read_survey
 
@@ -146,12 +146,12 @@ def shown_commands() -> list[list[str]]:
 
 @pytest.mark.parametrize("arguments", shown_commands(), ids=" ".join)
 def test_a_command_that_is_shown_is_one(arguments: list[str]) -> None:
-    assert parse(normalize(arguments)).command in COMMANDS
+    assert parse(normalize(arguments)).command in Commands().by_name
 
 
 def test_every_command_is_on_a_page() -> None:
     text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
-    assert [command for command in COMMANDS if f"rangesfm {command}" not in text] == []
+    assert [command for command in Commands().by_name if f"rangesfm {command}" not in text] == []
 
 
 def test_the_readme_is_read_in_one_go() -> None:
@@ -183,7 +183,7 @@ def test_keys_in_the_text_exist(page: Path) -> None:
 
 def test_flags_in_the_text_exist() -> None:
     with redirect_stdout(io.StringIO()) as helped:
-        for command in COMMANDS:
+        for command in Commands().by_name:
             with pytest.raises(SystemExit):
                 parse([*command.split(), "--help"])
     known = set(re.findall(r"--\w+", helped.getvalue()))

@@ -32,7 +32,7 @@ def test_an_attempt_begins_anew_where_a_worker_was_killed(course: Course, clock:
     course.tell(0, {"began_on": "two"})
     assert (course.states[0].stage, course.states[0].num_done) == ("", None)
     clock.now_s += 8
-    course.done(0, {"verdict": "good"}, "")
+    course.end(0, Status.DONE, "", 0, verdict="good")
     row = course.rows[0]
     assert (row.status, row.num_attempts, row.host, row.seconds) == (Status.DONE, 2, "two", 8)
     course.tell(0, {"began_on": "late"})  # from a worker that was thought lost
@@ -45,7 +45,7 @@ def test_time_left_is_that_of_those_that_are_done(course: Course, clock: Clock) 
         course.tell(index, {"began_on": "here"})
     clock.now_s += 30
     assert course.seconds_left() is None
-    course.done(0, {}, "")
+    course.end(0, Status.DONE, "", 0)
     course.tell(2, {"began_on": "here"})
     assert course.seconds_left() == pytest.approx((30 + 0 + 30) / 2)  # d waits, b is due, c has begun
     clock.now_s += 20
@@ -54,7 +54,7 @@ def test_time_left_is_that_of_those_that_are_done(course: Course, clock: Clock) 
 
 def test_whatever_is_not_over_when_it_is_interrupted_says_so(course: Course) -> None:
     course.tell(0, {"began_on": "here"})
-    course.done(1, {}, "")
+    course.end(1, Status.DONE, "", 0)
     course.end_all(Status.INTERRUPTED, "interrupted")
     assert course.is_over
     assert [row.status.value for row in course.rows] == ["interrupted", "done", "interrupted", "interrupted"]

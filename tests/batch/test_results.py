@@ -27,7 +27,7 @@ def course(tmp_path: Path) -> Course:
         course.tell(i, {"began_on": "here"})
         found = (verdict, 0.5, 0.002, "site", 14, 725, 481, 0.0795, 0.51, 0.0821, 2)
         figures = dict(zip(list(course.rows[i].cells())[-len(found) :], found))
-        course.done(i, figures, "" if verdict == "good" else "short path")
+        course.end(i, Status.DONE, "" if verdict == "good" else "short path", 0, **figures)
     (tmp_path / "out #0").mkdir()
     (tmp_path / "out #0" / "report.html").touch()
     return course

@@ -7,7 +7,7 @@ import io
 import pytest
 from tests.cli.screen import Clock, Terminal
 
-from rangesfm.batch.course import Course
+from rangesfm.batch.course import Course, Status
 from rangesfm.batch.jobs import Job
 from rangesfm.cli.batch import BatchTerminal
 from rangesfm.survey.settings import Survey
@@ -35,10 +35,10 @@ def go_on(course: Course, shown: BatchTerminal, clock: Clock) -> None:
     shown.show(course)
     course.tell(1, {"began_on": "there"})
     shown.show(course)
-    course.done(0, {"verdict": "good"}, "")
+    course.end(0, Status.DONE, "", 0, verdict="good")
     clock.now_s += 4.0
     shown.show(course)
-    course.failed(1, "the scale is not known", 3)
+    course.end(1, Status.FAILED, "the scale is not known", 3)
     shown.show(course)
 
 

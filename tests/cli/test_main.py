@@ -11,7 +11,7 @@ import pytest
 
 import rangesfm
 from rangesfm.cli import main
-from rangesfm.cli.arguments import COMMANDS
+from rangesfm.cli.arguments import Commands
 from rangesfm.errors import GeometryError, SolverError
 
 LOG = "timestamp_s,anchor_id,range_m\n0,a,1\n0.5,b,0\n1,a,2\n"
@@ -52,7 +52,7 @@ def raise_in_ranges(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> No
     monkeypatch.setattr("rangesfm.cli.ranges._ranges", fail)
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", Commands().by_name)
 def test_help_of_each_command_shows_an_example(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*command.split(), "--help"]) == 0
     text = capsys.readouterr().out

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rangesfm.cli import main
-from rangesfm.cli.arguments import COMMANDS, normalize, parse
+from rangesfm.cli.arguments import Commands, normalize, parse
 from rangesfm.cli.survey_flags import survey_from_arguments
 from rangesfm.ranging.errors.error_curve import read_error_curve
 from rangesfm.survey.inputs import read_ranging_inputs
@@ -68,13 +68,13 @@ def test_every_command_takes_the_curve(survey: Path) -> None:
 
 def test_the_help_promises_the_curve_to_the_commands_that_take_it(capsys: pytest.CaptureFixture[str]) -> None:
     takes = {}
-    for command in COMMANDS:
+    for command in Commands().by_name:
         assert main([*command.split(), "--help"]) == 0
         takes[command] = "--error_curve CSV" in capsys.readouterr().out
     assert main(["ranges", "calibrate", "--help"]) == 0
     promised = re.search(r"(\w+(, \w+)+ and \w+) take the file", " ".join(capsys.readouterr().out.split()))
     assert promised is not None
-    assert set(re.findall(r"\w+", promised[1])) - {"and"} == {command for command in COMMANDS if takes[command]}
+    assert set(re.findall(r"\w+", promised[1])) - {"and"} == {command for command, does in takes.items() if does}
 
 
 def test_bad_input_leaves_no_curve(survey: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -144,7 +144,7 @@ def test_ranges_held_out_of_the_result_have_no_say_while_the_map_is_a_part_of_it
     other = pycolmap.Reconstruction(model)
     assert adjust.adjust(model)
     spoilt = adjustment(survey)
-    spoilt._inputs = replace(spoilt._inputs, log=replace(log, range_m=log.range_m + 0.5 * is_check))
+    spoilt.measured = replace(spoilt.measured, log=replace(log, range_m=log.range_m + 0.5 * is_check))
     assert spoilt.adjust(other)
     assert np.array_equal(centers(other), centers(model))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from enum import Enum
 from typing import Any, Protocol
@@ -208,21 +208,20 @@ class Course:
         elif "num_done" in message:
             self._states[index] = replace(state, num_done=message["num_done"], num_total=message["num_total"])
 
-    def done(self, index: int, figures: Mapping[str, Any], reason: str) -> None:
-        """With what it found (``figures_of``), and the reasons of a verdict that is not good."""
-        self._end(index, Status.DONE, reason, 0, **figures)
-
-    def failed(self, index: int, reason: str, exit_status: int) -> None:
-        """One line why, and the exit status that ``rangesfm run`` has then."""
-        self._end(index, Status.FAILED, reason, exit_status)
-
     def end_all(self, status: Status, reason: str, exit_status: int | None = None) -> None:
         """Whatever is not over ends so."""
         for index, row in enumerate(self.rows):
             if not row.status.is_final:
-                self._end(index, status, reason, exit_status)
+                self.end(index, status, reason, exit_status)
 
-    def _end(self, index: int, status: Status, reason: str, exit_status: int | None, **figures: Any) -> None:
+    def end(self, index: int, status: Status, reason: str, exit_status: int | None, **figures: Any) -> None:
+        """A survey is over.
+
+        Args:
+            reason: why it failed, or of a verdict that is not good; one line.
+            exit_status: that ``rangesfm run`` has then.
+            figures: what it found (``figures_of``).
+        """
         state = self._states[index]
         seconds = None if state.began_s is None else self.seconds_running(state)
         ended = replace(state.row, status=status, reason=reason, exit_status=exit_status, seconds=seconds, **figures)

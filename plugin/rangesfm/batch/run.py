@@ -142,9 +142,9 @@ class _Crew:
         task = self._task_of[future]
         ending = _ending(future)
         if isinstance(ending, Failure):
-            self._course.failed(task.index, ending.message, ending.exit_status)
+            self._course.end(task.index, Status.FAILED, ending.message, ending.exit_status)
         else:
-            self._course.done(task.index, ending["figures"], ending["reason"])
+            self._course.end(task.index, Status.DONE, ending["reason"], 0, **ending["figures"])
 
     def _stop(self) -> None:
         """Have the workers interrupt what they are at, and wait for it; then nothing is half-written."""

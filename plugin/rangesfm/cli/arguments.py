@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import difflib
 import inspect
-import itertools
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,16 +14,8 @@ from typing import Any, NoReturn
 from rangesfm.errors import InputError
 from rangesfm.progress import Progress
 
-_COMMANDS_OF = {
-    "begin": ("init", "check"),
-    "stages": ("run", "demo", "reconstruct", "scale", "refine", "join"),
-    "batch": ("batch",),
-    "planning": ("plan",),
-    "results": ("export", "compare", "report"),
-    "ranges": ("ranges", "ranges calibrate", "trilaterate"),
-    "doctor": ("doctor",),
-}
-COMMANDS = tuple(itertools.chain.from_iterable(_COMMANDS_OF.values()))
+# In the order of the help.
+_MODULES = ("begin", "stages", "batch", "planning", "results", "ranges", "doctor")
 
 
 @dataclass(frozen=True)
@@ -42,7 +33,7 @@ class Parser(argparse.ArgumentParser):
     """Raises InputError where argparse would print its usage and exit; has some arguments only once it reads."""
 
     def __init__(self, **options: Any):
-        super().__init__(**options)
+        super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False, **options)
         self.later: list[Callable[[Parser], None]] = []  # what adds arguments when this parser is the one that reads
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
@@ -59,11 +50,24 @@ class Parser(argparse.ArgumentParser):
 
 
 class Commands:
-    """Collects the commands, each described by its own file."""
+    """All commands, each described by the file that does it, and the parser of the whole command line.
 
-    def __init__(self, parser: Parser):
-        self._subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=Parser)
+    Attributes:
+        by_name: the parser of each, in the order of the help.
+    """
+
+    def __init__(self) -> None:
+        self.parser = Parser(
+            prog="rangesfm",
+            description="Metric COLMAP models from photos and ultra-wideband ranges.",
+            epilog="example:\n  rangesfm demo\n\n"
+            "rangesfm COMMAND --help explains each; options may be spelt with _ or -.",
+        )
+        self.parser.add_argument("--version", action=_PrintVersion)
+        self._subparsers = self.parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=Parser)
         self.by_name: dict[str, Parser] = {}
+        for module in _MODULES:
+            import_module(f"rangesfm.cli.{module}").add_commands(self)
 
     def add(self, name: str, execute: Execute, help: str) -> Parser:
         """A new command, with the options that all of them have. What it does, and an example, says its docstring."""
@@ -73,8 +77,6 @@ class Commands:
             help=help,
             description=description,
             epilog=f"example:{example}",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-            allow_abbrev=False,
         )
         parser.add_argument("--quiet", action="store_true", help="print results and errors only")
         parser.set_defaults(execute=execute, command=name)
@@ -108,22 +110,12 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         InputError: an unknown command or option, naming the nearest known one, or a bad value.
         SystemExit: after ``--help``; for ``--version`` with what is to be printed.
     """
-    parser = Parser(
-        prog="rangesfm",
-        description="Metric COLMAP models from photos and ultra-wideband ranges.",
-        epilog="example:\n  rangesfm demo\n\nrangesfm COMMAND --help explains each; options may be spelt with _ or -.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    parser.add_argument("--version", action=_PrintVersion)
-    commands = Commands(parser)
-    for module in _COMMANDS_OF:
-        import_module(f"rangesfm.cli.{module}").add_commands(commands)
+    commands = Commands()
     args: argparse.Namespace
     two = " ".join(argv[:2])  # a command of two words is one to argparse
-    args, unknown = parser.parse_known_args([two, *argv[2:]] if two in COMMANDS and len(argv) > 1 else list(argv))
+    args, unknown = commands.parser.parse_known_args([two, *argv[2:]] if two in commands.by_name else list(argv))
     if not hasattr(args, "command"):
-        parser.error("a command is missing, expected one of " + ", ".join(COMMANDS))
+        commands.parser.error("a command is missing, expected one of " + ", ".join(commands.by_name))
     if unknown:
         commands.by_name[args.command].error(_unknown(unknown[0], commands.by_name[args.command]))
     return args

@@ -29,17 +29,19 @@ def add_commands(commands: Commands) -> None:
         metavar="FILE",
         help="carry these, made from the unscaled model, over instead: PLY, OBJ, camera JSON, COLMAP folders",
     )
-    export.add_argument("--images", metavar="FOLDER", help="the photos (default: where the run found them)")
+    export.add_argument("--images", type=Path, metavar="FOLDER", help="the photos (default: where the run found them)")
     export.add_argument("--output_path", metavar="FOLDER", help="where to (default: the result folder)")
     compare = commands.add("compare", _compare, "models with each other and with a reference")
     compare.add_argument("models", nargs="*", metavar="MODEL", help="result folders, COLMAP models, CSV or TUM files")
     compare.add_argument("--input_path", metavar="RESULT", help="one result folder (default: out)")
-    compare.add_argument("--reference", metavar="FILE", help="true positions: CSV or TUM")
+    compare.add_argument("--reference", type=Path, metavar="FILE", help="true positions: CSV or TUM")
     compare.add_argument("--output_path", metavar="FOLDER", help="of two or more: write comparison.html there as well")
     add_flags(compare, *_COMPARE_KEYS, without=_OF_A_RUN)
     report = commands.add("report", _report, "result folder to one self-contained HTML page")
     _add_result_argument(report)
-    report.add_argument("--images", metavar="FOLDER", help="the photos, for thumbnails (default: as in the run)")
+    report.add_argument(
+        "--images", type=Path, metavar="FOLDER", help="the photos, for thumbnails (default: as in the run)"
+    )
     report.add_argument("--png", action="store_true", help="write the figures for a paper too, as PNG and SVG")
 
 
@@ -55,10 +57,6 @@ def _result_path(args: argparse.Namespace) -> Path:
     return Path(args.result or args.input_path or "out")
 
 
-def _path(given: str | None) -> Path | None:
-    return None if given is None else Path(given)
-
-
 def _export(args: argparse.Namespace, progress: Progress) -> Outcome:
     """Write the metric model of a result folder in other formats; an unknown one lists them all.
 
@@ -71,7 +69,7 @@ def _export(args: argparse.Namespace, progress: Progress) -> Outcome:
     options = survey_from_arguments(args).export
     if args.apply_to is None:
         destination, notes = Path(args.output_path or source), []
-        written = export_result(source, options.formats, destination, options=options, images_path=_path(args.images))
+        written = export_result(source, options.formats, destination, options=options, images_path=args.images)
     else:
         if "formats" in options.model_fields_set:
             raise InputError("--apply_to writes files in their own formats: leave out --formats")
@@ -119,7 +117,7 @@ def _compare(args: argparse.Namespace, progress: Progress) -> Outcome:
         raise InputError(f"one model is given, {paths[0]}; ranges and distances to hold models against need two")
     from rangesfm.comparison.before_after import compare_folder
 
-    return Outcome([str(compare_folder(paths[0], _path(args.reference)))])
+    return Outcome([str(compare_folder(paths[0], args.reference))])
 
 
 def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
@@ -160,8 +158,8 @@ def _report(args: argparse.Namespace, progress: Progress) -> Outcome:
     """
     from rangesfm.report import write_report, write_report_pictures
 
-    source, images = _result_path(args), _path(args.images)
-    if images is not None and not images.is_dir():
-        raise InputError("no such folder of photos", images)
+    source = _result_path(args)
+    if args.images is not None and not args.images.is_dir():
+        raise InputError("no such folder of photos", args.images)
     pictures = write_report_pictures if args.png else lambda _: ()
-    return Outcome([str(write_report(source, images_path=images)), *map(str, pictures(source))])
+    return Outcome([str(write_report(source, images_path=args.images)), *map(str, pictures(source))])

@@ -57,6 +57,23 @@ class PathOfModel:
     observations: RangeObservations
 
 
+def estimate_scale(survey: Survey, inputs: RangingInputs, path: PathOfModel) -> ScaleEstimate:
+    """``initialize_scale`` by a survey's options, with the lengths of its inputs."""
+    distances = None
+    if inputs.tape is not None:
+        distances = locate_distances(inputs.tape, path.sfm, path.observations.log.anchor_ids)
+    return initialize_scale(
+        path.observations,
+        path.trajectory,
+        inputs.anchors,
+        anchor_frame=inputs.anchor_frame,
+        options=survey.scale,
+        range_model=survey.ranges,
+        distances=distances,
+        seed=survey.output.seed,
+    )
+
+
 @dataclass(frozen=True)
 class JoinedModels:
     """The models that could be joined, as one in the world and the unit of the first, and the verdicts on all."""
@@ -127,25 +144,13 @@ def _scaled_alone(
 
 def _alone(part: PathOfModel, survey: Survey, inputs: RangingInputs, *, has_first_camera: bool) -> ScaledModel:
     """A model by its own ranges. For one without the first camera, anchors given in its frame are those of a site."""
-    frame, options = inputs.anchor_frame, survey.scale
+    frame, tape = inputs.anchor_frame, inputs.tape
     if not has_first_camera:
         frame = "site" if frame == "first_camera" else frame
-        options = options.changed(up_in_first_camera=None)
-    anchor_ids = part.observations.log.anchor_ids
-    distances = None
-    if inputs.tape is not None:
-        within = distances_within(locatable(inputs.tape, part.sfm), part.sfm, anchor_ids)
-        distances = locate_distances(within, part.sfm, anchor_ids)
-    estimate = initialize_scale(
-        part.observations,
-        part.trajectory,
-        inputs.anchors,
-        anchor_frame=frame,
-        options=options,
-        range_model=survey.ranges,
-        distances=distances,
-        seed=survey.output.seed,
-    )
+        survey = survey.changed({"scale.up_in_first_camera": None})
+    if tape is not None:
+        tape = distances_within(locatable(tape, part.sfm), part.sfm, part.observations.log.anchor_ids)
+    estimate = estimate_scale(survey, replace(inputs, anchor_frame=frame, tape=tape), part)
     is_given = frame == "first_camera"
     return ScaledModel(
         part.trajectory, estimate, is_in_anchor_frame=is_given or estimate.frame == "site", frame_is_given=is_given

@@ -11,12 +11,12 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.colmap.transform import rescale, without_photos
-from rangesfm.distances.ends import locate_distances, surveyed_distances
+from rangesfm.distances.ends import surveyed_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.join.models import ModelVerdict, PathOfModel, join_models
+from rangesfm.join.models import ModelVerdict, PathOfModel, estimate_scale, join_models
 from rangesfm.progress import Journal
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock.estimate import REMEDY, TimeOffset, estimate_time_offset
@@ -27,7 +27,6 @@ from rangesfm.refine.radio import predicted_ranges
 from rangesfm.refine.with_ranges import RefineSummary, refine_with_ranges
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.scale.estimate import NORMAL_95, ScaleEstimate
-from rangesfm.scale.initialize import initialize_scale
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.trust.finished_map import Doubt, doubts_of_map, place_of_map, why_broken
@@ -96,9 +95,8 @@ def ranges_on_paths(
     Args:
         trajectory: of the first model.
     """
-    offset_s = offset.value_s if offset is not None else survey.ranges.time_offset_s
-    radio_times_s = inputs.log.timestamp_s
-    offsets_s = (offset_s or 0.0) if offset is None or radio_times_s is None else offset.at(radio_times_s)
+    given_s, radio_times_s = survey.ranges.time_offset_s or 0.0, inputs.log.timestamp_s
+    offsets_s = given_s if offset is None or radio_times_s is None else offset.at(radio_times_s)
     paths = [PathOfModel("sparse/0", models[0], trajectory, ranges_on_path(survey, inputs, trajectory, offsets_s))]
     names = set(trajectory.image_names)
     for k, model in enumerate(models[1:], start=1):
@@ -139,23 +137,6 @@ def _why_no_range_has_a_place(observations: RangeObservations, trajectory: Traje
             f"overlap the photos' ({photo_times[0]:.3f} to {photo_times[-1]:.3f} s): give another time offset, or auto"
         )
     return "no range is near enough to a keyframe in time: use more photos, or a larger max_interpolation_gap_s"
-
-
-def estimate_scale(survey: Survey, inputs: RangingInputs, path: PathOfModel) -> ScaleEstimate:
-    """``initialize_scale`` by a survey's options, with the lengths of its inputs."""
-    distances = None
-    if inputs.tape is not None:
-        distances = locate_distances(inputs.tape, path.sfm, path.observations.log.anchor_ids)
-    return initialize_scale(
-        path.observations,
-        path.trajectory,
-        inputs.anchors,
-        anchor_frame=inputs.anchor_frame,
-        options=survey.scale,
-        range_model=survey.ranges,
-        distances=distances,
-        seed=survey.output.seed,
-    )
 
 
 def refine_by_survey(
@@ -243,7 +224,7 @@ def scale_by_survey(
 
 def _with_cause(error: GeometryError, survey: Survey, inputs: RangingInputs, path: PathOfModel) -> GeometryError:
     """A refusal with the mistake that the ranges show on the map all the same, if they show one."""
-    lenient = survey.model_copy(update={"scale": survey.scale.changed(max_relative_stddev=_ANY_STDDEV)})
+    lenient = survey.changed({"scale.max_relative_stddev": _ANY_STDDEV})
     try:
         trust = _trust_in_ranges(survey, estimate_scale(lenient, inputs, path), path.trajectory)
     except (GeometryError, np.linalg.LinAlgError):

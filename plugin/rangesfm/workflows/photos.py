@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.export import check_formats
 from rangesfm.files.atomic import sha256_of
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.join.models import PathOfModel
+from rangesfm.join.models import PathOfModel, estimate_scale
 from rangesfm.progress import Journal
 from rangesfm.ranging.clock.estimate import estimate_time_offset
 from rangesfm.ranging.observations import RangeObservations
@@ -36,7 +36,7 @@ from rangesfm.vision.mapping_loop import GlobalAdjustment
 from rangesfm.vision.reconstruct import reconstruct
 from rangesfm.vision.rigs import read_rigs
 from rangesfm.vision.tags import find_tags
-from rangesfm.workflows.metric_map import estimate_scale, path_of_model, ranges_on_path, refine_by_survey
+from rangesfm.workflows.metric_map import path_of_model, ranges_on_path, refine_by_survey
 
 # Fewer have no shape by which ranges could tell a scale.
 _MIN_NUM_KEYFRAMES = 5
@@ -199,6 +199,7 @@ def map_keyframes(
     return summary.models
 
 
+@dataclass
 class AdjustmentWithRanges:
     """Scale, clocks and refinement of whatever there is of a map, by the options of a survey.
 
@@ -206,27 +207,26 @@ class AdjustmentWithRanges:
     are worth keeping. Taped distances wait for the whole map, where their ends are.
 
     Attributes:
+        measured: all that is in metres.
+        first_keyframe: the photo to whose frame anchors of the frame "first_camera" refer.
+        times: of the photos; None: the log names them.
         num_with_ranges, num_without: adjustments so far, and those left to COLMAP.
+        found_offset_s: of the clocks, where that is searched for, from a path of so many keyframes.
     """
 
-    def __init__(self, survey: Survey, inputs: RangingInputs, first_keyframe: str, times: ImageTimes | None):
-        """
-        Args:
-            first_keyframe: the photo to whose frame anchors of the frame "first_camera" refer.
-            times: of the photos; None: the log names them.
-        """
-        self._survey = survey
-        self._inputs = inputs
-        self._first_keyframe = first_keyframe
-        self._times = times
-        self._offset_s = 0.0 if inputs.log.timestamp_s is None else survey.ranges.time_offset_s
-        self._num_with_offset = 0
-        self.num_with_ranges = self.num_without = 0
+    survey: Survey
+    measured: RangingInputs
+    first_keyframe: str
+    times: ImageTimes | None
+    num_with_ranges: int = 0
+    num_without: int = 0
+    found_offset_s: float = 0.0
+    num_with_offset: int = 0
 
     @property
     def inputs(self) -> list[Any]:
         """All settings that it may look at, and its files by their content."""
-        survey = self._survey
+        survey = self.survey
         settings = survey.model_dump(
             mode="json",
             include={"camera", "ranges", "anchors", "tag", "scale", "refine"},
@@ -235,11 +235,11 @@ class AdjustmentWithRanges:
         files = (survey.ranges.error_curve, survey.anchors.path, survey.images.times)
         logs = [item.path for item in survey.input_paths() if item.key == "ranges.path" and item.role == "file"]
         contents = [None if path is None else sha256_of(path) for path in (*logs, *files)]
-        return [settings, self._inputs.anchor_frame, self._first_keyframe, contents]
+        return [settings, self.measured.anchor_frame, self.first_keyframe, contents]
 
     def adjust(self, model: pycolmap.Reconstruction) -> bool:
         """Adjust a model in place; False, and it is as it was, while the ranges do not determine its scale."""
-        path = path_of_model(model, self._times)
+        path = path_of_model(model, self.times)
         try:
             if len(path) < _MIN_NUM_KEYFRAMES:
                 raise GeometryError(f"{_MIN_NUM_KEYFRAMES} or more are needed")
@@ -259,9 +259,9 @@ class AdjustmentWithRanges:
         return f"ranges took part in {self.num_with_ranges} of {num} global adjustments of the map while it grew"
 
     def _adjusted(self, model: pycolmap.Reconstruction, path: Trajectory) -> pycolmap.Reconstruction:
-        survey, inputs = self._survey, replace(self._inputs, tape=None)
+        survey, inputs = self.survey, replace(self.measured, tape=None)
         # Positions in the first camera's frame are of no use before that photo is part of the map.
-        if inputs.anchor_frame == "first_camera" and path.image_names[0] != self._first_keyframe:
+        if inputs.anchor_frame == "first_camera" and path.image_names[0] != self.first_keyframe:
             inputs = replace(inputs, anchor_frame="unknown")
         estimate = estimate_scale(survey, inputs, PathOfModel("", model, path, self._observations(path)))
         refine_intrinsics = survey.camera.intrinsics_in_mapping != "kept"
@@ -271,13 +271,14 @@ class AdjustmentWithRanges:
         return refined
 
     def _observations(self, path: Trajectory) -> RangeObservations:
-        survey, inputs = self._survey, self._inputs
-        is_open = inputs.log.timestamp_s is not None and survey.ranges.time_offset_s is None
-        if is_open and len(path) >= _GROWTH * self._num_with_offset:
+        survey, inputs, offset_s = self.survey, self.measured, self.survey.ranges.time_offset_s
+        if inputs.log.timestamp_s is None or offset_s is not None:
+            return ranges_on_path(survey, inputs, path, offset_s or 0.0)
+        if len(path) >= _GROWTH * self.num_with_offset:
             found = estimate_time_offset(
                 inputs.log, path, inputs.tag_in_cam_m, association=survey.ranges, seed=survey.output.seed
             )
             if found.rivals or not found.is_certain:
                 raise GeometryError("more than one time offset is likely")
-            self._offset_s, self._num_with_offset = found.value_s, len(path)
-        return ranges_on_path(survey, inputs, path, self._offset_s or 0.0)
+            self.found_offset_s, self.num_with_offset = found.value_s, len(path)
+        return ranges_on_path(survey, inputs, path, self.found_offset_s)
