@@ -22,8 +22,17 @@ class Progress(Protocol):
         """One line that the user should read."""
 
 
-class SilentProgress(Progress):
+class SilentProgress:
     """Listens to nothing: the default of every stage."""
+
+    def stage(self, name: str) -> None:
+        pass
+
+    def update(self, num_done: int, num_total: int | None = None) -> None:
+        pass
+
+    def message(self, text: str) -> None:
+        pass
 
 
 @dataclass

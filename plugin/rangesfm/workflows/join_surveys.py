@@ -122,20 +122,16 @@ def _registered(model: pycolmap.Reconstruction) -> set[str]:
 
 def _with_names_of_their_own(surveys: Sequence[FinishedRun]) -> list[FinishedRun]:
     counts = Counter(name for survey in surveys for name in survey.own_name)
-    if not counts or max(counts.values()) == 1:
-        return list(surveys)
-    renamed = []
-    for survey in surveys:
-        own_name = {name: f"{survey.name}/{name}" for name in survey.own_name}
-        model = pycolmap.Reconstruction(survey.model)
-        for image in model.images.values():
-            image.name = own_name[image.name]
-        times = survey.result.timestamps_s
-        path = trajectory_from_reconstruction(
-            model, times and {own_name[name]: time for name, time in times.items() if name in own_name}
-        )
-        renamed.append(replace(survey, model=model, path=path, own_name=own_name))
-    return renamed
+    return list(surveys) if max(counts.values()) == 1 else list(map(_renamed, surveys))
+
+
+def _renamed(survey: FinishedRun) -> FinishedRun:
+    own_name = {name: f"{survey.name}/{name}" for name in survey.own_name}
+    model = pycolmap.Reconstruction(survey.model)
+    for image in model.images.values():
+        image.name = own_name[image.name]
+    path = replace(survey.path, image_names=tuple(own_name[name] for name in survey.path.image_names))
+    return replace(survey, model=model, path=path, own_name=own_name)
 
 
 def _with_tags_of_their_own(surveys: Sequence[FinishedRun]) -> list[FinishedRun]:
