@@ -39,6 +39,7 @@ from rangesfm.ranging.readers import write_ranges_csv
 from rangesfm.vision.mapping import map_photos, mapping_options, read_models
 from rangesfm.vision.photos import Photos
 from rangesfm.vision.rigs import NO_RIGS
+from rangesfm.vision.steps import Workspace
 
 TAG_IN_CAM_M = (0.03, -0.12, -0.05)
 _STEP_M = 0.5
@@ -93,7 +94,7 @@ def simulate(folder: Path, num_photos: int, seed: int) -> None:
 
 
 def map_database(folder: Path, method: str, leaf_size: int) -> None:
-    """All photos of a simulated database; the models go to a folder named after the method."""
+    """All photos of a simulated database; its models go to sparse, in the place of another method's."""
     database = folder / "database.db"
     with pycolmap.Database.open(database) as opened:
         names = tuple(image.name for image in sorted(opened.read_all_images(), key=lambda image: image.image_id))
@@ -109,9 +110,7 @@ def map_database(folder: Path, method: str, leaf_size: int) -> None:
     mapper = MapperOptions(pipeline=pipelines[method], num_threads=1).changed(method=method)
     options = mapping_options(camera, mapper, NO_RIGS, 0, database)
     photos = Photos(folder, names, ((known.width, known.height),) * len(names), {})
-    map_photos(
-        database, photos, folder / method, folder / "snapshots", options, folder / "mapper.log", SilentProgress()
-    )
+    map_photos(Workspace(folder, SilentProgress()), photos, options)
 
 
 def cost_of(*arguments: object) -> tuple[float, float]:
@@ -174,12 +173,12 @@ def main() -> None:
             for method in arguments.methods:
                 seconds, peak_mb = cost_of(folder, method, arguments.leaf_size)
                 costs[method].append((num_photos, seconds))
-                models = read_models(folder / method)
+                models = read_models(folder / "sparse")
                 sizes = "+".join(str(model.num_reg_images()) for model in models)
                 row = f"{num_photos:6} {method:12} {seconds:8.1f} s {peak_mb:7.0f} MB   {sizes} registered"
                 print(f"{row}   RMSE {rmse_m(folder, models[0]):.3f}", end="", flush=True)
                 does_refine = num_photos <= arguments.max_refined
-                end = refined(folder, folder / method / "0", folder / f"{method}_refined") if does_refine else ""
+                end = refined(folder, folder / "sparse" / "0", folder / f"{method}_refined") if does_refine else ""
                 print(f", {end} m" if end else " m", flush=True)
     for method, points in costs.items():
         if len(points) > 1:

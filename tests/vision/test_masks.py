@@ -14,8 +14,9 @@ from PIL import Image
 from rangesfm.errors import InputError, OptionError
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import SilentProgress
-from rangesfm.vision.reconstruct import Workspace, match_photos
+from rangesfm.vision.reconstruct import match_photos
 from rangesfm.vision.rigs import NO_RIGS
+from rangesfm.vision.steps import Workspace
 
 if TYPE_CHECKING:
     from tests.vision.conftest import Room
@@ -39,7 +40,7 @@ def masks(room: Room, tmp_path: Path) -> Path:
 def leftmost_features(room: Room, masks: Path) -> list[float]:
     """Of each photo, as a share of its width."""
     mapper = MapperOptions(mask_path=masks)
-    space = Workspace(masks.with_name("out"), SilentProgress(), lambda: None)
+    space = Workspace(masks.with_name("out"), SilentProgress())
     match_photos(room.folder, room.names[:NUM_PHOTOS], CameraOptions(), mapper, NO_RIGS, 0, space, restart=False)
     with pycolmap.Database.open(space.database) as database:
         return [float(database.read_keypoints(id_)[:, 0].min() / 256) for id_ in range(1, NUM_PHOTOS + 1)]

@@ -19,7 +19,6 @@ from rangesfm.errors import OptionError, ReconstructionError
 from rangesfm.files.atomic import new_folder, scratch_folder
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.processes.supervision import run_children
-from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import num_matching_pairs
 from rangesfm.vision.mapping_loop import GlobalAdjustment, adjust_whole, incremental_mapping
@@ -27,6 +26,7 @@ from rangesfm.vision.own_process import MODULE, WholeMapping, WholePipelineOptio
 from rangesfm.vision.photos import Photos
 from rangesfm.vision.rigs import Rigs
 from rangesfm.vision.snapshots import Snapshots, newest_snapshot
+from rangesfm.vision.steps import Workspace
 
 PipelineOptions = pycolmap.IncrementalPipelineOptions | WholePipelineOptions
 
@@ -121,64 +121,52 @@ def _held_cameras(
 
 
 def map_photos(
-    database_path: Path,
-    photos: Photos,
-    models_path: Path,
-    snapshots_path: Path,
-    options: MappingOptions,
-    log: Path,
-    progress: Progress,
-    adjustment: GlobalAdjustment | None = None,
+    space: Workspace, photos: Photos, options: MappingOptions, adjustment: GlobalAdjustment | None = None
 ) -> None:
-    """Write all models to ``models_path``/0, /1, ..., the one with the most photos first.
+    """Write all models of the database, the one with the most photos first.
 
-    Args:
-        snapshots_path: of the incremental mapper, which goes on from the newest and has its own there until it is done.
-        log: what a mapper in a process of its own says is appended to it.
+    The incremental mapper goes on from the newest snapshot there is, and has its own there until it is done.
 
     Raises:
         ReconstructionError: there is not a single model, or COLMAP failed.
     """
     growing, whole = options.growing, options.whole
     if isinstance(growing, pycolmap.IncrementalPipelineOptions):
-        models = _map_incrementally(database_path, photos, models_path, snapshots_path, growing, progress, adjustment)
+        models = _map_incrementally(space, photos, growing, adjustment)
     else:
-        models = _map_at_once(database_path, photos.folder, growing, log, progress)
+        models = _map_at_once(space, photos.folder, growing)
     if whole is not None:
         for model in models:
-            adjust_whole(database_path, model, options=whole, adjustment=adjustment)
+            adjust_whole(space.database, model, options=whole, adjustment=adjustment)
     if not models:
-        with pycolmap.Database.open(database_path) as database:
+        with pycolmap.Database.open(space.database) as database:
             num_matching = num_matching_pairs(database)
         raise ReconstructionError(
             f"no model from {len(photos.names)} photos, of which {num_matching} pairs match: photos from"
             " more places sideways to the view, or known camera parameters, may help"
         )
-    with new_folder(models_path) as temporary:
+    with new_folder(space.models) as temporary:
         for index, model in enumerate(sorted(models, key=lambda model: -model.num_reg_images())):
             (temporary / str(index)).mkdir()
             write_binary_model(model, temporary / str(index))
-    shutil.rmtree(snapshots_path, ignore_errors=True)
+    shutil.rmtree(space.snapshots, ignore_errors=True)
 
 
 def _map_incrementally(
-    database_path: Path,
+    space: Workspace,
     photos: Photos,
-    models_path: Path,
-    snapshots_path: Path,
     options: pycolmap.IncrementalPipelineOptions,
-    progress: Progress,
     adjustment: GlobalAdjustment | None,
 ) -> list[pycolmap.Reconstruction]:
     """All models that COLMAP's incremental mapper makes; there may be none."""
-    begun = newest_snapshot(snapshots_path)
+    begun = newest_snapshot(space.snapshots)
     num_begun = 0
     if begun is not None:
         num_begun = pycolmap.Reconstruction(begun).num_reg_images()
-        progress.message(f"mapping: goes on from {num_begun} photos of an earlier run")
+        space.progress.message(f"mapping: goes on from {num_begun} photos of an earlier run")
     num_registered: list[int] = []  # by model; a photo may be in more than one
-    with scratch_folder(models_path.with_name("mapping")) as folder:
-        snapshots = Snapshots(snapshots_path, folder)
+    with scratch_folder(space.output / "mapping") as folder:
+        snapshots = Snapshots(space.snapshots, folder)
 
         def begin_model() -> None:
             num_registered.append(0 if num_registered else num_begun)
@@ -190,34 +178,32 @@ def _map_incrementally(
 
         return run_in_background(
             lambda token: incremental_mapping(
-                database_path,
+                space.database,
                 photos.folder,
                 options=options,
                 adjustment=adjustment,
-                input_path=begun or "",
+                input_path=begun,
                 initial_image_pair_callback=begin_model,
                 next_image_callback=add_photo,
                 cancellation_token=token,
             ),
-            progress,
+            space.progress,
             lambda: sum(num_registered),
             len(photos.names),
         )
 
 
-def _map_at_once(
-    database_path: Path, image_path: Path, options: WholePipelineOptions, log: Path, progress: Progress
-) -> list[pycolmap.Reconstruction]:
+def _map_at_once(space: Workspace, image_path: Path, options: WholePipelineOptions) -> list[pycolmap.Reconstruction]:
     """The same of the mappers that take all photos at once; what COLMAP says is appended to the log."""
-    progress.message("mapping: this mapper does not say how far it is, and an interrupted one begins anew")
-    with scratch_folder(database_path.with_name("mapping")) as folder:
+    space.progress.message("mapping: this mapper does not say how far it is, and an interrupted one begins anew")
+    with scratch_folder(space.output / "mapping") as folder:
         # A copy: they note there what they find of pairs of photos.
-        work = WholeMapping(Path(shutil.copyfile(database_path, folder / "database.db")), image_path, options)
+        work = WholeMapping(Path(shutil.copyfile(space.database, folder / "database.db")), image_path, options)
         try:
             with closing(run_children(MODULE, [work], 1, lambda _: None)) as ended:
                 list(ended)
         finally:
-            append_log(work.log, log)
+            append_log(work.log, space.log)
         return [read_model(path) for path in sorted(folder.iterdir()) if path.is_dir()]
 
 

@@ -49,7 +49,7 @@ def incremental_mapping(
     *,
     options: pycolmap.IncrementalPipelineOptions,
     adjustment: GlobalAdjustment | None = None,
-    input_path: Path | str = "",
+    input_path: Path | None = None,
     initial_image_pair_callback: Callable[[], None] = lambda: None,
     next_image_callback: Callable[[pycolmap.Reconstruction], None] = lambda model: None,
     cancellation_token: pycolmap.CancellationToken | None = None,
@@ -66,7 +66,7 @@ def incremental_mapping(
     """
     options.image_path = image_path
     manager = pycolmap.ReconstructionManager()
-    if input_path:
+    if input_path is not None:
         manager.read(input_path)
     with pycolmap.Database.open(database_path) as database:
         pipeline = pycolmap.IncrementalPipeline(options, database, manager)

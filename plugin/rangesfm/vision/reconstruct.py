@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import pycolmap
 
-from rangesfm.colmap.log import colmap_log
 from rangesfm.errors import InputError, ReconstructionError
 from rangesfm.files.atomic import make_output_folder, scratch_folder
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import Progress, SilentProgress
-from rangesfm.vision.camera import PhotoCameras, cameras_of_photos, check_camera
-from rangesfm.vision.features import extract_features, feature_options
-from rangesfm.vision.given_database import GivenDatabase, opened
+from rangesfm.vision.camera import cameras_of_photos, check_camera
+from rangesfm.vision.features import feature_options
+from rangesfm.vision.given_database import opened
 from rangesfm.vision.mapping import MappingOptions, map_photos, mapping_options, pipeline_options, read_models
 from rangesfm.vision.mapping_loop import GlobalAdjustment
-from rangesfm.vision.matching import MatchingOptions, match_features, matching_options, verify_matches
+from rangesfm.vision.matching import matching_options
 from rangesfm.vision.photos import Photos, contents_of_masks, usable_photos
 from rangesfm.vision.renewed_database import RenewedDatabase, forget_database
 from rangesfm.vision.rigs import NO_RIGS, Rigs
-from rangesfm.vision.steps import Steps, fingerprint
+from rangesfm.vision.steps import Workspace, fingerprint
 
 
 @dataclass(frozen=True)
@@ -84,44 +82,40 @@ def reconstruct(
         ReconstructionError: the photos cannot be read, or do not give a model.
         KeyboardInterrupt: as soon as COLMAP has stopped.
     """
-    progress = progress or SilentProgress()
-    space = Workspace(Path(output_path), progress, before_change)
+    space = Workspace(Path(output_path), progress or SilentProgress(), before_change)
     pipeline_options(camera, mapper, seed)  # what COLMAP does not take is refused before anything is computed
     photos, of_matches = match_photos(Path(image_path), image_names, camera, mapper, rigs, seed, space, restart=restart)
     intrinsics = [table.intrinsics_in_mapping for table in camera.tables]
-    inputs = [of_matches, mapper.method, mapper.pipeline, *intrinsics]
-    if adjustment is not None:
-        inputs.append(adjustment.inputs)
+    of_adjustment = [] if adjustment is None else [adjustment.inputs]
+    inputs = fingerprint(of_matches, mapper.method, mapper.pipeline, *intrinsics, *of_adjustment)
     with space.logged():
         if not all(rigs.are_known):
             space.steps.run(
                 "rigs",
-                fingerprint(*inputs),
+                inputs,
                 space.database,
                 lambda: rigs.apply(space.database),
                 lambda: _place_cameras(
-                    photos, rigs, mapping_options(camera, mapper, NO_RIGS, seed, space.database), space
+                    space, photos, rigs, mapping_options(camera, mapper, NO_RIGS, seed, space.database)
                 ),
             )
         options = mapping_options(camera, mapper, rigs, seed, space.database)
         space.steps.run(
             "mapping",
-            fingerprint(*inputs),
+            inputs,
             space.models / "0",
             space.remove_old_models,
-            lambda: map_photos(
-                space.database, photos, space.models, space.snapshots, options, space.log, progress, adjustment
-            ),
+            lambda: map_photos(space, photos, options, adjustment),
             unfinished=space.snapshots,
         )
     found = read_models(space.models)
     if len(found) > 1:
         sizes = ", ".join(str(model.num_reg_images()) for model in found)
-        progress.message(f"{len(found)} separate models of {sizes} photos")
+        space.progress.message(f"{len(found)} separate models of {sizes} photos")
     return ReconstructionSummary(found, len(image_names), found[0].num_reg_images(), space.steps.seconds, space.log)
 
 
-def _place_cameras(photos: Photos, rigs: Rigs, options: MappingOptions, space: Workspace) -> None:
+def _place_cameras(space: Workspace, photos: Photos, rigs: Rigs, options: MappingOptions) -> None:
     """Map the photos as if there were no rigs, and enter in the database where their cameras sit in that model.
 
     Places that are known say what its unit is, so that all go together.
@@ -130,12 +124,12 @@ def _place_cameras(photos: Photos, rigs: Rigs, options: MappingOptions, space: W
         ReconstructionError: there is no model, or a camera of a rig is not in it together with its reference camera.
     """
     with scratch_folder(space.output / "rigs") as folder:
-        database_path = Path(shutil.copyfile(space.database, folder / "database.db"))
-        with pycolmap.Database.open(database_path) as database:
+        without_rigs = Workspace(folder, space.progress, log=space.log)
+        shutil.copyfile(space.database, without_rigs.database)
+        with pycolmap.Database.open(without_rigs.database) as database:
             pycolmap.apply_rig_config([], database)
-        models = folder / "sparse"
-        map_photos(database_path, photos, models, folder / "snapshots", options, space.log, space.progress)
-        model = read_models(models)[0]
+        map_photos(without_rigs, photos, options)
+        model = read_models(without_rigs.models)[0]
     rigs.rescale(model)
     why_not = (
         "without the rig no photos of its cameras that were taken at once come into one model: say in"
@@ -148,41 +142,6 @@ def _place_cameras(photos: Photos, rigs: Rigs, options: MappingOptions, space: W
     with pycolmap.Database.open(space.database) as database:
         if any(pose is None for rig in database.read_all_rigs() for pose in rig.non_ref_sensors.values()):
             raise ReconstructionError(why_not)
-
-
-class Workspace:
-    """The output folder of a reconstruction: what is where, and what of it an earlier run has done."""
-
-    def __init__(self, output: Path, progress: Progress, before_change: Callable[[], None]):
-        self.progress = progress
-        self.output = output
-        self.database = output / "database.db"
-        self.models = output / "sparse"
-        self.snapshots = output / "mapping_snapshot"
-        self.log = output / "mapper.log"
-        self.steps = Steps(output / "reconstruct.json", progress)
-        self._before_change = before_change
-
-    def begin(self, *, restart: bool) -> None:
-        """Make the folder; with ``restart`` nothing of an earlier run is taken over."""
-        make_output_folder(self.output)
-        if restart:
-            self.steps.forget("features")
-            forget_database(self.steps)
-
-    def remove_old_models(self) -> None:
-        self._before_change()
-        for folder in (self.models, self.snapshots):
-            shutil.rmtree(folder, ignore_errors=True)
-
-    @contextmanager
-    def logged(self) -> Iterator[None]:
-        """Have COLMAP's own words in the log, and say in a failure where they are."""
-        with colmap_log(self.log):
-            try:
-                yield
-            except ReconstructionError as error:
-                raise ReconstructionError(f"{error} (COLMAP's log: {self.log})") from error
 
 
 def match_photos(
@@ -206,7 +165,10 @@ def match_photos(
     photos = usable_photos(image_path, image_names)
     cameras = cameras_of_photos(camera, photos, rigs)
     masks = contents_of_masks(mapper.mask_path, photos)
-    space.begin(restart=restart)
+    make_output_folder(space.output)
+    if restart:
+        space.steps.forget("features")
+        forget_database(space.steps)
     if photos.left_out:
         name, reason = next(iter(photos.left_out.items()))
         num, num_all = len(photos.left_out), len(photos.left_out) + len(photos.names)
@@ -222,56 +184,6 @@ def match_photos(
                 f"the camera's parameters are of photos of another shape than {cameras.guessed[0]}: COLMAP guesses its"
                 f" camera ({len(cameras.guessed)} of {len(cameras.cameras)} cameras)"
             )
-        return _match(photos, cameras, rigs, given, masks, mapper, for_features, for_matching, space)
-
-
-def _match(
-    photos: Photos,
-    cameras: PhotoCameras,
-    rigs: Rigs,
-    given: GivenDatabase | None,
-    masks: dict[str, str],
-    mapper: MapperOptions,
-    for_features: pycolmap.FeatureExtractionOptions,
-    for_matching: MatchingOptions,
-    space: Workspace,
-) -> tuple[Photos, str]:
-    steps, progress, database = space.steps, space.progress, space.database
-    has_matches = given is not None and given.num_pairs > 0
-
-    def prepare_features() -> None:
-        space.remove_old_models()
-        space.log.unlink(missing_ok=True)
-        renewed.begin(progress)
-
-    def prepare_matching() -> None:
-        space.remove_old_models()
-        renewed.begin_matching()
-
-    def match() -> None:
-        if has_matches:
-            verify_matches(database, photos, for_matching, progress)
-        else:
-            match_features(database, photos, for_matching, space.log, progress)
-
-    with space.logged():
-        steps.note("photos", photos.contents(steps.notes.get("photos", {})))
-        contents = {name: sha256 for name, (_, sha256) in steps.notes["photos"].items()}
-        sources = [mapper.features, *([masks] if masks else [])] if given is None else given.inputs
-        of_features = fingerprint(pycolmap.__version__, *sources)
-        how = [] if has_matches else [for_matching.pairing_inputs, mapper.matcher, for_matching.seed]
-        of_matches = fingerprint(of_features, cameras.inputs, *how)
-        renewed = RenewedDatabase(
-            database, photos, contents, cameras, rigs, given, for_matching, of_features, of_matches, steps
-        )
-        inputs = fingerprint(of_features, cameras.inputs, list(contents.items()), *rigs.inputs)
-        steps.run(
-            "features",
-            inputs,
-            database,
-            prepare_features,
-            lambda: extract_features(database, photos, for_features, progress, mapper.mask_path),
-        )
-        inputs = fingerprint(inputs, of_matches)
-        steps.run("matching", inputs, database, prepare_matching, match)
-    return photos, inputs
+        renewed = RenewedDatabase(space, photos, cameras, rigs, given, mapper, masks, for_features, for_matching)
+        with space.logged():
+            return photos, renewed.fill()

@@ -1,14 +1,17 @@
-"""COLMAP's database begun anew where photos or options are other ones; what still holds of an earlier one stays."""
+"""Steps 1 and 2 in COLMAP's database, begun anew where photos or options are other ones: what holds of it stays."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+import pycolmap
+
 from rangesfm.files.atomic import new_file
-from rangesfm.progress import Progress
+from rangesfm.options import MapperOptions
 from rangesfm.vision.camera import PhotoCameras
 from rangesfm.vision.database import (
     clear_matches,
@@ -20,12 +23,13 @@ from rangesfm.vision.database import (
     remove_database,
     write_positions,
 )
+from rangesfm.vision.features import extract_features
 from rangesfm.vision.given_database import GivenDatabase
-from rangesfm.vision.matching import MatchingOptions
+from rangesfm.vision.matching import MatchingOptions, match_features, verify_matches
 from rangesfm.vision.pairs import pairs_to_match
 from rangesfm.vision.photos import Photos, exif_position
 from rangesfm.vision.rigs import Rigs
-from rangesfm.vision.steps import Steps
+from rangesfm.vision.steps import Steps, Workspace, fingerprint
 
 _NOTE = "database"
 
@@ -37,43 +41,86 @@ class RenewedDatabase:
     Killed at any moment, it leaves a note that is true or none; without one nothing of the database is used.
 
     Attributes:
-        photos: in the order of their ids. contents: SHA-256 of each, by name.
+        photos: in the order of their ids.
         given: the user's database, whose features take the place of all that an earlier run has found.
-        feature_inputs: fingerprint of what features depend on beside the photo itself.
-        match_inputs: likewise, of matches beside the two photos.
+        masks: SHA-256 of each photo's, by name.
     """
 
-    path: Path
+    space: Workspace
     photos: Photos
-    contents: Mapping[str, str]
     cameras: PhotoCameras
     rigs: Rigs
     given: GivenDatabase | None
+    mapper: MapperOptions
+    masks: Mapping[str, str]
+    features: pycolmap.FeatureExtractionOptions
     matching: MatchingOptions
-    feature_inputs: str
-    match_inputs: str
-    steps: Steps
 
-    def begin(self, progress: Progress) -> None:
+    @cached_property
+    def contents(self) -> dict[str, str]:
+        """SHA-256 of each photo, by name."""
+        steps = self.space.steps
+        steps.note("photos", self.photos.contents(steps.notes.get("photos", {})))
+        return {name: sha256 for name, (_, sha256) in steps.notes["photos"].items()}
+
+    @cached_property
+    def feature_inputs(self) -> str:
+        """Fingerprint of what features depend on beside the photo itself."""
+        sources = [self.mapper.features, *([self.masks] if self.masks else [])]
+        return fingerprint(pycolmap.__version__, *(sources if self.given is None else self.given.inputs))
+
+    @property
+    def has_matches(self) -> bool:
+        return self.given is not None and self.given.num_pairs > 0
+
+    @cached_property
+    def match_inputs(self) -> str:
+        """Likewise, of matches beside the two photos."""
+        how = [self.matching.pairing_inputs, self.mapper.matcher, self.matching.seed]
+        return fingerprint(self.feature_inputs, self.cameras.inputs, *([] if self.has_matches else how))
+
+    def fill(self) -> str:
+        """Find features and matches, as far as no earlier run has; returns the fingerprint of all they depend on."""
+        database, photos, steps = self.space.database, self.photos, self.space.steps
+        contents = list(self.contents.items())
+        inputs = fingerprint(self.feature_inputs, self.cameras.inputs, contents, *self.rigs.inputs)
+        find = partial(extract_features, database, photos, self.features, self.space.progress, self.mapper.mask_path)
+        steps.run("features", inputs, database, self._begin, find)
+        inputs = fingerprint(inputs, self.match_inputs)
+        steps.run("matching", inputs, database, self._begin_matching, self._match)
+        return inputs
+
+    def _begin(self) -> None:
         """Put a new database in the place of the earlier one, with what that has of the same photos."""
-        earlier = self.steps.notes.get(_NOTE, {})
-        forget_database(self.steps)
-        with new_file(self.path) as fresh:
+        space = self.space
+        space.remove_old_models()
+        space.log.unlink(missing_ok=True)
+        earlier = space.steps.notes.get(_NOTE, {})
+        forget_database(space.steps)
+        with new_file(space.database) as fresh:
             self._create(fresh)
             if self.given is not None:
                 self.given.copy_to(fresh)
             elif num_taken := self._take_over(earlier, fresh):
-                progress.message(f"features: those of {num_taken} photos are taken over from an earlier run")
-            remove_database(self.path)  # also what SQLite keeps beside it, which would be taken for the new one's
+                space.progress.message(f"features: those of {num_taken} photos are taken over from an earlier run")
+            remove_database(space.database)  # also what SQLite keeps beside it, which would be taken for the new one's
         self._write_note()
 
-    def begin_matching(self) -> None:
+    def _begin_matching(self) -> None:
         """Forget the matches, unless they were made with the same options."""
+        self.space.remove_old_models()
         # In the place of those under which a process that was killed may have been matching.
-        name_photos(self.path, self.photos.names)
-        if self.steps.notes.get(_NOTE, {}).get("matches") != self.match_inputs:
-            clear_matches(self.path)
+        name_photos(self.space.database, self.photos.names)
+        if self.space.steps.notes.get(_NOTE, {}).get("matches") != self.match_inputs:
+            clear_matches(self.space.database)
         self._write_note()
+
+    def _match(self) -> None:
+        database, progress = self.space.database, self.space.progress
+        if self.has_matches:
+            verify_matches(database, self.photos, self.matching, progress)
+        else:
+            match_features(database, self.photos, self.matching, self.space.log, progress)
 
     def _create(self, path: Path) -> None:
         create_database(path, self.photos.names, self.cameras.cameras, self.cameras.of_photo)
@@ -82,13 +129,13 @@ class RenewedDatabase:
 
     def _take_over(self, earlier: Mapping[str, Any], fresh: Path) -> int:
         """Returns of how many photos there were features."""
-        ids = self._earlier_ids(earlier)
-        if not ids or not self.path.exists():
+        ids, path = self._earlier_ids(earlier), self.space.database
+        if not ids or not path.exists():
             return 0
         try:
             same_matches = self.matching.is_by_place and earlier.get("matches") == self.match_inputs
             pairs = pairs_to_match(fresh, self.photos, self.matching.pairing) if same_matches else []
-            with copying(self.path, fresh) as (source, target):
+            with copying(path, fresh) as (source, target):
                 taken = {
                     new_id: old_id
                     for new_id, old_id in ids.items()
@@ -97,7 +144,7 @@ class RenewedDatabase:
                 copy_features(source, target, {old_id: new_id for new_id, old_id in taken.items()})
             of_pairs = (((taken.get(first, 0), taken.get(second, 0)), (first, second)) for first, second in pairs)
             # Not of photos that stood in the other order: COLMAP does not match two as it would the other way round.
-            copy_matches(self.path, fresh, ((old, pair) for old, pair in of_pairs if 0 < old[0] < old[1]))
+            copy_matches(path, fresh, ((old, pair) for old, pair in of_pairs if 0 < old[0] < old[1]))
             return len(taken)
         except RuntimeError:  # somebody has damaged the earlier one
             self._create(fresh)
@@ -112,8 +159,8 @@ class RenewedDatabase:
         return {new_id: ids[content] for new_id, content in contents if content in ids}
 
     def _write_note(self) -> None:
-        note = {"features": self.feature_inputs, "matches": self.match_inputs, "photos": dict(self.contents)}
-        self.steps.note(_NOTE, note)
+        note = {"features": self.feature_inputs, "matches": self.match_inputs, "photos": self.contents}
+        self.space.steps.note(_NOTE, note)
 
 
 def forget_database(steps: Steps) -> None:

@@ -1,14 +1,18 @@
-"""Steps that are done once: what an earlier run into the same folder did need not be done again."""
+"""Steps that are done once, and their folder: what an earlier run into the same one did need not be done again."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from rangesfm.colmap.log import colmap_log
+from rangesfm.errors import ReconstructionError
 from rangesfm.files.records import write_json
 from rangesfm.progress import Progress
 
@@ -84,6 +88,45 @@ class Steps:
 
     def _write(self) -> None:
         write_json({"steps": self._record, "notes": self.notes}, self._path)
+
+
+class Workspace:
+    """The output folder of a reconstruction: what is where, and what of it an earlier run has done.
+
+    Args:
+        before_change: called before models of an earlier run are removed or replaced.
+        log: of COLMAP's own words; None: in this folder.
+    """
+
+    def __init__(
+        self,
+        output: Path,
+        progress: Progress,
+        before_change: Callable[[], None] = lambda: None,
+        log: Path | None = None,
+    ):
+        self.progress = progress
+        self.output = output
+        self.database = output / "database.db"
+        self.models = output / "sparse"
+        self.snapshots = output / "mapping_snapshot"
+        self.log = log or output / "mapper.log"
+        self.steps = Steps(output / "reconstruct.json", progress)
+        self._before_change = before_change
+
+    def remove_old_models(self) -> None:
+        self._before_change()
+        for folder in (self.models, self.snapshots):
+            shutil.rmtree(folder, ignore_errors=True)
+
+    @contextmanager
+    def logged(self) -> Iterator[None]:
+        """Have COLMAP's own words in the log, and say in a failure where they are."""
+        with colmap_log(self.log):
+            try:
+                yield
+            except ReconstructionError as error:
+                raise ReconstructionError(f"{error} (COLMAP's log: {self.log})") from error
 
 
 def _read(path: Path, part: str) -> dict[str, dict[str, Any]]:
