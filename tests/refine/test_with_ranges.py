@@ -158,7 +158,7 @@ def make_survey(
 
 
 def unbend_with_known_errors(problem: RefinementProblem, rays: Observations, errors: RangeErrors) -> Unbent:
-    return Unbent(errors, 0.0, unbend_again(problem, rays, errors, problem.anchors), 0.0, 0)
+    return Unbent(errors, 0.0, unbend_again(problem, rays, errors, problem.radio.anchors), 0.0, 0)
 
 
 def adjust_by_colmap(sfm: pycolmap.Reconstruction) -> None:

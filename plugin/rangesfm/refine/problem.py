@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
@@ -15,11 +15,10 @@ from rangesfm.colmap.calibration import cameras_as_given
 from rangesfm.geometry.gravity import UP_IN_SITE, Gravity
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.options import CameraOptions, RefineOptions
-from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.refine.bundle_adjustment import BundleAdjustment, bundle_adjustment
 from rangesfm.refine.distances import MeasuredDistances, add_distances
-from rangesfm.refine.radio import RadioBlocks, RadioEstimate, RadioRanges, add_radio_priors, add_ranges
+from rangesfm.refine.radio import AddedRadio, RadioEstimate, RadioRanges, add_radio_priors, add_ranges, radio_blocks
 
 _PARAMETER_STEP = 1e-6
 
@@ -29,17 +28,17 @@ class RefinementProblem:
     """What stays the same from one solution to the next; only the model changes, in place.
 
     Attributes:
-        metric: the model. anchors, tags_in_cam_m: as given, which their priors go by.
-        ranges: that take part. distances: measured ones, which the map keeps to.
+        metric: the model.
+        ranges: that take part. radio: anchors and tags as given, which their priors go by.
+        distances: measured ones, which the map keeps to.
         first_pose_is_fixed: the gauge.
         gravity: which way is up in the first camera; None where its pose is fixed, or nobody knows.
         left_out_ids: 3-D points that take no part.
     """
 
     metric: pycolmap.Reconstruction
-    anchors: tuple[AnchorEstimate, ...]
     ranges: RadioRanges
-    tags_in_cam_m: Array
+    radio: RadioEstimate
     distances: MeasuredDistances
     camera: CameraOptions
     options: RefineOptions
@@ -71,16 +70,16 @@ class RefinementProblem:
             left_out_ids=self.left_out_ids - set(self.distances.marker_ids.values()),
         )
 
-    def add_to(self, bundle: BundleAdjustment, errors: RangeErrors, radio: RadioEstimate) -> RadioBlocks:
+    def add_to(self, bundle: BundleAdjustment, errors: RangeErrors, radio: RadioEstimate) -> AddedRadio:
         """All else that was measured, from an estimate; ``errors`` are those of the ranges that take part."""
-        blocks = RadioBlocks.at(radio, self.options)
-        rows = add_ranges(bundle, self.ranges, errors, blocks, self.options)
-        blocks.others.extend(add_distances(bundle, self.distances, radio.anchors, blocks.positions, errors))
-        add_radio_priors(bundle, radio, self.tags_in_cam_m, errors.common_bias_stddev_m, blocks, self.options)
+        blocks = radio_blocks(radio, self.metric, self.ranges.trajectory, self.options)
+        rows = add_ranges(bundle, self.ranges, errors, blocks)
+        others = add_distances(bundle, self.distances, radio.anchors, blocks.anchors, errors)
+        add_radio_priors(bundle, radio, self.radio.tags_in_cam_m, errors.common_bias_stddev_m, blocks, self.options)
         add_calibration(bundle, self.camera)
         if self.gravity is not None:
             self._add_gravity(bundle, self.gravity)
-        return replace(blocks, residual_rows=rows)
+        return AddedRadio(blocks, others, rows)
 
     def _add_gravity(self, bundle: BundleAdjustment, gravity: Gravity) -> None:
         """What the first camera saw of the vertical; the stddev in the unit of pixels."""
@@ -92,15 +91,14 @@ class RefinementProblem:
         pose = pose_of(bundle.metric.frame(self.first_frame_id)).params
         ceres.add_residual_block(bundle.adjuster, cost, None, [pose])
 
-    def residual_errors(self, added: RadioBlocks, errors: RangeErrors) -> ResidualErrors | None:
+    def residual_errors(self, added: AddedRadio, errors: RangeErrors) -> ResidualErrors | None:
         """How the residuals of the k ranges that took part err; the scale's uncertainty counts the same errors.
 
         None where nobody has learnt what they get wrong together.
         """
         if (learned := errors.learned) is None:
             return None
-        radio = added.estimate(RadioEstimate(self.anchors, self.tags_in_cam_m))
-        scaled = self.residuals_m(radio)[self.ranges.rows] / errors.stddev_m
+        scaled = self.residuals_m(added.estimate(self.radio))[self.ranges.rows] / errors.stddev_m
         in_residuals = np.sqrt(errors.weight) * errors.loss.slopes(scaled) / errors.stddev_m
         covariance_m2, has_cell = learned.covariance_m2, np.flatnonzero(learned.of_range >= 0)
         places = (has_cell, learned.of_range[has_cell])

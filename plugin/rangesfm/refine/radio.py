@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -64,19 +64,12 @@ def antennas(
         tags_in_cam_m: (num_tags, 3), in the order of the log's tags.
     """
     tags_in_cam = tags_in_cam_m[observations.log.tag_index]
-    turns, weight = trajectory.world_from_cam, observations.weight[:, None]
-    before, after = (
-        np.einsum("nij,nj->ni", turns[ends], tags_in_cam) for ends in (observations.before, observations.after)
+    on_line = Antennas(
+        observations.before, observations.after, observations.weight, tags_in_cam, np.zeros_like(tags_in_cam)
     )
-    on_line = (1 - weight) * before + weight * after
-    beyond = metric_from_sfm.scale * observations.center_offsets + observations.tag_from_center - on_line
-    return Antennas(
-        observations.before,
-        observations.after,
-        observations.weight,
-        tags_in_cam,
-        beyond @ metric_from_sfm.rotation.T,
-    )
+    from_center = on_line.positions(np.zeros_like(trajectory.centers), trajectory.world_from_cam)
+    beyond = metric_from_sfm.scale * observations.center_offsets + observations.tag_from_center - from_center
+    return replace(on_line, offset_in_world_m=beyond @ metric_from_sfm.rotation.T)
 
 
 @dataclass(frozen=True)
@@ -150,58 +143,70 @@ def predicted_ranges(
 
     Arguments as for ``refine_with_ranges``.
     """
+    ranges, radio = radio_as_given(trajectory, observations, metric_from_sfm, tag_in_cam_m, anchors)
+    return ranges.predicted_m(metric, radio)
+
+
+def radio_as_given(
+    trajectory: Trajectory,
+    observations: RangeObservations,
+    metric_from_sfm: Similarity,
+    tag_in_cam_m: npt.ArrayLike,
+    anchors: Sequence[AnchorEstimate],
+) -> tuple[RadioRanges, RadioEstimate]:
+    """Arguments as for ``refine_with_ranges``."""
     tags_in_cam_m = lever_arms(observations.log, tag_in_cam_m)
     placed = antennas(trajectory, observations, metric_from_sfm, tags_in_cam_m)
-    return RadioRanges(observations, trajectory, placed).predicted_m(
-        metric, RadioEstimate(tuple(anchors), tags_in_cam_m)
+    return RadioRanges(observations, trajectory, placed), RadioEstimate(tuple(anchors), tags_in_cam_m)
+
+
+def radio_blocks(
+    radio: RadioEstimate, metric: pycolmap.Reconstruction, trajectory: Trajectory, options: RefineOptions
+) -> ceres.RangeBlocks:
+    """Parameter blocks that start from an estimate, and the poses that a model has."""
+    return ceres.RangeBlocks(
+        poses=[pose_of(metric.frame(int(frame_id))).params for frame_id in trajectory.frame_ids],
+        anchors=[anchor.position_m.copy() for anchor in radio.anchors],
+        biases=[np.array([anchor.range_bias_m]) for anchor in radio.anchors],
+        tags_in_cam=list(radio.tags_in_cam_m.copy()),
+        lever_arms_are_free=options.lever_arm_stddev_m > 0,
+        time_shift=np.array([radio.time_shift_s]) if options.time_offset_stddev_s else None,
+        amplitude=np.array([radio.short_range_error_m]) if options.short_range_stddev_m else None,
     )
 
 
 @dataclass(frozen=True)
-class RadioBlocks:
-    """The same as parameter blocks, which the solver changes in place; one that is not wanted is None.
+class AddedRadio:
+    """What came into the full problem with the ranges.
 
-    ``others`` are blocks of further residuals; ``residual_rows``: (k,) where the residuals of the ranges that take part
-    are among the problem's.
+    Attributes:
+        blocks: parameters, which the solver changes in place. others: those of further residuals.
+        residual_rows: (k,) where the residuals of the ranges that take part are among the problem's.
     """
 
-    positions: list[Array]
-    biases: list[Array]
-    tags_in_cam: list[Array]
-    time_shift: Array | None
-    short_range_error: Array | None
-    others: list[Array] = field(default_factory=list)
-    residual_rows: Indices = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    blocks: ceres.RangeBlocks
+    others: list[Array]
+    residual_rows: Indices
 
     @property
-    def all_but_positions(self) -> list[Array]:
+    def all_but_anchors(self) -> list[Array]:
         """Every block that is no point of the world."""
-        wanted = [block for block in (self.time_shift, self.short_range_error) if block is not None]
-        return [*self.biases, *self.tags_in_cam, *wanted, *self.others]
-
-    @classmethod
-    def at(cls, radio: RadioEstimate, options: RefineOptions) -> RadioBlocks:
-        """Blocks that start from an estimate."""
-        return cls(
-            [anchor.position_m.copy() for anchor in radio.anchors],
-            [np.array([anchor.range_bias_m]) for anchor in radio.anchors],
-            list(radio.tags_in_cam_m.copy()),
-            np.array([radio.time_shift_s]) if options.time_offset_stddev_s else None,
-            np.array([radio.short_range_error_m]) if options.short_range_stddev_m else None,
-        )
+        wanted = [block for block in (self.blocks.time_shift, self.blocks.amplitude) if block is not None]
+        return [*self.blocks.biases, *self.blocks.tags_in_cam, *wanted, *self.others]
 
     def estimate(self, before: RadioEstimate) -> RadioEstimate:
         """As the solver left them."""
+        blocks = self.blocks
         return RadioEstimate(
-            moved_anchors(before.anchors, self.positions, [bias[0] for bias in self.biases]),
-            np.array(self.tags_in_cam).reshape(-1, 3),
-            before.time_shift_s if self.time_shift is None else float(self.time_shift[0]),
-            before.short_range_error_m if self.short_range_error is None else float(self.short_range_error[0]),
+            moved_anchors(before.anchors, blocks.anchors, [bias[0] for bias in blocks.biases]),
+            np.array(blocks.tags_in_cam).reshape(-1, 3),
+            before.time_shift_s if blocks.time_shift is None else float(blocks.time_shift[0]),
+            before.short_range_error_m if blocks.amplitude is None else float(blocks.amplitude[0]),
         )
 
 
 def add_ranges(
-    bundle: BundleAdjustment, ranges: RadioRanges, errors: RangeErrors, blocks: RadioBlocks, options: RefineOptions
+    bundle: BundleAdjustment, ranges: RadioRanges, errors: RangeErrors, blocks: ceres.RangeBlocks
 ) -> Indices:
     """Ranges in units of pixels: one stddev of either weighs the same.
 
@@ -224,20 +229,11 @@ def add_ranges(
         interval_s=ranges.interval_s[rows],
         share=bundle.pixel_stddev**2 * errors.weight,
     )
-    range_blocks = ceres.RangeBlocks(
-        poses=[pose_of(bundle.metric.frame(int(frame_id))).params for frame_id in ranges.trajectory.frame_ids],
-        anchors=blocks.positions,
-        biases=blocks.biases,
-        tags_in_cam=blocks.tags_in_cam,
-        lever_arms_are_free=options.lever_arm_stddev_m > 0,
-        time_shift=blocks.time_shift,
-        amplitude=blocks.short_range_error,
-    )
     return ceres.add_ranges(
         bundle.adjuster,
         placed,
-        range_blocks,
-        short_range_length_m=None if blocks.short_range_error is None else SHORT_RANGE_LENGTH_M,
+        blocks,
+        short_range_length_m=None if blocks.amplitude is None else SHORT_RANGE_LENGTH_M,
         loss_scale=errors.loss.width,
         loss_is_bounded=errors.loss.is_bounded,
     )
@@ -248,7 +244,7 @@ def add_radio_priors(
     radio: RadioEstimate,
     tags_in_cam_m: Array,
     common_bias_stddev_m: float,
-    blocks: RadioBlocks,
+    blocks: ceres.RangeBlocks,
     options: RefineOptions,
 ) -> None:
     """Hold, draw or free whatever has residuals; stddevs in the unit of pixels.
@@ -257,13 +253,13 @@ def add_radio_priors(
         tags_in_cam_m: (num_tags, 3) as given, on which the prior is centred.
         common_bias_stddev_m: of what all biases share.
     """
-    for anchor, position in zip(radio.anchors, blocks.positions, strict=True):
+    for anchor, position in zip(radio.anchors, blocks.anchors, strict=True):
         _add_prior(bundle, position, anchor.prior_position_m, anchor.prior_position_stddev_m)
     _add_bias_priors(bundle, radio.anchors, blocks.biases, common_bias_stddev_m)
     for block, given in zip(blocks.tags_in_cam, tags_in_cam_m, strict=True):
         _add_prior(bundle, block, given, options.lever_arm_stddev_m)
     _add_prior(bundle, blocks.time_shift, np.zeros(1), options.time_offset_stddev_s)
-    _add_prior(bundle, blocks.short_range_error, np.zeros(1), options.short_range_stddev_m)
+    _add_prior(bundle, blocks.amplitude, np.zeros(1), options.short_range_stddev_m)
 
 
 def _add_bias_priors(

@@ -71,14 +71,14 @@ def unbend(problem: RefinementProblem, rays: Observations, errors: RangeErrors) 
         rays: all that the photos see. errors: of the ranges that take part.
     """
     if not len(problem.ranges.rows):  # a few lengths bend no map
-        return Unbent(errors, 0.0, problem.anchors, 0.0, 0)
-    bound = _Bound.of(problem, rays, errors, problem.anchors)
+        return Unbent(errors, 0.0, problem.radio.anchors, 0.0, 0)
+    bound = _Bound.of(problem, rays, errors, problem.radio.anchors)
     fit, errors = _solve_with_own_errors(bound.graph)
     bound.move(problem, fit.state, errors)
     return Unbent(
         errors=errors,
         num_absorbed=fit.num_absorbed,
-        anchors=moved_anchors(problem.anchors, fit.state.anchors_m, fit.state.biases_m),
+        anchors=moved_anchors(problem.radio.anchors, fit.state.anchors_m, fit.state.biases_m),
         bend_m=_bend(bound.graph.vision.origin.centers, fit.state.poses.centers),
         num_steps=fit.num_steps,
     )

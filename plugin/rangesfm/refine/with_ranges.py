@@ -22,14 +22,13 @@ from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.association import lever_arms
 from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors, misfits
 from rangesfm.ranging.errors.robust_loss import RobustLoss
 from rangesfm.ranging.observations import RangeObservations, status_by_weight
 from rangesfm.refine.bundle_adjustment import BundleAdjustment, Solution, solve, solve_until_still
 from rangesfm.refine.distances import MeasuredDistances, add_marker_points, remove_marker_points
 from rangesfm.refine.problem import RefinementProblem
-from rangesfm.refine.radio import RadioBlocks, RadioEstimate, RadioRanges, antennas
+from rangesfm.refine.radio import AddedRadio, RadioEstimate, radio_as_given
 from rangesfm.refine.unbend import SAME_ERRORS, Unbent, unbend, unbend_again
 from rangesfm.refine.vision_information import misplaced_points, model_observations, model_poses
 
@@ -141,13 +140,11 @@ def refine_with_ranges(
     metric = pycolmap.Reconstruction(reconstruction)
     tape = (tape or Tape()).control()
     marker_ids = add_marker_points(metric, tape)
-    tags_in_cam_m = lever_arms(observations.log, tag_in_cam_m)
-    placed = antennas(trajectory, observations, metric_from_sfm, tags_in_cam_m)
+    ranges, radio = radio_as_given(trajectory, observations, metric_from_sfm, tag_in_cam_m, anchors)
     problem = RefinementProblem(
         metric,
-        tuple(anchors),
-        RadioRanges(observations, trajectory, placed),
-        tags_in_cam_m,
+        ranges,
+        radio,
         MeasuredDistances(_between_anchors(observations, anchors, errors), tape, marker_ids),
         camera or CameraOptions(),
         options,
@@ -206,12 +203,12 @@ class _Round:
 
 def _adjust(problem: RefinementProblem, bundle: BundleAdjustment, start: Unbent) -> RefineSummary:
     """Alternate between the full problem and the errors that its residuals show."""
-    added: RadioBlocks
+    added: AddedRadio
 
     def fit(errors: RangeErrors, before: _Round | None) -> _Round:
         nonlocal bundle, added
         if before is None:
-            before = _Round(RadioEstimate(start.anchors, problem.tags_in_cam_m), (), problem.options.max_num_iterations)
+            before = _Round(replace(problem.radio, anchors=start.anchors), (), problem.options.max_num_iterations)
         else:
             rays = model_observations(problem.metric, problem.frame_ids).with_pixel_stddev(bundle.pixel_stddev)
             anchors = unbend_again(problem, rays, errors, before.radio.anchors)
@@ -247,7 +244,7 @@ def _tolerance_m(problem: RefinementProblem, errors: RangeErrors) -> float:
 
 
 def _covariance(
-    problem: RefinementProblem, bundle: BundleAdjustment, added: RadioBlocks, errors: RangeErrors
+    problem: RefinementProblem, bundle: BundleAdjustment, added: AddedRadio, errors: RangeErrors
 ) -> JointCovariance | None:
     metric, limit = problem.metric, _MAX_NUM_IMAGES_FOR_COVARIANCE
     if not problem.options.covariance:
@@ -258,8 +255,8 @@ def _covariance(
         return joint_covariance(
             bundle.adjuster.problem,
             metric,
-            anchors=added.positions,
-            others=added.all_but_positions,
+            anchors=added.blocks.anchors,
+            others=added.all_but_anchors,
             residual_stddev=bundle.pixel_stddev,
             errors=problem.residual_errors(added, errors),
         )
