@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
-from scipy.spatial.transform import Rotation
 
 from rangesfm import ceres
 from rangesfm.arrays import Array
@@ -20,6 +19,7 @@ from rangesfm.errors import SolverError
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.errors.noise import robust_stddev
+from rangesfm.refine.vision_information import model_poses
 
 # Ceres' default of 1e4 damps the scale, which all poses share, so strongly that it creeps and is then taken for
 # converged; 1e8 does the same to the bends of a path of 2000 keyframes.
@@ -324,5 +324,4 @@ def farthest(before: Array, after: Array) -> float:
 
 def keyframe_centers(metric: pycolmap.Reconstruction) -> Array:
     """(n, 3) origins of the rig frames in the world."""
-    poses = np.array([pose_of(metric.frame(frame_id)).params for frame_id in metric.reg_frame_ids()])
-    return np.asarray(-Rotation.from_quat(poses[:, :4]).inv().apply(poses[:, 4:]))
+    return model_poses(metric, metric.reg_frame_ids()).centers

@@ -48,11 +48,6 @@ class GraphState:
     biases_m: Array
     common_bias_m: float
 
-    def range_gradient(self, antennas: Antennas, anchor_index: Indices) -> RangeGradient:
-        """Of the k distances."""
-        at = antennas.positions(self.poses.centers, self.poses.world_from_rig)
-        return RangeGradient.of(at - self.anchors_m[anchor_index])
-
 
 @dataclass(frozen=True)
 class KeyframeGraph:
@@ -83,8 +78,14 @@ class KeyframeGraph:
 
     def residuals_m(self, state: GraphState) -> Array:
         """(k,) predicted minus measured."""
+        return self.ranges_at(state)[0]
+
+    def ranges_at(self, state: GraphState) -> tuple[Array, RangeGradient]:
+        """``residuals_m``, and how the k distances grow."""
         index = self.errors.anchor_index
-        return state.range_gradient(self.antennas, index).distance_m + state.biases_m[index] - self.range_m
+        at = self.antennas.positions(state.poses.centers, state.poses.world_from_rig)
+        gradient = RangeGradient.of(at - state.anchors_m[index])
+        return gradient.distance_m + state.biases_m[index] - self.range_m, gradient
 
 
 @dataclass(frozen=True)
@@ -145,7 +146,7 @@ def linear_functions(graph: KeyframeGraph, gradients: Array) -> tuple[Array, Arr
     gradient[: layout.first_anchor] = gradients
     solved = _factor(terms, 0.0).solve(gradient[layout.free])
     by_stddev = terms.whitened[:, layout.free] @ solved
-    by_prior = _prior_rows(graph, layout, graph.start())[1][:, layout.free] @ solved
+    by_prior = terms.prior[:, layout.free] @ solved
     by_metre = (np.sqrt(graph.errors.weight) / graph.errors.stddev_m)[:, None] * by_stddev
     return gradient[layout.free].T @ solved - by_stddev.T @ by_stddev - by_prior.T @ by_prior, by_metre
 
@@ -155,51 +156,43 @@ class _Layout:
     """Columns: 6 for each pose (turn in its own frame, shift of its centre), 3 for each anchor, biases, their common.
 
     Attributes:
-        num: of all. free: which take part. world_is_free: whether no keyframe is held.
+        first_anchor, first_bias: where these begin. num: of all.
+        free: which take part. world_is_free: whether no keyframe is held.
         of_ranges: (k, 16) on which each range depends: two poses, an anchor, its bias.
         order, starts: of the ranges, those between the same keyframes to the same anchor together: their derivatives
             have the same columns.
     """
 
-    num_frames: int
-    num_anchors: int
+    first_anchor: int
+    first_bias: int
+    num: int
     free: Indices
     world_is_free: bool
     of_ranges: Indices
     order: Indices
     starts: Indices
 
-    @property
-    def num(self) -> int:
-        return 6 * self.num_frames + 4 * self.num_anchors + 1
-
-    @property
-    def first_anchor(self) -> int:
-        return 6 * self.num_frames
-
-    @property
-    def first_bias(self) -> int:
-        return 6 * self.num_frames + 3 * self.num_anchors
-
     @classmethod
     def of(cls, graph: KeyframeGraph) -> _Layout:
         n, m = len(graph.vision.origin), len(graph.anchors)
-        is_free = np.ones(6 * n + 4 * m + 1, dtype=bool)
+        first_anchor, first_bias, num = 6 * n, 6 * n + 3 * m, 6 * n + 4 * m + 1
+        is_free = np.ones(num, dtype=bool)
         if graph.held_frame is not None:
             is_free[6 * graph.held_frame : 6 * graph.held_frame + 6] = False
         heard = np.isin(np.arange(m), graph.errors.anchor_index)
         anchor_is_free = heard & [anchor.prior_position_stddev_m > 0 for anchor in graph.anchors]
         bias_is_free = heard & [anchor.prior_bias_stddev_m > 0 for anchor in graph.anchors]
-        is_free[6 * n : 6 * n + 3 * m] = np.repeat(anchor_is_free, 3)
-        is_free[6 * n + 3 * m : -1] = bias_is_free
+        is_free[first_anchor:first_bias] = np.repeat(anchor_is_free, 3)
+        is_free[first_bias:-1] = bias_is_free
         is_free[-1] = graph.errors.common_bias_stddev_m > 0 and bool(bias_is_free.any())
         before, after, anchor = graph.antennas.before, graph.antennas.after, graph.errors.anchor_index
-        firsts = ((6 * before, 6), (6 * after, 6), (6 * n + 3 * anchor, 3), (6 * n + 3 * m + anchor, 1))
-        of_ranges = np.concatenate([first[:, None] + np.arange(num) for first, num in firsts], axis=1)
+        firsts = ((6 * before, 6), (6 * after, 6), (first_anchor + 3 * anchor, 3), (first_bias + anchor, 1))
+        of_ranges = np.concatenate([first[:, None] + np.arange(size) for first, size in firsts], axis=1)
         key = (anchor * n + after) * n + before
         order = np.argsort(key, kind="stable")
         starts = np.flatnonzero(np.diff(key[order], prepend=-1))
-        return cls(n, m, np.flatnonzero(is_free), graph.held_frame is None, of_ranges, order, starts)
+        world_is_free = graph.held_frame is None
+        return cls(first_anchor, first_bias, num, np.flatnonzero(is_free), world_is_free, of_ranges, order, starts)
 
     def squares(self, rows: sparse.csr_array) -> sparse.coo_array:
         """J^T J of the derivatives of the ranges, dense among those alike."""
@@ -305,10 +298,9 @@ def local_scales(vision: VisionInformation, poses: Poses) -> Array:
 
 def _range_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tuple[Array, sparse.csr_array]:
     """(k,) residuals in stddevs, and their derivative."""
-    antennas, index, stddev_m = graph.antennas, graph.errors.anchor_index, graph.errors.stddev_m
-    by = state.range_gradient(antennas, index)
-    residuals = (by.distance_m + state.biases_m[index] - graph.range_m) / stddev_m
-    value = np.empty((len(residuals), 16))
+    antennas, stddev_m = graph.antennas, graph.errors.stddev_m
+    residuals_m, by = graph.ranges_at(state)
+    value = np.empty((len(residuals_m), 16))
     for first, frame, weight in ((0, antennas.before, 1 - antennas.weight), (6, antennas.after, antennas.weight)):
         value[:, first : first + 3] = by.by_turn_of_cam(antennas.tag_in_cam_m, state.poses.world_from_rig[frame])
         value[:, first + 3 : first + 6] = by.by_tag
@@ -318,7 +310,7 @@ def _range_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tup
     value /= stddev_m[:, None]
     starts = np.arange(0, value.size + 1, value.shape[1])
     shape = (len(value), layout.num)
-    return residuals, sparse.csr_array((value.ravel(), layout.of_ranges.ravel(), starts), shape=shape)
+    return residuals_m / stddev_m, sparse.csr_array((value.ravel(), layout.of_ranges.ravel(), starts), shape=shape)
 
 
 def _prior_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tuple[Array, sparse.csr_array]:

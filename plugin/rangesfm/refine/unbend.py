@@ -22,6 +22,7 @@ from rangesfm.refine.radio import moved_anchors
 from rangesfm.refine.vision_information import (
     Observations,
     Poses,
+    VisionInformation,
     model_poses,
     project,
     ray_residuals,
@@ -72,14 +73,14 @@ def unbend(problem: RefinementProblem, rays: Observations, errors: RangeErrors) 
     """
     if not len(problem.ranges.rows):  # a few lengths bend no map
         return Unbent(errors, 0.0, problem.radio.anchors, 0.0, 0)
-    bound = _Bound.of(problem, rays, errors, problem.radio.anchors)
-    fit, errors = _solve_with_own_errors(bound.graph)
-    bound.move(problem, fit.state, errors)
+    graph = _graph(problem, rays, errors, problem.radio.anchors)
+    fit, errors = _solve_with_own_errors(graph)
+    _move(problem, rays, graph.vision, fit.state.poses, errors)
     return Unbent(
         errors=errors,
         num_absorbed=fit.num_absorbed,
         anchors=moved_anchors(problem.radio.anchors, fit.state.anchors_m, fit.state.biases_m),
-        bend_m=_bend(bound.graph.vision.origin.centers, fit.state.poses.centers),
+        bend_m=_bend(graph.vision.origin.centers, fit.state.poses.centers),
         num_steps=fit.num_steps,
     )
 
@@ -92,50 +93,44 @@ def unbend_again(
     Where the errors change, the whole map turns by a little: nothing here, and tens of refused steps in the full
     problem, whose points follow a turn along straight lines.
     """
-    bound = _Bound.of(problem, rays, errors, anchors)
-    state = solve_graph(bound.graph, bound.graph.start(), tolerance_m=_tolerance_m(errors)).state
-    bound.move(problem, state, errors)
+    graph = _graph(problem, rays, errors, anchors)
+    state = solve_graph(graph, graph.start(), tolerance_m=_tolerance_m(errors)).state
+    _move(problem, rays, graph.vision, state.poses, errors)
     return moved_anchors(anchors, state.anchors_m, state.biases_m)
 
 
-@dataclass(frozen=True)
-class _Bound:
-    """The keyframe graph of a model, and all that the photos see in it, by which it moves."""
+def _graph(
+    problem: RefinementProblem, rays: Observations, errors: RangeErrors, anchors: tuple[AnchorEstimate, ...]
+) -> KeyframeGraph:
+    """Of the model as it is."""
+    ranges = problem.ranges
+    takes_part = ~np.isin(rays.point_ids, list(problem.left_out_ids))[rays.point]
+    seen = rays.subset(np.flatnonzero(takes_part))
+    return KeyframeGraph(
+        vision=vision_information(seen, model_poses(problem.metric, problem.frame_ids)),
+        antennas=ranges.antennas.subset(ranges.rows),
+        range_m=ranges.observations.log.range_m[ranges.rows],
+        errors=errors,
+        anchors=anchors,
+        held_frame=0 if problem.first_pose_is_fixed else None,
+        gravity=problem.gravity,
+    )
 
-    rays: Observations
-    graph: KeyframeGraph
 
-    @classmethod
-    def of(
-        cls,
-        problem: RefinementProblem,
-        rays: Observations,
-        errors: RangeErrors,
-        anchors: tuple[AnchorEstimate, ...],
-    ) -> _Bound:
-        ranges = problem.ranges
-        takes_part = ~np.isin(rays.point_ids, list(problem.left_out_ids))[rays.point]
-        seen = rays.subset(np.flatnonzero(takes_part))
-        graph = KeyframeGraph(
-            vision=vision_information(seen, model_poses(problem.metric, problem.frame_ids)),
-            antennas=ranges.antennas.subset(ranges.rows),
-            range_m=ranges.observations.log.range_m[ranges.rows],
-            errors=errors,
-            anchors=anchors,
-            held_frame=0 if problem.first_pose_is_fixed else None,
-            gravity=problem.gravity,
-        )
-        return cls(rays, graph)
-
-    def move(self, problem: RefinementProblem, state: GraphState, errors: RangeErrors) -> None:
-        """As a whole, to which the photos are indifferent, or, where it bends, keyframe by keyframe."""
-        before, after, held = self.graph.vision.origin, state.poses, self.graph.held_frame
-        whole = _as_a_whole(before, after, held)
-        if rmse(after.centers - whole.apply(before.centers)) > _MIN_BEND * float(np.median(errors.stddev_m)):
-            scales = local_scales(self.graph.vision, after)
-            carry_model(problem.metric, problem.frame_ids, self.rays, before, after, scales)
-        else:
-            _move(problem.metric, whole, None if held is None else int(problem.frame_ids[held]))
+def _move(
+    problem: RefinementProblem, rays: Observations, vision: VisionInformation, after: Poses, errors: RangeErrors
+) -> None:
+    """As a whole, to which the photos are indifferent, or, where it bends, keyframe by keyframe."""
+    metric, before = problem.metric, vision.origin
+    whole = _as_a_whole(before, after, 0 if problem.first_pose_is_fixed else None)
+    if rmse(after.centers - whole.apply(before.centers)) > _MIN_BEND * float(np.median(errors.stddev_m)):
+        carry_model(metric, problem.frame_ids, rays, before, after, local_scales(vision, after))
+        return
+    first = pose_of(metric.frame(problem.first_frame_id)).params
+    held = first.copy()
+    transform(metric, whole)
+    if problem.first_pose_is_fixed:
+        first[:] = held  # which rounding may have changed
 
 
 def _as_a_whole(before: Poses, after: Poses, held_frame: int | None) -> Similarity:
@@ -196,14 +191,6 @@ def _alternate(graph: KeyframeGraph, errors: RangeErrors, start: GraphState) -> 
 
 def _tolerance_m(errors: RangeErrors, share: float = _TOLERANCE) -> float:
     return share * float(errors.stddev_m.min())
-
-
-def _move(metric: pycolmap.Reconstruction, whole: Similarity, held_frame_id: int | None) -> None:
-    held = None if held_frame_id is None else pose_of(metric.frame(held_frame_id)).params
-    kept = None if held is None else held.copy()
-    transform(metric, whole)
-    if held is not None:
-        held[:] = kept  # which rounding may have changed
 
 
 def _bend(before: Array, after: Array) -> float:

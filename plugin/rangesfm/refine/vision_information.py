@@ -7,7 +7,7 @@ and shifts that all of them share cost nothing, nor does a common scale, which t
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -103,7 +103,7 @@ class VisionInformation:
     matrix: sparse.bsr_array
 
 
-def model_poses(metric: pycolmap.Reconstruction, frame_ids: Indices) -> Poses:
+def model_poses(metric: pycolmap.Reconstruction, frame_ids: Iterable[int]) -> Poses:
     """Poses of these frames."""
     rigid = [pose_of(metric.frame(int(frame_id))) for frame_id in frame_ids]
     world_from_rig = np.array([pose.rotation.matrix().T for pose in rigid])
