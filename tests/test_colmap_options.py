@@ -182,9 +182,8 @@ def test_a_model_is_adjusted_as_colmap_adjusts_it() -> None:
     bundle = bundle_adjustment(
         model.reconstruction,
         CameraOptions(),
-        RefineOptions(),
+        RefineOptions(max_num_iterations=77),
         fixed_frame_id=None,
-        max_num_iterations=77,
         num_threads=1,
     )
     assert changes(bundle.adjuster.options) == {

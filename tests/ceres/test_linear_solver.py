@@ -107,9 +107,8 @@ def test_the_refinement_of_a_long_path_is_direct() -> None:
     problem = bundle_adjustment(
         walk(1010, 6).reconstruction,
         CameraOptions(),
-        RefineOptions(),
+        RefineOptions(max_num_iterations=1),
         fixed_frame_id=None,
-        max_num_iterations=1,
         num_threads=1,
     )
     assert problem.adjuster.options.ceres.max_num_images_direct_sparse_cpu_solver == 1010

@@ -136,8 +136,8 @@ def _do_what_is_done_with_models(model: object, model_path: Path) -> None:
         metric.write_binary(folder)
         write_points(metric, Path(folder) / "points.ply")
     with contextlib.suppress(RangesfmError):
-        options = {"fixed_frame_id": None, "max_num_iterations": 2, "num_threads": 1}
-        problem = bundle_adjustment(metric, CameraOptions(), RefineOptions(), **options)  # type: ignore[arg-type]
+        options = RefineOptions(max_num_iterations=2)
+        problem = bundle_adjustment(metric, CameraOptions(), options, fixed_frame_id=None, num_threads=1)
         solve(problem, tolerance_m=1e-3)
 
 

@@ -22,9 +22,8 @@ def test_more_residuals_than_colmap_gives_to_one_thread_are_added_up_by_one() ->
     bundle = bundle_adjustment(
         rescale(made.reconstruction, made.metric_from_sfm),
         CameraOptions(),
-        RefineOptions(),
+        RefineOptions(max_num_iterations=1),
         fixed_frame_id=1,
-        max_num_iterations=1,
         num_threads=2,
     )
     problem, adjuster = bundle.adjuster.problem, bundle.adjuster

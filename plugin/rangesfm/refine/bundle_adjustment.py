@@ -105,7 +105,6 @@ def bundle_adjustment(
     options: RefineOptions,
     *,
     fixed_frame_id: int | None,
-    max_num_iterations: int,
     num_threads: int,
     marker_ids: Collection[int] = (),
     left_out_ids: Collection[int] = (),
@@ -120,7 +119,7 @@ def bundle_adjustment(
         SolverError: nothing takes part.
         InputError: an unknown key among the options passed through.
     """
-    adjuster = _bundle_adjuster(metric, camera, options, fixed_frame_id, max_num_iterations, num_threads)
+    adjuster = _bundle_adjuster(metric, camera, options, fixed_frame_id, num_threads)
     for point_id in left_out_ids:
         if adjuster.problem.has_parameter_block(xyz := metric.point3D(point_id).xyz):
             adjuster.problem.remove_parameter_block(xyz)
@@ -228,7 +227,6 @@ def _bundle_adjuster(
     camera: CameraOptions,
     options: RefineOptions,
     fixed_frame_id: int | None,
-    max_num_iterations: int,
     num_threads: int,
 ) -> pycolmap.CeresBundleAdjuster:
     ba = pycolmap.BundleAdjustmentOptions(print_summary=False)
@@ -239,7 +237,7 @@ def _bundle_adjuster(
     solver.function_tolerance = _FUNCTION_TOLERANCE
     # Steps are compared with all parameters, of which points on the horizon may be millions of metres.
     solver.gradient_tolerance = solver.parameter_tolerance = 0.0
-    solver.max_num_iterations = max_num_iterations
+    solver.max_num_iterations = options.max_num_iterations
     solver.num_threads = num_threads
     ba.ceres.solver_options = solver
     ba.ceres.min_num_residuals_for_cpu_multi_threading = _MIN_NUM_RESIDUALS_FOR_THREADS

@@ -62,9 +62,8 @@ class RefinementProblem:
         return bundle_adjustment(
             self.metric,
             self.camera,
-            self.options,
+            self.options.changed(max_num_iterations=max_num_iterations),
             fixed_frame_id=self.first_frame_id if self.first_pose_is_fixed else None,
-            max_num_iterations=max_num_iterations,
             num_threads=self.num_threads,
             marker_ids=self.distances.marker_ids.values(),
             left_out_ids=self.left_out_ids - set(self.distances.marker_ids.values()),
