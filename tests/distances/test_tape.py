@@ -34,7 +34,6 @@ def test_marks_are_gathered_by_marker(tmp_path: Path) -> None:
         tmp_path / "m.csv", "marker,image_name,x_px,y_px\ndoor,a.jpg,1,2\nwall,a.jpg,3,4\ndoor,b.jpg,5,6.5\n"
     )
     found = read_tape(distances, markers).markers
-    assert found is not None
     assert found["door"].image_names == ("a.jpg", "b.jpg")
     np.testing.assert_array_equal(found["door"].pixels, [[1, 2], [5, 6.5]])
     assert found["door"].lines == (2, 4)

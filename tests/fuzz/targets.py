@@ -120,7 +120,7 @@ def _check_tape(tape: Tape) -> None:
     for taped in tape.distances:
         _expect(0 < taped.distance_m < np.inf, "distances that are finite and positive")
         _expect(0 < taped.stddev_m < np.inf, "stddevs that are finite and positive")
-    for marker in (tape.markers or {}).values():
+    for marker in tape.markers.values():
         _expect(np.all(np.isfinite(marker.pixels)), "pixels that are finite")
 
 

@@ -127,7 +127,7 @@ def test_photos_of_printed_tags_become_a_metric_map_by_init_and_run(room: Room, 
     assert high / low < 1.03
     assert len(summary.distances) == 4 * NUM_TAGS
     again = read_tape(room.taped(tmp_path, PAIRS[:1]), tmp_path / "out" / "markers.csv").markers
-    assert {name: len(marker.image_names) for name, marker in known(again).items()} == {
+    assert {name: len(marker.image_names) for name, marker in again.items()} == {
         f"tag{tag}.{corner}": NUM_MAPPED for tag in range(NUM_TAGS) for corner in range(4)
     }
 

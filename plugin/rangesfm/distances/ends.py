@@ -112,7 +112,7 @@ def locate_distances(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Seq
         start, end = taped.ends
         if start in points and end in points:
             ends[row] = points[start], points[end]
-            marked = [((tape.markers or {})[name], points[name]) for name in taped.ends if name in markers]
+            marked = [(tape.markers[name], points[name]) for name in taped.ends if name in markers]
             of_ends = [_mark_covariance(marker, point, images) for marker, point in marked]
             along = (ends[row, 1] - ends[row, 0]) / max(float(np.linalg.norm(ends[row, 1] - ends[row, 0])), 1e-12)
             mark_stddev[row] = np.sqrt(sum(along @ covariance @ along for covariance in of_ends))
@@ -136,8 +136,9 @@ def locate_distances(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Seq
 def distances_within(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Sequence[str]) -> Tape:
     """Those of the distances that one of several models can hold: both ends in its photos, or anchors."""
     images = images_by_name(model)
-    markers = (tape.markers or {}).items()
-    marked = {name for name, marker in markers if sum(photo in images for photo in marker.image_names) >= 2}
+    marked = {
+        name for name, marker in tape.markers.items() if sum(photo in images for photo in marker.image_names) >= 2
+    }
     ends = (images.keys() | marked, set(anchor_ids))
     within = (taped for taped in tape.distances if any(known.issuperset(taped.ends) for known in ends))
     return replace(tape, distances=tuple(within))
@@ -158,8 +159,7 @@ def images_by_name(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Image]:
 def triangulate_markers(tape: Tape, model: pycolmap.Reconstruction) -> dict[str, Array]:
     """(3,) place of each marker that is the end of a distance; InputError as ``locate_distances`` has it."""
     images, ends = images_by_name(model), {name for taped in tape.distances for name in taped.ends}
-    markers = (tape.markers or {}).items()
-    return {name: _triangulate(name, marker, images, tape) for name, marker in markers if name in ends}
+    return {name: _triangulate(name, marker, images, tape) for name, marker in tape.markers.items() if name in ends}
 
 
 def _triangulate(name: str, marker: Marker, images: dict[str, pycolmap.Image], tape: Tape) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -82,7 +82,7 @@ class Tape:
     """
 
     distances: tuple[TapedDistance, ...] = ()
-    markers: dict[str, Marker] | None = None
+    markers: Mapping[str, Marker] = field(default_factory=dict)
     distances_path: Path | None = None
     markers_path: Path | None = None
 
@@ -93,12 +93,11 @@ class Tape:
     @property
     def found_markers(self) -> dict[str, Marker]:
         """Those that nobody marked by hand."""
-        of_all = (self.markers or {}).items()
-        return {name: marker for name, marker in of_all if marker.stddev_px == FOUND_STDDEV_PX}
+        return {name: marker for name, marker in self.markers.items() if marker.stddev_px == FOUND_STDDEV_PX}
 
     def with_more(self, distances: tuple[TapedDistance, ...], markers: Mapping[str, Marker] | None = None) -> Tape:
         """With others, and with marks found in photos; names that somebody gave to marks of his own stay his."""
-        return replace(self, distances=self.distances + distances, markers={**(markers or {}), **(self.markers or {})})
+        return replace(self, distances=self.distances + distances, markers={**(markers or {}), **self.markers})
 
     def without(self, rows: Collection[int]) -> Tape:
         """With some of the distances, by their numbers, as left out."""
@@ -115,7 +114,7 @@ def read_tape(distances_path: str | Path, markers_path: str | Path | None = None
         InputError: with the line, for what is not as described.
     """
     distances = _distances(read_table(distances_path, DISTANCE_COLUMNS, ["stddev_m", "kind"]))
-    markers = None if markers_path is None else _markers(read_table(markers_path, MARKER_COLUMNS))
+    markers = {} if markers_path is None else _markers(read_table(markers_path, MARKER_COLUMNS))
     return Tape(distances, markers, Path(distances_path), None if markers_path is None else Path(markers_path))
 
 

@@ -41,7 +41,7 @@ def add_marker_points(model: pycolmap.Reconstruction, tape: Tape) -> dict[str, i
     """
     places, images = triangulate_markers(tape, model), images_by_name(model)
     ids = {}
-    for name, marker in (tape.markers or {}).items():
+    for name, marker in tape.markers.items():
         if name not in places:
             continue
         track = pycolmap.Track()

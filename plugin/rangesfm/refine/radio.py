@@ -263,7 +263,7 @@ def add_radio_priors(
 
 
 def _add_bias_priors(
-    bundle: BundleAdjustment, anchors: tuple[AnchorEstimate, ...], biases: list[Array], common_stddev_m: float
+    bundle: BundleAdjustment, anchors: tuple[AnchorEstimate, ...], biases: Sequence[Array], common_stddev_m: float
 ) -> None:
     """One of all biases that are estimated, as they share the tag's."""
     drawn = []
