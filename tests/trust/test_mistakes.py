@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -26,6 +27,20 @@ def test_a_clean_survey_is_not_doubted() -> None:
     assert found.reasons == ()
     assert not any(test.rejected for test in found.tests)
     assert len({(test.name, test.subject) for test in found.tests}) == len(found.tests)
+
+
+def test_the_worst_that_could_hide_is_named_where_it_does_more_than_a_good_scale_may_be_off_by(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("rangesfm.trust.verdict.DOUBTFUL_ABOVE", 0.0)
+    found = trust(surveyed(DRONE, SEED))
+    (reason,) = found.reasons
+    assert reason.startswith("a mistake could stay hidden here")
+    hidden = [test for test in found.tests if f"({test.name} {test.subject}".strip() in reason]
+    said = re.search(r"change the scale by ([0-9.]+) %", reason)
+    assert hidden
+    assert said is not None
+    assert 0 < float(said[1]) <= 100 * max(test.effect_on_scale or 0.0 for test in hidden) + 0.05
 
 
 def test_a_clock_that_is_off_is_named_with_its_size() -> None:

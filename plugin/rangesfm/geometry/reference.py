@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
@@ -90,11 +90,14 @@ class Reference:
 
         gap = known[after] - known[before]
         between = (gap > 0) & (gap <= max_gap_s + ROUNDING_S) & (times_s >= known[before]) & (times_s <= known[after])
-        positions[between] = np.column_stack([np.interp(times_s[between], known, axis) for axis in self.positions_m.T])
+        weight = ((times_s - known[before])[between] / gap[between])[:, None]
+        start_m, end_m = self.positions_m[before[between]], self.positions_m[after[between]]
+        positions[between] = (1 - weight) * start_m + weight * end_m
         if rotations is not None and between.any():
             assert self.world_from_cam is not None
-            turns = Slerp(known, Rotation.from_matrix(self.world_from_cam))
-            rotations[between] = turns(times_s[between]).as_matrix()
+            start, end = (Rotation.from_matrix(self.world_from_cam[index[between]]) for index in (before, after))
+            turned = start * Rotation.from_rotvec(weight * (start.inv() * end).as_rotvec())
+            rotations[between] = turned.as_matrix()
         return positions, rotations
 
     def why_nothing_is_known(

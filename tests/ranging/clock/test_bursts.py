@@ -1,0 +1,21 @@
+"""What a pairing of bursts of ranges with photos must show before it counts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rangesfm.ranging.clock.bursts import Pairing
+
+PAIRING = Pairing(1.5, np.arange(9), np.arange(9), variance=1e-3, num_spare=5.0, chance=1e-6)
+
+
+def test_a_path_explains_medians_that_are_enough_and_that_nothing_else_explains() -> None:
+    assert PAIRING.explains()
+
+
+@pytest.mark.parametrize("change", [{"num_spare": 3.0}, {"chance": 0.01}])
+def test_few_medians_or_chance_explain_nothing(change: dict[str, float]) -> None:
+    assert not replace(PAIRING, **change).explains()
