@@ -49,26 +49,17 @@ def add_residual_block(
     Raises:
         ValueError: a block is no such array, or given twice, or not of the cost's size.
     """
-    _add(adjuster.problem, _used_by_adjuster.setdefault(adjuster, []), cost, loss, blocks)
-
-
-def _add(
-    problem: Any,
-    used: list[Any],
-    cost: pyceres.CostFunction,
-    loss: pyceres.LossFunction | None,
-    blocks: Sequence[Array],
-) -> None:
     for block in blocks:
         if block.dtype != np.float64 or not block.flags.carray:
             raise ValueError("the solver works in place: a block must be a contiguous, writeable float64 array")
     if len({block.__array_interface__["data"][0] for block in blocks}) < len(blocks):
         raise ValueError("a block is given twice: the blocks of one residual must be different ones")
+    problem = adjuster.problem
     held = [b for b in blocks if b.size == _NUM_POSE_PARAMS and not problem.has_parameter_block(b)]
     problem.add_residual_block(cost, loss, list(blocks))
     for pose in held:
         problem.set_parameter_block_constant(pose)
-    used.append((cost, loss, blocks))
+    _used_by_adjuster.setdefault(adjuster, []).append((cost, loss, blocks))
 
 
 def add_normal_prior(
@@ -207,9 +198,7 @@ def add_ranges(
     if blocks.time_shift is not None and ranges.interval_s is None:
         raise ValueError("a time shift needs interval_s, the time between the keyframes of each range")
     check_compatibility()
-    # Looked up once: a log has thousands of blocks.
-    problem, used = adjuster.problem, _used_by_adjuster.setdefault(adjuster, [])
-    first = problem.num_residuals()
+    first = adjuster.problem.num_residuals()
     model = {
         "short_range_length_m": short_range_length_m,
         "loss_scale": loss_scale,
@@ -218,7 +207,7 @@ def add_ranges(
     groups = _groups(ranges)
     for rows in groups:
         cost = _cost(ranges, rows, blocks, model)
-        _add(problem, used, cost, None, _blocks_of_group(ranges, int(rows[0]), blocks))
+        add_residual_block(adjuster, cost, None, _blocks_of_group(ranges, int(rows[0]), blocks))
     return np.asarray(first + np.argsort(np.concatenate([np.zeros(0, dtype=np.int64), *groups])))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.distances.tape import CONTROL, Marker, Tape, TapedDistance
 from rangesfm.errors import InputError
 from rangesfm.ranging.anchors.anchor import Anchor
@@ -43,14 +43,14 @@ class LocatedDistances:
     """
 
     model_length: Array
-    anchor_pair: npt.NDArray[np.int64]
+    anchor_pair: Indices
     distance_m: Array
     stddev_m: Array
-    is_check: npt.NDArray[np.bool_]
+    is_check: Mask
     ends: Array
     mark_stddev: Array
-    is_printed: npt.NDArray[np.bool_]
-    is_everywhere: npt.NDArray[np.bool_]
+    is_printed: Mask
+    is_everywhere: Mask
 
     @classmethod
     def of(
@@ -59,7 +59,7 @@ class LocatedDistances:
         stddev_m: Array,
         *,
         model_length: Array | None = None,
-        anchor_pair: npt.NDArray[np.int64] | None = None,
+        anchor_pair: Indices | None = None,
     ) -> LocatedDistances:
         """All control, between points that are anywhere, or between anchors."""
         k = len(distance_m)
@@ -69,14 +69,14 @@ class LocatedDistances:
         return cls(length, pair, distance_m, stddev_m, no, nowhere, np.zeros(k), no, no)
 
     @property
-    def is_between_points(self) -> npt.NDArray[np.bool_]:
+    def is_between_points(self) -> Mask:
         """(k,)"""
         return np.asarray(self.anchor_pair[:, 0] < 0)
 
     def __len__(self) -> int:
         return len(self.distance_m)
 
-    def subset(self, rows: npt.NDArray[np.bool_]) -> LocatedDistances:
+    def subset(self, rows: Mask) -> LocatedDistances:
         """Some of them."""
         return LocatedDistances(*(column[rows] for column in self._columns()))
 
@@ -90,7 +90,7 @@ class LocatedDistances:
     def lengths_m(self, scale: float, anchors_m: Array) -> Array:
         """(k,) as a map has them, with the model's scale and the anchors (m, 3); NaN where an anchor has no place."""
         lengths = scale * self.model_length
-        between_anchors = self.anchor_pair[:, 0] >= 0
+        between_anchors = ~self.is_between_points
         first, second = anchors_m[self.anchor_pair[between_anchors].T]
         lengths[between_anchors] = np.linalg.norm(first - second, axis=1)
         return lengths

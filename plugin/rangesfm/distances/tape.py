@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import AliasChoices, Field
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.records import Number, NumberOrNull, Record, Text
 from rangesfm.files.tables import Table, read_table, repeated
@@ -66,7 +66,7 @@ class Marker:
     """
 
     image_names: tuple[str, ...]
-    pixels: npt.NDArray[np.float64]
+    pixels: Array
     lines: tuple[int, ...]
     stddev_px: float = _CLICKED_STDDEV_PX
 
@@ -162,7 +162,7 @@ class DistanceRow(Record):
     residual_m: NumberOrNull
 
 
-def distance_rows(tape: Tape, lengths_m: npt.NDArray[np.float64]) -> list[DistanceRow]:
+def distance_rows(tape: Tape, lengths_m: Array) -> list[DistanceRow]:
     """One entry for each distance of the tape, in its order, with (k,) lengths in the map."""
     return [
         DistanceRow(

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Mask
 from rangesfm.geometry.rotations import cross_matrices
 
 
@@ -62,10 +61,10 @@ def are_apart(points: Array) -> bool:
     return bool(np.ptp(points, axis=0).max() > rounding_of(points))
 
 
-def off_origin(centers: Array) -> npt.NDArray[np.bool_]:
+def off_origin(centers: Array) -> Mask:
     """(n,) which cameras of a path are elsewhere than at its origin, where no scale moves them."""
     distance = np.linalg.norm(centers, axis=1)
-    is_off: npt.NDArray[np.bool_] = distance > max(_AT_ORIGIN * float(distance.max(initial=0.0)), rounding_of(centers))
+    is_off: Mask = distance > max(_AT_ORIGIN * float(distance.max(initial=0.0)), rounding_of(centers))
     return is_off
 
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
+
+from rangesfm.arrays import Array, Indices
 
 if TYPE_CHECKING:
     import pycolmap
@@ -31,19 +32,17 @@ class Trajectory:
         time_resolution_s: step to which each of the times was rounded or cut; 0: they are exact.
     """
 
-    frame_ids: npt.NDArray[np.int64]
+    frame_ids: Indices
     image_names: tuple[str, ...]
-    timestamps_s: npt.NDArray[np.float64] | None
-    centers: npt.NDArray[np.float64]
-    world_from_cam: npt.NDArray[np.float64]
+    timestamps_s: Array | None
+    centers: Array
+    world_from_cam: Array
     time_resolution_s: float = 0.0
 
     def __len__(self) -> int:
         return len(self.image_names)
 
-    def transformed(
-        self, scale: float, rotation: npt.NDArray[np.float64], translation: npt.NDArray[np.float64]
-    ) -> Trajectory:
+    def transformed(self, scale: float, rotation: Array, translation: Array) -> Trajectory:
         """The same path in the world ``x_new = scale * rotation @ x + translation``."""
         centers = scale * self.centers @ rotation.T + translation
         return replace(self, centers=centers, world_from_cam=rotation @ self.world_from_cam)
@@ -109,7 +108,7 @@ def trajectory_from_reconstruction(
     )
 
 
-def joined_trajectory(parts: Sequence[Trajectory]) -> tuple[Trajectory, list[npt.NDArray[np.int64]]]:
+def joined_trajectory(parts: Sequence[Trajectory]) -> tuple[Trajectory, list[Indices]]:
     """One path of several parts in one world, and for each part where its keyframes are in it.
 
     All parts have times, or none; the order is that of ``trajectory_from_reconstruction``.

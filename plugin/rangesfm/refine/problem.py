@@ -76,19 +76,15 @@ class RefinementProblem:
         others = add_distances(bundle, self.distances, radio.anchors, blocks.anchors, errors)
         add_radio_priors(bundle, radio, self.radio.tags_in_cam_m, errors.common_bias_stddev_m, blocks, self.options)
         add_calibration(bundle, self.camera)
-        if self.gravity is not None:
-            self._add_gravity(bundle, self.gravity)
+        if self.gravity is not None:  # what the first camera saw of the vertical; the stddev in the unit of pixels
+            cost = ceres.direction_cost(
+                direction_in_world=UP_IN_SITE,
+                direction_in_cam=self.gravity.up_in_first_camera,
+                stddev_rad=self.gravity.stddev_rad / bundle.pixel_stddev,
+            )
+            pose = pose_of(self.metric.frame(self.first_frame_id)).params
+            ceres.add_residual_block(bundle.adjuster, cost, None, [pose])
         return AddedRadio(blocks, others, rows)
-
-    def _add_gravity(self, bundle: BundleAdjustment, gravity: Gravity) -> None:
-        """What the first camera saw of the vertical; the stddev in the unit of pixels."""
-        cost = ceres.direction_cost(
-            direction_in_world=UP_IN_SITE,
-            direction_in_cam=gravity.up_in_first_camera,
-            stddev_rad=gravity.stddev_rad / bundle.pixel_stddev,
-        )
-        pose = pose_of(bundle.metric.frame(self.first_frame_id)).params
-        ceres.add_residual_block(bundle.adjuster, cost, None, [pose])
 
     def residual_errors(self, added: AddedRadio, errors: RangeErrors) -> ResidualErrors | None:
         """How the residuals of the k ranges that took part err; the scale's uncertainty counts the same errors.
