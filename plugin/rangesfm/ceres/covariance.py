@@ -255,20 +255,22 @@ def _tied_points(points: csc_array) -> Mask:
 
 
 def _world_motions(columns: _Columns) -> Array:
-    """(num_columns, 7) how a small change of scale, turns and shifts of the world move everything in it."""
+    """(num_columns, 7) how small turns, shifts and a change of scale of the world move everything in it."""
     motions = np.zeros((int(columns.starts[-1]), 7))
     num = columns.num_kept_blocks
     for i, (kind, block) in enumerate(zip(columns.kinds[:num], columns.variable[:num], strict=True)):
         rows = motions[columns.span(i)]
         if kind == "pose":
-            rows[:3, 1:4] = -0.5 * _matrix(block)
-            rows[3:, 4:] = -_matrix(block)
-        if kind in ("pose", "sensor") and len(rows) == 6:
-            rows[3:, 0] = block[4:]
+            rotation, translation = _matrix(block), block[4:]
+            center = -rotation.T @ translation
+            rows[:3, :3] = -0.5 * rotation
+            rows[3:, 3:] = -rotation @ np.column_stack([np.eye(3), center])
+        elif kind == "sensor" and len(rows) == 6:
+            rows[3:, 6] = block[4:]
         elif kind == "anchor":
-            rows[:] = similarity_motions(block[None])[0]
+            rows[:] = np.roll(similarity_motions(block[None])[0], -1, axis=1)
     points = np.array(columns.variable[num:]).reshape(-1, 3)
-    motions[columns.num_kept_columns :] = similarity_motions(points).reshape(-1, 7)
+    motions[columns.num_kept_columns :] = np.roll(similarity_motions(points), -1, axis=2).reshape(-1, 7)
     return motions
 
 
