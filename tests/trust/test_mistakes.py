@@ -7,9 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.known import known
 from tests.studies.erring_surveys import SITES, Given, Site, run, surveyed
 from tests.studies.mistakes import kinds
 
+from rangesfm.trust.alternatives import alternatives
 from rangesfm.trust.verdict import TrustVerdict
 
 HALL, YARD, DRONE = SITES
@@ -175,3 +177,13 @@ def test_a_mistake_is_the_likeliest_cause(kind: str, size: float, name: str) -> 
     mistake.make(given, size, np.random.default_rng(SEED))
     given.needs_search = mistake.of is None
     assert trust(given).causes[0].name == name
+
+
+def test_a_lever_arm_in_other_axes_is_as_long_as_it_was_given() -> None:
+    given = surveyed(DRONE, SEED)
+    of_arms = [each for each in alternatives(known(run(given, SEED).on_map)) if each.name == "lever arm's axes"]
+    moves_m = [move_m for each in of_arms for move_m in known(each.correction.tag_moves_m).values()]
+    arm_m = np.asarray(given.tag_in_cam_m)
+    assert len(moves_m) == 5
+    np.testing.assert_allclose(np.linalg.norm(arm_m + np.array(moves_m), axis=1), np.linalg.norm(arm_m), rtol=1e-6)
+    assert len(np.unique(np.round(moves_m, 6), axis=0)) == 5

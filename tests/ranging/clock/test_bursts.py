@@ -16,6 +16,6 @@ def test_a_path_explains_medians_that_are_enough_and_that_nothing_else_explains(
     assert PAIRING.explains()
 
 
-@pytest.mark.parametrize("change", [{"num_spare": 3.0}, {"chance": 0.01}])
-def test_few_medians_or_chance_explain_nothing(change: dict[str, float]) -> None:
-    assert not replace(PAIRING, **change).explains()
+@pytest.mark.parametrize("pairing", [replace(PAIRING, num_spare=3.0), replace(PAIRING, chance=0.01)])
+def test_few_medians_or_chance_explain_nothing(pairing: Pairing) -> None:
+    assert not pairing.explains()
