@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
 from rangesfm.files.tables import (
     Table,
@@ -121,7 +122,7 @@ class Reference:
             f"{max_gap_s:g} s apart they are interpolated"
         )
 
-    def _at_index(self, index: Indices) -> tuple[Array, Array | None]:
+    def _at_index(self, index: npt.NDArray[np.int64]) -> tuple[Array, Array | None]:
         rotations = None if self.world_from_cam is None else _rows(self.world_from_cam, index)
         return _rows(self.positions_m, index), rotations
 
@@ -225,7 +226,7 @@ def _rotations(table: Table) -> Array | None:
     return rotations
 
 
-def _rows(values: Array, index: Indices) -> Array:
+def _rows(values: Array, index: npt.NDArray[np.int64]) -> Array:
     """Rows of ``values``; NaN where the index is -1."""
     rows = np.full((len(index), *values.shape[1:]), np.nan)
     rows[index >= 0] = values[index[index >= 0]]
