@@ -14,6 +14,7 @@ from rangesfm.colmap.observations import seen_in
 _MAX_ERROR_PX = 4.0
 # Of the longer side of a photo: features of large photos are coarser.
 _MAX_ERROR_SHARE = 0.005
+MISMATCHED = "check that model, photos and the camera's parameters belong together"
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,13 @@ class PointErrors:
     def fit(self) -> bool:
         """Whether the points are of these photos and cameras at all; nothing speaks against no points."""
         return not self.median_px > self.max_median_px
+
+    def apart(self, whose: str, photos: str = "the photos") -> str:
+        """In words, how far points lie that do not fit."""
+        return (
+            f"{whose}'s points lie {self.median_px:.3g} px (median) from where {photos} show them, expected below "
+            f"{self.max_median_px:.3g} px"
+        )
 
 
 def point_errors(model: pycolmap.Reconstruction) -> PointErrors:

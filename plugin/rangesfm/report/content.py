@@ -99,7 +99,7 @@ class Content:
         is turned as in the final map, and anchors stand where that has them.
         """
         ranges, path = self.ranges, self.final
-        if ranges is None or path is None:
+        if ranges is None or path is None or not self.reference_by_photo:
             return None
         anchors_m = self.result.anchor_positions_m
         index_of = {name: i for i, name in enumerate(path.image_names)}

@@ -10,12 +10,11 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.colmap.reprojection import photo_errors_px, point_errors
+from rangesfm.colmap.reprojection import MISMATCHED, photo_errors_px, point_errors
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
-from rangesfm.trust.finished_map import MISMATCHED, points_apart
 
 # No surveyor measures the heights of three anchors to be the same to a millimetre, nor puts two into one place.
 _SAME_HEIGHT_M, _SAME_PLACE_M = 1e-3, 0.01
@@ -149,7 +148,7 @@ def notes_on_model(model: pycolmap.Reconstruction) -> Iterator[str]:
     """Of a model that was brought along."""
     errors = point_errors(model)
     if not errors.fit:
-        yield f"{points_apart('the model', errors, 'its photos')}: {MISMATCHED}"
+        yield f"{errors.apart('the model', 'its photos')}: {MISMATCHED}"
         return
     off_px = {name: off for name, off in photo_errors_px(model).items() if off > errors.max_median_px}
     if off_px:

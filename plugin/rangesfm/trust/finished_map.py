@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array
-from rangesfm.colmap.reprojection import PointErrors, point_errors
+from rangesfm.colmap.reprojection import MISMATCHED, PointErrors, point_errors
 from rangesfm.geometry.similarity import IDENTITY, align_most, path_shape, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
@@ -21,7 +21,6 @@ from rangesfm.refine.with_ranges import RefineSummary
 from rangesfm.scale.estimate import NORMAL_95, ScaleEstimate
 from rangesfm.scale.verdict import DOUBTFUL_ABOVE
 
-MISMATCHED = "check that model, photos and the camera's parameters belong together"
 # Prior stddevs that a coordinate may be off: by chance one in two thousand is.
 _MAX_STDDEVS = 3.5
 # Noise of UWB radios in the open is 0.02 to 0.3 m.
@@ -95,14 +94,6 @@ def doubts_of_map(
     )
 
 
-def points_apart(whose: str, points: PointErrors, photos: str = "the photos") -> str:
-    """In words, how far points are that fit no photos."""
-    return (
-        f"{whose}'s points lie {points.median_px:.3g} px (median) from where {photos} show them, expected below "
-        f"{points.max_median_px:.3g} px"
-    )
-
-
 def _surveyed(anchors: Sequence[AnchorEstimate]) -> Iterator[tuple[str, Array, float]]:
     """Of anchors that were measured, and not exactly: the id, how far each went from there (3,), and its stddev."""
     for anchor in anchors:
@@ -116,7 +107,7 @@ def _of_fit(
 ) -> Iterator[Doubt]:
     """Of points that do not fit the photos, of the solver, and of a scale that the refinement took elsewhere."""
     if not points.fit:
-        yield Doubt(points_apart("the map", points), MISMATCHED)
+        yield Doubt(points.apart("the map"), MISMATCHED)
     if summary is not None and not summary.converged:
         remedy = "give it more iterations ([refine] max_num_iterations), or the map fewer wrong points"
         yield Doubt(f"the refinement stopped before it converged: {summary.message}", remedy)
@@ -244,7 +235,7 @@ def _max_growth(scaled: pycolmap.Reconstruction, summary: RefineSummary, range_l
 
 def _out_of_line(before: PointErrors, after: PointErrors, summary: RefineSummary, max_growth: float) -> Iterator[str]:
     if not after.fit:
-        yield points_apart("the refined map", after)
+        yield after.apart("the refined map")
         return
     typical_px = max(before.median_px, summary.pixel_stddev if before.fit else 0.0)
     if after.median_px > max_growth * typical_px:

@@ -122,7 +122,7 @@ def _registered(model: pycolmap.Reconstruction) -> set[str]:
 
 def _with_names_of_their_own(surveys: Sequence[FinishedRun]) -> list[FinishedRun]:
     counts = Counter(name for survey in surveys for name in survey.own_name)
-    return list(surveys) if max(counts.values()) == 1 else list(map(_renamed, surveys))
+    return list(surveys) if max(counts.values(), default=1) == 1 else list(map(_renamed, surveys))
 
 
 def _renamed(survey: FinishedRun) -> FinishedRun:
