@@ -108,6 +108,20 @@ def test_two_anchors_above_each_other_leave_the_heading_open(make_survey: MakeSu
     assert any("turn of the map about their line open" in reason for reason in estimate.reasons)
 
 
+def test_a_level_line_of_anchors_is_in_a_level_plane_where_gravity_is_known(make_survey: MakeSurvey) -> None:
+    survey = make_survey(
+        centers_m=flat_loop(make_survey),
+        anchors_m={"A": (6.0, 0.0, 1.0), "B": (-6.0, 1.0, 1.0)},
+        radio=NOISE,
+        num_epochs=2,
+        tag_in_cam_m=(0, 0, 0),
+    )
+    for side, height_m in (("above", 2.4), ("below", -0.4)):
+        options = ScaleOptions.model_validate({"camera_side": side, "up_in_first_camera": up_of(survey)})
+        estimate = survey.scale("site", "AB", options=options)
+        np.testing.assert_allclose(estimate.metric_from_sfm.apply(survey.trajectory.centers)[:, 2], height_m, atol=0.15)
+
+
 def test_one_anchor_and_gravity_give_the_cameras_height_and_its_distance(make_survey: MakeSurvey) -> None:
     survey = make_survey(anchors_m=ONE_ANCHOR_M)
     estimate = survey.scale("site", "A", options=ScaleOptions(up_in_first_camera=up_of(survey)))

@@ -18,6 +18,7 @@ from rangesfm.options import ScaleOptions
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
+from rangesfm.trust import finished_map
 from rangesfm.trust.finished_map import doubts_of_map, place_of_map
 
 __all__ = ["make_survey"]
@@ -168,3 +169,15 @@ def test_motions_of_a_similarity_are_its_derivatives() -> None:
     np.testing.assert_allclose(motions @ np.eye(7)[0], points)
     np.testing.assert_allclose(motions @ [0, 0.1, 0.2, 0.3, 0, 0, 0], np.cross([0.1, 0.2, 0.3], points))
     np.testing.assert_allclose(motions @ np.eye(7)[5], np.tile(np.eye(3)[1], (5, 1)))
+
+
+@pytest.mark.parametrize(("share", "is_said"), [(0.4, False), (0.6, True)])
+def test_points_thrown_away_are_said_if_they_are_most(
+    walked: Survey, estimate: ScaleEstimate, share: float, is_said: bool
+) -> None:
+    """Whatever their reprojection errors: along their rays they may go far and err by little."""
+    path = path_in_site(walked, estimate)
+    points = np.random.default_rng(0).standard_normal((100, 3))
+    thrown = np.where((np.arange(100) < 100 * share)[:, None], 1e4 * points, points)
+    reasons = list(finished_map._elsewhere(points, thrown, path, path, estimate))
+    assert [reason.split(":")[0] for reason in reasons] == is_said * ["the points were thrown away from the path"]

@@ -149,6 +149,24 @@ def test_long_ranges_and_small_coordinates_are_named_together() -> None:
     assert {cause.name for cause in trust(given).causes} == {"range share", "anchors' scale"}
 
 
+@pytest.mark.parametrize(("factor", "words"), [(0.94, "small"), (1.06, "large")])
+def test_coordinates_that_are_too_small_are_not_called_too_large(factor: float, words: str) -> None:
+    given = surveyed(YARD, SEED)
+    true_m = given.anchors_m
+    given.anchors_m = {name: factor * place_m for name, place_m in true_m.items()}
+    found = trust(given)
+    said = re.search(r"anchors' coordinates are about ([0-9.]+) % too (\w+)", found.reasons[0])
+    assert said is not None
+    assert said[2] == words
+    # By how much they must grow to be right; of two causes that look alike each explains all of it.
+    assert float(said[1]) == pytest.approx(100 * abs(1 / factor - 1), abs=1.0)
+    (correction,) = (cause.correction for cause in found.causes if cause.name == "anchors' scale")
+    apart_m, corrected_m = (
+        np.linalg.norm(known(places["N"]) - known(places["S"])) for places in (true_m, correction.anchors_m)
+    )
+    assert corrected_m == pytest.approx(apart_m, rel=0.01)
+
+
 def test_an_anchor_that_reads_long_is_named_unless_radios_do_so() -> None:
     given = surveyed(HALL, SEED)
     of_a1 = given.is_of("A1")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rangesfm.ranging.clock.fit import refine_offset
+from rangesfm.ranging.clock import estimate
+from rangesfm.ranging.clock.fit import Timing, fit_at_offset, refine_offset
 from rangesfm.ranging.clock.search import PathSamples, TimedRanges
 
 STEP_S = 0.025
@@ -41,3 +42,21 @@ def test_descents_end_soon_where_they_are_far_behind_and_go_on_where_they_are_no
     assert abs(behind.offset_s + 20.0) < abs(alone.offset_s + 20.0)  # it ended on the way
     again = refine_offset(ranges, path, 0.3, behind)
     assert again.offset_s == best.offset_s
+
+
+def test_even_motion_on_a_line_tells_nothing_of_the_clocks() -> None:
+    """Another offset is another place of the anchor."""
+    times_s = STEP_S * np.arange(NUM_SAMPLES)
+    way = times_s[:, None] * np.array([0.5, 0.2, 0.0])
+    even = PathSamples(0.0, STEP_S, way, np.zeros((1, NUM_SAMPLES, 3)), np.ones(NUM_SAMPLES, dtype=bool))
+    assert fit_at_offset(ranges_at(even, 0.0, 0.02), even, 0.0).timing() == Timing(np.inf, 0.0, np.inf)
+
+
+def test_of_two_offsets_one_is_as_much_likelier_as_the_other_is_less_likely(path: PathSamples) -> None:
+    """Each puts other ranges on the path; those that both do are compared."""
+    ranges = ranges_at(path, 0.0, 0.02)
+    best, rival = (fit_at_offset(ranges, path, offset_s) for offset_s in (0.0, -60.0))
+    assert len(rival.losses) < len(best.losses)
+    odds = estimate._log_odds(best, rival, path)
+    assert odds > 0
+    assert odds == pytest.approx(-estimate._log_odds(rival, best, path), rel=1e-9)
