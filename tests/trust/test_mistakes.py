@@ -88,6 +88,7 @@ def test_an_anchor_that_is_mostly_blocked_is_named_before_what_that_looks_like()
     given.range_m = given.range_m + (given.is_of("A1") & (rng.random(num) < 0.7)) * rng.exponential(1.5, num)
     likeliest = trust(given).tests[0]
     assert (likeliest.name, likeliest.subject) == ("anchor's outliers", "A1")
+    assert likeliest.words.startswith(f"{100 * known(likeliest.size):.0f} % of the ranges to anchor A1 ")
 
 
 def test_ranges_to_another_anchor_under_a_label_are_named() -> None:

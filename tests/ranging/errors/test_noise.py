@@ -29,3 +29,7 @@ def test_errors_of_a_stretch_that_are_alike_widen_and_rounding_does_not() -> Non
     assert correlation_inflation(alike, np.ones(500), groups) == pytest.approx(5.0)
     assert correlation_inflation(1e-12 * alike, np.ones(500), groups) == 1.0
     assert correlation_inflation(0 * alike, np.ones(500), groups) == 1.0
+
+
+def test_one_stretch_says_nothing_of_what_the_errors_of_one_have_in_common() -> None:
+    assert correlation_inflation(np.ones(500), np.ones(500), np.zeros(500, dtype=np.int64)) == 1.0
