@@ -11,6 +11,7 @@ import pytest
 from rangesfm.demo.ranges import Radio
 from rangesfm.errors import GeometryError
 from rangesfm.options import ScaleOptions
+from rangesfm.ranging.observations import RangeStatus
 from rangesfm.scale.estimate import CutoffTest
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.sensitivity import scale_drift
@@ -62,6 +63,9 @@ def test_few_ranges_and_many_outliers_have_their_advice(make_survey: MakeSurvey)
     obstructed = Radio(range_stddev_m=0.05, obstructed_share=0.45, obstructed_mean_m=5.0)
     many = make_survey(radio=obstructed, num_epochs=4).scale("first_camera", "ABCDE")
     assert any("nothing stands between" in advice for advice in many.advice)
+    status = many.observations.status
+    outliers = np.mean(status[status <= RangeStatus.OUTLIER] == RangeStatus.OUTLIER)
+    assert any(reason.startswith(f"{100 * outliers:.0f} % of the ranges do not fit") for reason in many.reasons)
 
 
 def test_two_surveyed_anchors_ask_for_a_third(make_survey: MakeSurvey) -> None:
