@@ -56,7 +56,7 @@ def mutants_of(path: Path) -> list[tuple[Mutant, int]]:
             continue
         operator: Any = get_operator(name)()
         places = [start[0] for node in nodes for start, _ in operator.mutation_positions(node)]
-        left = ("frozen=True", "strict=True") if name.endswith("ReplaceTrueWithFalse") else ("frozen=True",)
+        left = ("frozen=True", "strict=True") if name.endswith("ReplaceTrueWithFalse") else ()
         kept = [(k, line) for k, line in enumerate(places) if not any(word in lines[line - 1] for word in left)]
         found += [(Mutant(path, name, k), line) for k, line in kept]
     return found
