@@ -19,6 +19,7 @@ import pycolmap
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from tests.outputs import paths_below
 from tests.simulated.ranges import simulate_ranges_at
 
 from rangesfm.colmap.model_files import read_model
@@ -132,14 +133,14 @@ class Left:
     @property
     def files(self) -> set[str]:
         """Everything in the folder but the models' own files."""
-        paths = {path.relative_to(self.folder).as_posix() for path in self.folder.rglob("*") if path.is_file()}
+        paths = {path.relative_to(self.folder).as_posix() for path in paths_below(self.folder) if path.is_file()}
         models = {path for path in paths if path.startswith("sparse") and os.path.basename(path) in MODEL_FILES}
         return (paths - models) | {os.path.dirname(path) for path in models}
 
     @property
     def timeless_contents(self) -> dict[str, bytes]:
         """Of all files but those that tell how long things took."""
-        paths = {path.relative_to(self.folder).as_posix(): path for path in self.folder.rglob("*") if path.is_file()}
+        paths = {path.relative_to(self.folder).as_posix(): path for path in paths_below(self.folder) if path.is_file()}
         return {name: path.read_bytes() for name, path in paths.items() if name not in ("result.json", "report.html")}
 
     @property

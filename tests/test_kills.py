@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import signal
 import subprocess
@@ -38,7 +39,8 @@ IN_MATCHING = ("rangesfm.vision.matching", "append_log", 0)
 IN_MAPPING = ("rangesfm.vision.snapshots", "_keep", 3)
 AMONG_TABLES = ("rangesfm.result.tables", "write_table", 2)
 BEFORE_THE_RESULT = ("rangesfm.workflows.results", "input_hashes", 0)
-BEFORE_THE_REPORT = ("rangesfm.workflows.results", "write_report", 0)
+BEFORE_THE_REPORT = ("rangesfm.workflows.results", "write_report_of", 0)
+AMONG_RENAMES = ("rangesfm.files.output_folder", "_rename", 9)
 
 
 def killed(moment: tuple[str, str, int], *arguments: str, cwd: Path) -> str:
@@ -71,10 +73,9 @@ def test_killed_in_step_after_step_it_ends_as_if_nothing_had_been(
     assert_whole(output, photo_run.output_path)
 
 
-@pytest.mark.parametrize(("moment", "is_new"), [(AMONG_TABLES, False), (BEFORE_THE_REPORT, True)])
-def test_killed_while_it_replaces_a_result_it_leaves_none_or_the_new_one(
+@pytest.mark.parametrize("moment", [AMONG_TABLES, BEFORE_THE_REPORT, AMONG_RENAMES])
+def test_killed_while_it_replaces_a_result_it_leaves_the_old_one_or_what_completes_the_new_one(
     moment: tuple[str, str, int],
-    is_new: bool,
     photo_run: PhotoRun,
     rangesfm_command: Command,
     tmp_path: Path,
@@ -82,7 +83,11 @@ def test_killed_while_it_replaces_a_result_it_leaves_none_or_the_new_one(
     output, folder = shutil.copytree(photo_run.output_path, tmp_path / "out"), photo_run.survey.folder
     flags = (*photo_run.flags, "--output_path", str(output))
     killed(moment, *flags, "--check_share", "0.2", cwd=folder)
-    assert (output / "result.json").exists() is is_new
-    assert not (output / "report.html").exists()
+    if moment is AMONG_RENAMES:
+        assert not (output / "result.json").exists()
+        rangesfm_command("report", str(output), cwd=folder)
+        assert json.loads((output / "result.json").read_text())["check_ranges"]["num"] > 0
+    else:
+        assert_whole(output, photo_run.output_path)
     rangesfm_command("run", *flags, cwd=folder)
     assert_whole(output, photo_run.output_path)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from tests.outputs import paths_below
 
 from rangesfm.cli import main
 
@@ -26,7 +27,7 @@ NOT_TEXT = os.fsdecode(b"caf\xe9")
 
 def contents(folder: Path) -> dict[str, bytes]:
     """All files under a folder, hidden ones too."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths_below(folder) if path.is_file()}
 
 
 def quick_flags(survey: WalkedSurvey, folder: Path | None = None) -> tuple[str, ...]:

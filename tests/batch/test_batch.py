@@ -22,7 +22,7 @@ import pytest
 from distributed import LocalCluster
 
 from rangesfm.cli import main
-from rangesfm.files.atomic import LOCK_NAME
+from rangesfm.files.output_folder import LOCK_NAME
 
 if TYPE_CHECKING:
     from tests.conftest import Command, PhotoRun

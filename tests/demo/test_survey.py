@@ -11,6 +11,7 @@ import pycolmap
 import pytest
 from PIL import Image
 from PIL.ExifTags import IFD, Base
+from tests.outputs import paths_below
 
 from rangesfm.demo.survey import (
     ANCHOR_STDDEV_M,
@@ -22,14 +23,13 @@ from rangesfm.demo.survey import (
     make_demo_survey,
 )
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import sole_writer
+from rangesfm.files.atomic import sole_writer, write_text
 from rangesfm.geometry.reference import read_reference
 from rangesfm.ranging.anchors.anchor import read_anchors
 from rangesfm.ranging.readers import read_ranges
 from rangesfm.survey.settings import read_survey
 
 NUM_PHOTOS = 4
-NO_PROCESS = 99999999  # above any that Linux gives
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def _make(folder: Path, seed: int = 5) -> DemoSurvey:
 
 
 def _files(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths_below(folder) if path.is_file()}
 
 
 def test_folder_holds_the_survey_and_nothing_half_written(made: DemoSurvey) -> None:
@@ -163,9 +163,11 @@ def test_one_at_a_time_makes_a_survey_in_a_folder(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("no_photos")
 def test_what_a_killed_one_left_is_not_in_the_way_and_goes(tmp_path: Path) -> None:
-    left = tmp_path / f".images.{NO_PROCESS}.part"
-    left.mkdir()
-    (left / "IMG_0001.jpg").touch()
+    with sole_writer(tmp_path):
+        write_text("anchor_id\n", tmp_path / "anchors.csv")
     with pytest.raises(KeyboardInterrupt):
         _make(tmp_path)
-    assert _files(tmp_path) == {}
+    (tmp_path / "anchors.csv").write_text("mine\n")
+    with pytest.raises(InputError, match="expected a new or an empty folder"):
+        _make(tmp_path)
+    assert _files(tmp_path) == {"anchors.csv": b"mine\n"}

@@ -12,10 +12,11 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from tests.export.models import centers_of, read_ply, synthesized, xyz
+from tests.outputs import names_in, paths_in
 from tests.result_document import anchor_entry, result_document
 
 from rangesfm.errors import InputError
-from rangesfm.export import COVARIANCE_FORMATS, EXPORTERS, export_model, write_model, write_positions
+from rangesfm.export import COVARIANCE_FORMATS, EXPORTED_NAMES, EXPORTERS, export_model, write_model, write_positions
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.workflows.export_result import export_result
 
@@ -54,11 +55,21 @@ def test_colmap_models_are_read_back_whole(tmp_path: Path, model: pycolmap.Recon
 
 
 def test_a_model_replaces_an_older_one_whole(tmp_path: Path, model: pycolmap.Reconstruction) -> None:
-    (tmp_path / "0").mkdir()
-    (tmp_path / "0" / "stray.bin").write_text("")
+    write_model(model, tmp_path / "0", as_text=True)
     write_model(model, tmp_path / "0")
-    assert not (tmp_path / "0" / "stray.bin").exists()
-    assert [path.name for path in tmp_path.iterdir()] == ["0"]
+    assert {path.suffix for path in paths_in(tmp_path / "0")} == {".bin"}
+    assert names_in(tmp_path) == ["0"]
+
+
+def test_a_model_with_files_of_somebody_else_in_it_is_not_replaced(
+    tmp_path: Path, model: pycolmap.Reconstruction
+) -> None:
+    write_model(model, tmp_path / "0")
+    (tmp_path / "0" / "fused.ply").write_text("hours of work")
+    before = {path: path.read_bytes() for path in paths_in(tmp_path / "0")}
+    with pytest.raises(InputError, match=r"fused\.ply: is not a file that rangesfm wrote"):
+        write_model(model, tmp_path / "0", as_text=True)
+    assert {path: path.read_bytes() for path in paths_in(tmp_path / "0")} == before
 
 
 def test_the_tum_trajectory_holds_world_from_camera_in_order_of_time(
@@ -174,8 +185,8 @@ def test_formats_after_one_that_fails_are_written_and_all_failures_told(
         export_model(model, ["transform", "tum", "opf", "ply"], tmp_path)
     failed, written = error.value.advice
     assert failed.startswith("opf: the format 'opf' needs the stddev")
-    assert written == f"written all the same: {tmp_path / 'trajectory.tum'}, {tmp_path / 'points.ply'}"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["points.ply", "trajectory.tum"]
+    assert written == "written all the same: tum, ply"
+    assert names_in(tmp_path) == ["points.ply", "trajectory.tum"]
 
 
 def write_photos(folder: Path, model: pycolmap.Reconstruction) -> Path:
@@ -226,7 +237,8 @@ def test_a_result_is_exported_in_its_best_form_in_every_format(
     assert rows[0, 0] == 1.7e9
     np.testing.assert_array_equal(xyz(read_ply(paths["anchors.ply"])), [[1, 2, 3]])
     assert paths["transform_colmap_4.txt"].read_text().split()[0] == "2"
-    assert not list((tmp_path / "exports").glob(".*"))
+    expected_names = {name for format in formats for name in EXPORTED_NAMES[format]}
+    assert set(names_in(tmp_path / "exports")) == expected_names
 
 
 def test_a_folder_without_a_metric_model_cannot_be_exported(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.outputs import names_in
 
 from rangesfm.files.records import Count, Flag, Number, NumberOrNull, Record, Text, Vector, VectorOrNull
 
@@ -52,7 +53,7 @@ def test_record_is_plain_json_whatever_the_numbers(tmp_path: Path) -> None:
         "nowhere": None,
         "by_name": {"über": None, NOT_UTF8: 1.0},
     }
-    assert [path.name for path in tmp_path.iterdir()] == ["example.json"]
+    assert names_in(tmp_path) == ["example.json"]
 
 
 def test_record_is_read_as_it_was_written(tmp_path: Path) -> None:

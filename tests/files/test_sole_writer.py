@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from tests.outputs import names_in
 from tests.result_document import result_document
 
 from rangesfm.cli import main
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import LOCK_NAME, new_file, new_folder, sole_writer
+from rangesfm.files.atomic import new_file, new_folder, sole_writer, write_text
+from rangesfm.files.output_folder import LOCK_NAME, PRIVATE_NAME
 
 if TYPE_CHECKING:
     from tests.conftest import Command, WalkedSurvey
@@ -68,7 +70,7 @@ def test_what_is_written_into_a_result_waits_for_its_run(
     process = hold(tmp_path / "out")
     assert main(command.split()) == InputError.exit_status
     assert re.fullmatch(rf"rangesfm: error: out: .*process {process.pid}.*\n", capsys.readouterr().err)
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"result.json", LOCK_NAME}
+    assert names_in(tmp_path / "out") == ["result.json"]
 
 
 @pytest.mark.parametrize("command", ["refine", "scale", "run", "run --live"])
@@ -86,7 +88,7 @@ def test_a_second_run_is_refused_and_told_of_the_first(
     assert f"out: process {holder.pid} (-c {out}) has been writing to this folder since 20" in line
     assert line.endswith(": wait for it to end, or give another output path")
     assert done.stdout == ""
-    assert os.listdir(out) == [LOCK_NAME]
+    assert [path.relative_to(out).as_posix() for path in out.rglob("*")] == [PRIVATE_NAME, LOCK_NAME]
 
 
 def test_a_reconstruction_is_refused_too(
@@ -137,7 +139,8 @@ def test_where_there_are_no_locks_it_goes_on_in_silence(tmp_path: Path, monkeypa
 
     monkeypatch.setattr("fcntl.flock", fail)
     with sole_writer(tmp_path), sole_writer(tmp_path):
-        assert os.listdir(tmp_path) == []
+        assert names_in(tmp_path) == []
+    assert os.listdir(tmp_path) == []
 
 
 def test_a_folder_made_for_nothing_is_gone_again(tmp_path: Path) -> None:
@@ -152,8 +155,8 @@ def test_a_folder_made_for_nothing_is_gone_again(tmp_path: Path) -> None:
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from rangesfm.files.atomic import new_file, new_folder
-with new_folder(Path("models") / "0") as folder, new_file(Path("table.csv")) as file:
+from rangesfm.files.atomic import new_file, new_folder, sole_writer
+with sole_writer(Path()), new_folder(Path("models") / "0") as folder, new_file(Path("table.csv")) as file:
     (folder / "x").touch()
     file.touch()
     os.kill(os.getpid(), signal.SIGKILL)
@@ -164,31 +167,24 @@ def test_what_a_killed_process_had_in_the_making_is_cleared_away(tmp_path: Path)
     (tmp_path / "models").mkdir()
     (tmp_path / ".mine.part").touch()
     subprocess.run([sys.executable, "-c", KILLED], cwd=tmp_path, check=False)
-    names = {path.name.split(".")[1] for path in tmp_path.rglob(".*") if path.name != ".mine.part"}
-    assert names == {"table", "0"}
+    parts = [path.name for path in (tmp_path / PRIVATE_NAME / "parts").iterdir()]
+    assert len(parts) == 2
+    assert names_in(tmp_path) == [".mine.part", "models"]
     with sole_writer(tmp_path):
         pass
     assert {path.name for path in tmp_path.rglob("*")} == {"models", ".mine.part"}
 
 
-def test_a_killed_process_is_over_before_its_parent_asks_for_it(tmp_path: Path) -> None:
-    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
-        leftover = tmp_path / f".points.{process.pid}.part.ply"
-        leftover.touch()
-        with sole_writer(tmp_path):
-            assert leftover.exists()
-        process.kill()
-        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)  # it has ended, and stays to be asked for
-        with sole_writer(tmp_path):
-            assert not leftover.exists()
-
-
 def test_what_a_living_process_has_in_the_making_stays(tmp_path: Path) -> None:
-    being_made = tmp_path / f".table.{os.getppid()}.part.csv"
-    being_made.touch()
+    with sole_writer(tmp_path) as output:
+        token = output.part("x").name.partition("-")[0]
+        write_text("", tmp_path / "file")
+        alive = output.private / "parts" / f"{token}-{os.getppid()}-0-points.ply"
+        dead, another = (alive.with_name(name) for name in (f"{token}-{2**31}-0-points.ply", "abc-123-0-points.ply"))
+        for path in (alive, dead, another):
+            path.touch()
     with sole_writer(tmp_path):
-        pass
-    assert being_made.exists()
+        assert {path.name for path in alive.parent.iterdir()} == {alive.name, another.name}
 
 
 def test_what_is_made_inside_is_not_cleared_away(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from tests.outputs import names_in
 
 from rangesfm.errors import InputError
 from rangesfm.ranging.log import RangeLog
@@ -61,7 +62,7 @@ def test_figure_is_written_as_its_name_says(tmp_path: Path) -> None:
         write_picture(plot_ranges(LOG), tmp_path / "out.doc")
     with pytest.raises(InputError, match="cannot be written"):
         write_picture(plot_ranges(LOG), tmp_path / "none" / "out.png")
-    assert [path.name for path in tmp_path.iterdir()] == ["out.PNG"]
+    assert names_in(tmp_path) == ["out.PNG"]
 
 
 def test_pictures_have_the_pages_light_colours() -> None:

@@ -9,93 +9,97 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.outputs import names_in, paths_in
 from tests.result_document import anchor_entry, result_document
 
 from rangesfm.errors import InputError
 from rangesfm.result.folder import (
     RESULT_FILES,
-    forget_result,
+    new_result,
     read_result_folder,
     refuse_to_overwrite,
-    replacing_result,
 )
 from rangesfm.result.tables import TABLES, RangesAsUsed
-from rangesfm.survey.settings import InputPath
+from rangesfm.survey.settings import Survey, survey_from_tables
 
 PAGE = (Path(__file__).parents[2] / "examples" / "results.md").read_text(encoding="utf-8")
 
 
 def files_of(folder: Path) -> set[str]:
-    return {path.name for path in folder.iterdir()}
+    return set(names_in(folder))
+
+
+def survey_reading(path: Path, output: Path, key: str = "report.reference", **tables: Any) -> Survey:
+    table, name = key.split(".")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch()
+    return survey_from_tables({table: {name: str(path)}, "output": {"path": str(output)}, **tables}, path.parent)
 
 
 @pytest.mark.parametrize(
-    "name", ["ranges.csv", "images.csv", "reference.csv", "trajectory.tum", "sparse_scaled/0", "sparse_metric/0"]
+    "name",
+    [
+        *(
+            "ranges.csv",
+            "images.csv",
+            "reference.csv",
+            "trajectory.tum",
+            "sparse_scaled/0/a.csv",
+            "sparse_metric/x.csv",
+        ),
+        *("sparse/0/a.csv", "photos/walk.csv", "database.db", "mapper.log", "reconstruct.json", "opf/a.csv"),
+    ],
 )
 def test_input_is_never_overwritten(name: str, tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "out", target_is_directory=True)
     for path in (tmp_path / "out" / name, tmp_path / "out" / "." / name, tmp_path / "link" / name):
+        export: Any = {"export": {"formats": ["tum", "opf"]}}
         with pytest.raises(InputError, match="the results would overwrite this input") as caught:
-            refuse_to_overwrite([InputPath("", "file", path)], tmp_path / "out")
+            refuse_to_overwrite(survey_reading(path, tmp_path / "out", **export))
         assert caught.value.path == path
-    beside = [InputPath("", "file", tmp_path / name), InputPath("", "model", tmp_path / "out" / "sparse" / "0")]
-    refuse_to_overwrite(beside, tmp_path / "out")
+    refuse_to_overwrite(survey_reading(tmp_path / "beside.csv", tmp_path / "out"))
 
 
-def test_results_do_not_stand_among_a_model_nor_a_model_among_results(tmp_path: Path) -> None:
-    for model, output in (("0", "0"), ("out/sparse_metric/0/copy", "out")):
+def test_a_model_that_is_read_may_stand_beside_the_results_and_not_among_them(tmp_path: Path) -> None:
+    for model, output in (("0", "0"), ("out/sparse_metric/0/copy", "out"), ("out/sparse_metric", "out")):
         (tmp_path / model).mkdir(parents=True, exist_ok=True)
-        (tmp_path / model / "cameras.bin").touch()
+        survey = survey_from_tables({"images": {"model": model}, "output": {"path": output}}, tmp_path)
         with pytest.raises(InputError, match="expected another output path"):
-            refuse_to_overwrite([InputPath("", "model", tmp_path / model)], tmp_path / output)
-    refuse_to_overwrite([InputPath("", "photos", tmp_path / "photos")], tmp_path / "photos" / "out")
+            refuse_to_overwrite(survey)
+    for images in ({"path": "photos"}, {"model": "photos/out/sparse/0"}):
+        refuse_to_overwrite(survey_from_tables({"images": images, "output": {"path": "photos/out"}}, tmp_path))
 
 
-class TestForgetting:
+class TestNewResult:
     @pytest.fixture
     def folder(self, tmp_path: Path) -> Path:
-        (tmp_path / "sparse" / "0").mkdir(parents=True)
-        for name in ("result.json", "report.html", "ranges.csv", "mine.txt"):
-            (tmp_path / name).touch()
+        self.write(tmp_path, "result.json", "report.html", "ranges.csv", "sparse_metric")
+        for name in ("sparse", "mine.txt"):
+            (tmp_path / name).write_text("mine")
         return tmp_path
 
-    def test_takes_away_what_was_said_of_the_model_and_nothing_else(self, folder: Path) -> None:
-        forget_result(folder)
-        assert files_of(folder) == {"sparse", "mine.txt"}
+    def write(self, folder: Path, *names: str) -> None:
+        with new_result(folder) as staged:
+            for name in names:
+                (staged / name).write_text(name)
 
-    def test_leaves_files_alone_that_belong_to_no_result(self, folder: Path) -> None:
-        (folder / "result.json").unlink()
-        forget_result(folder)
-        assert files_of(folder) == {"sparse", "report.html", "ranges.csv", "mine.txt"}
+    def test_takes_the_place_of_all_of_the_earlier_one_and_of_nothing_else(self, folder: Path) -> None:
+        self.write(folder, "result.json", "images.csv")
+        assert files_of(folder) == {"sparse", "mine.txt", "result.json", "images.csv"}
 
-    def test_goes_on_where_it_was_killed(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        def die(path: Path, **_: Any) -> None:
-            raise KeyboardInterrupt
+    def test_that_fails_leaves_the_earlier_one_whole(self, folder: Path) -> None:
+        before = {path.name: path.read_text() for path in paths_in(folder)}
+        with pytest.raises(ZeroDivisionError), new_result(folder) as staged:
+            (staged / "ranges.csv").write_text(str(1 / 0))
+        assert {path.name: path.read_text() for path in paths_in(folder)} == before
 
-        with monkeypatch.context() as patched:
-            patched.setattr(Path, "unlink", die)
-            with pytest.raises(KeyboardInterrupt):
-                forget_result(folder)
-        assert {"report.html", "ranges.csv"} < files_of(folder)
-        assert "result.json" not in files_of(folder)
-        forget_result(folder)
-        assert files_of(folder) == {"sparse", "mine.txt"}
-
-    def test_comes_before_a_new_result_of_which_nothing_stays_if_it_fails(self, folder: Path) -> None:
-        def write_and_fail() -> None:
-            with replacing_result(folder):
-                assert {path.name for path in folder.glob("[!.]*")} == {"sparse", "mine.txt"}
-                (folder / "ranges.csv").touch()
-                raise KeyboardInterrupt
-
-        with pytest.raises(KeyboardInterrupt):
-            write_and_fail()
-        assert files_of(folder) == {"sparse", "mine.txt"}
-
-    def test_leaves_nothing_beside_a_new_result(self, folder: Path) -> None:
-        with replacing_result(folder):
-            (folder / "result.json").touch()
-        assert files_of(folder) == {"sparse", "mine.txt", "result.json"}
+    @pytest.mark.parametrize("name", ["markers.csv", "reference.csv", "images.csv", "sparse_scaled", "report.html"])
+    def test_is_refused_where_somebody_else_has_a_file_of_that_name(self, name: str, folder: Path) -> None:
+        (folder / name).write_text("of somebody else")
+        before = {path.name: path.read_text() for path in paths_in(folder)}
+        with pytest.raises(InputError, match=f"{name}: is not a file that rangesfm wrote"), new_result(folder):
+            pytest.fail("the block was entered")
+        assert {path.name: path.read_text() for path in paths_in(folder)} == before
 
 
 def write_document(folder: Path, **changes: Any) -> Path:

@@ -48,9 +48,9 @@ def test_a_run_leaves_what_the_schema_says(photo_run: PhotoRun) -> None:
 )
 def test_what_is_read_is_written_again(changes: dict[str, Any], tmp_path: Path) -> None:
     document = result_document(**changes)
+    (tmp_path / "first.json").write_text(json.dumps(document))
     path = tmp_path / "result.json"
-    path.write_text(json.dumps(document))
-    ResultSummary.read(path).write(path)
+    ResultSummary.read(tmp_path / "first.json").write(path)
     assert json.loads(path.read_text(encoding="utf-8")) == document
     jsonschema.validate(document, json.loads(schema()))
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.outputs import names_in
 
 from rangesfm.errors import InputError
 from rangesfm.result.tables import TABLES, CenterCovariances, PhotoTimes, ScaleConsensus, TableFile, TimeOffsetCurve
@@ -31,7 +32,7 @@ def test_table_is_read_as_it_was_written(kind: type[TableFile], num_rows: int, t
     written = example(kind, num_rows)
     written.write(tmp_path)
     found = kind.read(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == [kind.NAME]
+    assert names_in(tmp_path) == [kind.NAME]
     for name in kind.columns():
         np.testing.assert_array_equal(getattr(found, name), getattr(written, name))
 

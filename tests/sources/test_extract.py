@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from tests.outputs import names_in
 
 from rangesfm.errors import InputError
 from rangesfm.progress import SilentProgress
@@ -113,7 +114,7 @@ def test_what_ends_halfway_leaves_the_photos_of_before_and_nothing_else(error: t
     with pytest.raises(error):
         take(film)
     out = film.path.parent / "out"
-    assert [path.name for path in out.iterdir()] == ["photos"]
+    assert names_in(out) == ["photos"]
     assert TakenPhotos.read(out / "photos" / "photos.json") == before
 
 

@@ -27,6 +27,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from tests.outputs import paths_below
 from tests.simulated.small_demo import make_small_demo
 
 from rangesfm.colmap.model_files import read_model
@@ -106,7 +107,7 @@ def differences(whole: Path, other: Path) -> list[str]:
 
 def names_in(folder: Path) -> set[str]:
     """Of all files and folders, however deep."""
-    return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
+    return {path.relative_to(folder).as_posix() for path in paths_below(folder)}
 
 
 def _same_table(first: Path, second: Path) -> bool:

@@ -11,7 +11,7 @@ import pytest
 from tests.vision.matches import content_of
 
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import sha256_of
+from rangesfm.files.contents import sha256_of
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.vision.reconstruct import ReconstructionSummary, reconstruct
 

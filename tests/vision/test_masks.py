@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from rangesfm.errors import InputError, OptionError
+from rangesfm.files.atomic import sole_writer
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.vision.reconstruct import match_photos
@@ -40,10 +41,11 @@ def masks(room: Room, tmp_path: Path) -> Path:
 def leftmost_features(room: Room, masks: Path) -> list[float]:
     """Of each photo, as a share of its width."""
     mapper = MapperOptions(mask_path=masks)
-    space = Workspace(masks.with_name("out"), SilentProgress())
-    match_photos(room.folder, room.names[:NUM_PHOTOS], CameraOptions(), mapper, NO_RIGS, 0, space, restart=False)
-    with pycolmap.Database.open(space.database) as database:
-        return [float(database.read_keypoints(id_)[:, 0].min() / 256) for id_ in range(1, NUM_PHOTOS + 1)]
+    with sole_writer(masks.with_name("out")) as output:
+        space = Workspace(output.private, SilentProgress())
+        match_photos(room.folder, room.names[:NUM_PHOTOS], CameraOptions(), mapper, NO_RIGS, 0, space)
+        with pycolmap.Database.open(space.database) as database:
+            return [float(database.read_keypoints(id_)[:, 0].min() / 256) for id_ in range(1, NUM_PHOTOS + 1)]
 
 
 def test_no_feature_is_where_a_mask_is_black_and_other_masks_give_others(room: Room, masks: Path) -> None:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 import pycolmap
 import pytest
 from PIL import Image
+from tests.outputs import names_in, paths_below, unfinished
 from tests.vision.matches import content_of
 
 from rangesfm.errors import InputError, ReconstructionError
@@ -55,7 +56,7 @@ class TestOneModel:
 
     def test_is_on_disk_beside_the_database_and_the_log_and_nothing_else(self, done: ReconstructionSummary) -> None:
         folder = done.log_path.parent
-        assert sorted(os.listdir(folder)) == ["database.db", "mapper.log", "reconstruct.json", "sparse"]
+        assert names_in(folder) == ["database.db", "mapper.log", "reconstruct.json", "sparse"]
         assert os.listdir(folder / "sparse") == ["0"]
         assert pycolmap.Reconstruction(folder / "sparse" / "0").num_reg_images() == 6
         log = done.log_path.read_text()
@@ -271,7 +272,7 @@ class TestEarlierRun:
     def test_of_unchanged_photos_does_not_read_them_again(
         self, room: Room, output: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("rangesfm.files.atomic.sha256_of", pytest.fail)
+        monkeypatch.setattr("rangesfm.files.contents.sha256_of", pytest.fail)
         summary = reconstruct(room.folder, room.names, output, camera=room.camera, mapper=MAPPER)
         assert summary.seconds == {}
 
@@ -292,12 +293,19 @@ class TestEarlierRun:
         assert list(summary.seconds) == ["matching", "mapping"]
         assert set(centers_by_name(summary.models[0])) == set(room.names)
 
-    def test_on_other_photos_leaves_nothing_behind_when_these_do_not_reconstruct(
-        self, room: Room, output: Path
-    ) -> None:
+    def test_is_left_as_it_was_when_other_photos_do_not_reconstruct(self, room: Room, output: Path) -> None:
+        before = {path: path.read_bytes() for path in paths_below(output) if path.is_file()}
         with pytest.raises(ReconstructionError, match="no model from 2 photos"):
             reconstruct(room.folder, [room.names[0], room.names[-1]], output, camera=room.camera, mapper=MAPPER)
-        assert not (output / "sparse").exists()
+        assert {path: path.read_bytes() for path in paths_below(output) if path.is_file()} == before
+
+    def test_is_left_as_it_was_through_a_hard_link(self, room: Room, output: Path, tmp_path: Path) -> None:
+        linked = tmp_path / "backup.db"
+        os.link(output / "database.db", linked)
+        before = linked.read_bytes()
+        reconstruct(room.folder, room.names, output, camera=room.camera, mapper=MAPPER, seed=1)
+        assert linked.read_bytes() == before
+        assert (output / "database.db").read_bytes() != before
 
 
 class TestOtherPhotos:
@@ -363,16 +371,38 @@ class TestOtherPhotos:
         assert not listener.messages
         assert listener.stages == ["features", "matching", "mapping"]
 
-    def test_start_from_nothing_where_the_database_is_damaged(
-        self, room: Room, output: Path, listener: Listener
-    ) -> None:
+    def test_are_refused_where_somebody_changed_the_database(self, room: Room, output: Path) -> None:
         data = (output / "database.db").read_bytes()
-        (output / "database.db").write_bytes(data[:4096] + bytes(len(data) - 4096))
-        reconstruct(room.folder, room.names[:4], output, camera=room.camera, mapper=MAPPER, progress=listener)
+        changed = data[:4096] + bytes(len(data) - 4096)
+        (output / "database.db").write_bytes(changed)
+        with pytest.raises(InputError, match=r"database\.db: is not a file that rangesfm wrote as it is now"):
+            reconstruct(room.folder, room.names[:4], output, camera=room.camera, mapper=MAPPER)
+        assert (output / "database.db").read_bytes() == changed
+
+    def test_are_reconstructed_though_colmap_has_looked_at_the_database(self, room: Room, output: Path) -> None:
+        with pycolmap.Database.open(output / "database.db") as database:  # which counts that in the file's header
+            assert database.num_images() == 6
+        summary = reconstruct(room.folder, room.names[:4], output, camera=room.camera, mapper=MAPPER)
+        assert summary.num_registered == 4
+
+    def test_start_from_nothing_where_the_unfinished_database_is_damaged(
+        self, room: Room, tmp_path: Path, listener: Listener, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def die(*_: Any) -> None:
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patched:
+            patched.setattr("rangesfm.vision.renewed_database.RenewedDatabase._match", die)
+            with pytest.raises(KeyboardInterrupt):
+                reconstruct(room.folder, room.names, tmp_path, camera=room.camera, mapper=MAPPER)
+        database = unfinished(tmp_path) / "database.db"
+        data = database.read_bytes()
+        database.write_bytes(data[:4096] + bytes(len(data) - 4096))
+        reconstruct(room.folder, room.names[:4], tmp_path, camera=room.camera, mapper=MAPPER, progress=listener)
         assert listener.messages == []
         assert listener.stages == ["features", "matching", "mapping"]
 
-    def test_start_from_nothing_after_a_run_that_was_killed_as_it_renewed_the_database(
+    def test_that_were_given_up_leave_the_reconstruction_of_before_to_be_taken_over(
         self, room: Room, changed: Room, output: Path, monkeypatch: pytest.MonkeyPatch, listener: Listener
     ) -> None:
         def die(*_: Any) -> None:
@@ -383,8 +413,8 @@ class TestOtherPhotos:
             with pytest.raises(KeyboardInterrupt):
                 reconstruct(changed.folder, room.names, output, camera=room.camera, mapper=MAPPER)
         reconstruct(room.folder, room.names, output, camera=room.camera, mapper=MAPPER, progress=listener)
-        assert not listener.messages
-        assert listener.stages == ["features", "matching", "mapping"]
+        assert listener.stages == []
+        assert not unfinished(output).exists()
 
 
 class TestBadPhotos:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pycolmap
 import pytest
+from tests.outputs import names_in, unfinished
 
 from rangesfm.options import MapperOptions
 from rangesfm.vision import snapshots as snapshots_module
@@ -40,7 +41,7 @@ class Mapping:
 
     @property
     def snapshots(self) -> Path:
-        return self.output / "mapping_snapshot"
+        return unfinished(self.output) / "mapping_snapshot"
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +107,7 @@ def test_goes_on_from_the_photos_it_had_and_ends_as_if_nothing_had_been(
     assert_as_undisturbed(mapping.run(listener), undisturbed)
     assert f"mapping: goes on from {num_photos} photos of an earlier run" in listener.messages
     assert listener.updates["mapping"][-1] == (NUM_PHOTOS, NUM_PHOTOS)
-    assert sorted(os.listdir(mapping.output)) == ["database.db", "mapper.log", "reconstruct.json", "sparse"]
+    assert names_in(mapping.output) == ["database.db", "mapper.log", "reconstruct.json", "sparse"]
 
 
 def test_with_other_options_begins_anew(interrupted: Callable[[int], Mapping], listener: Listener) -> None:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rangesfm.files.output_folder import LOCK_NAME, PRIVATE_NAME
 from rangesfm.vision.steps import Steps, fingerprint
 
 if TYPE_CHECKING:
@@ -15,8 +16,17 @@ Run = Callable[..., list[str]]
 
 
 @pytest.fixture
-def run(tmp_path: Path, listener: Listener) -> Run:
+def folder(tmp_path: Path) -> Path:
+    """A folder in which everything is the tool's own."""
+    (tmp_path / PRIVATE_NAME).mkdir()
+    (tmp_path / LOCK_NAME).touch()
+    return tmp_path / PRIVATE_NAME
+
+
+@pytest.fixture
+def run(folder: Path, listener: Listener) -> Run:
     """Runs step a and then step b, and says what was done: "prepare a", "work a", ..."""
+    tmp_path = folder
 
     def run_both(
         a: str = "1", b: str = "1", *, forget: str | None = None, interrupted_in: str | None = None
@@ -111,16 +121,16 @@ def test_an_interrupted_preparation_is_repeated_and_nothing_of_before_is_believe
 
 
 @pytest.mark.parametrize(("lost", "done"), [("b", ["prepare b", "work b"]), ("a", ALL), ("steps.json", ALL)])
-def test_what_is_lost_is_done_anew(run: Run, tmp_path: Path, lost: str, done: list[str]) -> None:
+def test_what_is_lost_is_done_anew(run: Run, folder: Path, lost: str, done: list[str]) -> None:
     run()
-    (tmp_path / lost).unlink()
+    (folder / lost).unlink()
     assert run() == done
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", '{"a": 1}', '{"steps": {"a": 1}}'])
-def test_a_damaged_record_is_no_record(run: Run, tmp_path: Path, text: str) -> None:
+def test_a_damaged_record_is_no_record(run: Run, folder: Path, text: str) -> None:
     run()
-    (tmp_path / "steps.json").write_text(text)
+    (folder / "steps.json").write_text(text)
     assert run() == ALL
 
 

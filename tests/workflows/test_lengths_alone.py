@@ -13,6 +13,7 @@ import pycolmap
 import pytest
 from scipy.spatial.distance import pdist
 from tests.known import known
+from tests.outputs import paths_in
 from tests.rendering.tagged_room import DICTIONARY, NUM_TAGS, SIDE_M, tagged_room
 from tests.simulated.model import SyntheticModel
 
@@ -81,7 +82,7 @@ def test_three_taped_lengths_make_metres_and_no_word_is_said_of_ranges(room: Roo
     assert not any(row.rejected for row in summary.tests)
     assert max(abs(known(row.residual_m)) for row in summary.distances) < 0.015
     assert not {"ranges.csv", "scale_candidates.csv", "scale_consensus.csv"} & {
-        path.name for path in survey.output.path.iterdir()
+        path.name for path in paths_in(survey.output.path)
     }
     page = (survey.output.path / "report.html").read_text()
     assert not [word for word in ("Ranges used", "Range RMS", "Clock offset") if f">{word}<" in page]

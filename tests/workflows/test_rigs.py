@@ -154,5 +154,5 @@ def test_a_frame_is_one_keyframe_with_the_time_of_its_photos_and_all_of_them_are
         return summary
 
     monkeypatch.setattr(photos, "reconstruct", reconstruct)
-    map_keyframes(survey, keyframes[1:], journal, restart=False)
+    map_keyframes(survey, keyframes[1:], journal, restart=False, deferred=False)
     assert mapped == names[2:]

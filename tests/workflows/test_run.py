@@ -16,6 +16,7 @@ import numpy.typing as npt
 import pycolmap
 import pytest
 from tests.known import known
+from tests.outputs import names_in, paths_below
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import loop_path
 
@@ -90,7 +91,7 @@ def refined(walked_survey: WalkedSurvey, tmp_path_factory: pytest.TempPathFactor
 
 
 def files_of(folder: Path) -> set[str]:
-    return {path.name for path in folder.iterdir()}
+    return set(names_in(folder))
 
 
 def test_result_and_summary_are_returned_as_written(refined: Done) -> None:
@@ -139,11 +140,11 @@ def test_the_result_names_its_inputs_by_their_hashes(scaled: Done) -> None:
 
 def test_refused_run_leaves_the_result_before_it(survey: Survey, scaled: Done) -> None:
     shutil.copytree(scaled.survey.output.path, survey.output.path)
-    before = {path: path.stat().st_mtime_ns for path in survey.output.path.rglob("*")}
+    before = {path: path.stat().st_mtime_ns for path in paths_below(survey.output.path)}
     strict = survey.changed({"scale.max_relative_stddev": 1e-6})
     with pytest.raises(GeometryError, match="the scale is only known to"):
         refine_model(strict, progress=SilentProgress())
-    assert {path: path.stat().st_mtime_ns for path in survey.output.path.rglob("*")} == before
+    assert {path: path.stat().st_mtime_ns for path in paths_below(survey.output.path)} == before
 
 
 def test_ranges_held_out_check_the_result(survey: Survey) -> None:

@@ -40,6 +40,7 @@ def _init(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm init my_survey --tag_in_cam 0.03,-0.12,-0.05
     """
     from rangesfm.files.atomic import write_text
+    from rangesfm.files.output_folder import free_output
     from rangesfm.findings.survey_file import NAME, survey_text
     from rangesfm.findings.understood import understand
     from rangesfm.survey.settings import read_survey
@@ -54,7 +55,7 @@ def _init(args: argparse.Namespace, progress: Progress) -> Outcome:
     understood.survey()  # refuses values that are none, before anything is written
     folder = path.absolute().parent
     folder.mkdir(parents=True, exist_ok=True)
-    write_text(survey_text({**understood.values, "output.path": folder / "out"}, folder), path)
+    write_text(survey_text({**understood.values, "output.path": free_output(folder)}, folder), path)
     checked = check_survey(read_survey(path))
     lines = [f"wrote {path}", *told(checked, fault="missing"), *(f"note: {note}" for note in understood.notes)]
     command = shlex.join(["rangesfm", "check" if checked.faults else "run", str(path)])

@@ -27,11 +27,14 @@ def _plan(args: argparse.Namespace, progress: Progress) -> Outcome:
     """
     if (args.plan is None) == (args.result is None):
         raise InputError("expected either a plan's file or --from RESULT")
+    from rangesfm.files.atomic import require_apart
     from rangesfm.planning.placement import place_anchors
     from rangesfm.planning.settings import read_plan
     from rangesfm.planning.survey_plan import plan_survey
     from rangesfm.report.plan_page import write_plan
 
+    if args.output_path is not None:
+        require_apart([Path(args.plan or args.result)], Path(args.output_path))
     if args.plan is not None:
         planned = place_anchors(read_plan(args.plan), progress)
     else:

@@ -171,6 +171,16 @@ def _number_of(text: str, is_good: Callable[[float], bool], what: str) -> float:
     return value
 
 
+def _require_apart(args: argparse.Namespace, *inputs: str | Path | None) -> None:
+    """Raise InputError if the command would write to the log or to another file that it reads."""
+    from rangesfm.files.atomic import require_apart
+
+    read = [Path(path) for path in (*args.log, *inputs) if path is not None]
+    for output in (args.output_path, getattr(args, "plot", None)):
+        if output is not None:
+            require_apart(read, Path(output))
+
+
 def _read_log(args: argparse.Namespace, anchor_ids: Sequence[str] = ()) -> RangeLog:
     """The log that the arguments name; ``anchor_ids`` as for ``read_ranges``."""
     from rangesfm.survey.inputs import read_log
@@ -201,6 +211,7 @@ def _ranges(args: argparse.Namespace, progress: Progress) -> Outcome:
     from rangesfm.ranging.readers import read_anchors_in_log, write_ranges_csv
     from rangesfm.ranging.summary import summarize_ranges
 
+    _require_apart(args, args.anchors)
     anchors = read_anchors(args.anchors) if args.anchors is not None else ()
     log = _read_log(args, [anchor.anchor_id for anchor in anchors])
     lines = [
@@ -292,6 +303,7 @@ def _calibrate(args: argparse.Namespace, progress: Progress) -> Outcome:
     from rangesfm.ranging.errors.calibration import calibrate_ranges
     from rangesfm.ranging.errors.error_curve import write_error_curve
 
+    _require_apart(args, args.anchors, args.positions)
     anchors = read_anchors(args.anchors)
     log, tags_m = _read_placed_log(args)
     calibration = calibrate_ranges(log, tags_m, anchors)
@@ -337,6 +349,7 @@ def _trilaterate(args: argparse.Namespace, progress: Progress) -> Outcome:
     from rangesfm.ranging.anchors.anchor import write_anchors
     from rangesfm.ranging.anchors.trilateration import TrilaterationOptions, trilaterate_anchors
 
+    _require_apart(args, args.positions)
     log, tags_m = _read_placed_log(args)
     options = TrilaterationOptions(
         range_stddev_m=args.range_stddev_m,

@@ -204,9 +204,10 @@ def survey_from_arguments(args: argparse.Namespace, progress: Progress | None = 
     if path is None:
         return survey_from_tables({}, Path.cwd(), overrides)
     if path.is_dir():
+        from rangesfm.files.output_folder import free_output
         from rangesfm.findings.understood import understand
 
-        understood = understand([path], {"output.path": path.absolute() / "out", **overrides})
+        understood = understand([path], {"output.path": free_output(path.absolute()), **overrides})
         if progress is not None:
             for note in understood.notes:
                 progress.message(note)

@@ -8,7 +8,6 @@ x east, y north, z up, origin on the ground in the south-west corner of the yard
 from __future__ import annotations
 
 import csv
-import re
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,8 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array
 from rangesfm.demo.ranges import CameraPath, Radio, SimulatedRanges, simulate_ranges
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import LEFTOVER, LOCK_NAME, new_folder, sole_writer, write_text
+from rangesfm.files.atomic import new_folder, sole_writer, write_text
+from rangesfm.files.output_folder import PRIVATE_NAME
 from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.ranging.readers import write_ranges_csv
 
@@ -51,6 +51,9 @@ _RADIO = Radio(
     time_offset_s=TIME_OFFSET_S,
     resolution_m=0.001,
 )
+
+
+_EXPECTED = "expected a new or an empty folder, or one that holds the same demo"
 
 
 @dataclass(frozen=True)
@@ -95,9 +98,13 @@ def make_demo_survey(folder: Path, *, num_photos: int = 40, seed: int = 0) -> De
     text = _survey_file(num_photos, seed)
     if _is_there(survey, text):
         return survey
-    if folder.exists() and (not folder.is_dir() or any(map(_is_anothers, folder.iterdir()))):
-        raise InputError("expected a new or an empty folder, or one that holds the same demo", folder)
-    with sole_writer(folder):
+    if folder.exists() and not folder.is_dir():
+        raise InputError(_EXPECTED, folder)
+    with sole_writer(folder) as output:
+        # What a demo left that was killed while it was made is complete in parts, and all its own.
+        others = [path for path in output.path.iterdir() if path.name != PRIVATE_NAME]
+        if survey.survey_path.exists() or not all(output.is_own(path) for path in others):
+            raise InputError(_EXPECTED, folder)
         with new_folder(folder / "images") as images:
             for name in survey.image_names:
                 shutil.copyfile(PHOTOS / name, images / name)
@@ -135,11 +142,6 @@ def _is_there(survey: DemoSurvey, text: str) -> bool:
         )
     except (OSError, UnicodeDecodeError):
         return False
-
-
-def _is_anothers(path: Path) -> bool:
-    """Not what a demo that is being made, or was killed, has in its folder."""
-    return path.name != LOCK_NAME and not re.fullmatch(LEFTOVER, path.name)
 
 
 def _anchor_file(seed: int) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 
 import pycolmap
@@ -22,6 +22,7 @@ from rangesfm.options import ExportOptions
 
 __all__ = [
     "COVARIANCE_FORMATS",
+    "EXPORTED_NAMES",
     "EXPORTERS",
     "MetricMap",
     "apply_to",
@@ -65,6 +66,29 @@ EXPORTERS: dict[str, Exporter] = {
 }
 """Each writes one format of a map into a folder and returns what it wrote."""
 
+EXPORTED_NAMES: dict[str, tuple[str, ...]] = {
+    "colmap": ("colmap",),
+    "colmap_text": ("colmap_text",),
+    "undistorted": ("undistorted",),
+    "tum": ("trajectory.tum",),
+    "kitti": ("trajectory.kitti",),
+    "tum_covariance": ("trajectory_covariance.csv", "trajectory.tum"),
+    "kitti_covariance": ("trajectory_covariance.csv", "trajectory.kitti"),
+    "ply": ("points.ply",),
+    "ply_cameras": ("cameras.ply",),
+    "ply_anchors": ("anchors.ply",),
+    "laz": ("points.laz",),
+    "gpkg": ("survey.gpkg",),
+    "geojson": ("survey.geojson",),
+    "kml": ("survey.kml",),
+    "transform": ("transform_colmap_4.txt", "transform_colmap_3.8.txt"),
+    "model_aligner": ("positions.txt",),
+    "nerfstudio": ("transforms.json", "transforms_points.ply"),
+    "opensfm": ("reconstruction.json",),
+    "opf": ("opf",),
+}
+"""Names in the folder that each format writes."""
+
 
 def export_model(
     reconstruction: pycolmap.Reconstruction,
@@ -101,28 +125,28 @@ def export_map(map_: MetricMap, output_path: Path, options: ExportOptions) -> tu
     check_formats(chosen)
     map_ = in_frame(map_, options)
     make_output_folder(output_path)
-    written: list[Path] = []
+    written: dict[str, list[Path]] = {}
     failures: dict[str, Exception] = {}
     for name in chosen:
         try:
             paths = EXPORTERS[name](map_, output_path)
-            written += [paths] if isinstance(paths, Path) else paths
+            written[name] = [paths] if isinstance(paths, Path) else [*paths]
         except (RangesfmError, OSError) as error:
             failures[name] = error
     if failures:
         raise _not_all(failures, written, num_chosen=len(chosen))
-    return tuple(dict.fromkeys(written))
+    return tuple(dict.fromkeys(path for paths in written.values() for path in paths))
 
 
-def _not_all(failures: Mapping[str, Exception], written: list[Path], num_chosen: int) -> Exception:
-    """One error for those of all formats: each has its line, and what was written has one."""
+def _not_all(failures: Mapping[str, Exception], written: Collection[str], num_chosen: int) -> Exception:
+    """One error for those of all formats: each has its line, and the formats that were written have one."""
     if num_chosen == 1:
         return next(iter(failures.values()))
     told = [failure_of(error) for error in failures.values()]
     lines = [f"{name}: {failure.message}" for name, failure in zip(failures, told)]
     error = InputError(
         f"{len(failures)} of {num_chosen} formats could not be written: {lines[0]}",
-        advice=[*lines[1:], *(["written all the same: " + ", ".join(map(str, written))] if written else [])],
+        advice=[*lines[1:], *(["written all the same: " + ", ".join(written)] if written else [])],
     )
     error.exit_status = max(failure.exit_status for failure in told)
     return error

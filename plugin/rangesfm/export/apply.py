@@ -19,7 +19,7 @@ from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
 from rangesfm.export.colmap import write_model
 from rangesfm.export.ply import transform_ply
-from rangesfm.files.atomic import make_output_folder, write_text
+from rangesfm.files.atomic import make_output_folder, require_apart, write_text
 from rangesfm.files.records import read_json, write_json
 from rangesfm.files.tables import read_text
 from rangesfm.geometry.similarity import Similarity, align_points, overflow_raised, rmse
@@ -53,8 +53,7 @@ def apply_to(paths: list[Path], metric_from_sfm: Similarity, folder: Path) -> tu
     """
     chosen = [(path, _transformer_of(path)) for path in paths]
     for path in paths:
-        if (folder / path.name).resolve() == path.resolve():
-            raise InputError("the metric file would overwrite this one, expected another output path", path)
+        require_apart(paths, folder / path.name)
     if len({path.name for path in paths}) < len(paths):
         raise InputError("two of the files to carry over have the same name")
     make_output_folder(folder)

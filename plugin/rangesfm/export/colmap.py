@@ -43,9 +43,7 @@ def write_project(map_: MetricMap, path: Path, *, as_text: bool = False) -> Path
     """
     write_model(map_.reconstruction, path, as_text=as_text)
     if map_.images_path is not None and map_.images_path.is_dir():
-        database_path = map_.database_path
-        if database_path is None or not database_path.is_file():
-            database_path = path / "database.db"
+        database_path = map_.database_path or path / "database.db"
         text = f"database_path={database_path.resolve()}\nimage_path={map_.images_path.resolve()}\n"
         if "#" not in text:  # which begins a comment there
             write_text(text, path / "project.ini")

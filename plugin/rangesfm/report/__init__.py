@@ -8,9 +8,9 @@ from rangesfm.files.atomic import sole_writer
 from rangesfm.report.chart import write_pictures
 from rangesfm.report.content import Content
 from rangesfm.report.page import render_report, sections_of, write_page
-from rangesfm.result.folder import read_result_folder
+from rangesfm.result.folder import REPORT_NAME, read_result_folder
 
-__all__ = ["write_report", "write_report_pictures"]
+__all__ = ["write_report", "write_report_of", "write_report_pictures"]
 
 
 def write_report(result_folder: Path, *, images_path: Path | None = None) -> Path:
@@ -28,10 +28,14 @@ def write_report(result_folder: Path, *, images_path: Path | None = None) -> Pat
     Raises:
         InputError: the folder is not a result, a file in it cannot be read, or a run is writing there.
     """
-    result = read_result_folder(result_folder)
-    path = result_folder / "report.html"
     with sole_writer(result_folder):
-        write_page(render_report(Content(result, images_path=images_path)), path)
+        return write_report_of(Content(read_result_folder(result_folder), images_path=images_path), result_folder)
+
+
+def write_report_of(content: Content, folder: Path) -> Path:
+    """Write ``report.html`` into a folder; returns the page's path."""
+    path = folder / REPORT_NAME
+    write_page(render_report(content), path)
     return path
 
 
@@ -41,7 +45,7 @@ def write_report_pictures(result_folder: Path) -> list[Path]:
     Raises:
         InputError: as ``write_report``.
     """
-    result = read_result_folder(result_folder)
     with sole_writer(result_folder):
+        result = read_result_folder(result_folder)
         figures = [figure for section in sections_of(Content(result)) for figure in section.figures]
         return write_pictures(figures, result_folder / "figures")

@@ -53,17 +53,18 @@ class Content:
         cameras: intrinsics in the scaled and in the final model.
     """
 
-    def __init__(self, result: ResultFolder, *, images_path: Path | None = None):
+    def __init__(self, result: ResultFolder, *, images_path: Path | None = None, home: Path | None = None):
         """Read what the report needs.
 
         Args:
             images_path: folder of the photos, for thumbnails; None: where the run had them.
+            home: folder that the result is for, while it is made in another one; None: where it is.
 
         Raises:
             InputError: a file of the result is there but cannot be read.
         """
         self.result, self.summary = result, result.summary
-        self.title = _title(result.path.resolve())
+        self.title = _title((home or result.path).resolve())
         self.images_path = images_path or result.images_path
         self.ranges = result.read(RangesAsUsed)
         self.tags_in_cam_m = result.lever_arms_m(() if self.ranges is None else self.ranges.tag_id)

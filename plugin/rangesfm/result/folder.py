@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,69 +14,77 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.colmap.model_files import read_model
 from rangesfm.errors import BAD_INPUT, InputError
-from rangesfm.export import COVARIANCE_FORMATS, MetricMap, export_map, write_model
-from rangesfm.files.atomic import path_of
+from rangesfm.export import COVARIANCE_FORMATS, EXPORTED_NAMES, MetricMap, export_map, write_model
+from rangesfm.files.atomic import path_of, scratch_folder, sole_writer
 from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.reference import Reference, read_reference
 from rangesfm.options import ExportOptions
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.summary import ResultSummary
 from rangesfm.result.tables import TABLES, PhotoTimes, TableFile
-from rangesfm.survey.settings import InputPath
+from rangesfm.survey.settings import Survey
+from rangesfm.vision.steps import RECONSTRUCTION_NAMES
 
 _Table = TypeVar("_Table", bound=TableFile)
 
 REPORT_NAME = "report.html"
-DATABASE_NAME = "database.db"
+PHOTOS_NAMES = ("photos", "photos_2")
+"""Folders of photos taken out of a video or a bag; an earlier result's stay in one while a new one's are made."""
 REFERENCE_NAME = "reference.csv"
-# The first says that a result is whole: it is the last to be written and the first to go.
+MODEL_NAMES = ("sparse_scaled", "sparse_metric")
 RESULT_FILES = (ResultSummary.NAME, REPORT_NAME, REFERENCE_NAME, *(table.NAME for table in TABLES))
-# Stands in the place of result.json while the files beside it belong to no result.
-_UNFINISHED = ".result.unfinished"
-_WRITTEN = (*RESULT_FILES, "trajectory.tum", "points.ply", "sparse_scaled/0", "sparse_metric/0")
+RESULT_NAMES = (*RESULT_FILES, *MODEL_NAMES)
+"""What a result consists of; the first says that it is whole."""
 
 
-def refuse_to_overwrite(inputs: Iterable[InputPath], folder: Path) -> None:
+def refuse_to_overwrite(survey: Survey) -> None:
     """Raise InputError for an input that stands where a result will be written, or that results would stand among."""
-    written = {(folder / name).resolve() for name in _WRITTEN}
-    for item in inputs:
+    folder = survey.output.path.resolve()
+    written = set(RESULT_NAMES).union(*(EXPORTED_NAMES[name] for name in survey.export.formats))
+    written.update(() if survey.images.model is not None else (*RECONSTRUCTION_NAMES, *PHOTOS_NAMES))
+    places = {folder / name for name in written}
+    for item in survey.input_paths():
         path = item.path.resolve()
-        if not written.isdisjoint((path, *path.parents)):
+        if not places.isdisjoint((path, *path.parents)):
             raise InputError("the results would overwrite this input, expected another output path", item.path)
-        if path.is_dir() and path == folder.resolve():
+        if path.is_dir() and path == folder:
             raise InputError("the results would stand among this input, expected another output path", item.path)
 
 
-def forget_result(folder: Path) -> None:
-    """Take away what an earlier run wrote about models that are about to change.
-
-    Killed at any moment, it leaves a whole result or none; the next call goes on where it stopped.
-    """
-    result, unfinished = (folder / name for name in (ResultSummary.NAME, _UNFINISHED))
-    if result.is_file():
-        os.replace(result, unfinished)
-    if unfinished.is_file():
-        for name in RESULT_FILES:
-            (folder / name).unlink(missing_ok=True)
-        unfinished.unlink()
+def places_for_photos(folder: Path) -> tuple[Path, Path]:
+    """Return two folders for photos of a video, first the one that is free: the result that is there has the other."""
+    first, second = (folder / name for name in PHOTOS_NAMES)
+    try:
+        used = ResultSummary.read(folder / ResultSummary.NAME).settings.images.path
+    except (InputError, OSError):  # there is none
+        return first, second
+    return (second, first) if used is not None and path_of(used).name == first.name else (first, second)
 
 
 @contextmanager
-def replacing_result(folder: Path) -> Iterator[None]:
-    """Forget the result before the block, which writes a new one; none of its files stay if it fails.
+def new_result(folder: Path, images_path: Path | None = None) -> Iterator[Path]:
+    """Yield a folder to write a whole result into; on success it takes the place of the earlier result, all at once.
 
-    Whoever is killed inside it leaves a mark, by which the next run knows the files for what they are.
+    Whoever is killed inside it, or finds no room, leaves the earlier result as it was.
+
+    Args:
+        images_path: folder of the photos. If it is one of those that are taken out of a video, the other one, of an
+            earlier result, goes with that.
+
+    Raises:
+        InputError: a file in the place of one of a result's is not this tool's own.
     """
-    forget_result(folder)
-    unfinished = folder / _UNFINISHED
-    unfinished.touch()
-    try:
-        yield
-        # Now there is a result. Should this be the last that happens, the next run takes it for one that is whole.
-        unfinished.unlink()
-    finally:
-        if unfinished.is_file():
-            forget_result(folder)
+    with sole_writer(folder) as output:
+        places = [output.path / name for name in RESULT_NAMES]
+        output.require_own(places)
+        with scratch_folder(output.path / "result") as staged:
+            yield staged
+            new = {output.path / path.name: path for path in staged.iterdir()}
+            removed = [place for place in places if place not in new]
+            photos = [output.path / name for name in PHOTOS_NAMES]
+            if images_path is not None and images_path.resolve() in photos:
+                removed += [path for path in photos if path != images_path.resolve() and output.is_own(path)]
+            output.publish(new, removed, last=output.path / ResultSummary.NAME)
 
 
 def write_models_and_tables(
@@ -86,26 +92,24 @@ def write_models_and_tables(
     export: ExportOptions,
     folder: Path,
     *,
+    database_path: Path,
     images_path: Path | None = None,
     georeference: Georeference | None = None,
 ) -> InputError | None:
-    """Write a result's models, its tables and the formats that were asked for beside them, each whole or not at all.
+    """Write a result's models, its tables and the formats that were asked for into a new folder.
 
-    What an earlier run left of those that are not written goes.
+    Args:
+        database_path: where the database of the photos' features will be.
 
     Returns:
         What is to be said of formats that cannot be written, which spoil nothing else.
     """
     write_model(found.scaled, folder / "sparse_scaled" / "0")
-    if found.refined is None:
-        shutil.rmtree(folder / "sparse_metric", ignore_errors=True)
-    else:
+    if found.refined is not None:
         write_model(found.final, folder / "sparse_metric" / "0")
     for kind in TABLES:
         table = kind.of(found)
-        if table is None:
-            (folder / kind.NAME).unlink(missing_ok=True)
-        else:
+        if table is not None:
             table.write(folder)
     times = PhotoTimes.of(found)
     map_ = MetricMap(
@@ -115,7 +119,7 @@ def write_models_and_tables(
         metric_from_sfm=found.estimate.metric_from_sfm,
         relative_scale_stddev=found.estimate.uncertainty.empirical,
         images_path=images_path,
-        database_path=folder / DATABASE_NAME,
+        database_path=database_path,
         is_site=found.estimate.frame == "site",
         georeference=georeference,
         center_covariance_m2=found.center_covariance_m2,

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from itertools import groupby
 from pathlib import Path
 
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import new_folder, state_and_sha256
+from rangesfm.files.atomic import new_folder
+from rangesfm.files.contents import state_and_sha256
 from rangesfm.files.records import Record
 from rangesfm.files.tables import write_table
 from rangesfm.progress import Progress
@@ -65,13 +65,11 @@ def take_photos(
     Raises:
         InputError: the source cannot be read, or has fewer than two photos.
     """
-    earlier = None
-    with suppress(InputError):
-        earlier = TakenPhotos.read(folder / RECORD_NAME)
-    wanted = TakenPhotos(files=_files(path, earlier), rate_hz=rate_hz, topic=topic)
-    if earlier is not None and not restart and wanted.choice == earlier.choice and earlier.are_in(folder):
+    earlier = None if restart else earlier_photos(path, folder, rate_hz=rate_hz, topic=topic)
+    if earlier is not None:
         progress.message("photos: taken over from an earlier run")
         return earlier
+    wanted = TakenPhotos(files=_files(path, None), rate_hz=rate_hz, topic=topic)
     progress.stage("photos")
     source = open_source(path, topic)
     with new_folder(folder) as new:
@@ -84,6 +82,16 @@ def take_photos(
         taken.write(new / RECORD_NAME)
     progress.message(f"photos: {len(times_s)} in {folder} ({num_bytes / 1e6:.3g} MB)")
     return taken
+
+
+def earlier_photos(path: Path, folder: Path, *, rate_hz: float, topic: str | None) -> TakenPhotos | None:
+    """Return what an earlier run took from the same source in the same way, if all of it is in ``folder``."""
+    try:
+        earlier = TakenPhotos.read(folder / RECORD_NAME)
+    except InputError:
+        return None
+    wanted = TakenPhotos(files=_files(path, earlier), rate_hz=rate_hz, topic=topic)
+    return earlier if wanted.choice == earlier.choice and earlier.are_in(folder) else None
 
 
 def sharpest(frames: Iterable[Frame], rate_hz: float) -> Iterator[Frame]:

@@ -13,7 +13,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.distances.tape import Tape, read_tape
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import sha256_of
+from rangesfm.files.contents import sha256_of
 from rangesfm.files.folders import walk
 from rangesfm.geometry.reference import Reference, read_reference
 from rangesfm.geometry.trajectory import photos_by_frame

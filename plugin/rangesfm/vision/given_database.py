@@ -13,7 +13,8 @@ import pycolmap
 
 from rangesfm.colmap.log import colmap_log
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import scratch_folder, sha256_of
+from rangesfm.files.atomic import scratch_folder
+from rangesfm.files.contents import sha256_of
 from rangesfm.vision.camera import PhotoCameras
 from rangesfm.vision.database import copy_features, copying
 from rangesfm.vision.photos import MIN_NUM_PHOTOS, Photos

@@ -11,7 +11,7 @@ from typing import Any
 from PIL import Image
 
 from rangesfm.errors import InputError, ReconstructionError
-from rangesfm.files.atomic import sha256_of, state_and_sha256
+from rangesfm.files.contents import sha256_of, state_and_sha256
 
 MIN_NUM_PHOTOS = 2
 UNREADABLE = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import pycolmap
 
 from rangesfm.errors import InputError, ReconstructionError
-from rangesfm.files.atomic import make_output_folder, scratch_folder
+from rangesfm.files.atomic import scratch_folder, sole_writer
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import Progress, SilentProgress
 from rangesfm.vision.camera import cameras_of_photos, check_camera
@@ -20,9 +20,10 @@ from rangesfm.vision.mapping import MappingOptions, map_photos, mapping_options,
 from rangesfm.vision.mapping_loop import GlobalAdjustment
 from rangesfm.vision.matching import matching_options
 from rangesfm.vision.photos import Photos, contents_of_masks, usable_photos
-from rangesfm.vision.renewed_database import RenewedDatabase, forget_database
+from rangesfm.vision.renewed_database import RenewedDatabase
 from rangesfm.vision.rigs import NO_RIGS, Rigs
-from rangesfm.vision.steps import Workspace, fingerprint
+from rangesfm.vision.steps import LOG_NAME, Workspace, fingerprint
+from rangesfm.vision.unpublished import UnpublishedReconstruction
 
 
 @dataclass(frozen=True)
@@ -55,16 +56,17 @@ def reconstruct(
     seed: int = 0,
     progress: Progress | None = None,
     restart: bool = False,
-    before_change: Callable[[], None] = lambda: None,
     adjustment: GlobalAdjustment | None = None,
+    superseded: Sequence[str] = (),
+    deferred: bool = False,
 ) -> ReconstructionSummary:
     """Reconstruct photos.
 
     Writes ``database.db``, the models ``sparse/0`` (the largest), ``sparse/1``, ..., ``mapper.log``
-    and ``reconstruct.json`` to ``output_path``. Steps that an earlier run into the same folder did
-    with the same photos (by their content) and options are taken over, and so are the features and matches that an
-    interrupted one had found, and its newest snapshot of the mapping (``mapping_snapshot``). Where only some photos
-    are other ones, so are the features of those that are the same, and the matches of pairs of them.
+    and ``reconstruct.json`` to ``output_path``, once all of them are complete. Steps that an earlier run into the same
+    folder did with the same photos (by their content) and options are taken over, and so are the features and matches
+    that an interrupted one had found, and its newest snapshot of the mapping. Where only some photos are other ones, so
+    are the features of those that are the same, and the matches of pairs of them.
 
     Args:
         image_path: folder of the photos.
@@ -74,17 +76,51 @@ def reconstruct(
         rigs: that cameras are on.
         seed: the same one gives the same models.
         restart: take nothing over.
-        before_change: called before models of an earlier run are removed or replaced.
         adjustment: takes the place of COLMAP's global bundle adjustment while the map grows, photo by photo.
+        superseded: names of what was made from the earlier models, in the output folder; it goes with them.
+        deferred: leave the earlier reconstruction in its place until a result is published (``OutputFolder.defer``).
 
     Raises:
-        InputError: options that COLMAP does not take, or a folder that cannot be written to.
+        InputError: options that COLMAP does not take, a folder that cannot be written to, or files in the places of
+            the results that this tool did not write.
         ReconstructionError: the photos cannot be read, or do not give a model.
         KeyboardInterrupt: as soon as COLMAP has stopped.
     """
-    space = Workspace(Path(output_path), progress or SilentProgress(), before_change)
     pipeline_options(camera, mapper, seed)  # what COLMAP does not take is refused before anything is computed
-    photos, of_matches = match_photos(Path(image_path), image_names, camera, mapper, rigs, seed, space, restart=restart)
+    progress = progress or SilentProgress()
+    with (
+        sole_writer(Path(output_path)) as output,
+        UnpublishedReconstruction(output, progress, restart=restart) as unpublished,
+    ):
+        space = unpublished.space
+        photos, inputs = match_photos(Path(image_path), image_names, camera, mapper, rigs, seed, space)
+        _map(space, photos, inputs, camera, mapper, rigs, seed, adjustment)
+        found, log_path = read_models(unpublished.models_path), output.path / LOG_NAME
+        files = unpublished.files()
+        if files and deferred:
+            output.defer(files)
+            log_path = space.log
+        else:
+            if files:
+                output.publish(files, [output.path / name for name in superseded])
+            unpublished.discard()
+    if len(found) > 1:
+        sizes = ", ".join(str(model.num_reg_images()) for model in found)
+        progress.message(f"{len(found)} separate models of {sizes} photos")
+    return ReconstructionSummary(found, len(image_names), found[0].num_reg_images(), space.steps.seconds, log_path)
+
+
+def _map(
+    space: Workspace,
+    photos: Photos,
+    of_matches: str,
+    camera: CameraOptions,
+    mapper: MapperOptions,
+    rigs: Rigs,
+    seed: int,
+    adjustment: GlobalAdjustment | None,
+) -> None:
+    """Write the models of the matches, whose fingerprint is given, into the workspace."""
     intrinsics = [table.intrinsics_in_mapping for table in camera.tables]
     of_adjustment = [] if adjustment is None else [adjustment.inputs]
     inputs = fingerprint(of_matches, mapper.method, mapper.pipeline, *intrinsics, *of_adjustment)
@@ -99,20 +135,14 @@ def reconstruct(
                     space, photos, rigs, mapping_options(camera, mapper, NO_RIGS, seed, space.database)
                 ),
             )
-        options = mapping_options(camera, mapper, rigs, seed, space.database)
         space.steps.run(
             "mapping",
             inputs,
             space.models / "0",
             space.remove_old_models,
-            lambda: map_photos(space, photos, options, adjustment),
+            lambda: map_photos(space, photos, mapping_options(camera, mapper, rigs, seed, space.database), adjustment),
             unfinished=space.snapshots,
         )
-    found = read_models(space.models)
-    if len(found) > 1:
-        sizes = ", ".join(str(model.num_reg_images()) for model in found)
-        space.progress.message(f"{len(found)} separate models of {sizes} photos")
-    return ReconstructionSummary(found, len(image_names), found[0].num_reg_images(), space.steps.seconds, space.log)
 
 
 def _place_cameras(space: Workspace, photos: Photos, rigs: Rigs, options: MappingOptions) -> None:
@@ -152,8 +182,6 @@ def match_photos(
     rigs: Rigs,
     seed: int,
     space: Workspace,
-    *,
-    restart: bool,
 ) -> tuple[Photos, str]:
     """Features and matches of photos, returned by their ids 1, 2, ..., with the matches' fingerprint.
 
@@ -165,10 +193,6 @@ def match_photos(
     photos = usable_photos(image_path, image_names)
     cameras = cameras_of_photos(camera, photos, rigs)
     masks = contents_of_masks(mapper.mask_path, photos)
-    make_output_folder(space.output)
-    if restart:
-        space.steps.forget("features")
-        forget_database(space.steps)
     if photos.left_out:
         name, reason = next(iter(photos.left_out.items()))
         num, num_all = len(photos.left_out), len(photos.left_out) + len(photos.names)

@@ -29,7 +29,7 @@ from rangesfm.vision.matching import MatchingOptions, match_features, verify_mat
 from rangesfm.vision.pairs import pairs_to_match
 from rangesfm.vision.photos import Photos, exif_position
 from rangesfm.vision.rigs import Rigs
-from rangesfm.vision.steps import Steps, Workspace, fingerprint
+from rangesfm.vision.steps import Workspace, fingerprint
 
 _NOTE = "database"
 
@@ -96,7 +96,7 @@ class RenewedDatabase:
         space.remove_old_models()
         space.log.unlink(missing_ok=True)
         earlier = space.steps.notes.get(_NOTE, {})
-        forget_database(space.steps)
+        space.steps.note(_NOTE, {})  # until there is a new one nothing is taken over from the database
         with new_file(space.database) as fresh:
             self._create(fresh)
             if self.given is not None:
@@ -154,15 +154,13 @@ class RenewedDatabase:
         """Id in the earlier database of each photo that has not changed, by its new one."""
         if earlier.get("features") != self.feature_inputs:
             return {}
-        ids = {(name, sha256): id_ for id_, (name, sha256) in enumerate(earlier.get("photos", {}).items(), 1)}
+        photos = earlier.get("photos")
+        if not isinstance(photos, dict) or not all(isinstance(sha256, str) for sha256 in photos.values()):
+            return {}
+        ids = {content: id_ for id_, content in enumerate(photos.items(), 1)}
         contents = enumerate(((name, self.contents[name]) for name in self.photos.names), 1)
         return {new_id: ids[content] for new_id, content in contents if content in ids}
 
     def _write_note(self) -> None:
         note = {"features": self.feature_inputs, "matches": self.match_inputs, "photos": self.contents}
         self.space.steps.note(_NOTE, note)
-
-
-def forget_database(steps: Steps) -> None:
-    """Take nothing over from the database."""
-    steps.note(_NOTE, {})

@@ -11,8 +11,9 @@ from rangesfm.export import MetricMap, apply_to, best_similarity, check_formats,
 from rangesfm.export.metric_map import in_frame
 from rangesfm.files.atomic import sole_writer
 from rangesfm.options import ExportOptions
-from rangesfm.result.folder import DATABASE_NAME, ResultFolder, read_result_folder
+from rangesfm.result.folder import ResultFolder, read_result_folder
 from rangesfm.result.tables import CenterCovariances
+from rangesfm.vision.steps import DATABASE_NAME
 
 
 def export_result(

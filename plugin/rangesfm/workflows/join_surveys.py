@@ -13,7 +13,7 @@ import pycolmap
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
 from rangesfm.export import check_formats
-from rangesfm.files.atomic import sole_writer
+from rangesfm.files.atomic import require_apart, sole_writer
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.join.models import PathOfModel
@@ -232,8 +232,7 @@ def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress)
     journal = Journal(progress)
     check_formats(survey.export.formats)
     finished = read_finished_runs(folders)
-    if survey.output.path.resolve() in [folder.resolve() for folder in folders]:
-        raise InputError("the results would overwrite this survey, expected another output path", survey.output.path)
+    require_apart(folders, survey.output.path)
     log, number, is_check = joined_log(finished, survey.anchors.use)
     anchors, frame = _anchors(survey, finished, log)
     crs = survey.anchors.crs or _common(one.result.summary.settings.anchors.crs for one in finished)

@@ -18,14 +18,14 @@ from rangesfm.colmap.transform import rescale, take_over
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.export import check_formats
-from rangesfm.files.atomic import sha256_of
+from rangesfm.files.contents import sha256_of
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.join.models import PathOfModel, estimate_scale
 from rangesfm.progress import Journal
 from rangesfm.ranging.clock.estimate import estimate_time_offset
 from rangesfm.ranging.observations import RangeObservations
-from rangesfm.result.folder import forget_result, refuse_to_overwrite
-from rangesfm.sources.extract import TIMES_NAME, take_photos
+from rangesfm.result.folder import RESULT_NAMES, places_for_photos, refuse_to_overwrite
+from rangesfm.sources.extract import TIMES_NAME, earlier_photos, take_photos
 from rangesfm.sources.source import is_source
 from rangesfm.survey.inputs import RangingInputs, read_ranging_inputs
 from rangesfm.survey.settings import Survey
@@ -49,7 +49,7 @@ def read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
     check_formats(survey.export.formats)
     with survey.source.naming_lines():
         apply_options(pycolmap.BundleAdjustmentOptions(), survey.refine.bundle_adjustment, "refine.bundle_adjustment")
-    refuse_to_overwrite(survey.input_paths(), survey.output.path)
+    refuse_to_overwrite(survey)
     inputs = read_ranging_inputs(survey)
     journal.warn(*inputs.notes, *notes_before_work(survey, inputs))
     return inputs
@@ -106,16 +106,12 @@ def with_photos_in_folder(survey: Survey, journal: Journal, *, restart: bool = F
         return survey
     if survey.images.times is not None:
         raise InputError("its images have their times: expected no other ones ([images] times)", path)
-    folder = survey.output.path / "photos"
+    rate_hz, topic = survey.images.rate_hz, survey.images.topic
+    places = places_for_photos(survey.output.path)
     with journal.timed("photos"):
-        taken = take_photos(
-            path,
-            folder,
-            rate_hz=survey.images.rate_hz,
-            topic=survey.images.topic,
-            progress=journal.progress,
-            restart=restart,
-        )
+        taken_before = (place for place in places if earlier_photos(path, place, rate_hz=rate_hz, topic=topic))
+        folder = places[0] if restart else next(taken_before, places[0])
+        taken = take_photos(path, folder, rate_hz=rate_hz, topic=topic, progress=journal.progress, restart=restart)
     journal.warn(*taken.notes)
     values: dict[str, Any] = {"images.path": folder, "images.times": folder / TIMES_NAME}
     given = survey.camera
@@ -174,8 +170,14 @@ def map_keyframes(
     journal: Journal,
     restart: bool,
     adjustment: GlobalAdjustment | None = None,
+    *,
+    deferred: bool,
 ) -> tuple[pycolmap.Reconstruction, ...]:
-    """Map the keyframes into ``sparse``; returns ``sparse/0``, ``sparse/1``, ..."""
+    """Map the keyframes into ``sparse``; returns ``sparse/0``, ``sparse/1``, ...
+
+    Args:
+        deferred: leave an earlier reconstruction where it is until there is a result of the new one.
+    """
     rigs = read_rigs(survey.images.rig_config)
     frames = rigs.frames(list_images(survey.photos_path))
     with survey.source.naming_lines():
@@ -189,8 +191,9 @@ def map_keyframes(
             seed=survey.output.seed,
             progress=journal.progress,
             restart=restart,
-            before_change=lambda: forget_result(survey.output.path),
             adjustment=adjustment,
+            superseded=RESULT_NAMES,
+            deferred=deferred,
         )
     journal.seconds.update(summary.seconds)
     if summary.num_registered < summary.num_keyframes:

@@ -14,14 +14,22 @@ from rangesfm.distances.tape import DistanceRow, disagreements, distance_rows
 from rangesfm.export import COVARIANCE_FORMATS
 from rangesfm.geometry.reference import write_reference
 from rangesfm.progress import Journal
-from rangesfm.report import write_report
+from rangesfm.report import write_report_of
+from rangesfm.report.content import Content
 from rangesfm.result.entries import ComparisonRow
-from rangesfm.result.folder import REFERENCE_NAME, replacing_result, write_models_and_tables
+from rangesfm.result.folder import (
+    REFERENCE_NAME,
+    REPORT_NAME,
+    new_result,
+    read_result_folder,
+    write_models_and_tables,
+)
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.summary import ResultSummary
 from rangesfm.scale.lengths import BENDING
 from rangesfm.survey.inputs import RangingInputs, input_hashes
 from rangesfm.survey.settings import Survey
+from rangesfm.vision.steps import DATABASE_NAME
 
 
 @dataclass(frozen=True)
@@ -43,7 +51,8 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
     """All files of the result, ``result.json`` after all others, and the report on them.
 
     Raises:
-        InputError: a format of [export] cannot be written; all else has been.
+        InputError: a format of [export] cannot be written; all else has been. Or a file of somebody else's is in the
+            place of one of the result's; then nothing has been written.
     """
     if not metric.center_covariance_m2 and (left_out := set(COVARIANCE_FORMATS) & set(survey.export.formats)):
         journal.warn(f"without covariances of the poses there is no {', '.join(sorted(left_out))}")
@@ -54,13 +63,18 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
     journal.warn(*disagreeing)
     metric = metric.doubted(disagreeing)
     folder = survey.output.path
-    with replacing_result(folder):
+    with new_result(folder, survey.images.path) as staged:
         with journal.stage("results"):
-            comparison = _comparison(survey, inputs, metric)
+            comparison = _comparison(survey, inputs, metric, staged)
             # Of the final map: that of the anchors, if the map could be carried to them.
             georeference = inputs.site.georeference if metric.estimate.frame == "site" else None
             not_exported = write_models_and_tables(
-                metric, survey.export, folder, images_path=survey.images.path, georeference=georeference
+                metric,
+                survey.export,
+                staged,
+                database_path=folder / DATABASE_NAME,
+                images_path=survey.images.path,
+                georeference=georeference,
             )
         summary = ResultSummary.of(
             metric,
@@ -73,10 +87,13 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
             seconds=journal.all_seconds(),
             warnings=journal.warnings,
         )
-        summary.write(folder / summary.NAME)
+        summary.write(staged / summary.NAME)
+        if survey.report.enabled:
+            content = Content(read_result_folder(staged), images_path=survey.images.path, home=folder)
+            write_report_of(content, staged)
     lines = [*summary.lines(folder, format_table(comparison) if comparison else None)]
     if survey.report.enabled:
-        lines.append(f"report: {write_report(folder)}")
+        lines.append(f"report: {folder / REPORT_NAME}")
     if not_exported is not None:
         raise not_exported
     return RunResult(folder, summary, tuple(lines))
@@ -91,7 +108,7 @@ def _distances(metric: MetricResult) -> list[DistanceRow]:
     return distance_rows(metric.tape, located.lengths_m(1.0, anchors_m))
 
 
-def _comparison(survey: Survey, inputs: RangingInputs, metric: MetricResult) -> tuple[ComparisonRow, ...]:
+def _comparison(survey: Survey, inputs: RangingInputs, metric: MetricResult, folder: Path) -> tuple[ComparisonRow, ...]:
     """The paper's table; empty without a reference, which is left beside the result in its frame."""
     if inputs.reference is None:
         return ()
@@ -101,5 +118,5 @@ def _comparison(survey: Survey, inputs: RangingInputs, metric: MetricResult) -> 
     rows = papers_table(scaled, refined, inputs.reference, frame=frame)
     in_frame = reference_in_frame(refined or scaled, inputs.reference, frame=frame)
     if in_frame is not None:
-        write_reference(in_frame, survey.output.path / REFERENCE_NAME)
+        write_reference(in_frame, folder / REFERENCE_NAME)
     return rows

@@ -18,6 +18,8 @@ from rangesfm.files.atomic import sole_writer
 from rangesfm.join.models import PathOfModel
 from rangesfm.progress import Journal, Progress
 from rangesfm.ranging.clock.estimate import TimeOffset
+from rangesfm.result.folder import RESULT_NAMES, refuse_to_overwrite
+from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.inputs import RangingInputs, times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes
@@ -52,13 +54,18 @@ def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> 
     """Photos and ranges to a metric model. Steps of the reconstruction that are done are reused."""
     journal = Journal(progress)
     inputs = read_inputs(survey, journal)
-    with sole_writer(survey.output.path):
+    with sole_writer(survey.output.path) as output:
+        output.require_own(output.path / name for name in RESULT_NAMES)
         survey = with_photos_in_folder(survey, journal, restart=restart)
         keyframes, times = checked_keyframes(survey, inputs, journal)
         inputs = with_tags(survey, inputs, keyframes, journal)
         adjustment = AdjustmentWithRanges(survey, inputs, keyframes[0], times)
         with_ranges = survey.mapper.ranges_in_mapping and len(inputs.log) > 0
-        models = map_keyframes(survey, keyframes, journal, restart, adjustment if with_ranges else None)
+        # An earlier result stays with its reconstruction until there is a new one.
+        deferred = (output.path / ResultSummary.NAME).exists()
+        models = map_keyframes(
+            survey, keyframes, journal, restart, adjustment if with_ranges else None, deferred=deferred
+        )
         if note := adjustment.note():
             journal.warn(note)
         return to_metric(survey, inputs, models, times, journal, refine=survey.refine.enabled)
@@ -69,10 +76,11 @@ def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = Fa
     journal = Journal(progress)
     if survey.mapper.ranges_in_mapping:
         journal.warn("ranges_in_mapping: nothing has been said of ranges here, they take part in a whole run")
+    refuse_to_overwrite(survey)
     with sole_writer(survey.output.path):
         survey = with_photos_in_folder(survey, journal, restart=restart)
         keyframes, _ = find_keyframes(survey, journal)
-        sfm = map_keyframes(survey, keyframes, journal, restart)[0]
+        sfm = map_keyframes(survey, keyframes, journal, restart, deferred=False)[0]
     path = survey.output.path / "sparse" / "0"
     return [f"unscaled model: {sfm.num_reg_images()} photos, {sfm.num_points3D()} points, in {path}"]
 
@@ -94,7 +102,8 @@ def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResul
     if refine and not sfm.num_points3D():
         raise InputError("the model has no 3-D points to refine: a trajectory can only be scaled", survey.images.model)
     times = None
-    with sole_writer(survey.output.path):
+    with sole_writer(survey.output.path) as output:
+        output.require_own(output.path / name for name in RESULT_NAMES)
         survey = with_photos_in_folder(survey, journal)
         if inputs.log.image_name is None:
             times = times_of_model(survey, sfm, survey.given_model_path)

@@ -1,0 +1,184 @@
+"""A record of the files that this tool wrote into a folder, by which it knows them from everybody else's."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import secrets
+import stat
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from rangesfm.errors import InputError
+from rangesfm.files.contents import CHUNK_BYTES
+
+_NAME = "manifest.json"
+_VERSION = 1
+_SQLITE_MAGIC = b"SQLite format 3\x00"
+# SQLite counts in its header how often the file was opened for writing: COLMAP does so to look at a database.
+# https://www.sqlite.org/fileformat2.html, sections 1.3.7 and 1.3.18
+_SQLITE_COUNTERS = ((24, 28), (92, 96))
+
+_State = tuple[int, int, int]
+
+
+class Manifest:
+    """The files of one folder that this tool wrote, with the content that it gave them.
+
+    A file is this tool's as long as it is a regular file with that content; whoever changes one makes it their own.
+
+    Attributes:
+        token: a random word that the names of unfinished files carry, so that nobody else's can have it.
+        moves: renames that were begun and not finished: source in the private folder, target in the folder.
+    """
+
+    def __init__(self, folder: Path, private: Path):
+        """Read the record of ``folder`` from its private folder; empty if there is none.
+
+        Raises:
+            InputError: there is something in its place that is no such record.
+        """
+        self._folder = folder
+        self._path = private / _NAME
+        self.token = secrets.token_hex(4)
+        self.moves: list[tuple[str, str]] = []
+        self._hashes: dict[str, list[str]] = {}
+        self._states: dict[str, _State] = {}
+        # Size, time and hash of what was expected last: a rename leaves the first two as they are.
+        self._expected: dict[str, tuple[tuple[int, int], str]] = {}
+        if os.path.lexists(self._path):
+            self._read()
+
+    @property
+    def is_empty(self) -> bool:
+        return not self._hashes and not self.moves
+
+    def foreign_file(self, path: Path) -> Path | None:
+        """Return a file at ``path``, or inside it, that this tool did not write as it is now; None if there is none."""
+        for file in _files_in(path):
+            if not self._is_own(file):
+                return file
+        return None
+
+    def expect(self, files: Iterable[tuple[Path, Path]]) -> None:
+        """Count the content of ``source`` as this tool's own at ``target``, beside what is own there already.
+
+        Args:
+            files: pairs (source, target) of files or folders. To be saved before the one is renamed to the other.
+        """
+        for source, target in files:
+            for file in _files_in(source):
+                name = self._name_of(target / file.relative_to(source))
+                state, found = _state_of(file.lstat()), content_hash(file)
+                self._hashes.setdefault(name, []).append(found)
+                self._expected[name] = state[:2], found
+
+    def settle(self, targets: Iterable[Path]) -> None:
+        """Count nothing as this tool's own at or inside these targets but what is there now."""
+        for target in targets:
+            present = {self._name_of(file): file for file in _files_in(target)}
+            name = self._name_of(target)
+            inside = [other for other in self._hashes if other == name or other.startswith(f"{name}/")]
+            for other in inside:
+                if other not in present:
+                    del self._hashes[other]
+                    self._states.pop(other, None)
+            for other, file in present.items():
+                if other in self._hashes:
+                    state = _state_of(file.lstat())
+                    before, expected = self._expected.get(other, (None, ""))
+                    self._hashes[other] = [expected if before == state[:2] else content_hash(file)]
+                    self._states[other] = state
+
+    def save(self) -> None:
+        """Write the record, whole or not at all."""
+        files = {
+            name: {"sha256": hashes, "state": self._states.get(name)} for name, hashes in sorted(self._hashes.items())
+        }
+        record = {"version": _VERSION, "token": self.token, "moves": self.moves, "files": files}
+        temporary = self._path.with_name(f"{_NAME}.{os.getpid()}")
+        try:
+            temporary.write_text(json.dumps(record, indent=1), encoding="utf-8", errors="surrogateescape")
+            os.replace(temporary, self._path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+    def remove(self) -> None:
+        self._path.unlink(missing_ok=True)
+
+    def _read(self) -> None:
+        try:
+            record = json.loads(self._path.read_text(encoding="utf-8", errors="surrogateescape"))
+            if record["version"] != _VERSION:
+                raise ValueError(f"version {record['version']}")
+            self.token = _word(record["token"])
+            self.moves = [(_text(source), _text(target)) for source, target in record["moves"]]
+            for name, entry in record["files"].items():
+                self._hashes[_text(name)] = [_text(sha256) for sha256 in entry["sha256"]]
+                if entry["state"] is not None:
+                    size, modified, changed = map(int, entry["state"])
+                    self._states[name] = size, modified, changed
+        except (OSError, ValueError, TypeError, AttributeError, LookupError, RecursionError) as error:
+            raise InputError(
+                "is not a record of this version of rangesfm of what it wrote: move it away, or give another output"
+                " path",
+                self._path,
+            ) from error
+
+    def _is_own(self, path: Path) -> bool:
+        name, found = self._name_of(path), path.lstat()
+        if name not in self._hashes or not stat.S_ISREG(found.st_mode):
+            return False
+        state = _state_of(found)
+        if self._states.get(name) == state:
+            return True
+        if content_hash(path) not in self._hashes[name]:
+            return False
+        self._states[name] = state
+        return True
+
+    def _name_of(self, path: Path) -> str:
+        return path.relative_to(self._folder).as_posix()
+
+
+def content_hash(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal; of an SQLite database without the counters of who has opened it."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        head = bytearray(file.read(CHUNK_BYTES))
+        if head.startswith(_SQLITE_MAGIC):
+            for first, end in _SQLITE_COUNTERS:
+                head[first:end] = bytes(end - first)
+        digest.update(head)
+        while chunk := file.read(CHUNK_BYTES):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+def _files_in(path: Path) -> Iterator[Path]:
+    """The path itself unless it is a folder, whose files then; a link counts as a file, wherever it leads."""
+    if not os.path.lexists(path):
+        return
+    if path.is_symlink() or not path.is_dir():
+        yield path
+        return
+    for parent, folders, names in os.walk(path):
+        yield from (Path(parent, name) for name in sorted(names))
+        yield from (Path(parent, name) for name in sorted(folders) if Path(parent, name).is_symlink())
+
+
+def _state_of(found: os.stat_result) -> _State:
+    return found.st_size, found.st_mtime_ns, found.st_ctime_ns
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r} is no text")
+    return value
+
+
+def _word(value: object) -> str:
+    if not _text(value).isalnum():
+        raise ValueError(f"{value!r} is no token")
+    return str(value)

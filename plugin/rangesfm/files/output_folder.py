@@ -1,0 +1,367 @@
+"""A folder that one process at a time writes to, and in which nothing is lost that this tool did not write.
+
+What is being made, the lock and the record of what was written stand in one hidden folder inside it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import shutil
+import socket
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from datetime import datetime
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+from rangesfm.errors import InputError
+from rangesfm.files.manifest import Manifest
+
+if TYPE_CHECKING:
+    from filelock import BaseFileLock
+
+PRIVATE_NAME = ".rangesfm"
+DEFAULT_OUTPUT = "out"
+LOCK_NAME = f"{PRIVATE_NAME}/lock"
+_PARTS_NAME = "parts"
+# For a holder that ends, and removes the file, between two tries; and for one that writes a single file.
+_MAX_WAIT_S = 0.2
+_MAX_WAIT_FOR_ONE_FILE_S = 10.0
+_NOT_OURS = "is not a file that rangesfm wrote as it is now: move it away, or give another output path"
+_NUM_TRIES = 5
+_LOCK_BEGIN = '{"pid": '
+_numbers = itertools.count()
+
+
+class OutputFolder:
+    """A folder that this process alone writes to while the object is in use; see ``sole_writer``.
+
+    Attributes:
+        path: the folder, absolute and without links.
+        private: the hidden folder inside it, whose content is this tool's own.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.private = path / PRIVATE_NAME
+        self._manifest = Manifest(path, self.private)
+        self._deferred: dict[Path, Path] = {}
+        self._clear_parts()
+        self._finish_moves()
+
+    def part(self, name: str) -> Path:
+        """Return a path for something in the making, which is nobody else's and on the same file system."""
+        folder = self.private / _PARTS_NAME
+        if not folder.exists():
+            self._manifest.save()  # by whose token the next process knows what this one has left
+            folder.mkdir()
+        return folder / f"{self._manifest.token}-{os.getpid()}-{next(_numbers)}-{name}"
+
+    def require_own(self, targets: Iterable[Path]) -> None:
+        """Check that all there is at these paths, or inside them, was written by this tool and is unchanged.
+
+        Raises:
+            InputError: names the first file that was not, or a link on the way to it.
+        """
+        for target in targets:
+            for parent in target.parents:
+                if parent == self.path:
+                    break
+                if parent.is_symlink():
+                    raise InputError("is a link, expected a folder: give another output path", parent)
+            try:
+                foreign = self._manifest.foreign_file(target)
+            except OSError as error:
+                raise InputError(f"cannot be read ({error.strerror}), and so not be replaced", target) from error
+            if foreign is not None:
+                raise InputError(_NOT_OURS, foreign)
+
+    def is_own(self, path: Path) -> bool:
+        """Whether there is a file at this path that this tool wrote as it is now."""
+        return os.path.lexists(path) and self._manifest.foreign_file(path) is None
+
+    def defer(self, new: Mapping[Path, Path]) -> None:
+        """Have the next ``publish`` that replaces a whole result put these in their places, too."""
+        self._deferred.update(new)
+
+    def publish(self, new: Mapping[Path, Path], removed: Sequence[Path] = (), *, last: Path | None = None) -> None:
+        """Put files and folders in the places of earlier ones, all of them or, where that fails, none.
+
+        A process that is killed in between has it finished by the next one that writes to the folder.
+
+        Args:
+            new: for each place what comes there, from the private folder.
+            removed: places where nothing is to be left.
+            last: a file whose presence says that the others are whole: it goes first and comes last.
+
+        Raises:
+            InputError: what is in one of the places is not this tool's own.
+        """
+        if last is not None:
+            new, self._deferred = {**self._deferred, **new}, {}
+        targets = [*removed, *(target for target in new if target != last)]
+        moves: list[tuple[Path | None, Path]] = [(new.get(target), target) for target in targets]
+        if last is not None:
+            moves = [(None, last), *moves, *([(new[last], last)] if last in new else [])]
+        self.require_own({target for _, target in moves})
+        self._manifest.expect((source, target) for target, source in new.items())
+        self._manifest.moves = [
+            ("" if source is None else self._relative(source, self.private), self._relative(target, self.path))
+            for source, target in moves
+        ]
+        self._manifest.save()
+        done: list[tuple[Path, Path]] = []
+        try:
+            for source, target in moves:
+                if os.path.lexists(target):
+                    _rename(target, self.part(target.name), done)
+                if source is not None:
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    _rename(source, target, done)
+        except BaseException:
+            for before, after in reversed(done):
+                if os.path.lexists(after) and not os.path.lexists(before):
+                    os.rename(after, before)
+            self._manifest.moves = []
+            self._manifest.save()
+            raise
+        self._settle([target for _, target in moves])
+
+    def close(self) -> None:
+        """Remove what is in the making, and the private folder if it keeps nothing."""
+        self._clear_parts()
+        with suppress(OSError):
+            (self.private / _PARTS_NAME).rmdir()
+        if self._manifest.is_empty and not (set(os.listdir(self.private)) - {"lock", "manifest.json"}):
+            self._manifest.remove()
+
+    def _settle(self, targets: Sequence[Path]) -> None:
+        self._manifest.moves = []
+        self._manifest.settle(targets)
+        self._manifest.save()
+
+    def _finish_moves(self) -> None:
+        """Finish what a killed process had begun to put in its place; everything that it needs is there."""
+        moves = [
+            (self._inside(self.private, source) if source else None, self._inside(self.path, target))
+            for source, target in self._manifest.moves
+        ]
+        if not moves:
+            return
+        self.require_own(target for _, target in moves)
+        new = {target: source for source, target in moves if source is not None}
+        for target, source in new.items():
+            if os.path.lexists(source):  # else it is in its place already
+                if os.path.lexists(target):
+                    os.rename(target, self.part(target.name))
+                target.parent.mkdir(parents=True, exist_ok=True)
+                os.rename(source, target)
+        for _, target in moves:
+            if target not in new and os.path.lexists(target):
+                os.rename(target, self.part(target.name))
+        self._settle([target for _, target in moves])
+        self._clear_parts()
+
+    def _inside(self, folder: Path, name: str) -> Path:
+        path = Path(name)
+        if path.is_absolute() or ".." in path.parts or not path.parts:
+            raise InputError(f"names '{name}', expected a path inside the folder", self.private / "manifest.json")
+        return folder / path
+
+    def _relative(self, path: Path, folder: Path) -> str:
+        return path.relative_to(folder).as_posix()
+
+    def _clear_parts(self) -> None:
+        """Remove what no living process is making; what is still to be put in its place stays."""
+        folder = self.private / _PARTS_NAME
+        kept = {Path(source).parts[1] for source, _ in self._manifest.moves if source.startswith(f"{_PARTS_NAME}/")}
+        for path in sorted(folder.iterdir()) if folder.is_dir() and not folder.is_symlink() else ():
+            token, pid = (*path.name.split("-", 2), "")[:2]
+            is_ours = token == self._manifest.token and pid.isdecimal() and path.name not in kept
+            if is_ours and not _is_another_process(int(pid)):
+                remove(path)
+
+
+_held: ContextVar[Mapping[Path, OutputFolder]] = ContextVar("held", default=MappingProxyType({}))
+"""Folders that this thread holds: what it calls meanwhile may ask for them again."""
+
+
+@contextmanager
+def sole_writer(folder: Path, *, max_wait_s: float = _MAX_WAIT_S) -> Iterator[OutputFolder]:
+    """Keep other runs out of ``folder`` inside the block; clear away what killed ones left half-made there.
+
+    The folder is made if need be, and is gone again if nothing was written to it. The lock is the
+    kernel's, so a killed process leaves none behind; where the file system knows no locks there is
+    none at all.
+
+    Raises:
+        InputError: another process (or thread) writes there, or the folder cannot be written to.
+    """
+    key = folder.resolve()
+    if key in _held.get():
+        yield _held.get()[key]
+        return
+    private = key / PRIVATE_NAME
+    made = [path for path in (private, key, *key.parents) if not os.path.lexists(path)]
+    make_output_folder(folder)
+    try:
+        lock = _lock(folder, private, max_wait_s)
+    except BaseException:
+        _remove_empty(made)
+        raise
+    try:
+        held = OutputFolder(key)
+        token = _held.set(MappingProxyType({**_held.get(), key: held}))
+        try:
+            yield held
+        finally:
+            _held.reset(token)
+            held.close()
+    finally:
+        with suppress(OSError):  # Windows removes no open file
+            (key / LOCK_NAME).unlink()  # before it is let go, or it might already be another's
+        lock.release()
+        _remove_empty([private, *made])
+
+
+@contextmanager
+def writer_of(path: Path) -> Iterator[OutputFolder]:
+    """Give the folder that is held and that ``path`` is in; its own folder, held as long as the block, if none is."""
+    path = absolute(path)
+    around = [held for folder, held in _held.get().items() if path.is_relative_to(folder)]
+    if around:
+        yield max(around, key=lambda held: len(held.path.parts))
+        return
+    with sole_writer(path.parent, max_wait_s=_MAX_WAIT_FOR_ONE_FILE_S) as held:
+        yield held
+
+
+def absolute(path: Path) -> Path:
+    """Return the path without links on the way to it; a link at its end stays one."""
+    return path.parent.resolve() / path.name
+
+
+def is_private(path: Path) -> bool:
+    """Whether a path lies in the hidden folder of an output folder that this or another process holds."""
+    return any(parent.name == PRIVATE_NAME and (parent / "lock").is_file() for parent in path.parents)
+
+
+def free_output(folder: Path) -> Path:
+    """Choose an output folder inside ``folder``: ``out``, unless somebody else keeps something there."""
+    first = folder / DEFAULT_OUTPUT
+    is_free = (
+        not os.path.lexists(first) or (first / PRIVATE_NAME).is_dir() or (first.is_dir() and not os.listdir(first))
+    )
+    return first if is_free else folder / f"rangesfm_{DEFAULT_OUTPUT}"
+
+
+def make_output_folder(path: Path) -> None:
+    """Make ``path`` and check that it can be written to; raise InputError if not."""
+    if path.resolve() == Path(path.resolve().anchor):
+        raise InputError("is the root of the file system, expected a folder for the results", path)
+    if PRIVATE_NAME in path.resolve().parts and not is_private(path.resolve()):
+        raise InputError(f"lies in a folder {PRIVATE_NAME}, where rangesfm keeps what is its own", path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise InputError(f"cannot write to this output folder ({error.strerror})", path) from error
+
+
+def remove(path: Path) -> None:
+    """Remove a file, a link or a whole folder, as far as it can be."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink()
+
+
+def _remove_empty(folders: Iterable[Path]) -> None:
+    for path in folders:
+        with suppress(OSError):  # not empty
+            path.rmdir()
+
+
+def _rename(source: Path, target: Path, done: list[tuple[Path, Path]]) -> None:
+    done.append((source, target))  # before it: an interruption may come right after it
+    os.rename(source, target)
+
+
+def _lock(folder: Path, private: Path, max_wait_s: float) -> BaseFileLock:
+    """The lock of a folder, held unless the file system knows none."""
+    from filelock import FileLock, Timeout
+
+    try:
+        private.mkdir(exist_ok=True)
+    except OSError as error:
+        raise InputError("is there, expected a folder of rangesfm's own or nothing", private) from error
+    if private.is_symlink():
+        raise InputError("is a link, expected a folder of rangesfm's own or nothing", private)
+    path = private / "lock"
+    if os.path.lexists(path) and not _is_lock(path):
+        raise InputError("is there and no lock of rangesfm's: move it away, or give another output path", path)
+    lock = FileLock(path)
+    for _ in range(_NUM_TRIES):
+        try:
+            lock.acquire(timeout=max_wait_s, poll_interval=_MAX_WAIT_S / 4)
+        except Timeout:
+            raise InputError(f"{_holder(path)}: wait for it to end, or give another output path", folder) from None
+        except FileNotFoundError:  # a holder that ended has just removed the private folder
+            private.mkdir(parents=True, exist_ok=True)
+            continue
+        except OSError:  # the file system knows no locks; the file still says who writes there
+            pass
+        break
+    with suppress(OSError):  # on Windows nobody can write there now: then others are not told whose it is
+        path.write_text(_own_name(), encoding="utf-8")
+    return lock
+
+
+def _is_lock(path: Path) -> bool:
+    """Whether a file is a lock: empty, as it is when it has just been made, or beginning as the name of a holder."""
+    try:
+        if path.is_symlink() or not path.is_file():
+            return False
+        text = path.read_text(encoding="utf-8", errors="replace")
+        return not text or text.startswith(_LOCK_BEGIN)
+    except OSError:
+        return False
+
+
+def _own_name() -> str:
+    program, *arguments = sys.argv or ["python"]
+    name = "rangesfm" if Path(program).name == "__main__.py" else Path(program).name
+    command = " ".join([name, *arguments])
+    since = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
+    return json.dumps({"pid": os.getpid(), "host": socket.gethostname(), "command": command, "since": since})
+
+
+def _holder(lock: Path) -> str:
+    """Who writes to the folder, by what the lock file says."""
+    try:
+        holder = json.loads(lock.read_text(encoding="utf-8", errors="replace"))
+        host = "" if holder["host"] == socket.gethostname() else f" on {holder['host']}"
+        who, since = f"process {holder['pid']}{host} ({holder['command']})", holder["since"]
+        return f"{who} has been writing to this folder since {since}"
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):  # it has only just begun
+        return "another process is writing to this folder"
+
+
+def _is_another_process(pid: int) -> bool:
+    """Whether another process has this number: our own leftovers are those of one before us that had it."""
+    import psutil
+
+    try:  # one that has ended stays until its parent asks for it
+        return pid != os.getpid() and psutil.Process(pid).status() not in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
+    except psutil.AccessDenied:
+        return True
+    except (psutil.NoSuchProcess, OverflowError):
+        return False
