@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 from tests.conftest import Command, PhotoRun
+from tests.outputs import paths_below
+from tests.result_document import result_document
 from tests.simulated.phone_survey import write_log
 from tests.sources.recorded import Message, camera_info, compressed, raw, write_bag
 
@@ -118,3 +121,14 @@ def test_a_folder_with_one_bag_of_camera_and_radio_is_a_whole_survey(
     assert bag.scale_error_percent == pytest.approx(photos.scale_error_percent, abs=noise_percent)
     assert of_photos.place is not None
     assert bag.rmse_m == pytest.approx(photos.rmse_m, abs=float(np.linalg.norm(of_photos.place.stddev_m)))
+
+
+def test_photos_of_a_result_stay_until_there_is_another_one(survey: Survey) -> None:
+    first = with_photos_in_folder(survey, Journal(SilentProgress()))
+    settings = {"images": {"path": str(first.images.path)}}
+    (survey.output.path / "result.json").write_text(json.dumps(result_document(settings=settings)))
+    before = {path: path.read_bytes() for path in paths_below(survey.output.path) if path.is_file()}
+    slower = with_photos_in_folder(survey.changed({"images.rate_hz": 1.0}), Journal(SilentProgress()))
+    assert slower.images.path == survey.output.path / "photos_2"
+    assert {path: path.read_bytes() for path in before} == before
+    assert with_photos_in_folder(survey, Journal(SilentProgress())) == first

@@ -37,12 +37,17 @@ RESULT_NAMES = (*RESULT_FILES, *MODEL_NAMES)
 """What a result consists of; the first says that it is whole."""
 
 
+def result_names(survey: Survey) -> set[str]:
+    """Names in the output folder that a result of this survey takes, with the formats that are asked for."""
+    return set(RESULT_NAMES).union(*(EXPORTED_NAMES[name] for name in survey.export.formats))
+
+
 def refuse_to_overwrite(survey: Survey) -> None:
     """Raise InputError for an input that stands where a result will be written, or that results would stand among."""
     folder = survey.output.path.resolve()
-    written = set(RESULT_NAMES).union(*(EXPORTED_NAMES[name] for name in survey.export.formats))
-    written.update(() if survey.images.model is not None else (*RECONSTRUCTION_NAMES, *PHOTOS_NAMES))
-    places = {folder / name for name in written}
+    maps = survey.images.model is None
+    places = {folder / name for name in result_names(survey)}
+    places.update(folder / name for name in (*RECONSTRUCTION_NAMES, *PHOTOS_NAMES) if maps)
     for item in survey.input_paths():
         path = item.path.resolve()
         if not places.isdisjoint((path, *path.parents)):

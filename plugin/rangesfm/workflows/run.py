@@ -18,7 +18,7 @@ from rangesfm.files.atomic import sole_writer
 from rangesfm.join.models import PathOfModel
 from rangesfm.progress import Journal, Progress
 from rangesfm.ranging.clock.estimate import TimeOffset
-from rangesfm.result.folder import RESULT_NAMES, refuse_to_overwrite
+from rangesfm.result.folder import refuse_to_overwrite, result_names
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.inputs import RangingInputs, times_of_model
 from rangesfm.survey.settings import Survey
@@ -55,7 +55,7 @@ def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> 
     journal = Journal(progress)
     inputs = read_inputs(survey, journal)
     with sole_writer(survey.output.path) as output:
-        output.require_own(output.path / name for name in RESULT_NAMES)
+        output.require_own(output.path / name for name in result_names(survey))
         survey = with_photos_in_folder(survey, journal, restart=restart)
         keyframes, times = checked_keyframes(survey, inputs, journal)
         inputs = with_tags(survey, inputs, keyframes, journal)
@@ -103,7 +103,7 @@ def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResul
         raise InputError("the model has no 3-D points to refine: a trajectory can only be scaled", survey.images.model)
     times = None
     with sole_writer(survey.output.path) as output:
-        output.require_own(output.path / name for name in RESULT_NAMES)
+        output.require_own(output.path / name for name in result_names(survey))
         survey = with_photos_in_folder(survey, journal)
         if inputs.log.image_name is None:
             times = times_of_model(survey, sfm, survey.given_model_path)
