@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from tests.outputs import paths_below
+from tests.traps import set_traps
 
 from rangesfm.cli import main
 
@@ -164,8 +165,8 @@ def test_output_that_cannot_be_written_to_is_one_line(
 def test_working_folder_that_was_deleted_is_one_line(tmp_path: Path) -> None:
     gone = tmp_path / "gone"
     gone.mkdir()
-    program = "import os; os.rmdir(os.getcwd()); from rangesfm.cli import main; raise SystemExit(main(['ranges', 'a']))"
-    done = subprocess.run([sys.executable, "-c", program], cwd=gone, capture_output=True, check=False)
+    program = f'rmdir "$PWD"; exec "{sys.executable}" -m rangesfm ranges a'
+    done = subprocess.run(["bash", "-c", program], cwd=gone, capture_output=True, check=False)
     assert done.returncode == 2
     assert done.stderr == b"rangesfm: error: the working folder has been deleted: change to one that is there\n"
 
@@ -188,6 +189,17 @@ def test_root_of_the_file_system_is_no_output_folder(
     assert main(["scale", *quick_flags(own_survey), "--output_path", "/"]) == 2
     said = "rangesfm: error: /: is the root of the file system, expected a folder for the results\n"
     assert capfd.readouterr().err.endswith(said)
+
+
+@pytest.mark.parametrize("name", ["rangesfm", "python -m rangesfm"])
+def test_modules_in_the_working_folder_are_not_run(name: str, own_survey: WalkedSurvey) -> None:
+    sprung = set_traps(own_survey.folder)
+    script = [str(Path(sys.executable).with_name("rangesfm"))]
+    command = script if name == "rangesfm" else [sys.executable, "-m", "rangesfm"]
+    flags = ("scale", *quick_flags(own_survey), "--output_path", "out", "--quiet")
+    done = subprocess.run([*command, *flags], cwd=own_survey.folder, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert not sprung()
 
 
 @pytest.mark.parametrize("path", ["/dev/zero", "fifo"])

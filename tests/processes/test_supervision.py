@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
+import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
+from tests.traps import set_traps
 
-from rangesfm.processes.supervision import Ended, supervise
+from rangesfm.processes.supervision import Ended, child_command, supervise
 
 
 def run(
@@ -82,3 +86,29 @@ def test_nothing_is_left_running_where_the_listener_fails() -> None:
     with pytest.raises(ZeroDivisionError):
         run("say(pid=os.getpid())\ntime.sleep(60)", fail)
     assert not psutil.pid_exists(heard[0]["pid"])
+
+
+@pytest.mark.parametrize("module", ["rangesfm.vision.own_process", "rangesfm.batch.survey_process"])
+def test_a_child_imports_nothing_from_the_working_folder(
+    module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sprung = set_traps(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    ended = supervise(
+        child_command(module),
+        pickle.dumps("no work"),
+        lambda _: None,
+        environment=os.environ,
+        memory_limit_bytes=None,
+        is_stopped=lambda: False,
+    )
+    assert ended.last is not None, ended.how  # it came as far as to say what is wrong
+    assert "failed" in ended.last
+    assert not sprung()
+
+
+def test_a_child_imports_what_is_on_the_path_of_the_user(tmp_path: Path) -> None:
+    (tmp_path / "of_the_user.py").write_text("import sys\nprint(__name__, len(sys.argv), int(sys.argv[1]) > 0)\n")
+    paths = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(child_command("of_the_user"), env=paths, capture_output=True, text=True, check=True)
+    assert done.stdout == "__main__ 2 True\n"

@@ -1,7 +1,8 @@
 """A process of our own, watched from its start to its end: what it says, what memory it takes, and why it ended.
 
-It is started as ``python -m MODULE PARENT``, reads one pickled object and writes one JSON object a line:
-``{"stage": name}``, ``{"num_done": n, "num_total": m}``, and last either ``{"done": ...}`` or ``{"failed": ...}``.
+It runs a module as ``python -m MODULE PARENT`` would, but imports nothing from the working folder. It reads one pickled
+object and writes one JSON object a line: ``{"stage": name}``, ``{"num_done": n, "num_total": m}``, and last either
+``{"done": ...}`` or ``{"failed": ...}``.
 """
 
 from __future__ import annotations
@@ -33,6 +34,12 @@ _UPDATE_INTERVAL_S = 0.5
 _POLL_INTERVAL_S = 0.2
 _MAX_STOP_S = 20.0  # until a process that was interrupted is killed
 _MAX_LINE = 200
+# Python puts the working folder first on the path, as "". A survey that somebody sent may hold a numpy.py, which would
+# be imported and so run. `python -P` would leave it out, but is only known from Python 3.11 on.
+_RUN_MODULE = (
+    "import sys; sys.path[:1] == [''] and sys.path.pop(0); "
+    "import runpy; runpy.run_module(sys.argv.pop(1), run_name='__main__', alter_sys=True)"
+)
 _STACK_TRACE = ("***", "@", "PC:")  # as glog begins its lines
 
 
@@ -122,8 +129,8 @@ class Ended:
 
 
 def child_command(module: str) -> list[str]:
-    """Of a module that works for its parent (``work_for_parent``)."""
-    return [sys.executable, "-m", module, str(os.getpid())]
+    """The command that runs a module which works for its parent (``work_for_parent``)."""
+    return [sys.executable, "-c", _RUN_MODULE, module, str(os.getpid())]
 
 
 def supervise(

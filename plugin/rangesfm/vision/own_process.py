@@ -1,6 +1,6 @@
 """What COLMAP does in a process of its own: a share of the matching, and the mappers that take all photos at once.
 
-``python -m rangesfm.vision.own_process PARENT`` does one such piece of work.
+Run as a module by ``rangesfm.processes.supervision`` it does one such piece of work.
 """
 
 from __future__ import annotations
