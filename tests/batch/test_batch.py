@@ -1,4 +1,4 @@
-"""A whole batch: a scheduler and worker processes of this machine, some of which are killed in mid-work."""
+"""A whole batch: surveys in processes of this machine, some of which are killed in mid-work, and on a scheduler."""
 
 from __future__ import annotations
 
@@ -16,12 +16,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import dask
 import psutil
 import pycolmap
 import pytest
-from distributed import LocalCluster
+from distributed import LocalCluster, Security
+from tests.traps import set_traps
 
+from rangesfm.batch.workers import num_at_once, workers_of
 from rangesfm.cli import main
+from rangesfm.errors import InputError
 from rangesfm.files.output_folder import LOCK_NAME
 
 if TYPE_CHECKING:
@@ -99,16 +103,24 @@ def left_over(folder: Path) -> list[Path]:
     return [path for path in folder.rglob(".*") if path.name != LOCK_NAME]
 
 
-def test_all_surveys_end_though_a_worker_is_killed_and_others_fail(surveys: Path, photo_run: PhotoRun) -> None:
+def ports_of(process: psutil.Process) -> list[object]:
+    """Where it and its children can be spoken to."""
+    of_all = [process, *process.children(recursive=True)]
+    return [socket.laddr for one in of_all for socket in one.net_connections() if socket.status == psutil.CONN_LISTEN]
+
+
+def test_all_surveys_end_though_one_is_killed_and_others_fail_and_nothing_is_open_to_other_users(
+    surveys: Path, photo_run: PhotoRun
+) -> None:
     files = [f"{name}/survey.toml" for name in NAMES]
+    sprung = set_traps(surveys)  # what every process of the batch would find in its working folder
     with batch(surveys, "broken.toml", *files, "--num_workers", "2") as process:
         survey = survey_process(surveys, process)
-        worker = survey.parent()
-        assert worker is not None
-        assert worker.ppid() == process.pid
-        worker.kill()
+        assert ports_of(psutil.Process(process.pid)) == []
+        survey.kill()
         out, errors = process.communicate()
     assert not survey.is_running()
+    assert not sprung()
     assert process.returncode == 3, errors
     rows = rows_of(surveys)
     assert list(rows) == ["broken.toml", *files]
@@ -181,25 +193,59 @@ def test_what_cannot_be_is_refused(
     assert not (tmp_path / "batch").exists()
 
 
-def test_the_workers_of_a_scheduler_do_what_they_are_given(surveys: Path, rangesfm_process: Command) -> None:
-    shutil.rmtree(surveys / "north" / "images")
+@contextmanager
+def scheduler(scratch: Path, protocol: str, security: Security) -> Iterator[str]:
+    """The address of one with a worker, both in this process."""
     with LocalCluster(
         n_workers=1,
         threads_per_worker=1,
         processes=False,
-        protocol="tcp",
+        protocol=protocol,
+        security=security,
         host="127.0.0.1",
         dashboard_address=None,
-        local_directory=str(surveys / "scratch"),
+        local_directory=str(scratch),
         scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
     ) as cluster:
-        done = rangesfm_process(
-            "batch", "north/survey.toml", "--scheduler", cluster.scheduler_address, cwd=surveys, status=2
-        )
+        yield cluster.scheduler_address
+
+
+def test_the_workers_of_a_scheduler_do_what_they_are_given(surveys: Path, rangesfm_process: Command) -> None:
+    shutil.rmtree(surveys / "north" / "images")
+    with scheduler(surveys / "scratch", "tcp", Security()) as address:
+        done = rangesfm_process("batch", "north/survey.toml", "--scheduler", address, cwd=surveys, status=2)
     row = rows_of(surveys)["north/survey.toml"]
     assert (row["status"], row["num_attempts"], row["host"]) == ("failed", "1", socket.gethostname())
     assert row["reason"] == f"{surveys / 'north' / 'images'}: no such folder"
     assert done.stderr.splitlines()[0] == "north/survey.toml: begins"
+
+
+def test_a_scheduler_with_certificates_speaks_only_to_who_has_one_of_them(tmp_path: Path) -> None:
+    ours, of_others = Security.temporary(), Security.temporary()
+    with scheduler(tmp_path / "scratch", "tls", ours) as address:
+        with dask.config.set(as_configured(ours, tmp_path)), workers_of(address) as client:
+            assert sum(num_at_once(client).values()) == 1
+        with dask.config.set(as_configured(of_others, tmp_path)), pytest.raises(InputError), workers_of(address):
+            pass
+        expected = (
+            "tls:// needs certificates, expected distributed.comm.tls.ca-file, client.cert and client.key in Dask's"
+        )
+        with pytest.raises(InputError, match=f"no Dask scheduler answers at '{address}', .*: {expected}"):
+            workers_of(address).__enter__()
+        without = address.replace("tls:", "tcp:")
+        with pytest.raises(InputError, match=f"no Dask scheduler answers at '{without}'"):
+            workers_of(without).__enter__()
+        required = dask.config.set({"distributed.comm.require-encryption": True})
+        with required, pytest.raises(InputError, match="expected an address as tls://head:8786"):
+            workers_of(without).__enter__()
+
+
+def as_configured(security: Security, folder: Path) -> dict[str, str]:
+    """Dask's configuration of a client that has certificates, as files."""
+    for name in ("tls_ca_file", "tls_client_cert", "tls_client_key"):
+        (folder / name).write_text(getattr(security, name))
+    of_client = {f"distributed.comm.tls.client.{name}": str(folder / f"tls_client_{name}") for name in ("cert", "key")}
+    return {"distributed.comm.tls.ca-file": str(folder / "tls_ca_file"), **of_client}
 
 
 def test_without_dask_it_says_what_to_install(

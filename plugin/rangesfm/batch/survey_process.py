@@ -1,4 +1,4 @@
-"""One survey in a process of its own: what ``python -m rangesfm.batch.survey_process PARENT`` does.
+"""One survey in a process of its own: what this module does, run by ``rangesfm.processes.supervision``.
 
 A worker starts it, so that a crash of the survey leaves the worker whole, what the survey needs of memory is known, and
 it can be interrupted. It is given a (survey, restart), and ends with the survey's figures.

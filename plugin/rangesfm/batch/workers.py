@@ -16,7 +16,7 @@ from typing import Any
 
 import dask
 from dask.system import CPU_COUNT
-from distributed import Client, LocalCluster, get_worker
+from distributed import Client, Scheduler, Security, SpecCluster, Worker, get_worker
 from distributed.comm import get_address_host_port
 from distributed.system import MEMORY_LIMIT
 
@@ -26,6 +26,7 @@ from rangesfm.processes.supervision import Ended, child_command, supervise
 from rangesfm.survey.settings import Survey
 
 _CONNECT_S = 10
+_IN_PROCESS = "inproc://"
 # Nothing is served beside the work itself.
 _CONFIG = {
     "distributed.scheduler.http.routes": [],
@@ -41,50 +42,77 @@ _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
 _stopped: set[str] = set()
 
 
+class _NoServer:
+    """A scheduler or worker that serves no pages: the server of Dask's would open a port even without any."""
+
+    def start_http_server(self, *arguments: Any, **options: Any) -> None:
+        """Start nothing."""
+
+
+class _Scheduler(_NoServer, Scheduler):  # type: ignore[misc] # Dask has no type hints
+    pass
+
+
+class _Worker(_NoServer, Worker):  # type: ignore[misc] # Dask has no type hints
+    pass
+
+
 @contextmanager
 def local_workers(num: int) -> Iterator[Client]:
-    """Processes of this machine, each for one survey at a time, which only this machine can speak to."""
+    """Workers in this process, each for one survey at a time.
+
+    They need no processes of their own, as every survey has one, and they open no port: Dask runs whatever code is
+    sent to a port of its, so that any other user of this machine could have it run as this one.
+    """
     with (
         dask.config.set(_CONFIG),
         _silence(),
         tempfile.TemporaryDirectory(prefix="rangesfm_batch_", ignore_cleanup_errors=True) as scratch,
-        LocalCluster(
-            n_workers=num,
-            threads_per_worker=1,
-            processes=True,
-            host="127.0.0.1",
-            dashboard_address=None,
-            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
+        SpecCluster(
+            scheduler={"cls": _Scheduler, "options": {"protocol": _IN_PROCESS, "dashboard": False}},
+            workers={key: {"cls": _Worker, "options": _worker_options(scratch)} for key in range(num)},
             silence_logs=_SILENT,
-            memory_limit=0,  # surveys are watched, and named
-            local_directory=scratch,
-            # A Ctrl-C in the terminal is for the command, which stops them in order, and by SIGTERM.
-            preload=[
-                "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
-                "if hasattr(signal, 'pthread_sigmask'): signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})"
-            ],
         ) as cluster,
         Client(cluster, set_as_default=False) as client,
     ):
         yield client
 
 
+def _worker_options(scratch: str) -> dict[str, Any]:
+    # Dask need not watch the memory: each survey is watched by name.
+    return {"protocol": _IN_PROCESS, "nthreads": 1, "memory_limit": 0, "local_directory": scratch}
+
+
 @contextmanager
 def workers_of(scheduler: str) -> Iterator[Client]:
     """The workers of a scheduler, by its address.
 
+    Certificates for an address that begins with tls:// are those of Dask's own configuration.
+
     Raises:
-        InputError: it does not answer.
+        InputError: it does not answer, or there are no certificates that it asks for.
     """
     with dask.config.set(_CONFIG), _silence():
         try:
             get_address_host_port(scheduler)
+            _require_certificates(scheduler)
             client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
         except (OSError, ValueError, ImportError, RuntimeError) as error:
             reason = " ".join(str(error).split())
             raise InputError(f"no Dask scheduler answers at '{scheduler}', as tcp://head:8786: {reason}") from None
         with client:
             yield client
+
+
+def _require_certificates(scheduler: str) -> None:
+    """Raise ValueError if an address and Dask's configuration do not agree on certificates; its client would hang."""
+    security = Security()
+    if scheduler.startswith("tls://"):
+        if security.get_connection_args("client")["ssl_context"] is None:
+            expected = "distributed.comm.tls.ca-file, client.cert and client.key"
+            raise ValueError(f"tls:// needs certificates, expected {expected} in Dask's configuration")
+    elif security.require_encryption:
+        raise ValueError("Dask's configuration says require-encryption, expected an address as tls://head:8786")
 
 
 @contextmanager
