@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from rangesfm.cli.arguments import Outcome, normalize, parse
 from rangesfm.cli.terminal import terminal_progress
 from rangesfm.errors import INTERNAL_ERROR, InputError, failure_of, one_line
+from rangesfm.processes.threads import settle_num_threads
 
 _BROKEN_PIPE = 141  # as shells have it
 
@@ -34,6 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             os.getcwd()
         except FileNotFoundError:
             raise InputError("the working folder has been deleted: change to one that is there") from None
+        settle_num_threads()
         try:
             args = parse(normalize(sys.argv[1:] if argv is None else argv))
         except SystemExit as ended:  # --help, which is printed, and --version, which is not

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
+
+from rangesfm.errors import InputError, shown
 
 _Part = TypeVar("_Part")
 _Done = TypeVar("_Done")
@@ -13,10 +16,33 @@ _First = TypeVar("_First")
 _Second = TypeVar("_Second")
 
 
+# OpenMP takes one number for each level of parallel loops within others; there are no such loops here.
+_NUMBER = r"\s*0*([1-9][0-9]{0,8})\s*(,.*)?"
+_VARIABLE = "OMP_NUM_THREADS"
+
+
 def num_threads() -> int:
-    """As many as ``OMP_NUM_THREADS`` allows, or one for each core."""
-    asked = os.environ.get("OMP_NUM_THREADS", "")
-    return max(int(asked), 1) if asked.isdigit() else os.cpu_count() or 1
+    """One for each core, or fewer where ``OMP_NUM_THREADS`` says so."""
+    found = re.fullmatch(_NUMBER, os.environ.get(_VARIABLE, ""))
+    num_cores = os.cpu_count() or 1
+    return num_cores if found is None else min(int(found[1]), num_cores)
+
+
+def settle_num_threads() -> None:
+    """Check ``OMP_NUM_THREADS`` before libraries read it: they print what they do not like, or try 100000 threads.
+
+    Raises:
+        InputError: it is neither a number nor empty.
+    """
+    given = os.environ.get(_VARIABLE)
+    if given is None:
+        return
+    if not given.strip():
+        del os.environ[_VARIABLE]
+    elif re.fullmatch(_NUMBER, given) is None:
+        raise InputError(f"the environment's {_VARIABLE} is {shown(given)}, expected a number of threads")
+    else:
+        os.environ[_VARIABLE] = str(num_threads())
 
 
 def side_by_side(function: Callable[[_Part], _Done], parts: Iterable[_Part]) -> list[_Done]:
