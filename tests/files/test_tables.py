@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import tempfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -12,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rangesfm.errors import InputError
-from rangesfm.files.tables import Table, header_names, read_table, read_text
+from rangesfm.files.tables import Table, header_names, read_table, read_text, write_table
 
 
 def write(folder: Path, content: str | bytes) -> Path:
@@ -162,6 +164,40 @@ def test_header_names_of_no_table_at_all_are_empty() -> None:
 
 def test_text_of_any_line_ending_is_the_same(tmp_path: Path) -> None:
     assert read_text(write(tmp_path, b"\xef\xbb\xbfa\r\nb\rc\n")) == "a\nb\nc\n"
+
+
+FORMULAS = ["=1+1", "+49 89 1", "-@SUM(1)", "@SUM(A1)", "\uff1d1", "'=1", "''-x", "-", "='#'!A1"]
+
+
+@pytest.mark.parametrize("text", ["#1", "##", '#"', *FORMULAS, "'quoted", "'", '"', "a,b", "-3.2", "1e-5"])
+def test_what_is_written_is_read_as_it_was(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    write_table(path, ("a", "b", "c"), [(text, text, "-1.5"), ("plain", text, "+2")])
+    table = read_table(path, ["a", "b", "c"], text=["a", "b"])
+    assert (table.text("a"), table.text("b")) == ([text, "plain"], [text, text])
+    assert (table.categories("a").names, table.categories("b").names) == ((text, "plain"), (text,))
+    np.testing.assert_array_equal(table.numbers("c"), [-1.5, 2])
+
+
+@given(st.lists(st.text("'=+-@#\uff1d1x.\"", min_size=1, max_size=5)))
+def test_whatever_is_written_is_read_as_it_was(texts: list[str]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "table.csv")
+        write_table(path, ("a", "b"), [(text, "1") for text in texts])
+        assert read_table(path, ["a", "b"], text=["a"]).text("a") == texts
+
+
+@pytest.mark.parametrize("text", FORMULAS)
+def test_nothing_is_written_that_a_spreadsheet_would_compute(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    write_table(path, ("a", "b"), [(text, "-1.5")])
+    with path.open(newline="") as file:
+        assert list(csv.reader(file))[1] == [f"'{text}", "-1.5"]
+
+
+def test_comments_of_the_user_are_comments_and_quoted_cells_are_cells(tmp_path: Path) -> None:
+    table = read_table(write(tmp_path, '# c\n#a,b\na,b\n#x,1\n"#x",2\n  # y\n'), ["a", "b"])
+    assert (table.text("a"), table.text("b")) == (["#x"], ["2"])
 
 
 class TestFastWay:

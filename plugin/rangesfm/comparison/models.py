@@ -24,6 +24,7 @@ from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruct
 from rangesfm.report.tables import Table
 from rangesfm.result.entries import rms
 from rangesfm.result.folder import ResultFolder, read_result_folder
+from rangesfm.result.model_path import path_of_model
 from rangesfm.result.summary import ResultSummary
 
 Length = tuple[str, str, tuple[float, ...]]
@@ -177,7 +178,7 @@ def _read_model(path: Path) -> NamedModel:
         model = result.read_metric_model()
         if model is None:
             raise InputError("the result holds no metric model", path)
-        return NamedModel(str(path), trajectory_from_reconstruction(model, result.timestamps_s), model, result)
+        return NamedModel(str(path), path_of_model(model, result), model, result)
     model = read_model(path)
     return NamedModel(str(path), trajectory_from_reconstruction(model), model, None)
 

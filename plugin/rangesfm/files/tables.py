@@ -2,6 +2,10 @@
 
 A file's table has a header row; ``#`` comments and blank lines may stand anywhere; a byte order mark, any line ending
 and quoted cells are understood. Whatever is wrong is an InputError with its line.
+
+What is written is read back as it was. A first cell that begins with ``#`` is quoted, or its row would be a comment.
+Text that a spreadsheet would take for a formula, and compute, is written with an apostrophe before it; the apostrophe
+is how spreadsheets themselves mark text, and reading takes it off.
 """
 
 from __future__ import annotations
@@ -10,6 +14,7 @@ import csv
 import gzip
 import io
 import os
+import re
 import stat
 import zlib
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
@@ -27,6 +32,9 @@ from rangesfm.files.atomic import new_file
 _HEAD_BYTES = 1 << 16
 _GZIP_MARK = b"\x1f\x8b"
 _UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
+# What a formula begins with, also in the wide letters of East Asian keyboards; an apostrophe may mark it as text.
+_FORMULA = re.compile(r"'*\s*[=+\-@\uff1d\uff0b\uff0d\uff20]")
+_MAY_BEGIN_FORMULA = frozenset("'=+-@\uff1d\uff0b\uff0d\uff20 \u3000\xa0\t")
 _UNPACKED = (".gz", ".bz2", ".xz")  # by numpy, whatever such a file holds
 
 
@@ -92,7 +100,7 @@ class Table:
 
     def text(self, column: str, *, empty: str | None = None) -> list[str]:
         """The cells without surrounding blanks; ``empty`` stands for empty ones, which are refused if it is None."""
-        texts = list(map(str.strip, self._raw(column)))
+        texts = [_without_mark(cell.strip()) for cell in self._raw(column)]
         if "" in texts:
             if empty is None:
                 raise self.error(texts.index(""), column, "some text")
@@ -107,7 +115,7 @@ class Table:
     def categories(self, column: str, *, empty: str | None = None) -> Categories:
         """The cells as ``text`` has them, told apart: fast where they are few."""
         raw = Categories.of(self._raw(column))
-        names = [name.strip() for name in raw.names]
+        names = [_without_mark(name.strip()) for name in raw.names]
         if "" in names and empty is None:
             raise self.error(int(np.argmax(raw.index == names.index(""))), column, "some text")
         kinds = Categories.of([name or str(empty) for name in names])
@@ -245,9 +253,21 @@ def _table_of_texts(
 def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Write a CSV file, whole or not at all."""
     with new_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
-        writer.writerows(rows)
+        plain = csv.writer(file, lineterminator="\n")
+        quoted = csv.writer(file, lineterminator="\n", quoting=csv.QUOTE_ALL)
+        for row in (header, *rows):
+            cells = [_marked(cell) if cell[:1] in _MAY_BEGIN_FORMULA else cell for cell in row]
+            (plain if _has_content(cells[0]) else quoted).writerow(cells)
+
+
+def _marked(cell: str) -> str:
+    """A cell as it is written: with an apostrophe if it would be taken for a formula."""
+    return f"'{cell}" if _FORMULA.match(cell) and _number(cell) is None else cell
+
+
+def _without_mark(cell: str) -> str:
+    """What a written cell holds."""
+    return cell[1:] if cell[:1] == "'" and _FORMULA.match(cell) else cell
 
 
 def write_user_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

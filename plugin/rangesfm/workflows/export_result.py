@@ -12,6 +12,7 @@ from rangesfm.export.metric_map import in_frame
 from rangesfm.files.atomic import sole_writer
 from rangesfm.options import ExportOptions
 from rangesfm.result.folder import ResultFolder, read_result_folder
+from rangesfm.result.model_path import path_of_model
 from rangesfm.result.tables import CenterCovariances
 from rangesfm.vision.steps import DATABASE_NAME
 
@@ -75,6 +76,7 @@ def _read_map(result: ResultFolder, images_path: Path | None) -> MetricMap:
     reconstruction, summary = result.read_metric_model(), result.summary
     if reconstruction is None:
         raise InputError("there is no metric model (sparse_metric/0 or sparse_scaled/0) to export", result.path)
+    path_of_model(reconstruction, result)  # or nobody would be told of trajectories without poses
     covariances = result.read(CenterCovariances)
     return MetricMap(
         reconstruction,

@@ -15,7 +15,7 @@ from rangesfm.errors import InputError
 from rangesfm.export import check_formats
 from rangesfm.files.atomic import require_apart, sole_writer
 from rangesfm.geometry.reference import read_reference
-from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.join.models import PathOfModel
 from rangesfm.progress import Journal, Progress
 from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame, read_anchors
@@ -24,6 +24,7 @@ from rangesfm.ranging.association import associate
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.result.folder import ResultFolder, read_result_folder
+from rangesfm.result.model_path import path_of_model
 from rangesfm.result.tables import RangesAsUsed
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
@@ -98,9 +99,7 @@ def _read(name: str, result: ResultFolder) -> FinishedRun:
     model, ranges = _unscaled_model(result), result.read(RangesAsUsed)
     if ranges is None:
         raise InputError("there is no ranges.csv, expected the output_path of a run", result.path)
-    path = trajectory_from_reconstruction(model, result.timestamps_s)
-    if not len(path):
-        raise InputError("none of the model's photos has a time in images.csv", result.path)
+    path = path_of_model(model, result)
     own_name = {image.name: image.name for image in model.images.values()}
     of_two_anchors = RangeStatus.ANCHOR_ANCHOR.label
     tags = (id_ for id_, status in zip(ranges.tag_id, ranges.status, strict=True) if status != of_two_anchors)

@@ -13,7 +13,7 @@ from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.export.metric_map import up_in_world
 from rangesfm.geometry.gravity import UP_IN_SITE
-from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.planning.advice import advise, best_words
 from rangesfm.planning.expected import expect
 from rangesfm.planning.planned import PlannedSurvey
@@ -21,6 +21,7 @@ from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.result.folder import read_result_folder
 from rangesfm.result.metric_result import MetricResult
+from rangesfm.result.model_path import path_of_model
 from rangesfm.result.tables import RangesAsUsed
 from rangesfm.scale.verdict import CALIBRATE
 
@@ -40,7 +41,7 @@ def plan_of_result(path: str | Path) -> PlannedSurvey:
     model, ranges = folder.read_metric_model(), folder.read(RangesAsUsed)
     if model is None or ranges is None or not ranges.is_used.any():
         raise InputError("has no metric model or no used ranges, expected a finished result", path)
-    trajectory = trajectory_from_reconstruction(model, folder.timestamps_s)
+    trajectory = path_of_model(model, folder)
     used = np.array(ranges.anchor_id, dtype=str)[ranges.is_used]
     (arm,) = folder.lever_arms_m(ranges.tag_id[:1])
     stddevs = {name: anchor.stddev_m or 0.0 for name, anchor in folder.summary.anchors.items()}

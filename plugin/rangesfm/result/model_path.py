@@ -1,0 +1,22 @@
+"""The path of a model in a result folder, by the times that the run left beside it."""
+
+from __future__ import annotations
+
+import pycolmap
+
+from rangesfm.errors import InputError
+from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.result.folder import ResultFolder
+from rangesfm.result.tables import PhotoTimes
+
+
+def path_of_model(model: pycolmap.Reconstruction, result: ResultFolder) -> Trajectory:
+    """Return the path of one of a result's models.
+
+    Raises:
+        InputError: the result has times of photos, and none is of a photo of the model.
+    """
+    path = trajectory_from_reconstruction(model, result.timestamps_s)
+    if not len(path) and model.num_reg_images():
+        raise InputError(f"none of the model's photos has a time in {PhotoTimes.NAME}", result.path)
+    return path
