@@ -51,27 +51,35 @@ def write_result(
     has_reference: bool = True,
     has_photos: bool = False,
     num_points: int = 9000,
+    offset_m: tuple[float, float, float] | Array = (0.0, 0.0, 0.0),
     changes: dict[str, Any] | None = None,
 ) -> Path:
-    """A whole result folder; ``changes`` are made to result.json (see ``merged``)."""
+    """A whole result folder; ``changes`` are made to result.json (see ``merged``).
+
+    Args:
+        offset_m: of the whole site, as in the coordinates of a national grid.
+    """
     rng = np.random.default_rng(3)
     times = np.linspace(0.0, 190.0, num_keyframes)
     truth = _loop(times)
     refined = truth + 0.012 * _wander(rng, num_keyframes)
     scaled = 1.011 * (truth - truth[0]) + truth[0] + 0.07 * _wander(rng, num_keyframes)
     folder.mkdir(parents=True)
-    points = _room(rng, num_points)
-    _write_model(folder / "sparse_scaled" / "0", scaled, points)
+    points = _room(rng, num_points) + offset_m
+    _write_model(folder / "sparse_scaled" / "0", scaled + offset_m, points)
     if is_refined:
-        _write_model(folder / "sparse_metric" / "0", refined, points)
+        _write_model(folder / "sparse_metric" / "0", refined + offset_m, points)
     _write_csv(folder / "images.csv", ["image_name", "timestamp_s"], zip(_names(num_keyframes), times))
     if has_reference:
-        rows = [[name, *position] for name, position in zip(_names(num_keyframes), truth)]
+        rows = [[name, *position] for name, position in zip(_names(num_keyframes), truth + offset_m)]
         _write_csv(folder / "reference.csv", ["image_name", "x_m", "y_m", "z_m"], rows)
     rows = _ranges(rng, times, truth, scaled, refined if is_refined else None, anchor_ids, num_ranges_per_anchor)
     _write_csv(folder / "ranges.csv", RANGES_HEADER.split(), rows)
     _write_scale_tables(folder, rows)
     summary = _summary(rows, anchor_ids, is_refined, has_reference)
+    for anchor in summary["anchors"].values():
+        for key in ("position_m", "surveyed_position_m"):
+            anchor[key] = np.add(anchor[key], offset_m).tolist()
     if has_photos:
         summary["settings"]["images"]["path"] = str(_write_photos(folder / "photos", num_keyframes))
     (folder / "result.json").write_text(json.dumps(merged(summary, changes or {})))
@@ -138,7 +146,7 @@ def _write_model(path: Path, centers: Array, points: Array) -> None:
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ center)
         reconstruction.add_image_with_trivial_frame(image, pose)
     for point in points:
-        reconstruction.add_point3D(point, pycolmap.Track(), (40 + 70 * np.abs(point) / 3).astype(np.uint8))
+        reconstruction.add_point3D(point, pycolmap.Track(), (40 + 70 * (np.abs(point) % 9) / 3).astype(np.uint8))
     path.mkdir(parents=True)
     reconstruction.write_binary(path)
 

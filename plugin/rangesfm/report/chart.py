@@ -37,6 +37,7 @@ _NUM_COLUMNS = {"single": 1, "views": 2, "panels": 3}
 _SYMBOLS = {"dots": "circle", "disc": "circle", "triangle": "triangle-up"}
 
 _NUM_PICTURE_COLORS = 128
+_FAR = 2.0  # from zero, in widths of what is drawn
 _MAP_DOT_PX, _DOT_PX = 1.6, 2.8
 # Least room beside rows; of their labels each letter takes so much.
 _LEFT_OF_ROWS_PX, _RIGHT_OF_ROWS_PX, _LETTER_PX = 64, 74, 6.8
@@ -84,12 +85,18 @@ def _page_chart(panel: Panel) -> Spec:
         "title": panel.title,
         "labels": panel.labels,
         "keeps_shape": panel.keeps_shape,
-        "series": [
-            {"name": one.name, "is_data": one.is_data, "points": pack(points_of(one), "float32")}
-            for one in panel.series
-        ],
+        "series": [{"name": one.name, "is_data": one.is_data, **_packed(points_of(one))} for one in panel.series],
         "marks": [{"name": mark.title, "x": mark.x, "y": mark.y} for mark in panel.marks],
     }
+
+
+def _packed(points: Array) -> Spec:
+    """Points as 32-bit numbers, relative to a place near them where they are far from zero: a national grid is."""
+    known = points[np.isfinite(points).all(axis=1)]
+    low, high = (known.min(axis=0), known.max(axis=0)) if len(known) else np.zeros((2, 2))
+    is_far = np.abs(low + high) / 2 > _FAR * (high - low)
+    origin = np.where(is_far, np.round((low + high) / 2), 0.0)
+    return {"origin": origin.tolist(), "points": pack(points - origin, "float32")}
 
 
 def points_of(series: Series) -> Array:

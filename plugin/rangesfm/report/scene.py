@@ -1,9 +1,10 @@
-"""The 3-D view: what stands where, in metres, and what the page says around it."""
+"""The 3-D view: what stands where, in metres from an origin near it, and what the page says around it."""
 
 from __future__ import annotations
 
 import base64
 import io
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,11 +102,12 @@ def scene_of(content: Content) -> Scene | None:
 
 def view_of(scene: Scene) -> dict[str, Any]:
     """The view on the page: what its script draws, its layers (id, name, colour and shape of the swatch) and a note."""
-    box, content, photos = _box(scene), scene.content, scene.result.image_names
+    origin_m = _origin_m(scene)
+    box, content, photos = _box(scene, origin_m), scene.content, scene.result.image_names
     cameras, scale = (None, None) if content is None else (content.cameras, content.summary.scale)
     pictures = {} if content is None else thumbnails(content.images_path, photos)
-    points, ranges = _points(scene), None if content is None else _ranges(content, scene.result)
-    anchors = [_anchor(id_, anchor) for id_, anchor in scene.anchors.items() if anchor.position_m is not None]
+    points, ranges = _points(scene, origin_m), None if content is None else _ranges(content, scene.result)
+    anchors = [_anchor(id_, anchor, origin_m) for id_, anchor in scene.anchors.items() if anchor.position_m is not None]
     layers = [("points", "Map points", "map", "dots")] if points else []
     layers += [(path.id, path.name, path.color, "line" if path.has_orientations else "dashed") for path in scene.paths]
     layers += [("anchors", "Anchors", "anchor", "triangle")] if anchors else []
@@ -122,8 +124,9 @@ def view_of(scene: Scene) -> dict[str, Any]:
     )
     return {
         "up": [0, 0, 1] if scene.frame == "site" else [0, -1, 0],
+        "origin": origin_m.tolist(),
         "box": box,
-        "paths": [_path(path) for path in scene.paths],
+        "paths": [_path(path, origin_m) for path in scene.paths],
         "points": points,
         "anchors": anchors,
         "ranges": ranges,
@@ -137,7 +140,7 @@ def view_of(scene: Scene) -> dict[str, Any]:
     }
 
 
-def _path(path: ScenePath) -> dict[str, Any]:
+def _path(path: ScenePath, origin_m: Array) -> dict[str, Any]:
     trajectory = path.trajectory
     times = trajectory.timestamps_s
     return {
@@ -146,16 +149,16 @@ def _path(path: ScenePath) -> dict[str, Any]:
         "color": path.color,
         "names": list(trajectory.image_names),
         "times": None if times is None else pack(times - times[0], "float32"),
-        "centers": pack(trajectory.centers, "float32"),
+        "centers": pack(trajectory.centers - origin_m, "float32"),
         "rotations": pack(trajectory.world_from_cam, "float32") if path.has_orientations else None,
     }
 
 
-def _points(scene: Scene) -> dict[str, Any] | None:
+def _points(scene: Scene, origin_m: Array) -> dict[str, Any] | None:
     chosen = _chosen_points(scene)
     if len(chosen) == 0:
         return None
-    points = scene.points_m[chosen]
+    points = scene.points_m[chosen] - origin_m
     origin, extent = points.min(axis=0), max(float(np.ptp(points, axis=0).max()), 1e-9)
     return {
         "num": len(points),
@@ -185,14 +188,32 @@ def _around(scene: Scene) -> Array:
     return np.concatenate([*(path.trajectory.centers for path in scene.paths), *anchors])
 
 
-def _box(scene: Scene) -> dict[str, Any]:
-    """Corners and radius of what is to be seen at first, and the height of the ground."""
+def _seen_m(scene: Scene) -> tuple[Array, Array, float]:
+    """Corners and radius of what is to be seen at first."""
     seen = [_around(scene)]
     if len(scene.points_m):
         seen.append(np.quantile(scene.points_m, [_SEEN_QUANTILE, 1 - _SEEN_QUANTILE], axis=0))
     corners = np.concatenate(seen)
     low, high = corners.min(axis=0), corners.max(axis=0)
-    radius = max(float(np.linalg.norm(high - low)) / 2, 1e-3)
+    return low, high, max(float(np.linalg.norm(high - low)) / 2, 1e-3)
+
+
+def _origin_m(scene: Scene) -> Array:
+    """What the view's positions are relative to, near the middle of what is to be seen.
+
+    A graphics card computes with 32 bits: in the coordinates of a national grid, 5400000 m from their origin, that is
+    half a metre. It is a round place, so that the grid's lines are at round coordinates.
+    """
+    low, high, radius = _seen_m(scene)
+    step = 10.0 ** math.floor(math.log10(radius))
+    origin: Array = step * np.round((low + high) / 2 / step)
+    return origin
+
+
+def _box(scene: Scene, origin_m: Array) -> dict[str, Any]:
+    """Corners and radius of what is to be seen at first, and the height of the ground."""
+    low, high, radius = _seen_m(scene)
+    low, high = low - origin_m, high - origin_m
     ground = float(low[2]) if scene.frame == "site" else float(high[1])
     return {"low": low.tolist(), "high": high.tolist(), "radius": radius, "ground": ground}
 
@@ -204,12 +225,15 @@ def _frustum_size(path: Trajectory, radius: float) -> float:
     return float(np.clip(0.7 * typical, 0.012 * radius, 0.05 * radius))
 
 
-def _anchor(anchor_id: str, anchor: AnchorEntry) -> dict[str, Any]:
+def _anchor(anchor_id: str, anchor: AnchorEntry, origin_m: Array) -> dict[str, Any]:
+    def relative(position_m: Sequence[float] | None) -> list[float] | None:
+        return None if position_m is None else np.subtract(position_m, origin_m).tolist()
+
     return {
         "id": anchor_id,
-        "position": anchor.position_m,
+        "position": relative(anchor.position_m),
         "ellipsoid": [_RADIUS_OF_95_PERCENT * anchor.stddev_m] * 3 if anchor.stddev_m else None,
-        "mirror": anchor.mirror_position_m,
+        "mirror": relative(anchor.mirror_position_m),
     }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import csv
 import io
 import json
 import shutil
@@ -116,6 +117,18 @@ class Browser:
 
     def quit(self) -> None:
         self._driver.quit()
+
+
+def downloaded(browser: Browser, figure: str) -> list[list[str]]:
+    """The rows of a figure's CSV file, caught where its button hands it to the browser."""
+    browser.run(
+        "window.made = null;"
+        "URL.createObjectURL = blob => { blob.text().then(text => { window.made = text; }); return '#'; };"
+        "HTMLAnchorElement.prototype.click = function () { window.fileName = this.download; };"
+    )
+    browser.run(f"document.querySelector('#{figure} button.csv').click()")
+    browser.wait_for("window.made")
+    return [*csv.reader(io.StringIO(browser.run("return window.made")))]
 
 
 @pytest.fixture(scope="session")

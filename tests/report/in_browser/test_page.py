@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from tests.report.in_browser.conftest import downloaded
 
 from rangesfm.report import write_report
 
@@ -21,6 +22,15 @@ MakeResult = Callable[..., Path]
 NUM_CHARTS = 21
 WIDTHS_PX = (320, 390, 768, 1280)
 EVIL = "</script><script>document.title = 'broken out'</script>"
+HOSTILE = (
+    EVIL,
+    "<img src=x onerror=alert(1)>",
+    "\"'><svg onload=\"document.title = 'broken out'\">",
+    "{{7*7}}${7*7}",
+    "\N{RIGHT-TO-LEFT OVERRIDE}gpj.1A",
+    "__proto__",
+    "=HYPERLINK(1)",
+)
 
 # Of every text: its own colour on the nearest opaque background, as WCAG 2 has it; large text needs less.
 CONTRASTS = """
@@ -126,7 +136,7 @@ def test_every_control_has_a_name(browser: Browser, page: Path) -> None:
 
 
 def test_names_from_files_cannot_break_out(browser: Browser, make_result: MakeResult) -> None:
-    folder = make_result(anchor_ids=(EVIL, "<img src=x onerror=alert(1)>"), num_keyframes=12, num_ranges_per_anchor=30)
+    folder = make_result(anchor_ids=HOSTILE, num_keyframes=12, num_ranges_per_anchor=30)
     for table in ("ranges.csv", "scale_candidates.csv"):
         assert EVIL in (folder / table).read_text()
     browser.open(write_report(folder))
@@ -134,7 +144,10 @@ def test_names_from_files_cannot_break_out(browser: Browser, make_result: MakeRe
     assert browser.console() == []
     assert "broken out" not in browser.run("return document.title")
     browser.wait_for("document.querySelector('.label.anchor')")  # with the first frame
-    assert browser.run("return [...document.querySelectorAll('.label.anchor')].map(x => x.textContent)")[0] == EVIL
+    labels = "return [...document.querySelectorAll('.label.anchor')].map(x => x.textContent)"
+    assert sorted(browser.run(labels)) == sorted(HOSTILE)
+    rows = downloaded(browser, "range_residuals")[1:]
+    assert {row[1] for row in rows} == {*HOSTILE[:-1], f"'{HOSTILE[-1]}"}
 
 
 @pytest.mark.parametrize(
@@ -152,16 +165,9 @@ def test_the_data_of_figures_are_downloads(
     browser: Browser, page: Path, figure: str, header: str, min_num_rows: int
 ) -> None:
     browser.open(page)
-    # What the button makes is caught where it is handed to the browser.
-    browser.run(
-        "URL.createObjectURL = blob => { blob.text().then(text => { window.made = text; }); return '#'; };"
-        "HTMLAnchorElement.prototype.click = function () { window.fileName = this.download; };"
-    )
-    browser.run(f"document.querySelector('#{figure} button.csv').click()")
-    browser.wait_for("window.made")
-    lines = browser.run("return window.made").splitlines()
-    assert lines[0] == header
-    assert len(lines) > min_num_rows
+    rows = downloaded(browser, figure)
+    assert rows[0] == header.split(",")
+    assert len(rows) > min_num_rows
     assert browser.run("return window.fileName") == f"{figure}.csv"
     assert browser.console() == []
 

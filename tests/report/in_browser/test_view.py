@@ -8,7 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pycolmap
 import pytest
+from tests.report.conftest import ANCHORS
+from tests.report.in_browser.conftest import downloaded
 
 from rangesfm.report import write_report
 
@@ -169,5 +172,38 @@ def test_points_stand_where_the_map_has_them(opened: Browser) -> None:
         "return [Math.min, Math.max].map(f => [0, 1, 2].map(axis => all.reduce((m, p) => f(m, p[axis]), all[0][axis])))"
     )
     # The room of the made-up result: walls at these places, with noise.
-    assert np.subtract(low, (-2.4, -2.9, 0.0)) == pytest.approx(np.zeros(3), abs=0.1)
-    assert np.subtract(high, (2.4, 2.9, 2.3)) == pytest.approx(np.zeros(3), abs=0.1)
+    origin = opened.run("return rangesfmView.scene.origin")
+    assert np.add(low, origin) == pytest.approx(np.array((-2.4, -2.9, 0.0)), abs=0.1)
+    assert np.add(high, origin) == pytest.approx(np.array((2.4, 2.9, 2.3)), abs=0.1)
+
+
+def test_in_the_coordinates_of_a_national_grid_all_stands_where_it_is_to_a_millimetre(
+    browser: Browser, make_result: MakeResult
+) -> None:
+    offset_m = np.array((450000.25, 5400000.5, 312.0))
+    folder = make_result(num_keyframes=12, num_ranges_per_anchor=20, num_points=300, offset_m=offset_m)
+    browser.open(write_report(folder))
+    browser.wait_for("window.rangesfmView && rangesfmView.stage")
+    model = pycolmap.Reconstruction(folder / "sparse_metric" / "0")
+    centers = np.array([model.find_image_with_name(name).projection_center() for name in _names(browser)])
+    origin = np.array(browser.run("return rangesfmView.scene.origin"))
+    drawn = np.reshape(browser.run("return Array.from(rangesfmView.path.centers)"), (-1, 3))
+    assert np.abs(drawn).max() < 10
+    assert np.abs(drawn + origin - centers).max() < 1e-4
+    anchors = np.array(browser.run("return rangesfmView.scene.anchors.map(({ position }) => position)"))
+    assert np.abs(anchors + origin - offset_m - ANCHORS).max() < 1e-9
+    said = re.search(r"x, y, z = ([\d.]+), ([\d.]+), ([\d.]+) m", text_of(browser, ".photo .place"))
+    assert said is not None
+    index = int(browser.run("return rangesfmView.chosen"))
+    assert np.abs(np.array(said.groups(), dtype=float) - centers[index]).max() <= 5.01e-4
+    points = np.array([point.xyz for point in model.points3D.values()])
+    made = np.array([row[:3] for row in downloaded(browser, "map_points")[1:]], dtype=float)
+    assert len(made) == len(points)
+    assert max(np.linalg.norm(points - row, axis=1).min() for row in made) < 1e-3
+    rows = downloaded(browser, "trajectory")[1:]
+    refined = [row[2:] for row in rows if row[:2] == [rows[0][0], "refined"]]
+    assert np.abs(np.array(refined, dtype=float) - centers[:, :2]).max() < 1e-3
+
+
+def _names(browser: Browser) -> list[str]:
+    return list(browser.run("return rangesfmView.path.names"))

@@ -13,7 +13,7 @@ class Chart {
   /** Draws it, once: thousands of points take their time. */
   draw() {
     if (this.view !== null) return;
-    const datasets = Object.fromEntries(this.series.map(({ points }, i) => [`series${i}`, rowsOf(points)]));
+    const datasets = Object.fromEntries(this.series.map((one, i) => [`series${i}`, rowsOf(one)]));
     const runtime = VEGA.parse(VEGA.compile({ ...this.spec, datasets }).spec, {}, { ast: true });
     this.view = new VEGA.View(runtime, { expr: VEGA.expressionInterpreter, renderer: "svg" }).initialize(this.node);
     this.node.style.height = "";
@@ -26,10 +26,17 @@ class Chart {
 
   /** {name, x, y} of all data, as the CSV file has them. */
   *rows() {
-    for (const { name, points, is_data } of this.series) {
-      if (is_data) for (const { x, y } of rowsOf(points)) if (isFinite(x + y)) yield { name, x, y };
+    for (const one of this.series) {
+      if (one.is_data) for (const { x, y } of rowsOf(one)) if (isFinite(x + y)) yield { name: one.name, x, y };
     }
     yield* this.marks;
+  }
+
+  /** Rounded to so many digits, and more where the axis shows values much closer together than they are far from 0. */
+  number(value, axis, numDigits) {
+    const [low, high] = this.spec.encoding[axis].scale.domain;
+    const share = Math.max(Math.abs(low), Math.abs(high)) / (high - low);
+    return Number(value.toPrecision(Math.min(numDigits + Math.max(0, Math.ceil(Math.log10(share))), 17)));
   }
 
   #size() {
@@ -57,16 +64,17 @@ class Chart {
     this.tip.hidden = nearest === null;
     if (nearest === null) return;
     const { name, x, y, px, py } = nearest;
-    const values = [x, y].map((value, i) => this.labels[i] && `${this.labels[i]} ${Number(value.toPrecision(5))}`);
+    const told = [this.number(x, "x", 5), this.number(y, "y", 5)];
+    const values = told.map((value, i) => this.labels[i] && `${this.labels[i]} ${value}`);
     this.tip.textContent = [name, ...values].filter(Boolean).join(" · ");
     this.tip.classList.toggle("left", px > box.width / 2);
     Object.assign(this.tip.style, { left: `${px}px`, top: `${py}px` });
   }
 }
 
-/** Rows of x and y of a flat array of both in turn. */
-function rowsOf(points) {
-  return Array.from({ length: points.length / 2 }, (_, i) => ({ x: points[2 * i], y: points[2 * i + 1] }));
+/** Rows of x and y of a flat array of both in turn, which are relative to an origin. */
+function rowsOf({ points, origin }) {
+  return Array.from({ length: points.length / 2 }, (_, i) => ({ x: origin[0] + points[2 * i], y: origin[1] + points[2 * i + 1] }));
 }
 
 /** All figures of the page, by name: a list of charts each, which are drawn when they come near or go to paper. */

@@ -1,8 +1,14 @@
 // Data of the page as CSV files, made when asked for.
 
 function csvText(rows) {
-  const cell = (value) => (/[",\n\r]/.test(value) ? `"${value.replaceAll('"', '""')}"` : Number.isNaN(value) ? "" : value);
+  const quoted = (text) => (/[",\n\r]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
+  const cell = (value) => (typeof value === "string" ? quoted(asText(value)) : Number.isNaN(value) ? "" : value);
   return `${[Object.keys(rows[0]), ...rows.map(Object.values)].map((row) => row.map(cell).join(",")).join("\n")}\n`;
+}
+
+/** A text with an apostrophe before it where a spreadsheet would take it for a formula, as in the result's tables. */
+function asText(text) {
+  return /^'*\s*[=+\-@\uff1d\uff0b\uff0d\uff20]/.test(text) && isNaN(text) ? `'${text}` : text;
 }
 
 function rounded(value, decimals) {
@@ -32,10 +38,10 @@ const TABLES = {
       error_scaled_m: rounded(ranges.residual_scaled[i] + ranges.measured[i] - ranges.true[i], 4),
       error_refined_m: rounded(ranges.residual_refined[i] + ranges.measured[i] - ranges.true[i], 4),
     })),
-  points: ({ points }) =>
-    Array.from({ length: points.num }, (_, i) => {
-      const [x_m, y_m, z_m] = pointPosition(points, i).map((value) => rounded(value, 4));
-      const [red, green, blue] = row3(points.colors, i);
+  points: (scene) =>
+    Array.from({ length: scene.points.num }, (_, i) => {
+      const [x_m, y_m, z_m] = inFrame(scene, pointPosition(scene.points, i)).map((value) => rounded(value, 4));
+      const [red, green, blue] = row3(scene.points.colors, i);
       return { x_m, y_m, z_m, red, green, blue };
     }),
 };
@@ -43,10 +49,10 @@ const TABLES = {
 /** Rows of what a figure's charts draw. */
 function rowsOfCharts(charts) {
   const [x, y] = charts[0].labels.map((label) => (label || "row").replace("−", "minus ").split(/\s+/).join("_"));
-  const number = (value) => Number(value.toPrecision(7));
-  return charts.flatMap((chart) =>
-    [...chart.rows()].map((row) => ({ panel: chart.title, series: row.name, [x]: number(row.x), [y]: number(row.y) })),
-  );
+  return charts.flatMap((chart) => {
+    const number = (row, axis) => chart.number(row[axis], axis, 7);
+    return [...chart.rows()].map((row) => ({ panel: chart.title, series: row.name, [x]: number(row, "x"), [y]: number(row, "y") }));
+  });
 }
 
 /** A figure's button gives the table it names, or else what its charts draw. */

@@ -17,6 +17,11 @@ function row3(values, i) {
   return [values[3 * i], values[3 * i + 1], values[3 * i + 2]];
 }
 
+/** A position of the scene in the frame of the result: all are relative to its origin, which may be far away. */
+function inFrame({ origin }, position) {
+  return position.map((value, axis) => value + origin[axis]);
+}
+
 /** A colour of the page's style, so that view and page change together. */
 function themeColor(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();

@@ -58,7 +58,7 @@ class View {
     this.stage.lookFrom(directions[name]);
   }
 
-  /** Position of the i-th point of the map, metres. */
+  /** Position of the i-th point of the map, metres from the scene's origin. */
   pointAt(i) {
     return pointPosition(this.scene.points, i);
   }

@@ -25,7 +25,7 @@ class PhotoPanel {
   }
 
   #place(path, i) {
-    const at = row3(path.centers, i).map((value) => value.toFixed(3).replace("-", "−"));
+    const at = inFrame(this.scene, row3(path.centers, i)).map((value) => value.toFixed(3).replace("-", "−"));
     const time = path.times === null ? "" : ` at ${path.times[i].toFixed(2)} s`;
     return `Photo ${i + 1} of ${path.names.length}${time}; x, y, z = ${at.join(", ")} m${this.#moved(path, i)}`;
   }

@@ -21,7 +21,7 @@ function makePoints(stage, { steps, colors, origin, extent, num }) {
   return points;
 }
 
-/** Position of the i-th point, metres: whole steps of the largest side of their box. */
+/** Position of the i-th point, metres from the scene's origin: whole steps of the largest side of their box. */
 function pointPosition({ steps, origin, extent }, i) {
   return row3(steps, i).map((value, axis) => origin[axis] + (extent / 65535) * value);
 }
