@@ -143,7 +143,7 @@ def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expect
     posed = planned.posed(observations)
     state = planned.state(posed, observations.log.anchor_ids)
     tags, scale = tag_positions(posed.ranges, state.metric_from_model), state.metric_from_model.scale
-    errors = posed.errors.at(tags, scale * posed.center_stddev)
+    errors = posed.errors.at(tags, posed.placing_stddev_m(scale))
     solution = _at_the_truth(posed, errors, state, planned.num_alike)
     rotations, made = model_from_cam(observations, path, posed), None
     stddevs = usual_stddevs(is_calibrated=planned.curve_stddev_m is not None) | dict(planned.component_stddevs)

@@ -6,11 +6,11 @@ from collections.abc import Collection
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
+from rangesfm.geometry.motion_prior import learn_motion
 from rangesfm.geometry.reference import Reference
 from rangesfm.geometry.trajectory import ROUNDING_S, Trajectory
 from rangesfm.options import AssociationOptions
@@ -18,13 +18,6 @@ from rangesfm.ranging.errors.noise import robust_stddev
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
 
-# A spline through every second keyframe misses the others by up to this many times what one
-# through all keyframes misses in between: 16 for a smooth path (the error grows with the
-# fourth power of the gap), 4 for a jerky one (second power).
-_MAX_HALVING_GAIN = 6.0
-_MIN_TELLING_GAIN = 2.0
-# Median length of a Gaussian vector in space, in stddevs of its coordinates.
-_MEDIAN_LENGTH = 1.538
 # Early and late halves of a burst must agree to this many stddevs before the camera counts as still.
 _MAX_STILL_DRIFT_STDDEVS = 2.0
 # A range this close in time to a keyframe was taken there: at walking pace it is a tenth of a millimetre off.
@@ -42,9 +35,9 @@ def associate(
 ) -> RangeObservations:
     """Find the camera pose at which each range was taken.
 
-    Between keyframes that are close in time the centre follows a cubic spline and the
-    rotation the shortest turn; the stddev of the centre says how far that, and times that
-    are written in coarse steps, can be trusted. Between keyframes further apart than
+    Between keyframes that are close in time centre and rotation move as the keyframes let
+    expect (``MotionPrior``); their stddevs say how far that, and times that are written in
+    coarse steps, can be trusted. Between keyframes further apart than
     ``options.max_interpolation_gap_s`` a range belongs to the nearest keyframe, and only
     if it is within ``max_time_difference_s`` or the ranges themselves show that the camera
     stood still around its photos.
@@ -87,19 +80,21 @@ def associate(
     # The last entry stands for the index of no tag.
     tags_in_cam_m = np.vstack([lever_arms(log, tag_in_cam_m), np.full(3, np.nan)])[log.tag_index]
     centers, lever = np.full((len(log), 3), np.nan), np.full((len(log), 3), np.nan)
-    offsets, stddev = np.zeros((len(log), 3)), np.zeros(len(log))
+    offsets, stddev, arm_stddev_m = np.zeros((len(log), 3)), np.zeros(len(log)), np.zeros(len(log))
 
     b, a, w = before[placed], after[placed], weight[placed]
-    lever[placed] = _turned_lever_arms(trajectory, tags_in_cam_m[placed], b, w)
-    if trajectory.timestamps_s is not None:
-        curved = np.flatnonzero(placed)[(w > 0) & (a != b)]
-        offsets[curved], stddev[curved] = _curve_beyond_line(
-            trajectory.timestamps_s, trajectory.centers, before[curved], weight[curved], options
+    if trajectory.timestamps_s is None or len(trajectory) < 2:
+        lever[placed] = np.einsum("nij,nj->ni", trajectory.world_from_cam[b], tags_in_cam_m[placed])
+    else:
+        is_bridged = ~is_too_long(np.diff(trajectory.timestamps_s), options)
+        lever[placed], arm_stddev_m[placed] = _interpolated_lever_arms(
+            trajectory, tags_in_cam_m[placed], b, w, is_bridged
         )
+        offsets[placed], stddev[placed] = _interpolated_centers(trajectory, b, w, is_bridged)
         stddev[placed] = np.hypot(stddev[placed], _timing_stddev(log, trajectory, b, a, w, options))
     linear = (1 - w)[:, None] * trajectory.centers[b] + w[:, None] * trajectory.centers[a]
     centers[placed] = linear + offsets[placed]
-    return RangeObservations(log, status, before, after, weight, centers, offsets, lever, stddev)
+    return RangeObservations(log, status, before, after, weight, centers, offsets, lever, stddev, arm_stddev_m)
 
 
 def tag_positions(
@@ -224,15 +219,39 @@ def _deviations(values: Array) -> Array:
     return np.sort(np.abs(values - np.median(values)))[len(values) % 2 :]
 
 
-def _turned_lever_arms(trajectory: Trajectory, tags_in_cam_m: Array, before: Indices, weight: Array) -> Array:
-    """(n, 3) lever arms in the world, part of the shortest turn from one keyframe to the next."""
-    rotations = trajectory.world_from_cam
-    if np.any(weight > 0):
-        to_next = Rotation.from_matrix(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:]).as_rotvec()
-        # The last keyframe has none, and every range there has weight 0.
-        turns = weight[:, None] * np.append(to_next, np.zeros((1, 3)), axis=0)[before]
-        tags_in_cam_m = Rotation.from_rotvec(turns).apply(tags_in_cam_m)
-    return np.asarray(np.einsum("nij,nj->ni", rotations[before], tags_in_cam_m))
+def _interpolated_centers(
+    trajectory: Trajectory, before: Indices, weight: Array, is_bridged: Mask
+) -> tuple[Array, Array]:
+    """(n, 3) what the motion has beyond the line between two keyframes, and (n,) the stddev of each coordinate."""
+    assert trajectory.timestamps_s is not None, "a motion in time needs times"
+    motion = learn_motion(trajectory.timestamps_s, trajectory.centers, is_bridged)
+    offsets, stddev = np.zeros((len(before), 3)), np.full(len(before), motion.noise_stddev)
+    between = weight > 0
+    offsets[between], stddev[between] = motion.beyond_chord(before[between], weight[between])
+    return offsets, stddev
+
+
+def _interpolated_lever_arms(
+    trajectory: Trajectory, tags_in_cam_m: Array, before: Indices, weight: Array, is_bridged: Mask
+) -> tuple[Array, Array]:
+    """(n, 3) lever arms in the world, and (n,) the stddev of each coordinate, metres.
+
+    The turns from keyframe to keyframe, laid end to end in the camera's frame, are coordinates like those of the
+    centre: between two keyframes that holds as long as one turn is small or about the axis of the next.
+    """
+    assert trajectory.timestamps_s is not None, "a motion in time needs times"
+    to_next = Rotation.from_matrix(np.swapaxes(trajectory.world_from_cam[:-1], 1, 2) @ trajectory.world_from_cam[1:])
+    turned = np.vstack([np.zeros((1, 3)), np.cumsum(to_next.as_rotvec(), axis=0)])
+    motion = learn_motion(trajectory.timestamps_s, turned, is_bridged)
+    stddev = np.full(len(before), motion.noise_stddev)
+    between = weight > 0
+    beyond, stddev[between] = motion.beyond_chord(before[between], weight[between])
+    arms = tags_in_cam_m.copy()
+    turns = weight[between, None] * to_next.as_rotvec()[before[between]] + beyond
+    arms[between] = Rotation.from_rotvec(turns).apply(arms[between])
+    # A turn moves the end of the arm in two of three directions.
+    stddev_m = np.sqrt(2 / 3) * stddev * np.linalg.norm(tags_in_cam_m, axis=1)
+    return np.einsum("nij,nj->ni", trajectory.world_from_cam[before], arms), stddev_m
 
 
 def _timing_stddev(
@@ -253,43 +272,3 @@ def _timing_stddev(
     speed = np.where(before == after, np.maximum(around[before], around[before + 1]), around[before + 1])
     photo_share = np.where(before == after, 1.0, np.hypot(1 - weight, weight))
     return np.asarray(speed / np.sqrt(3) * np.hypot(log_stddev_s, photo_share * photo_stddev_s))
-
-
-def _curve_beyond_line(
-    times: Array, centers: Array, before: Indices, weight: Array, options: AssociationOptions
-) -> tuple[Array, Array]:
-    """What a cubic spline has beyond the chord at each place, and how far the spline can be trusted."""
-    offsets, stddev = np.zeros((len(before), 3)), np.zeros(len(before))
-    breaks = np.flatnonzero(is_too_long(np.diff(times), options)) + 1
-    for segment in np.split(np.arange(len(times)), breaks):
-        here = (before >= segment[0]) & (before < segment[-1])
-        if len(segment) < 4 or not here.any():
-            continue
-        b, w = before[here], weight[here][:, None]
-        at = times[b] + weight[here] * (times[b + 1] - times[b])
-        offsets[here] = CubicSpline(times[segment], centers[segment])(at) - ((1 - w) * centers[b] + w * centers[b + 1])
-        # The error vanishes at the keyframes and is largest half-way.
-        stddev[here] = _spline_error(times[segment], centers[segment]) * (4 * weight[here] * (1 - weight[here]))
-    return offsets, stddev
-
-
-def _spline_error(times: Array, centers: Array) -> float:
-    """Stddev (each coordinate) half-way between keyframes, from how well every second one predicts the others."""
-    if len(times) < 8:
-        return 0.0
-    missed, gain = _median_miss(times, centers), _MAX_HALVING_GAIN
-    if len(times) >= 16:
-        # All keyframes gain over every second one what these gain over every fourth, as long as the motion lasts longer
-        # than the gaps. Where already every second keyframe says little of the others, these tell no more than that it
-        # is between nothing and the most: the mean of the two (of logarithms) is within a factor of about two.
-        gain = _median_miss(times[::2], centers[::2]) / max(missed, 1e-300)
-        is_telling = gain >= _MIN_TELLING_GAIN
-        gain = min(gain, _MAX_HALVING_GAIN) if is_telling else float(np.sqrt(_MAX_HALVING_GAIN * max(gain, 1.0)))
-    return missed / (_MEDIAN_LENGTH * gain)
-
-
-def _median_miss(times: Array, centers: Array) -> float:
-    """How far a spline through every second place passes by the others."""
-    missed = CubicSpline(times[::2], centers[::2])(times[1:-1:2]) - centers[1:-1:2]
-    # Of lengths, so that it does not depend on how the world's axes lie.
-    return float(np.median(np.linalg.norm(missed, axis=1)))

@@ -55,8 +55,9 @@ class RangeObservations:
         centers: (n, 3) camera centres, model units; NaN without a place.
         center_offsets: (n, 3) model units.
         tag_from_center: (n, 3) lever arm turned into the world, metres.
-        center_stddev: (n,) of the interpolated centre, each coordinate, model units; 0 at a keyframe
-            if the times are exact.
+        center_stddev: (n,) of the interpolated centre, each coordinate, model units; at a keyframe whose time is exact
+            the keyframes' own error, as far as keyframes that are close in time show one.
+        arm_stddev_m: (n,) of the turned lever arm, each coordinate, metres.
         time_offset_stddev_s: of the clocks' offset by which they were put there.
     """
 
@@ -69,12 +70,17 @@ class RangeObservations:
     center_offsets: Array
     tag_from_center: Array
     center_stddev: Array
+    arm_stddev_m: Array
     time_offset_stddev_s: float = 0.0
 
     @property
     def has_place(self) -> Mask:
         """(n,) ranges that estimates may use: on the path, of a wanted anchor, not held out."""
         return np.asarray(self.status <= RangeStatus.OUTLIER)
+
+    def placing_stddev_m(self, metres_per_unit: float) -> Array:
+        """Return the stddev (n,) of each coordinate of the antenna's place, metres, in a map of this scale."""
+        return np.hypot(metres_per_unit * self.center_stddev, self.arm_stddev_m)
 
     @property
     def nearest(self) -> Indices:
@@ -169,6 +175,7 @@ def joined_observations(
             "center_offsets": similarity.scale * part.center_offsets @ similarity.rotation.T,
             "tag_from_center": part.tag_from_center @ similarity.rotation.T,
             "center_stddev": similarity.scale * part.center_stddev,
+            "arm_stddev_m": part.arm_stddev_m,
         }
         for name, values in moved.items():
             joined.setdefault(name, getattr(part, name).copy())[rows] = values[rows]

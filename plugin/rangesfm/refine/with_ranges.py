@@ -162,7 +162,7 @@ def _errors_to_begin_with(problem: RefinementProblem, errors: RangeErrors, metre
     ranges, options = problem.ranges, problem.options
     path = ranges.trajectory.as_in(problem.metric)
     tags_m = ranges.antennas.positions(path.centers, path.world_from_cam)
-    placing_m = metres_per_unit * ranges.observations.center_stddev
+    placing_m = ranges.observations.placing_stddev_m(metres_per_unit)
     placed = errors.subset(ranges.rows).at(tags_m[ranges.rows], placing_m[ranges.rows])
     if options.short_range_stddev_m > 0:
         placed = placed.without_shared()

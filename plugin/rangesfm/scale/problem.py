@@ -35,8 +35,8 @@ class ScaleProblem:
     Attributes:
         ranges: the problem; its model world is the first camera's frame, unscaled.
         errors: of its ranges, before anything is estimated.
-        center_stddev: (k,) of their interpolated centres, each coordinate, model units.
-        rows: (k,) which observations its ranges are.
+        observations: all of the log.
+        rows: (k,) which of the observations its ranges are.
         first_camera_from_sfm: rigid motion from the world of the unscaled model.
         frame: "site" or "first_camera": the metric world of the solution.
         anchors_are_known: whether the scale can lean on given anchor positions.
@@ -47,7 +47,7 @@ class ScaleProblem:
 
     ranges: RangeProblem
     errors: RangeErrors
-    center_stddev: Array
+    observations: RangeObservations
     rows: Indices
     first_camera_from_sfm: Similarity
     frame: str
@@ -55,6 +55,10 @@ class ScaleProblem:
     notes: tuple[str, ...]
     left_out: tuple[str, ...]
     order_given: tuple[str, ...]
+
+    def placing_stddev_m(self, metres_per_unit: float) -> Array:
+        """Return the stddev (k,) of each coordinate of the antenna's place, metres, in a map of this scale."""
+        return self.observations.placing_stddev_m(metres_per_unit)[self.rows]
 
 
 def scale_problem(
@@ -119,7 +123,7 @@ def scale_problem(
     return ScaleProblem(
         ranges,
         errors,
-        observations.center_stddev[rows],
+        observations,
         rows,
         first_camera_from_sfm,
         frame,

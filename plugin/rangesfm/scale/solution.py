@@ -198,7 +198,7 @@ def solution_from(posed: ScaleProblem, start: RangeState) -> Solution:
 
     def seen(errors: RangeErrors, state: RangeState) -> RangeErrors:
         placed = state.metric_from_model
-        errors = errors.at(tag_positions(given, placed), placed.scale * posed.center_stddev)
+        errors = errors.at(tag_positions(given, placed), posed.placing_stddev_m(placed.scale))
         return errors.seen_by_rigid_map(residuals_m(state), prior_cost(given, state))
 
     def shown(errors: RangeErrors, fitted: RangeFit) -> RangeErrors:

@@ -10,7 +10,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from rangesfm.arrays import Array
 from rangesfm.ranging.errors.cells import MAX_NUM_CELLS, Cells, cells, noisiness
-from rangesfm.ranging.errors.components import CLOCKS, GIVEN, REWEIGHTING
+from rangesfm.ranging.errors.components import CLOCKS, GIVEN, PLACES, REWEIGHTING
 from rangesfm.ranging.errors.learned import ROUNDING, ExpectedErrors, LearnedErrors, learn_errors
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.estimate import ScaleUncertainty
@@ -49,11 +49,11 @@ def learned_errors(
     """
     linear, taken_off = _linear(posed, solution), observations.log.shared_stddev_m
     of_ranges = _cells(posed, solution, observations, model_from_cam)
-    by_clocks = {}
+    others_m2 = _by_places(posed, solution, of_ranges)
     if velocities is not None and observations.time_offset_stddev_s:
         placed, by = solution.fit.state.metric_from_model, range_gradient(solution.problem, solution.fit.state)
         rates = of_ranges.mean(placed.scale * np.sum(by.by_tag * (velocities @ placed.rotation.T), axis=1))
-        by_clocks[CLOCKS] = observations.time_offset_stddev_s**2 * np.outer(rates, rates)
+        others_m2[CLOCKS] = observations.time_offset_stddev_s**2 * np.outer(rates, rates)
     return learn_errors(
         of_ranges,
         off_m=linear.off_m,
@@ -62,7 +62,7 @@ def learned_errors(
         noise_m=solution.noise_stddev_m,
         curve_stddev_m=None if taken_off is None else taken_off[posed.rows],
         ruled_out=ruled_out(solution.problem),
-        others_m2=by_clocks,
+        others_m2=others_m2,
     )
 
 
@@ -110,11 +110,22 @@ def errors_to_expect(
         max_num_cells: fewer are coarser, and sooner computed.
     """
     taken_off = observations.log.shared_stddev_m
+    of_ranges = _cells(posed, solution, observations, model_from_cam, max_num_cells)
     return ExpectedErrors.of(
-        _cells(posed, solution, observations, model_from_cam, max_num_cells),
+        of_ranges,
         None if taken_off is None else taken_off[posed.rows],
         ruled_out(solution.problem),
+        _by_places(posed, solution, of_ranges),
     ).usual(stddevs)
+
+
+def _by_places(posed: ScaleProblem, solution: Solution, of_ranges: Cells) -> dict[str, Array]:
+    """Return what uncertain places of the antenna do to the cells, by name; nothing where places are certain."""
+    placing_m = posed.placing_stddev_m(solution.fit.state.metric_from_model.scale)
+    if not np.any(placing_m > 0):
+        return {}
+    towards = range_gradient(solution.problem, solution.fit.state).by_tag
+    return {PLACES: of_ranges.shared_by_places(towards, placing_m, posed.observations.before[posed.rows])}
 
 
 def ruled_out(problem: RangeProblem) -> list[str]:

@@ -10,6 +10,7 @@ from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.errors.cells import Cells, cells, noisiness
+from rangesfm.ranging.errors.components import PLACES
 from rangesfm.ranging.errors.learned import ExpectedErrors, LearnedErrors
 from rangesfm.ranging.errors.noise import MIN_STDDEV_M, robust_stddev
 from rangesfm.ranging.observations import RangeObservations
@@ -58,6 +59,7 @@ class RangesOnMap:
         tag_index: (n,). tag_ids, anchor_ids: by index. order_given: of the anchors in their file.
         rows: (n,) of the log.
         weights: (n,) robust weights by which the estimate took them.
+        placing_m: (n,) stddev of each coordinate of the antenna's place. gap: (n,) the gap that each range is from.
         curve_stddev_m: (n,) of a learnt error curve that has been taken off; None if none has.
     """
 
@@ -72,6 +74,8 @@ class RangesOnMap:
     order_given: tuple[str, ...]
     rows: Indices
     weights: Array
+    placing_m: Array
+    gap: Indices
     curve_stddev_m: Array | None
 
     @property
@@ -110,6 +114,8 @@ def ranges_on_map(
         order_given=posed.order_given,
         rows=rows,
         weights=solution.fit.weights,
+        placing_m=posed.placing_stddev_m(solution.fit.state.metric_from_model.scale),
+        gap=observations.before[rows],
         curve_stddev_m=None if log.shared_stddev_m is None else log.shared_stddev_m[rows],
     )
 
@@ -183,7 +189,9 @@ def linearized(on_map: RangesOnMap, cells_of_ranges: Cells | None = None) -> Lin
             from its neighbours, however far from the map.
     """
     found, scatter_m = _cells(on_map) if cells_of_ranges is None else (cells_of_ranges, 0.0)
-    expected = ExpectedErrors.of(found, on_map.curve_stddev_m, ruled_out(on_map.problem), _wandering(found))
+    towards = RangeGradient.of(on_map.from_anchor_m).by_tag
+    others_m2 = _wandering(found) | {PLACES: found.shared_by_places(towards, on_map.placing_m, on_map.gap)}
+    expected = ExpectedErrors.of(found, on_map.curve_stddev_m, ruled_out(on_map.problem), others_m2)
     return _linearized(on_map, expected, scatter_m, expected.usual({"white": scatter_m}))
 
 

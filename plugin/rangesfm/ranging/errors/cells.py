@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.errors.noise import robust_stddev
@@ -53,6 +54,22 @@ class Cells:
         sums = np.stack([np.bincount(self.of_range, self.weight * column, len(self)) for column in flat.T], axis=1)
         means: Array = sums / np.maximum(self.worth, 1e-12)[:, None]
         return means.reshape(len(self), *values.shape[1:])
+
+    def shared_by_places(self, towards: Array, placing_m: Array, gap: Indices) -> Array:
+        """Return the covariance (c, c), metres^2, of what uncertain places of the antenna do to the cells.
+
+        Ranges from one gap between keyframes share one error of their place, a vector; those of different gaps do not.
+
+        Args:
+            towards: (n, 3) unit vectors from anchor to tag. placing_m: (n,) stddev of each coordinate of the place.
+            gap: (n,) the gap that each range is from.
+        """
+        share = self.weight * placing_m / np.maximum(self.worth[self.of_range], 1e-12)
+        covariance = np.zeros((len(self), len(self)))
+        for along in towards.T:
+            of_gaps = csr_array((share * along, (self.of_range, gap)), shape=(len(self), int(gap.max()) + 1))
+            covariance += (of_gaps @ of_gaps.T).toarray()
+        return covariance
 
     def total(self, values: Array) -> Array:
         """(c,) sums of (n,) values of each range."""

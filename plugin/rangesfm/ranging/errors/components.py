@@ -219,6 +219,10 @@ CLOCKS = "clocks"
 """None either: by how far the clocks' offset may be another."""
 
 
+PLACES = "places"
+"""Not a component of the ranges' errors: the uncertainty of the camera's places, of keyframes and between them."""
+
+
 def component_words(names: Iterable[str]) -> dict[str, str]:
     """What each component is, for people."""
     words = {component.name: component.words for component in COMPONENTS}
@@ -227,6 +231,7 @@ def component_words(names: Iterable[str]) -> dict[str, str]:
         GIVEN: "tapes, anchors' positions and what else was given",
         REWEIGHTING: "what the best weights for these errors would change",
         CLOCKS: "the clocks' offset, as far as the motion leaves it open",
+        PLACES: "the camera's places at and between the photos",
         "tape": "how the lengths were measured",
         "marks": "where their ends are in the photos",
     }

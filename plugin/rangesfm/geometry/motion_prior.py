@@ -1,0 +1,190 @@
+"""Motion between keyframes by a Gaussian process: white noise on acceleration, its power learnt from the keyframes.
+
+Source: Anderson and Barfoot, "Full STEAM ahead: exactly sparse Gaussian process regression for batch continuous-time
+trajectory estimation on SE(3)" (IROS 2015), with the prior "white noise on acceleration". Of scalar coordinates its
+posterior mean is the cubic smoothing spline (Wahba, 1978), in the banded form of Reinsch (1967).
+
+The second divided differences z of the keyframes have the covariance ``power * R + noise**2 * Q'Q``: R from the white
+acceleration, Q'Q from errors of the keyframes that are independent of each other. Both are learnt by the likelihood of
+z, which no straight and even motion changes. Errors of the keyframes are only told from motion where keyframes are
+close in time; elsewhere the keyframes count as exact.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
+
+from rangesfm.arrays import Array, Indices, Mask
+
+# Within so many seconds a camera hardly accelerates: two keyframes closer than this bound the keyframes' own errors.
+_CLOSE_S = 0.25
+# Ratios noise**2 / power that are tried, in cubes of the median gap between keyframes, beside 0. At the smallest the
+# keyframes count as exact, at the largest the whole path is one straight and even motion.
+_RATIOS = np.geomspace(1e-6, 1e9, 61)
+
+
+@dataclass(frozen=True)
+class MotionPrior:
+    """What d coordinates of n keyframes say of the motion between them.
+
+    Attributes:
+        times_s: (n,) strictly increasing.
+        is_bridged: (n - 1,) gaps across which the motion goes on; the others part the path.
+        power: of the white acceleration in each coordinate, unit^2 / s^3.
+        noise_stddev: of each coordinate of a keyframe, beside the motion.
+        bends: (n, d) posterior mean of the acceleration at the keyframes; 0 at the ends of each part.
+        bend_covariance: (3, n) diagonal and the next two of the covariance of (n,) bends, over ``power``, as if the
+            acceleration was piecewise linear; 0 at the ends of each part.
+    """
+
+    times_s: Array
+    is_bridged: Mask
+    power: float
+    noise_stddev: float
+    bends: Array
+    bend_covariance: Array
+
+    def beyond_chord(self, before: Indices, weight: Array) -> tuple[Array, Array]:
+        """What the motion has beyond the straight line between two keyframes, and how far that can be trusted.
+
+        Args:
+            before: (m,) the keyframe before; its gap is bridged. weight: (m,) share of the gap that has passed.
+
+        Returns:
+            (m, d) what is to be added to the straight line between the keyframes as they are, and (m,) the stddev of
+            each coordinate of the sum, with the errors of the keyframes.
+        """
+        gap_s = self.times_s[before + 1] - self.times_s[before]
+        early = gap_s**2 / 6 * ((1 - weight) ** 3 - (1 - weight))
+        late = gap_s**2 / 6 * (weight**3 - weight)
+        offsets = early[:, None] * self.bends[before] + late[:, None] * self.bends[before + 1]
+        of_before, of_next = self.bend_covariance[0, before], self.bend_covariance[0, before + 1]
+        told = early**2 * of_before + late**2 * of_next + 2 * early * late * self.bend_covariance[1, before]
+        variance = self.power * np.maximum(gap_s**3 * (weight * (1 - weight)) ** 2 / 3 - told, 0.0)
+        variance += self.noise_stddev**2 * ((1 - weight) ** 2 + weight**2)
+        variance += 2 * self.noise_stddev**2 * self._bent_by_ends(before, weight, early, late)
+        return offsets, np.sqrt(np.maximum(variance, 0.0))
+
+    def _bent_by_ends(self, before: Indices, weight: Array, early: Array, late: Array) -> Array:
+        """(m,) covariance of the offset and of the line's own error, both by errors of the two keyframes around."""
+        second = _second_differences(self.times_s, self.is_bridged)
+        # Of the second differences at the keyframes from the one before to the next but one.
+        by_line = np.zeros((4, len(before)))
+        for row, k in enumerate(range(-1, 3)):
+            at = np.clip(before + k, 0, len(self.times_s) - 1)
+            for end, share in ((0, 1 - weight), (1, weight)):
+                step = end - k
+                if -1 <= step <= 1:
+                    by_line[row] += np.where(at == before + k, second[1 + step, at], 0.0) * share
+        total = np.zeros(len(before))
+        for end, size in ((0, early), (1, late)):
+            for row, k in enumerate(range(-1, 3)):
+                apart = abs(end - k)
+                if apart <= 2:
+                    first = np.clip(before + min(end, k), 0, len(self.times_s) - 1)
+                    total += size * self.bend_covariance[apart, first] * by_line[row]
+        return total
+
+
+def learn_motion(times_s: Array, values: Array, is_bridged: Mask) -> MotionPrior:
+    """Learn the power of the acceleration and the noise of the keyframes, and what they say of the motion.
+
+    Args:
+        times_s: (n,) strictly increasing. values: (n, d) coordinates of the keyframes.
+        is_bridged: (n - 1,) gaps across which the motion goes on.
+    """
+    second = _second_differences(times_s, is_bridged)
+    is_inner = second[1] != 0
+    num_seen = np.count_nonzero(is_inner) * values.shape[1]
+    differences = second[0][:, None] * np.roll(values, 1, axis=0) + second[1][:, None] * values
+    differences += second[2][:, None] * np.roll(values, -1, axis=0)
+    if not num_seen or not np.any(differences):
+        nothing = np.zeros((3, len(times_s)))
+        return MotionPrior(times_s, is_bridged, 0.0, 0.0, np.zeros(values.shape), nothing)
+    by_motion, by_noise = _of_motion(times_s, is_inner), _of_noise(second)
+    unit = float(np.median(np.diff(times_s))) ** 3
+    most_noise = _most_noise(times_s, values, is_bridged)
+    best = None
+    for ratio in (0.0, *(unit * _RATIOS if most_noise > 0 else ())):
+        fit = _fit(by_motion + ratio * by_noise, differences, num_seen)
+        if fit is not None and ratio * fit[1] <= most_noise and (best is None or fit[0] < best[0]):
+            best = (*fit, ratio)
+    assert best is not None, "without noise the covariance of second differences is diagonally dominant"
+    _, power, bends, factor, ratio = best
+    covariance = np.where(is_inner, _inverse_near_diagonal(factor), 0.0)
+    covariance[1] *= np.append(is_inner[1:], False)
+    covariance[2] *= np.append(is_inner[2:], [False, False])
+    return MotionPrior(times_s, is_bridged, power, float(np.sqrt(ratio * power)), bends, covariance)
+
+
+def _second_differences(times_s: Array, is_bridged: Mask) -> Array:
+    """(3, n) factors of the keyframe before, of a keyframe and of the next one in the change of velocity at it.
+
+    0 at the ends of each part of the path.
+    """
+    rates = 1 / np.diff(times_s)
+    to_last, to_next = np.append(0.0, rates), np.append(rates, 0.0)
+    is_inner = np.append(False, is_bridged) & np.append(is_bridged, False)
+    return np.where(is_inner, np.array([to_last, -(to_last + to_next), to_next]), 0.0)
+
+
+def _of_motion(times_s: Array, is_inner: Mask) -> Array:
+    """(3, n) diagonal and the next two of R; 1 on the diagonal at the ends of each part."""
+    gaps_s = np.diff(times_s)
+    banded = np.zeros((3, len(times_s)))
+    banded[0] = np.where(is_inner, (np.append(0.0, gaps_s) + np.append(gaps_s, 0.0)) / 3, 1.0)
+    banded[1, :-1] = np.where(is_inner[:-1] & is_inner[1:], gaps_s / 6, 0.0)
+    return banded
+
+
+def _of_noise(second: Array) -> Array:
+    """(3, n) diagonal and the next two of Q'Q."""
+    before, at, after = second
+    banded = np.zeros_like(second)
+    banded[0] = np.sum(second**2, axis=0)
+    banded[1, :-1] = at[:-1] * before[1:] + after[:-1] * at[1:]
+    banded[2, :-2] = after[:-2] * before[2:]
+    return banded
+
+
+def _most_noise(times_s: Array, values: Array, is_bridged: Mask) -> float:
+    """The largest variance of a keyframe's coordinate that keyframes close in time allow; 0 where there are none."""
+    is_close = is_bridged & (np.diff(times_s) <= _CLOSE_S)
+    return 0.5 * float(np.mean(np.diff(values, axis=0)[is_close] ** 2)) if is_close.any() else 0.0
+
+
+def _fit(covariance: Array, differences: Array, num_seen: int) -> tuple[float, float, Array, Array] | None:
+    """-2 times the logarithm of the likelihood, the likeliest power, bends and the banded Cholesky factor.
+
+    Args:
+        covariance: (3, n) of the second differences, over the power. None where rounding leaves it indefinite.
+    """
+    try:
+        factor = np.asarray(cholesky_banded(covariance, lower=True, check_finite=False), dtype=np.float64)
+    except LinAlgError:
+        return None
+    bends = np.asarray(cho_solve_banded((factor, True), differences, check_finite=False), dtype=np.float64)
+    power = float(np.sum(differences * bends)) / num_seen
+    if not power > 0:
+        return None
+    determinant = 2 * differences.shape[1] * float(np.sum(np.log(factor[0])))
+    return determinant + num_seen * float(np.log(power)), power, bends, factor
+
+
+def _inverse_near_diagonal(factor: Array) -> Array:
+    """(3, n) diagonal and the next two of the inverse, from a banded Cholesky factor (Takahashi et al., 1973)."""
+    diagonal = factor[0]
+    one, two = (factor[1] / diagonal).tolist(), (factor[2] / diagonal).tolist()
+    own = (1 / diagonal**2).tolist()
+    num = len(own)
+    inverse = [[0.0] * (num + 2) for _ in range(3)]
+    on, next_to, beyond = inverse
+    for j in range(num - 1, -1, -1):
+        # Rows below the matrix have a factor of 0.
+        next_to[j] = -one[j] * on[j + 1] - two[j] * next_to[j + 1]
+        beyond[j] = -one[j] * next_to[j + 1] - two[j] * on[j + 2]
+        on[j] = own[j] - one[j] * next_to[j] - two[j] * beyond[j]
+    return np.array(inverse)[:, :num]
