@@ -13,9 +13,14 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
+from tests.known import known as known_scale
 
+from rangesfm.distances.ends import locate_distances
+from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
+from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.scale.lengths import scale_by_lengths
 from rangesfm.vision.given_database import opened
 from rangesfm.vision.image_times import read_image_times_csv
 from rangesfm.vision.photos import usable_photos
@@ -132,6 +137,34 @@ def test_what_is_known_of_distances_is_told_of_two_photos_in_the_model(simulated
     assert taped.ends == (f"{PREFIXES[0]}frame000000.png", f"{PREFIXES[2]}frame000000.png")
     assert taped.distance_m == pytest.approx(np.linalg.norm(simulated.poses[1].translation))
     assert taped.stddev_m == 0.002
+
+
+@pytest.mark.parametrize(("apart_m", "num_measured"), [(0.0, 1), (1e-4, 2)])
+def test_one_baseline_at_two_visits_is_one_length_and_one_measured_anew_is_another(
+    simulated: Simulated, tmp_path: Path, apart_m: float, num_measured: int
+) -> None:
+    model, stddev_m = pycolmap.Reconstruction(simulated.truth), 0.001
+    for image in model.images.values():
+        visit = "monday" if int(image.name[-8:-4]) < NUM_FRAMES // 2 else "friday"
+        image.name = f"{visit}/{image.name}"
+    pose, rigs = simulated.poses[1], []
+    for visit, longer_m in (("monday", 0.0), ("friday", apart_m)):
+        x, y, z, w = pose.rotation.quat.tolist()
+        length_m = np.linalg.norm(pose.translation)
+        known = {
+            "cam_from_rig_rotation": [w, x, y, z],
+            "cam_from_rig_translation": (pose.translation * (1 + longer_m / length_m)).tolist(),
+        }
+        reference = {"image_prefix": f"{visit}/{PREFIXES[0]}", "ref_sensor": True}
+        rigs.append({"cameras": [reference, {"image_prefix": f"{visit}/{PREFIXES[2]}", **known}]})
+    (tmp_path / "rig_config.json").write_text(json.dumps(rigs))
+    taped = read_rigs(tmp_path / "rig_config.json").baselines(model, stddev_m)
+    assert len(taped) == num_measured
+    located = locate_distances(Tape(taped), model, [])
+    found = known_scale(scale_by_lengths(located, trajectory_from_reconstruction(model).centers))
+    assert found.value == pytest.approx(1.0, rel=1e-3)
+    expected = stddev_m / np.linalg.norm(pose.translation) / np.sqrt(num_measured)
+    assert found.relative_stddev == pytest.approx(expected, rel=1e-3)
 
 
 def test_photos_of_one_frame_share_the_time_of_the_first_of_them_that_has_one(

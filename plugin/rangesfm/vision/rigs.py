@@ -18,6 +18,8 @@ from rangesfm.errors import InputError
 # Cameras that are nearer to each other share a centre, as those of a panorama do: no length.
 _MIN_BASELINE_M = 1e-4
 _MAX_OFF_UNIT = 1e-3
+# Places are written to a hundredth of a millimetre or finer: what differs by less was not measured twice.
+_SAME_PLACE_M = 1e-5
 
 
 @dataclass(frozen=True)
@@ -109,32 +111,40 @@ class Rigs:
         return {rig_id for rig_id, is_known in zip(ids, self.are_known, strict=False) if is_known}
 
     def baselines(self, model: pycolmap.Reconstruction, stddev_m: float) -> tuple[TapedDistance, ...]:
-        """The known distances of each rig's cameras from its reference camera, as if taped between two photos."""
-        found = ((length_m, next(pairs, None)) for length_m, pairs in self._baselines_in(model))
-        return tuple(
-            TapedDistance(ends, length_m, stddev_m, CONTROL, line=0, is_everywhere=True)
-            for length_m, ends in found
-            if ends is not None
-        )
+        """Return the known distances of the rigs' cameras from their reference cameras, as if taped between two photos.
+
+        A camera that sits in the same place in several rigs, as where one rig came back on another day or several were
+        built alike, was measured once. All of these lengths share that one error, so they are one length.
+        """
+        measured: list[pycolmap.RigConfigCamera] = []
+        taped = []
+        for camera, pairs in self._baselines_in(model):
+            ends = next(pairs, None)
+            if ends is not None and not any(_is_placed_alike(camera, other) for other in measured):
+                measured.append(camera)
+                taped.append(TapedDistance(ends, _baseline_m(camera), stddev_m, CONTROL, line=0, is_everywhere=True))
+        return tuple(taped)
 
     def rescale(self, model: pycolmap.Reconstruction) -> None:
         """Bring a model made without the rigs to the scale of the cameras whose places are known, if there are any."""
         ratios = [
-            length_m / length
-            for length_m, pairs in self._baselines_in(model)
+            _baseline_m(camera) / length
+            for camera, pairs in self._baselines_in(model)
             for pair in pairs
             if (length := _distance(model, pair)) > 0
         ]
         if ratios:
             model.transform(pycolmap.Sim3d(float(np.median(ratios)), pycolmap.Rotation3d(), np.zeros(3)))
 
-    def _baselines_in(self, model: pycolmap.Reconstruction) -> Iterator[tuple[float, Iterator[tuple[str, str]]]]:
-        """Each known distance of a camera from its rig's first, with the photos of a model that are so far apart."""
+    def _baselines_in(
+        self, model: pycolmap.Reconstruction
+    ) -> Iterator[tuple[pycolmap.RigConfigCamera, Iterator[tuple[str, str]]]]:
+        """Yield each camera whose distance from its rig's first is known, and the photos that are so far apart."""
         for config in self.configs:
             reference = next(camera.image_prefix for camera in config.cameras if camera.ref_sensor)
             for camera in config.cameras:
-                if length_m := _baseline_m(camera):
-                    yield length_m, _pairs(model, reference, camera.image_prefix)
+                if _baseline_m(camera):
+                    yield camera, _pairs(model, reference, camera.image_prefix)
 
 
 NO_RIGS = Rigs()
@@ -171,6 +181,12 @@ def _baseline_m(camera: pycolmap.RigConfigCamera) -> float:
     """0 where it is not known, or none."""
     length_m = 0.0 if camera.cam_from_rig is None else float(np.linalg.norm(camera.cam_from_rig.translation))
     return length_m if length_m >= _MIN_BASELINE_M else 0.0
+
+
+def _is_placed_alike(camera: pycolmap.RigConfigCamera, other: pycolmap.RigConfigCamera) -> bool:
+    """Whether two cameras have the same centre in their rigs, to the digits that a file is written with."""
+    centers = [known.cam_from_rig.inverse().translation for known in (camera, other) if known.cam_from_rig is not None]
+    return len(centers) == 2 and bool(np.allclose(centers[0], centers[1], rtol=0, atol=_SAME_PLACE_M))
 
 
 def _pairs(model: pycolmap.Reconstruction, reference: str, other: str) -> Iterator[tuple[str, str]]:
