@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import errno
 import os
+import re
+import resource
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -145,6 +149,21 @@ def test_a_full_disk_costs_no_earlier_result(
     assert done.returncode in (2, 4)
     assert "No space left on device" in done.stderr
     assert bytes_in(own_survey.folder / "out") == before
+
+
+@pytest.mark.parametrize("max_kilobytes", [10, 300, 1500])
+def test_photos_that_find_no_room_for_their_features_end_in_one_line(
+    max_kilobytes: int, photo_run: PhotoRun, tmp_path: Path
+) -> None:
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000 * max_kilobytes, 1000 * max_kilobytes))
+
+    flags = ("--images", str(photo_run.survey.folder / "images"), "--output_path", "out", "--quiet")
+    command = [sys.executable, "-m", "rangesfm", "reconstruct", *flags]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, preexec_fn=limit)
+    assert done.returncode == 4
+    assert re.fullmatch(r"rangesfm: error: .*(room on the disk|File too large|ended \(SIGABRT\)).*\n", done.stderr)
+    assert names_in(tmp_path / "out") == []
 
 
 def test_files_of_other_names_stay_beside_a_result(own_survey: WalkedSurvey, rangesfm_command: Command) -> None:

@@ -26,7 +26,7 @@ from tests.traps import set_traps
 from rangesfm.batch.workers import num_at_once, workers_of
 from rangesfm.cli import main
 from rangesfm.errors import InputError
-from rangesfm.files.output_folder import LOCK_NAME
+from rangesfm.files.output_folder import LOCK_NAME, PRIVATE_NAME
 
 if TYPE_CHECKING:
     from tests.conftest import Command, PhotoRun
@@ -100,7 +100,8 @@ def rows_of(folder: Path) -> dict[str, dict[str, str]]:
 
 
 def left_over(folder: Path) -> list[Path]:
-    return [path for path in folder.rglob(".*") if path.name != LOCK_NAME]
+    """What is in the making, hidden in whatever folder."""
+    return [path for path in folder.rglob(".*") if path.name != PRIVATE_NAME] + [*folder.rglob("parts/*")]
 
 
 def ports_of(process: psutil.Process) -> list[object]:

@@ -28,7 +28,6 @@ ALL = {"features": NUM_PHOTOS, "matching": NUM_PHOTOS * (NUM_PHOTOS - 1) // 2}
 PROGRAM = """
 import sys
 from rangesfm.options import CameraOptions, MapperOptions
-from rangesfm.vision import features
 from rangesfm.vision.image_times import list_images
 from rangesfm.vision.reconstruct import reconstruct
 
@@ -37,7 +36,6 @@ class Printer:
     def update(self, num_done, num_total=None): print(self.name, num_done, flush=True)
     def message(self, text): pass
 
-features._CALL_S = 0.0  # so few photos would be all of one call
 images, output, *params = sys.argv[1:]
 mapper = MapperOptions(features={"sift": {"max_num_features": 400}})
 camera = CameraOptions(model="SIMPLE_PINHOLE", params=tuple(map(float, params)))

@@ -37,7 +37,7 @@ def photos(render_room: Callable[..., Room], tmp_path_factory: pytest.TempPathFa
     cameras = cameras_of_photos(room.camera, photos)
     create_database(room.folder / "database.db", room.names, cameras.cameras, cameras.of_photo)
     options = feature_options(MapperOptions(features={"sift": {"max_num_features": 250}}))
-    extract_features(room.folder / "database.db", photos, options, SilentProgress())
+    extract_features(room.folder / "database.db", photos, options, room.folder / "features.log", SilentProgress())
     return photos
 
 

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import os
-import time
-from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 import pycolmap
 
+from rangesfm.colmap.log import append_log
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import OptionError, ReconstructionError
+from rangesfm.files.atomic import scratch_folder
 from rangesfm.options import MapperOptions
+from rangesfm.processes.supervision import run_children
 from rangesfm.progress import Progress
-from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import num_photos_with_features
+from rangesfm.vision.own_process import MODULE, FeatureExtraction
 from rangesfm.vision.photos import MIN_NUM_PHOTOS, Photos
 
 _MIN_NUM_FEATURES = 50  # COLMAP starts from pairs with 100 matches and adds photos that see 30 known points
-_CALL_S = 4.0
 
 
 def feature_options(mapper: MapperOptions) -> pycolmap.FeatureExtractionOptions:
@@ -46,25 +46,32 @@ def extract_features(
     database_path: Path,
     photos: Photos,
     options: pycolmap.FeatureExtractionOptions,
+    log: Path,
     progress: Progress,
     mask_path: Path | None = None,
 ) -> None:
     """Find features in the photos of the database that have none yet, where their masks are not black.
 
+    Args:
+        log: what COLMAP says is appended to it.
+
     Raises:
-        ReconstructionError: hardly any photo has features.
+        ReconstructionError: hardly any photo has features, or COLMAP failed.
     """
-    reader = pycolmap.ImageReaderOptions()
-    if mask_path is not None:
-        reader.mask_path = mask_path
     with pycolmap.Database.open(database_path) as database:
+
+        def say_how_many(_: int) -> None:
+            progress.update(num_photos_with_features(database), len(photos.names))
+
         missing = [name for id_, name in enumerate(photos.names, 1) if not database.exists_keypoints(id_)]
-        run_in_background(
-            lambda token: _call_colmap(database_path, photos.folder, missing, reader, options, token),
-            progress,
-            lambda: num_photos_with_features(database),
-            len(photos.names),
-        )
+        with scratch_folder(database_path.with_name("features")) as folder:
+            work = FeatureExtraction(database_path, photos.folder, missing, mask_path, options, folder / "mapper.log")
+            try:
+                with closing(run_children(MODULE, [work] if missing else [], 1, say_how_many)) as ended:
+                    list(ended)
+            finally:
+                append_log(work.log, log)
+        say_how_many(0)
         ids = enumerate(photos.names, 1)
         poor = [name for id_, name in ids if database.num_keypoints_for_image(id_) < _MIN_NUM_FEATURES]
     num_rich = len(photos.names) - len(poor)
@@ -78,29 +85,3 @@ def extract_features(
             f"{len(poor)} of {len(photos.names)} photos have fewer than {_MIN_NUM_FEATURES} features, the first is"
             f" {poor[0]}"
         )
-
-
-def _call_colmap(
-    database_path: Path,
-    folder: Path,
-    names: Sequence[str],
-    reader: pycolmap.ImageReaderOptions,
-    options: pycolmap.FeatureExtractionOptions,
-    token: pycolmap.CancellationToken,
-) -> None:
-    """Some seconds' photos at a time: COLMAP finishes all photos of a call before it heeds the token."""
-    num_at_a_time = num_threads = options.num_threads if options.num_threads > 0 else os.cpu_count() or 1
-    start = 0
-    while start < len(names):
-        begin_s = time.monotonic()
-        pycolmap.extract_features(
-            database_path,
-            folder,
-            image_names=names[start : start + num_at_a_time],
-            reader_options=reader,
-            extraction_options=options,
-            cancellation_token=token,
-        )
-        start += num_at_a_time
-        num_in_time = num_at_a_time * _CALL_S / (time.monotonic() - begin_s)
-        num_at_a_time = max(num_threads, int(num_in_time))

@@ -1,4 +1,6 @@
-"""What COLMAP does in a process of its own: a share of the matching, and the mappers that take all photos at once.
+"""What COLMAP does in a process of its own: features, a share of the matching, and the mappers that take all photos.
+
+A library that writes to a full disk from a thread of its own ends the whole process: here it ends one that is watched.
 
 Run as a module by ``rangesfm.processes.supervision`` it does one such piece of work.
 """
@@ -22,6 +24,33 @@ MODULE = "rangesfm.vision.own_process"
 WholePipelineOptions = pycolmap.GlobalPipelineOptions | pycolmap.HierarchicalPipelineOptions
 # Features that COLMAP keeps in memory, each of some 700 bytes with its index; what it forgets it indexes anew.
 _MAX_NUM_FEATURES = 400_000
+
+
+@dataclass(frozen=True)
+class FeatureExtraction:
+    """Photos of a database that are to have features, where their masks, if there are any, are not black."""
+
+    database: Path
+    image_path: Path
+    image_names: Sequence[str]
+    mask_path: Path | None
+    options: pycolmap.FeatureExtractionOptions
+    log: Path
+
+    def run(self, _: Progress) -> int:
+        """Returns how many photos there were; whoever looks into the database sees how many are done."""
+        reader = pycolmap.ImageReaderOptions()
+        if self.mask_path is not None:
+            reader.mask_path = self.mask_path
+        with colmap_log(self.log):
+            pycolmap.extract_features(
+                self.database,
+                self.image_path,
+                image_names=list(self.image_names),
+                reader_options=reader,
+                extraction_options=self.options,
+            )
+        return len(self.image_names)
 
 
 @dataclass(frozen=True)
@@ -91,7 +120,7 @@ class WholeMapping:
             return len(pycolmap.hierarchical_mapping(*where, self.options))
 
 
-def _run(work: MatchingShare | WholeMapping, parent: MessagesToParent) -> int:
+def _run(work: FeatureExtraction | MatchingShare | WholeMapping, parent: MessagesToParent) -> int:
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # at once: what is written down is whole
     return work.run(parent)
 

@@ -84,7 +84,8 @@ class RenewedDatabase:
         database, photos, steps = self.space.database, self.photos, self.space.steps
         contents = list(self.contents.items())
         inputs = fingerprint(self.feature_inputs, self.cameras.inputs, contents, *self.rigs.inputs)
-        find = partial(extract_features, database, photos, self.features, self.space.progress, self.mapper.mask_path)
+        log, progress = self.space.log, self.space.progress
+        find = partial(extract_features, database, photos, self.features, log, progress, self.mapper.mask_path)
         steps.run("features", inputs, database, self._begin, find)
         inputs = fingerprint(inputs, self.match_inputs)
         steps.run("matching", inputs, database, self._begin_matching, self._match)

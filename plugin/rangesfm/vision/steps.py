@@ -181,6 +181,12 @@ class Workspace:
                 yield
             except ReconstructionError as error:
                 raise ReconstructionError(f"{error} (COLMAP's log: {self.log})") from error
+            except RuntimeError as error:
+                # What pycolmap raises where the database cannot be read or written says nothing of the disk.
+                raise ReconstructionError(
+                    f"COLMAP stopped: {error}; is there room on the disk, and for files of that size?"
+                    f" (COLMAP's log: {self.log})"
+                ) from error
 
 
 def _read(path: Path, part: str) -> dict[str, dict[str, Any]]:
