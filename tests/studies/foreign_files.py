@@ -138,7 +138,7 @@ class Site:
         path = own[self.rng.integers(len(own))]
         kind = self.rng.choice(["same file", "new file", "appended", "same size", "link"])
         data = path.read_bytes()
-        if kind in ("new file", "link"):
+        if kind in ("new file", "link") or path.stat().st_nlink > 1:  # else its other name would change as well
             path.unlink()
         if kind == "link":
             path.symlink_to(self.outside / "file.txt")

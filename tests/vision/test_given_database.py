@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pycolmap
 import pytest
 from tests.vision.matches import content_of
@@ -112,4 +116,43 @@ def test_one_that_is_none_or_of_other_photos_is_refused(room: Room, given: Path,
         reconstructed(room, given, listener)
     given.write_text("no database")
     with pytest.raises(InputError, match=r"given.db: is no database of COLMAP's"):
+        reconstructed(room, given, listener)
+
+
+def _not_a_number(rows: sqlite3.Connection) -> None:
+    (data,) = rows.execute("SELECT data FROM keypoints WHERE image_id = 1").fetchone()
+    rows.execute("UPDATE keypoints SET data = ? WHERE image_id = 1", (np.full(len(data) // 4, np.nan, "f4").tobytes(),))
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        ("UPDATE keypoints SET data = substr(data, 1, 40) WHERE image_id = 1", "a row is not .* and 40 differ"),
+        ("UPDATE descriptors SET data = substr(data, 1, 40) WHERE image_id = 1", "a row is not .* and 40 differ"),
+        ("UPDATE matches SET data = substr(data, 1, 8)", "a row is not as COLMAP writes it"),
+        ("UPDATE two_view_geometries SET F = substr(F, 1, 8) WHERE rows > 0", "a row is not as COLMAP writes it"),
+        ("UPDATE keypoints SET cols = 1000000 WHERE image_id = 1", "a row is not as COLMAP writes it"),
+        ("UPDATE keypoints SET rows = -5 WHERE image_id = 1", "a row is not as COLMAP writes it"),
+        ("UPDATE descriptors SET rows = rows - 1, data = substr(data, 129)", "not as many descriptors as features"),
+        (_not_a_number, "a feature of photo000.png has no finite place"),
+        ("UPDATE matches SET rows = 1, data = x'FFFF0000FFFF0000'", "match in features that are not there"),
+        ("UPDATE cameras SET model = 77", "a row is not as COLMAP writes it"),
+        ("UPDATE cameras SET params = x''", "a row is not as COLMAP writes it"),
+        ("UPDATE cameras SET width = 0", "the camera of photo000.png has impossible parameters"),
+    ],
+)
+def test_a_damaged_row_is_one_line(
+    damage: str | Callable[[sqlite3.Connection], None], said: str, room: Room, given: Path, listener: Listener
+) -> None:
+    with closing(sqlite3.connect(given)) as rows, rows:
+        rows.execute(damage) if isinstance(damage, str) else damage(rows)
+    with pytest.raises(InputError, match=rf"given\.db: is damaged: .*{said}"):
+        reconstructed(room, given, listener)
+    assert not given.with_name("out").exists()
+
+
+@pytest.mark.parametrize("num_bytes", [0, 100, 5000, 40_000])
+def test_a_database_that_is_cut_off_is_one_line(num_bytes: int, room: Room, given: Path, listener: Listener) -> None:
+    given.write_bytes(given.read_bytes()[:num_bytes])
+    with pytest.raises(InputError, match=r"given\.db: (is no database of COLMAP's|has features of 0 of 6 photos)"):
         reconstructed(room, given, listener)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -9,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pycolmap
 
 from rangesfm.colmap.log import colmap_log
@@ -96,7 +98,7 @@ def _read(source: Path, path: Path, photos: Photos) -> GivenDatabase:
             database = pycolmap.Database.open(path)
     except RuntimeError:
         raise InputError("is no database of COLMAP's", source) from None
-    with database:
+    with database, _damage_named(source):
         of_name = {image.name: image.image_id for image in database.read_all_images()}
         ids = {
             name: of_name[name] for name in photos.names if name in of_name and database.exists_keypoints(of_name[name])
@@ -107,6 +109,7 @@ def _read(source: Path, path: Path, photos: Photos) -> GivenDatabase:
                 f" their names relative to the folder as {photos.names[0]}",
                 source,
             )
+        _require_sound(database, source, ids)
         num_pairs = len(_pairs(database, {id_: id_ for id_ in ids.values()}))
         has_rigs = any(rig.non_ref_sensors for rig in database.read_all_rigs())
         bare = next((name for name, id_ in ids.items() if not database.exists_descriptors(id_)), None)
@@ -120,6 +123,46 @@ def _read(source: Path, path: Path, photos: Photos) -> GivenDatabase:
     if has_rigs:
         note += "; its rigs are not: what [images] rig_config says of them counts"
     return GivenDatabase(source, path, sha256_of(source), photos.of(ids), tuple(ids.values()), num_pairs, note)
+
+
+@contextmanager
+def _damage_named(source: Path) -> Iterator[None]:
+    """Say of which file COLMAP cannot read a row, instead of in which line of its own code it noticed."""
+    try:
+        yield
+    except (RuntimeError, ValueError, LookupError, MemoryError) as error:
+        sizes = re.search(r"\((\d+) vs\. (\d+)\)", str(error))
+        why = f" (sizes of {sizes[1]} and {sizes[2]} differ)" if sizes else ""
+        raise InputError(f"is damaged: a row is not as COLMAP writes it{why}", source) from error
+
+
+def _require_sound(database: pycolmap.Database, source: Path, ids: Mapping[str, int]) -> None:
+    """Read all of these photos, by name, that COLMAP would read, and check what it would not.
+
+    Raises:
+        InputError: cameras or features that cannot be, or matches of features that are not there.
+    """
+    num_features = {}
+    for name, id_ in ids.items():
+        camera = database.read_camera(database.read_image(id_).camera_id)
+        if not (camera.verify_params() and np.isfinite(camera.params).all() and min(camera.width, camera.height) > 0):
+            raise InputError(f"is damaged: the camera of {name} has impossible parameters", source)
+        keypoints = database.read_keypoints(id_)
+        if not np.isfinite(keypoints).all():
+            raise InputError(f"is damaged: a feature of {name} has no finite place", source)
+        num_features[id_] = len(keypoints)
+        if database.exists_descriptors(id_) and len(database.read_descriptors(id_).data) != len(keypoints):
+            raise InputError(f"is damaged: {name} has not as many descriptors as features", source)
+    names = {id_: name for name, id_ in ids.items()}
+    for first, second in _pairs(database, num_features):
+        matches = [database.read_matches(first, second)]
+        if database.exists_two_view_geometry(first, second):
+            matches.append(database.read_two_view_geometry(first, second).inlier_matches)
+        limits = num_features[first], num_features[second]
+        if any(len(pairs) and (np.max(pairs, axis=0) >= limits).any() for pairs in matches):
+            raise InputError(
+                f"is damaged: {names[first]} and {names[second]} match in features that are not there", source
+            )
 
 
 def _pairs(database: pycolmap.Database, known: Mapping[int, Any]) -> Sequence[tuple[int, int]]:
