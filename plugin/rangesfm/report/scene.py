@@ -23,6 +23,7 @@ from rangesfm.report.plot import every_nth
 from rangesfm.report.text import count
 from rangesfm.result.entries import AnchorEntry
 from rangesfm.result.tables import USED_LABELS
+from rangesfm.vision.photos import UNREADABLE, opened_image
 
 MAX_NUM_POINTS = 500_000
 MAX_NUM_RANGES = 20_000
@@ -32,6 +33,8 @@ NUM_STEPS = 65535
 MAX_NUM_THUMBNAILS, MAX_THUMBNAIL_BYTES = 160, 600_000
 """The latter of all of them, as they stand in the page."""
 
+# Of a photo that is no JPEG, which takes three bytes for each: more is not worth a thumbnail.
+_MAX_DECODED_PIXELS = 100_000_000
 _WIDTHS_PX, _QUALITY = (256, 208, 160, 128), 60
 _FAR_QUANTILE = 0.005
 _SEEN_QUANTILE = 0.05
@@ -318,10 +321,12 @@ def thumbnails(folder: Path | None, image_names: Sequence[str]) -> dict[str, str
 def _small_copy(path: Path) -> Image.Image | None:
     width = _WIDTHS_PX[0]
     try:
-        with Image.open(path) as photo:
+        with opened_image(path) as photo:
             photo.draft("RGB", (2 * width, 2 * width))  # a JPEG is decoded no larger than needed
+            if photo.width * photo.height > _MAX_DECODED_PIXELS:
+                return None
             return ImageOps.contain(photo.convert("RGB"), (width, width))
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+    except UNREADABLE:
         return None
 
 

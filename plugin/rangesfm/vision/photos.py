@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+import threading
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,8 +16,11 @@ from rangesfm.errors import InputError, ReconstructionError
 from rangesfm.files.contents import sha256_of, state_and_sha256
 
 MIN_NUM_PHOTOS = 2
+MAX_PIXELS = 1_000_000_000
+"""Of a photo that is used: COLMAP needs three bytes for each, and a small file may claim any number of them."""
 UNREADABLE = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
 """What Pillow's readers raise."""
+_pillow_limit = threading.Lock()
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 _LATITUDE, _LONGITUDE, _ALTITUDE = 2, 4, 6
 _LATITUDE_REF, _LONGITUDE_REF, _ALTITUDE_REF = 1, 3, 5
@@ -53,11 +58,39 @@ class Photos:
         return {name: state_and_sha256(self.folder / name, known.get(name)) for name in self.names}
 
 
+@contextmanager
+def opened_image(path: Path) -> Iterator[Image.Image]:
+    """Open an image of whatever size, of which Pillow refuses those above 179 megapixels; no pixel is read by that.
+
+    Raises:
+        One of UNREADABLE: it is no image, or no regular file, of which some never end, or has more than MAX_PIXELS.
+    """
+    if not path.is_file():
+        raise FileNotFoundError("there is no such file")
+    with _pillow_limit:
+        usual_limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+        try:
+            image = Image.open(path)
+        finally:
+            Image.MAX_IMAGE_PIXELS = usual_limit
+    with image:
+        num_pixels = image.width * image.height
+        if num_pixels > MAX_PIXELS:
+            found, most = num_pixels / 1e6, MAX_PIXELS / 1e6
+            raise Image.DecompressionBombError(f"has {found:.0f} megapixels, expected at most {most:.0f}")
+        yield image
+
+
 def usable_photos(folder: Path, names: Sequence[str]) -> Photos:
     """Those that can be read; ReconstructionError for fewer than two of them."""
-    sizes = {name: image_size(folder / name) for name in names}
-    usable = {name: size for name, size in sizes.items() if size is not None}
-    left_out = {name: "cannot be read as an image" for name in names if name not in usable}
+    usable, left_out = dict[str, tuple[int, int]](), dict[str, str]()
+    for name in names:
+        try:
+            with opened_image(folder / name) as image:
+                usable[name] = image.size
+        except UNREADABLE as error:
+            is_too_large = isinstance(error, Image.DecompressionBombError)
+            left_out[name] = str(error) if is_too_large else "cannot be read as an image"
     if len(usable) < MIN_NUM_PHOTOS:
         why = "".join(f"; {name} {reason}" for name, reason in list(left_out.items())[:1])
         raise ReconstructionError(
@@ -70,7 +103,7 @@ def usable_photos(folder: Path, names: Sequence[str]) -> Photos:
 def image_size(path: Path) -> tuple[int, int] | None:
     """Width and height, pixels; None of what is no image."""
     try:
-        with Image.open(path) as image:
+        with opened_image(path) as image:
             return int(image.width), int(image.height)
     except UNREADABLE:
         return None
@@ -79,7 +112,7 @@ def image_size(path: Path) -> tuple[int, int] | None:
 def exif_tags(path: Path) -> dict[int, Any]:
     """Tags of the photo and of its exposure, by number; none if the file has none or is no image."""
     try:
-        with Image.open(path) as image:
+        with opened_image(path) as image:
             exif = image.getexif()
             return {**exif, **exif.get_ifd(_EXIF_IFD)}
     except UNREADABLE:
@@ -89,7 +122,7 @@ def exif_tags(path: Path) -> dict[int, Any]:
 def exif_position(path: Path) -> tuple[float, float, float] | None:
     """Latitude and longitude in degrees (WGS 84) and altitude in metres, 0 where it says none; None without a place."""
     try:
-        with Image.open(path) as image:
+        with opened_image(path) as image:
             tags = image.getexif().get_ifd(_GPS_IFD)
         latitude = _degrees(tags[_LATITUDE], tags.get(_LATITUDE_REF) == "S")
         longitude = _degrees(tags[_LONGITUDE], tags.get(_LONGITUDE_REF) == "W")

@@ -10,13 +10,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 
 from rangesfm.arrays import Array
 from rangesfm.distances.tape import CONTROL, FOUND_STDDEV_PX, Marker, TapedDistance
 from rangesfm.errors import InputError
 from rangesfm.progress import Progress
-from rangesfm.vision.photos import UNREADABLE
+from rangesfm.vision.photos import UNREADABLE, opened_image
 
 # To OpenCV the centre of the first pixel is (0, 0), to COLMAP (0.5, 0.5).
 _CENTRE_PX = 0.5
@@ -86,7 +85,7 @@ def find_tags(folder: Path, image_names: Sequence[str], dictionary: str, progres
     for number, name in enumerate(image_names):
         progress.update(number, len(image_names))
         try:
-            with Image.open(folder / name) as photo:
+            with opened_image(folder / name) as photo:
                 pixels = np.array(photo.convert("L"))
         except UNREADABLE as error:
             raise InputError(f"cannot be read as a photo ({error})", folder / name) from None
