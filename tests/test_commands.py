@@ -29,6 +29,8 @@ from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.readers import read_ranges, write_ranges_csv
+from rangesfm.result.places import path_in
+from rangesfm.survey.settings import KEYS
 
 if TYPE_CHECKING:
     from tests.conftest import Command, PhotoRun, WalkedSurvey
@@ -123,9 +125,12 @@ class Left:
 
     @property
     def without_seconds(self) -> dict[str, Any]:
-        """A copy of result.json but for how long things took and where it lies."""
+        """A copy of result.json but for how long things took and where it lies, with whole paths of its inputs."""
         result = copy.deepcopy(self.result)
         del result["seconds"], result["settings"]["output"]["path"]
+        paths = [(result["settings"][key.table], key.name) for key in KEYS if key.role not in (None, "output")]
+        for table, name in [*paths, *((entry, "path") for entry in result["inputs"])]:
+            table[name] = table[name] and str(path_in(self.folder, table[name]))
         if result["refine"] is not None:
             del result["refine"]["seconds"]
         return result

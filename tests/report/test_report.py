@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -21,6 +21,9 @@ from rangesfm.report import write_report
 from rangesfm.report.content import Content
 from rangesfm.report.scene import scene_of, thumbnails, view_of
 from rangesfm.result.folder import read_result_folder
+
+if TYPE_CHECKING:
+    from tests.conftest import Command
 
 MakeResult = Callable[..., Path]
 SECTIONS = ["verdict", "checks", "view-section", "path", "scale", "ranges", "mistakes", "anchors", "run"]
@@ -394,3 +397,34 @@ def test_a_name_from_a_file_fetches_nothing_from_outside_the_folder(tmp_path: Pa
 def test_what_is_no_photo_is_left_out(tmp_path: Path) -> None:
     (tmp_path / "a.jpg").write_bytes(b"\xff\xd8\xff\xe0 no photo")
     assert thumbnails(tmp_path, ["a.jpg", "missing.jpg"]) == {}
+
+
+def test_a_thumbnail_is_made_of_no_photo_that_a_link_leads_to_elsewhere(tmp_path: Path) -> None:
+    inside, outside = tmp_path / "photos", tmp_path / "private"
+    for folder in (inside, outside):
+        folder.mkdir()
+        Image.new("RGB", (8, 8)).save(folder / "a.png")
+    (inside / "b.png").symlink_to(outside / "a.png")
+    (inside / "c.png").symlink_to(inside / "a.png")
+    (inside / "more").symlink_to(outside)
+    (tmp_path / "linked").symlink_to(inside)
+    names = ["a.png", "b.png", "c.png", "more/a.png", "../private/a.png"]
+    assert list(thumbnails(inside, names)) == ["a.png", "c.png"]
+    assert list(thumbnails(tmp_path / "linked", names)) == ["a.png", "c.png"]  # the user's own folder, so called
+
+
+def test_photos_of_another_folder_are_on_the_page_only_if_the_reader_says_so(
+    make_result: MakeResult, tmp_path: Path, rangesfm_command: Command
+) -> None:
+    folder = make_result("around/result", num_keyframes=12, num_ranges_per_anchor=5, num_points=10, has_photos=True)
+    mine = (folder / "photos").rename(tmp_path / "mine")
+    summary = json.loads((folder / "result.json").read_text())
+    summary["settings"]["images"]["path"] = str(mine)
+    (folder / "result.json").write_text(json.dumps(summary))
+    said = rangesfm_command("report", folder, cwd=tmp_path).stdout
+    assert said.splitlines()[1].startswith(f"without photos: the run had them in {mine}, and not in the folder around")
+    page = folder / "report.html"
+    assert "data:image/jpeg" not in page.read_text()
+    said = rangesfm_command("report", folder, "--images", mine, cwd=tmp_path).stdout
+    assert said.splitlines() == [str(page)]
+    assert page.read_text().count("data:image/jpeg") == 12

@@ -25,6 +25,7 @@ from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.progress import Journal, SilentProgress
 from rangesfm.ranging.readers import read_ranges
+from rangesfm.result.places import path_in, recorded_path
 from rangesfm.result.summary import ResultSummary
 from rangesfm.result.tables import ScaleCandidates, ScaleConsensus
 from rangesfm.survey.settings import KEYS, Survey
@@ -130,12 +131,14 @@ def test_tables_beside_the_result_tell_how_the_scale_came_about(scaled: Done) ->
 
 def test_the_result_names_its_inputs_by_their_hashes(scaled: Done) -> None:
     survey = scaled.survey
-    by_path = {entry.path: entry.to_json() for entry in scaled.result.summary.inputs}
+    inputs = scaled.result.summary.inputs
+    by_path = {path_in(survey.output.path, entry.path): entry.to_json() for entry in inputs}
     assert survey.ranges.path is not None
     data = survey.ranges.path.read_bytes()
     expected = {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data), "hashed": "content"}
-    assert by_path[str(survey.ranges.path)] == {"path": str(survey.ranges.path), **expected}
-    assert {Path(path).name for path in by_path} >= {"cameras.bin", "images.bin", "points3D.bin", "uwb.csv"}
+    recorded = recorded_path(survey.ranges.path, survey.output.path)
+    assert by_path[survey.ranges.path] == {"path": recorded, **expected}
+    assert {path.name for path in by_path} >= {"cameras.bin", "images.bin", "points3D.bin", "uwb.csv"}
 
 
 def test_refused_run_leaves_the_result_before_it(survey: Survey, scaled: Done) -> None:

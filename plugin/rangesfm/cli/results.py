@@ -29,7 +29,9 @@ def add_commands(commands: Commands) -> None:
         metavar="FILE",
         help="carry these, made from the unscaled model, over instead: PLY, OBJ, camera JSON, COLMAP folders",
     )
-    export.add_argument("--images", type=Path, metavar="FOLDER", help="the photos (default: where the run found them)")
+    export.add_argument(
+        "--images", type=Path, metavar="FOLDER", help="the photos (default: the run's, beside the result)"
+    )
     export.add_argument("--output_path", metavar="FOLDER", help="where to (default: the result folder)")
     compare = commands.add("compare", _compare, "models with each other and with a reference")
     compare.add_argument("models", nargs="*", metavar="MODEL", help="result folders, COLMAP models, CSV or TUM files")
@@ -40,7 +42,10 @@ def add_commands(commands: Commands) -> None:
     report = commands.add("report", _report, "result folder to one self-contained HTML page")
     _add_result_argument(report)
     report.add_argument(
-        "--images", type=Path, metavar="FOLDER", help="the photos, for thumbnails (default: as in the run)"
+        "--images",
+        type=Path,
+        metavar="FOLDER",
+        help="the photos, for thumbnails (default: the run's, beside the result)",
     )
     report.add_argument("--png", action="store_true", help="write the figures for a paper too, as PNG and SVG")
 
@@ -153,13 +158,25 @@ def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
 def _report(args: argparse.Namespace, progress: Progress) -> Outcome:
     """Write report.html, one self-contained page, into a result folder.
 
+    Without --images its photos are those that the run had, if they are in the result's folder or in the folder around
+    it: whoever made a result does not choose which photos of yours are on a page that you hand on.
+
     example:
       rangesfm report out
+      rangesfm report results/monday --images photos
     """
     from rangesfm.report import write_report, write_report_pictures
+    from rangesfm.result.folder import read_result_folder
 
     source = _result_path(args)
     if args.images is not None and not args.images.is_dir():
         raise InputError("no such folder of photos", args.images)
     pictures = write_report_pictures if args.png else lambda _: ()
-    return Outcome([str(write_report(source, images_path=args.images)), *map(str, pictures(source))])
+    written = [str(write_report(source, images_path=args.images)), *map(str, pictures(source))]
+    result = read_result_folder(source)
+    recorded = result.summary.settings.images.path
+    if args.images is None and recorded is not None and result.images_path is None:
+        written.append(
+            f"without photos: the run had them in {recorded}, and not in the folder around the result (--images)"
+        )
+    return Outcome(written)

@@ -20,7 +20,7 @@ def write_report(result_folder: Path, *, images_path: Path | None = None) -> Pat
     ``images.csv``, ``reference.csv`` (in the map's frame) and the models may be.
 
     Args:
-        images_path: folder of the photos, for thumbnails; None: where the run had them, if they are still there.
+        images_path: folder of the photos, for thumbnails; None: those of the run, if they are beside the result.
 
     Returns:
         The page's path.

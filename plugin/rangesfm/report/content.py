@@ -58,7 +58,7 @@ class Content:
         """Read what the report needs.
 
         Args:
-            images_path: folder of the photos, for thumbnails; None: where the run had them.
+            images_path: folder of the photos, for thumbnails; None: those of the run, if they are beside the result.
             home: folder that the result is for, while it is made in another one; None: where it is.
 
         Raises:

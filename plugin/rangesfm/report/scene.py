@@ -15,13 +15,13 @@ import numpy.typing as npt
 from PIL import Image, ImageOps
 
 from rangesfm.arrays import Array
-from rangesfm.files.atomic import stays_inside
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.observations import RangeStatus
 from rangesfm.report.content import Content
 from rangesfm.report.plot import every_nth
 from rangesfm.report.text import count
 from rangesfm.result.entries import AnchorEntry
+from rangesfm.result.places import is_within
 from rangesfm.result.tables import USED_LABELS
 from rangesfm.vision.photos import UNREADABLE, opened_image
 
@@ -299,12 +299,14 @@ def pack(values: npt.ArrayLike, kind: str) -> dict[str, str]:
 def thumbnails(folder: Path | None, image_names: Sequence[str]) -> dict[str, str]:
     """JPEGs as data URIs by photo, evenly over the path; photos that cannot be read are left out.
 
-    So are those that a name from a file would fetch from outside the folder: the page is handed on.
+    So are those that a name or a link would fetch from outside the folder: the page is handed on.
 
     All are made as wide as fits into MAX_THUMBNAIL_BYTES; if even the smallest do not fit, there are fewer.
     """
-    image_names = [name for name in image_names if stays_inside(name)]
-    if folder is None or not folder.is_dir() or not image_names:
+    if folder is None or not folder.is_dir():
+        return {}
+    image_names = [name for name in image_names if is_within(folder / name, folder)]
+    if not image_names:
         return {}
     chosen = np.unique(np.linspace(0, len(image_names) - 1, MAX_NUM_THUMBNAILS).round().astype(int))
     photos = {image_names[i]: _small_copy(folder / image_names[i]) for i in chosen}

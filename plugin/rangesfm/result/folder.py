@@ -20,6 +20,7 @@ from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.reference import Reference, read_reference
 from rangesfm.options import ExportOptions
 from rangesfm.result.metric_result import MetricResult
+from rangesfm.result.places import path_in, photos_beside
 from rangesfm.result.summary import ResultSummary
 from rangesfm.result.tables import TABLES, PhotoTimes, TableFile
 from rangesfm.survey.settings import Survey
@@ -166,9 +167,15 @@ class ResultFolder:
 
     @property
     def images_path(self) -> Path | None:
-        """Folder of the photos, as the run was told; None if it had none."""
-        path = self.summary.settings.images.path
-        return None if path is None else path_of(path)
+        """Folder of the run's photos; None if it had none, or had them outside of the folder around the result."""
+        recorded = self.summary.settings.images.path
+        return None if recorded is None else photos_beside(self.path, recorded)
+
+    @property
+    def anchors_path(self) -> Path | None:
+        """File of the run's anchors; None if it had none."""
+        recorded = self.summary.settings.anchors.path
+        return None if recorded is None else path_in(self.path, recorded)
 
     def lever_arms_m(self, tag_ids: Sequence[str]) -> Array:
         """(n, 3) antenna in the camera's frame of each tag of a list; of one the settings do not name, the common."""

@@ -29,7 +29,7 @@ def export_result(
 
     Args:
         options: all but the formats.
-        images_path: folder of the photos; None: where the run found them.
+        images_path: folder of the photos; None: those of the run, if they are beside the result.
 
     Raises:
         InputError: as ``export_model``, the folder is not a result with a metric model, or a run is writing to the

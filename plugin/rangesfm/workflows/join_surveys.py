@@ -289,7 +289,7 @@ def _anchors_of_surveys(finished: Sequence[FinishedRun]) -> tuple[Anchor, ...]:
 
 def _anchors_of(one: FinishedRun) -> tuple[Anchor, ...]:
     anchors = one.result.summary.settings.anchors
-    path, frame = anchors.path, anchors.frame
+    path, frame = one.result.anchors_path, anchors.frame
     if path is None or frame == "unknown":
         return ()
     if frame == "first_camera":
@@ -298,7 +298,7 @@ def _anchors_of(one: FinishedRun) -> tuple[Anchor, ...]:
             "in a frame of the site, or --anchor_frame unknown",
             one.result.path,
         )
-    if not Path(path).is_file():
+    if not path.is_file():
         raise InputError(f"its anchors' file is gone, {path}: give --anchors CSV", one.result.path)
     return read_anchors(path)
 
@@ -311,6 +311,6 @@ def _common(settings: Iterable[str | None]) -> str | None:
 
 def _images_path(finished: Sequence[FinishedRun]) -> Path | None:
     """The folder of all photos, where there is one and they have kept their names."""
-    path = _common(one.result.summary.settings.images.path for one in finished)
+    paths = {one.result.images_path for one in finished}
     is_renamed = any(name != own for one in finished for own, name in one.own_name.items())
-    return None if path is None or is_renamed else Path(path)
+    return None if is_renamed or len(paths) > 1 else paths.pop()

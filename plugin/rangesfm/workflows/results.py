@@ -25,6 +25,7 @@ from rangesfm.result.folder import (
     write_models_and_tables,
 )
 from rangesfm.result.metric_result import MetricResult
+from rangesfm.result.places import recorded_inputs, recorded_settings
 from rangesfm.result.summary import ResultSummary
 from rangesfm.scale.lengths import BENDING
 from rangesfm.survey.inputs import RangingInputs, input_hashes
@@ -82,8 +83,8 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
             **({"comparison": comparison} if comparison else {}),
             georeference=georeference,
             versions=versions(),
-            settings=survey.to_dict(),
-            inputs=input_hashes(survey),
+            settings=recorded_settings(survey),
+            inputs=recorded_inputs(input_hashes(survey), survey),
             seconds=journal.all_seconds(),
             warnings=journal.warnings,
         )
