@@ -29,7 +29,7 @@ from rangesfm.errors import InputError
 from rangesfm.files.output_folder import LOCK_NAME, PRIVATE_NAME
 
 if TYPE_CHECKING:
-    from tests.conftest import Command, PhotoRun
+    from tests.conftest import Command, PhotoRun, WalkedSurvey
 
 NAMES = ("north", "east")
 QUICK = """
@@ -158,6 +158,30 @@ def test_interrupted_it_stops_its_workers_and_says_how_far_it_came(surveys: Path
     assert psutil.wait_procs(processes, timeout=600)[1] == []
     assert [row["status"] for row in rows_of(surveys).values()] == ["interrupted", "interrupted"]
     assert left_over(surveys) == []
+
+
+@pytest.mark.parametrize("is_refined", [True, False])
+def test_a_survey_may_begin_with_a_model(is_refined: bool, own_survey: WalkedSurvey, rangesfm_process: Command) -> None:
+    text = f"""
+        [images]
+        model = "sparse/0"
+        times = "images.csv"
+        [ranges]
+        path = "uwb.csv"
+        time_offset = 2.0
+        [anchors]
+        path = "anchors.csv"
+        [scale]
+        max_relative_stddev = 0.1
+        [refine]
+        enabled = {str(is_refined).lower()}
+        [report]
+        enabled = false
+    """
+    (own_survey.folder / "survey.toml").write_text(text)
+    done = rangesfm_process("batch", "survey.toml", cwd=own_survey.folder)
+    assert rows_of(own_survey.folder)["survey.toml"]["status"] == "done", done.stderr
+    assert (own_survey.folder / "out" / "sparse_metric" / "0").is_dir() == is_refined
 
 
 def test_two_surveys_with_one_folder_are_refused_before_anything_starts(

@@ -17,9 +17,9 @@ def _run(given: tuple[Survey, bool], worker: MessagesToParent) -> dict[str, Any]
     survey, restart = given
     sys.argv = ["rangesfm", "batch", str(survey.source.path)]  # by which others know who writes to its folder
     from rangesfm.batch.course import figures_of
-    from rangesfm.workflows.run import run_survey
+    from rangesfm.workflows.run import metric_map_of
 
-    summary = run_survey(survey, progress=worker, restart=restart).summary
+    summary = metric_map_of(survey, progress=worker, restart=restart).summary
     reasons = summary.scale.reasons if summary.scale.verdict != "good" else ()
     return {"figures": figures_of(summary), "reason": "; ".join(reasons)}
 

@@ -14,7 +14,6 @@ from rangesfm.progress import Progress
 
 if TYPE_CHECKING:
     from rangesfm.survey.settings import Survey
-    from rangesfm.workflows.results import RunResult
 
 
 _SCALE_KEYS = (
@@ -76,24 +75,18 @@ def _run(args: argparse.Namespace, progress: Progress) -> Outcome:
         survey.require_metres()
     else:
         _require_model_and_metres(survey)
+    from rangesfm.workflows.run import metric_map_of
+
     if not args.live:
-        return Outcome(_run_or_refine(survey, progress, args.restart).lines)
+        return Outcome(metric_map_of(survey, progress=progress, restart=args.restart).lines)
     from rangesfm.files.atomic import sole_writer
     from rangesfm.report.live import live_page
 
     with sole_writer(survey.output.path), live_page(progress, survey.output.path) as page:
         page.message(f"this run can be watched in {page.path}")
-        result = _run_or_refine(survey, page, args.restart)
+        result = metric_map_of(survey, progress=page, restart=args.restart)
         page.finish(survey.output.path / "report.html" if survey.report.enabled else None)
     return Outcome(result.lines)
-
-
-def _run_or_refine(survey: Survey, progress: Progress, restart: bool) -> RunResult:
-    from rangesfm.workflows.run import refine_model, run_survey, scale_model
-
-    if survey.images.model is None:
-        return run_survey(survey, progress=progress, restart=restart)
-    return (refine_model if survey.refine.enabled else scale_model)(survey, progress=progress)
 
 
 def _demo(args: argparse.Namespace, progress: Progress) -> Outcome:

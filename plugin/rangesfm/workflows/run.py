@@ -50,6 +50,13 @@ from rangesfm.workflows.plan_again import with_advice
 from rangesfm.workflows.results import RunResult, write_results
 
 
+def metric_map_of(survey: Survey, *, progress: Progress, restart: bool = False) -> RunResult:
+    """A survey to its metric model: from photos, or from the unscaled model that it begins with."""
+    if survey.images.model is None:
+        return run_survey(survey, progress=progress, restart=restart)
+    return (refine_model if survey.refine.enabled else scale_model)(survey, progress=progress)
+
+
 def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> RunResult:
     """Photos and ranges to a metric model. Steps of the reconstruction that are done are reused."""
     journal = Journal(progress)
