@@ -130,6 +130,11 @@ def joined_trajectory(parts: Sequence[Trajectory]) -> tuple[Trajectory, list[Ind
     return path, np.split(place, ends[:-1])
 
 
+def is_one_after_the_other(path: Trajectory) -> bool:
+    """Whether no two keyframes are of one time: those of a map that was joined from several cameras' may be."""
+    return path.timestamps_s is None or bool(np.all(np.diff(path.timestamps_s) > 0))
+
+
 def pose_of(frame: pycolmap.Frame) -> pycolmap.Rigid3d:
     """rig_from_world of a registered frame: a view, so that what is written to its params moves the frame."""
     pose = frame.rig_from_world

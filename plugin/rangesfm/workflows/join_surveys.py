@@ -15,7 +15,7 @@ from rangesfm.errors import InputError
 from rangesfm.export import check_formats
 from rangesfm.files.atomic import require_apart, sole_writer
 from rangesfm.geometry.reference import read_reference
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.geometry.trajectory import Trajectory, is_one_after_the_other
 from rangesfm.join.models import PathOfModel
 from rangesfm.progress import Journal, Progress
 from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame, read_anchors
@@ -100,6 +100,11 @@ def _read(name: str, result: ResultFolder) -> FinishedRun:
     if ranges is None:
         raise InputError("there is no ranges.csv, expected the output_path of a run", result.path)
     path = path_of_model(model, result)
+    if not is_one_after_the_other(path):
+        expected = "expected the result of one survey: join all surveys at once"
+        raise InputError(
+            f"two of its photos have the same time, as in a map of several cameras, {expected}", result.path
+        )
     own_name = {image.name: image.name for image in model.images.values()}
     of_two_anchors = RangeStatus.ANCHOR_ANCHOR.label
     tags = (id_ for id_, status in zip(ranges.tag_id, ranges.status, strict=True) if status != of_two_anchors)

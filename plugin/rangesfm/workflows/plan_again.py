@@ -13,7 +13,7 @@ from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.export.metric_map import up_in_world
 from rangesfm.geometry.gravity import UP_IN_SITE
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.geometry.trajectory import Trajectory, is_one_after_the_other
 from rangesfm.planning.advice import advise, best_words
 from rangesfm.planning.expected import expect
 from rangesfm.planning.planned import PlannedSurvey
@@ -42,6 +42,9 @@ def plan_of_result(path: str | Path) -> PlannedSurvey:
     if model is None or ranges is None or not ranges.is_used.any():
         raise InputError("has no metric model or no used ranges, expected a finished result", path)
     trajectory = path_of_model(model, folder)
+    if not is_one_after_the_other(trajectory):
+        expected = "expected the result of one survey"
+        raise InputError(f"two of its photos have the same time, as in a map of several cameras, {expected}", path)
     used = np.array(ranges.anchor_id, dtype=str)[ranges.is_used]
     (arm,) = folder.lever_arms_m(ranges.tag_id[:1])
     stddevs = {name: anchor.stddev_m or 0.0 for name, anchor in folder.summary.anchors.items()}
@@ -61,7 +64,7 @@ def with_advice(metric: MetricResult, tag_in_cam_m: Array) -> MetricResult:
     doubtful = metric.estimate.verdict == "doubtful", metric.place is not None and metric.place.verdict == "doubtful"
     observations = metric.observations
     used = observations.has_place & (observations.status < RangeStatus.OUTLIER)
-    if not any(doubtful) or not used.any():
+    if not any(doubtful) or not used.any() or not is_one_after_the_other(metric.trajectory):
         return metric
     log, estimate = observations.log, metric.estimate
     heard = {log.anchor_ids[k] for k in np.unique(log.anchor_index[used])}

@@ -1,0 +1,44 @@
+"""Surveys of several cameras that took their photos at the same times."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from tests.conftest import Command, WalkedSurvey
+
+
+@pytest.fixture(scope="module")
+def joined(walked_survey: WalkedSurvey, rangesfm_command: Command, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two results, and ``site``, joined of them by anchors of which one is a metre off."""
+    folder = tmp_path_factory.mktemp("cameras")
+    flags = (*walked_survey.flags, "--anchors", "anchors.csv", "--max_relative_stddev", "0.1", "--quiet")
+    rangesfm_command("scale", *flags, "--output_path", folder / "left", cwd=walked_survey.folder)
+    shutil.copytree(folder / "left", folder / "right")
+    anchors = (walked_survey.folder / "anchors.csv").read_text()
+    assert "A1,-6.0," in anchors
+    (folder / "anchors.csv").write_text(anchors.replace("A1,-6.0,", "A1,-5.0,"))
+    rangesfm_command("join", "left", "right", "--anchors", "anchors.csv", "--output_path", "site", cwd=folder)
+    return folder
+
+
+def test_cameras_with_equal_times_are_joined_also_where_the_scale_is_doubtful(joined: Path) -> None:
+    result = json.loads((joined / "site" / "result.json").read_text())
+    assert result["scale"]["verdict"] == "doubtful"
+    assert [model["joined"] for model in result["models"]] == [True, True]
+    assert (joined / "site" / "report.html").is_file()
+
+
+@pytest.mark.parametrize("command", [("plan", "--from", "site"), ("join", "site", "left", "--output_path", "more")])
+def test_what_takes_a_map_for_one_path_says_that_it_is_not(
+    command: tuple[str, ...], joined: Path, rangesfm_command: Command
+) -> None:
+    said = rangesfm_command(*command, cwd=joined, status=2).stderr
+    line = "rangesfm: error: site: two of its photos have the same time, as in a map of several cameras, expected "
+    assert said.splitlines()[-1].startswith(line)
+    assert not (joined / "more").exists()
