@@ -12,6 +12,10 @@ from tests.studies.erring_surveys import SITES, Given, Site, run, surveyed
 from tests.studies.mistakes import kinds
 
 from rangesfm.trust.alternatives import alternatives
+from rangesfm.trust.catalogue import STANDING
+from rangesfm.trust.linearized import linearized
+from rangesfm.trust.mistakes import _settled_test
+from rangesfm.trust.scanning import SCANNING
 from rangesfm.trust.verdict import TrustVerdict
 
 HALL, YARD, DRONE = SITES
@@ -196,6 +200,55 @@ def test_a_mistake_is_the_likeliest_cause(kind: str, size: float, name: str) -> 
     mistake.make(given, size, np.random.default_rng(SEED))
     given.needs_search = mistake.of is None
     assert trust(given).causes[0].name == name
+
+
+def test_a_clock_that_runs_as_no_quartz_does_is_not_named_so() -> None:
+    """Times that are stretched by 2 % are a mistake, and found; but no clock drifts by 20 000 ppm."""
+    given = surveyed(HALL, SEED)
+    given.time_s = given.time_s.mean() + 1.02 * (given.time_s - given.time_s.mean())
+    found = trust(given)
+    assert found.reasons
+    assert "ppm" not in " ".join(found.reasons)
+    (row,) = [test for test in found.tests if test.name == "clock drift"]
+    assert not row.rejected
+    assert row.size is None
+    assert row.words == "no clock drift that can happen (0.0002 s/s at most) explains the ranges"
+
+
+def test_a_tag_that_is_found_farther_than_its_camera_is_large_did_not_slip() -> None:
+    given = surveyed(YARD, SEED)
+    (slip,) = [each for each in kinds(given.ids) if each.name == "tag slips"]
+    slip.make(given, 3.0, np.random.default_rng(SEED))
+    found = trust(given)
+    assert found.reasons
+    assert "tag slipped" not in {cause.name for cause in found.causes}
+    assert all(test.size is None or test.size < 0.75 for test in found.tests if test.name == "tag slipped")
+
+
+def test_every_hypothesis_has_a_largest_size_that_can_happen() -> None:
+    problem = linearized(known(run(surveyed(YARD, SEED), SEED).on_map))
+    hypotheses = [h for of_kind in (*STANDING, *SCANNING) for h in of_kind(problem)]
+    assert {h.name for h in hypotheses} >= {"anchor moved", "map break", "clock jump", "common bias", "lever arm"}
+    for each in hypotheses:
+        assert 0 < each.most < 200
+        assert each.can_be(np.zeros(each.num))
+        assert not each.can_be(np.full(each.num, 1.01 * each.most))
+
+
+def test_a_mistake_whose_steps_grow_explains_nothing() -> None:
+    """A correction that does the opposite: each step leaves twice what it was to take away."""
+    given = surveyed(HALL, SEED)
+    given.range_m = given.range_m + 0.3 * given.is_of("A1")
+    problem = linearized(known(run(given, SEED).on_map))
+    linear = next(h for of_kind in STANDING for h in of_kind(problem) if h.key == ("anchor bias", "A1"))
+    in_steps = replace(linear, is_linear=False)
+    opposite = replace(in_steps, correction=lambda size: linear.correction(-size))
+    assert np.isfinite(_settled_test(problem, linear)[1])
+    assert np.isfinite(_settled_test(problem, in_steps)[1])
+    assert _settled_test(problem, opposite)[1] == np.inf
+    # Neither does one that leads beyond what can happen.
+    assert _settled_test(problem, replace(linear, most=0.1))[1] == np.inf
+    assert _settled_test(problem, replace(in_steps, most=0.1))[1] == np.inf
 
 
 def test_a_lever_arm_in_other_axes_is_as_long_as_it_was_given() -> None:

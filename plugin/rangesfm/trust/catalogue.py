@@ -11,9 +11,11 @@ from rangesfm.trust.hypothesis import (
     Correction,
     Effect,
     Hypothesis,
+    duration_s,
     in_axes,
     is_given,
     longer,
+    longest_m,
     of_anchor_place,
     of_cells,
     too_long,
@@ -25,8 +27,16 @@ _SAME_HEIGHT_M = 1e-3
 _STUCK = 0.3
 # Along a camera; of an anchor, beside what is drawn on any sketch of the site.
 MISMEASURED_M, UNSEEN_MOVE_M = 0.2, 1.0
-# Seconds a second: no quartz drifts by more.
-_BAD_CLOCK = 1e-3
+# Seconds a second: a quartz of either device is good to 100 ppm over its temperatures and its years.
+_MOST_CLOCK_DRIFT = 2e-4
+# Of all distances, of an anchor's, and of coordinates: feet, and ranges of both ways, are tried as such.
+_MOST_SHARE, _MOST_SHARE_OF_ANCHOR = 0.5, 2.0
+# Of anything that is carried or driven, from the lens to where a tag may sit.
+_LARGEST_RIG_M = 3.0
+# By which a radio's delays wander as it warms up, far beyond any that was seen.
+_MOST_WARMING_M = 5.0
+# Of whoever carries the camera: the way round a body, and the weak signal's late detection.
+_MOST_BODY_M = 2.0
 _MEASURE_AGAIN = "measure it again, or run with it unknown (leave its coordinates in the anchors' file empty)"
 
 
@@ -37,6 +47,8 @@ def anchor_places(problem: Linearized) -> Iterator[Hypothesis]:
 
 def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
     name, at = problem.on_map.anchor_ids[k], problem.on_map.problem.anchor_mean_m[k]
+    # It is within its ranges of the path, wherever it is said to be.
+    most_m = longest_m(problem, k) + float(np.max(problem.gradient.distance_m[problem.cells.anchor_index == k]))
 
     def unknown(_: Array) -> Correction:
         return Correction({name: None})
@@ -53,6 +65,7 @@ def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
             ),
             remedy=f"check its {letter}, or {_MEASURE_AGAIN}",
             correction=lambda size: Correction({name: at + size[0] * direction}),
+            most=most_m,
             adoption=unknown,
         )
 
@@ -66,6 +79,7 @@ def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
         ),
         remedy=_MEASURE_AGAIN,
         correction=lambda size: Correction({name: at + size}),
+        most=most_m,
         adoption=unknown,
         unawares=UNSEEN_MOVE_M,
         narrower=tuple(map(coordinate, range(3))),
@@ -87,6 +101,7 @@ def _bias(problem: Linearized, anchors: list[int], kind: str, subject: str, whos
         words=lambda size: f"the ranges to {whose} {too_long(size)}",
         remedy="calibrate the radio's delay (range_bias_m in the anchors' file), or look for what stands in the way",
         correction=longer(lambda: np.isin(problem.on_map.problem.anchor_index, anchors)),
+        most=max(longest_m(problem, k) for k in anchors),
         is_linear=True,
         is_in_interval=True,
     )
@@ -102,7 +117,7 @@ def range_shares(problem: Linearized) -> Iterator[Hypothesis]:
         remedy="check the unit, and the propagation speed that the radio assumes, against a taped distance",
         correction=lambda size: Correction(longer_m=distance_m * size[0] / (1 + size[0])),
         unit="1",
-        most=0.5,
+        most=_MOST_SHARE,
         is_linear=True,
         is_in_interval=True,
     )
@@ -131,6 +146,7 @@ def _share_of_anchor(problem: Linearized, k: int) -> Hypothesis:
         words=words,
         remedy="look at its ranges in the log, and leave it out (use_anchors)",
         correction=level,
+        most=_MOST_SHARE_OF_ANCHOR,
         unit="1",
         adoption=lambda _: Correction(left_out=of_ranges),
         is_linear=True,
@@ -157,6 +173,7 @@ def anchors_in_another_scale(problem: Linearized) -> Iterator[Hypothesis]:
         correction=lambda size: Correction(
             {ids[k]: middle + (1 + size[0]) * (given_m[k] - middle) for k in known},
         ),
+        most=_MOST_SHARE,
         unit="1",
         is_in_interval=True,
     )
@@ -180,7 +197,13 @@ def heights_never_measured(problem: Linearized) -> Iterator[Hypothesis]:
         correction=lambda size: Correction(
             {ids[k]: given_m[k] + height_m * up for k, height_m in zip(known, size, strict=True)}
         ),
+        most=longest_m(problem) * np.sqrt(len(known)),
     )
+
+
+def to_other_side_m(lever_arm_m: float) -> float:
+    """Return how far it is from a tag to the other side of its camera, for a hand that measures or a tag that slips."""
+    return MISMEASURED_M + 2 * lever_arm_m
 
 
 def lever_arms(problem: Linearized) -> Iterator[Hypothesis]:
@@ -188,11 +211,18 @@ def lever_arms(problem: Linearized) -> Iterator[Hypothesis]:
     return (_lever_arm(problem, k) for k in np.unique(problem.cells.tag_index).tolist())
 
 
+def lever_arm_m(problem: Linearized, tag: int | None = None) -> float:
+    """Return the length of a tag's lever arm as it is given, or that of the longest one."""
+    on_map = problem.on_map
+    arms_m = np.linalg.norm(on_map.problem.tag_from_center, axis=1)
+    tags = np.unique(on_map.tag_index) if tag is None else [tag]
+    return max(float(np.median(arms_m[on_map.tag_index == each])) for each in tags)
+
+
 def _lever_arm(problem: Linearized, k: int) -> Hypothesis:
     on_map = problem.on_map
     name = on_map.tag_ids[k] if len(on_map.tag_ids) > 1 else ""
-    arms_m = np.linalg.norm(on_map.problem.tag_from_center[on_map.tag_index == k], axis=1)
-    length_m = float(np.median(arms_m))
+    length_m = lever_arm_m(problem, k)
 
     def words(size: Array) -> str:
         of_tag, far = f" of tag {name}" if name else "", f"about {np.linalg.norm(size):.2f} m"
@@ -208,7 +238,8 @@ def _lever_arm(problem: Linearized, k: int) -> Hypothesis:
         words=words,
         remedy="measure where the tag's antenna sits, x to the right, y down, z forward (--tag_in_cam)",
         correction=lambda size: Correction(tag_moves_m={on_map.tag_ids[k]: size}),
-        unawares=MISMEASURED_M + 2 * length_m,  # the other way round
+        most=_LARGEST_RIG_M + length_m,
+        unawares=to_other_side_m(length_m),
     )
 
 
@@ -227,6 +258,7 @@ def radios_warming(problem: Linearized) -> Iterator[Hypothesis]:
         words=words,
         remedy="let the radio warm up before the survey, or calibrate it at the end too",
         correction=lambda size: Correction(longer_m=size[0] / lasts * of_ranges),
+        most=_MOST_WARMING_M,
         is_linear=True,
     )
 
@@ -241,6 +273,7 @@ def people_in_between(problem: Linearized) -> Iterator[Hypothesis]:
         words=lambda size: f"the ranges to anchors behind the camera {too_long(size)}",
         remedy="carry the tag above the head, or see what stands behind it",
         correction=longer(lambda: is_behind),
+        most=_MOST_BODY_M,
         is_linear=True,
         unawares=MISMEASURED_M,
     )
@@ -260,6 +293,7 @@ def clocks(problem: Linearized) -> Iterator[Hypothesis]:
         ),
         remedy=remedy,
         correction=lambda size: Correction(time_shift_s=float(size[0])),
+        most=duration_s(problem),
         unit="s",
     )
     yield Hypothesis(
@@ -271,7 +305,7 @@ def clocks(problem: Linearized) -> Iterator[Hypothesis]:
         remedy=remedy,
         correction=lambda size: Correction(time_shift_s=size[0] * of_ranges),
         unit="s/s",
-        unawares=_BAD_CLOCK,
+        most=_MOST_CLOCK_DRIFT,
     )
 
 

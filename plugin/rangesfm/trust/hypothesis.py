@@ -66,9 +66,10 @@ class Hypothesis:
         words: of an estimate (k,): what is probably the case.
         remedy: what to measure or to change.
         correction: of an estimate, what undoes it.
+        most: the largest size that can happen, the length of the vector of numbers, in their unit. An estimate beyond
+            it is not this mistake.
         unit: of the numbers.
         adoption: what takes its place where the mistake is adopted; None: the correction itself.
-        most: beyond which an estimate is not believed, in its unit.
         unawares: beyond which nobody makes it without seeing it, in its unit: a larger one need not be feared.
         finer: the same at times between those that are looked at; None: it is of no time.
         narrower: of fewer numbers, which explain as much if the mistake was of their kind.
@@ -81,10 +82,10 @@ class Hypothesis:
     words: Callable[[Array], str]
     remedy: str
     correction: Callable[[Array], Correction]
+    most: float
     subject: str = ""
     unit: str = "m"
     adoption: Callable[[Array], Correction] | None = None
-    most: float = np.inf
     unawares: float = np.inf
     finer: Callable[[], Iterator[Hypothesis]] | None = None
     narrower: tuple[Hypothesis, ...] = ()
@@ -99,6 +100,15 @@ class Hypothesis:
         steps = [self.correction(sizes + _SMALL * unit).longer_m for unit in np.eye(len(sizes))]
         slopes = [(step - longer_m) / _SMALL for step in steps if step is not None]
         return replace(self, effect=of_cells(problem, -problem.cells.mean(np.stack(slopes, axis=1))))
+
+    def can_be(self, sizes: Array) -> bool:
+        """Return whether a mistake of this size (k,) can happen."""
+        return bool(np.linalg.norm(sizes) <= self.most)
+
+    @property
+    def most_unnoticed(self) -> float:
+        """The largest size that can happen and that nobody sees without a test."""
+        return min(self.most, self.unawares)
 
     @property
     def num(self) -> int:
@@ -119,6 +129,21 @@ def is_given(problem: Linearized, anchor: int) -> bool:
     """Whether somebody said where an anchor is."""
     given = problem.on_map.problem
     return bool(np.isfinite(given.anchor_mean_m[anchor]).all() and np.isfinite(given.anchor_stddev_m[anchor]))
+
+
+def longest_m(problem: Linearized, anchor: int | None = None) -> float:
+    """Return the longest range to an anchor, or of all.
+
+    No range reads longer by more than itself, and no radio reaches twice as far as it was ever heard.
+    """
+    given = problem.on_map.problem
+    is_of = slice(None) if anchor is None else given.anchor_index == anchor
+    return float(np.max(given.range_m[is_of]))
+
+
+def duration_s(problem: Linearized) -> float:
+    """Return how long there are ranges: clocks that differ by more have no moment in common."""
+    return float(np.ptp(problem.on_map.time_s))
 
 
 def of_anchor_place(problem: Linearized, anchor: int, directions: Array) -> Effect:

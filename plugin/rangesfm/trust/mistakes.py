@@ -25,6 +25,8 @@ _AS_LIKELY = 6.0
 _SAME = 0.95
 _MAX_NUM_RIVALS = 2
 _NUM_SETTLING, _SETTLED = 6, 0.05
+# Steps in a row that are longer than the one before: the first may fall short, as of a large mistake.
+_NUM_LONGER = 2
 # Of what is not linear.
 _NUM_STEPS = 10
 
@@ -80,7 +82,7 @@ def find_mistakes(on_map: RangesOnMap, *, seed: int = 0) -> Findings:
     hypotheses = standing + [hypothesis for of_kind in SCANNING for hypothesis in of_kind(problem)]
     problem = _learnt(problem, standing)
     tests = _best_of_each(Factorization(problem).test(hypotheses, seed), problem)
-    possible = [test for test in tests if _is_possible(test)]
+    possible = [test for test in tests if test.is_possible]
     rejected = [test for test in possible if test.is_rejected]
     causes = _causes(problem, rejected or possible[:_NUM_NEARLY], is_sure=bool(rejected))
     if causes and causes[0].test is not None:
@@ -104,8 +106,9 @@ def _causes(problem: Linearized, nominated: Sequence[Test], *, is_sure: bool) ->
     for test in _varied(nominated):
         again, deviance, state = _settled_test(problem, _at_best_time(factorized, test.hypothesis))
         gain = before - deviance
+        is_found = again.is_possible and bool(np.isfinite(deviance))
         # What is not linear was tested by its first step, which says little of a large mistake.
-        if _is_possible(again) and ((is_sure and test.hypothesis.is_linear) or gain > test.threshold):
+        if is_found and ((is_sure and test.hypothesis.is_linear) or gain > test.threshold):
             causes.append(_cause(replace(again, threshold=test.threshold), state, gain, _penalty(again, num)))
     if not causes and not is_sure:
         return []
@@ -136,43 +139,82 @@ def _is_rival(best: Cause, other: Cause) -> bool:
 
 
 def _settled_test(problem: Linearized, hypothesis: Hypothesis) -> tuple[Test, float, RangeState]:
-    """The test of a hypothesis and its deviance, with the errors that it leaves and, if not linear, at the state."""
-    at, there, sizes, is_settled = (_linear_settled if hypothesis.is_linear else _settled_in_steps)(problem, hypothesis)
-    factorized = Factorization(_learnt(at, [there]))
-    [test] = factorized.estimates([there])
+    """Return the test of a hypothesis, its deviance and its state, with the errors that it leaves.
+
+    Where steps diverge the deviance is infinite: there is no size that fits.
+    """
+    found = (_linear_settled if hypothesis.is_linear else _settled_in_steps)(problem, hypothesis)
+    factorized = Factorization(_learnt(found.at, [found.hypothesis]))
+    [test] = factorized.estimates([found.hypothesis])
     # What a step promises counts only where steps keep what they promise.
-    reached = replace(test, hypothesis=hypothesis, sizes=sizes + test.sizes if is_settled else sizes)
-    return reached, factorized.deviance(test if is_settled else None), at.on_map.state
+    sizes = found.sizes + test.sizes if found.is_settled else found.sizes
+    deviance = np.inf if found.diverges else factorized.deviance(test if found.is_settled else None)
+    return replace(test, hypothesis=hypothesis, sizes=sizes), deviance, found.at.on_map.state
 
 
-def _linear_settled(problem: Linearized, hypothesis: Hypothesis) -> tuple[Linearized, Hypothesis, Array, bool]:
+@dataclass(frozen=True)
+class _Settled:
+    """Where steps to the likeliest size of a mistake ended.
+
+    Attributes:
+        at: with the ranges corrected by the size, and the state that is likeliest then.
+        hypothesis: as it is there. sizes: (k,) by which the ranges are corrected.
+        is_settled: whether the next step is short.
+        diverges: whether steps grow, or lead beyond what can happen.
+    """
+
+    at: Linearized
+    hypothesis: Hypothesis
+    sizes: Array
+    is_settled: bool
+    diverges: bool = False
+
+
+class _Steps:
+    """Whether steps shrink: twice in a row longer than the one before, they lead nowhere."""
+
+    def __init__(self) -> None:
+        self._last, self._num_longer = np.inf, 0
+
+    def grow(self, step: float) -> bool:
+        """Return whether steps grow, after one more of this length."""
+        self._num_longer = self._num_longer + 1 if step > self._last or not np.isfinite(step) else 0
+        self._last = step
+        return self._num_longer >= _NUM_LONGER
+
+
+def _linear_settled(problem: Linearized, hypothesis: Hypothesis) -> _Settled:
     """At the likeliest state if the mistake was made, of whatever size it has there."""
-    at, before = problem, np.zeros(hypothesis.num)
+    at, before, nothing, steps = problem, np.zeros(hypothesis.num), np.zeros(hypothesis.num), _Steps()
     for _ in range(_NUM_SETTLING):
         factorized = Factorization(at)
         [test] = factorized.estimates([hypothesis])
-        if np.linalg.norm(test.sizes - before) < _SETTLED * np.linalg.norm(test.sizes):
+        change = float(np.linalg.norm(test.sizes - before))
+        if change < _SETTLED * np.linalg.norm(test.sizes):
             break
+        if steps.grow(change) or not test.is_possible:
+            return _Settled(at, hypothesis, nothing, is_settled=True, diverges=True)
         at, before = at_state(at, _stepped(at, factorized, hypothesis, test.sizes)), test.sizes
-    return at, hypothesis, np.zeros(hypothesis.num), True
+    return _Settled(at, hypothesis, nothing, is_settled=True)
 
 
-def _settled_in_steps(problem: Linearized, original: Hypothesis) -> tuple[Linearized, Hypothesis, Array, bool]:
-    """Where the ranges are corrected by the likeliest size, the hypothesis as it is there, the size, and whether steps
-    came to an end: where little holds a mistake, they may grow instead.
-    """
-    at, hypothesis, sizes = problem, original, np.zeros(original.num)
+def _settled_in_steps(problem: Linearized, original: Hypothesis) -> _Settled:
+    """Where the ranges are corrected by the likeliest size; where little holds a mistake, steps may grow instead."""
+    at, hypothesis, sizes, steps = problem, original, np.zeros(original.num), _Steps()
     for _ in range(_NUM_STEPS):
         factorized = Factorization(at)
         [test] = factorized.estimates([hypothesis])
-        if np.linalg.norm(test.sizes) < _SETTLED * np.linalg.norm(sizes + test.sizes):
-            return at, hypothesis, sizes, True
+        step, size = (float(np.linalg.norm(each)) for each in (test.sizes, sizes + test.sizes))
+        if steps.grow(step) or not original.can_be(sizes + test.sizes):
+            return _Settled(at, hypothesis, sizes, is_settled=False, diverges=True)
+        if step < _SETTLED * size:
+            return _Settled(at, hypothesis, sizes, is_settled=True)
         sizes = sizes + test.sizes
         moved = replace(problem.on_map, state=_stepped(at, factorized, hypothesis, test.sizes).state)
         at = at_state(at, corrected(moved, original.correction(sizes)))
         found = (each for of_kind in STANDING for h in of_kind(at) for each in (h, *h.narrower))
         hypothesis = next((each for each in found if each.key == original.key), None) or original.at_size(at, sizes)
-    return at, hypothesis, sizes, False
+    return _Settled(at, hypothesis, sizes, is_settled=False)
 
 
 def _stepped(at: Linearized, factorized: Factorization, hypothesis: Hypothesis, sizes: Array) -> RangesOnMap:
@@ -186,6 +228,9 @@ def _narrowed(problem: Linearized, cause: Cause, before: float) -> Cause:
     if cause.test is None or not cause.test.hypothesis.narrower:
         return cause
     tried = [_settled_test(problem, h) for h in cause.test.hypothesis.narrower]
+    tried = [each for each in tried if each[0].is_possible]
+    if not tried:
+        return cause
     best, deviance, state = min(tried, key=lambda each: each[1])
     test = replace(best, threshold=cause.test.threshold)
     narrow = _cause(test, state, before - deviance, _penalty(best, len(problem.residual_m)))
@@ -232,7 +277,7 @@ def _best_of_each(tests: Sequence[Test], problem: Linearized) -> list[Test]:
     # Whoever makes such a mistake does not choose the time at which it is found best.
     best = {
         key: replace(
-            max(group, key=lambda test: test.statistic),
+            max(group, key=lambda test: (test.is_possible, test.statistic)),
             smallest_detectable=float(np.median([test.smallest_detectable for test in group])),
         )
         for key, group in of_key.items()
@@ -244,7 +289,3 @@ def _best_of_each(tests: Sequence[Test], problem: Linearized) -> list[Test]:
 def _penalty(test: Test, num: int) -> float:
     """Each number that a hypothesis may choose costs (Schwarz, 1978)."""
     return test.num * float(np.log(num))
-
-
-def _is_possible(test: Test) -> bool:
-    return bool(np.all(np.abs(test.sizes) <= test.hypothesis.most))

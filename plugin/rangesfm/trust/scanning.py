@@ -8,8 +8,9 @@ from functools import partial
 import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.trust.catalogue import MISMEASURED_M, UNSEEN_MOVE_M
-from rangesfm.trust.hypothesis import Correction, Hypothesis, in_axes, longer, of_cells, too_long
+from rangesfm.scale.range_equation import tag_positions
+from rangesfm.trust.catalogue import MISMEASURED_M, UNSEEN_MOVE_M, lever_arm_m, to_other_side_m
+from rangesfm.trust.hypothesis import Correction, Hypothesis, duration_s, in_axes, longer, longest_m, of_cells, too_long
 from rangesfm.trust.linearized import Linearized
 
 # A step is best found where it was: the ranges between the true time and the one that is tried fit neither way.
@@ -52,23 +53,31 @@ _MOVES: dict[str, tuple[Callable[[str, str, Array], str], str, float]] = {
 def anchors_moved(problem: Linearized) -> Iterator[Hypothesis]:
     """An anchor was moved at some time."""
     for k in problem.heard:
-        yield from _elsewhere(problem, k, "anchor moved", lambda: -np.eye(3), -problem.gradient.by_tag)
+        # Within reach before and after.
+        most_m = 2 * longest_m(problem, k)
+        yield from _elsewhere(problem, k, "anchor moved", most_m, lambda: -np.eye(3), -problem.gradient.by_tag)
 
 
 def map_breaks(problem: Linearized) -> Iterator[Hypothesis]:
     """From some time on the map lies elsewhere, as after a wrong match."""
-    return _elsewhere(problem, None, "map break", lambda: np.eye(3), problem.gradient.by_tag)
+    # Parts that break apart are as far from each other as the map is large, at most.
+    tags_m = tag_positions(problem.on_map.problem, problem.on_map.state.metric_from_model)
+    extent_m = float(np.linalg.norm(np.ptp(tags_m, axis=0)))
+    return _elsewhere(problem, None, "map break", extent_m, lambda: np.eye(3), problem.gradient.by_tag)
 
 
 def tags_slipped(problem: Linearized) -> Iterator[Hypothesis]:
     """From some time on the tag sits elsewhere on the camera."""
-    return _elsewhere(problem, None, "tag slipped", lambda: problem.on_map.world_from_cam, problem.by_lever_arm)
+    # It is still on the camera.
+    most_m = to_other_side_m(lever_arm_m(problem))
+    return _elsewhere(problem, None, "tag slipped", most_m, lambda: problem.on_map.world_from_cam, problem.by_lever_arm)
 
 
 def _elsewhere(
     problem: Linearized,
     anchor: int | None,
     name: str,
+    most_m: float,
     axes: Callable[[], Array],
     by_shift: Array,
     around: float | None = None,
@@ -76,7 +85,7 @@ def _elsewhere(
     """From some time on tags are elsewhere, as seen from an anchor, or from all.
 
     Args:
-        name: of the kind, of ``_MOVES``.
+        name: of the kind, of ``_MOVES``. most_m: the farthest that can happen.
         axes: along which they are shifted, (3, 3), or (n, 3, 3) for each range.
         by_shift: (c, 3) by how much the predicted ranges grow along these.
         around: as of ``_changes``.
@@ -97,9 +106,10 @@ def _elsewhere(
             words=partial(words, whose, _when(problem, time)),
             remedy=remedy,
             correction=partial(back, later),
+            most=most_m,
             adoption=partial(_left_out, later),
             unawares=unawares,
-            finer=partial(_elsewhere, problem, anchor, name, axes, by_shift, around=time),
+            finer=partial(_elsewhere, problem, anchor, name, most_m, axes, by_shift, around=time),
         )
 
 
@@ -124,6 +134,7 @@ def _steps(problem: Linearized, anchor: int | None, around: float | None = None)
             words=partial(words, _when(problem, time)),
             remedy="see what changed then: a tag that slipped, a restarted radio, a door or a vehicle in between",
             correction=longer(later),
+            most=longest_m(problem, anchor),
             is_linear=True,
             finer=partial(_steps, problem, anchor, around=time),
         )
@@ -150,6 +161,7 @@ def stretches(problem: Linearized) -> Iterator[Hypothesis]:
                 words=partial(words, name, _when(problem, start, end)),
                 remedy="look for what stood in the line of sight, and leave that stretch out",
                 correction=longer(within),
+                most=longest_m(problem, k),
                 adoption=partial(_left_out, within),
                 is_linear=True,
             )
@@ -173,6 +185,7 @@ def clock_jumps(problem: Linearized, around: float | None = None) -> Iterator[Hy
             words=partial(words, _when(problem, time)),
             remedy="see whether a logger was restarted then, and run the two parts as surveys of their own",
             correction=partial(correction, later),
+            most=duration_s(problem),
             unit="s",
             is_linear=True,
             finer=partial(clock_jumps, problem, around=time),

@@ -32,7 +32,7 @@ class Test:
     """What the observations say of one hypothesis.
 
     Attributes:
-        statistic: chi-square with ``num`` degrees of freedom if the mistake was not made.
+        statistic: chi-square with ``num`` degrees of freedom if the mistake was not made; of whatever size.
         threshold: for having looked at all hypotheses.
         sizes, stddevs: (k,) estimate of its numbers.
         smallest_detectable: in the direction in which it is found worst; inf: nothing can find it.
@@ -52,9 +52,14 @@ class Test:
     basis: Array
 
     @property
+    def is_possible(self) -> bool:
+        """Whether a mistake of the estimated size can happen."""
+        return self.hypothesis.can_be(self.sizes)
+
+    @property
     def is_rejected(self) -> bool:
-        """Whether chance alone is out of the question."""
-        return self.statistic > self.threshold
+        """Whether chance alone is out of the question, and the mistake is not."""
+        return self.is_possible and self.statistic > self.threshold
 
 
 @dataclass(frozen=True)
@@ -63,10 +68,11 @@ class MistakeTest:
 
     Attributes:
         name, subject: of which kind, and of what; an anchor's id, or nothing.
-        statistic, threshold: the mistake was made, or something that looks like it, where the first is larger.
+        statistic, threshold: the mistake was made, or something that looks like it, where the first is larger; 0 where
+            none that can happen is so large.
         words: what is the case if it was made. remedy: what to do then.
         unit: of ``size``, ``stddev`` and ``smallest_detectable``; "1": a share.
-        size, stddev: of the mistake, as estimated; the length of a vector. None: not estimated.
+        size, stddev: of the mistake, as estimated; the length of a vector. None: not estimated, or larger than can be.
         smallest_detectable: that would have been found, in four cases of five; None: no such mistake is ever found.
         effect_on_scale: relative, effect_on_place_m: root mean square along the path: the most that a mistake of that
             size does; None: there is no limit to it.
@@ -228,6 +234,13 @@ def overlap(first: Test, second: Test) -> float:
 
 
 def row_of(test: Test) -> MistakeTest:
+    """Return the row of the table: an estimate that cannot be is told as such, without its size."""
+    if not test.is_possible:
+        row = row_of(replace(test, statistic=0.0, sizes=np.zeros_like(test.sizes)))
+        name, unit = " ".join(test.hypothesis.key).strip(), test.hypothesis.unit.replace("1", "")
+        most = f"{test.hypothesis.most:.2g} {unit}".rstrip()
+        words = f"no {name} that can happen ({most} at most) explains the ranges"
+        return replace(row, size=None, stddev=None, words=words)
     one = len(test.sizes) == 1
     return MistakeTest(
         name=test.hypothesis.name,

@@ -87,7 +87,7 @@ def _before_causes(found: Findings, shown: Sequence[MistakeTest]) -> list[Mistak
 
 def sentence(causes: Sequence[Cause]) -> str:
     """The likeliest cause with what to do; several that nothing tells apart are all named."""
-    sure = f"{np.sqrt(max(causes[0].gain, 0.0)):.0f} stddevs"
+    sure = f"{np.sqrt(_statistic(causes[0])):.0f} stddevs"
     if len(causes) == 1:
         return f"probably {causes[0].words} ({sure}): {causes[0].remedy}"
     either = ", or ".join(cause.words for cause in causes)
@@ -100,7 +100,7 @@ def _what_could_hide(found: Findings) -> Iterator[str]:
     hidden = [t for t in found.tests if not t.hypothesis.is_in_interval and np.isfinite(t.effect_on_log_scale)]
     worst = max(hidden, key=_hidden_effect, default=None)
     if worst is not None and _hidden_effect(worst) > DOUBTFUL_ABOVE:
-        size = min(worst.smallest_detectable, worst.hypothesis.unawares)
+        size = min(worst.smallest_detectable, worst.hypothesis.most_unnoticed)
         what = f"{' '.join(worst.hypothesis.key).strip()}, {size:.2g} {worst.hypothesis.unit}"
         change = f"change the scale by {100 * _hidden_effect(worst):.1f} %"
         yield f"a mistake could stay hidden here ({what}) and {change}: {worst.hypothesis.remedy}"
@@ -108,14 +108,19 @@ def _what_could_hide(found: Findings) -> Iterator[str]:
 
 def _hidden_effect(test: Test) -> float:
     """On the logarithm of the scale, of the largest that neither test nor surveyor would see."""
-    return test.effect_on_log_scale * min(1.0, test.hypothesis.unawares / test.smallest_detectable)
+    return test.effect_on_log_scale * min(1.0, test.hypothesis.most_unnoticed / test.smallest_detectable)
 
 
 def _row_of_cause(cause: Cause) -> MistakeTest:
     """With the statistic by which it was found: how much likelier it makes the ranges."""
     if cause.test is None:
         return MistakeTest(cause.name, cause.subject, cause.gain, cause.penalty, cause.words, cause.remedy)
-    return row_of(replace(cause.test, statistic=max(cause.test.statistic, cause.gain)))
+    return row_of(replace(cause.test, statistic=_statistic(cause)))
+
+
+def _statistic(cause: Cause) -> float:
+    """Return by how much a cause makes the ranges likelier, with the errors that are left or as its test has it."""
+    return cause.gain if cause.test is None else max(cause.test.statistic, cause.gain)
 
 
 def _evidence(problem: Linearized) -> Iterator[MistakeTest]:
