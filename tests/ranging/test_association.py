@@ -117,6 +117,17 @@ class TestBetweenKeyframes:
         # A straight line between the two keyframes errs by 0.02 / sqrt(2).
         assert error < 0.035
 
+    @pytest.mark.parametrize("gap_s", [0.1, 0.5])
+    def test_one_keyframe_that_is_out_of_place_makes_no_other_place_uncertain(self, gap_s: float) -> None:
+        keyframe_times = np.arange(0.0, 60.0, gap_s)
+        centers = curved(keyframe_times) + 0.002 * np.random.default_rng(0).standard_normal((len(keyframe_times), 3))
+        range_times = np.arange(5.02, 50.0, 0.31)
+        usual = associate(log_at(range_times), trajectory_of(keyframe_times, centers), np.zeros(3))
+        centers[len(centers) // 2] += [5.0, 3.0, 0.0]
+        found = associate(log_at(range_times), trajectory_of(keyframe_times, centers), np.zeros(3))
+        between = found.weight > 0
+        assert np.all(found.center_stddev[between] < 1.5 * usual.center_stddev[between])
+
     def test_ranges_in_a_long_gap_are_known_less_well_than_those_in_a_short_one(self) -> None:
         rng = np.random.default_rng(0)
         fine = np.arange(0.0, 200.0, 0.05)

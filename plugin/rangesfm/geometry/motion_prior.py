@@ -7,7 +7,8 @@ posterior mean is the cubic smoothing spline (Wahba, 1978), in the banded form o
 The second divided differences z of the keyframes have the covariance ``power * R + noise**2 * Q'Q``: R from the white
 acceleration, Q'Q from errors of the keyframes that are independent of each other. Both are learnt by the likelihood of
 z, which no straight and even motion changes. Errors of the keyframes are only told from motion where keyframes are
-close in time; elsewhere the keyframes count as exact.
+close in time; elsewhere the keyframes count as exact. A keyframe far out of place says no more of the power than
+one that is just in place: all others are as certain as before.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
+from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded, solve_banded
 
 from rangesfm.arrays import Array, Indices, Mask
 
@@ -24,6 +25,9 @@ _CLOSE_S = 0.25
 # Ratios noise**2 / power that are tried, in cubes of the median gap between keyframes, beside 0. At the smallest the
 # keyframes count as exact, at the largest the whole path is one straight and even motion.
 _RATIOS = np.geomspace(1e-6, 1e9, 61)
+# In stddevs: a change of velocity counts as no larger than this (Huber's proposal 2, for scale).
+_MOST_STDDEVS = 3.0
+_NUM_SCALE_ROUNDS = 60
 
 
 @dataclass(frozen=True)
@@ -98,10 +102,9 @@ def learn_motion(times_s: Array, values: Array, is_bridged: Mask) -> MotionPrior
     """
     second = _second_differences(times_s, is_bridged)
     is_inner = second[1] != 0
-    num_seen = np.count_nonzero(is_inner) * values.shape[1]
     differences = second[0][:, None] * np.roll(values, 1, axis=0) + second[1][:, None] * values
     differences += second[2][:, None] * np.roll(values, -1, axis=0)
-    if not num_seen or not np.any(differences):
+    if not np.any(differences):
         nothing = np.zeros((3, len(times_s)))
         return MotionPrior(times_s, is_bridged, 0.0, 0.0, np.zeros(values.shape), nothing)
     by_motion, by_noise = _of_motion(times_s, is_inner), _of_noise(second)
@@ -109,7 +112,7 @@ def learn_motion(times_s: Array, values: Array, is_bridged: Mask) -> MotionPrior
     most_noise = _most_noise(times_s, values, is_bridged)
     best = None
     for ratio in (0.0, *(unit * _RATIOS if most_noise > 0 else ())):
-        fit = _fit(by_motion + ratio * by_noise, differences, num_seen)
+        fit = _fit(by_motion + ratio * by_noise, differences, is_inner)
         if fit is not None and ratio * fit[1] <= most_noise and (best is None or fit[0] < best[0]):
             best = (*fit, ratio)
     assert best is not None, "without noise the covariance of second differences is diagonally dominant"
@@ -153,11 +156,15 @@ def _of_noise(second: Array) -> Array:
 def _most_noise(times_s: Array, values: Array, is_bridged: Mask) -> float:
     """The largest variance of a keyframe's coordinate that keyframes close in time allow; 0 where there are none."""
     is_close = is_bridged & (np.diff(times_s) <= _CLOSE_S)
-    return 0.5 * float(np.mean(np.diff(values, axis=0)[is_close] ** 2)) if is_close.any() else 0.0
+    squares = np.mean(np.diff(values, axis=0)[is_close] ** 2, axis=1)
+    # Half of the mean, if all of it was noise; the median of squares is 0.45 to 1 of the mean.
+    return float(np.median(squares)) if is_close.any() else 0.0
 
 
-def _fit(covariance: Array, differences: Array, num_seen: int) -> tuple[float, float, Array, Array] | None:
-    """-2 times the logarithm of the likelihood, the likeliest power, bends and the banded Cholesky factor.
+def _fit(covariance: Array, differences: Array, is_inner: Mask) -> tuple[float, float, Array, Array] | None:
+    """Return how unlikely the second differences are, the likeliest power, bends and the banded Cholesky factor.
+
+    The first is -2 times the logarithm of the likelihood for each coordinate, up to a constant.
 
     Args:
         covariance: (3, n) of the second differences, over the power. None where rounding leaves it indefinite.
@@ -167,11 +174,22 @@ def _fit(covariance: Array, differences: Array, num_seen: int) -> tuple[float, f
     except LinAlgError:
         return None
     bends = np.asarray(cho_solve_banded((factor, True), differences, check_finite=False), dtype=np.float64)
-    power = float(np.sum(differences * bends)) / num_seen
+    whitened = solve_banded((2, 0), factor, differences, check_finite=False)[is_inner]
+    power = _mean_square(np.mean(whitened**2, axis=1))
     if not power > 0:
         return None
-    determinant = 2 * differences.shape[1] * float(np.sum(np.log(factor[0])))
-    return determinant + num_seen * float(np.log(power)), power, bends, factor
+    unlikeliness = 2 * float(np.sum(np.log(factor[0]))) + len(whitened) * float(np.log(power))
+    return unlikeliness, power, bends, factor
+
+
+def _mean_square(squares: Array) -> float:
+    """Return the mean of squares (m,), each counting as no larger than a multiple of it."""
+    mean = float(np.mean(squares))
+    for _ in range(_NUM_SCALE_ROUNDS):
+        before, mean = mean, float(np.mean(np.minimum(squares, _MOST_STDDEVS**2 * mean)))
+        if mean > 0.999 * before:
+            break
+    return mean
 
 
 def _inverse_near_diagonal(factor: Array) -> Array:
