@@ -50,7 +50,8 @@ def database(room: Room) -> Path:
 
 @pytest.fixture(scope="module")
 def tree(database: Path) -> Path:
-    """Of the words that these photos have."""
+    """Of the words that these photos have, by the random projection of one seed whatever ran before in this process."""
+    pycolmap.set_random_seed(0)
     with pycolmap.Database.open(database) as opened:
         found = [opened.read_descriptors(id_).data for id_ in range(1, opened.num_images() + 1)]
     words = pycolmap.FeatureDescriptorsFloat()

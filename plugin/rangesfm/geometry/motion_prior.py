@@ -39,7 +39,7 @@ class MotionPrior:
         is_bridged: (n - 1,) gaps across which the motion goes on; the others part the path.
         power: of the white acceleration in each coordinate, unit^2 / s^3.
         noise_stddev: of each coordinate of a keyframe, beside the motion.
-        bends: (n, d) posterior mean of the acceleration at the keyframes; 0 at the ends of each part.
+        bends: (n, d) posterior mean of the acceleration at the keyframes; at the ends of each part as it goes on there.
         bend_covariance: (3, n) diagonal and the next two of the covariance of (n,) bends, over ``power``, as if the
             acceleration was piecewise linear; 0 at the ends of each part.
     """
@@ -117,6 +117,8 @@ def learn_motion(times_s: Array, values: Array, is_bridged: Mask) -> MotionPrior
             best = (*fit, ratio)
     assert best is not None, "without noise the covariance of second differences is diagonally dominant"
     _, power, bends, factor, ratio = best
+    if ratio == 0:
+        bends = _going_on(by_motion, np.diff(times_s), is_bridged, differences, bends)
     covariance = np.where(is_inner, _inverse_near_diagonal(factor), 0.0)
     covariance[1] *= np.append(is_inner[1:], False)
     covariance[2] *= np.append(is_inner[2:], [False, False])
@@ -180,6 +182,31 @@ def _fit(covariance: Array, differences: Array, is_inner: Mask) -> tuple[float, 
         return None
     unlikeliness = 2 * float(np.sum(np.log(factor[0]))) + len(whitened) * float(np.log(power))
     return unlikeliness, power, bends, factor
+
+
+def _going_on(by_motion: Array, gaps_s: Array, is_bridged: Mask, differences: Array, bends: Array) -> Array:
+    """Return bends (n, d) that do not end before the path does.
+
+    White noise knows no acceleration at an end, where the camera may well be turning as evenly as before. It is taken
+    to go on there as far as it does from one keyframe to the next elsewhere in the same part: the regression of each
+    on its neighbour, which is 0 or less if the acceleration is white.
+    """
+    is_inner = np.append(False, is_bridged) & np.append(is_bridged, False)
+    both = is_inner[:-1] & is_inner[1:]
+    part = np.append(0, np.cumsum(~is_bridged))[:-1]
+    squares = np.bincount(part, both * np.sum(bends[:-1] ** 2 + bends[1:] ** 2, axis=1) / 2)
+    products = np.bincount(part, both * np.sum(bends[:-1] * bends[1:], axis=1))
+    share = np.clip(products / np.where(squares > 0, squares, 1.0), 0.0, 1.0)[part]
+    is_first, is_last = both ^ is_inner[1:], both ^ is_inner[:-1]
+    covariance = by_motion.copy()
+    covariance[0, 1:] += np.where(is_first, share * gaps_s / 6, 0.0)
+    covariance[0, :-1] += np.where(is_last, share * gaps_s / 6, 0.0)
+    factor = cholesky_banded(covariance, lower=True, check_finite=False)
+    bends = np.asarray(cho_solve_banded((factor, True), differences, check_finite=False), dtype=np.float64)
+    ends = np.zeros_like(bends)
+    ends[:-1] += np.where(is_first, share, 0.0)[:, None] * bends[1:]
+    ends[1:] += np.where(is_last, share, 0.0)[:, None] * bends[:-1]
+    return bends + ends
 
 
 def _mean_square(squares: Array) -> float:
