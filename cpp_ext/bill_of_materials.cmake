@@ -1,26 +1,14 @@
 # What is compiled into the extension and lies in the package beside it, with versions and licences, as a CycloneDX
 # document in the wheel's metadata (PEP 770). Python packages that are only depended on are not in it.
 
-# What the lines of a header that define numbers say, joined by dots.
-function(rangesfm_version_in header names result)
-  set(numbers)
-  foreach(name IN LISTS names)
-    file(STRINGS ${header} line REGEX "^#define ${name} +[0-9]+" LIMIT_COUNT 1)
-    string(REGEX MATCH "[0-9]+$" number "${line}")
-    list(APPEND numbers ${number})
-  endforeach()
-  string(REPLACE ";" "." version "${numbers}")
-  set(${result} ${version} PARENT_SCOPE)
-endfunction()
-
+# Ceres' version is three numbers in a header.
 list(GET RANGESFM_CERES_INCLUDE_DIRS 0 ceres_headers)
-rangesfm_version_in(${ceres_headers}/ceres/version.h
-  "CERES_VERSION_MAJOR;CERES_VERSION_MINOR;CERES_VERSION_REVISION" CERES_HEADERS_VERSION)
-
-get_target_property(eigen_headers Eigen3::Eigen INTERFACE_INCLUDE_DIRECTORIES)
-list(GET eigen_headers 0 eigen_headers)
-rangesfm_version_in(${eigen_headers}/Eigen/src/Core/util/Macros.h
-  "EIGEN_WORLD_VERSION;EIGEN_MAJOR_VERSION;EIGEN_MINOR_VERSION" EIGEN_HEADERS_VERSION)
+foreach(name MAJOR MINOR REVISION)
+  file(STRINGS ${ceres_headers}/ceres/version.h line REGEX "^#define CERES_VERSION_${name} +[0-9]+" LIMIT_COUNT 1)
+  string(REGEX MATCH "[0-9]+$" number "${line}")
+  list(APPEND CERES_HEADERS_VERSION ${number})
+endforeach()
+list(JOIN CERES_HEADERS_VERSION "." CERES_HEADERS_VERSION)
 
 # What the first line of a bundled script says.
 function(rangesfm_version_of_script file name result)
@@ -42,7 +30,7 @@ function(rangesfm_component name version license purl description)
   set(COMPONENT_NAMES "${COMPONENT_NAMES}\"${name}\", " PARENT_SCOPE)
 endfunction()
 
-rangesfm_component(eigen "${EIGEN_HEADERS_VERSION}" MPL-2.0 generic "headers, compiled into the extension")
+rangesfm_component(eigen "${Eigen3_VERSION}" MPL-2.0 generic "headers, compiled into the extension")
 rangesfm_component(ceres-solver "${CERES_HEADERS_VERSION}" BSD-3-Clause generic
   "headers of its cost functions and manifolds, compiled into the extension")
 rangesfm_component(pybind11 "${pybind11_VERSION}" BSD-3-Clause pypi "headers, compiled into the extension")

@@ -1,6 +1,6 @@
 # The headers of Ceres and Eigen, downloaded: for machines without packages of them, as those that build the wheels.
 #
-# Gives the target Eigen3::Eigen and RANGESFM_CERES_INCLUDE_DIRS, as the packages would. Sources that are already there
+# Gives the target Eigen3::Eigen, Eigen3_VERSION and RANGESFM_CERES_INCLUDE_DIRS, as the packages would. Sources that are already there
 # are used instead with FETCHCONTENT_SOURCE_DIR_CERES and FETCHCONTENT_SOURCE_DIR_EIGEN.
 
 include(FetchContent)
@@ -13,8 +13,9 @@ FetchContent_Declare(ceres
   URL http://ceres-solver.org/ceres-solver-2.2.0.tar.gz
   URL_HASH SHA256=48b2302a7986ece172898477c3bcd6deb8fb5cf19b3327bc49969aad4cede82d
   SOURCE_SUBDIR headers_only)
+set(Eigen3_VERSION 3.4.0)
 FetchContent_Declare(eigen
-  URL https://gitlab.com/libeigen/eigen/-/archive/3.4.0/eigen-3.4.0.tar.gz
+  URL https://gitlab.com/libeigen/eigen/-/archive/${Eigen3_VERSION}/eigen-${Eigen3_VERSION}.tar.gz
   URL_HASH SHA256=8586084f71f9bde545ee7fa6d00288b264a2b7ac3607b974e54d13e7162c1c72
   SOURCE_SUBDIR headers_only)
 FetchContent_MakeAvailable(ceres eigen)

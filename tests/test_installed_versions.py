@@ -1,23 +1,25 @@
-"""Versions of pycolmap and pyceres other than those that the compiled part was made for."""
+"""Versions and builds of pycolmap and pyceres other than those that the compiled part was made for."""
 
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
 import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from tests.installed import with_installed
 
 import rangesfm
-from rangesfm import ceres, installed_versions
+from rangesfm import ceres
 from rangesfm.ceres import check_compatibility
 from rangesfm.cli import main
 from rangesfm.errors import SolverError
-from rangesfm.installed_versions import INSTALL_COMMAND, NEEDED_VERSIONS, check_versions, installed_version
+from rangesfm.installed_versions import check_versions, install_command, installed_builds, is_version
 
+REMEDY = "python -m pip install 'pycolmap>=4.2,<4.3' 'pyceres>=2.6,<2.7'"
+CUDA_REMEDY = REMEDY.replace("pycolmap", "pycolmap-cuda12")
 OTHER_VERSIONS = [("pycolmap", "4.3.0"), ("pycolmap", "4.1.1"), ("pyceres", "2.5"), ("pyceres", None)]
 
 
@@ -25,14 +27,12 @@ OTHER_VERSIONS = [("pycolmap", "4.3.0"), ("pycolmap", "4.1.1"), ("pyceres", "2.5
 def complaint(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """What is said of a package in another version than needed, in a process that has not looked yet."""
     package, version = request.param
-    monkeypatch.setattr(
-        installed_versions, "installed_version", lambda name: version if name == package else installed_version(name)
-    )
+    with_installed(monkeypatch, pycolmap_cuda12=None, **{package: version})
     for check in (check_versions, check_compatibility):
         check.cache_clear()
     yield (
-        f"{package} {version or 'is not'} installed, rangesfm needs {package} {NEEDED_VERSIONS[package]}; "
-        f"run: {INSTALL_COMMAND}"
+        f"{package} {version or 'is not'} installed, rangesfm {rangesfm.__version__} is built for pycolmap 4.2 and"
+        f" pyceres 2.6; run: {REMEDY}"
     )
     for check in (check_versions, check_compatibility):
         check.cache_clear()
@@ -66,11 +66,36 @@ def test_functions_refuse_too_and_say_so_with_an_error_of_the_package(
         rangesfm.read_ranges  # noqa: B018
 
 
-def test_the_pins_checked_are_the_pins_of_the_package() -> None:
-    requirements = importlib.metadata.requires("rangesfm")
-    assert requirements is not None
-    for package, needed in NEEDED_VERSIONS.items():
-        major, minor = map(int, needed.split("."))
-        (requirement,) = (r for r in requirements if re.match(rf"{package}\b", r))
-        assert set(re.findall(r"[<>=]+[\d.]+", requirement)) == {f">={needed}", f"<{major}.{minor + 1}"}
-        assert f"'{package}>={needed},<{major}.{minor + 1}'" in INSTALL_COMMAND
+@pytest.fixture
+def unchecked() -> Iterator[None]:
+    """Nothing is known here of versions from before, and nothing will be from here."""
+    check_versions.cache_clear()
+    yield
+    check_versions.cache_clear()
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_the_build_with_cuda_is_as_good_as_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    with_installed(monkeypatch, pycolmap=None, pycolmap_cuda12="4.2.1")
+    check_versions()
+    assert installed_builds("pycolmap") == {"pycolmap-cuda12": "4.2.1"}
+    assert install_command() == CUDA_REMEDY
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("other", [None, "4.2.1"])
+def test_another_version_of_the_build_with_cuda_is_refused_by_its_name(
+    other: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_installed(monkeypatch, pycolmap=other, pycolmap_cuda12="4.3.0")
+    with pytest.raises(SolverError, match=r"^pycolmap-cuda12 4\.3\.0 installed, rangesfm .* pycolmap 4\.2 ") as caught:
+        check_versions()
+    assert str(caught.value).endswith(f"run: {CUDA_REMEDY}")
+
+
+@pytest.mark.parametrize(
+    ("found", "needed", "fits"),
+    [("4.2.1", "4.2", True), ("4.2", "4.2", True), ("4.20", "4.2", False), ("4", "4.2", False), ("5.0.1", "5.0", True)],
+)
+def test_a_version_fits_by_whole_numbers(found: str, needed: str, fits: bool) -> None:
+    assert is_version(found, needed) == fits

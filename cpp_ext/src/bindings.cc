@@ -6,6 +6,7 @@
 
 #include <ceres/cost_function.h>
 #include <ceres/manifold.h>
+#include <ceres/version.h>
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
@@ -218,6 +219,7 @@ PYBIND11_MODULE(_cpp, m) {
   m.doc() = "Cost functions of rangesfm; its package rangesfm.ceres is the door to them.";
   m.attr("pybind11_version") = PYBIND11_TOSTRING(PYBIND11_VERSION_MAJOR) "." PYBIND11_TOSTRING(
       PYBIND11_VERSION_MINOR) "." PYBIND11_TOSTRING(PYBIND11_VERSION_PATCH);
+  m.attr("ceres_version") = CERES_VERSION_STRING;
   m.attr("pybind11_internals_version") = PYBIND11_INTERNALS_VERSION;
 
   m.def("range_cost", &rangesfm::MakeRangeCost, kOwn, rangesfm::kRangeCostDoc, py::kw_only(), arg("range_m"),

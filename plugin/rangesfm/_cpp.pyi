@@ -58,5 +58,6 @@ def zero_tie_cost(
     *, size_a: typing.SupportsInt | typing.SupportsIndex, size_b: typing.SupportsInt | typing.SupportsIndex
 ) -> pyceres.CostFunction: ...
 
+ceres_version: str
 pybind11_internals_version: int
 pybind11_version: str

@@ -6,7 +6,6 @@ import functools
 import math
 import os
 import platform
-import sys
 from dataclasses import dataclass
 from typing import cast
 
@@ -14,15 +13,19 @@ import numpy as np
 
 from rangesfm.errors import SolverError
 from rangesfm.installed_versions import (
-    INSTALL_COMMAND,
+    CERES,
+    CERES_HEADERS,
     NEEDED_VERSIONS,
+    OTHER_BUILDS,
+    PYTHONS,
     check_versions,
-    installed_version,
+    install_command,
+    installed_builds,
+    is_version,
     needed_packages,
+    num_gpus,
 )
 
-MIN_PYTHON = (3, 10)
-MAX_PYTHON = (3, 13)
 _KNOWN_COST = 2.0
 
 
@@ -47,10 +50,7 @@ class Check:
 
 def diagnose() -> list[Check]:
     """Look at everything a run depends on. Nothing is raised or printed: what fails is in the list."""
-    checks = [_check_python(), _check_package("rangesfm", "", "python -m pip install rangesfm")]
-    for package in needed_packages():
-        command = INSTALL_COMMAND if package in NEEDED_VERSIONS else f"python -m pip install {package}"
-        checks.append(_check_package(package, NEEDED_VERSIONS.get(package, ""), command))
+    checks = [_check_python(), _check_package("rangesfm"), *map(_check_package, needed_packages())]
     checks.append(_check_compiled_part())
     # The rest asks pycolmap and pyceres themselves.
     if all(check.ok for check in checks):
@@ -62,24 +62,35 @@ def versions() -> dict[str, str]:
     """Versions that a result depends on, for the record; "not installed" where one is missing."""
     return {
         "python": platform.python_version(),
-        **{package: installed_version(package) or "not installed" for package in ("rangesfm", *needed_packages())},
+        **{package: _found(package) for package in ("rangesfm", *needed_packages())},
         "compiled_part": compiled_part_version(),
         "platform": platform.platform(),
     }
 
 
+def _found(package: str) -> str:
+    """The installed version in words, with the name of the build where it is another one."""
+    builds = installed_builds(package)
+    said = [version if name == package else f"{version} ({name})" for name, version in builds.items()]
+    return " and ".join(said) or "not installed"
+
+
 def _check_python() -> Check:
-    ok = MIN_PYTHON <= sys.version_info[:2] <= MAX_PYTHON
-    expected = f"{'.'.join(map(str, MIN_PYTHON))} to {'.'.join(map(str, MAX_PYTHON))}"
+    ok = any(is_version(platform.python_version(), python) for python in PYTHONS)
+    expected = f"{PYTHONS[0]} to {PYTHONS[-1]}"
     return Check("Python", platform.python_version(), expected, ok, "" if ok else f"use Python {expected}")
 
 
-def _check_package(package: str, needed: str, command: str) -> Check:
-    """Whether a package is there in a version that begins as needed ("4.2"; "" for any)."""
-    found = installed_version(package)
-    numbers = needed.split(".") if needed else []
-    ok = found is not None and found.split(".")[: len(numbers)] == numbers
-    return Check(package, found or "not installed", needed or "any", ok, "" if ok else f"run: {command}")
+def _check_package(package: str) -> Check:
+    """Whether a package is there, once, and in the version needed."""
+    needed, builds = NEEDED_VERSIONS.get(package), installed_builds(package)
+    expected, remedy = needed or "any", ""
+    if not builds or not all(needed is None or is_version(version, needed) for version in builds.values()):
+        remedy = f"run: {install_command() if needed else f'python -m pip install {package}'}"
+    elif len(builds) > 1:  # the files of one lie over those of the other
+        expected = f"one of {' and '.join(builds)}, as both are the module {package}"
+        remedy = f"run: python -m pip uninstall -y {' '.join(builds)}, then {install_command()}"
+    return Check(package, _found(package), expected, not remedy, remedy)
 
 
 def _check_compiled_part() -> Check:
@@ -93,13 +104,9 @@ def _check_compiled_part() -> Check:
 
 
 def _check_ceres() -> Check:
-    import pyceres
-    import pycolmap
-
-    of_pycolmap, of_pyceres = pycolmap.__ceres_version__, pyceres.__ceres_version__
-    ok = of_pycolmap == of_pyceres
-    found = f"{of_pycolmap} in pycolmap, {of_pyceres} in pyceres"
-    return Check("Ceres", found, "the same in both", ok, "" if ok else f"run: {INSTALL_COMMAND}")
+    # The compiled part has passed with them: what does not fit is in its own check.
+    found = ", ".join(f"{version} in {where}" for where, version in _ceres_versions().items())
+    return Check("Ceres", found, f"{CERES} in both", ok=True)
 
 
 def _check_threads() -> Check:
@@ -110,9 +117,14 @@ def _check_threads() -> Check:
 
 
 def _check_cuda() -> Check:
-    import pycolmap
-
-    found = "pycolmap has it" if pycolmap.has_cuda else "pycolmap has none: features and matching on the processor"
+    num = num_gpus()
+    if num is None:
+        others = " or ".join(OTHER_BUILDS["pycolmap"])
+        found = f"pycolmap has none (that would be {others}): the processor is used"
+    elif num == 0:
+        found = "pycolmap has it, and there is no GPU: the processor is used"
+    else:
+        found = f"pycolmap has it, and there {'is 1 GPU' if num == 1 else f'are {num} GPUs'} for features and matching"
     return Check("CUDA", found, "not needed", ok=True)
 
 
@@ -125,6 +137,7 @@ def check_compatibility() -> None:
     """
     check_versions()
     try:
+        _compare_ceres_versions()
         costs = _costs_of_known_residual()
     except ImportError as error:
         raise _incompatible(str(error)) from error
@@ -133,6 +146,30 @@ def check_compatibility() -> None:
     for where, cost in costs.items():
         if not math.isclose(cost, _KNOWN_COST):
             raise _incompatible(f"a residual of cost {_KNOWN_COST} costs {cost} {where}")
+
+
+def _ceres_versions() -> dict[str, str]:
+    """The versions of Ceres that meet here, by where they are."""
+    import pyceres
+    import pycolmap
+
+    from rangesfm import _cpp
+
+    return {
+        "pycolmap": pycolmap.__ceres_version__,
+        "pyceres": pyceres.__ceres_version__,
+        "the compiled part's headers": _cpp.ceres_version,
+    }
+
+
+def _compare_ceres_versions() -> None:
+    """Raises SolverError for objects of a Ceres other than those that are known to be the same in memory."""
+    found = _ceres_versions()
+    *libraries, headers = found.values()
+    fits = all(is_version(version, CERES) for version in libraries) and len(set(libraries)) == 1
+    if not fits or not any(is_version(headers, known) for known in CERES_HEADERS):
+        met = ", ".join(f"Ceres {version} in {where}" for where, version in found.items())
+        raise _incompatible(f"{met}; expected {CERES} in the packages, headers of {' or '.join(CERES_HEADERS)}")
 
 
 def _costs_of_known_residual() -> dict[str, float]:
@@ -171,12 +208,13 @@ def compiled_part_version() -> str:
         from rangesfm import _cpp
     except ImportError:
         return "not there"
-    return f"built with pybind11 {_cpp.pybind11_version} (internals {_cpp.pybind11_internals_version})"
+    with_pybind11 = f"pybind11 {_cpp.pybind11_version} (internals {_cpp.pybind11_internals_version})"
+    return f"built with {with_pybind11} and headers of Ceres {_cpp.ceres_version}"
 
 
 def _incompatible(problem: str) -> SolverError:
-    found = ", ".join(f"{package} {installed_version(package) or 'not'}" for package in NEEDED_VERSIONS)
+    found = ", ".join(f"{package} {_found(package)}" for package in NEEDED_VERSIONS)
     return SolverError(
         f"the compiled part does not fit the installed packages: {problem}; installed: {found}, "
-        f"rangesfm {compiled_part_version()}; run: {INSTALL_COMMAND}, then install rangesfm anew"
+        f"rangesfm {compiled_part_version()}; run: {install_command()}, then install rangesfm anew"
     )
