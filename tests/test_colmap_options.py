@@ -31,6 +31,7 @@ from rangesfm.vision.photos import Photos
 from rangesfm.vision.rigs import NO_RIGS
 
 SEED = 3
+ON_PROCESSOR = {"use_gpu": False} if pycolmap.has_cuda else {}  # COLMAP's own choice where it has no CUDA
 KNOWN_CAMERA = CameraOptions(model="SIMPLE_PINHOLE", params=(240.0, 128.0, 96.0))
 
 
@@ -49,15 +50,15 @@ def _changes(found: dict[str, Any], default: dict[str, Any]) -> Iterator[tuple[s
 
 
 def test_features_are_found_as_colmap_finds_them() -> None:
-    assert changes(feature_options(MapperOptions())) == {}
+    assert changes(feature_options(MapperOptions(device="cpu"))) == ON_PROCESSOR
 
 
 @pytest.mark.parametrize(
     ("mapper", "num_photos", "pairing"),
     [
-        (MapperOptions(), 60, pycolmap.ExhaustivePairingOptions),
-        (MapperOptions(), 61, pycolmap.SequentialPairingOptions),
-        (MapperOptions(matching="spatial"), 9, pycolmap.SpatialPairingOptions),
+        (MapperOptions(device="cpu"), 60, pycolmap.ExhaustivePairingOptions),
+        (MapperOptions(device="cpu"), 61, pycolmap.SequentialPairingOptions),
+        (MapperOptions(device="cpu", matching="spatial"), 9, pycolmap.SpatialPairingOptions),
     ],
     ids=["all", "neighbours", "near ones"],
 )
@@ -65,7 +66,7 @@ def test_photos_are_matched_as_colmap_matches_them(mapper: MapperOptions, num_ph
     options = matching_options(mapper, num_photos, SEED)
     assert isinstance(options.pairing, pairing)
     assert changes(options.pairing) == {}
-    assert changes(options.matcher) == ({} if pycolmap.has_cuda else {"num_threads": 1})
+    assert changes(options.matcher) == ON_PROCESSOR | {"num_threads": 1}
     assert changes(options.verification) == {"ransac.random_seed": SEED}
 
 
@@ -82,6 +83,11 @@ AS_GIVEN = {
     "ba_refine_extra_params": False,
     "mapper.abs_pose_refine_focal_length": False,
     "mapper.abs_pose_refine_extra_params": False,
+}
+GLOBALLY = {
+    "random_seed": SEED,
+    "mapper.global_positioning.use_gpu": False,
+    "mapper.bundle_adjustment.ceres.use_gpu": False,
 }
 GLOBALLY_AS_GIVEN = {
     "mapper.bundle_adjustment.refine_focal_length": False,
@@ -107,14 +113,14 @@ def database_of(path: Path, *sizes: tuple[int, int]) -> Path:
     ("method", "from_the_start", "as_given"),
     [
         ("incremental", SEEDS, AS_GIVEN),
-        ("global", {"random_seed": SEED}, GLOBALLY_AS_GIVEN),
+        ("global", GLOBALLY, GLOBALLY_AS_GIVEN),
         ("hierarchical", of_clusters(SEEDS), of_clusters(AS_GIVEN)),
     ],
 )
 def test_models_are_mapped_as_colmap_maps_them(
     method: str, from_the_start: dict[str, Any], as_given: dict[str, Any], tmp_path: Path
 ) -> None:
-    mapper, threads = MapperOptions(num_threads=3).changed(method=method), {"num_threads": 3}
+    mapper, threads = MapperOptions(device="cpu", num_threads=3).changed(method=method), {"num_threads": 3}
     database = database_of(tmp_path / "database.db", (256, 192))
     assert changes(pipeline_options(CameraOptions(), mapper, SEED)) == threads | from_the_start
     kept = mapping_options(KNOWN_CAMERA.changed(refine_intrinsics=False), mapper, NO_RIGS, SEED, database)
@@ -168,9 +174,9 @@ def test_a_camera_is_guessed_as_colmap_guesses_it(monkeypatch: pytest.MonkeyPatc
 def test_shares_of_pairs_are_matched_as_colmap_matches_pairs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     handed: list[Any] = []
     monkeypatch.setattr(pycolmap, "match_image_pairs", lambda _, *options, **__: handed.extend(options))
-    share = MatchingShare(tmp_path, [(1, 2)], "matcher", "verification")  # type: ignore[arg-type]
-    share.run(SilentProgress())
-    assert (handed[0], handed[2]) == ("matcher", "verification")
+    matcher, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+    MatchingShare(tmp_path, [(1, 2)], matcher, verification).run(SilentProgress())
+    assert (handed[0], handed[2]) == (matcher, verification)
     # As many photos at once as go by the features of each: of a database without any, one.
     assert changes(handed[1]) == {"match_list_path": tmp_path / "pairs.txt", "block_size": 1}
 

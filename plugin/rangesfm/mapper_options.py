@@ -33,6 +33,8 @@ class MapperOptions(Options, table="mapper"):
     database_path: Annotated[Path | None, Told(metavar="DB", role="file")] = None
     """Database of COLMAP's or hloc's, which is copied: its features, matches and (where [camera] says neither model nor
     params) cameras are used, and only what it lacks is computed; photos that it does not know are left out."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """What computes features and matches: the processor, or a GPU by CUDA; auto: a GPU if pycolmap finds one."""
     features: dict[str, Any] = Field(default_factory=dict)
     """Passed through to pycolmap's FeatureExtractionOptions."""
     pairing: dict[str, Any] = Field(default_factory=dict)

@@ -15,6 +15,7 @@ from rangesfm.options import MapperOptions
 from rangesfm.processes.supervision import run_children
 from rangesfm.progress import Progress
 from rangesfm.vision.database import num_photos_with_features
+from rangesfm.vision.device import refuse_missing_gpu, uses_gpu
 from rangesfm.vision.own_process import MODULE, FeatureExtraction
 from rangesfm.vision.photos import MIN_NUM_PHOTOS, Photos
 
@@ -22,10 +23,11 @@ _MIN_NUM_FEATURES = 50  # COLMAP starts from pairs with 100 matches and adds pho
 
 
 def feature_options(mapper: MapperOptions) -> pycolmap.FeatureExtractionOptions:
-    """Raises InputError for keys or values that are not COLMAP's."""
-    options = pycolmap.FeatureExtractionOptions(num_threads=mapper.num_threads)
+    """Raises InputError for keys or values that are not COLMAP's, or for a GPU that is not there."""
+    options = pycolmap.FeatureExtractionOptions(num_threads=mapper.num_threads, use_gpu=uses_gpu(mapper))
     apply_options(options, mapper.features, "mapper.features")
     refuse_learned(options.type.name, "mapper.features")
+    refuse_missing_gpu(options.use_gpu, "mapper.features")
     return options
 
 

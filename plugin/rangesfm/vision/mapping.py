@@ -21,6 +21,7 @@ from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.processes.supervision import run_children
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import num_matching_pairs
+from rangesfm.vision.device import uses_gpu
 from rangesfm.vision.mapping_loop import GlobalAdjustment, adjust_whole, incremental_mapping
 from rangesfm.vision.own_process import MODULE, WholeMapping, WholePipelineOptions
 from rangesfm.vision.photos import Photos
@@ -56,8 +57,9 @@ def pipeline_options(camera: CameraOptions, mapper: MapperOptions, seed: int) ->
     options: PipelineOptions
     if mapper.method == "global":
         options = pycolmap.GlobalPipelineOptions(num_threads=mapper.num_threads, random_seed=seed)
+        positioning, adjustment = options.mapper.global_positioning, options.mapper.bundle_adjustment
+        positioning.use_gpu = adjustment.ceres.use_gpu = uses_gpu(mapper)
         if any(table.intrinsics_in_mapping == "kept" for table in camera.tables):
-            adjustment = options.mapper.bundle_adjustment
             adjustment.refine_focal_length = adjustment.refine_extra_params = False
     elif mapper.method == "hierarchical":
         # Each cluster is mapped by one thread: with several the search for an initial pair is a race. COLMAP 4.2 hands

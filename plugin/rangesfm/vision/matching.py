@@ -22,6 +22,7 @@ from rangesfm.processes.supervision import run_children
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import num_matching_pairs
+from rangesfm.vision.device import refuse_missing_gpu, uses_gpu
 from rangesfm.vision.features import refuse_learned
 from rangesfm.vision.own_process import MODULE, MatchingShare
 from rangesfm.vision.pairs import NamedPairs, Pairing, pairing_options, pairs_to_match
@@ -71,18 +72,20 @@ class MatchingOptions:
 
 
 def matching_options(mapper: MapperOptions, num_photos: int, seed: int) -> MatchingOptions:
-    """Raises InputError for keys or values that are not COLMAP's."""
-    num_threads = mapper.num_threads if pycolmap.has_cuda else _NUM_CPU_THREADS
+    """Raises InputError for keys or values that are not COLMAP's, or for a GPU that is not there."""
+    on_gpu = uses_gpu(mapper)
+    num_threads = mapper.num_threads if on_gpu else _NUM_CPU_THREADS
     options = MatchingOptions(
         pairing=pairing_options(mapper, num_photos),
-        matcher=pycolmap.FeatureMatchingOptions(num_threads=num_threads),
+        matcher=pycolmap.FeatureMatchingOptions(num_threads=num_threads, use_gpu=on_gpu),
         verification=pycolmap.TwoViewGeometryOptions(),
-        num_processes=1 if pycolmap.has_cuda else mapper.num_cores,
+        num_processes=1 if on_gpu else mapper.num_cores,
     )
     # Within COLMAP's own: what it asks of two views is not what its RANSAC asks by itself.
     options.verification.ransac.random_seed = seed
     apply_options(options.matcher, mapper.matcher, "mapper.matcher")
     refuse_learned(options.matcher.type.name, "mapper.matcher")
+    refuse_missing_gpu(options.matcher.use_gpu, "mapper.matcher")
     return options
 
 

@@ -19,6 +19,7 @@ from rangesfm.processes.supervision import MessagesToParent, work_for_parent
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import copy_matches, copy_photos
+from rangesfm.vision.device import device_of
 
 MODULE = "rangesfm.vision.own_process"
 WholePipelineOptions = pycolmap.GlobalPipelineOptions | pycolmap.HierarchicalPipelineOptions
@@ -49,6 +50,7 @@ class FeatureExtraction:
                 image_names=list(self.image_names),
                 reader_options=reader,
                 extraction_options=self.options,
+                device=device_of(self.options),
             )
         return len(self.image_names)
 
@@ -85,7 +87,12 @@ class MatchingShare:
             pairing.block_size = max(1, _MAX_NUM_FEATURES * database.num_images() // (1 + database.num_descriptors()))
             run_in_background(
                 lambda token: pycolmap.match_image_pairs(
-                    self.database, self.matcher, pairing, self.verification, cancellation_token=token
+                    self.database,
+                    self.matcher,
+                    pairing,
+                    self.verification,
+                    device=device_of(self.matcher),
+                    cancellation_token=token,
                 ),
                 progress,
                 database.num_verified_image_pairs,

@@ -190,6 +190,8 @@ def match_photos(
     check_camera(camera)
     for_features = feature_options(mapper)
     for_matching = matching_options(mapper, len(image_names), seed)
+    if for_features.use_gpu:
+        space.progress.message("features and matching: on the GPU")
     photos = usable_photos(image_path, image_names)
     cameras = cameras_of_photos(camera, photos, rigs)
     masks = contents_of_masks(mapper.mask_path, photos)

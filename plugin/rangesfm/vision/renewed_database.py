@@ -67,7 +67,8 @@ class RenewedDatabase:
     def feature_inputs(self) -> str:
         """Fingerprint of what features depend on beside the photo itself."""
         sources = [self.mapper.features, *([self.masks] if self.masks else [])]
-        return fingerprint(pycolmap.__version__, *(sources if self.given is None else self.given.inputs))
+        on_gpu = ["GPU"] if self.features.use_gpu else []  # which finds other features, and matches them otherwise
+        return fingerprint(pycolmap.__version__, *(sources if self.given is None else self.given.inputs), *on_gpu)
 
     @property
     def has_matches(self) -> bool:
