@@ -68,6 +68,7 @@ def test_photos_are_matched_as_colmap_matches_them(mapper: MapperOptions, num_ph
     assert changes(options.pairing) == {}
     assert changes(options.matcher) == ON_PROCESSOR | {"num_threads": 1}
     assert changes(options.verification) == {"ransac.random_seed": SEED}
+    assert changes(options.verifier) == {}
 
 
 @pytest.mark.parametrize("matching", ["vocabtree", "sequential"])
@@ -215,6 +216,7 @@ def test_no_other_options_of_colmaps_are_made_and_none_inside_of_others() -> Non
         "ExhaustivePairingOptions",
         "FeatureExtractionOptions",
         "FeatureMatchingOptions",
+        "GeometricVerifierOptions",
         "GlobalPipelineOptions",
         "HierarchicalPipelineOptions",
         "ImageReaderOptions",

@@ -26,7 +26,7 @@ def test_this_installation_is_well() -> None:
 def test_everything_a_run_depends_on_is_looked_at() -> None:
     assert [check.name for check in diagnose()] == [
         *("Python", "rangesfm", "pycolmap", "pyceres", "numpy", "scipy", "Pillow", "pydantic", "filelock", "psutil"),
-        *("rich", "Jinja2", "ruamel.yaml", "vl-convert-python"),
+        *("rich", "threadpoolctl", "Jinja2", "ruamel.yaml", "vl-convert-python"),
         *("compiled part", "Ceres", "threads", "CUDA"),
     ]
 

@@ -2,18 +2,40 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
+import scipy.linalg
+from threadpoolctl import threadpool_info, threadpool_limits
 
-from rangesfm.processes.threads import both, num_threads, settle_num_threads, side_by_side
+import rangesfm
+from rangesfm.processes.threads import (
+    at_most,
+    both,
+    num_threads,
+    settle_num_threads,
+    side_by_side,
+    with_one_blas_thread,
+)
 
 if TYPE_CHECKING:
     from tests.conftest import Command
+
+# What only reads, writes, rearranges or holds something, or solves for four unknowns at most.
+COMPUTES_NOTHING = {
+    *("Anchor", "GeometryError", "InputError", "PlannedSurvey", "RangeLog", "RangesfmError", "ReconstructionError"),
+    *("Similarity", "SolverError", "Survey", "Trajectory", "export_model", "export_result", "find_image_times"),
+    *("read_anchors", "read_image_times_csv", "read_plan", "read_ranges", "read_reference", "read_survey"),
+    *("reconstruct", "rescale", "select_keyframes", "tag_positions", "trajectory_from_reconstruction"),
+    *("two_candidate", "write_report"),
+}
 
 
 @pytest.mark.parametrize("asked", ["1", "3"])
@@ -87,3 +109,57 @@ def test_what_is_no_number_of_threads_is_refused(given: str, rangesfm_process: C
         done = rangesfm_process("scale", cwd=Path.cwd(), status=2)
     said = f"rangesfm: error: the environment's OMP_NUM_THREADS is '{given}', expected a number of threads\n"
     assert done.stderr == said
+
+
+def test_no_more_threads_than_are_allowed_inside_a_block_however_they_are_nested(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("os.cpu_count", lambda: 8)
+    monkeypatch.setenv("OMP_NUM_THREADS", "6")
+    with at_most(4):
+        assert num_threads() == 4
+        with at_most(-1), at_most(9):
+            assert num_threads() == 4
+        with at_most(1):
+            here = threading.get_ident()
+            assert both(threading.get_ident, threading.get_ident) == (here, here)
+        assert num_threads() == 4
+    with pytest.raises(ZeroDivisionError), at_most(2):
+        1 / 0  # noqa: B018
+    assert num_threads() == 6
+
+
+@pytest.fixture
+def two_blas_threads() -> Iterator[None]:
+    """What numpy and scipy take by themselves where there are two cores."""
+    assert scipy.linalg.norm(np.eye(2)) > 0  # loaded
+    with threadpool_limits(limits=2, user_api="blas"):
+        yield
+
+
+def blas_threads() -> set[int]:
+    return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+
+@pytest.mark.usefixtures("two_blas_threads")
+def test_what_computes_takes_one_blas_thread_and_leaves_as_many_as_there_were() -> None:
+    @with_one_blas_thread
+    def compute(depth: int) -> set[int]:
+        return blas_threads() | (compute(depth - 1) if depth else set())
+
+    @with_one_blas_thread
+    def fail() -> None:
+        raise ZeroDivisionError
+
+    assert blas_threads() == {2}
+    assert compute(2) == {1}
+    assert blas_threads() == {2}
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert blas_threads() == {2}
+
+
+def test_every_public_function_that_computes_takes_one_blas_thread() -> None:
+    bounded = {name for name in rangesfm.__all__[1:] if hasattr(getattr(rangesfm, name), "__wrapped__")}
+    assert bounded == set(rangesfm.__all__[1:]) - COMPUTES_NOTHING
+    assert all(inspect.getdoc(getattr(rangesfm, name)) for name in bounded)

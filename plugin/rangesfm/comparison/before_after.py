@@ -15,6 +15,7 @@ from rangesfm.errors import InputError
 from rangesfm.files.tables import align_rows
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.result.entries import ComparisonRow, median, rms
 from rangesfm.result.folder import ResultFolder, read_result_folder
 from rangesfm.result.model_path import path_of_model
@@ -55,6 +56,7 @@ class ModelComparison:
         )
 
 
+@with_one_blas_thread
 def compare_models(
     before: pycolmap.Reconstruction | Trajectory,
     after: pycolmap.Reconstruction | Trajectory,

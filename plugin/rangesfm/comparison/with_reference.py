@@ -14,12 +14,14 @@ from rangesfm.files.tables import align_rows
 from rangesfm.geometry.reference import Reference
 from rangesfm.geometry.similarity import Similarity, align_points, rmse, similarity_between
 from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.result.entries import ComparisonRow
 
 MIN_NUM_ALIGNED = 3
 """Poses from which an alignment says something: two points always fit after Sim(3)."""
 
 
+@with_one_blas_thread
 def compare(
     paths: Mapping[str, Trajectory], reference: Reference, *, frame: str | None = "site"
 ) -> tuple[ComparisonRow, ...]:

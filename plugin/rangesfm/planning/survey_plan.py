@@ -12,6 +12,7 @@ import numpy as np
 from rangesfm.planning.advice import Advice, advise, ranked
 from rangesfm.planning.expected import OPEN, Expected, expect
 from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.errors.components import component_words
 from rangesfm.trust.catalogue import STANDING
 from rangesfm.trust.linearized import linearized, ranges_on_map
@@ -101,6 +102,7 @@ class SurveyPlan:
         }
 
 
+@with_one_blas_thread
 def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
     """What a survey will know, by the formulas of a run at the true map, and which change would gain most.
 

@@ -14,6 +14,7 @@ from rangesfm.geometry.motion_prior import learn_motion
 from rangesfm.geometry.reference import Reference
 from rangesfm.geometry.trajectory import ROUNDING_S, Trajectory
 from rangesfm.options import AssociationOptions
+from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.errors.noise import robust_stddev
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
@@ -24,6 +25,7 @@ _MAX_STILL_DRIFT_STDDEVS = 2.0
 _SAME_TIME_S = 1e-4
 
 
+@with_one_blas_thread
 def associate(
     log: RangeLog,
     trajectory: Trajectory,

@@ -21,6 +21,7 @@ from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import CameraOptions, RefineOptions
+from rangesfm.processes.threads import at_most, with_one_blas_thread
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors, misfits
 from rangesfm.ranging.errors.robust_loss import RobustLoss
@@ -91,6 +92,7 @@ class RefineSummary:
     weights: Array
 
 
+@with_one_blas_thread
 def refine_with_ranges(
     reconstruction: pycolmap.Reconstruction,
     trajectory: Trajectory,
@@ -152,7 +154,8 @@ def refine_with_ranges(
         None if first_pose_is_fixed else gravity,
         num_threads,
     )
-    summary = _refine(problem, _errors_to_begin_with(problem, errors, metric_from_sfm.scale))
+    with at_most(num_threads):
+        summary = _refine(problem, _errors_to_begin_with(problem, errors, metric_from_sfm.scale))
     remove_marker_points(metric, marker_ids)
     return metric, summary
 

@@ -14,7 +14,7 @@ from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import RangeModelOptions, ScaleOptions
-from rangesfm.processes.threads import both
+from rangesfm.processes.threads import both, with_one_blas_thread
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.range_errors import RangeErrors
@@ -31,6 +31,7 @@ from rangesfm.scale.uncertainty import learned_errors, parameter_covariance, sca
 from rangesfm.scale.verdict import judge, judge_lengths, levelled_places
 
 
+@with_one_blas_thread
 def initialize_scale(
     observations: RangeObservations,
     trajectory: Trajectory,

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rangesfm.arrays import Indices
+from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.scale.verdict import DOUBTFUL_ABOVE
 from rangesfm.trust.linearized import Linearized, RangesOnMap, linearized, near_m
 from rangesfm.trust.mistakes import Cause, Findings, find_mistakes
@@ -50,6 +51,7 @@ class TrustVerdict:
         return replace(self, tests=tests, reasons=(*self.reasons, *more.reasons))
 
 
+@with_one_blas_thread
 def trust_in(on_map: RangesOnMap, *, seed: int = 0) -> TrustVerdict:
     """Test all that may be wrong with the ranges on a map."""
     found = find_mistakes(on_map, seed=seed)

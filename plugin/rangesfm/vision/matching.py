@@ -44,12 +44,14 @@ class MatchingOptions:
 
     Attributes:
         pairing: says which pairs.
+        verifier: of matches that are given.
         num_processes: that match at once.
     """
 
     pairing: Pairing | NamedPairs
     matcher: pycolmap.FeatureMatchingOptions
     verification: pycolmap.TwoViewGeometryOptions
+    verifier: pycolmap.GeometricVerifierOptions
     num_processes: int
 
     @property
@@ -79,6 +81,7 @@ def matching_options(mapper: MapperOptions, num_photos: int, seed: int) -> Match
         pairing=pairing_options(mapper, num_photos),
         matcher=pycolmap.FeatureMatchingOptions(num_threads=num_threads, use_gpu=on_gpu),
         verification=pycolmap.TwoViewGeometryOptions(),
+        verifier=pycolmap.GeometricVerifierOptions(num_threads=mapper.num_threads),
         num_processes=1 if on_gpu else mapper.num_cores,
     )
     # Within COLMAP's own: what it asks of two views is not what its RANSAC asks by itself.
@@ -123,7 +126,10 @@ def verify_matches(database_path: Path, photos: Photos, options: MatchingOptions
         if database.num_verified_image_pairs() < num_pairs:
             run_in_background(
                 lambda token: pycolmap.geometric_verification(
-                    database_path, two_view_geometry_options=options.verification, cancellation_token=token
+                    database_path,
+                    options.verifier,
+                    two_view_geometry_options=options.verification,
+                    cancellation_token=token,
                 ),
                 progress,
                 database.num_verified_image_pairs,

@@ -17,6 +17,7 @@ from rangesfm.files.atomic import require_apart, sole_writer
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, is_one_after_the_other
 from rangesfm.join.models import PathOfModel
+from rangesfm.processes.threads import at_most, with_one_blas_thread
 from rangesfm.progress import Journal, Progress
 from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame, read_anchors
 from rangesfm.ranging.anchors.site import local_site
@@ -222,6 +223,7 @@ def paths_of_surveys(
     return paths
 
 
+@with_one_blas_thread
 def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress) -> RunResult:
     """One map of several surveys, from what their runs left.
 
@@ -252,7 +254,7 @@ def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress)
             "tag.lever_arms_m": {tag_id: tuple(arm.tolist()) for tag_id, arm in arms.items()},
         }
     )
-    with sole_writer(survey.output.path):
+    with sole_writer(survey.output.path), at_most(survey.mapper.num_threads):
         paths = paths_of_surveys(finished, log, number, is_check, tags_in_cam_m)
         return map_in_metres(as_joined, inputs, paths, None, journal, refine=survey.refine.enabled, must_join=True)
 

@@ -16,6 +16,7 @@ from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import sole_writer
 from rangesfm.join.models import PathOfModel
+from rangesfm.processes.threads import at_most, with_one_blas_thread
 from rangesfm.progress import Journal, Progress
 from rangesfm.ranging.clock.estimate import TimeOffset
 from rangesfm.result.folder import refuse_to_overwrite, result_names
@@ -57,11 +58,12 @@ def metric_map_of(survey: Survey, *, progress: Progress, restart: bool = False) 
     return (refine_model if survey.refine.enabled else scale_model)(survey, progress=progress)
 
 
+@with_one_blas_thread
 def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> RunResult:
     """Photos and ranges to a metric model. Steps of the reconstruction that are done are reused."""
     journal = Journal(progress)
     inputs = read_inputs(survey, journal)
-    with sole_writer(survey.output.path) as output:
+    with sole_writer(survey.output.path) as output, at_most(survey.mapper.num_threads):
         output.require_own(output.path / name for name in result_names(survey))
         survey = with_photos_in_folder(survey, journal, restart=restart)
         keyframes, times = checked_keyframes(survey, inputs, journal)
@@ -84,7 +86,7 @@ def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = Fa
     if survey.mapper.ranges_in_mapping:
         journal.warn("ranges_in_mapping: nothing has been said of ranges here, they take part in a whole run")
     refuse_to_overwrite(survey)
-    with sole_writer(survey.output.path):
+    with sole_writer(survey.output.path), at_most(survey.mapper.num_threads):
         survey = with_photos_in_folder(survey, journal, restart=restart)
         keyframes, _ = find_keyframes(survey, journal)
         sfm = map_keyframes(survey, keyframes, journal, restart, deferred=False)[0]
@@ -102,6 +104,7 @@ def scale_model(survey: Survey, *, progress: Progress) -> RunResult:
     return _from_model(survey, progress, refine=False)
 
 
+@with_one_blas_thread
 def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResult:
     journal = Journal(progress)
     inputs = read_inputs(survey, journal)
@@ -109,7 +112,7 @@ def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResul
     if refine and not sfm.num_points3D():
         raise InputError("the model has no 3-D points to refine: a trajectory can only be scaled", survey.images.model)
     times = None
-    with sole_writer(survey.output.path) as output:
+    with sole_writer(survey.output.path) as output, at_most(survey.mapper.num_threads):
         output.require_own(output.path / name for name in result_names(survey))
         survey = with_photos_in_folder(survey, journal)
         if inputs.log.image_name is None:

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import PathShape, oriented, path_shape
+from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.point_fit import (
     FitErrors,
@@ -179,6 +180,7 @@ class _Found:
         return replace(problem, stddev_m=inflation * problem.stddev_m, prior=problem.prior / self.inflation)
 
 
+@with_one_blas_thread
 def trilaterate(
     tag_positions_m: npt.ArrayLike,
     range_m: npt.ArrayLike,
@@ -237,6 +239,7 @@ class AnchorPlacement:
         return Anchor(self.anchor_id, self.found.position_m, self.found.position_stddev_m, *bias)
 
 
+@with_one_blas_thread
 def trilaterate_anchors(
     log: RangeLog,
     tag_positions_m: Array,

@@ -13,6 +13,7 @@ from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import AssociationOptions
+from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.progress import Progress, SilentProgress
 from rangesfm.ranging.association import associate, is_too_long, lever_arms
 from rangesfm.ranging.clock.bursts import Bursts, curve_of, find_bursts, offsets_that_keep, pair_bursts
@@ -99,6 +100,7 @@ class TimeOffset:
         return self.value_s + drift * (radio_times_s - self.reference_s)
 
 
+@with_one_blas_thread
 def estimate_time_offset(
     log: RangeLog,
     trajectory: Trajectory,

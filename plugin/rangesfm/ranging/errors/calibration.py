@@ -10,6 +10,7 @@ from scipy.linalg import block_diag
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError, InputError
+from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.error_curve import ErrorCurve
 from rangesfm.ranging.errors.noise import correlation_inflation, robust_stddev
@@ -73,6 +74,7 @@ class _Problem:
     groups: Indices
 
 
+@with_one_blas_thread
 def calibrate_ranges(log: RangeLog, tags_m: Array, anchors: Sequence[Anchor]) -> Calibration:
     """Learn the mean error of a radio as a smooth function of distance.
 
