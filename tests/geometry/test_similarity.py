@@ -158,7 +158,7 @@ ONE_PLACE = np.tile([0.1, -7.3, 1.6], (7, 1))
 
 
 def test_points_that_only_rounding_parts_are_one_place(rng: np.random.Generator) -> None:
-    shaken = ONE_PLACE + rng.choice([-1e-15, 0.0, 1e-15], (7, 3))
+    shaken = ONE_PLACE + rng.choice(np.array([-1e-15, 0.0, 1e-15]), (7, 3))
     for one_place in (ONE_PLACE, shaken, 1e7 * shaken):
         assert not are_apart(one_place)
         assert align_points(one_place, rng.normal(size=(7, 3))).scale == 1.0

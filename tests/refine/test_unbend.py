@@ -43,7 +43,7 @@ def test_a_path_turned_inside_out_or_of_one_place_keeps_its_scale() -> None:
     assert _as_a_whole(before, inside_out, None).scale == 1.0
     one_place = Poses(before.world_from_rig, np.ones((8, 3)))
     assert _as_a_whole(one_place, one_place, None).scale == 1.0
-    elsewhere = np.random.default_rng(1).choice([0.1, 0.1 + 1e-16, 0.1 - 1e-16], (7, 3))
+    elsewhere = np.random.default_rng(1).choice(np.array([0.1, 0.1 + 1e-16, 0.1 - 1e-16]), (7, 3))
     before, after = (Poses(poses().world_from_rig[:7], at) for at in (np.full((7, 3), 0.1), elsewhere))
     for held_frame in (None, 0):
         assert _as_a_whole(before, after, held_frame).scale == 1.0

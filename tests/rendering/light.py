@@ -93,14 +93,14 @@ class Beam:
         blocked, near = np.zeros(shape, dtype=np.bool_), np.zeros(shape, dtype=np.bool_)
         u = ((np.arange(shape[1], dtype=np.float32) + 0.5) / np.float32(shape[1]))[None, :]
         v = ((np.arange(shape[0], dtype=np.float32) + 0.5) / np.float32(shape[0]))[:, None]
-        at_corner, along_u, along_v = (
+        begin, step_u, step_v = (
             values[possible].astype(np.float32)[:, :, None, None] for values in (at_corner, along_u, along_v)
         )
         at_once = max(1, _MAX_VALUES_AT_ONCE // (shape[0] * shape[1]))
-        for first in range(0, len(at_corner), at_once):
+        for first in range(0, len(begin), at_once):
             some = slice(first, first + at_once)
-            values = along_u[some] * u + along_v[some] * v
-            values += at_corner[some]
+            values = step_u[some] * u + step_v[some] * v
+            values += begin[some]
             distance, across, down = values[:, 0], values[:, 1], values[:, 2]
             hit = (distance > 1e-4) & (across > 0) & (across < 1) & (down > 0) & (down < 1)
             blocked |= hit.any(axis=0)

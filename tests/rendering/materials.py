@@ -126,7 +126,7 @@ def steel(canvas: Canvas, colour: Colour, corrugation_m: float = 0.0, rust: floa
     """Painted sheet metal, corrugated if asked, with scratches, chipped paint and running rust."""
     wave = np.zeros((1, canvas.shape[1]), dtype=np.float32)
     if corrugation_m > 0:
-        wave = np.clip(1.6 * np.sin(2 * np.pi * canvas.x / np.float32(corrugation_m)), -1, 1)
+        wave = np.clip(1.6 * np.sin(2 * np.pi * canvas.x / np.float32(corrugation_m)), -1, 1).astype(np.float32)
     paint = linear(colour) * (1 + 0.10 * canvas.fractal(0.8, 5) + 0.04 * canvas.grain() + 0.06 * wave)
     faded = smooth_step(0.2, 1.1, canvas.fractal(0.6, 5, stretch_y=2.5))
     paint += (0.22 * faded) * (linear((176, 172, 164)) - paint)

@@ -104,7 +104,11 @@ def test_ground_that_runs_under_the_camera_fills_the_lower_half() -> None:
 
 def test_fine_pattern_far_away_is_averaged_not_aliased() -> None:
     checks = np.indices((256, 256)).sum(axis=0) % 2
-    photo = render(Scene([_wall(0.8 * checks, 30.0)], NO_CLOUDS), CAMERA, _pose((0.0, 0.0, 1.0), (0.0, 30.0, 1.0)))
+    photo = render(
+        Scene([_wall(np.multiply(0.8, checks, dtype=np.float64), 30.0)], NO_CLOUDS),
+        CAMERA,
+        _pose((0.0, 0.0, 1.0), (0.0, 30.0, 1.0)),
+    )
     np.testing.assert_allclose(photo[112:128, 152:168], 0.4, atol=0.03)
 
 
