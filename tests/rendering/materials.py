@@ -144,7 +144,7 @@ def steel(canvas: Canvas, colour: Colour, corrugation_m: float = 0.0, rust: floa
 def cardboard(canvas: Canvas) -> Material:
     """A carton's side: faint corrugation, dents, tape along the middle."""
     tone = 1 + 0.07 * canvas.fractal(0.2, 5) + 0.05 * canvas.grain() + 0.03 * np.sin(canvas.x * np.float32(900))
-    albedo = linear((168, 138, 104)) * tone
+    albedo = linear((168, 138, 104)) * tone.astype(np.float32)
     tape = smooth_step(0.03, 0.026, np.abs(canvas.y - canvas.height_m / 2) + 0.004 * canvas.noise(0.05))
     albedo += (0.5 * tape) * (linear((198, 172, 126)) - albedo)
     stains = smooth_step(0.6, 0.9, canvas.fractal(0.25, 5))
