@@ -33,11 +33,13 @@ def odd_survey(request: pytest.FixtureRequest, own_survey: WalkedSurvey) -> Walk
     model.write(folder / "sparse" / "0")
     with (folder / "images.csv").open(newline="") as file:
         rows = [(name_of[row["image_name"]], row["timestamp_s"]) for row in csv.DictReader(file)]
+    (folder / "images.csv").unlink()  # nothing takes the place of what the tool has not written
     write_table(folder / "images.csv", ("image_name", "timestamp_s"), rows)
     for name in ("uwb.csv", "anchors.csv"):
         with (folder / name).open(newline="") as file:
             header, *table = csv.reader(file)
         renamed = [[f"{prefixes[0]}A1" if cell == "A1" else cell for cell in row] for row in table]
+        (folder / name).unlink()
         write_table(folder / name, header, renamed)
     return dataclasses.replace(own_survey, image_names=tuple(name_of.values()))
 
