@@ -26,7 +26,7 @@ from rangesfm.ceres import (
     range_cost,
     tangent_jacobian,
 )
-from rangesfm.ceres.covariance import ResidualErrors, joint_covariance
+from rangesfm.ceres.covariance import PhotosAlone, ResidualErrors, joint_covariance
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import IDENTITY, similarity_motions
 from rangesfm.geometry.trajectory import pose_of
@@ -337,3 +337,80 @@ def test_a_motion_that_only_rounding_keeps_from_moving_nothing_is_none() -> None
         found = joint_covariance(survey.problem, survey.reconstruction, anchors=[at], others=survey.biases[:1])
         counts.append(found.num_free_directions)
     assert counts[0] == counts[1]
+
+
+def photos_alone(*, hold_first: bool = False) -> tuple[pycolmap.Reconstruction, pycolmap.CeresBundleAdjuster]:
+    """Where the photos have it."""
+    reconstruction = model()
+    adjuster = bundle_adjuster(reconstruction, hold_first=hold_first)
+    adjuster.solve()
+    return reconstruction, adjuster
+
+
+def ratios(reconstruction: pycolmap.Reconstruction) -> tuple[Array, Array]:
+    """Logarithms of how much farther the second and the last frame are from the middle one than the first is, and
+    their derivative by the centres: where the map is and how large does not matter to them.
+    """
+    frames = sorted(reconstruction.reg_frame_ids())
+    centers = np.array([pose_of(reconstruction.frame(i)).inverse().translation for i in frames])
+    apart = centers - centers[4]
+    squares = np.sum(apart**2, axis=1)
+    found, slopes = [], np.zeros((2, len(centers), 3))
+    for row, k in enumerate((1, -1)):
+        found.append(0.5 * np.log(squares[k] / squares[0]))
+        slopes[row, k], slopes[row, 0] = apart[k] / squares[k], -apart[0] / squares[0]
+        slopes[row, 4] = apart[0] / squares[0] - apart[k] / squares[k]
+    return np.array(found), slopes
+
+
+@pytest.mark.parametrize("hold_first", [False, True])
+def test_what_photos_leave_open_is_the_inverse_of_all_their_normal_equations(hold_first: bool) -> None:
+    reconstruction, adjuster = photos_alone(hold_first=hold_first)
+    frames = np.array(sorted(reconstruction.reg_frame_ids()))
+    _, slopes = ratios(reconstruction)
+    found, shift = PhotosAlone(adjuster.problem, reconstruction, 0.7).of_functions(
+        frames, np.zeros_like(slopes), slopes
+    )
+    poses = [pose_of(reconstruction.frame(i)).params for i in frames.tolist()]
+    blocks = [*poses, *(point.xyz for point in reconstruction.points3D.values())]
+    is_free = [adjuster.problem.has_parameter_block(block) for block in blocks]
+    covariance = covariance_of_all(adjuster.problem, [b for b, free in zip(blocks, is_free, strict=True) if free])
+    gradient = np.zeros((len(covariance), 2))
+    for k, pose in enumerate(poses):
+        if is_free[k]:
+            rotation = Rotation.from_quat(pose[:4]).as_matrix()
+            x, y, z = 2 * pose[4:]
+            cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+            by_step = -rotation.T @ np.hstack([cross, np.eye(3)])
+            column = 6 * (k - hold_first)
+            gradient[column : column + 6] = (slopes[:, k] @ by_step).T
+    np.testing.assert_allclose(found, 0.49 * gradient.T @ covariance @ gradient, rtol=1e-6)
+    assert np.abs(shift).max() < 1e-3 * np.sqrt(found.diagonal().min())
+
+
+def test_photos_say_how_far_a_map_was_moved_from_where_they_have_it() -> None:
+    reconstruction, adjuster = photos_alone()
+    before, _ = ratios(reconstruction)
+    rng, frames = np.random.default_rng(1), np.array(sorted(reconstruction.reg_frame_ids()))
+    for frame in frames.tolist():
+        pose_of(reconstruction.frame(frame)).params[4:] += 1e-3 * rng.standard_normal(3)
+    after, slopes = ratios(reconstruction)
+    _, shift = PhotosAlone(adjuster.problem, reconstruction, 1.0).of_functions(frames, np.zeros_like(slopes), slopes)
+    np.testing.assert_allclose(shift, before - after, rtol=0.05)
+
+
+def test_priors_may_err_otherwise_than_the_residuals_of_photos() -> None:
+    """With priors as good as the covariance's unit has them, or all other residuals worse."""
+    survey = joint(model())
+    rows = np.zeros(0, dtype=np.int64)
+    nothing = csr_array((0, 1))
+    usual, better = (
+        joint_covariance(
+            survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases,
+            errors=ResidualErrors(rows, nothing, np.eye(1), variance),
+        )
+        for variance in (1.0, 0.0)
+    )  # fmt: skip
+    plain = joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases)
+    np.testing.assert_allclose(usual.centers, plain.centers, rtol=1e-9)
+    assert (np.trace(better.centers, axis1=1, axis2=2) < np.trace(usual.centers, axis1=1, axis2=2)).all()

@@ -28,6 +28,7 @@ Labels = npt.NDArray[np.int64]
 METRES_PER_UNIT = 2.3
 LASTING_S, DRIFT_S, PLACE_M, LOBE = 3.0, 60.0, 0.5, 0.1
 NUM_WAVES = 300
+BENDING_M = 0.007
 # Knots of an uneven curve over the logarithm of distance.
 _KNOTS = np.linspace(np.log(0.05), np.log(300.0), 400)
 
@@ -46,7 +47,7 @@ class Measured:
 def stddevs_of(planned: PlannedSurvey) -> dict[str, float]:
     """Of the components of its ranges' errors: as told, or as radios have them in the mean."""
     usual = usual_stddevs(is_calibrated=planned.curve_stddev_m is not None)
-    return usual | dict(planned.component_stddevs)
+    return usual | {"bending": BENDING_M} | dict(planned.component_stddevs)
 
 
 def measured(planned: PlannedSurvey, seed: int) -> Measured:
@@ -60,7 +61,7 @@ def measured(planned: PlannedSurvey, seed: int) -> Measured:
     log = RangeLog.from_arrays([ids[k] for k in turn % len(ids)], np.ones(len(turn)), timestamp_s=at_s)
     places = associate(log, true, planned.tag_in_cam_m)
     standing_m = np.array([planned.anchors_m[ids.index(name)] for name in log.anchor_ids])
-    errors_m, distance_m = _errors(places, true, standing_m, stddevs, planned.curve_stddev_m, rng)
+    errors_m, distance_m = errors_of_radio(places, true, standing_m, stddevs, planned.curve_stddev_m, rng)
     ranges_m = np.maximum(np.nan_to_num(distance_m + errors_m, nan=1.0), 0.02)
     curve = None if planned.curve_stddev_m is None else np.full(len(log), planned.curve_stddev_m)
     log = replace(log, range_m=ranges_m, shared_stddev_m=curve)
@@ -82,7 +83,7 @@ def _required(times: Array | None) -> Array:
     return times
 
 
-def _errors(
+def errors_of_radio(
     places: RangeObservations,
     true: Trajectory,
     standing_m: Array,

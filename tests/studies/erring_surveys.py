@@ -17,14 +17,16 @@ from rangesfm.colmap.reprojection import PointErrors
 from rangesfm.demo.ranges import CameraPath
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import align_points
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
+from rangesfm.ranging.errors.bending import WalkBending
 from rangesfm.ranging.log import RangeLog
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.range_equation import RangeProblem, RangeState
+from rangesfm.trust.bent_path import bent_to_ranges, estimate_by_bent
 from rangesfm.trust.finished_map import by_similarity, doubts_of_map
 from rangesfm.trust.linearized import RangesOnMap, ranges_on_map
 from rangesfm.trust.verdict import TrustVerdict, trust_in
@@ -204,7 +206,7 @@ class Run:
         assert self.estimate is not None
         assert self.trust is not None
         no_points = PointErrors(np.zeros(0), np.zeros((0, 3)), np.inf)
-        of_map = doubts_of_map(self.estimate, None, None, no_points, noise_is_given=False)
+        of_map = doubts_of_map(self.estimate, None, no_points, noise_is_given=False)
         of_scale = self.estimate.reasons if self.estimate.verdict != "good" else ()
         return [*self.trust.reasons, *of_scale, *(doubt.reason for doubt in of_map)]
 
@@ -236,7 +238,10 @@ def run(given: Given, seed: int) -> Run:
         return Run(given, None, None, refusal=str(error))
     assert estimate.problem is not None
     assert estimate.solution is not None
-    on_map = ranges_on_map(estimate.problem, estimate.solution, estimate.observations, given.trajectory)
+    bending = WalkBending(in_first_camera(given.trajectory))
+    on_map = ranges_on_map(estimate.problem, estimate.solution, estimate.observations, given.trajectory, bending)
+    on_map = bent_to_ranges(on_map)
+    estimate = estimate_by_bent(estimate, on_map, options)
     return Run(given, estimate, trust_in(on_map, seed=seed), on_map)
 
 

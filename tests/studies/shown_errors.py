@@ -36,7 +36,6 @@ START |= {
     "antenna": 0.05,
     "off_axis": 0.05,
     "tag_antenna": 0.05,
-    "bending": 0.01,
 }
 SPREAD, OF_WHITE = 0.7, 1.0
 

@@ -315,7 +315,7 @@ def test_a_site_in_national_coordinates_loses_nothing(survey: Survey, refined: D
     near = refined.result.summary
     moved = survey.changed({"anchors.path": tmp_path / "far.csv", "output.path": tmp_path / "far"})
     away = refine_model(moved, progress=SilentProgress()).summary
-    assert away.scale.value == pytest.approx(near.scale.value, rel=1e-9)
+    assert away.metric_from_sfm.scale == pytest.approx(near.metric_from_sfm.scale, rel=1e-9)
     assert known(away.refine).scale_value == pytest.approx(known(near.refine).scale_value, rel=1e-7)
     for anchor_id, anchor in near.anchors.items():
         moved_m, own_m = known(away.anchors[anchor_id].position_m), known(anchor.position_m)

@@ -41,11 +41,13 @@ class ResidualErrors:
         rows: (k,) which residuals, in the order of the problem; 3-D points have no part in them.
         by_error: (k, m) sparse: how each of m errors changes them, in residual stddevs.
         covariance: (m, m) of these errors: all that the residuals have.
+        variance_without_points: of the other residuals in which no 3-D point has a part, as priors are.
     """
 
     rows: Indices
     by_error: csr_array
     covariance: Array
+    variance_without_points: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -107,9 +109,9 @@ def joint_covariance(
     """
     columns = _Columns.of(problem, reconstruction, anchors, others)
     jacobian = tangent_jacobian(problem, columns.variable)
-    normal, kept = _schur_complement(jacobian, columns)
+    normal, kept, _ = _schur_complement(jacobian, columns, np.zeros(jacobian.shape[0]))
     free = _free_motions(jacobian, _world_motions(columns))[kept]
-    inverse = _Inverse(normal, free, columns, _excess(jacobian[:, kept], errors))
+    inverse = _Inverse(normal, free, columns, _excess(jacobian, kept, columns, errors))
     blocks = inverse.diagonal_blocks([columns.span(i) for i in range(columns.num_kept_blocks)])
     variance = residual_stddev**2
     frames = columns.frames
@@ -125,6 +127,46 @@ def joint_covariance(
         similarity=variance * _similarity_covariance(columns, inverse, len(kept)),
         num_free_directions=free.shape[1],
     )
+
+
+class PhotosAlone:
+    """What the photos of a map say of its poses, by first order: how far they would move, and what is left open."""
+
+    def __init__(self, problem: Any, reconstruction: pycolmap.Reconstruction, residual_stddev: float) -> None:
+        """Of a problem without anything but photos, at its present parameters.
+
+        Args:
+            residual_stddev: of its residuals.
+
+        Raises:
+            GeometryError: they leave more open than where the map is and how large.
+        """
+        self._columns = _Columns.of(problem, reconstruction, (), ())
+        jacobian, residuals = tangent_jacobian(problem, self._columns.variable), problem.evaluate_residuals()
+        normal, kept, self._gradient = _schur_complement(jacobian, self._columns, np.asarray(residuals))
+        free = _free_motions(jacobian, _world_motions(self._columns))[kept]
+        self._inverse = _Inverse(normal, free, self._columns, np.zeros_like)
+        self._size, self._stddev = len(kept), residual_stddev
+
+    def of_functions(self, frame_ids: Indices, by_turn: Array, by_center: Array) -> tuple[Array, Array]:
+        """Covariance (c, c) of functions that do not see where the map is, nor how large; and (c,) how much they grow
+        as the map goes to where the photos alone would have it.
+
+        Args:
+            frame_ids: (k,). by_turn, by_center: (c, k, 3) by a turn of each frame's rig in its own frame, and by a
+                shift of the rig's origin.
+        """
+        columns, gradients = self._columns, np.zeros((self._size, len(by_turn)))
+        pose_of_frame = dict(zip(columns.frames.tolist(), columns.poses, strict=True))
+        for k, frame_id in enumerate(frame_ids.tolist()):
+            pose = pose_of_frame[frame_id]
+            if (index := columns.index_of.get(_address(pose))) is not None:
+                # Ceres turns the world's side of the camera, by twice its step.
+                by_step = by_center[:, k] @ _center_from_step(pose)
+                by_step[:, :3] -= 2.0 * by_turn[:, k]
+                gradients[columns.span(index)] = by_step.T
+        solution = self._inverse.solve(gradients)
+        return self._stddev**2 * gradients.T @ solution, -solution.T @ self._gradient
 
 
 @dataclass(frozen=True)
@@ -202,12 +244,16 @@ class _Columns:
         return f"{kind} number {self.kinds[:index].count(kind)}"
 
 
-def _excess(kept: csc_array, errors: ResidualErrors | None) -> _Product:
+def _excess(jacobian: csc_array, kept: Indices, columns: _Columns, errors: ResidualErrors | None) -> _Product:
     """J^T (S - 1) J times (size, k), in the columns that are kept."""
     if errors is None:
         return np.zeros_like
-    rows = csr_array(kept)[errors.rows]
+    has_point = np.diff(csr_array(jacobian[:, columns.num_kept_columns :]).indptr) > 0
+    has_point[errors.rows] = True
+    of_all = csr_array(jacobian[:, kept])
+    rows, without = of_all[errors.rows], of_all[np.flatnonzero(~has_point)]
     independent, by_error = csr_array(rows.T @ rows), csr_array(rows.T @ errors.by_error)
+    independent = independent + (1 - errors.variance_without_points) * csr_array(without.T @ without)
     return lambda right: np.asarray(by_error @ (errors.covariance @ (by_error.T @ right)) - independent @ right)
 
 
@@ -215,19 +261,23 @@ def _address(block: Array) -> int:
     return int(block.__array_interface__["data"][0])
 
 
-def _schur_complement(jacobian: csc_array, columns: _Columns) -> tuple[Array | csr_array, Indices]:
-    """Normal equations of what is kept once the points are eliminated, and which columns are kept."""
+def _schur_complement(
+    jacobian: csc_array, columns: _Columns, residuals: Array
+) -> tuple[Array | csr_array, Indices, Array]:
+    """Normal equations of what is kept once the points are eliminated, which columns are kept, and the gradient."""
     first = columns.num_kept_columns
     stays = np.repeat(_tied_points(jacobian[:, first:]), 3)
     kept_columns = np.concatenate([np.arange(first), first + np.flatnonzero(stays)])
     kept, points = jacobian[:, kept_columns], jacobian[:, first + np.flatnonzero(~stays)]
-    rows = kept.tocsr()
-    own, explained = both(lambda: kept.T @ rows, lambda: _explained_by(points, rows))
-    return own - explained, kept_columns
+    rows, whitener = kept.tocsr(), _whitener(points)
+    own, explained = both(lambda: kept.T @ rows, lambda: _explained_by(points, rows, whitener))
+    off_points = points.T @ residuals
+    gradient = kept.T @ residuals - rows.T @ (points @ (whitener @ (whitener.T @ off_points)))
+    return own - explained, kept_columns, np.asarray(gradient)
 
 
-def _explained_by(points: csc_array, kept: csr_array) -> Array | csr_array:
-    """What the points take from the normal equations of what is kept."""
+def _whitener(points: csc_array) -> bsr_array:
+    """Square, in blocks of 3: times its transpose the inverse of the points' own normal equations."""
     num_points = points.shape[1] // 3
     squares = (points.T @ points.tocsr()).tocoo()
     blocks = np.zeros((num_points, 3, 3))
@@ -236,10 +286,14 @@ def _explained_by(points: csc_array, kept: csr_array) -> Array | csr_array:
     blocks += 1e-12 * np.maximum(np.trace(blocks, axis1=1, axis2=2), 1e-300)[:, None, None] * np.eye(3)
     whitener = np.swapaxes(np.linalg.inv(np.linalg.cholesky(blocks)), 1, 2)
     indices = np.arange(num_points)
-    whiten = bsr_array((whitener, indices, np.arange(num_points + 1)), shape=(3 * num_points, 3 * num_points))
+    return bsr_array((whitener, indices, np.arange(num_points + 1)), shape=(3 * num_points, 3 * num_points))
+
+
+def _explained_by(points: csc_array, kept: csr_array, whitener: bsr_array) -> Array | csr_array:
+    """What the points take from the normal equations of what is kept."""
     coupling = csr_array(points.T @ kept)
     coupling.resize(points.shape[1], -(-kept.shape[1] // 6) * 6)
-    coupling = whiten.T @ coupling.tobsr((3, 6))  # blocks of poses and points multiply faster than numbers
+    coupling = whitener.T @ coupling.tobsr((3, 6))  # blocks of poses and points multiply faster than numbers
     return resized(normal_matrix(coupling), kept.shape[1])
 
 

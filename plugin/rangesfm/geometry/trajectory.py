@@ -72,6 +72,12 @@ class Trajectory:
         return self.transformed(factor, np.eye(3), (1.0 - factor) * fixed_point)
 
 
+def in_first_camera(trajectory: Trajectory, unit: float = 1.0) -> Trajectory:
+    """A path as seen from its first pose, in a unit of so many of its own."""
+    turn = trajectory.world_from_cam[0].T
+    return trajectory.transformed(1 / unit, turn, -turn @ trajectory.centers[0] / unit)
+
+
 def trajectory_from_reconstruction(
     reconstruction: pycolmap.Reconstruction,
     timestamps_s: Mapping[str, float] | None = None,

@@ -13,6 +13,7 @@ from rangesfm.distances.ends import distances_within, locatable, locate_distance
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory, joined_trajectory
+from rangesfm.ranging.errors.bending import MapBending
 from rangesfm.ranging.observations import RangeObservations, each_on_one_path, joined_observations
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
@@ -57,7 +58,9 @@ class PathOfModel:
     observations: RangeObservations
 
 
-def estimate_scale(survey: Survey, inputs: RangingInputs, path: PathOfModel) -> ScaleEstimate:
+def estimate_scale(
+    survey: Survey, inputs: RangingInputs, path: PathOfModel, bending: MapBending | None = None
+) -> ScaleEstimate:
     """``initialize_scale`` by a survey's options, with the lengths of its inputs."""
     distances = None
     if inputs.tape is not None:
@@ -70,6 +73,7 @@ def estimate_scale(survey: Survey, inputs: RangingInputs, path: PathOfModel) -> 
         options=survey.scale,
         range_model=survey.ranges,
         distances=distances,
+        bending=bending,
         seed=survey.output.seed,
     )
 

@@ -16,7 +16,7 @@ from rangesfm.planning.paths import way_along
 from rangesfm.planning.placement import spread_places
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.errors.components import COMPONENTS
+from rangesfm.ranging.errors.components import BENDS, COMPONENTS
 from rangesfm.scale.verdict import CALIBRATE
 
 _RAISED_M = (1.0, -1.0, 2.0, -2.0)
@@ -63,15 +63,15 @@ _Change = tuple[str, str, str, PlannedSurvey]
 
 def advise(expected: Expected) -> tuple[Advice, ...]:
     """All changes of a plan that gain something, in no order; a map bends as it did before."""
-    bending = expected.learned.stddev_of_component["bending"]
+    bending = {name: stddev for name, stddev in expected.learned.stddev_of_component.items() if name in BENDS}
     before = _compared(expected.planned, bending)
     afters = ((change, _compared(change[3], bending)) for change in _changes(expected.planned))
     found = (_advice(change, after, before, expected) for change, after in afters if before and after)
     return tuple(advice for advice in found if max(advice.scale_gain, advice.place_gain) > _LEAST_GAIN)
 
 
-def _compared(planned: PlannedSurvey, bending: float) -> Expected | None:
-    return compare(replace(planned, component_stddevs={**planned.component_stddevs, "bending": bending}))
+def _compared(planned: PlannedSurvey, bending: dict[str, float]) -> Expected | None:
+    return compare(replace(planned, component_stddevs={**planned.component_stddevs, **bending}))
 
 
 def best_words(advice: Sequence[Advice], *, for_scale: bool, for_place: bool) -> list[str]:

@@ -9,10 +9,13 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import similarity_motions
+from rangesfm.geometry.trajectory import in_first_camera
 from rangesfm.options import ScaleOptions
 from rangesfm.planning.photos import PlannedMap
 from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.ranging.errors.bending import WalkBending
 from rangesfm.ranging.errors.cells import MAX_NUM_CELLS
+from rangesfm.ranging.errors.components import BENDS
 from rangesfm.ranging.errors.learned import LearnedErrors, usual_stddevs
 from rangesfm.ranging.errors.noise import START_STDDEV_M
 from rangesfm.ranging.errors.place import shares_of_places
@@ -149,15 +152,16 @@ def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expect
     stddevs = usual_stddevs(is_calibrated=planned.curve_stddev_m is not None) | dict(planned.component_stddevs)
     if planned.photos is not None:
         made = PlannedMap(path, planned.photos.information(path), posed, observations, planned.tag_in_cam_m)
-        stddevs["bending"] = float(np.hypot(stddevs["bending"], made.bend_m(solution)))
-    learned = errors_to_expect(posed, solution, observations, rotations, stddevs, max_num_cells)
+        stddevs |= {**dict.fromkeys(BENDS, 0.0), "bending": made.bend_m(solution)}
+    bending = WalkBending(in_first_camera(path))
+    learned = errors_to_expect(posed, solution, observations, rotations, stddevs, max_num_cells, bending)
     for _ in range(_NUM_NOISE_ROUNDS):
         solution = _at_the_truth(posed, _as_seen(solution, learned), state, planned.num_alike)
     open_m2 = _undetermined(solution.fit)
     uncertainty = expected_scale_uncertainty(solution, learned, BENDING)
     placement = placement_covariance(solution, parameter_covariance(solution, learned) + open_m2)
     bends_m = np.zeros(len(path))
-    others = learned if made is None else learned.without("bending")
+    others = learned if made is None else learned.without(*BENDS)
     by_ranges = placement_covariance(solution, parameter_covariance(solution, others) + open_m2)
     if by_ranges is None:
         scale_stddev = expected_scale_uncertainty(solution, others, BENDING).empirical

@@ -148,7 +148,7 @@ def _place(expected: Expected) -> PlannedPlace | None:
 
 def _mistakes(expected: Expected) -> tuple[MistakeTest, ...]:
     """Of every mistake that lasts for the whole survey; that it was made is not tested, as nothing was measured."""
-    on_map = ranges_on_map(expected.posed, expected.solution, expected.observations, expected.planned.trajectory)
+    on_map = ranges_on_map(expected.posed, expected.solution, expected.observations, expected.planned.trajectory, None)
     problem = replace(linearized(on_map, expected.learned.cells), errors=expected.learned)
     hypotheses = [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
     found = []

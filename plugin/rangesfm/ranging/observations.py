@@ -37,6 +37,15 @@ class RangeStatus(IntEnum):
 
 
 @dataclass(frozen=True)
+class OnPath:
+    """Where on a path of keyframes n ranges were taken: ``(1 - weight) * before + weight * after``."""
+
+    before: Indices
+    after: Indices
+    weight: Array
+
+
+@dataclass(frozen=True)
 class RangeObservations:
     """n ranges (all of the log, in its order) on the path of one model.
 
@@ -86,6 +95,10 @@ class RangeObservations:
     def nearest(self) -> Indices:
         """(n,) keyframe; -1 without a place."""
         return np.where(self.weight < 0.5, self.before, self.after)
+
+    def on_path(self, rows: Indices) -> OnPath:
+        """Of some that have a place."""
+        return OnPath(self.before[rows], self.after[rows], self.weight[rows])
 
     @property
     def placed_rows(self) -> Indices:

@@ -15,6 +15,7 @@ from rangesfm.colmap.calibration import cameras_as_given
 from rangesfm.geometry.gravity import UP_IN_SITE, Gravity
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.options import CameraOptions, RefineOptions
+from rangesfm.ranging.errors.components import BENDS
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.refine.bundle_adjustment import BundleAdjustment, bundle_adjustment
 from rangesfm.refine.distances import MeasuredDistances, add_distances
@@ -86,19 +87,23 @@ class RefinementProblem:
             ceres.add_residual_block(bundle.adjuster, cost, None, [pose])
         return AddedRadio(blocks, others, rows)
 
-    def residual_errors(self, added: AddedRadio, errors: RangeErrors) -> ResidualErrors | None:
+    def residual_errors(self, added: AddedRadio, errors: RangeErrors, bending_factor: float) -> ResidualErrors | None:
         """How the residuals of the k ranges that took part err; the scale's uncertainty counts the same errors.
 
         None where nobody has learnt what they get wrong together.
+
+        Args:
+            bending_factor: by how much the photos' residuals err more, which are the unit here.
         """
-        if (learned := errors.learned) is None:
+        if errors.learned is None:
             return None
+        learned = errors.learned.without(*BENDS)  # the photos' own residuals err as well
         scaled = self.residuals_m(added.estimate(self.radio))[self.ranges.rows] / errors.stddev_m
         in_residuals = np.sqrt(errors.weight) * errors.loss.slopes(scaled) / errors.stddev_m
         covariance_m2, has_cell = learned.covariance_m2, np.flatnonzero(learned.of_range >= 0)
         places = (has_cell, learned.of_range[has_cell])
         of_cells = csr_array((in_residuals[has_cell], places), shape=(len(scaled), len(covariance_m2)))
-        return ResidualErrors(added.residual_rows, of_cells, covariance_m2)
+        return ResidualErrors(added.residual_rows, of_cells, covariance_m2 / bending_factor**2, bending_factor**-2)
 
     def residuals_m(self, radio: RadioEstimate) -> Array:
         """(n,) predicted minus measured; NaN without a place."""

@@ -115,15 +115,24 @@ class RadioRanges:
             return np.zeros(len(self.antennas.before))
         return times[self.antennas.after] - times[self.antennas.before]
 
-    def predicted_m(self, metric: pycolmap.Reconstruction, radio: RadioEstimate) -> Array:
-        """(n,) ranges that a metric model predicts, as the residuals do; NaN without a place."""
-        index = self.observations.log.anchor_index
+    def places(self, path: Trajectory, radio: RadioEstimate) -> tuple[Array, Array]:
+        """(n, 3) of the tag and (n, 3) of the camera's centre on a metric path.
+
+        What the path's curve has beyond straight lines between keyframes counts as the tag's.
+        """
         weight, between = self.antennas.weight.copy(), self.antennas.before != self.antennas.after
         if radio.time_shift_s:
             weight[between] += radio.time_shift_s / self.interval_s[between]
-        tags = radio.tags_in_cam_m[self.observations.log.tag_index]
-        path = self.trajectory.as_in(metric)
-        at = replace(self.antennas, tag_in_cam_m=tags, weight=weight).positions(path.centers, path.world_from_cam)
+        tags_in_cam_m = radio.tags_in_cam_m[self.observations.log.tag_index]
+        at = replace(self.antennas, tag_in_cam_m=tags_in_cam_m, weight=weight)
+        ends = path.centers[at.before], path.centers[at.after]
+        centers_m = (1 - weight)[:, None] * ends[0] + weight[:, None] * ends[1]
+        return at.positions(path.centers, path.world_from_cam), centers_m
+
+    def predicted_m(self, metric: pycolmap.Reconstruction, radio: RadioEstimate) -> Array:
+        """(n,) ranges that a metric model predicts, as the residuals do; NaN without a place."""
+        index = self.observations.log.anchor_index
+        at, _ = self.places(self.trajectory.as_in(metric), radio)
         from_anchor = at - np.array([a.position_m for a in radio.anchors]).reshape(-1, 3)[index]
         distance = np.linalg.norm(from_anchor, axis=1)
         predicted = distance + np.array([a.range_bias_m for a in radio.anchors])[index]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,11 +18,12 @@ from rangesfm.distances.ends import LocatedDistances, distances_by_radio
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.gravity import Gravity
-from rangesfm.geometry.similarity import Similarity
+from rangesfm.geometry.similarity import Similarity, align_most, align_points
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.processes.threads import at_most, with_one_blas_thread
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors, misfits
 from rangesfm.ranging.errors.robust_loss import RobustLoss
 from rangesfm.ranging.observations import RangeObservations, status_by_weight
@@ -65,6 +66,7 @@ class RefineSummary:
             if it was not estimated.
         covariance: of poses, anchors and scale; None if it was not asked for, the model is too large or ranges and
             photos leave something undetermined.
+        bending_factor: by how much more than the photos' residuals let expect the map was bent; 1 if nobody looked.
         observations: with status by the final weight of each range.
         predicted_m: (n,) ranges by the refined model; NaN without a place.
         weights: (n,) robust weights in [0, 1]; NaN without a place.
@@ -87,9 +89,43 @@ class RefineSummary:
     time_shift_s: float | None
     short_range_error_m: float | None
     covariance: JointCovariance | None
+    bending_factor: float
     observations: RangeObservations
     predicted_m: Array
     weights: Array
+
+
+@dataclass(frozen=True)
+class AtRest:
+    """A refined map, when it has come to rest, and the k ranges that took part.
+
+    Attributes:
+        trajectory_m: its keyframes. scale: metres per unit of the unscaled model.
+        tags_m, centers_m: (k, 3) where tag and camera were.
+        anchors: with their biases. errors: as weighted.
+        photos: alone.
+    """
+
+    trajectory_m: Trajectory
+    scale: float
+    tags_m: Array
+    centers_m: Array
+    anchors: tuple[AnchorEstimate, ...]
+    errors: RangeErrors
+    photos: BundleAdjustment
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """What was learnt at a map: the ranges' errors, None if nothing; and by how much more than its photos' residuals
+    let expect it is bent.
+    """
+
+    errors: LearnedErrors | None
+    bending_factor: float
+
+
+Learn = Callable[[AtRest], Learnt]
 
 
 @with_one_blas_thread
@@ -107,6 +143,7 @@ def refine_with_ranges(
     camera: CameraOptions | None = None,
     options: RefineOptions | None = None,
     tape: Tape | None = None,
+    learn: Learn | None = None,
     num_threads: int = -1,
 ) -> tuple[pycolmap.Reconstruction, RefineSummary]:
     """Bundle adjustment of a scaled model with range residuals.
@@ -127,6 +164,7 @@ def refine_with_ranges(
         gravity: which way is up in the first camera; counts where its pose is not fixed.
         tape: taped distances, of which the map keeps to the control ones; as it does to the ranges between anchors
             that the log holds.
+        learn: the ranges' errors anew, where the map has come to rest, for its covariance; None: those in ``errors``.
 
     Returns:
         the refined model and the summary.
@@ -155,7 +193,7 @@ def refine_with_ranges(
         num_threads,
     )
     with at_most(num_threads):
-        summary = _refine(problem, _errors_to_begin_with(problem, errors, metric_from_sfm.scale))
+        summary = _refine(problem, _errors_to_begin_with(problem, errors, metric_from_sfm.scale), learn)
     remove_marker_points(metric, marker_ids)
     return metric, summary
 
@@ -185,14 +223,14 @@ def _between_anchors(
     )
 
 
-def _refine(problem: RefinementProblem, errors: RangeErrors) -> RefineSummary:
+def _refine(problem: RefinementProblem, errors: RangeErrors, learn: Learn | None) -> RefineSummary:
     """Unbend the map, then solve the full problem, both without the misplaced points."""
     frame_ids = problem.frame_ids
     rays = model_observations(problem.metric, frame_ids)
     misplaced = misplaced_points(rays, model_poses(problem.metric, frame_ids))
     problem = replace(problem, left_out_ids=frozenset(rays.point_ids[misplaced].tolist()))
     bundle = problem.of_photos(problem.options.max_num_iterations)
-    return _adjust(problem, bundle, unbend(problem, rays.with_pixel_stddev(bundle.pixel_stddev), errors))
+    return _adjust(problem, bundle, unbend(problem, rays.with_pixel_stddev(bundle.pixel_stddev), errors), learn)
 
 
 @dataclass(frozen=True)
@@ -204,7 +242,7 @@ class _Round:
     num_left: int
 
 
-def _adjust(problem: RefinementProblem, bundle: BundleAdjustment, start: Unbent) -> RefineSummary:
+def _adjust(problem: RefinementProblem, bundle: BundleAdjustment, start: Unbent, learn: Learn | None) -> RefineSummary:
     """Alternate between the full problem and the errors that its residuals show."""
     added: AddedRadio
 
@@ -236,9 +274,21 @@ def _adjust(problem: RefinementProblem, bundle: BundleAdjustment, start: Unbent)
     )
     more, is_still = solve_until_still(bundle, last.solutions[-1], _tolerance_m(problem, errors), last.num_left)
     last = replace(last, radio=added.estimate(last.radio), solutions=(*last.solutions, *more))
-    covariance = _covariance(problem, bundle, added, errors)
+    learnt = Learnt(errors.learned, 1.0) if learn is None else learn(_at_rest(problem, last.radio, errors))
+    errors = replace(errors, learned=learnt.errors)
+    covariance = _covariance(problem, bundle, added, errors, learnt.bending_factor)
     problem.metric.update_point_3d_errors()
-    return _summary(problem, start, bundle, last, errors, covariance, is_still=is_still)
+    return _summary(problem, start, bundle, last, errors, covariance, learnt.bending_factor, is_still=is_still)
+
+
+def _at_rest(problem: RefinementProblem, radio: RadioEstimate, errors: RangeErrors) -> AtRest:
+    ranges = problem.ranges
+    path = ranges.trajectory.as_in(problem.metric)
+    tags_m, centers_m = (places[ranges.rows] for places in ranges.places(path, radio))
+    before_m = ranges.trajectory.centers
+    scale = align_most(before_m, path.centers, align_points(before_m, path.centers)).scale
+    photos = problem.of_photos(problem.options.max_num_iterations)
+    return AtRest(path, scale, tags_m, centers_m, radio.anchors, errors, photos)
 
 
 def _tolerance_m(problem: RefinementProblem, errors: RangeErrors) -> float:
@@ -247,7 +297,11 @@ def _tolerance_m(problem: RefinementProblem, errors: RangeErrors) -> float:
 
 
 def _covariance(
-    problem: RefinementProblem, bundle: BundleAdjustment, added: AddedRadio, errors: RangeErrors
+    problem: RefinementProblem,
+    bundle: BundleAdjustment,
+    added: AddedRadio,
+    errors: RangeErrors,
+    bending_factor: float,
 ) -> JointCovariance | None:
     metric, limit = problem.metric, _MAX_NUM_IMAGES_FOR_COVARIANCE
     if not problem.options.covariance:
@@ -260,8 +314,8 @@ def _covariance(
             metric,
             anchors=added.blocks.anchors,
             others=added.all_but_anchors,
-            residual_stddev=bundle.pixel_stddev,
-            errors=problem.residual_errors(added, errors),
+            residual_stddev=bending_factor * bundle.pixel_stddev,
+            errors=problem.residual_errors(added, errors, bending_factor),
         )
     except GeometryError as error:
         logging.getLogger(__name__).info("%s", error)
@@ -275,6 +329,7 @@ def _summary(
     done: _Round,
     errors: RangeErrors,
     covariance: JointCovariance | None,
+    bending_factor: float,
     *,
     is_still: bool,
 ) -> RefineSummary:
@@ -304,6 +359,7 @@ def _summary(
         time_shift_s=radio.time_shift_s if options.time_offset_stddev_s else None,
         short_range_error_m=radio.short_range_error_m if options.short_range_stddev_m else None,
         covariance=covariance,
+        bending_factor=bending_factor,
         observations=replace(observations, status=status),
         predicted_m=residuals_m + log.range_m,
         weights=weights,

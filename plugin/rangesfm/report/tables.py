@@ -26,6 +26,7 @@ _REFINEMENT = {
     "iterations": "iterations",
     "keyframe_graph_steps": "steps along the path before",
     "bend_m": "bent by, m",
+    "bending_factor": "bent before by photos, times what their residuals let expect",
     "initial_cost": "cost before",
     "final_cost": "cost after",
     "reprojection_rms_px": "reprojection RMS, px",

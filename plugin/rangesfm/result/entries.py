@@ -273,6 +273,7 @@ class RefineEntry(Record):
     Attributes:
         kept: whether the final map is the refined one; else it is the scaled one.
         why_not_kept: what the refined one could not be.
+        bending_factor: by how much more than the photos' residuals let expect the map was bent before.
     """
 
     kept: Flag
@@ -280,6 +281,7 @@ class RefineEntry(Record):
     iterations: Count
     keyframe_graph_steps: Count
     bend_m: NumberOrNull
+    bending_factor: NumberOrNull = None
     initial_cost: NumberOrNull
     final_cost: NumberOrNull
     reprojection_rms_px: NumberOrNull

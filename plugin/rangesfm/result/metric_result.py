@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
@@ -19,13 +20,22 @@ from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.clock.estimate import TimeOffset
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
 from rangesfm.refine.with_ranges import RefineSummary
+from rangesfm.scale.at_map import MapWithRanges
 from rangesfm.scale.diagnostics import ScaleDiagnostics, scale_diagnostics
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.trust.finished_map import Place
+from rangesfm.trust.linearized import RangesOnMap
 from rangesfm.trust.verdict import TrustVerdict
 
 USED = (RangeStatus.USED, RangeStatus.DOWN_WEIGHTED)
 """Of ranges with a say in the final model, however small."""
+
+
+class Rivals(NamedTuple):
+    """Other offsets of the clocks: doubts in words, and the relative stddev of the scale by the choice among them."""
+
+    doubts: tuple[str, ...]
+    stddev: float
 
 
 @dataclass(frozen=True)
@@ -46,8 +56,11 @@ class MetricResult:
             one is the result.
         place: of the map in the site's frame; None where the frame is the first camera's, or nobody judged it yet.
         models: that were to be joined to what is one model here; empty where there was only one.
-        trust: what the tests of mistakes say of the scaled map.
+        trust: what the tests of mistakes say of the final map.
         tape: the measured lengths, those that cannot belong to the map as left out; None: there are none.
+        rivals: of the clocks' offset; None: there are none.
+        on_map: the ranges on the scaled map; None where that is only the start of a refinement, or there are none.
+        refined_with_ranges: the refined map as ranges lie on it; None without.
     """
 
     trajectory: Trajectory
@@ -64,6 +77,9 @@ class MetricResult:
     models: tuple[ModelVerdict, ...] = ()
     trust: TrustVerdict | None = None
     tape: Tape | None = None
+    rivals: Rivals | None = None
+    on_map: RangesOnMap | None = None
+    refined_with_ranges: MapWithRanges | None = None
 
     @property
     def final(self) -> pycolmap.Reconstruction:
@@ -128,6 +144,8 @@ class MetricResult:
         """Metres per SfM unit after refinement, by where most keyframe centres went."""
         if self.refined is None:
             return None
+        if self.refined_with_ranges is not None:
+            return self.refined_with_ranges.solution.fit.state.metric_from_model.scale
         return align_most(
             self.trajectory.centers, self.trajectory.as_in(self.refined).centers, self.estimate.metric_from_sfm
         ).scale

@@ -104,12 +104,7 @@ class ResultSummary(Record):
             yield f"next time: {advice}"
         yield from _notable(scale.sensitivity)
         if self.refine is not None:
-            refined = _text(self.refine.scale_value, ".6g")
-            yield (
-                f"refined: {refined} m per SfM unit after {self.refine.iterations} iterations"
-                if self.refine.kept
-                else "the refinement broke the map: the result is the scaled map"
-            )
+            yield _refined(self.refine)
         rms, median = (_text(value, ".3f") for value in (ranges.rms_m, ranges.median_abs_m))
         residuals = f", rms {rms} m, median {median} m" if ranges.num_used else ""
         if self.has_ranges:
@@ -126,6 +121,14 @@ class ResultSummary(Record):
             yield from ("", *table.splitlines(), "")
         yield f"metric model: {folder / ('sparse_scaled/0' if self.refine is None else 'sparse_metric/0')}"
         yield f"all results: {folder / self.NAME}"
+
+
+def _refined(refine: entries.RefineEntry) -> str:
+    """What the refinement did; that photos bend a map is nobody's mistake."""
+    if not refine.kept:
+        return "the refinement broke the map: the result is the scaled map"
+    bent_back = f"; the photos alone had bent the map by {refine.bend_m:.2g} m (rms), back by the ranges"
+    return f"refined after {refine.iterations} iterations{bent_back if refine.bend_m else ''}"
 
 
 def _notable(sensitivity: ScaleSensitivity) -> Iterator[str]:

@@ -53,7 +53,7 @@ def scale_diagnostics(estimate: ScaleEstimate, trajectory: Trajectory) -> ScaleD
     bias = np.array([anchor.range_bias_m for anchor in estimate.anchors])[log.anchor_index[rows]]
     tolerance = TOLERANCE_STDDEVS * estimate.errors.stddev_m[rows]
     starts, ends = agreeing_intervals(centers, tags - anchor_m, range_m - bias, tolerance)
-    scales = estimate.value * np.geomspace(1 / CURVE_FACTOR, CURVE_FACTOR, NUM_CURVE_POINTS)
+    scales = placed.scale * np.geomspace(1 / CURVE_FACTOR, CURVE_FACTOR, NUM_CURVE_POINTS)
     num_begun = np.searchsorted(np.sort(starts), scales, side="right")
     return ScaleDiagnostics(
         candidate_rows=np.zeros(0, dtype=np.int64) if table is None else rows[table.rows],

@@ -136,6 +136,8 @@ class ScaleEstimate:
         placement: (7, 7) covariance of the logarithm of the scale, of a turn (rad) and of a shift (m) of the map about
             where the first camera is, by what the ranges get wrong; None where the frame is the first camera's.
         lengths: what measured lengths say by themselves; None: there are none between points of the map.
+        remarks: reasons among these that no refinement changes.
+        refined_value: scale of the map that was refined, which the uncertainty is then of; None of one that was not.
         by_kind: "ranges" and "lengths", as far as there are any, where lengths took part.
     """
 
@@ -159,11 +161,13 @@ class ScaleEstimate:
     placement: Array | None = None
     lengths: LengthScale | None = None
     by_kind: Mapping[str, ScaleByKind] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+    refined_value: float | None = None
 
     @property
     def value(self) -> float:
-        """Metres per SfM unit."""
-        return self.metric_from_sfm.scale
+        """Metres per SfM unit, of the map that is delivered."""
+        return self.metric_from_sfm.scale if self.refined_value is None else self.refined_value
 
     @property
     def stddev_formal(self) -> float:

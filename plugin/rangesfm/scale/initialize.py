@@ -12,10 +12,11 @@ from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.similarity import IDENTITY, Similarity
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.processes.threads import both, with_one_blas_thread
 from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.errors.bending import MapBending, WalkBending
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.observations import RangeObservations, RangeStatus, status_by_weight
@@ -41,6 +42,7 @@ def initialize_scale(
     options: ScaleOptions | None = None,
     range_model: RangeModelOptions | None = None,
     distances: LocatedDistances | None = None,
+    bending: MapBending | None = None,
     seed: int = 0,
 ) -> ScaleEstimate:
     """Estimate scale and frame of an unscaled path from ranges, from measured lengths, or from both.
@@ -53,6 +55,7 @@ def initialize_scale(
             "first_camera" (positions in the first keyframe's camera frame, metres) or
             "unknown" (positions are ignored; the map stays in the first camera's frame).
         distances: taped ones in the model of ``trajectory``; its checks have no say.
+        bending: what is known of how the map is bent; None: it drifts as maps of poses do.
 
     Raises:
         InputError: the log has an anchor that is not given.
@@ -77,9 +80,10 @@ def initialize_scale(
         solution = solution_from(problem, error.in_first_camera)
     table = _paper_table(solution)
     rotations = model_from_cam(observations, trajectory, problem)
+    bending = bending or WalkBending(in_first_camera(trajectory))
     learned, (per_anchor, tests) = both(
         lambda: learned_errors(
-            problem, solution, observations, rotations, camera_velocities(observations, trajectory, problem)
+            problem, solution, observations, rotations, camera_velocities(observations, trajectory, problem), bending
         ),
         lambda: (scale_per_anchor(solution, observations.log.anchor_ids), cutoff_test(solution)),
     )
@@ -88,9 +92,10 @@ def initialize_scale(
     covariance = parameter_covariance(solution, learned)
     found = anchor_estimates(solution, observations.log.anchor_ids, covariance)
     judged = judge(problem, solution, uncertainty, per_anchor, found, tests, options)
-    verdict, reasons = judged.verdict, (*judged.reasons, *open_place)
+    verdict, remarks = judged.verdict, open_place
     if gravity is not None and problem.frame == "first_camera" and anchor_frame == "site":
-        reasons = (*reasons, *levelled_places(gravity, anchors, found))
+        remarks = (*remarks, *levelled_places(gravity, anchors, found))
+    reasons = (*judged.reasons, *remarks)
     if options.method == "two-candidate":
         robust = solution.fit.state.metric_from_model.scale
         verdict = "doubtful"
@@ -117,6 +122,7 @@ def initialize_scale(
         problem=posed,
         solution=solution,
         placement=placement_covariance(solution, covariance),
+        remarks=remarks,
         lengths=lengths,
         by_kind={} if lengths is None else {"ranges": _by_ranges(problem, solution, learned), **_by_lengths(lengths)},
     )

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from rangesfm.arrays import Array
+from rangesfm.ranging.errors.bending import BendingOfCells, MapBending, by_poses
 from rangesfm.ranging.errors.cells import MAX_NUM_CELLS, Cells, cells, noisiness
 from rangesfm.ranging.errors.components import CLOCKS, GIVEN, PLACES, REWEIGHTING
 from rangesfm.ranging.errors.learned import ROUNDING, ExpectedErrors, LearnedErrors, learn_errors
@@ -16,8 +17,10 @@ from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.estimate import ScaleUncertainty
 from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import (
+    Columns,
     RangeFit,
     RangeProblem,
+    RangeState,
     columns_of,
     invert_information,
     predicted_ranges,
@@ -40,15 +43,18 @@ def learned_errors(
     observations: RangeObservations,
     model_from_cam: Array,
     velocities: Array | None = None,
+    bending: MapBending | None = None,
+    max_num_cells: int = MAX_NUM_CELLS,
 ) -> LearnedErrors:
     """What the residuals of a solution say of the ranges' errors.
 
     Args:
+        bending: of the map; None: it is not bent.
         model_from_cam: (n, 3, 3) rotation of the camera at each range, into the world of the problem.
         velocities: (n, 3) of the camera there, model units per second; None: the clocks' offset does not matter.
     """
     linear, taken_off = _linear(posed, solution), observations.log.shared_stddev_m
-    of_ranges = _cells(posed, solution, observations, model_from_cam)
+    of_ranges = _cells(posed, solution, observations, model_from_cam, max_num_cells)
     others_m2 = _by_places(posed, solution, of_ranges)
     if velocities is not None and observations.time_offset_stddev_s:
         placed, by = solution.fit.state.metric_from_model, range_gradient(solution.problem, solution.fit.state)
@@ -63,7 +69,25 @@ def learned_errors(
         curve_stddev_m=None if taken_off is None else taken_off[posed.rows],
         ruled_out=ruled_out(solution.problem),
         others_m2=others_m2,
+        bending=bending_of_cells(bending, of_ranges, posed, solution.fit.state, observations, model_from_cam),
     )
+
+
+def bending_of_cells(
+    bending: MapBending | None,
+    of_ranges: Cells,
+    posed: ScaleProblem,
+    state: RangeState,
+    observations: RangeObservations,
+    model_from_cam: Array,
+) -> BendingOfCells | None:
+    """As the ranges of a problem see it at a state; None of a map that is not bent."""
+    if bending is None:
+        return None
+    problem, on_path = posed.ranges, observations.on_path(posed.rows)
+    gradient, arms_m = range_gradient(problem, state), problem.tag_from_center
+    slopes = by_poses(gradient, state.metric_from_model, model_from_cam, arms_m, on_path)
+    return bending.of_cells(of_ranges, slopes, frame_is_free=problem.frame_is_free)
 
 
 @dataclass(frozen=True)
@@ -102,6 +126,7 @@ def errors_to_expect(
     model_from_cam: Array,
     stddevs: Mapping[str, float],
     max_num_cells: int = MAX_NUM_CELLS,
+    bending: MapBending | None = None,
 ) -> LearnedErrors:
     """The same before anything is measured, as radios let expect.
 
@@ -109,13 +134,14 @@ def errors_to_expect(
         stddevs: of components of which more is known, by name.
         max_num_cells: fewer are coarser, and sooner computed.
     """
-    taken_off = observations.log.shared_stddev_m
+    taken_off, state = observations.log.shared_stddev_m, solution.fit.state
     of_ranges = _cells(posed, solution, observations, model_from_cam, max_num_cells)
     return ExpectedErrors.of(
         of_ranges,
         None if taken_off is None else taken_off[posed.rows],
         ruled_out(solution.problem),
         _by_places(posed, solution, of_ranges),
+        bending=bending_of_cells(bending, of_ranges, posed, state, observations, model_from_cam),
     ).usual(stddevs)
 
 
@@ -182,21 +208,70 @@ def scale_uncertainty(
     """
     linear = _linear(posed, solution)
     design, off_m = learned.cells.mean(linear.design), learned.cells.mean(linear.off_m)
-    covariance = learned.covariance_m2
-    covariance[np.diag_indices_from(covariance)] += ROUNDING * np.trace(covariance)
-    whitened = cho_solve(cho_factor(covariance), design)
-    inverse = invert_information(design.T @ whitened + linear.prior_design.T @ linear.prior_design)
-    of_cells, of_priors = whitened @ inverse[0], linear.prior_design @ inverse[0]
+    _, weights, of_given = best_estimate(learned.covariance_m2, design, linear.prior_design)
+    of_cells, of_priors = weights[0], of_given[0]
     components = learned.stddev_of_cells(of_cells)
     if (given := float(np.linalg.norm(of_priors))) > 0:
         components[GIVEN] = given
     summed = expected_scale_uncertainty(solution, learned, bending_of_lengths).components
     best, of_sum = (float(np.linalg.norm(list(each.values()))) for each in (components, summed))
-    chance = np.sqrt(max(of_sum**2 - best**2, 0.0))
-    change = float(of_cells @ off_m + of_priors @ linear.prior_off)
-    lean = float(np.clip(change, -_MAX_CHANCE * chance, _MAX_CHANCE * chance))
+    lean = believable(float(of_cells @ off_m + of_priors @ linear.prior_off), best, of_sum)
     components[REWEIGHTING] = abs(lean)
     return ScaleUncertainty(solution.fit.log_scale_stddev, components, lean)
+
+
+def believable(change: float, best: float, other: float) -> float:
+    """As much of a change between the best estimate and another, of these stddevs, as may be chance."""
+    chance = float(np.sqrt(max(other**2 - best**2, 0.0)))
+    return float(np.clip(change, -_MAX_CHANCE * chance, _MAX_CHANCE * chance))
+
+
+@dataclass(frozen=True)
+class AsWeighed:
+    """What is known of a map that photos and ranges hold together, each by the weight it was given.
+
+    Attributes:
+        uncertainty: of the scale. covariance: (p, p) of the map as a whole and of the anchors, as of ``columns``.
+    """
+
+    uncertainty: ScaleUncertainty
+    covariance: Array
+    columns: Columns
+
+
+def uncertainty_as_weighed(
+    posed: ScaleProblem, solution: Solution, learned: LearnedErrors, formal_bending_m2: Array
+) -> AsWeighed:
+    """Of a map that was bent to the ranges, at that map: its weights, and errors that are what they were learnt to be.
+
+    Args:
+        solution: weighted as the map was.
+        formal_bending_m2: (c, c) of the cells, with what the photos were given.
+    """
+    linear, errors, cells = _linear(posed, solution), solution.errors, learned.cells
+    robust = solution.fit.weights / errors.stddev_m**2
+    alone = np.diag(1 / np.maximum(cells.total(robust), 1e-12)) + formal_bending_m2
+    given, index = posed.ranges, cells.anchor_index
+    of_biases = given.bias_stddev_m[index] ** 2 * (index[:, None] == index) + given.common_bias_stddev_m**2
+    weighed = np.diag(1 / np.maximum(cells.total(errors.weight * robust), 1e-12)) + formal_bending_m2 + of_biases
+    design = cells.mean(linear.design)
+    formal, _, _ = best_estimate(alone, design, linear.prior_design)
+    _, of_cells, of_priors = best_estimate(weighed, design, linear.prior_design)
+    components = learned.stddev_of_cells(of_cells[0])
+    if (by_given := float(np.linalg.norm(of_priors[0]))) > 0:
+        components[GIVEN] = by_given
+    covariance = of_cells @ learned.covariance_m2 @ of_cells.T + of_priors @ of_priors.T
+    only_map = replace(given, bias_stddev_m=np.zeros(given.num_anchors))
+    uncertainty = ScaleUncertainty(float(np.sqrt(formal[0, 0])), components)
+    return AsWeighed(uncertainty, covariance, columns_of([only_map])[0])
+
+
+def best_estimate(covariance: Array, design: Array, prior_design: Array) -> tuple[Array, Array, Array]:
+    """(p, p) covariance of the best estimate with errors of some covariance, and its (p, c) and (p, r) weights."""
+    covariance = covariance + ROUNDING * np.trace(covariance) * np.eye(len(covariance))
+    whitened = cho_solve(cho_factor(covariance), design)
+    inverse = invert_information(design.T @ whitened + prior_design.T @ prior_design)
+    return inverse, inverse @ whitened.T, inverse @ prior_design.T
 
 
 def expected_scale_uncertainty(

@@ -94,15 +94,24 @@ def judge_lengths(lengths: LengthScale, uncertainty: ScaleUncertainty, options: 
     return _verdict(doubts, [], uncertainty.half_width_95, options)
 
 
-def _verdict(doubts: list[_Doubt], remarks: list[_Doubt], half_width: float, options: ScaleOptions) -> Verdict:
+def refuse_unknown(half_width: float, reasons: Sequence[str], advice: Sequence[str], options: ScaleOptions) -> None:
+    """GeometryError where a scale is less certain than was asked for, with the first of the reasons and of the advice.
+
+    Args:
+        half_width: of the 95 % interval.
+    """
     if half_width > NORMAL_95 * options.max_relative_stddev:
-        why = f": {doubts[0].reason}" if doubts else ""
-        advised = (doubt.advice for doubt in doubts if doubt.advice)
+        planned = "plan it first, which says what would narrow it (rangesfm plan)"
         raise GeometryError(
-            f"the scale is only known to {100 * half_width / NORMAL_95:.1f} % (1 stddev), "
-            f"more than the {100 * options.max_relative_stddev:g} % allowed (max_relative_stddev){why}; next time: "
-            f"{next(advised, 'plan it first, which says what would narrow it (rangesfm plan)')}"
+            f"the scale is only known to {100 * half_width / NORMAL_95:.1f} % (1 stddev), more than the "
+            f"{100 * options.max_relative_stddev:g} % allowed (max_relative_stddev)"
+            f"{''.join(f': {reason}' for reason in reasons[:1])}; next time: {next(iter(advice), planned)}"
         )
+
+
+def _verdict(doubts: list[_Doubt], remarks: list[_Doubt], half_width: float, options: ScaleOptions) -> Verdict:
+    why, advised = [doubt.reason for doubt in doubts], [doubt.advice for doubt in doubts if doubt.advice]
+    refuse_unknown(half_width, why, advised, options)
     summary = f"the scale is known to {100 * half_width:.1f} % (95 % interval)"
     if half_width > DOUBTFUL_ABOVE:
         doubts.insert(0, _Doubt(f"{summary}, worse than {100 * DOUBTFUL_ABOVE:g} %"))

@@ -13,7 +13,7 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.colmap.reprojection import MISMATCHED, PointErrors, point_errors
-from rangesfm.geometry.similarity import IDENTITY, align_most, path_shape, similarity_motions
+from rangesfm.geometry.similarity import path_shape, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
@@ -37,8 +37,6 @@ _LARGE, _MANY_MORE = 10.0, 0.05
 _MAX_POINTS_GROWTH = 2.0
 # Of the median residual of the ranges, or of their stddev: a refinement brings them nearer.
 _MAX_RESIDUAL_GROWTH = 2.0
-# Half widths of the scale's 95 % interval: beyond them it is no longer the same map.
-_MAX_HALF_WIDTHS = 3.0
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,6 @@ class Place:
 def doubts_of_map(
     estimate: ScaleEstimate,
     summary: RefineSummary | None,
-    refined_scale: float | None,
     points: PointErrors,
     *,
     noise_is_given: bool,
@@ -80,14 +77,14 @@ def doubts_of_map(
 
     Args:
         estimate: of the scale.
-        summary, refined_scale: of the refinement; None for a map that is only scaled.
+        summary: of the refinement; None for a map that is only scaled.
         points: of the final model.
         noise_is_given: somebody said how much the ranges scatter.
     """
     stage = estimate if summary is None else summary
     noise_m = np.full(len(stage.observations.log), np.nan) if noise_is_given else stage.errors.stddev_m
     return (
-        *_of_fit(estimate, summary, refined_scale, points),
+        *_of_fit(summary, points),
         *_of_say(stage.observations),
         *_of_positions(stage.anchors),
         *_of_noise(stage.observations, noise_m),
@@ -102,10 +99,8 @@ def _surveyed(anchors: Sequence[AnchorEstimate]) -> Iterator[tuple[str, Array, f
             yield anchor.anchor_id, anchor.position_m - prior_m, stddev_m
 
 
-def _of_fit(
-    estimate: ScaleEstimate, summary: RefineSummary | None, refined_scale: float | None, points: PointErrors
-) -> Iterator[Doubt]:
-    """Of points that do not fit the photos, of the solver, and of a scale that the refinement took elsewhere."""
+def _of_fit(summary: RefineSummary | None, points: PointErrors) -> Iterator[Doubt]:
+    """Of points that do not fit the photos, and of the solver."""
     if not points.fit:
         yield Doubt(points.apart("the map"), MISMATCHED)
     if summary is not None and not summary.converged:
@@ -113,12 +108,6 @@ def _of_fit(
         yield Doubt(f"the refinement stopped before it converged: {summary.message}", remedy)
     for misfit in () if summary is None else summary.misfits:
         yield Doubt(f"after the refinement {misfit}", "check clocks, lever arm and anchors")
-    low, high = estimate.interval_95
-    if refined_scale is not None and not low <= refined_scale <= high:
-        reason = (
-            f"the refined scale, {refined_scale:.5g}, lies outside the scale's own interval, {low:.5g} to {high:.5g}"
-        )
-        yield Doubt(reason, "photos and ranges disagree: check clocks, lever arm and anchors")
 
 
 def _of_say(observations: RangeObservations) -> Iterator[Doubt]:
@@ -160,7 +149,11 @@ def _of_noise(observations: RangeObservations, noise_m: Array) -> Iterator[Doubt
 
 
 def place_of_map(
-    estimate: ScaleEstimate, summary: RefineSummary | None, centers_m: Array, doubts: Sequence[Doubt]
+    estimate: ScaleEstimate,
+    summary: RefineSummary | None,
+    centers_m: Array,
+    doubts: Sequence[Doubt],
+    bent_by_m: Array,
 ) -> Place | None:
     """How far to trust the place of a map in the site's frame; None where its frame is the first camera's.
 
@@ -168,6 +161,7 @@ def place_of_map(
         summary: of the refinement; None for a map that is only scaled.
         centers_m: (n, 3) of the keyframes in the final map, the first in time first.
         doubts: of the map; its place is no better.
+        bent_by_m: (n,) how far ranges would bend each keyframe of a map that is only scaled; (0,) if nobody looked.
     """
     if estimate.placement is None:
         return None
@@ -176,7 +170,8 @@ def place_of_map(
     of_map, of_keyframes = of_one_piece if found is None else (found.similarity, found.centers)
     stddevs = np.sqrt(np.maximum(np.diag(of_map), 0.0))
     heading_deg = float(np.rad2deg(stddevs[3]))
-    worst_m = float(np.sqrt(np.trace(of_keyframes, axis1=1, axis2=2).max()))
+    bent_m2 = np.square(bent_by_m) if found is None and len(bent_by_m) else 0.0
+    worst_m = float(np.sqrt((np.trace(of_keyframes, axis1=1, axis2=2) + bent_m2).max()))
     surveyed = [a.prior_position_m for a in estimate.anchors if a.prior_position_m is not None]
     size_m = float(np.linalg.norm(np.ptp(np.vstack([centers_m, *surveyed]), axis=0)))
     summary_of_place = (
@@ -217,7 +212,7 @@ def why_broken(
     old, new = (trajectory.as_in(model).centers for model in (scaled, refined))
     return (
         *_out_of_line(before, after, summary, _max_growth(scaled, summary, range_loss_scale)),
-        *_elsewhere(before.points - old.mean(axis=0), after.points - new.mean(axis=0), old, new, estimate),
+        *_elsewhere(before.points - old.mean(axis=0), after.points - new.mean(axis=0)),
         *_apart_from_ranges(estimate, summary, old),
     )
 
@@ -251,21 +246,12 @@ def _out_of_line(before: PointErrors, after: PointErrors, summary: RefineSummary
         )
 
 
-def _elsewhere(old_points: Array, new_points: Array, old: Array, new: Array, estimate: ScaleEstimate) -> Iterator[str]:
-    """Points, from the path's middle, and keyframes."""
+def _elsewhere(old_points: Array, new_points: Array) -> Iterator[str]:
+    """Points, from the path's middle."""
     # Those on the horizon may go where they like, half of all may not.
     old_m, new_m = (np.median(np.linalg.norm(of, axis=1)) if len(of) else 0.0 for of in (old_points, new_points))
     if len(old_points) and new_m > _MAX_POINTS_GROWTH * old_m:
         yield f"the points were thrown away from the path: from {old_m:.3g} to {new_m:.3g} m (median)"
-    if len(old) < 3:
-        return
-    change = align_most(old, new, IDENTITY).scale
-    half_width = estimate.uncertainty.half_width_95
-    if not change > 0 or abs(np.log(change)) > _MAX_HALF_WIDTHS * half_width:
-        yield (
-            f"the refinement changed the scale by {100 * (change - 1):+.1f} %, where it was known to "
-            f"{100 * half_width:.1f} % (95 % interval)"
-        )
 
 
 def _apart_from_ranges(estimate: ScaleEstimate, summary: RefineSummary, path_m: Array) -> Iterator[str]:

@@ -5,15 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.ranging.errors.bending import BendingOfCells, MapBending, by_poses
 from rangesfm.ranging.errors.cells import Cells, cells, noisiness
 from rangesfm.ranging.errors.components import PLACES
 from rangesfm.ranging.errors.learned import ExpectedErrors, LearnedErrors
 from rangesfm.ranging.errors.noise import MIN_STDDEV_M, robust_stddev
-from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.observations import OnPath, RangeObservations
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.scale.initialize import camera_velocities, model_from_cam
 from rangesfm.scale.problem import ScaleProblem
@@ -61,6 +63,7 @@ class RangesOnMap:
         weights: (n,) robust weights by which the estimate took them.
         placing_m: (n,) stddev of each coordinate of the antenna's place. gap: (n,) the gap that each range is from.
         curve_stddev_m: (n,) of a learnt error curve that has been taken off; None if none has.
+        on_path: where they were taken. bending: of the map; None: it is not bent.
     """
 
     problem: RangeProblem
@@ -77,6 +80,8 @@ class RangesOnMap:
     placing_m: Array
     gap: Indices
     curve_stddev_m: Array | None
+    on_path: OnPath
+    bending: MapBending | None
 
     @property
     def world_from_cam(self) -> Array:
@@ -98,9 +103,13 @@ class RangesOnMap:
 
 
 def ranges_on_map(
-    posed: ScaleProblem, solution: Solution, observations: RangeObservations, trajectory: Trajectory
+    posed: ScaleProblem,
+    solution: Solution,
+    observations: RangeObservations,
+    trajectory: Trajectory,
+    bending: MapBending | None,
 ) -> RangesOnMap:
-    """As the scale stage left them."""
+    """At a solution, on the path as its problem has it."""
     log, rows = observations.log, posed.rows
     return RangesOnMap(
         problem=replace(posed.ranges, stddev_m=np.ones(len(rows)), share=None),
@@ -117,6 +126,8 @@ def ranges_on_map(
         placing_m=posed.placing_stddev_m(solution.fit.state.metric_from_model.scale),
         gap=observations.before[rows],
         curve_stddev_m=None if log.shared_stddev_m is None else log.shared_stddev_m[rows],
+        on_path=observations.on_path(rows),
+        bending=bending,
     )
 
 
@@ -125,7 +136,8 @@ class Linearized:
     """c cells of ranges and r priors, by p parameters. What ranges are off by for each anchor's sake is random.
 
     Attributes:
-        residual_m: (c,) predicted minus measured. design: (c, p) its derivative.
+        residual_m: (c,) predicted minus measured, where the photos alone would have the map.
+        design: (c, p) its derivative.
         prior_residual, prior_design: (r,) and (r, p), in stddevs; first those of the anchors' places.
         columns: which of the p parameters is what; the first is the logarithm of the scale.
         place: (c, 3, p) derivative of the camera's place in each cell.
@@ -165,10 +177,10 @@ class Linearized:
 
     def with_learnt_errors(self, columns: Array, priors: Array) -> Linearized:
         """With what is left random when (c, k) columns and (r, k) priors explain what they can."""
-        # At the place where nothing speaks against what is known beforehand.
+        # At the place where nothing speaks against what is known beforehand, of the map as it is.
         back = np.linalg.lstsq(self.prior_design, self.prior_residual, rcond=1e-12)[0]
         learnt = self.expected.learnt(
-            off_m=self.design @ back - self.residual_m,
+            off_m=self.design @ back - self.residual_m + self.expected.shift_m,
             design=np.hstack([self.design, columns]),
             prior_design=np.hstack([self.prior_design, priors]),
             noise_m=self.scatter_m,
@@ -191,7 +203,9 @@ def linearized(on_map: RangesOnMap, cells_of_ranges: Cells | None = None) -> Lin
     found, scatter_m = _cells(on_map) if cells_of_ranges is None else (cells_of_ranges, 0.0)
     towards = RangeGradient.of(on_map.from_anchor_m).by_tag
     others_m2 = _wandering(found) | {PLACES: found.shared_by_places(towards, on_map.placing_m, on_map.gap)}
-    expected = ExpectedErrors.of(found, on_map.curve_stddev_m, ruled_out(on_map.problem), others_m2)
+    expected = ExpectedErrors.of(
+        found, on_map.curve_stddev_m, ruled_out(on_map.problem), others_m2, _bending(on_map, found)
+    )
     return _linearized(on_map, expected, scatter_m, expected.usual({"white": scatter_m}))
 
 
@@ -214,7 +228,7 @@ def _linearized(on_map: RangesOnMap, expected: ExpectedErrors, scatter_m: float,
         arms_m = mean(tag_positions(problem, placed) - placed.translation)
         place[:, :, columns.frame : columns.frame + 6] = similarity_motions(arms_m)[:, :, 1:]
     return Linearized(
-        residual_m=mean(on_map.residual_m),
+        residual_m=mean(on_map.residual_m) + expected.shift_m,
         design=mean(range_jacobian(problem, columns, state, state)),
         prior_residual=prior_residuals(problem, columns, state),
         prior_design=prior_jacobian(problem, columns, state, state),
@@ -230,6 +244,18 @@ def _linearized(on_map: RangesOnMap, expected: ExpectedErrors, scatter_m: float,
         expected=expected,
         errors=errors,
     )
+
+
+def _bending(on_map: RangesOnMap, cells_of_ranges: Cells) -> BendingOfCells | None:
+    if on_map.bending is None:
+        return None
+    return on_map.bending.of_cells(cells_of_ranges, slopes_by_poses(on_map), frame_is_free=on_map.problem.frame_is_free)
+
+
+def slopes_by_poses(on_map: RangesOnMap) -> csr_array:
+    """(n, 6 k) of the distances, by the path's poses."""
+    gradient, placed = RangeGradient.of(on_map.from_anchor_m), on_map.state.metric_from_model
+    return by_poses(gradient, placed, on_map.model_from_cam, on_map.problem.tag_from_center, on_map.on_path)
 
 
 def _wandering(cells_of_ranges: Cells) -> dict[str, Array]:

@@ -107,9 +107,12 @@ def _causes(problem: Linearized, nominated: Sequence[Test], *, is_sure: bool) ->
         again, deviance, state = _settled_test(problem, _at_best_time(factorized, test.hypothesis))
         gain = before - deviance
         is_found = again.is_possible and bool(np.isfinite(deviance))
-        # What is not linear was tested by its first step, which says little of a large mistake.
-        if is_found and ((is_sure and test.hypothesis.is_linear) or gain > test.threshold):
-            causes.append(_cause(replace(again, threshold=test.threshold), state, gain, _penalty(again, num)))
+        # What is not linear was tested by its first step, which says little of a large mistake. What the errors explain
+        # as well, where they need not share with all other mistakes, is none.
+        penalty = _penalty(again, num)
+        enough = penalty if is_sure and test.hypothesis.is_linear else test.threshold
+        if is_found and gain > enough:
+            causes.append(_cause(replace(again, threshold=test.threshold), state, gain, penalty))
     if not causes and not is_sure:
         return []
     causes += _alternatives(problem, before)

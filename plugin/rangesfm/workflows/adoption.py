@@ -16,13 +16,13 @@ from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.trust.hypothesis import Correction
 from rangesfm.trust.verdict import TrustVerdict
-from rangesfm.workflows.metric_map import ranges_on_path, scale_by_survey
+from rangesfm.workflows.metric_map import metric_map, ranges_on_path
 
 
 def with_likeliest_cause(
     survey: Survey, inputs: RangingInputs, path: PathOfModel, metric: MetricResult, journal: Journal
 ) -> tuple[RangingInputs, MetricResult]:
-    """The scale again from corrected inputs, with what changed as a reason to doubt it; the same if nothing was found.
+    """The map again from corrected inputs, with what changed as a reason to doubt it; the same if nothing was found.
 
     What is told apart no better than by the likelier of two is adopted all the same: who asks for it has been told.
     """
@@ -35,7 +35,8 @@ def with_likeliest_cause(
     corrected = _corrected_inputs(inputs, cause.correction, metric.trust.rows)
     try:
         moved = replace(path, observations=_observations(survey, corrected, path, metric, metric.trust))
-        adopted = scale_by_survey(survey, corrected, moved, metric.time_offset, journal)
+        is_refined = metric.refined is not None
+        adopted = metric_map(survey, corrected, moved, metric.time_offset, journal, refine=is_refined)
     except GeometryError as error:
         journal.warn(f"nothing is adopted, as with that {error}")
         return inputs, metric

@@ -29,11 +29,9 @@ from rangesfm.workflows.adoption import with_likeliest_cause
 from rangesfm.workflows.metric_map import (
     find_time_offset,
     join_by_survey,
-    judge_map,
+    metric_map,
     path_with_times,
     ranges_on_paths,
-    refine_map,
-    scale_by_survey,
 )
 from rangesfm.workflows.photos import (
     AdjustmentWithRanges,
@@ -158,20 +156,16 @@ def map_in_metres(
         offset: of the clocks, if it was estimated.
         must_join: whether it is an error if all others are left out.
     """
-    # Scale, and the metric map that follows from it.
-    with journal.stage("scale"):
+    with journal.timed("scale"):
         path, verdicts = join_by_survey(survey, inputs, paths, journal, must_join=must_join)
         tape = (inputs.tape or Tape()).with_more(
             read_rigs(survey.images.rig_config).baselines(path.sfm, survey.images.baseline_stddev_m)
         )
         inputs = replace(inputs, tape=locatable(tape, path.sfm) if tape.distances else None)
-        metric = replace(scale_by_survey(survey, inputs, path, offset, journal), models=verdicts)
-        if survey.scale.adopt:
-            inputs, metric = with_likeliest_cause(survey, inputs, path, metric, journal)
-    # Global refinement: photos and ranges together.
-    if refine:
-        with journal.stage("refinement"):
-            metric = refine_map(survey, inputs, metric, journal)
+    # Scale, global refinement of photos and ranges together, and what is known of the map in the end.
+    made = replace(metric_map(survey, inputs, path, offset, journal, refine=refine), models=verdicts)
+    if survey.scale.adopt:
+        inputs, made = with_likeliest_cause(survey, inputs, path, made, journal)
     # Comparison and results.
-    judged = with_advice(judge_map(survey, metric, journal), inputs.tag_in_cam_m)
+    judged = with_advice(made, inputs.tag_in_cam_m)
     return write_results(survey, inputs, judged, journal)

@@ -39,7 +39,7 @@ _USUAL_NOISE_M = 0.1
 _USUAL_NOISE_COUNTS = 2.0
 _MIN_ORDINARY = 0.3
 # Of the errors that are learnt: each anchor's bias is estimated with a prior of its own, and the path is known.
-_NOT_HERE = ("bias", "common_bias", "bending")
+_NOT_HERE = ("bias", "common_bias")
 
 
 def multilaterate(positions: Array, ranges: Array) -> tuple[Array, Array]:

@@ -27,8 +27,6 @@ _OFF_AXIS_RAD = 1.0
 # In logarithms of distance.
 _SMOOTH, _ROUGH = 1.0, 0.5
 _MIN_DISTANCE_M = 0.05
-# Of the time a path takes, within which it bends one way.
-_BEND = 0.125
 # Metres (slope: share of the distance), as learnt against the true distances from one start for all, by
 # ``python -m tests.studies.shown_errors``. The logs are those of ``examples/radios.md``.
 _SHOWN = """
@@ -48,7 +46,6 @@ slope       0.0044    0.0040           0.0044     0.0040        0.0040        0.
 antenna     0.035     0.048            0.024      0.025         0.023         0.025    0.005  0.029
 off_axis    0.080     0.053            0.040      0.040         0.042         0.040    0.020  0.039
 tag_antenna 0.033     0.029            0.021      0.024         0.019         0.045    0.008  0.025
-bending     0.004     0.008            0.005      0.004         0.004         0.004    0.010  0.009
 """
 LOGS = tuple(_SHOWN.split()[1:9])
 # Of the logarithms: eight logs do not show how alike other radios are.
@@ -125,11 +122,6 @@ def _off_axis(cells: Cells) -> Array:
     return _smooth(np.arccos(np.clip(cosine, -1.0, 1.0)), _OFF_AXIS_RAD)
 
 
-def _bending(cells: Cells) -> Array:
-    length_s = max(_BEND * float(np.ptp(cells.time_s)), 1e-9)
-    return (cells.from_anchor @ cells.from_anchor.T) * _fading(cells.time_s, length_s)
-
-
 def components(expected: Mapping[str, tuple[float, float]]) -> tuple[Component, ...]:
     """All of them, with median and spread over radios by name."""
 
@@ -176,7 +168,6 @@ def components(expected: Mapping[str, tuple[float, float]]) -> tuple[Component, 
         ),
         of("off_axis", "anchors' antennas, alike, away from the path's middle", _off_axis),
         of("tag_antenna", "the tag's antenna by direction", lambda c: _same(c.tag_index) * _by_direction(c.in_cam)),
-        of("bending", "the map's own bending", _bending),
     )
 
 
@@ -204,6 +195,13 @@ def population(without: str | None = None) -> dict[str, tuple[float, float]]:
 
 COMPONENTS = components(population())
 
+BENDS = {
+    "scale_drift": "the map's scale, drifting along the path",
+    "heading_drift": "the map's heading, drifting along the path",
+    "bending": "the map's own bending",
+}
+"""Components that are the map's, not the ranges', with words for people: what it does to them depends on the map."""
+
 LEARNT_CURVE = "learnt_curve"
 """What is left of an error curve that has been taken off, as it was learnt with it."""
 
@@ -225,7 +223,7 @@ PLACES = "places"
 
 def component_words(names: Iterable[str]) -> dict[str, str]:
     """What each component is, for people."""
-    words = {component.name: component.words for component in COMPONENTS}
+    words = {component.name: component.words for component in COMPONENTS} | BENDS
     words |= {
         LEARNT_CURVE: "the learnt error curve",
         GIVEN: "tapes, anchors' positions and what else was given",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,8 +10,9 @@ from scipy.linalg import lapack
 from scipy.optimize import minimize
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.ranging.errors.bending import BendingOfCells
 from rangesfm.ranging.errors.cells import Cells
-from rangesfm.ranging.errors.components import COMPONENTS, LEARNT_CURVE, Component
+from rangesfm.ranging.errors.components import BENDS, COMPONENTS, LEARNT_CURVE, Component
 
 # Noise of single ranges up to which a radio is one of the population. Of one with more all else may be off by more, and
 # faster than in proportion: an old one with five times the noise reads 7 % long, where the others are right to a
@@ -37,6 +38,7 @@ class LearnedErrors:
         names, stddevs: of the components; metres, ``slope`` a share of the distance; of what is not learnt, of cells on
             average.
         covariances_m2: (k, c, c) that each of them adds.
+        unlikeliness: what is expected has against these stddevs, as -2 times a logarithm.
     """
 
     cells: Cells
@@ -44,6 +46,7 @@ class LearnedErrors:
     names: tuple[str, ...]
     stddevs: Array
     covariances_m2: Array
+    unlikeliness: float = 0.0
 
     @property
     def covariance_m2(self) -> Array:
@@ -55,23 +58,15 @@ class LearnedErrors:
         """By name."""
         return dict(zip(self.names, self.stddevs.tolist(), strict=True))
 
-    @property
-    def unlikeliness(self) -> float:
-        """What radios let expect has against these stddevs, as -2 times a logarithm."""
-        known = {component.name: component for component in COMPONENTS}
-        is_calibrated = LEARNT_CURVE in self.names
-        off = [
-            np.log(stddev / _median(known[name], is_calibrated)) / known[name].spread
-            for name, stddev in zip(self.names, self.stddevs, strict=True)
-            if name in known
-        ]
-        return float(np.sum(np.square(off)))
-
-    def without(self, name: str) -> LearnedErrors:
-        """But for one component."""
-        kept = [row for row, each in enumerate(self.names) if each != name]
-        names = tuple(self.names[row] for row in kept)
-        return replace(self, names=names, stddevs=self.stddevs[kept], covariances_m2=self.covariances_m2[kept])
+    def without(self, *names: str) -> LearnedErrors:
+        """But for some components."""
+        kept = [row for row, each in enumerate(self.names) if each not in names]
+        return replace(
+            self,
+            names=tuple(self.names[row] for row in kept),
+            stddevs=self.stddevs[kept],
+            covariances_m2=self.covariances_m2[kept],
+        )
 
     def subset(self, rows: Indices) -> LearnedErrors:
         """Of some of the ranges."""
@@ -102,6 +97,7 @@ def learn_errors(
     curve_stddev_m: Array | None = None,
     ruled_out: Collection[str] = (),
     others_m2: Mapping[str, Array] | None = None,
+    bending: BendingOfCells | None = None,
 ) -> LearnedErrors:
     """Restricted maximum likelihood (Patterson and Thompson, 1971) with lognormal priors on the stddevs.
 
@@ -113,14 +109,19 @@ def learn_errors(
         curve_stddev_m: (n,) of a learnt error curve that has been taken off; None if none has.
         ruled_out: components that the user knows not to be there.
         others_m2: (c, c) covariances of what else there is, by name, of which nothing is to be learnt.
+        bending: of the map; None: it is not bent.
     """
-    expected = ExpectedErrors.of(cells, curve_stddev_m, ruled_out, others_m2)
+    expected = ExpectedErrors.of(cells, curve_stddev_m, ruled_out, others_m2, bending)
     return expected.learnt(cells.mean(off_m), cells.mean(design), prior_design, noise_m)
 
 
 def usual_stddevs(*, is_calibrated: bool) -> dict[str, float]:
     """Of all components by name: roots of the mean variances over radios (of a lognormal stddev)."""
-    return {c.name: float(_median(c, is_calibrated) * np.exp(c.spread**2)) for c in COMPONENTS}
+    return _usual(COMPONENTS, is_calibrated=is_calibrated)
+
+
+def _usual(components: Iterable[Component], *, is_calibrated: bool) -> dict[str, float]:
+    return {c.name: float(_median(c, is_calibrated) * np.exp(c.spread**2)) for c in components}
 
 
 @dataclass(frozen=True)
@@ -130,6 +131,7 @@ class ExpectedErrors:
     Attributes:
         components: these. of_components: (k, c, c) covariances for a stddev of 1 of each.
         known: (c, c) covariances that nothing is to be learnt of, by name.
+        shift_m: (c,) by how much predicted ranges grow as the map goes to where the photos alone would have it.
         is_calibrated: whether a learnt error curve has been taken off.
     """
 
@@ -137,6 +139,7 @@ class ExpectedErrors:
     components: tuple[Component, ...]
     of_components: Array
     known: Mapping[str, Array]
+    shift_m: Array
     is_calibrated: bool
 
     @classmethod
@@ -146,9 +149,11 @@ class ExpectedErrors:
         curve_stddev_m: Array | None = None,
         ruled_out: Collection[str] = (),
         others_m2: Mapping[str, Array] | None = None,
+        bending: BendingOfCells | None = None,
     ) -> ExpectedErrors:
         """As of ``learn_errors``."""
         components = tuple(component for component in COMPONENTS if component.name not in ruled_out)
+        components += () if bending is None else bending.components
         of_anchor = np.outer(cells.noisiness, cells.noisiness)
         of_components = [c.correlation(cells) * (of_anchor if c.is_of_anchor else 1.0) for c in components]
         known = dict(others_m2 or {})
@@ -156,35 +161,41 @@ class ExpectedErrors:
             stddev = cells.mean(curve_stddev_m)
             smooth = next(component for component in COMPONENTS if component.name == "curve")
             known[LEARNT_CURVE] = np.outer(stddev, stddev) * smooth.correlation(cells)
-        return cls(cells, components, np.array(of_components), known, curve_stddev_m is not None)
+        shift_m = np.zeros(len(cells)) if bending is None else bending.shift_m
+        return cls(cells, components, np.array(of_components), known, shift_m, curve_stddev_m is not None)
 
     def usual(self, stddevs: Mapping[str, float]) -> LearnedErrors:
         """Roots of the mean variances over radios, or by name what is known better."""
-        usual = usual_stddevs(is_calibrated=self.is_calibrated) | dict(stddevs)
+        usual = _usual(self.components, is_calibrated=self.is_calibrated) | dict(stddevs)
         sizes = np.array([usual[component.name] for component in self.components])
         return self._of(sizes, sizes[:, None, None] ** 2 * self.of_components)
 
     def learnt(
         self, off_m: Array, design: Array, prior_design: Array, noise_m: float, most_unusual: float = np.inf
     ) -> LearnedErrors:
-        """As of ``learn_errors``, with (c,) and (c, p) of cells.
+        """As of ``learn_errors``, with (c,) and (c, p) of cells of the map as it is.
 
         Args:
             most_unusual: how far above its median any stddev may be, in spreads over radios.
         """
         # A map bends no more for a bad radio, and the noise says itself how large it is.
         widening = max(1.0, noise_m / _USUAL_NOISE_M) ** _WIDENING_POWER
-        widened = [1.0 if c.name in ("bending", "white") else widening**2 for c in self.components]
+        widened = [1.0 if c.name in (*BENDS, "white") else widening**2 for c in self.components]
         likelihood = _Likelihood(
             np.array(widened)[:, None, None] * self.of_components if widening > 1 else self.of_components,
             np.log([_median(component, self.is_calibrated) for component in self.components]),
             np.array([component.spread for component in self.components]),
             np.sum([*self.known.values(), np.zeros((len(self.cells), len(self.cells)))], axis=0),
-            off_m,
+            off_m - self.shift_m,
             *_independent(design, prior_design),
         )
         stddevs = likelihood.mean_stddevs(likelihood.most_likely(most_unusual))
-        return self._of(stddevs, stddevs[:, None, None] ** 2 * likelihood.of_components)
+        off_expected = [
+            np.log(stddev / _median(component, self.is_calibrated)) / component.spread
+            for component, stddev in zip(self.components, stddevs, strict=True)
+        ]
+        found = self._of(stddevs, stddevs[:, None, None] ** 2 * likelihood.of_components)
+        return replace(found, unlikeliness=float(np.sum(np.square(off_expected))))
 
     def _of(self, stddevs: Array, covariances: Array) -> LearnedErrors:
         """With what is known otherwise."""

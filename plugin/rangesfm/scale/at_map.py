@@ -1,0 +1,139 @@
+"""A metric map with the ranges on it, as a scale problem that is solved: what is learnt and known there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.options import ScaleOptions
+from rangesfm.ranging.errors.bending import MapBending
+from rangesfm.ranging.errors.learned import LearnedErrors
+from rangesfm.ranging.errors.range_errors import RangeErrors
+from rangesfm.ranging.observations import RangeObservations
+from rangesfm.scale.estimate import ScaleEstimate
+from rangesfm.scale.initialize import camera_velocities, model_from_cam
+from rangesfm.scale.problem import ScaleProblem, first_camera_from
+from rangesfm.scale.range_equation import RangeState, fit_at, predicted_ranges
+from rangesfm.scale.solution import Solution, weighted
+from rangesfm.scale.uncertainty import AsWeighed, bending_of_cells, learned_errors, uncertainty_as_weighed
+from rangesfm.scale.verdict import judge
+
+# What is learnt of the errors changes by less than a twentieth with twice as many (hall and laps of
+# ``tests.studies.drifting_maps``), and each costs a solution of the photos' normal equations.
+MAX_NUM_CELLS = 200
+
+
+@dataclass(frozen=True)
+class MapWithRanges:
+    """A map that photos and ranges hold together.
+
+    Attributes:
+        posed: its ranges, in the first camera's frame and the unit of the unscaled model.
+        solution: where the map is. observations: of the ranges. trajectory: of the map, in that unit.
+        bending: of the map.
+    """
+
+    posed: ScaleProblem
+    solution: Solution
+    observations: RangeObservations
+    trajectory: Trajectory
+    bending: MapBending
+
+    @classmethod
+    def of(
+        cls,
+        start: ScaleEstimate,
+        trajectory_m: Trajectory,
+        scale: float,
+        tags_m: Array,
+        centers_m: Array,
+        anchors_m: Array,
+        biases_m: Array,
+        errors: RangeErrors,
+        bending: MapBending,
+    ) -> MapWithRanges:
+        """Of the ranges that a scale was found by, on another map.
+
+        Args:
+            start: that scale. trajectory_m: the other map's, in the metric world.
+            scale: of it, metres per unit of the unscaled model.
+            tags_m, centers_m: (k, 3) where tag and camera were at each of the ranges.
+            anchors_m: (m, 3). biases_m: (m,). errors: of the k ranges, as weighted.
+        """
+        assert start.problem is not None, "a map with ranges"
+        trajectory = trajectory_m.transformed(1 / scale, np.eye(3), np.zeros(3))
+        from_map = first_camera_from(trajectory)
+        placed = Similarity(scale, from_map.rotation.T, trajectory_m.centers[0])
+        problem = replace(
+            start.problem.ranges,
+            centers=placed.inverse().apply(centers_m),
+            tag_from_center=(tags_m - centers_m) @ placed.rotation,
+        )
+        posed = replace(start.problem, ranges=problem, first_camera_from_sfm=from_map)
+        state = RangeState(placed, anchors_m, biases_m)
+        by_errors = weighted(problem, errors)
+        robust = errors.robust_weights(predicted_ranges(problem, state) - problem.range_m)
+        fit = fit_at(by_errors, state, robust)
+        solution = Solution(by_errors, fit, errors, float(np.median(errors.stddev_m)))
+        return cls(posed, solution, start.observations, trajectory, bending)
+
+    @cached_property
+    def _rotations(self) -> Array:
+        return model_from_cam(self.observations, self.trajectory, self.posed)
+
+    def learned(self) -> LearnedErrors:
+        """What is learnt of the ranges' errors, and of the map's."""
+        velocities = camera_velocities(self.observations, self.trajectory, self.posed)
+        return learned_errors(
+            self.posed, self.solution, self.observations, self._rotations, velocities, self.bending, MAX_NUM_CELLS
+        )
+
+    def bending_factor(self, learned: LearnedErrors) -> float:
+        """By how much more than its photos' residuals let expect the map was bent; 1 where nobody looked at them."""
+        formal_m2 = self._formal_bending_m2(learned)
+        mean_m = float(np.sqrt(np.trace(formal_m2) / len(formal_m2)))
+        return learned.stddev_of_component["bending"] / mean_m if mean_m > 0 else 1.0
+
+    def known(self, learned: LearnedErrors) -> AsWeighed:
+        """How far off the map as a whole may be."""
+        return uncertainty_as_weighed(self.posed, self.solution, learned, self._formal_bending_m2(learned))
+
+    def _formal_bending_m2(self, learned: LearnedErrors) -> Array:
+        state = self.solution.fit.state
+        bent = bending_of_cells(self.bending, learned.cells, self.posed, state, self.observations, self._rotations)
+        return np.zeros_like(learned.covariance_m2) if bent is None else bent.formal_m2
+
+
+def estimate_at(
+    on_map: MapWithRanges, learned: LearnedErrors, start: ScaleEstimate, options: ScaleOptions
+) -> ScaleEstimate:
+    """The scale of a map that was refined, judged there.
+
+    Args:
+        start: where it began, of which all stays that is no judgement.
+
+    Raises:
+        GeometryError: refused, as the scale is less certain than ``options.max_relative_stddev``.
+    """
+    known = on_map.known(learned)
+    judged = judge(on_map.posed, on_map.solution, known.uncertainty, {}, start.anchors, (), options)
+    columns, placement = known.columns, None
+    if columns.frame >= 0:
+        of_map = [columns.scale, *range(columns.frame, columns.frame + 6)]
+        placement = known.covariance[np.ix_(of_map, of_map)]
+    return replace(
+        start,
+        refined_value=on_map.solution.fit.state.metric_from_model.scale,
+        uncertainty=known.uncertainty,
+        verdict=judged.verdict,
+        reasons=(*judged.reasons, *start.remarks),
+        advice=judged.advice,
+        placement=placement,
+        errors=replace(start.errors, learned=learned.spread(on_map.posed.rows, len(start.observations.log))),
+        noise_stddev_m=on_map.solution.noise_stddev_m,
+    )

@@ -1,0 +1,148 @@
+"""A path of poses alone, bent back by the ranges on it, so that it is judged where it probably was."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from rangesfm.arrays import Array
+from rangesfm.geometry.similarity import rmse
+from rangesfm.options import ScaleOptions
+from rangesfm.ranging.errors.bending import WalkBending
+from rangesfm.ranging.errors.components import BENDS, GIVEN, REWEIGHTING
+from rangesfm.ranging.observations import status_by_weight
+from rangesfm.scale.estimate import ScaleEstimate, ScaleUncertainty
+from rangesfm.scale.problem import ScaleProblem
+from rangesfm.scale.range_equation import state_after
+from rangesfm.scale.uncertainty import believable, best_estimate
+from rangesfm.scale.verdict import judge
+from rangesfm.trust.linearized import Linearized, RangesOnMap, linearized, slopes_by_poses
+from rangesfm.trust.testing import Factorization
+
+_MAX_NUM_ROUNDS = 8
+# Of the noise of single ranges: where another round moves less, it is the last.
+_STILL = 0.1
+
+
+def bent_to_ranges(on_map: RangesOnMap) -> RangesOnMap:
+    """The map where ranges and random walks together have it, by Gauss-Newton steps; the same if it is of no walk.
+
+    However far a path has drifted, what is learnt and tested there is linear about where it was.
+    """
+    for _ in range(_MAX_NUM_ROUNDS if isinstance(on_map.bending, WalkBending) else 0):
+        problem = learnt_at(on_map)
+        before, on_map = on_map, _bent_once(problem)
+        moved_m = on_map.from_anchor_m - before.from_anchor_m
+        if float(np.sqrt(np.mean(moved_m**2))) < _STILL * problem.scatter_m:
+            break
+    return on_map
+
+
+def bends_m(on_map: RangesOnMap) -> Array:
+    """(k,) how far the ranges have bent each pose from where the path came with it; of no walk nothing, (0,)."""
+    walk, scale = on_map.bending, on_map.state.metric_from_model.scale
+    if not isinstance(walk, WalkBending) or walk.steps is None:
+        return np.zeros(0)
+    return np.asarray(scale * np.linalg.norm(walk.path.centers - walk.given.centers, axis=1))
+
+
+def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: ScaleOptions) -> ScaleEstimate:
+    """The similarity that brings a path nearest to where ranges have bent it back; the same where they have bent it by
+    less than they scatter, so that it is as good as rigid.
+
+    Args:
+        estimate: of the path as one piece. on_map: as bent back.
+
+    Raises:
+        GeometryError: refused, as the scale is less certain than ``options.max_relative_stddev``.
+    """
+    posed, solution, bent_by_m = estimate.problem, estimate.solution, bends_m(on_map)
+    if posed is None or solution is None or not len(bent_by_m):
+        return estimate
+    problem, drift_m = learnt_at(on_map), rmse(bent_by_m[:, None])
+    if drift_m < problem.scatter_m:
+        return estimate
+    uncertainty, covariance = _known(problem, posed, estimate.uncertainty.formal)
+    fit = replace(solution.fit, state=on_map.state, weights=problem.cells.weight)
+    judged = judge(posed, replace(solution, fit=fit), uncertainty, {}, estimate.anchors, (), options)
+    columns = problem.columns
+    of_map = [columns.scale, *range(columns.frame, columns.frame + 6)]
+    positions = zip(estimate.anchors, on_map.state.anchors_m, strict=True)
+    drift = f"the path drifts by {drift_m:.2g} m (root mean square) from where the ranges have it"
+    status, stddev_m = estimate.observations.status.copy(), estimate.errors.stddev_m.copy()
+    status[on_map.rows] = status_by_weight(problem.cells.weight)
+    stddev_m[on_map.rows] = problem.scatter_m
+    return replace(
+        estimate,
+        metric_from_sfm=on_map.state.metric_from_model @ posed.first_camera_from_sfm,
+        uncertainty=uncertainty,
+        verdict=judged.verdict,
+        reasons=(*judged.reasons, drift, *estimate.remarks),
+        advice=judged.advice,
+        placement=None if columns.frame < 0 else covariance[np.ix_(of_map, of_map)],
+        observations=replace(estimate.observations, status=status),
+        errors=replace(estimate.errors, stddev_m=stddev_m),
+        anchors=tuple(replace(anchor, position_m=at) for anchor, at in positions),
+    )
+
+
+def _known(problem: Linearized, posed: ScaleProblem, formal: float) -> tuple[ScaleUncertainty, Array]:
+    """Of the best estimate, which the map is at; its interval holds, too, what simple weights would have found."""
+    errors, given, index = problem.errors, posed.ranges, problem.cells.anchor_index
+    covariance, of_cells, of_priors = best_estimate(errors.covariance_m2, problem.design, problem.prior_design)
+    components = errors.stddev_of_cells(of_cells[0])
+    components[GIVEN] = float(np.linalg.norm(of_priors[0]))
+    simple = errors.without(*(set(errors.names) - {"white", *BENDS})).covariance_m2
+    simple += given.bias_stddev_m[index] ** 2 * (index[:, None] == index) + given.common_bias_stddev_m**2
+    _, by_cells, by_priors = best_estimate(simple, problem.design, problem.prior_design)
+    of_simple = errors.stddev_of_cells(by_cells[0])
+    change = -float(by_cells[0] @ problem.residual_m + by_priors[0] @ problem.prior_residual)
+    best, other = (float(np.linalg.norm(list(each.values()))) for each in (components, of_simple))
+    lean = believable(change, best, other)
+    return ScaleUncertainty(formal, {**components, REWEIGHTING: abs(lean)}, lean), covariance
+
+
+def learnt_at(on_map: RangesOnMap) -> Linearized:
+    """Linearised at the map, with the errors that are learnt if no mistake was made."""
+    problem = linearized(on_map)
+    nothing = np.zeros((len(problem.residual_m), 0)), np.zeros((problem.num_priors, 0))
+    return problem.with_learnt_errors(*nothing)
+
+
+def _bent_once(problem: Linearized) -> RangesOnMap:
+    on_map, walk = problem.on_map, problem.on_map.bending
+    assert isinstance(walk, WalkBending)
+    is_free = on_map.problem.frame_is_free
+    factors = walk.factors(problem.cells, slopes_by_poses(on_map), frame_is_free=is_free)
+    step = Factorization(problem).step()
+    left_m = problem.residual_m + problem.design @ step
+    pulls = cho_solve(cho_factor(problem.errors.covariance_m2), left_m)
+    bent = walk.bent_back(factors, pulls, problem.errors.stddev_of_component, frame_is_free=is_free)
+    state = state_after((problem.columns,), on_map.state, step)
+    return _on_path(replace(on_map, state=state), walk, bent)
+
+
+def _on_path(on_map: RangesOnMap, before: WalkBending, after: WalkBending) -> RangesOnMap:
+    """The ranges where they were taken on another path."""
+    at, problem = on_map.on_path, on_map.problem
+    moved = after.path.centers - before.path.centers
+    turned = after.path.world_from_cam @ np.swapaxes(before.path.world_from_cam, 1, 2)
+    turn = turned[np.where(at.weight < 0.5, at.before, at.after)]
+    share = at.weight[:, None]
+
+    def turned_by(vectors: Array) -> Array:
+        return np.asarray(np.einsum("nij,nj->ni", turn, vectors))
+
+    return replace(
+        on_map,
+        problem=replace(
+            problem,
+            centers=problem.centers + (1 - share) * moved[at.before] + share * moved[at.after],
+            tag_from_center=turned_by(problem.tag_from_center),
+        ),
+        model_from_cam=turn @ on_map.model_from_cam,
+        velocity=None if on_map.velocity is None else turned_by(on_map.velocity),
+        bending=after,
+    )

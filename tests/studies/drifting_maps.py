@@ -1,0 +1,372 @@
+"""How clean surveys of maps that drift are judged: what is kept, what is said to be known, and what is named wrongly.
+
+Run: python -m tests.studies.drifting_maps [--kinds lap hall ...] [--num_seeds 2] [--seed 0] [--out FILE]
+
+Nothing is wrong with any of these surveys but what is wrong with all of them: features are located to 0.7 pixels, so
+that COLMAP's bundle adjustment of them bends and drifts, and radios err.
+
+- ``lap``: a rover's lap of 300 m round a field, forward camera, tracks of at most 8 photos, no loop closed, one
+  anchor on a mast beside the middle, known in the first camera's frame, Gaussian ranges of 0.1 m. How many features a
+  photo has, and how noisy they are, brings its drift to 0.2, 0.5, 1, 2, 5 and 15 m on average over seeds.
+- ``lap_unknown``: the same, nobody measured the anchor. ``lap_site``: four surveyed anchors round the field.
+- ``lap_radio``: as ``lap_site``, with a radio drawn from the population of real ones, one range in 25 obstructed.
+- ``hall``: 120 s in a hall, tracks of at most 8 photos, six surveyed anchors, likewise.
+- ``poses``: keyframes of ``lap_site`` without points, scaled only.
+- ``desk``: real monocular keyframes (ORB-SLAM on TUM's fr2_desk), scaled only, with four surveyed anchors round the
+  desk and simulated ranges of 0.08 m. Needs --data.
+
+Prints for each kind: refinements kept that are nearer to the truth than the scaled map was, and those thrown away; how
+many of the delivered scales lie in their 95 % interval, and its median half width; errors of scale and of keyframes in
+their stated stddevs (root mean square: 1 where what is stated is so); and how many surveys are doubted, and have a
+mistake named. With --out each run is a line of a file, and what stands there is not run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+from scipy.spatial.transform import Rotation
+from tests.simulated.model import synthetic_model
+from tests.simulated.path import lap_path
+from tests.simulated.surveys import errors_of_radio
+from tests.studies.erring_surveys import METRES_PER_UNIT, OBSTRUCTED_MEAN_M, OBSTRUCTED_SHARE, SITES
+from tests.studies.simulated_survey import MIN_TRI_ANGLE_DEG, TAG_IN_CAM_M, mapped, rmse_bound_m, unit_pixel_errors
+from tests.studies.simulated_survey import Survey as Truth
+
+from rangesfm.colmap.transform import rescale
+from rangesfm.demo.ranges import CameraPath
+from rangesfm.errors import GeometryError, SolverError
+from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points, rmse
+from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.join.models import PathOfModel
+from rangesfm.progress import Journal, SilentProgress
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.site import Site
+from rangesfm.ranging.association import associate
+from rangesfm.ranging.errors.components import population
+from rangesfm.ranging.log import RangeLog
+from rangesfm.result.metric_result import MetricResult
+from rangesfm.survey.inputs import RangingInputs
+from rangesfm.survey.settings import Survey
+from rangesfm.workflows.run import map_in_metres
+
+Array = npt.NDArray[np.float64]
+Line = dict[str, Any]
+
+LEVELS_M = (0.2, 0.5, 1.0, 2.0, 5.0, 15.0)
+HALL_PIXELS = 0.7
+MAST_M = {"A1": (10.0, 5.0, 8.0)}
+# At heights that tell the map from its mirror image.
+ROUND_THE_FIELD_M = {"N": (5.0, 52.0, 14.0), "E": (68.0, -4.0, 2.0), "S": (-8.0, -50.0, 18.0), "W": (-66.0, 9.0, 4.0)}
+
+
+@dataclass(frozen=True)
+class Made:
+    """A survey as its user has it, and the truth of its keyframes in the world of the result."""
+
+    sfm: pycolmap.Reconstruction
+    trajectory: Trajectory
+    anchors_m: dict[str, Array]
+    frame: str
+    log: RangeLog
+    tag_in_cam_m: Array
+    truth_m: Array
+    refine: bool
+
+
+def lap(seed: int, frame: str = "first_camera", *, with_radio: bool = False) -> Made:
+    """One lap; its level of drift is the next one with each seed."""
+    return lap_of_drift(LEVELS_M[seed % len(LEVELS_M)], seed, frame, with_radio=with_radio)
+
+
+def lap_of_drift(
+    level_m: float, seed: int, frame: str = "first_camera", *, with_radio: bool = False, num_keyframes: int = 600
+) -> Made:
+    """One lap that drifts so far on average."""
+    num_observations = 150 if level_m < 3 else 60 if level_m < 10 else 40
+    anchors_m = ROUND_THE_FIELD_M if frame == "site" else MAST_M
+    path, times = lap_path(300.0, share=0.98), np.linspace(0.0, 300.0, num_keyframes)
+    survey = truth_of(path, times, anchors_m, frame, num_observations, (6.0, 40.0))
+    pixels = level_m / rmse_bound_m(survey, 1.0, with_ranges=False)
+    return made(survey, path, np.repeat(times, len(anchors_m)), pixels, seed, 0.1, with_radio=with_radio)
+
+
+def hall(seed: int) -> Made:
+    site = SITES[0]
+    path = site.path(seed)
+    times = np.arange(path.start_s, path.end_s, 0.5)
+    survey = truth_of(path, times, site.anchors_m, "site", 120, (1.5, 9.0))
+    num = int((path.end_s - path.start_s) * site.rate_hz) * len(site.anchors_m)
+    at_s = path.start_s + (np.arange(num) + 0.5) / (site.rate_hz * len(site.anchors_m))
+    return made(survey, path, at_s[at_s < times[-1]], HALL_PIXELS, seed, site.stddev_m, with_radio=True)
+
+
+def poses(seed: int) -> Made:
+    return without_points(lap(seed, "site", with_radio=True))
+
+
+def without_points(survey: Made) -> Made:
+    """Its path alone, which can be scaled."""
+    return replace(survey, sfm=pycolmap.Reconstruction(), refine=False)
+
+
+def desk(folder: Path, seed: int) -> Made:
+    """Real keyframes; the truth's times are matched, its gaps are left."""
+    keyframes, truth = (np.loadtxt(folder / name) for name in ("fr2_desk_ORB_kf_mono.txt", "fr2_desk_groundtruth.txt"))
+    rng = np.random.default_rng([seed, 11])
+    nearest = np.abs(truth[:, 0] - keyframes[:, :1]).argmin(axis=1)
+    known = np.abs(truth[nearest, 0] - keyframes[:, 0]) < 0.02
+    keyframes, truth = keyframes[known], truth[nearest[known]]
+    times, centers_m = keyframes[:, 0] - keyframes[0, 0], truth[:, 1:4]
+    true_cam, seen_cam = (Rotation.from_quat(rows[:, 4:8]).as_matrix() for rows in (truth, keyframes))
+    middle, size = centers_m.mean(axis=0), np.ptp(centers_m, axis=0)
+    corners = np.array([(-1, -1, 0.3), (1, -1, -0.6), (1, 1, 0.8), (-1, 1, -0.2)])
+    anchors_m = {f"A{k}": middle + corner * (0.6 * size + 0.8) for k, corner in enumerate(corners, 1)}
+    path = Trajectory(
+        np.arange(1, len(times) + 1), tuple(f"{k:05d}.png" for k in range(len(times))), times, keyframes[:, 1:4],
+        seen_cam,
+    )  # fmt: skip
+    at = np.repeat(np.arange(len(times)), len(anchors_m))
+    ids = np.tile(np.arange(len(anchors_m)), len(times))
+    tags_m = centers_m[at] + true_cam[at] @ TAG_IN_CAM_M
+    range_m = np.linalg.norm(tags_m - np.array(list(anchors_m.values()))[ids], axis=1) + 0.08 * rng.normal(size=len(at))
+    log = RangeLog.from_arrays(np.array(list(anchors_m))[ids], range_m, timestamp_s=times[at])
+    return Made(pycolmap.Reconstruction(), path, anchors_m, "site", log, TAG_IN_CAM_M, centers_m, refine=False)
+
+
+def truth_of(
+    path: CameraPath,
+    times: Array,
+    anchors_m: dict[str, tuple[float, float, float]],
+    frame: str,
+    num_observations: int,
+    depth_range_m: tuple[float, float],
+) -> Truth:
+    """Without noise, in the world of the result."""
+    centers, world_from_cam = path.centers(times), path.world_from_cam(times)
+    rotation, origin = (np.eye(3), np.zeros(3)) if frame == "site" else (world_from_cam[0], centers[0])
+    model = synthetic_model(
+        times,
+        (centers - origin) @ rotation,
+        rotation.T @ world_from_cam,
+        num_observations=num_observations,
+        max_track_length=8,
+        depth_range_m=depth_range_m,
+        metric_from_sfm=IDENTITY,
+    )
+    points = model.reconstruction
+    pycolmap.ObservationManager(points).filter_points3D_with_small_triangulation_angle(
+        MIN_TRI_ANGLE_DEG, set(points.point3D_ids())
+    )
+    return Truth(model, {name: (np.array(at) - origin) @ rotation for name, at in anchors_m.items()}, frame, 0.1)
+
+
+def made(
+    survey: Truth,
+    path: CameraPath,
+    at_s: Array,
+    pixel_stddev: float,
+    seed: int,
+    range_stddev_m: float,
+    *,
+    with_radio: bool,
+) -> Made:
+    """Mapped from noisy features, in a world of its own, and ranged to its anchors in turn."""
+    rng = np.random.default_rng([seed, 5])
+    sfm = mapped(survey, pixel_stddev * unit_pixel_errors(survey, seed))
+    turned = Rotation.from_quat(rng.normal(size=4)).as_matrix()
+    sfm = rescale(sfm, Similarity(1 / METRES_PER_UNIT, turned, rng.normal(size=3)))
+    model, ids = survey.model, list(survey.anchors_m)
+    origin, turn = path.centers(at_s[:1] * 0 + path.start_s)[0], path.world_from_cam(at_s[:1] * 0 + path.start_s)[0]
+    if survey.anchor_frame == "site":
+        origin, turn = np.zeros(3), np.eye(3)
+    world_from_cam = turn.T @ path.world_from_cam(at_s)
+    tags_m = (path.centers(at_s) - origin) @ turn + world_from_cam @ TAG_IN_CAM_M
+    anchor = np.arange(len(at_s)) % len(ids)
+    range_m = np.linalg.norm(tags_m - np.array(list(survey.anchors_m.values()))[anchor], axis=1)
+    trajectory = trajectory_from_reconstruction(sfm, model.timestamps_s)
+    errors_m = range_stddev_m * rng.standard_normal(len(range_m))
+    if with_radio:
+        errors_m = drawn_errors(survey, at_s, np.array(ids)[anchor], rng)
+    range_m = range_m + errors_m
+    log = RangeLog.from_arrays(np.array(ids)[anchor], np.maximum(range_m, 0.02), timestamp_s=at_s)
+    anchors_m = dict(survey.anchors_m)
+    return Made(sfm, trajectory, anchors_m, survey.anchor_frame, log, TAG_IN_CAM_M, model.centers_m, refine=True)
+
+
+def drawn_errors(survey: Truth, at_s: Array, ids: npt.NDArray[np.str_], rng: np.random.Generator) -> Array:
+    """Of a radio as they are, with ranges that were obstructed."""
+    model, anchors_m = survey.model, survey.anchors_m
+    log = RangeLog.from_arrays(ids, np.ones(len(ids)), timestamp_s=at_s)
+    true = replace(
+        trajectory_from_reconstruction(model.reconstruction, model.timestamps_s),
+        centers=model.centers_m,
+        world_from_cam=model.world_from_cam,
+    )
+    stddevs = {
+        name: float(median * np.exp(spread * rng.standard_normal())) for name, (median, spread) in population().items()
+    }
+    standing_m = np.array([anchors_m[name] for name in log.anchor_ids])
+    errors_m, _ = errors_of_radio(associate(log, true, TAG_IN_CAM_M), true, standing_m, stddevs, None, rng)
+    is_obstructed = rng.random(len(ids)) < OBSTRUCTED_SHARE
+    return np.asarray(np.nan_to_num(errors_m) + is_obstructed * rng.exponential(OBSTRUCTED_MEAN_M, len(ids)))
+
+
+def run(survey: Made, seed: int) -> MetricResult:
+    """From the scale on, with all defaults."""
+    settings = Survey().changed({"output.seed": seed, "camera.refine_intrinsics": False, "mapper.num_threads": 1})
+    anchors = tuple(Anchor(name, None if survey.frame == "unknown" else at) for name, at in survey.anchors_m.items())
+    inputs = RangingInputs(
+        survey.log, survey.tag_in_cam_m[None], anchors, survey.frame, Site(np.zeros(3)), None, None, ()
+    )
+    observations = associate(survey.log, survey.trajectory, survey.tag_in_cam_m)
+    sfm = survey.sfm if survey.sfm.num_reg_images() else of_poses(survey.trajectory)
+    path = PathOfModel("sparse/0", sfm, survey.trajectory, observations)
+    found: list[MetricResult] = []
+    with (
+        patch("rangesfm.workflows.run.write_results", lambda survey, inputs, metric, journal: found.append(metric)),
+        patch("rangesfm.workflows.run.with_advice", lambda metric, tag_in_cam_m: metric),
+    ):
+        map_in_metres(settings, inputs, [path], None, Journal(SilentProgress()), refine=survey.refine)
+    return found[0]
+
+
+def of_poses(path: Trajectory) -> pycolmap.Reconstruction:
+    """A model without points."""
+    model = synthetic_model(
+        np.arange(float(len(path))), path.centers, path.world_from_cam, num_observations=0, metric_from_sfm=IDENTITY
+    ).reconstruction
+    for image_id, name in zip(sorted(model.reg_image_ids()), path.image_names, strict=True):
+        model.image(image_id).name = name
+    return model
+
+
+def told(survey: Made, kind: str, seed: int) -> Line:
+    """What counts of a run."""
+    line: Line = {"kind": kind, "seed": seed}
+    try:
+        metric = run(survey, seed)
+    except (GeometryError, SolverError) as error:
+        return {**line, "refused": str(error)}
+    true_scale = align_points(survey.trajectory.centers, survey.truth_m).scale
+    scaled_m, final_m = (metric.trajectory.as_in(model).centers for model in (metric.scaled, metric.final))
+    kept = metric.kept_refinement is not None
+    estimate = metric.estimate
+    # Before the judgement came last, the interval was the scaled map's, whatever was delivered.
+    delivered = metric.refined_scale if kept else estimate.value
+    low, high = estimate.interval_95
+    variances = metric.center_covariance_m2
+    known = np.array([variances[name] for name in metric.trajectory.image_names]) if variances else None
+    refined_m = None if metric.refined is None else metric.trajectory.as_in(metric.refined).centers
+    off_m = final_m - survey.truth_m
+    return {
+        **line,
+        "refused": "",
+        "scaled_m": rmse(scaled_m - survey.truth_m),
+        "final_m": rmse(off_m),
+        "refined_m": None if refined_m is None else rmse(refined_m - survey.truth_m),
+        "kept": kept,
+        "why_not": list(metric.why_broken),
+        "log_error": float(np.log((delivered or np.nan) / true_scale)),
+        "half_width": estimate.uncertainty.half_width_95,
+        "stddev": estimate.uncertainty.empirical,
+        "covered": bool(low <= true_scale <= high),
+        "places": None if known is None else float(np.sqrt(np.mean(np.sum(off_m**2, axis=1) / _traces(known)))),
+        "places_covered": None if known is None else _covered(off_m, known),
+        "verdict": estimate.verdict,
+        "reasons": list(estimate.reasons),
+        "causes": [] if metric.trust is None else [f"{c.name} {c.subject}".strip() for c in metric.trust.causes],
+        "of_evidence": []
+        if metric.trust is None
+        else [t.name for t in metric.trust.tests if t.rejected and not t.stddev],
+    }
+
+
+def _traces(covariances: Array) -> Array:
+    return np.asarray(np.maximum(np.trace(covariances, axis1=1, axis2=2), 1e-12))
+
+
+def _covered(off_m: Array, covariances: Array) -> float:
+    """Share of coordinates within 1.96 of their stddevs, of all keyframes that are not held."""
+    stddevs = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    free = stddevs.min(axis=1) > 1e-9
+    return float(np.mean(np.abs(off_m[free]) <= 1.96 * stddevs[free]))
+
+
+def surveys(data: Path | None) -> dict[str, Callable[[int], Made]]:
+    """By kind."""
+    found: dict[str, Callable[[int], Made]] = {
+        "lap": lap,
+        "lap_unknown": lambda seed: lap(seed, "unknown"),
+        "lap_site": lambda seed: lap(seed, "site"),
+        "lap_radio": lambda seed: lap(seed, "site", with_radio=True),
+        "hall": hall,
+        "poses": poses,
+    }
+    if data is not None:
+        found["desk"] = lambda seed: desk(data / "slam_keyframes", seed)
+    return found
+
+
+def report(lines: list[Line]) -> Iterator[str]:
+    """A row for each kind."""
+    for kind in dict.fromkeys(line["kind"] for line in lines):
+        own = [line for line in lines if line["kind"] == kind]
+        judged = [line for line in own if not line["refused"]]
+        if not judged:
+            yield f"{kind:12}{len(own):4} runs, all refused"
+            continue
+        refined = [line for line in judged if line["refined_m"] is not None]
+        nearer = [line for line in refined if line["refined_m"] < line["scaled_m"]]
+        in_stddevs = np.array([line["log_error"] / line["stddev"] for line in judged])
+        places = [line["places"] for line in judged if line["places"] is not None]
+        share = [line["places_covered"] for line in judged if line["places_covered"] is not None]
+        yield (
+            f"{kind:12}{len(own):4} runs, {len(own) - len(judged)} refused; nearer to the truth {len(nearer)} of "
+            f"{len(refined)} refined, of these kept {sum(line['kept'] for line in nearer)}; scale covered "
+            f"{100 * np.mean([line['covered'] for line in judged]):.0f} %, half width "
+            f"{100 * np.median([line['half_width'] for line in judged]):.2f} %, errors in stddevs "
+            f"{np.sqrt(np.mean(in_stddevs**2)):.2f}, of places {np.median(places) if places else np.nan:.2f}, places "
+            f"covered {100 * np.mean(share) if share else np.nan:.0f} %; doubted "
+            f"{sum(line['verdict'] != 'good' for line in judged)}, mistake named "
+            f"{sum(bool(line['causes']) for line in judged)}"
+        )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kinds", nargs="*")
+    parser.add_argument("--num_seeds", type=int, default=6)
+    parser.add_argument("--seed", type=int, default=0, help="the first")
+    parser.add_argument("--data", type=Path)
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    known = args.out.read_text(encoding="utf-8").splitlines() if args.out is not None and args.out.exists() else []
+    done = {(line["kind"], line["seed"]): line for line in map(json.loads, known)}
+    makers = surveys(args.data)
+    for seed in range(args.seed, args.seed + args.num_seeds):
+        for kind in args.kinds or makers:
+            if (kind, seed) in done:
+                continue
+            line = done[kind, seed] = told(makers[kind](seed), kind, seed)
+            print(json.dumps(line), flush=True)
+            if args.out is not None:
+                with args.out.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(line) + "\n")
+    for text in report(list(done.values())):
+        print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

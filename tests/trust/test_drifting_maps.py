@@ -1,0 +1,75 @@
+"""A clean survey of a map that drifts is good: drift is nobody's mistake, and what is said is of the map delivered."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tests.known import known
+from tests.studies.drifting_maps import Made, lap_of_drift, run, without_points
+
+from rangesfm.geometry.similarity import align_points, rmse
+from rangesfm.result.metric_result import MetricResult
+
+
+@pytest.fixture(scope="module", params=[(0.5, "first_camera"), (5.0, "first_camera"), (5.0, "unknown"), (2.0, "site")])
+def lap(request: pytest.FixtureRequest) -> Made:
+    drift_m, frame = request.param
+    return lap_of_drift(drift_m, 1, frame, num_keyframes=150)
+
+
+@pytest.fixture(scope="module")
+def refined(lap: Made) -> MetricResult:
+    return run(lap, 0)
+
+
+def error_m(lap: Made, found: MetricResult) -> float:
+    return rmse(found.trajectory.as_in(found.final).centers - lap.truth_m)
+
+
+def true_scale(lap: Made) -> float:
+    return align_points(lap.trajectory.centers, lap.truth_m).scale
+
+
+def test_a_refinement_that_bends_drift_back_is_kept_however_far_it_changes_the_scale(
+    lap: Made, refined: MetricResult
+) -> None:
+    assert refined.why_broken == ()
+    assert refined.kept_refinement is not None
+    scaled_m = rmse(refined.trajectory.as_in(refined.scaled).centers - lap.truth_m)
+    assert error_m(lap, refined) < 0.8 * scaled_m
+
+
+def test_no_mistake_is_named_that_nobody_made(refined: MetricResult) -> None:
+    assert known(refined.trust).causes == ()
+    assert refined.estimate.verdict == "good", refined.estimate.reasons
+
+
+def test_the_scale_that_is_stated_is_the_refined_maps_and_the_truth_is_in_its_interval(
+    lap: Made, refined: MetricResult
+) -> None:
+    assert refined.estimate.value == refined.refined_scale
+    low, high = refined.estimate.interval_95
+    assert low < true_scale(lap) < high
+    assert refined.estimate.uncertainty.half_width_95 < 0.02
+
+
+def test_keyframes_err_as_their_covariances_say(lap: Made, refined: MetricResult) -> None:
+    covariances = np.array([refined.center_covariance_m2[name] for name in refined.trajectory.image_names])
+    off_m = refined.trajectory.as_in(refined.final).centers - lap.truth_m
+    stated_m = float(np.sqrt(np.mean(np.trace(covariances, axis1=1, axis2=2))))
+    assert 0.1 * stated_m < rmse(off_m) < 2 * stated_m
+
+
+@pytest.mark.parametrize("drift_m", [2.0, 5.0])
+def test_a_path_of_poses_is_scaled_to_where_ranges_bend_it_back(drift_m: float) -> None:
+    """With the likeliest similarity, and how far it drifts from there said as a fact."""
+    lap = without_points(lap_of_drift(drift_m, 2, "site", num_keyframes=150))
+    found = run(lap, 0)
+    assert known(found.trust).causes == ()
+    low, high = found.estimate.interval_95
+    assert low < true_scale(lap) < high
+    assert found.estimate.uncertainty.half_width_95 < 0.02
+    best_m = rmse(align_points(lap.trajectory.centers, lap.truth_m).apply(lap.trajectory.centers) - lap.truth_m)
+    assert error_m(lap, found) < 1.1 * best_m + 0.1
+    assert any("drifts" in reason for reason in found.estimate.reasons)
+    assert known(found.place).worst_keyframe_stddev_m > 0.5 * best_m
