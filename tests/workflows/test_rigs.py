@@ -122,7 +122,7 @@ def test_a_baseline_wrong_by_3_percent_is_found_by_the_ranges_and_said(tmp_path:
 def test_a_stereo_rig_gives_metres_without_a_radio(tmp_path: Path) -> None:
     survey = stereo_survey(tmp_path)
     found = survey.refined(with_radio=False)
-    assert found.scale.value == pytest.approx(survey.true_scale, rel=1e-6)
+    assert found.metric_from_sfm.scale == pytest.approx(survey.true_scale, rel=1e-6)
     low, high = found.scale.interval_95 or (0.0, 0.0)
     assert low < survey.true_scale < high
     assert "one length that nothing checks" in " ".join(found.scale.reasons)

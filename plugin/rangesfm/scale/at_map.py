@@ -12,10 +12,11 @@ from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.errors.bending import MapBending
+from rangesfm.ranging.errors.components import REWEIGHTING
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.observations import RangeObservations
-from rangesfm.scale.estimate import ScaleEstimate
+from rangesfm.scale.estimate import ScaleEstimate, ScaleUncertainty
 from rangesfm.scale.initialize import camera_velocities, model_from_cam
 from rangesfm.scale.problem import ScaleProblem, first_camera_from
 from rangesfm.scale.range_equation import RangeState, fit_at, predicted_ranges
@@ -121,15 +122,18 @@ def estimate_at(
         GeometryError: refused, as the scale is less certain than ``options.max_relative_stddev``.
     """
     known = on_map.known(learned)
-    judged = judge(on_map.posed, on_map.solution, known.uncertainty, {}, start.anchors, (), options)
+    value = on_map.solution.fit.state.metric_from_model.scale
+    # Measured lengths say more of the scale than the refinement, in which many ranges outweigh them, lets them.
+    uncertainty = known.uncertainty if start.lengths is None else _about(start, value)
+    judged = judge(on_map.posed, on_map.solution, uncertainty, {}, start.anchors, (), options)
     columns, placement = known.columns, None
     if columns.frame >= 0:
         of_map = [columns.scale, *range(columns.frame, columns.frame + 6)]
         placement = known.covariance[np.ix_(of_map, of_map)]
     return replace(
         start,
-        refined_value=on_map.solution.fit.state.metric_from_model.scale,
-        uncertainty=known.uncertainty,
+        refined_value=value,
+        uncertainty=uncertainty,
         verdict=judged.verdict,
         reasons=(*judged.reasons, *start.remarks),
         advice=judged.advice,
@@ -137,3 +141,9 @@ def estimate_at(
         errors=replace(start.errors, learned=learned.spread(on_map.posed.rows, len(start.observations.log))),
         noise_stddev_m=on_map.solution.noise_stddev_m,
     )
+
+
+def _about(start: ScaleEstimate, value: float) -> ScaleUncertainty:
+    """What is known of a scale, as seen from another value of it."""
+    lean = start.uncertainty.lean + float(np.log(start.value / value))
+    return replace(start.uncertainty, components={**start.uncertainty.components, REWEIGHTING: abs(lean)}, lean=lean)
