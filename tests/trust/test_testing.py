@@ -64,12 +64,16 @@ def test_the_smallest_detectable_mistake_raises_the_statistic_as_it_must(problem
 def test_the_size_of_one_number_keeps_its_sign_and_that_of_more_is_their_length(problem: Linearized) -> None:
     silent = without_noise(problem)
     for each in hypotheses(problem):
-        size = -np.arange(1.0, each.num + 1)
-        made = replace(silent, residual_m=each.effect.columns @ size, prior_residual=each.effect.priors @ size)
-        [test] = Factorization(made).test([each], 0)
-        if np.isfinite(test.smallest_detectable):
-            told = row_of(test).size
-            assert told == pytest.approx(-1.0 if each.num == 1 else np.linalg.norm(size), rel=1e-4)
+        direction = -np.arange(1.0, each.num + 1) / np.linalg.norm(np.arange(1.0, each.num + 1))
+        for share in (0.5, 1.5):
+            size = share * each.most * direction
+            made = replace(silent, residual_m=each.effect.columns @ size, prior_residual=each.effect.priors @ size)
+            [test] = Factorization(made).test([each], 0)
+            if np.isfinite(test.smallest_detectable):
+                told = row_of(test).size
+                signed = -share * each.most if each.num == 1 else share * each.most
+                # One that cannot happen is not told.
+                assert told == (pytest.approx(signed, rel=1e-4) if share < 1 else None)
 
 
 def test_baardas_number() -> None:
