@@ -148,7 +148,9 @@ def _geographic_from(crs: str) -> Transformer:
 
 def _apply(transformer: Any, points: Array, *, inverse: bool = False) -> Array:
     direction = "INVERSE" if inverse else "FORWARD"
-    return np.column_stack(transformer.transform(*np.asarray(points, dtype=np.float64).T, direction=direction))
+    # As lists: an array of one number some versions of pyproj take for the number, which numpy warns of.
+    columns = np.asarray(points, dtype=np.float64).T.tolist()
+    return np.column_stack(transformer.transform(*columns, direction=direction))
 
 
 def _pyproj() -> Any:
