@@ -250,7 +250,8 @@ def _interpolated_lever_arms(
     beyond, stddev[between] = motion.beyond_chord(before[between], weight[between])
     arms = tags_in_cam_m.copy()
     turns = weight[between, None] * to_next.as_rotvec()[before[between]] + beyond
-    arms[between] = Rotation.from_rotvec(turns).apply(arms[between])
+    if len(turns):  # SciPy before 1.16 makes no rotations of nothing
+        arms[between] = Rotation.from_rotvec(turns).apply(arms[between])
     # A turn moves the end of the arm in two of three directions.
     stddev_m = np.sqrt(2 / 3) * stddev * np.linalg.norm(tags_in_cam_m, axis=1)
     return np.einsum("nij,nj->ni", trajectory.world_from_cam[before], arms), stddev_m
