@@ -6,6 +6,7 @@ import json
 import sqlite3
 import struct
 import xml.etree.ElementTree as ET
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -213,7 +214,7 @@ def test_kml_is_xml_with_the_same_places(on_earth: MetricMap, tmp_path: Path) ->
 
 def test_geopackage_is_a_database_of_points_in_the_maps_system(on_earth: MetricMap, tmp_path: Path) -> None:
     (path,) = export_map(on_earth, tmp_path, ExportOptions(formats=("gpkg",), crs="EPSG:32632"))
-    with sqlite3.connect(path) as database:
+    with closing(sqlite3.connect(path)) as database:
         rows = database.execute("select name, geom from survey").fetchall()
         (system,) = database.execute("select srs_id from gpkg_geometry_columns").fetchone()
     assert system == 32632

@@ -152,13 +152,13 @@ def factor(normal: Array | csr_array) -> Factored:
 
 
 def _dense(normal: Array) -> Factored:
-    try:
-        # Symmetric: transposed, columns lie as LAPACK wants them, and nothing is copied.
-        lower = linalg.cho_factor(normal.T, lower=True, overwrite_a=True, check_finite=False)
-    except linalg.LinAlgError as error:
-        raise SingularError(int(str(error).split("-th")[0]) - 1) from error
+    # Symmetric: transposed, columns lie as LAPACK wants them, and nothing is copied. What SciPy makes of a failure in
+    # words, from which the column would have to be read, differs from version to version.
+    lower, info = linalg.lapack.dpotrf(normal.T, lower=True, overwrite_a=True, clean=False)
+    if info > 0:
+        raise SingularError(info - 1)
     return Factored(
-        lambda right: np.asarray(linalg.cho_solve(lower, right, check_finite=False)), np.square(np.diag(lower[0]))
+        lambda right: np.asarray(linalg.cho_solve((lower, True), right, check_finite=False)), np.square(np.diag(lower))
     )
 
 
