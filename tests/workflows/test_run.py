@@ -28,7 +28,8 @@ from rangesfm.ranging.readers import read_ranges
 from rangesfm.result.places import path_in, recorded_path
 from rangesfm.result.summary import ResultSummary
 from rangesfm.result.tables import ScaleCandidates, ScaleConsensus
-from rangesfm.survey.settings import KEYS, Survey
+from rangesfm.survey.settings import KEYS, Survey, survey_from_tables
+from rangesfm.workflows import run
 from rangesfm.workflows.export_result import export_result
 from rangesfm.workflows.results import RunResult
 from rangesfm.workflows.run import refine_model, scale_model
@@ -394,3 +395,18 @@ def test_a_wrong_coordinate_is_said_and_mended_only_when_asked_for(
     assert mended.scale.verdict == "doubtful"
     assert mended.scale.reasons[0].startswith("adopted: ")
     assert mended.scale.value == pytest.approx(scaled.result.summary.scale.value, rel=0.002)
+
+
+@pytest.mark.parametrize(
+    ("model", "refine", "stage"), [(None, True, "run_survey"), ("m", True, "refine_model"), ("m", False, "scale_model")]
+)
+def test_a_survey_begins_with_its_photos_or_with_its_model(
+    model: str | None, refine: bool, stage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun: list[str] = []
+    for name in ("run_survey", "refine_model", "scale_model"):
+        monkeypatch.setattr(run, name, lambda survey, name=name, **_: begun.append(name))
+    images = {"path": "photos"} | ({} if model is None else {"model": model})
+    survey = survey_from_tables({"images": images, "refine": {"enabled": refine}}, tmp_path)
+    run.metric_map_of(survey, progress=SilentProgress())
+    assert begun == [stage]
