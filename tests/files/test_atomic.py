@@ -127,6 +127,17 @@ class TestNewFile:
         assert caught.value.filename == str(tmp_path / "a.csv")
 
 
+def test_a_disk_with_no_room_for_the_record_is_named_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("rangesfm.files.manifest.Manifest.save", full)
+    with pytest.raises(OSError, match="No space left") as caught:
+        write_text("new", tmp_path / "a.csv")
+    assert caught.value.filename == str(tmp_path / "a.csv")
+    assert names_in(tmp_path) == []
+
+
 @pytest.mark.parametrize("output", ["in.csv", "link/in.csv", "folder", "folder/new.csv"])
 def test_no_output_is_an_input_or_inside_one(output: str, tmp_path: Path) -> None:
     (tmp_path / "in.csv").touch()

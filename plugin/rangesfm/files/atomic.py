@@ -75,13 +75,16 @@ def new_file(path: Path) -> Iterator[Path]:
         output.require_own([target])
         if target.is_dir():
             raise InputError("is a folder, expected a file", path)
+        our_names: set[str | None] = {None}  # of which an error says nothing to the user
         try:
             # With the same ending, by which libraries tell the format.
-            with _temporary(output.part(path.name)) as temporary:
+            part = output.part(path.name)
+            our_names.add(str(part))
+            with _temporary(part) as temporary:
                 yield temporary
                 output.publish({target: temporary})
-        except OSError as error:  # of a full disk, which says nothing of the file
-            error.filename = str(path) if error.filename in (None, str(temporary)) else error.filename
+        except OSError as error:  # of a full disk, which may say nothing of the file
+            error.filename = str(path) if error.filename in our_names else error.filename
             raise
 
 
