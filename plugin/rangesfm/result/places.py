@@ -61,8 +61,10 @@ def photos_beside(folder: Path, recorded: str) -> Path | None:
 def is_within(path: Path, folder: Path) -> bool:
     """Whether a path leads into a folder, whatever links there are on the way."""
     try:
-        return path.resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError, ValueError):  # links in a circle, or no name that a file can have
+        end = path.resolve()
+        # Before Python 3.13 links in a circle are an error; from then on what is left of them is still a link.
+        return not end.is_symlink() and end.is_relative_to(folder.resolve())
+    except (OSError, RuntimeError, ValueError):  # or no name that a file can have
         return False
 
 
