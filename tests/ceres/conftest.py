@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
+
+from rangesfm.ceres import check_compatibility
 
 AdjusterOf: TypeAlias = Callable[..., pycolmap.CeresBundleAdjuster]
 
@@ -60,3 +62,11 @@ def _pose_block(reconstruction: pycolmap.Reconstruction, frame_id: int) -> npt.N
     assert rig_from_world is not None
     params: npt.NDArray[np.float64] = rig_from_world.params
     return params
+
+
+@pytest.fixture
+def unchecked() -> Iterator[None]:
+    """Nothing has been checked yet in this process, and will not have been."""
+    check_compatibility.cache_clear()
+    yield
+    check_compatibility.cache_clear()

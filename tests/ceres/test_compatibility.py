@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import subprocess
-from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
@@ -22,14 +21,6 @@ TAG_IN_CAM_M = np.array([-0.0012, -0.0900, -0.0663])
 
 def test_the_gate_opens_for_what_is_installed() -> None:
     check_compatibility()
-
-
-@pytest.fixture
-def unchecked() -> Iterator[None]:
-    """Nothing has been checked yet in this process, and will not have been."""
-    check_compatibility.cache_clear()
-    yield
-    check_compatibility.cache_clear()
 
 
 @pytest.mark.usefixtures("unchecked")

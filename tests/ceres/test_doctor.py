@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator
 
 import pytest
 from tests.installed import with_gpus, with_installed
 
 from rangesfm.ceres import doctor
-from rangesfm.ceres.doctor import Check, check_compatibility, diagnose, versions
+from rangesfm.ceres.doctor import Check, diagnose, versions
 from rangesfm.errors import SolverError
 
 
@@ -101,14 +100,6 @@ def test_a_compiled_part_that_does_not_fit_is_reported_and_not_raised(monkeypatc
     check = check_named("compiled part")
     assert not check.ok
     assert check.remedy == "it does not fit; do this"
-
-
-@pytest.fixture
-def unchecked() -> Iterator[None]:
-    """Nothing has been checked yet in this process, and will not have been."""
-    check_compatibility.cache_clear()
-    yield
-    check_compatibility.cache_clear()
 
 
 @pytest.mark.usefixtures("unchecked")
