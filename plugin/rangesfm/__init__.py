@@ -1,6 +1,6 @@
 """rangesfm: metric COLMAP models from photos and ultra-wideband ranges.
 
-The stages are plain functions, found here by name and imported when first asked for:
+The stages are plain functions. Each is found here by name, and its module is imported on first use:
 
     import rangesfm
 
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import importlib
 import logging
-import zlib as zlib  # before pycolmap: if its own copy is loaded first, Python's zlib aborts or hangs (4.2.1)
+import zlib as zlib  # before pycolmap 4.2.1: where its own copy of zlib is loaded first, Python's zlib aborts or hangs
 from typing import Any
 
 __version__ = "0.1.0"
@@ -66,9 +66,13 @@ logging.getLogger(__name__).addHandler(logging.NullHandler())
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name from its module when it is first used: pycolmap and scipy are slow to load.
+    """Import a public name from its module on first use, because pycolmap and scipy are slow to load.
 
-    Whatever may need pycolmap or pyceres is refused with other versions of them than it was made for.
+    All names but the error classes may need pycolmap and pyceres, so the installed versions are checked first.
+
+    Raises:
+        AttributeError: there is no such public name.
+        SolverError: pycolmap or pyceres is missing or installed in another version than this package is built for.
     """
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,4 +1,4 @@
-"""What arrays hold; their shapes stand with each."""
+"""Types of numpy arrays by the kind of number they hold; the shape is said where an array is used."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""The range and distance residuals alone, for bundle adjustment programs of one's own.
+"""Range and distance residuals alone, for users who write their own bundle adjustment.
 
-See ``examples/own_problem.py``. Blocks, units and errors are described with each function. A cost is a
-``pyceres.CostFunction``; importing this raises ``SolverError`` where pyceres does not fit (``rangesfm doctor``).
+``examples/own_problem.py`` shows how. Each function describes its parameter blocks, units and errors. A cost is a
+``pyceres.CostFunction``. Importing this module raises ``SolverError`` where the compiled part does not fit the
+installed pyceres (``rangesfm doctor`` says why).
 """
 
 from rangesfm.ceres import (

@@ -1,4 +1,4 @@
-"""The errors a user can meet, and how a run that failed ends; everything else that escapes is a bug."""
+"""Errors that a user can meet, and the message and exit status of each. Any other error that escapes is a bug."""
 
 from __future__ import annotations
 
@@ -10,44 +10,46 @@ from pathlib import Path
 
 _MAX_SHOWN = 100
 INTERNAL_ERROR, BAD_INPUT, FAILED = 1, 2, 4
-"""Exit statuses; the first is of what nobody should ever see."""
+"""Exit statuses. INTERNAL_ERROR means a bug in this package."""
 INTERRUPTED = 130
-"""As shells have it."""
-# A library that finds no room as it is loaded or begins a thread says it in these words.
+"""Exit status after Ctrl-C, the one that shells use."""
+# Words of libraries that found no memory when they were loaded or when they started a thread.
 _WANT_OF_MEMORY = ("failed to map segment", "cannot allocate memory", "can't start new thread")
 _UNUSABLE_PATH = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG)
 
 
 def one_line(text: str) -> str:
-    """``text`` without line breaks and whatever else a terminal would not print but obey."""
+    """Replace line breaks and control characters in a text, so that a terminal prints it on one line."""
     return "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in text)
 
 
 def printable(text: str) -> str:
-    """``text`` fit for one line of a message."""
+    """Shorten a text to 100 characters and make it one printable line, for use inside a message."""
     return one_line(text if len(text) <= _MAX_SHOWN else text[:_MAX_SHOWN] + "...")
 
 
 def shown(value: object) -> str:
-    """A value of an option as a message names it."""
+    """Return the value of an option as messages show it: text in quotes, a table as "a table"."""
     if isinstance(value, (str, Path)):
         return printable(f"'{value}'")
     try:
         return "a table" if isinstance(value, Mapping) else printable(str(value))
-    except ValueError:  # a whole number of thousands of digits
+    except ValueError:  # Python refuses to convert a whole number of thousands of digits
         return "a number beyond all bounds"
 
 
 def nearest_known(name: str, known: Iterable[str]) -> str:
-    """The one of ``known`` most like ``name``, whatever the case."""
+    """Return the item of ``known`` that is most similar to ``name``, ignoring case."""
     by_lower = {item.lower(): item for item in known}
     return by_lower[difflib.get_close_matches(name.lower(), by_lower, 1, 0.0)[0]]
 
 
 class RangesfmError(Exception):
-    """Root of all errors raised on purpose. Its text is one line for the user, whatever names the files hold.
+    """Base class of all errors raised on purpose. The text is always one line, for the user.
 
-    ``advice`` are further lines, for who sits at the terminal.
+    Attributes:
+        exit_status: of the command that ends with this error.
+        advice: further lines, which the command line prints below the error.
     """
 
     exit_status = 4
@@ -58,7 +60,7 @@ class RangesfmError(Exception):
 
 
 class InputError(RangesfmError):
-    """Bad usage or bad input: names the file, the line and what was expected."""
+    """Bad usage or bad input. The text names the file, the line and what was expected."""
 
     exit_status = 2
 
@@ -78,7 +80,12 @@ class InputError(RangesfmError):
 
 
 class OptionError(InputError):
-    """An option that is passed through to another library, which does not take it: a key of a table."""
+    """A bad key or value of a table of options; the reader of the survey file adds the file and the line.
+
+    Attributes:
+        table: of the survey file, without brackets.
+        key: in that table; None where the whole table is meant.
+    """
 
     def __init__(self, message: str, table: str, key: str | None = None):
         self.table = table
@@ -87,13 +94,13 @@ class OptionError(InputError):
 
 
 class GeometryError(RangesfmError):
-    """The geometry does not determine what was asked; the text says what and why."""
+    """The geometry does not determine what was asked. The text says what, and why."""
 
     exit_status = 3
 
 
 class ReconstructionError(RangesfmError):
-    """The photos did not give a model."""
+    """COLMAP made no model of the photos."""
 
 
 class SolverError(RangesfmError):
@@ -102,7 +109,7 @@ class SolverError(RangesfmError):
 
 @dataclass(frozen=True)
 class Failure:
-    """One line for the user, the exit status, and lines of advice."""
+    """End of a failed command: one line for the user, the exit status, and further lines of advice."""
 
     message: str
     exit_status: int
@@ -110,7 +117,7 @@ class Failure:
 
 
 def failure_of(error: BaseException) -> Failure:
-    """What to tell about any error at all; one that is not of our own classes may be a bug, and is called so."""
+    """Return message, exit status and advice for any error. An unexpected error is called an internal error."""
     message, status = _told(error)
     advice = error.advice if isinstance(error, RangesfmError) else ()
     return Failure(" ".join(one_line(message).split()), status, advice)
@@ -131,7 +138,7 @@ def _told(error: BaseException) -> tuple[str, int]:
 
 
 def _with_causes(error: BaseException | None) -> Iterator[BaseException]:
-    """It and what it came from: a library that is being loaded makes an error of its own of whatever happens."""
+    """Yield an error and its causes: a library that fails while it is loaded wraps the cause in its own error."""
     while error is not None:
         yield error
         error = error.__cause__ or error.__context__

@@ -1,7 +1,7 @@
-"""The packages that rangesfm needs: in which versions, and which are installed.
+"""Packages that rangesfm needs, in which versions, and which versions are installed.
 
-What goes together stands here and nowhere else in the program. The metadata, the build and the README have to say it in
-words of their own, and the tests hold them against this.
+The program takes the needed versions from here only. The package metadata, the build and the README state them again,
+and the tests compare those with this module.
 """
 
 from __future__ import annotations
@@ -14,20 +14,21 @@ import rangesfm
 from rangesfm.errors import SolverError
 
 PYTHONS = ("3.10", "3.11", "3.12", "3.13", "3.14")
-# Those that it exchanges C++ objects with: the next version of either needs another build of rangesfm.
+# The compiled part exchanges C++ objects with these packages, so another version of either needs another build of it.
 NEEDED_VERSIONS = {"pycolmap": "4.2", "pyceres": "2.6"}
-# Other packages with the same module, of which one has to be there. COLMAP with CUDA goes by another name on PyPI.
+# Packages that provide the same Python module; one of them must be installed. PyPI has pycolmap with CUDA under its own
+# name.
 OTHER_BUILDS = {"pycolmap": ("pycolmap-cuda12",)}
-# The Ceres inside both of them, and those whose headers describe the same objects.
+# Version of Ceres inside pycolmap and pyceres, and the versions whose headers describe the same C++ objects.
 CERES = "2.2"
 CERES_HEADERS = ("2.1", "2.2")
-# What else the compiled part is made of: its own affair, so that any of these will do.
+# Other libraries of the compiled part. It exchanges no objects of theirs, so any of these versions will do.
 EIGEN_HEADERS = ("3.4", "5.0")
 PYBIND11 = "3.0"
 
 
 def installed_version(package: str) -> str | None:
-    """Version of an installed package; None if it is not."""
+    """Return the version of a package, or None where it is not installed."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
@@ -35,19 +36,19 @@ def installed_version(package: str) -> str | None:
 
 
 def installed_builds(package: str) -> dict[str, str]:
-    """Versions of those installed packages, by name, that hold this one's module: itself, or another build of it."""
+    """Return name and version of each installed package that provides this package's module: itself or other builds."""
     names = (package, *OTHER_BUILDS.get(package, ()))
     return {name: version for name in names if (version := installed_version(name)) is not None}
 
 
 def is_version(found: str, needed: str) -> bool:
-    """Whether a version begins with the numbers of another: 4.2.1 is a 4.2, and 4.20 is none."""
+    """Return whether a version begins with the numbers of another: 4.2.1 is a 4.2, 4.20 is not."""
     numbers = needed.split(".")
     return found.split(".")[: len(numbers)] == numbers
 
 
 def install_command() -> str:
-    """What to run to have the versions needed, with the build of pycolmap that is wanted here."""
+    """Return the shell command that installs the needed versions, keeping the build of pycolmap that is installed."""
     wanted = [next(reversed(installed_builds(package)), package) for package in NEEDED_VERSIONS]
     return f"python -m pip install {' '.join(map(_requirement, wanted, NEEDED_VERSIONS.values()))}"
 
@@ -58,17 +59,20 @@ def _requirement(package: str, needed: str) -> str:
 
 
 def needed_packages() -> list[str]:
-    """All that rangesfm does not work without, by its own metadata; those of NEEDED_VERSIONS if it is not installed."""
+    """Return the names of all required packages from the package metadata.
+
+    Where rangesfm itself is not installed, these are the packages of ``NEEDED_VERSIONS``.
+    """
     try:
         requirements = importlib.metadata.requires("rangesfm") or []
     except importlib.metadata.PackageNotFoundError:
         requirements = list(NEEDED_VERSIONS)
-    # After a semicolon stands when alone it is needed: by an extra, or by an older Python.
+    # A requirement with a semicolon is conditional: only an extra or an older Python needs it.
     return [re.split(r"[^\w.-]", requirement)[0] for requirement in requirements if ";" not in requirement]
 
 
 def num_gpus() -> int | None:
-    """How many GPUs pycolmap finds; None where it is built without CUDA."""
+    """Return the number of GPUs that pycolmap finds, or None where it is built without CUDA."""
     import pycolmap
 
     find = getattr(pycolmap, "get_num_cuda_devices", None)
@@ -77,10 +81,10 @@ def num_gpus() -> int | None:
 
 @functools.cache
 def check_versions() -> None:
-    """Check, once in a process and without importing them, that the packages are there in the versions needed.
+    """Check that pycolmap and pyceres are installed in the needed versions, once in a process, without importing them.
 
     Raises:
-        SolverError: they are not; it names what is installed, what is needed and what to run.
+        SolverError: they are not. The text names what is installed, what is needed and what to run.
     """
     pair = " and ".join(f"{package} {needed}" for package, needed in NEEDED_VERSIONS.items())
     for package, needed in NEEDED_VERSIONS.items():

@@ -1,4 +1,4 @@
-"""The keys of [mapper] in a survey file, as ``options`` has those of the other tables."""
+"""Keys of the table [mapper] of a survey file. Those of all other tables are in ``options``."""
 
 from __future__ import annotations
 
@@ -12,29 +12,32 @@ from pydantic import Field, model_validator
 from rangesfm.errors import OptionError
 from rangesfm.option_model import Options, Told
 
-_LIKE_OURS = 0.85  # a key this similar to one of ours is a slip; others are pycolmap's
+# A key this similar to one of ours (difflib's ratio, 0 to 1) is a typing error; any other key is meant for pycolmap.
+_LIKE_OURS = 0.85
 
 
 class MapperOptions(Options, table="mapper"):
-    """Photos to unscaled model. Keys that are not here are of pycolmap's options of the mapper, as in pipeline."""
+    """How COLMAP makes an unscaled model of the photos. Other keys are passed to pycolmap, like keys of pipeline."""
 
     method: Annotated[Literal["incremental", "global", "hierarchical"], Told(flag="mapper_method")] = "incremental"
-    """COLMAP's mapper: photo by photo; all at once; photo by photo in clusters, which are merged."""
+    """COLMAP's mapper. incremental: photo by photo; global: all photos at once; hierarchical: photo by photo in
+    clusters, which are then merged."""
     matching: Literal["sequential", "exhaustive", "spatial", "vocabtree", "auto"] = "auto"
-    """Which photos are matched: neighbours in time, all, neighbours by EXIF position, those that look alike; auto: all
-    up to 60 keyframes, else neighbours in time."""
+    """Which pairs of photos are matched. sequential: neighbours in time; exhaustive: all pairs; spatial: neighbours by
+    EXIF position; vocabtree: photos that look alike; auto: exhaustive up to 60 keyframes, sequential above."""
     vocab_tree_path: Annotated[Path | None, Told(metavar="TREE", role="file")] = None
-    """COLMAP's vocabulary tree, by which photos look alike: for vocabtree matching, and for loop_detection of the
-    pairing of neighbours in time; nothing is downloaded."""
+    """File with COLMAP's vocabulary tree, which finds photos that look alike. vocabtree matching needs it, and so does
+    loop_detection with sequential matching; it is never downloaded."""
     pairs: Annotated[Path | None, Told(role="file")] = None
-    """Text file with the names of two photos a line, a tab between them: these pairs are matched, and no others."""
+    """Text file with the names of two photos on each line, separated by a tab. Only these pairs are matched."""
     mask_path: Annotated[Path | None, Told(role="photos")] = None
-    """Folder of masks: for photo a/b.jpg the image a/b.jpg.png of the same size, black where no features are wanted."""
+    """Folder of masks. The mask of photo a/b.jpg is a/b.jpg.png, of the same size, black where features are not
+    wanted."""
     database_path: Annotated[Path | None, Told(metavar="DB", role="file")] = None
-    """Database of COLMAP's or hloc's, which is copied: its features, matches and (where [camera] says neither model nor
-    params) cameras are used, and only what it lacks is computed; photos that it does not know are left out."""
+    """COLMAP database, also one written by hloc. It is copied. Its features and matches are used, and its cameras too
+    unless [camera] gives a model or params; what it lacks is computed. Photos that are not in it are left out."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """What computes features and matches: the processor, or a GPU by CUDA; auto: a GPU if pycolmap finds one."""
+    """Device that computes features and matches. cuda: an NVIDIA GPU; auto: a GPU if pycolmap finds one."""
     features: dict[str, Any] = Field(default_factory=dict)
     """Passed through to pycolmap's FeatureExtractionOptions."""
     pairing: dict[str, Any] = Field(default_factory=dict)
@@ -42,20 +45,20 @@ class MapperOptions(Options, table="mapper"):
     matcher: dict[str, Any] = Field(default_factory=dict)
     """Passed through to pycolmap's FeatureMatchingOptions."""
     pipeline: dict[str, Any] = Field(default_factory=dict)
-    """Passed through to pycolmap's IncrementalPipelineOptions; of the other mappers GlobalPipelineOptions and
+    """Passed through to the options of pycolmap's mapper: IncrementalPipelineOptions, GlobalPipelineOptions or
     HierarchicalPipelineOptions."""
     ranges_in_mapping: bool = False
-    """Each global bundle adjustment of the mapping carries the ranges, as soon as they determine the scale; takes much
-    longer, and the refinement at the end mostly comes to the same map."""
+    """Whether each global bundle adjustment during mapping uses the ranges, once they determine the scale. This takes
+    much longer, and the refinement at the end usually finds the same map without it."""
     num_threads: Annotated[
         Literal[-1] | Annotated[int, Field(ge=1, le=4096)], Told(expected="1 or more up to 4096, or -1 for all cores")
     ] = -1
-    """-1 for all cores. Matching on the processor takes so many processes with one thread each, as pycolmap 4.2 loses
-    matches with more threads; matcher.num_threads overrides that one."""
+    """Number of threads; -1: one for each core. Matching on the processor runs this many processes with one thread
+    each, because pycolmap 4.2 loses matches with several threads; matcher.num_threads sets the threads of a process."""
 
     @property
     def num_cores(self) -> int:
-        """What ``num_threads`` comes to here."""
+        """Return ``num_threads``, or the number of cores of this machine where it is -1."""
         return self.num_threads if self.num_threads > 0 else os.cpu_count() or 1
 
     @model_validator(mode="after")
@@ -72,7 +75,7 @@ class MapperOptions(Options, table="mapper"):
     @model_validator(mode="before")
     @classmethod
     def _others_to_pipeline(cls, values: dict[str, Any]) -> dict[str, Any]:
-        """pycolmap knows best what its keys may be; only one much like ours is a slip."""
+        """Move unknown keys to ``pipeline``, for pycolmap to check, unless they resemble a key of this table."""
         known = list(cls.model_fields)
         others = {
             name: value for name, value in values.items() if not difflib.get_close_matches(name, known, 1, _LIKE_OURS)

@@ -1,4 +1,4 @@
-"""What the tables of options are made of: models whose keys are checked and explain themselves."""
+"""Base class of the tables of options: their keys are checked, and each carries its own explanation."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _UNITS = {"m_per_s": "metres a second", "m": "metres", "s": "seconds", "deg": "d
 
 @dataclass(frozen=True)
 class Told:
-    """What a key is told by its annotation, where its name and type do not say it.
+    """Annotation of a key: what its name and its type do not say.
 
     Attributes:
-        flag: its name on the command line, without dashes; None: the key's own.
-        metavar: how its value is shown there; None: by its type.
-        expected: what it may be, for messages; None: by its type and bounds.
-        role: of a path, what stands there.
-        is_key: whether it stands in a table of the file.
+        flag: name of the flag on the command line, without dashes; None: that of the key.
+        metavar: placeholder for the value in the help text; None: by the type.
+        expected: description of valid values, for messages; None: made from type and bounds.
+        role: of a path, what kind of file or folder it leads to.
+        is_key: whether users may write it into the survey file.
     """
 
     flag: str | None = None
@@ -42,11 +42,17 @@ class Told:
 
 @dataclass(frozen=True)
 class Key:
-    """A key of a survey file: where it stands, what its annotation says, and what its docstring says.
+    """A key of a survey file: its place, and what its annotation and its docstring say.
 
     Attributes:
-        type: of its value, without None for one that is not given.
-        meaning: with its default.
+        table: name of its table, without brackets.
+        name: of the key in that table.
+        flag: as in ``Told``, never None.
+        metavar: as in ``Told``.
+        type: of the value, without the None that means "not given".
+        expected: as in ``Told``, never None.
+        meaning: the docstring on one line without its full stop, followed by the default.
+        role: as in ``Told``.
     """
 
     table: str
@@ -64,12 +70,15 @@ class Key:
 
 
 class Options(BaseModel):
-    """A table of options, or a part of one: values that hold by themselves and never change.
+    """A table of options, or a part of one. Its values are checked when it is made, and cannot be changed.
 
-    What is made from it says how the table is called in a survey file: ``class ScaleOptions(Options, table="scale")``.
+    A derived class gives the table's name in a survey file: ``class ScaleOptions(Options, table="scale")``. The
+    docstring under each field is the explanation that users read in the help, on the page of keys and in new survey
+    files.
 
     Raises:
-        OptionError: an unknown key (names the nearest known one), or a value of another type or out of bounds.
+        OptionError: an unknown key (the text names the nearest known one), or a value of the wrong type or out of
+            bounds.
     """
 
     model_config = ConfigDict(
@@ -89,18 +98,18 @@ class Options(BaseModel):
             raise self._error(error.errors()[0]["loc"], values) from None
 
     def changed(self: Same, **values: Any) -> Same:
-        """The same with other values of some keys, which are checked."""
+        """Return a copy with other values of some keys; they are checked, too."""
         given = {name: getattr(self, name) for name in self.model_fields_set}
         return type(self)(**{**given, **values})
 
     def refused(self, key: str, why: str) -> OptionError:
-        """An error about one of the keys: what it is, and what was expected."""
+        """Return the error about a key. ``why`` says what the key is and what was expected."""
         return OptionError(f"[{self.table}] {key} {why}", self.table, key)
 
     @classmethod
     @cache
     def keys(cls) -> Mapping[str, Key]:
-        """All keys by their names."""
+        """Return all keys of this table by name."""
         bare, hints = get_type_hints(cls), get_type_hints(cls, include_extras=True)
         keys = {}
         for name, field in cls.model_fields.items():
@@ -131,7 +140,7 @@ class Options(BaseModel):
 
 
 def _default(value: Any) -> str:
-    """What a key is if it is not given, where the meaning does not say it."""
+    """Return " (default: ...)" for a key with a default value, else an empty text."""
     if value is None or value in ((), {}):
         return ""
     parts = value if isinstance(value, tuple) else (value,)
@@ -146,7 +155,7 @@ def _without_none(hint: Any) -> Any:
 
 
 def _described(hint: Any, unit: str | None) -> str:
-    """What values a type has, with their bounds."""
+    """Return a description of the values that a type allows, with bounds and unit: "a number of metres from 0 to 1"."""
     origin, args = get_origin(hint), get_args(hint)
     if origin is Annotated:
         constraints = [item for info in args[1:] if isinstance(info, FieldInfo) for item in info.metadata]

@@ -1,8 +1,8 @@
-"""The keys of a survey file: of each its type, bounds, default, meaning and flag, written here (those of [mapper]
-in ``mapper_options``) and nowhere else.
+"""Keys of a survey file, with type, bounds, default, meaning and flag of each.
 
-The stages take these tables, or the part of one that is theirs, as their options. The reader of survey files, the
-commands' flags, their help, the reference of all keys and the settings in ``result.json`` follow from them.
+This is their only definition; those of the table [mapper] are in ``mapper_options``. The stages take these tables, or
+parts of them, as their options. The reader of survey files, the flags of the commands and their help, the page of all
+keys and the settings in ``result.json`` are made from them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from rangesfm.mapper_options import MapperOptions as MapperOptions
 from rangesfm.option_model import Options, Told
 
 DEFAULT_FORMATS = ("tum", "ply")
-_CALIBRATION_STDDEV = 0.005  # of a focal length, relative: what focus, warmth and another board make of it
+# Relative stddev of a calibrated focal length: focus, temperature and another calibration board change it by this much.
+_CALIBRATION_STDDEV = 0.005
 
 # fmt: off
 TagDictionary = Literal[
@@ -28,7 +29,7 @@ TagDictionary = Literal[
 ]
 # fmt: on
 
-# Bounds keep out what only a slip can mean, and what would be infinite once it is squared or divided by.
+# Values beyond these bounds can only be mistakes, or would overflow when they are squared or divided by.
 _Count = Annotated[int, Field(ge=1, le=1_000_000)]
 _Zero = Annotated[float, Field(ge=0, le=0)]
 _Positive = Annotated[float, Field(ge=1e-6, le=1e3)]
@@ -40,7 +41,7 @@ _Numbers = Annotated[tuple[_Number, ...], Field(strict=False)]
 _Times = Annotated[tuple[_Time, ...], Field(strict=False)]
 _Three = Annotated[tuple[_Number, _Number, _Number], Field(strict=False)]
 _Texts = Annotated[tuple[str, ...], Field(strict=False)]
-# No camera carries its tag further away: beyond that its unit is wrong.
+# In metres. No camera carries its tag further away than this, so a larger number is in a wrong unit.
 _OfLeverArm = Annotated[float, Field(ge=-20, le=20)]
 _LeverArm = Annotated[tuple[_OfLeverArm, _OfLeverArm, _OfLeverArm], Field(strict=False)]
 _Place = Annotated[
@@ -70,78 +71,87 @@ def _span(times: tuple[float, ...]) -> tuple[float, ...]:
 
 
 class KeyframeOptions(Options, table="images"):
-    """Which photos become keyframes. All that are given must hold."""
+    """Which photos become keyframes. Where several keys are given, all of them apply."""
 
     every_nth: _Count = 1
-    """Use every n-th photo, in time order."""
+    """Use every n-th photo, in order of time."""
     min_interval_s: _Duration = 0.0
-    """Least time between keyframes."""
+    """Shortest time between two keyframes."""
     max_num_keyframes: Annotated[int, Field(ge=3, le=1_000_000)] | None = None
-    """Thin evenly to at most this many."""
+    """Largest number of keyframes; the photos are thinned evenly to it (default: no limit)."""
 
 
 class ImageOptions(KeyframeOptions):
     """The photos."""
 
     path: Annotated[Path | None, Told(flag="images", metavar="PATH", role="photos")] = None
-    """Folder of the photos and of folders of them, a video, or a ROS bag with images; as a flag also the CSV of the
-    photos' times."""
+    """Folder of the photos (subfolders included), a video, or a ROS bag with images. The flag also takes the CSV with
+    the photos' times."""
     model: Annotated[Path | None, Told(flag="input_path", metavar="MODEL", role="model")] = None
-    """Folder of a COLMAP model, as sparse/0, to go on from: then no photos are needed."""
+    """Folder of a COLMAP model, such as sparse/0, to start from; no photos are needed then."""
     times: Annotated[Path | None, Told(flag="image_times", role="file")] = None
-    """CSV image_name,timestamp_s (default: EXIF, else file names)."""
+    """CSV image_name,timestamp_s with the times of the photos (default: EXIF, else file names)."""
     rig_config: Annotated[Path | None, Told(flag="rig_config_path", metavar="JSON", role="file")] = None
-    """COLMAP's rig_config.json, lengths in metres: photos of one rig whose names go on alike after their image_prefix
-    were taken at once, when the reference camera's was. A cam_from_rig is kept while mapping, and the length of its
-    translation is a measured distance, which checks the ranges and is checked by them; cameras without one are placed
-    by a model made without the rig first."""
+    """COLMAP's rig_config.json, lengths in metres. Photos of a rig whose names are the same after their image_prefix
+    were taken at the same time, that of the reference camera's photo. A given cam_from_rig is kept while mapping, and
+    the length of its translation is a measured distance, tested against the ranges; cameras without one are placed by
+    a first model made without the rig."""
     baseline_stddev_m: _Positive = 0.001
-    """Of each known distance of a rig's camera from its reference camera."""
+    """Standard deviation of the known distance of each camera of a rig from the reference camera."""
     rate_hz: Annotated[float, Field(ge=1e-3, le=1e3), Told(flag="image_rate_hz")] = 2.0
-    """Photos a second of a video or a bag: of each such interval the sharpest one."""
+    """Photos per second taken from a video or a bag: the sharpest image of each interval."""
     topic: Annotated[str | None, Told(flag="image_topic")] = None
-    """Of the images, for a bag with several such topics."""
+    """Topic of the images, for a bag with several image topics."""
 
 
 class CameraOptions(Options, table="camera"):
     """The cameras of the photos."""
 
     images: Annotated[str | None, Told(flag="camera_images", metavar="PATTERN")] = None
-    """Of several [[camera]] tables, which photos each is of: a folder, or a pattern of their names as left*.jpg; one
-    table may do without, for all others."""
+    """Photos that this table is about, where there are several [[camera]] tables: a folder, or a pattern of names such
+    as left*.jpg. One table may leave it out, for all other photos."""
     mode: Annotated[Literal["auto", "single", "per_folder", "per_image"], Told(flag="camera_mode")] = "auto"
-    """Which photos of one size share a camera: those of the same make, model, serial number and focal length by EXIF
-    (auto; without EXIF all), all of them, those of one folder, or none."""
+    """Which photos of one size share a camera. auto: those with the same make, model, serial number and focal length in
+    EXIF, or all without EXIF; single: all; per_folder: those of one folder; per_image: none."""
     model: Annotated[str | None, Told(flag="camera_model")] = None
-    """COLMAP camera model, as OPENCV (default: COLMAP guesses)."""
+    """COLMAP camera model, such as OPENCV (default: COLMAP chooses one)."""
     params: Annotated[_Numbers | None, Told(flag="camera_params")] = None
-    """Its parameters in COLMAP's order, for photos of the most common size; rescaled for others of the same shape."""
+    """Parameters of the camera model in COLMAP's order, for photos of the most common size; they are rescaled for
+    photos of another size and the same shape."""
     focal_length_stddev_px: _Uncertainty | None = None
-    """Of the focal lengths in params, a calibration, which mapping and refinement refine where the photos know better;
-    the other parameters' follow from it (default: 0.5 % of the focal length). 0 keeps them all to the digit."""
+    """Standard deviation of the focal lengths in params, in pixels; those of the other parameters are derived from it.
+    Mapping and refinement adjust the given parameters within it. 0 keeps them all exactly as given (default: 0.5 % of
+    the focal length)."""
     refine_intrinsics: bool | None = None
-    """Whether mapping and refinement adjust them at all (default: mapping does, to given ones once the map is whole;
-    the refinement does to given ones, by their stddev, and else keeps what it finds, so that it does the same to a
-    model just mapped and one brought)."""
+    """Whether mapping and refinement adjust the camera parameters (default: mapping does, given ones only once the map
+    is complete; the refinement adjusts given ones within their stddev and keeps all others)."""
 
     others: Annotated[tuple[CameraOptions, ...], Told(is_key=False)] = ()
-    """Those of the other tables, each with its pattern; this one is for photos of which none is."""
+    """Further [[camera]] tables, each with its pattern. This table is for photos that match none of them."""
 
     @property
     def tables(self) -> tuple[CameraOptions, ...]:
         return (self, *self.others)
 
     def of_photo(self, name: str) -> CameraOptions:
-        """The table that a photo belongs to; OptionError for one that belongs to two."""
+        """Return the table that a photo belongs to.
+
+        Raises:
+            OptionError: the photo matches the patterns of two tables.
+        """
         found = [table for table in self.others if table.images is not None and _is_of(name, table.images)]
         if len(found) > 1:
             patterns = " and ".join(f"'{table.images}'" for table in found)
-            raise OptionError(f"[[camera]] images {patterns} are both of the photo {name}, expected one", "camera")
+            raise OptionError(f"[[camera]] images {patterns} both match the photo {name}, expected one", "camera")
         return found[0] if found else self
 
     @property
     def intrinsics_in_mapping(self) -> Literal["kept", "refined last", "refined"]:
-        """A calibration holds while the map grows: few photos know less of a lens, and what they take it for lasts."""
+        """Say when mapping adjusts the camera parameters.
+
+        A given calibration is kept until the map is complete: few photos determine a lens badly, and a map begun with
+        wrong parameters stays bent.
+        """
         if self.refine_intrinsics is None and self.params is not None:
             return "kept" if self.focal_length_stddev_px == 0 else "refined last"
         return "kept" if self.refine_intrinsics is False else "refined"
@@ -153,122 +163,122 @@ class CameraOptions(Options, table="camera"):
         return self.refine_intrinsics
 
     def calibration_stddev_px(self, focal_length_px: float) -> float:
-        """Of a given focal length."""
+        """Return the standard deviation of a given focal length, both in pixels."""
         return self.focal_length_stddev_px or _CALIBRATION_STDDEV * focal_length_px
 
 
 class LogOptions(Options, table="ranges"):
-    """The radio's log and how to take it."""
+    """The radio's log and how it is read."""
 
     path: Annotated[Path | None, Told(flag="ranges", metavar="LOG", role="log")] = None
-    """The radio's log: a file, a folder of them, or a pattern as uwb_*.csv."""
+    """The radio's log: a file, a folder of files, or a pattern such as uwb_*.csv."""
     format: Annotated[str | None, Told(flag="ranges_format")] = None
-    """Its format (default: recognised by content)."""
+    """Format of the log (default: recognised by content)."""
     columns: Annotated[dict[str, str], Told(metavar="QUANTITY=NAME,..")] = Field(default_factory=dict)
-    """Names of its columns (numbers, where they have none) for timestamp (or image_name), anchor_id, range, tag_id,
-    range_stddev, los; range:A1 for a column of one anchor; without range, the time stamps tx1, rx1, tx2, rx2 and
-    possibly tx3, rx3 of two-way ranging."""
+    """Names of the log's columns (numbers, where they have no names) for timestamp (or image_name), anchor_id, range,
+    tag_id, range_stddev, los; range:A1 for a column that holds the ranges of anchor A1. A log without ranges needs the
+    time stamps of two-way ranging: tx1, rx1, tx2, rx2 and possibly tx3, rx3."""
     timestamp_unit: Literal["s", "ms", "us", "ns", "min", "h", "d", "iso", "dmy", "mdy"] | None = None
-    """Of its times; d: days, also as Excel and MATLAB count them; iso: dates and times, dmy and mdy: those whose dates
-    begin with the day or the month (default: by format, name or values)."""
+    """Unit of the log's times. d: days, also as Excel and MATLAB count them; iso: dates and times; dmy, mdy: the same
+    with dates that begin with the day or the month (default: by format, column name or values)."""
     range_unit: Literal["m", "cm", "mm", "ft"] | None = None
-    """Of its ranges (default: by format, name or values)."""
+    """Unit of the log's ranges (default: by format, column name or values)."""
     separator: Annotated[
         Annotated[str, Field(min_length=1, max_length=1)] | None, Told(metavar="CHARACTER", expected="one character")
     ] = None
-    """Between cells (default: told from the rows)."""
+    """Character between the cells of a row (default: recognised)."""
     ranging_interval_s: Annotated[float, Field(ge=1e-6, le=1e6)] | None = None
-    """Between two rounds, for a Qorvo log without the host's times (default: 0.2)."""
+    """Time between two ranging rounds, for a Qorvo log without times of the host (default: 0.2)."""
     stamp_unit: Literal["ns", "us", "ms", "s", "ticks"] = "ns"
-    """Of time stamps, in a log without ranges."""
+    """Unit of the time stamps, in a log without ranges."""
     stamp_bits: Literal[32, 40] = 32
-    """Of the stamps' counter; 32 do up to 67 ms."""
+    """Number of bits of the counter behind the time stamps; 32 bits count up to 67 ms."""
     propagation_speed: Annotated[
         Literal["air", "vacuum"] | Annotated[float, Field(ge=1e8, le=3e8)],
         Told(expected="air, vacuum or a speed of light in m/s"),
     ] = "air"
-    """Of the signal, for stamps."""
+    """Speed of the radio signal, for ranges computed from time stamps."""
     t_off_s: Annotated[float, Field(ge=-1, le=1)] = 0.0
-    """What all delays of both devices together add to a round trip of stamps."""
+    """Time that the delays of both devices together add to a round trip, for ranges computed from time stamps."""
     error_curve: Annotated[Path | None, Told(role="file")] = None
-    """The radio's error by distance, as rangesfm ranges calibrate writes it."""
+    """File with the radio's error by distance, written by rangesfm ranges calibrate."""
     time_offset: Annotated[
         Literal["auto"] | _Time,
         Told(flag="ranges_time_offset", metavar="auto|SECONDS", expected='"auto" or seconds, at most 1e+10 of them'),
     ] = "auto"
-    """Image time = range time + offset; auto: searched for."""
+    """Time offset between the clocks: image time = range time + offset. auto: it is searched for."""
 
     @property
     def time_offset_s(self) -> float | None:
-        """None: to be searched for."""
+        """Return the given time offset, or None where it is to be searched for."""
         return None if self.time_offset == "auto" else self.time_offset
 
 
 class AssociationOptions(Options, table="ranges"):
-    """Ranges to places on the path."""
+    """How each range gets its place on the camera's path."""
 
     max_interpolation_gap_s: _Duration = 2.0
-    """Between keyframes further apart than this no pose is interpolated."""
+    """Longest time between two keyframes between which poses are interpolated."""
     max_time_difference_s: _Duration = 0.02
-    """A range this close to a keyframe counts as taken there, where no pose can be interpolated."""
+    """Where no pose can be interpolated, a range this close in time to a keyframe counts as taken there."""
 
 
 class CheckOptions(Options, table="ranges"):
-    """Ranges held out of every estimate, to be compared with the result."""
+    """Ranges that are held out of every estimate and compared with the result (checks)."""
 
     check_share: Annotated[float, Field(ge=0, le=0.5)] = 0.0
-    """Share of the ranges held out as checks, chosen at random; neighbours in time err alike, so that this is the
-    mildest check."""
+    """Fraction of the ranges that is held out as checks, chosen at random. This is the mildest check, because ranges
+    that are close in time have the same errors."""
     check_anchors: _Texts = ()
-    """Ids of anchors with surveyed positions, whose ranges are all held out."""
+    """Ids of anchors with surveyed positions; all their ranges are held out."""
     check_times_s: Annotated[
         _Times, AfterValidator(_span), Told(metavar="A,B", expected="two times in seconds, the later one last")
     ] = ()
-    """From when to when, on the radio's clock, ranges are held out."""
+    """First and last time, on the radio's clock; the ranges between them are held out."""
 
 
 class RangeModelOptions(Options, table="ranges"):
-    """What is assumed of the radio."""
+    """Assumptions about the radio's errors."""
 
     range_stddev_m: _Positive | None = None
-    """Noise of a range (default: estimated from the residuals)."""
+    """Standard deviation of the noise of a range (default: estimated from the residuals)."""
     range_bias_stddev_m: _Uncertainty = 0.01
-    """Prior of each anchor's own constant bias, mean 0; small on purpose: a freer bias soaks up errors that depend on
-    direction, and shifts the map instead."""
+    """Standard deviation of the prior of each anchor's own constant bias, mean 0. It is small on purpose: a freer bias
+    absorbs errors that depend on direction, and shifts the map."""
     common_bias_stddev_m: _Uncertainty = 0.1
-    """Prior of the bias that all anchors share (the tag's delay), mean 0."""
+    """Standard deviation of the prior of the bias that all anchors share (the tag's delay), mean 0."""
 
 
 class RangesOptions(RangeModelOptions, CheckOptions, AssociationOptions, LogOptions):
-    """The radio's log, what is assumed of it, and which of its ranges are held out."""
+    """The radio's log, assumptions about its errors, and ranges that are held out."""
 
 
 class AnchorOptions(Options, table="anchors"):
     """The anchors."""
 
     path: Annotated[Path | None, Told(flag="anchors", role="file")] = None
-    """CSV anchor_id,x_m,y_m,z_m[,position_stddev_m,range_bias_m,range_bias_stddev_m] (default: the anchors in the log,
-    all unknown)."""
+    """CSV anchor_id,x_m,y_m,z_m[,position_stddev_m,range_bias_m,range_bias_stddev_m]; empty coordinates mean an unknown
+    position (default: the anchors in the log, all unknown)."""
     frame: Annotated[Literal["site", "first_camera", "unknown"] | None, Told(flag="anchor_frame")] = None
-    """What their coordinates refer to (default: site if the file knows any position, else unknown)."""
+    """Frame of the anchors' coordinates (default: site if the file has any position, else unknown)."""
     crs: Annotated[str | None, Told(flag="anchor_crs")] = None
-    """Coordinate system of their positions, as EPSG:2056 (default: metres of a frame of their own)."""
+    """Coordinate reference system of the anchors' positions, such as EPSG:2056 (default: a local frame in metres)."""
     use: Annotated[_Texts, Told(flag="use_anchors")] = ()
-    """Only these anchors' ranges are used (default: all)."""
+    """Ids of the anchors whose ranges are used (default: all)."""
 
 
 class TagOptions(Options, table="tag"):
-    """The tag on the camera, or several."""
+    """The radio tag on the camera, or several tags."""
 
     tag_in_cam_m: Annotated[_LeverArm, Told(flag="tag_in_cam", metavar="[ID:]X,Y,Z")] = (0.0, 0.0, 0.0)
-    """Lever arm: the tag's antenna in the camera frame, of a rig its reference camera's, metres; of several tags, the
-    flag once for each with its ID."""
+    """Lever arm: position of the tag's antenna in the camera frame (right, down, forward), metres; with a rig, in the
+    frame of its reference camera. With several tags, give the flag once for each, with the tag's ID."""
     lever_arms_m: Annotated[dict[str, _LeverArm], Told(flag="tag_in_cam", metavar="ID:X,Y,Z")] = Field(
         default_factory=dict
     )
-    """The same by tag id, for a camera with several tags."""
+    """Lever arms by tag id, for a camera with several tags."""
     tag_id: str | None = None
-    """The tag that counts, if the log has others (default: all with a lever arm)."""
+    """Id of the tag whose ranges are used, if the log has others (default: all tags with a lever arm)."""
 
     @model_validator(mode="after")
     def _one_or_several(self) -> TagOptions:
@@ -279,27 +289,27 @@ class TagOptions(Options, table="tag"):
 
 
 class ScaleOptions(Options, table="scale"):
-    """How the scale is found, and distances taped on the site."""
+    """How the scale is estimated, and distances taped on the site."""
 
     method: Annotated[Literal["robust", "two-candidate"], Told(flag="scale_method")] = "robust"
-    """How the scale is found; two-candidate is the paper's."""
+    """Method of the scale estimate. robust: a robust fit of all ranges; two-candidate: that of the 2018 paper."""
     max_relative_stddev: Annotated[float, Field(ge=1e-9, le=1e3)] = 0.1
-    """A scale less certain than this is refused."""
+    """Largest accepted relative standard deviation of the scale; a scale that is less certain is refused."""
     up_in_first_camera: Annotated[
         Annotated[_Three, AfterValidator(_direction)] | None,
         Told(expected="a list of 3 numbers up to 1e+09: a direction, not 0,0,0"),
     ] = None
-    """Upward in the first keyframe's camera frame, of any length; 0,-1,0 if it was level. Two anchors of a site are
-    enough with it, and a mirror image is ruled out that would stand the map on its head."""
+    """Upward direction in the camera frame of the first keyframe, of any length; 0,-1,0 if the camera was level. With
+    it, two anchors with site coordinates are enough, and a mirror image that puts the map upside down is ruled out."""
     camera_side: Literal["above", "below"] | None = None
-    """Where the camera went, seen from surveyed anchors that are all in one plane."""
+    """Side of the anchors' plane on which the camera moved, for surveyed anchors that are all in one plane."""
     adopt: bool = False
-    """Where the tests find a mistake, run again as if its likeliest cause were so: an anchor unknown, a lever arm as it
-    fits, labels swapped, a stretch of ranges left out; what changed is said."""
+    """Whether to run again with the likeliest mistake corrected, where the tests find one: an anchor taken as unknown,
+    the lever arm that fits, labels swapped, some of the ranges left out. The result says what was changed."""
     distances: Annotated[Path | None, Told(role="file")] = None
-    """CSV from,to,distance_m[,stddev_m,kind]: taped distances."""
+    """CSV from,to,distance_m[,stddev_m,kind] with taped distances."""
     markers: Annotated[Path | None, Told(role="file")] = None
-    """CSV marker,image_name,x_px,y_px: marks that they refer to."""
+    """CSV marker,image_name,x_px,y_px with the places in photos of the marks between which distances were taped."""
 
     @model_validator(mode="after")
     def _markers_are_of_distances(self) -> ScaleOptions:
@@ -313,13 +323,13 @@ class MarkerOptions(Options, table="markers"):
     """Printed tags of known size in the photos."""
 
     dictionary: Annotated[TagDictionary | None, Told(flag="marker_dictionary")] = None
-    """Which tags are looked for in the photos, by OpenCV's names: the corners of tag 7 are the markers tag7.0 (upper
-    left, as it is read) to tag7.3, clockwise (default: none are looked for)."""
+    """Dictionary of the printed tags, by OpenCV's name. The corners of tag 7 are the markers tag7.0 (upper left of the
+    upright tag) to tag7.3, clockwise (default: no tags are looked for)."""
     side_m: Annotated[_Positive | None, Told(flag="marker_side_m")] = None
-    """Side of the tags, from black corner to black corner: each that is found is four lengths (default: they are none,
-    but ends of taped distances)."""
+    """Side of the tags, from black corner to black corner. Each tag found gives four known lengths (default: none; the
+    corners only serve as ends of taped distances)."""
     side_stddev_m: Annotated[_Positive, Told(flag="marker_side_stddev_m")] = 0.0005
-    """Of that; all tags are off by the same."""
+    """Standard deviation of the side; the error is the same for all tags."""
 
     @model_validator(mode="after")
     def _side_is_of_a_dictionary(self) -> MarkerOptions:
@@ -332,41 +342,42 @@ class RefineOptions(Options, table="refine"):
     """Bundle adjustment with the ranges."""
 
     enabled: Annotated[bool, Told(flag="refine")] = True
-    """Whether the map is refined, or left as scaled."""
+    """Whether the map is refined after it is scaled."""
     max_num_iterations: Annotated[int, Field(ge=0, le=1_000_000)] = 200
-    """Of the refinement's solver."""
+    """Largest number of iterations of the solver."""
     range_loss_scale: Annotated[float, Field(ge=1e-3, le=1e9)] = 3.46
-    """Residual in stddevs from which a range is down-weighted (Geman-McClure)."""
+    """Residual, in standard deviations, from which a range is down-weighted (Geman-McClure loss)."""
     lever_arm_stddev_m: _Uncertainty = 0.0
-    """Of each coordinate of the tags' places in the camera frame, which are refined unless it is 0."""
+    """Standard deviation of each coordinate of the lever arms. They are refined unless it is 0."""
     time_offset_stddev_s: _Uncertainty = 0.0
-    """Of the clocks' offset, which is refined unless it is 0; one that the motion tells but loosely is, by its own."""
+    """Standard deviation of the time offset, which is refined unless it is 0. An offset that the search finds only
+    roughly is refined in any case, with the standard deviation of the search."""
     short_range_stddev_m: _Uncertainty = 0.0
-    """Of an error of short ranges that all share and that dies out with a length of 1 m, which is refined unless it is
-    0 (they are trusted less instead)."""
+    """Standard deviation of an error of short ranges that all anchors share and that decays with a length of 1 m. It is
+    refined unless this is 0; with 0, short ranges get less weight instead."""
     covariance: bool = True
-    """Whether to find that of poses, anchors and scale; not found of more than 1500 photos that see much of the same;
-    along a path, of some thousands."""
+    """Whether to compute the covariance of poses, anchors and scale. It is not computed for more than 1500 photos that
+    see much of the same; along a path it can be for some thousands."""
     bundle_adjustment: dict[str, Any] = Field(default_factory=dict)
     """Passed through to pycolmap's BundleAdjustmentOptions."""
 
 
 class ExportOptions(Options, table="export"):
-    """The metric model in other formats, and in which frame."""
+    """The metric model in other formats, and the frame of the exported files."""
 
     formats: _Texts = DEFAULT_FORMATS
-    """Names of exporters; an unknown one lists them all."""
+    """Names of export formats; the message about an unknown name lists them all."""
     frame: Annotated[Literal["result", "level", "enu"], Told(flag="export_frame")] = "result"
-    """One of result (the site's or the first camera's, as the result has it), level (z up, y as the first camera looks,
-    origin as it is) and enu (x east, y north, z up; for that the map must be georeferenced)."""
+    """Frame of the exported files. result: that of the result (site or first camera); level: z up, y along the first
+    camera's view, same origin; enu: x east, y north, z up, which needs a georeferenced map."""
     up: str = "auto"
-    """What is up: cameras (the mean of what is up in the photos), path (across the plane of the path), X,Y,Z (a
-    direction in the result's frame) or auto (z in a site frame, else as cameras)."""
+    """Upward direction, for the frames level and enu. cameras: mean upward direction of the photos; path: perpendicular
+    to the plane of the path; X,Y,Z: a direction in the result's frame; auto: z in a site frame, else as cameras."""
     crs: Annotated[str | None, Told(flag="export_crs")] = None
-    """Coordinate system of what is written for maps (LAZ, GeoPackage), as EPSG:2056 (default: the anchors', else
+    """Coordinate reference system of LAZ and GeoPackage files, such as EPSG:2056 (default: that of the anchors, else
     longitude and latitude)."""
     origin_anchor: str | None = None
-    """Id of an anchor whose place on the Earth is known."""
+    """Id of an anchor whose geographic position is known."""
     origin_lat_lon_height: Annotated[
         _Place | None,
         Told(
@@ -374,24 +385,24 @@ class ExportOptions(Options, table="export"):
             expected="3 numbers: latitude up to 90 and longitude up to 360 degrees, height up to 1e+05 metres",
         ),
     ] = None
-    """That place, degrees and metres above the ellipsoid (WGS 84)."""
+    """Geographic position of that anchor: degrees, and metres above the ellipsoid (WGS 84)."""
     heading_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
-    """Azimuth in which the first camera looks, from north through east."""
+    """Azimuth of the first camera's viewing direction, clockwise from north."""
 
 
 class ReportOptions(Options, table="report"):
-    """What is said of the result."""
+    """The report, and true positions to compare the result with."""
 
     reference: Annotated[Path | None, Told(metavar="FILE", role="file")] = None
-    """True positions, for comparison: CSV or TUM."""
+    """File with true positions of the camera, for comparison: CSV or TUM."""
     enabled: Annotated[bool, Told(flag="report")] = True
     """Whether report.html is written."""
 
 
 class OutputOptions(Options, table="output"):
-    """Where the results go."""
+    """The folder of the results, and the seed."""
 
     path: Annotated[Path, Told(flag="output_path", role="output")] = Path("out")
     """Folder of the results."""
     seed: Annotated[int, Field(ge=0, le=2**31 - 1)] = 0
-    """Of everything random."""
+    """Seed of everything random: same input and seed, same result."""

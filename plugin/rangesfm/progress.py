@@ -1,4 +1,4 @@
-"""How long work tells what it is doing, without knowing who listens; and what a run keeps of that."""
+"""Progress of long work, reported to whoever listens, and the record that a run keeps of it."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from typing import Protocol
 
 
 class Progress(Protocol):
-    """Receives the course of a run. The command line prints it; a library user may ignore it."""
+    """Listener to the progress of a run. The command line prints it; a library user may ignore it."""
 
     def stage(self, name: str) -> None:
-        """A stage begins (for example ``"features"``); the previous one has ended."""
+        """Note that a stage begins (for example ``"features"``), and that the previous one has ended."""
 
     def update(self, num_done: int, num_total: int | None = None) -> None:
-        """``num_done`` of ``num_total`` items of the current stage are done (None: unknown)."""
+        """Note how many items of the current stage are done, of how many (None: unknown)."""
 
     def message(self, text: str) -> None:
-        """One line that the user should read."""
+        """Receive one line that the user should read."""
 
 
 class SilentProgress:
-    """Listens to nothing: the default of every stage."""
+    """Listener that ignores everything: the default of every stage."""
 
     def stage(self, name: str) -> None:
         pass
@@ -37,7 +37,14 @@ class SilentProgress:
 
 @dataclass
 class Journal:
-    """What happened in a run, beside its results."""
+    """Record of a run beside its results: seconds by stage, and warnings.
+
+    Attributes:
+        progress: the listener that is told of stages and warnings.
+        seconds: by name of the stage.
+        warnings: one line each.
+        start: reading of the monotonic clock, seconds.
+    """
 
     progress: Progress
     seconds: dict[str, float] = field(default_factory=dict)
@@ -46,31 +53,31 @@ class Journal:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Tell of a stage and time it."""
+        """Announce a stage to the listener and time it."""
         self.progress.stage(name)
         with self.timed(name):
             yield
 
     @contextmanager
     def timed(self, name: str) -> Iterator[None]:
-        """Time what is too short to tell of."""
+        """Time a piece of work without announcing it."""
         start = time.monotonic()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - start
 
     def all_seconds(self) -> dict[str, float]:
-        """By stage, and in total."""
+        """Return the seconds by stage, and the time since the start as ``"total"``."""
         return {**self.seconds, "total": time.monotonic() - self.start}
 
     def warn(self, *texts: str) -> None:
-        """Lines for the user, kept for ``result.json``."""
+        """Tell the user these lines, and keep them for ``result.json``."""
         for text in texts:
             self.warnings.append(text)
             self.progress.message(text)
 
 
 def duration(seconds: float) -> str:
-    """As hours, minutes and seconds, no finer than needed."""
+    """Return a duration as text: "12.3 s", "5 min 03 s" or "2 h 07 min"."""
     if seconds < 60:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)

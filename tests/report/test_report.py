@@ -113,7 +113,7 @@ def test_the_numbers_are_those_of_the_result(make_result: MakeResult) -> None:
         "−0.051",
         "0.0214",
         "[refine] range_loss_scale",
-        "Residual in stddevs from which a range is down-weighted (Geman-McClure) (default: 3.46)",
+        "Residual, in standard deviations, from which a range is down-weighted (Geman-McClure loss) (default: 3.46)",
         "4.2.1",
     ]
     assert [text for text in expected if text not in texts] == []

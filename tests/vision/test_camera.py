@@ -82,7 +82,7 @@ def test_of_several_tables_each_is_of_the_photos_in_its_folder_or_of_its_pattern
 @pytest.mark.parametrize(
     ("pattern", "message"),
     [
-        ("*1.jpg", r"\[\[camera\]\] images 'a' and '\*1.jpg' are both of the photo a/1.jpg, expected one"),
+        ("*1.jpg", r"\[\[camera\]\] images 'a' and '\*1.jpg' both match the photo a/1.jpg, expected one"),
         ("c/", r"\[\[camera\]\] images is 'c/', expected some photo's name, as a/0.jpg"),
     ],
 )
