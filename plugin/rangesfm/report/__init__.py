@@ -1,4 +1,4 @@
-"""A result folder as one self-contained HTML page."""
+"""The report: a result folder as one self-contained HTML page, and its figures as files."""
 
 from __future__ import annotations
 
@@ -14,16 +14,15 @@ __all__ = ["write_report", "write_report_of", "write_report_pictures"]
 
 
 def write_report(result_folder: Path, *, images_path: Path | None = None) -> Path:
-    """Write ``report.html`` into a run's output folder.
-
-    The page shows what the folder holds: ``result.json`` must be there; ``ranges.csv``,
-    ``images.csv``, ``reference.csv`` (in the map's frame) and the models may be.
+    """Write ``report.html`` into the output folder of a run.
 
     Args:
-        images_path: folder of the photos, for thumbnails; None: those of the run, if they are beside the result.
+        result_folder: must hold ``result.json``. ``ranges.csv``, ``images.csv``, ``reference.csv`` (in the frame of the
+            map) and the models are shown where they are there.
+        images_path: folder of the photos, for thumbnails; None: that of the run, if it is beside the result folder.
 
     Returns:
-        The page's path.
+        Path of the page.
 
     Raises:
         InputError: the folder is not a result, a file in it cannot be read, or a run is writing there.
@@ -33,17 +32,20 @@ def write_report(result_folder: Path, *, images_path: Path | None = None) -> Pat
 
 
 def write_report_of(content: Content, folder: Path) -> Path:
-    """Write ``report.html`` into a folder; returns the page's path."""
+    """Write ``report.html`` into a folder and return the path of the page."""
     path = folder / REPORT_NAME
     write_page(render_report(content), path)
     return path
 
 
 def write_report_pictures(result_folder: Path) -> list[Path]:
-    """Write the report's figures as PNG and SVG files into ``figures`` in a run's output folder; returns their paths.
+    """Write the report's figures as PNG and SVG files into the subfolder ``figures`` of a result folder.
+
+    Returns:
+        Paths of the files.
 
     Raises:
-        InputError: as ``write_report``.
+        InputError: as in ``write_report``.
     """
     with sole_writer(result_folder):
         result = read_result_folder(result_folder)

@@ -1,4 +1,4 @@
-"""Figures as Vega-Lite specifications: what the page draws, and alike the pictures for a paper."""
+"""Figures as Vega-Lite specifications, from which the page draws its charts and picture files are made."""
 
 from __future__ import annotations
 
@@ -26,30 +26,31 @@ MIN_LABEL_DISTANCE_PX = 12.0
 ZOOM: Spec = {
     "name": "zoom",
     "bind": "scales",
-    # A wheel alone scrolls the page; with a key, or when two fingers pinch, it zooms. A double click goes back.
+    # The wheel alone scrolls the page. It zooms while a key is held, and so do two fingers. A double click resets.
     "select": {"type": "interval", "zoom": "wheel![event.ctrlKey || event.metaKey]"},
 }
 
-# Of a picture for a paper; and the width of its panels at most, for text to have the size that papers have.
+# For picture files: pixels of a PNG per pixel of the page, and the largest width of a panel, with which text has the
+# size that is usual in papers.
 PNG_SCALE, MAX_WIDTH_PX = 2.5, 660.0
 FORMATS = ("png", "svg")
 _NUM_COLUMNS = {"single": 1, "views": 2, "panels": 3}
 _SYMBOLS = {"dots": "circle", "disc": "circle", "triangle": "triangle-up"}
 
 _NUM_PICTURE_COLORS = 128
-_FAR = 2.0  # from zero, in widths of what is drawn
+_FAR = 2.0  # data further from zero than this many times their own extent are stored relative to an origin
 _MAP_DOT_PX, _DOT_PX = 1.6, 2.8
-# Least room beside rows; of their labels each letter takes so much.
+# Smallest room left and right of rows, and the width of a letter of their labels.
 _LEFT_OF_ROWS_PX, _RIGHT_OF_ROWS_PX, _LETTER_PX = 64, 74, 6.8
 
 
 def css(color: str) -> str:
-    """A colour of the page's style by its name, or one that is given as such."""
+    """Return a colour as CSS: a variable of the page's style for a name, "#rrggbb" unchanged."""
     return color if color.startswith("#") else f"var(--{color})"
 
 
 _LABEL: Spec = {"fontSize": 12, "fontWeight": 600, "baseline": "middle", "color": css("ink")}
-# What all figures have in common.
+# Configuration of all figures.
 CONFIG: Spec = {
     "aria": False,  # the element around a chart describes it
     "font": "sans-serif",
@@ -70,7 +71,7 @@ CONFIG: Spec = {
 
 
 def page_charts(figures: list[Figure]) -> dict[str, list[Spec]]:
-    """What the page's script, assets/view/charts.js, draws figures from, by name."""
+    """Return the data from which the script of the page, assets/view/charts.js, draws each figure, by figure name."""
     return {figure.name: [_page_chart(panel) for panel in figure.panels] for figure in figures}
 
 
@@ -91,7 +92,11 @@ def _page_chart(panel: Panel) -> Spec:
 
 
 def _packed(points: Array) -> Spec:
-    """Points as 32-bit numbers, relative to a place near them where they are far from zero: a national grid is."""
+    """Return points (n, 2) as 32-bit numbers and their origin.
+
+    The origin is near the points where these are far from zero, as coordinates of a national grid are: 32 bits would
+    round such numbers.
+    """
     known = points[np.isfinite(points).all(axis=1)]
     low, high = (known.min(axis=0), known.max(axis=0)) if len(known) else np.zeros((2, 2))
     is_far = np.abs(low + high) / 2 > _FAR * (high - low)
@@ -100,16 +105,18 @@ def _packed(points: Array) -> Spec:
 
 
 def points_of(series: Series) -> Array:
-    """(n, 2) to be drawn: only a line is broken by what is not known."""
+    """Return the points to draw, (n, 2). Unknown points break a line, and are left out of dots."""
     is_known = np.isfinite(series.points).all(axis=1)
     return series.points[is_known] if series.kind == "dots" else series.points
 
 
 def panel_spec(panel: Panel, data_of: Callable[[int], Spec]) -> Spec:
-    """One panel.
+    """Return the Vega-Lite specification of one panel.
 
     Args:
-        data_of: where the rows of x and y of the i-th series are; y is null or not a number where a line is broken.
+        panel: to draw.
+        data_of: returns the Vega-Lite data source of the i-th series, with rows of x and y; y is null or NaN where a
+            line is broken.
     """
     width, height = panel.size
     x_range, y_range = panel.limits
@@ -122,10 +129,10 @@ def panel_spec(panel: Panel, data_of: Callable[[int], Spec]) -> Spec:
         "encoding": {
             "x": _axis("x", x_range, x_axis),
             "y": _axis("y", y_range, y_axis),
-            "order": {"value": None},  # points in turn, not from left to right
+            "order": {"value": None},  # a line joins points in the given order, not from left to right
         },
         "layer": [
-            _layer("point", []),  # the page's zoom hangs on it
+            _layer("point", []),  # an empty layer that carries the zoom of the page
             *_background(panel, x_range, y_range),
             *(_series(one, data_of(i), y_range) for i, one in enumerate(panel.series)),
             *_labels(panel),
@@ -139,7 +146,10 @@ def _axis(field: str, limits: Range, axis: Spec | None) -> Spec:
 
 
 def _layer(kind: str, rows: list[Spec], encoding: Spec | None = None, **mark: Any) -> Spec:
-    """Clipped to the panel, since zooming moves marks out of it; x and y are encoded for all layers alike."""
+    """Return a layer of a panel.
+
+    It is clipped to the panel, because zooming moves marks out of it. The encoding of x and y is that of the panel.
+    """
     return {"data": {"values": rows}, "mark": {"type": kind, "clip": True, **mark}, "encoding": encoding or {}}
 
 
@@ -169,8 +179,8 @@ def _series(series: Series, data: Spec, y_range: Range) -> Spec:
     if series.kind == "dots":
         size, opacity = (_MAP_DOT_PX, 1.0) if series.color == "map" else (_DOT_PX, 0.5)
         dots = _layer("line", [], color=color, strokeWidth=size, strokeCap="round", opacity=opacity)
-        # What lies beyond the axis is drawn at its edge. Dots are a line that is broken after each: one path with
-        # round ends, where thousands of marks would be slow.
+        # Values beyond the axis are drawn at its edge. Dots are drawn as one line with round ends that is broken after
+        # each dot, because thousands of separate marks would be slow.
         broken = f"[clamp(datum.y, {y_range[0]!r}, {y_range[1]!r}), null]"
         return dots | {"data": data, "transform": [{"calculate": broken, "as": "y"}, {"flatten": ["y"]}]}
     how: Spec = {"strokeDash": [4, 3], "strokeWidth": 1.2} if series.kind == "dashed" else {"strokeWidth": 1.8}
@@ -178,7 +188,7 @@ def _series(series: Series, data: Spec, y_range: Range) -> Spec:
 
 
 def _beside_rows(panel: Panel) -> tuple[int, int]:
-    """Pixels to the left and to the right."""
+    """Return the room that the labels of rows need to the left and to the right, in pixels."""
     left, right = (max(map(len, texts)) for texts in list(zip(*panel.rows))[1:])
     return (
         max(_LEFT_OF_ROWS_PX, round(_LETTER_PX * left) + 16),
@@ -187,7 +197,7 @@ def _beside_rows(panel: Panel) -> tuple[int, int]:
 
 
 def _labels(panel: Panel) -> list[Spec]:
-    """Texts left and right of the heights that they belong to; marks, and texts beside them."""
+    """Return layers with the labels of rows, the marks, and the labels of the marks."""
     layers = []
     if panel.rows:
         rows = [{"y": at, "left": left, "right": right} for at, left, right in panel.rows]
@@ -207,7 +217,7 @@ def _labels(panel: Panel) -> list[Spec]:
 
 
 def joined_labels(panel: Panel) -> list[Mark]:
-    """Marks that fall on one another in a panel share one label."""
+    """Return marks for labelling: of marks less than 12 pixels apart only the first, with all their labels."""
     scale = [(high - low) / size for (low, high), size in zip(panel.limits, panel.size)]
     groups: list[list[Mark]] = []
     for mark in panel.marks:
@@ -221,7 +231,7 @@ def joined_labels(panel: Panel) -> list[Mark]:
 
 
 def write_pictures(figures: list[Figure], folder: Path) -> list[Path]:
-    """Write each figure as ``NAME.png`` and ``NAME.svg`` into a folder; returns their paths.
+    """Write each figure as ``NAME.png`` and ``NAME.svg`` into a folder and return the paths.
 
     Raises:
         InputError: the folder cannot be written to.
@@ -236,15 +246,15 @@ def write_pictures(figures: list[Figure], folder: Path) -> list[Path]:
 
 
 def write_picture(figure: Figure, path: Path) -> None:
-    """Write a figure in the format that the file's name says.
+    """Write a figure as PNG or SVG, according to the ending of the file name.
 
     Raises:
-        InputError: the file cannot be written, or the format is none of FORMATS.
+        InputError: the file cannot be written, or its ending is not one of ``FORMATS``.
     """
     format = path.suffix[1:].lower()
     if format not in FORMATS:
         raise InputError(f"no figure format is named '{format}', expected one of {', '.join(FORMATS)}", path)
-    import vl_convert  # 90 MB with a browser's script engine: only where a picture is drawn
+    import vl_convert  # it loads 90 MB with a script engine, so it is imported only where a picture is drawn
 
     spec = figure_spec(figure)
     if format == "png":
@@ -259,7 +269,7 @@ def write_picture(figure: Figure, path: Path) -> None:
 
 
 def figure_spec(figure: Figure) -> Spec:
-    """All panels of a figure with its legend, in the page's light colours."""
+    """Return the specification of a whole figure: its panels and its legend, in the light colours of the page."""
 
     def sheet(panel: Panel) -> Spec:
         panel = replace(panel, size=(min(panel.size[0], MAX_WIDTH_PX), panel.size[1]))
@@ -277,13 +287,13 @@ def figure_spec(figure: Figure) -> Spec:
 
 
 def light_colors() -> dict[str, str]:
-    """The page's colours by name, of its light theme."""
+    """Return the colours of the page's light theme, "#rrggbb" by name."""
     light, _ = re.findall(r":root \{(.*?)\}", (ASSETS / "page.css").read_text(encoding="utf-8"), flags=re.DOTALL)
     return dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", light))
 
 
 def _legend(entries: dict[str, tuple[str, str]]) -> Spec:
-    """A layer of which nothing is seen but its legend."""
+    """Return an invisible layer that makes Vega-Lite draw the legend."""
     texts = list(entries)
     legend = {"title": None, "orient": "top", "columns": 6, "symbolOpacity": 1}
     ranges = {

@@ -1,4 +1,4 @@
-"""Quality checks: what a careful reader would look at first, with limits."""
+"""Quality checks of a result: numbers that a careful reader looks at first, each with its limits."""
 
 from __future__ import annotations
 
@@ -19,13 +19,16 @@ class Check:
     """One traffic light.
 
     Attributes:
-        meaning: one sentence on why it matters.
+        name: heading of the check.
+        meaning: one sentence that says what the value is.
         value: None where the run did not measure it.
-        green_limit, amber_limit: green up to the first, amber up to the second, red beyond
-            (from the first upwards, where larger is better).
-        larger_is_better: the limits are lower ones.
-        key: of the value in ``result.json``.
-        no_matter: why any value is as good here, so that the light is green; None: it matters.
+        unit: of value and limits.
+        green_limit, amber_limit: the light is green up to the first limit, amber up to the second and red beyond it;
+            where larger is better, green from the first limit upwards, amber from the second and red below it.
+        decimals: of the value as shown.
+        larger_is_better: whether the limits are lower bounds.
+        key: of the value in ``result.json``; empty where it is computed from several.
+        no_matter: reason why the value does not matter in this survey, so that the light is green; None: it matters.
     """
 
     name: str
@@ -41,7 +44,7 @@ class Check:
 
     @property
     def light(self) -> str:
-        """ "green", "amber", "red", or "off" without a value."""
+        """Return the colour of the light: "green", "amber", "red", or "off" without a value."""
         if self.value is None:
             return "off"
         if self.no_matter is not None:
@@ -58,21 +61,21 @@ class Check:
 
     @property
     def limits(self) -> str:
-        """What the value is measured against."""
+        """Return the limits as text, as in "green ≤ 1 px · amber ≤ 2 px"."""
         relation = "≥" if self.larger_is_better else "≤"
         green, amber = (fixed(x, 0 if x >= 1 else 2, self.unit) for x in (self.green_limit, self.amber_limit))
         return f"green {relation} {green} · amber {relation} {amber}"
 
     @property
     def zones(self) -> list[tuple[str, float]]:
-        """Colour and width, in percent of the gauge, of each stretch from zero to its end."""
+        """Return colour and width (percent of the gauge) of each zone, from zero to the end of the gauge."""
         low, high = sorted(100.0 * limit / self._gauge_end for limit in (self.green_limit, self.amber_limit))
         colors = ("red", "amber", "green") if self.larger_is_better else ("green", "amber", "red")
         return list(zip(colors, (low, high - low, 100.0 - high)))
 
     @property
     def needle_percent(self) -> float | None:
-        """Where on the gauge the value is."""
+        """Return the position of the value on the gauge, in percent of its length; None without a value."""
         return None if self.value is None else min(max(100.0 * self.value / self._gauge_end, 0.0), 100.0)
 
     @property
@@ -81,7 +84,7 @@ class Check:
 
 
 def quality_checks(summary: ResultSummary) -> tuple[Check, ...]:
-    """The checks of a result, in the order in which they matter."""
+    """Return the checks of a result, the most important one first."""
     scale, ranges, offset = summary.scale, summary.ranges, summary.time_offset
     uncertainty = _relative_percent(scale.larger_stddev, scale.value)
     share_used = _relative_percent(ranges.num_used, ranges.num)
@@ -97,17 +100,19 @@ def quality_checks(summary: ResultSummary) -> tuple[Check, ...]:
     of_scale = Markup("One standard deviation: the larger of the formal, {}, and the empirical one, {}.").format(
         told("scale.stddev_formal", by_digits), told("scale.stddev_empirical", by_digits)
     )
-    of_anchors = "Farthest that the scale from one anchor alone is from the joint one."
-    of_check_ranges = Markup("RMS of {} ranges held out, which no estimate has seen.").format(told("check_ranges.num"))
-    of_ranges = Markup("RMS of the ranges used; half of them are within {}.").format(
+    of_anchors = "Largest difference between the scale from one anchor alone and the joint scale."
+    of_check_ranges = Markup("RMS residual of {} ranges that were held out of all estimates.").format(
+        told("check_ranges.num")
+    )
+    of_ranges = Markup("RMS residual of the ranges used; half of the residuals are below {}.").format(
         told("ranges.median_abs_m", lambda x: fixed(x, 3, "m"))
     )
-    of_share = Markup("{} of the {} ranges in the log had a say.").format(told("ranges.num_used"), told("ranges.num"))
+    of_share = Markup("{} of the {} ranges in the log were used.").format(told("ranges.num_used"), told("ranges.num"))
     decimals = min(decimals_for(offset.stddev_s, default=3), 6)
-    of_clocks = Markup("Standard deviation of image time minus range time, {}.").format(
+    of_clocks = Markup("Standard deviation of the time offset (image time minus range time), which is {}.").format(
         told("time_offset.value_s", lambda x: signed(x, decimals, "s"))
     )
-    of_points = "RMS distance of the map's points from where the photos show them."
+    of_points = "RMS distance in the photos between the points of the map and the features that show them."
     does_not = sentence(offset.note or "any offset near this one gives the same result")
     no_matter = does_not if offset.offset_matters is False else None
     checked_m, clocks_s = summary.check_ranges.rms_m, offset.stddev_s

@@ -1,4 +1,4 @@
-"""Content: all that a report shows, gathered from a result folder; what is missing is None."""
+"""Everything that a report shows, gathered from a result folder."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from rangesfm.result.tables import RangesAsUsed
 
 DEFAULT_FOLDER = "out"
 MAX_KEYFRAME_SHARE = 0.1
-"""A range counts as taken at a photo if it is no farther from it, in parts of the way to the next."""
+"""A range counts as taken at a photo if its time is within this fraction of the interval to the next photo."""
 
 
 @dataclass(frozen=True)
 class CameraIntrinsics:
-    """One camera of the models.
+    """Intrinsics of one camera of the models.
 
     Attributes:
-        title: COLMAP's number and model of it, and the size of its photos.
-        parameters: name, value before the refinement, value after it (NaN without).
-        half_angles: half width and half height of its picture at unit distance.
+        title: COLMAP's camera id and camera model, and the size of the photos in pixels.
+        parameters: name, value before the refinement, and value after it (NaN without a refinement).
+        half_angles: half the width and half the height of the field of view at unit distance.
     """
 
     title: str
@@ -39,27 +39,30 @@ class CameraIntrinsics:
 
 
 class Content:
-    """What a report shows of a result folder.
+    """Everything that a report shows of a result folder; parts that the folder lacks are None or empty.
 
     Attributes:
         title: name of the result.
-        summary: ``result.json``; ``result`` has the tables beside it.
+        summary: content of ``result.json``; ``result`` reads the tables beside it.
         images_path: folder of the photos; None where it is not known.
-        ranges: ``ranges.csv``.
-        tags_in_cam_m: (n, 3) antenna of each range's tag in the camera's frame; n is 0 without ranges.
-        range_times_s: (n,) when each range was taken, seconds since the first; NaN where unknown.
-        scaled, refined: the path before and after the refinement; ``final`` is the best there is.
-        reference_m: (k, 3) positions in the map's frame; ``reference_by_photo`` (3,) by name.
-        points_m, points_rgb: (m, 3) of the final map.
-        cameras: intrinsics in the scaled and in the final model.
+        ranges: content of ``ranges.csv``; None without ranges.
+        tags_in_cam_m: (n, 3) lever arm of each range's tag, in the camera frame; n is 0 without ranges.
+        range_times_s: (n,) time of each range in seconds since the first; NaN where unknown.
+        scaled, refined: the camera's path before and after the refinement; ``final`` is the refined path, else the
+            scaled one.
+        reference_m: (k, 3) true positions in the frame of the map; ``reference_by_photo`` has the same by photo, each
+            of shape (3,).
+        points_m, points_rgb: (m, 3) positions and colours of the points of the final map.
+        cameras: intrinsics in the scaled and in the refined model.
     """
 
     def __init__(self, result: ResultFolder, *, images_path: Path | None = None, home: Path | None = None):
         """Read what the report needs.
 
         Args:
-            images_path: folder of the photos, for thumbnails; None: those of the run, if they are beside the result.
-            home: folder that the result is for, while it is made in another one; None: where it is.
+            result: the folder to read.
+            images_path: folder of the photos, for thumbnails; None: that of the run, if it is beside the result.
+            home: folder that names the result, where the result is still in a temporary folder; None: its own folder.
 
         Raises:
             InputError: a file of the result is there but cannot be read.
@@ -82,9 +85,10 @@ class Content:
 
     @cached_property
     def true_scale(self) -> Trajectory | None:
-        """The path before the refinement with the reference's scale; None if that is not known.
+        """Return the path before the refinement, resized to the scale of the reference; None if that is not known.
 
-        By the error that the comparison found: the reference itself may know no more than a few photos.
+        The size follows from the scale error that the comparison found, because the reference may hold the positions of
+        only a few photos.
         """
         errors = [row.scale_error_percent for row in self.summary.comparison if row.name == "estimated scale"]
         if self.scaled is None or not errors or errors[0] is None:
@@ -93,10 +97,10 @@ class Content:
 
     @cached_property
     def true_ranges_m(self) -> Array | None:
-        """(n,) distances by the reference from the tag to the anchor, NaN where it says nothing; None: nowhere.
+        """Return the true length of each range by the reference, (n,) metres; NaN where unknown, None if all are.
 
-        Only of ranges used and taken at a photo: what the camera did in between the reference may not say. The camera
-        is turned as in the final map, and anchors stand where that has them.
+        They are known for ranges that are used and were taken at a photo, because the reference may not say where the
+        camera was in between. Camera orientations and anchor positions are those of the final map.
         """
         ranges, path = self.ranges, self.final
         if ranges is None or path is None or not self.reference_by_photo:
@@ -116,7 +120,7 @@ class Content:
 
 
 def _title(folder: Path) -> str:
-    """The folder's name; that of the survey around it where the folder has the name that all results have."""
+    """Return the name of the folder; where it has the default name, that of the survey folder around it."""
     return folder.parent.name if folder.name == DEFAULT_FOLDER and folder.parent.name else folder.name
 
 
@@ -135,12 +139,12 @@ def _cameras(
 
 
 def in_natural_order(ids: Iterable[str]) -> list[str]:
-    """The distinct ids, "2" before "10"."""
+    """Return the distinct ids in order, numbers by their value: "2" before "10"."""
     return sorted(set(ids), key=lambda id_: (not id_.isdecimal(), int(id_) if id_.isdecimal() else 0, id_))
 
 
 def _range_times(ranges: RangesAsUsed, image_times_s: dict[str, float]) -> Array:
-    """Time of each range (its own, or that of its photo) since the first: epochs have no room on an axis."""
+    """Return the time of each range (its own, or that of its photo) in seconds since the first, NaN where unknown."""
     of_image = np.array([image_times_s.get(name, np.nan) for name in ranges.image_name], dtype=np.float64)
     times = np.where(np.isfinite(ranges.timestamp_s), ranges.timestamp_s, of_image)
     since_first: Array = times - np.min(times, initial=np.inf, where=np.isfinite(times))

@@ -1,4 +1,4 @@
-"""Figure of the tests of mistakes: which were found, which were not, and what those that were not may do."""
+"""Figure of the tests of mistakes: which mistakes were found, and how much the others may change the scale."""
 
 from __future__ import annotations
 
@@ -14,22 +14,26 @@ from rangesfm.report.text import mistake, percent, rough, signed
 from rangesfm.result.entries import MistakeEntry
 
 MAX_NUM_ROWS = 16
-# Ends of the axes; what lies beyond is drawn at the edge.
+# Ends of the two axes (ratio; percent of the scale). Larger values are drawn at the edge.
 _MOST_EVIDENCE, _MOST_EFFECT_PERCENT = 3.0, 20.0
 _ROW_HEIGHT_PX = 22.0
 _COLORS = {"found": "before", "not found": "after", "would not be found, however large": "rejected"}
 
 
 def mistakes(content: Content) -> Figure | None:
-    """Of those that were found, then of those that may do most: the evidence, and what could have stayed hidden."""
+    """Return the figure of the mistakes: evidence on the left, largest hidden effect on the scale on the right.
+
+    The mistakes found come first, then those that may change the scale most, up to ``MAX_NUM_ROWS``. None where no test
+    has anything to show.
+    """
     tests = sorted(content.summary.tests, key=lambda test: (not test.rejected, -_effect_percent(test)))
     shown = [test for test in tests if test.rejected or _effect_percent(test) > 0][:MAX_NUM_ROWS]
     if not shown:
         return None
     evidence = _panel(
         "Evidence",
-        "For each mistake how far the ranges speak for it, and where chance ends",
-        "test value over its threshold (roots)",
+        "Evidence of the ranges for each mistake, and the limit of chance",
+        "root of test value over threshold",
         shown,
         [math.sqrt(max(test.statistic, 0.0) / test.threshold) if test.threshold > 0 else 0.0 for test in shown],
         [_size(test) for test in shown],
@@ -39,7 +43,7 @@ def mistakes(content: Content) -> Figure | None:
     low, high = content.summary.scale.interval_95 or (1.0, 1.0)
     could_hide = _panel(
         "What could hide",
-        "For each mistake how much one that is just not found may change the scale",
+        "Largest change of the scale by a mistake of each kind that is just not found",
         "change of the scale %",
         shown,
         [_effect_percent(test) for test in shown],
@@ -48,9 +52,10 @@ def mistakes(content: Content) -> Figure | None:
         band=("half of the scale's interval", 0.0, 50 * math.log(high / low)),
     )
     caption = (
-        "What was tested for. Left: how far the ranges speak for each mistake, with its size as they have it; right of "
-        "the line it is no chance. Right: the smallest that would have been found, and the most that one of that size "
-        "does to the scale. What lies beyond an axis is drawn at its edge; the table has all."
+        "Tests of possible mistakes. Left: evidence of the ranges for each mistake, with its estimated size; right of "
+        "the line it is more than chance explains. Right: the smallest size that would have been found, and how much a "
+        "mistake of that size changes the scale at most. Values beyond an axis are drawn at its edge; the table has "
+        "them."
     )
     return Figure("mistake_tests", caption, (evidence, could_hide), layout="views")
 
@@ -94,7 +99,10 @@ def _kind(test: MistakeEntry) -> str:
 
 
 def _effect_percent(test: MistakeEntry) -> float:
-    """Without end where nothing could find it; 0 of one whose effect nobody computed."""
+    """Return the largest change of the scale in percent by such a mistake that is just not found.
+
+    Infinite where no size of it would be found; 0 where the effect was not computed.
+    """
     if test.effect_on_scale is not None:
         return 100 * test.effect_on_scale
     return 0.0 if test.rejected or test.smallest_detectable is not None else math.inf

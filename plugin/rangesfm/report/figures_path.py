@@ -1,4 +1,4 @@
-"""Figures of the path and the map: plan, elevation, and the scale along the way."""
+"""Figures of the path and the map: plan, elevation, and the scale along the path."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _NUM_WINDOWS = 20
 
 
 def trajectory_views(content: Content) -> Figure | None:
-    """The path in plan and in elevation: with the true, with the estimated scale, and refined."""
+    """Return plan and elevation of the path: with the true scale, with the estimated scale, and refined."""
     if not content.final:
         return None
     frame = content.summary.frame
@@ -39,7 +39,7 @@ def trajectory_views(content: Content) -> Figure | None:
 
 
 def map_views(content: Content) -> Figure | None:
-    """The map's points in plan and in elevation, in their own colours."""
+    """Return plan and elevation of the map's points in their own colours."""
     if not content.final or len(content.points_m) == 0:
         return None
     path = content.final.centers
@@ -49,7 +49,7 @@ def map_views(content: Content) -> Figure | None:
 
 
 def local_scale(content: Content) -> Figure | None:
-    """How the scale of the scaled map changes along the path: what one similarity cannot take away."""
+    """Return the figure of the local scale of the scaled map along the path, which shows its drift in scale."""
     path = content.scaled
     if path is None or content.refined is None:
         return None
@@ -63,8 +63,8 @@ def local_scale(content: Content) -> Figure | None:
         return None
     return figure_of(
         "local_scale",
-        f"Scale of stretches of {2 * _window(path) + 1} photos, relative to that of the scaled map. A level "
-        "line is a common error of the scale; a slope is drift.",
+        f"Scale of parts of the path of {2 * _window(path) + 1} photos, relative to that of the scaled map. A level "
+        "line away from zero is an error of the whole scale; a slope is drift.",
         "Local scale along the path",
         ("photo" if path.timestamps_s is None else "time s", "local scale %"),
         series,
@@ -88,7 +88,7 @@ def _map_view(content: Content, path: Array, view: View) -> Panel:
     points, line = view.seen(content.points_m), Series("path", "after", view.seen(path), "line")
     corners = np.quantile(points, [_SEEN_QUANTILE, 1 - _SEEN_QUANTILE], axis=0)
     limits = equal_view(np.concatenate([corners, line.points]))
-    # What is nearer to the reader comes last: from above, what is higher.
+    # Points nearer to the reader are drawn last, over the others: seen from above, the higher ones.
     (across,) = {0, 1, 2} - set(view.axes)
     towards_reader = 1.0 if content.summary.frame == "site" and across == 2 else -1.0
     order = np.argsort(towards_reader * content.points_m[:, across])
@@ -97,7 +97,7 @@ def _map_view(content: Content, path: Array, view: View) -> Panel:
 
 
 def _raster(points: Array, colors: Pixels, limits: Limits) -> Pixels:
-    """(h, w, 4) pixels with each point two pixels wide."""
+    """Return the points as an RGBA picture (h, w, 4), each two pixels wide."""
     (x_low, x_high), (y_low, y_high), size = limits
     width, height = PICTURE_WIDTH_PX, max(round(PICTURE_WIDTH_PX * size[1] / size[0]), 1)
     pixels = np.zeros((height, width, 4), dtype=np.uint8)
@@ -116,7 +116,17 @@ def _window(path: Trajectory) -> int:
 
 
 def _local_scales(path: Trajectory, target: Array) -> Array:
-    """(k, 2): when, and percent by which stretches of the path are too short for the target; none where it stands."""
+    """Return the local scale along a path, relative to target positions.
+
+    Args:
+        path: of n keyframes.
+        target: (n, 3) positions of the same keyframes; NaN where unknown.
+
+    Returns:
+        (k, 2): time in seconds since the first keyframe (or number of the keyframe) at the middle of a window, and the
+        percentage by which the target is larger than the path there. Windows in which the camera hardly moves are left
+        out.
+    """
     times, half, points = path.timestamps_s, _window(path), []
     along = np.arange(len(path), dtype=np.float64) if times is None else times - times[0]
     least = 0.02 * float(np.linalg.norm(np.ptp(path.centers, axis=0)))

@@ -1,4 +1,4 @@
-"""Figures of ranges: of a log or a radio alone; of a result their residuals, and true errors by a reference."""
+"""Figures of ranges: residuals and true errors of a result, the ranges of a log, and the error curve of a radio."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from rangesfm.result.tables import RangesAsUsed
 NUM_HISTOGRAM_BINS = 60
 NUM_MEDIAN_BINS = 48
 MAX_NUM_DRAWN = 6_000
-"""Ranges that a figure has a dot for; medians and histograms are of all."""
+"""Largest number of dots in a figure. Medians and histograms use all ranges."""
 
 PANEL_SIZE = (270.0, 125.0)
 _SIZE_ALONE = (660.0, 330.0)
@@ -37,20 +37,21 @@ _COLORS = {"measured": "rejected", "scaled": "before", "refined": "after"}
 
 
 def residuals_over_time(content: Content) -> Figure | None:
-    """One panel for each anchor: residuals of its ranges before and after the refinement."""
+    """Return the figure of range residuals over time, before and after the refinement, with a panel for each anchor."""
     ranges = content.ranges
     if ranges is None or not _of_used(ranges):
         return None
     panels = tuple(_residual_panel(content, ranges, anchor_id) for anchor_id in in_natural_order(ranges.anchor_id))
     caption = (
-        "Range residuals over time, predicted minus measured, with their running median. A steady offset is a bias; "
-        "a slow wave is drift or a clock. What lies beyond an axis is drawn at its edge." + _thinned(len(ranges.status))
+        "Range residuals (predicted minus measured) over time, with their running median. A steady offset is a bias; "
+        "a slow wave is drift of the map or an error of the time offset. Values beyond an axis are drawn at its edge."
+        + _thinned(len(ranges.status))
     )
     return Figure("range_residuals", caption, panels, layout="panels", table="ranges")
 
 
 def residual_histogram(content: Content) -> Figure | None:
-    """Distribution of the residuals of the ranges used, before and after."""
+    """Return the histogram of the residuals of the ranges used, before and after the refinement."""
     ranges = content.ranges
     if ranges is None or not _of_used(ranges):
         return None
@@ -61,7 +62,8 @@ def residual_histogram(content: Content) -> Figure | None:
     ]
     return figure_of(
         "range_residual_histogram",
-        "Residuals of the ranges used. Real radios lean to long measurements, which here are negative.",
+        "Residuals of the ranges used. Real radios measure too long more often than too short; such residuals are "
+        "negative.",
         "Histogram of the range residuals before and after the refinement",
         ("predicted − measured m", "ranges"),
         outlines,
@@ -72,7 +74,10 @@ def residual_histogram(content: Content) -> Figure | None:
 
 
 def absolute_errors(content: Content) -> Figure | None:
-    """True errors of the ranges: measured, and as both maps have them, by the reference's camera positions."""
+    """Return the figure of the true errors of ranges: as measured, and as predicted by both maps.
+
+    The true ranges follow from the camera positions of the reference; None without one.
+    """
     ranges, true_m = content.ranges, content.true_ranges_m
     if ranges is None or true_m is None:
         return None
@@ -89,8 +94,9 @@ def absolute_errors(content: Content) -> Figure | None:
     sizes = np.concatenate([series.points[:, 1] for series in dots])
     return figure_of(
         "absolute_range_errors",
-        "How far ranges are from those of the reference: as measured, by the scaled map, and by the refined one, with "
-        "their running medians. Ranges taken at a photo, to anchors where this map has them." + _thinned(len(rows)),
+        "Absolute errors of ranges against the reference: as measured, as predicted by the scaled map and by the "
+        "refined map, with their running medians. Shown are ranges that were taken at a photo; anchor positions are "
+        "those of this map." + _thinned(len(rows)),
         "Absolute range errors over time",
         (time_label, "absolute error m"),
         [*dots, *(_median(name, errors, x_range) for name, errors in points.items())],
@@ -132,24 +138,27 @@ def _median(name: str, points: Array, x_range: Range) -> Series:
 
 
 def _thinned(num: int) -> str:
-    """What a caption says where not all are drawn."""
+    """Return the remark of a caption that not all ranges are drawn, or an empty text."""
     stride = every_nth(num, MAX_NUM_DRAWN)
-    return "" if stride == 1 else f" One range in {stride} is drawn; the medians are of all."
+    return "" if stride == 1 else f" One range in {stride} is drawn; the medians use all."
 
 
 def _of_used(ranges: RangesAsUsed) -> dict[str, Array]:
-    """Residuals that are known, of the ranges used, by model."""
+    """Return the known residuals of the ranges used, by model ("scaled", "refined"), in metres."""
     used = {name: residuals[ranges.is_used] for name, residuals in ranges.residuals_by_model_m.items()}
     return {name: residuals[np.isfinite(residuals)] for name, residuals in used.items() if np.isfinite(residuals).any()}
 
 
 def _residual_limit(ranges: RangesAsUsed) -> float:
-    """Half the height of the residual axes: room for nearly all ranges used, before and after."""
+    """Return half the height of the residual axes in metres, with room for nearly all ranges used."""
     return max(1.15 * max(float(np.quantile(np.abs(known), 0.995)) for known in _of_used(ranges).values()), 1e-3)
 
 
 def plot_ranges(log: RangeLog) -> Figure:
-    """Every range of a log, one colour an anchor; over their number where the log has photos for times."""
+    """Return the figure of all ranges of a log over time, with a colour for each anchor.
+
+    Where the log names photos in place of times, the horizontal axis is the number of the range.
+    """
     times = log.timestamp_s
     x = np.arange(len(log)) if times is None else times - times.min()
     series = []
@@ -163,7 +172,7 @@ def plot_ranges(log: RangeLog) -> Figure:
 
 
 def plot_error_curve(calibration: Calibration) -> Figure:
-    """A radio's error curve with two stddevs on either side, over the errors that it was learnt from."""
+    """Return the figure of a radio's error curve with two stddevs on either side, and the errors it was learnt from."""
     curve = calibration.curve
     shown = 5 * calibration.noise_stddev_m
 

@@ -1,4 +1,4 @@
-"""Figures of the scale: anchor by anchor, the paper's candidates, consensus, resampling; and of the clocks."""
+"""Figures of the scale (anchor by anchor, candidates of the paper, consensus) and of the time offset."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from rangesfm.result.tables import ScaleCandidates, ScaleConsensus, TimeOffsetCu
 
 MAX_NUM_CANDIDATES = 3000
 CANDIDATE_AXIS = (-1.0, 4.0)
-"""Ends of the axis of candidates, in units of the scale: they have no bounds of their own."""
+"""Ends of the axis of candidates, in units of the scale. Candidates themselves are unbounded."""
 
 
 def scale_per_anchor(content: Content) -> Figure | None:
-    """The scale from each anchor alone against the joint one with its stddev."""
+    """Return the figure of the scale from each anchor alone, beside the joint scale and its standard deviation."""
     scale = content.summary.scale
     joint, stddev = scale.value, scale.larger_stddev
     values = {anchor_id: scale.per_anchor[anchor_id] for anchor_id in in_natural_order(scale.per_anchor)}
@@ -31,8 +31,8 @@ def scale_per_anchor(content: Content) -> Figure | None:
         marks.append(Mark("one anchor", "after", "disc", value, row, "", title))
     return figure_of(
         "scale_per_anchor",
-        "The scale from each anchor alone, and how far it is from the joint one. Line and band: the joint scale "
-        "and one standard deviation. What an anchor alone has wrong, its place or its antenna, shows here.",
+        "The scale from each anchor alone, and its difference from the joint scale. Line and band: the joint scale "
+        "and one standard deviation. An error of a single anchor, such as a wrong position, shows here.",
         "Scale from each anchor alone against the joint scale",
         ("scale m per unit", ""),
         (),
@@ -47,7 +47,7 @@ def scale_per_anchor(content: Content) -> Figure | None:
 
 
 def candidates(content: Content) -> Figure | None:
-    """The paper's figure: both candidates of each range over time."""
+    """Return the figure of the 2018 paper: both candidates of each range over time."""
     table, scale = content.result.read(ScaleCandidates), content.summary.scale.value
     if table is None or len(table.alpha0) == 0:
         return None
@@ -55,11 +55,12 @@ def candidates(content: Content) -> Figure | None:
     times, label = time_axis(table.timestamp_s[::stride])
     found = np.array([[times.min(), scale], [times.max(), scale]])
     caption = (
-        "Each range has two possible scales. The true one is constant over time, the other is not; where the path "
-        "turns towards or away from an anchor they change places. What lies beyond the axis is drawn at its edge."
+        "Each range has two possible scales, its candidates. The true one is constant over time, the other is not. "
+        "They swap where the path turns towards an anchor or away from it. Values beyond the axis are drawn at its "
+        "edge."
     )
     if stride > 1:
-        caption += f" One range in {stride}; scale_candidates.csv holds all."
+        caption += f" One range in {stride} is drawn; scale_candidates.csv has all."
     return figure_of(
         "scale_candidates",
         caption,
@@ -76,15 +77,15 @@ def candidates(content: Content) -> Figure | None:
 
 
 def consensus(content: Content) -> Figure | None:
-    """How many ranges agree with each scale."""
+    """Return the figure of how many ranges agree with each scale."""
     table = content.result.read(ScaleConsensus)
     if table is None or len(table.scale) == 0:
         return None
     curve = Series("ranges that agree", "after", np.column_stack([table.scale, table.num_agreeing]), "filled")
     return figure_of(
         "scale_consensus",
-        "How many ranges fit to each scale within their tolerance, anchors where the estimate has them. One high, "
-        "narrow peak at the scale found (the line) is what a sound survey looks like.",
+        "Number of ranges that agree with each scale within their tolerance; anchor positions are those estimated. A "
+        "sound survey has one high, narrow peak at the scale found (the line).",
         "Number of ranges that agree with each scale",
         ("scale m per unit", "ranges"),
         (curve,),
@@ -94,14 +95,15 @@ def consensus(content: Content) -> Figure | None:
 
 
 def clock_curve(content: Content) -> Figure | None:
-    """How well each clock offset fits."""
+    """Return the figure of how badly the ranges fit for each time offset between the clocks."""
     table = content.result.read(TimeOffsetCurve)
     if table is None or len(table.cost) == 0:
         return None
     offset = content.summary.time_offset.value_s
     return figure_of(
         "time_offset_curve",
-        "Misfit of the ranges for each offset between the clocks. One sharp valley at the line is what is wanted.",
+        "Misfit of the ranges for each time offset between the clocks. A sound survey has one sharp minimum, at the "
+        "line.",
         "Misfit of the ranges for each clock offset",
         ("time offset s", "misfit"),
         [Series("misfit", "after", np.column_stack([table.time_offset_s, table.cost]), "line")],

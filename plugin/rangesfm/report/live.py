@@ -1,4 +1,4 @@
-"""A page that follows a run: it loads itself anew every few seconds, and ends as the report."""
+"""A page that shows the progress of a run. It reloads itself every few seconds and leads to the report at the end."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MIN_INTERVAL_S = 1.0
 
 
 class LivePage:
-    """Passes a run's progress on and keeps a page of it up to date."""
+    """Listener that keeps a page of the progress up to date and passes the progress on to another listener."""
 
     def __init__(self, listener: Progress, folder: Path, *, clock: Callable[[], float] = time.monotonic):
         make_output_folder(folder)
@@ -50,13 +50,13 @@ class LivePage:
         self._write_running()
 
     def finish(self, report: Path | None) -> None:
-        """The run is over: from here the reader is taken to the report, if there is one."""
+        """Write that the run is done; the page then leads the reader to the report, if there is one."""
         self._end_stage()
         to_report = None if report is None else f"0; url={report.name}"
         self._write("The run is done.", reload=to_report)
 
     def fail(self) -> None:
-        """The run stopped before its end."""
+        """Write that the run stopped before its end."""
         self._end_stage()
         self._write("The run stopped before its end; the terminal says why.", reload=None)
 
@@ -87,7 +87,7 @@ class LivePage:
 
 @contextmanager
 def live_page(listener: Progress, folder: Path) -> Iterator[LivePage]:
-    """A LivePage that says so if the block fails; the block itself finishes it."""
+    """Yield a LivePage and mark it as failed if the block raises; otherwise the block itself must finish it."""
     page = LivePage(listener, folder)
     try:
         yield page

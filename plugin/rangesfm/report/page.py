@@ -1,4 +1,4 @@
-"""Pages: templates, the style and the script in one file that fetches nothing."""
+"""HTML pages: templates, style and script in one file that loads nothing from elsewhere."""
 
 from __future__ import annotations
 
@@ -23,12 +23,13 @@ from rangesfm.report.scene import scene_of, view_of
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-# Nothing may be fetched, not even by mistake: the page holds all it shows. One script may run, this package's.
+# The browser must load nothing, not even by mistake, because the page holds all that it shows. Only one script may run:
+# that of this package, named by its hash.
 CONTENT_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; script-src {script}"
 
 
 class Section(NamedTuple):
-    """A card of a page, which leaves it out if there is neither a figure nor a table with rows in it."""
+    """A card of a page. The page leaves it out where it has neither a figure nor a table with rows."""
 
     id: str
     title: str
@@ -36,7 +37,7 @@ class Section(NamedTuple):
     tables: Sequence[tables.Table] = ()
 
 
-# Of the report: a section's title, and what makes its figures and tables.
+# Sections of the report: title, and the functions that make its figures and tables.
 _SECTIONS: dict[str, tuple[Callable[[Content], Figure | tables.Table | None], ...]] = {
     "Path": (figures_path.trajectory_views, figures_path.map_views, figures_path.local_scale, tables.comparison),
     "Scale": (
@@ -63,7 +64,7 @@ _FILTERS = (text.count, text.duration, text.fixed, text.percent, text.plain, tex
 
 
 def sections_of(content: Content) -> list[Section]:
-    """All that the report has of a result."""
+    """Return all sections of the report, with their figures and tables."""
     sections = []
     for title, makers in _SECTIONS.items():
         made = [make(content) for make in makers]
@@ -75,7 +76,7 @@ def sections_of(content: Content) -> list[Section]:
 
 
 def render_report(content: Content) -> str:
-    """The report of a result."""
+    """Return the HTML text of the report of a result."""
     scene = scene_of(content)
     return render(
         "report.html",
@@ -90,7 +91,7 @@ def render_report(content: Content) -> str:
 
 
 def _tiles(content: Content) -> list[tuple[str, str, str]]:
-    """Name, value and a note on it, of how large the survey was."""
+    """Return name, value and note of each tile; the tiles say how large the survey was."""
     path, seconds, anchors = content.final, content.summary.seconds, content.summary.anchors
     num_surveyed = sum(anchor.surveyed_position_m is not None for anchor in anchors.values())
     length_m = None if path is None else float(np.linalg.norm(np.diff(path.centers, axis=0), axis=1).sum())
@@ -104,11 +105,12 @@ def _tiles(content: Content) -> list[tuple[str, str, str]]:
 
 
 def render(template: str, *, sections: Sequence[Section] = (), **values: Any) -> str:
-    """A whole self-contained page.
+    """Return the HTML text of a whole self-contained page.
 
     Args:
-        sections: with figures in them comes the page's script, for its 3-D view as well.
-        values: of the template; whatever is not Markup is escaped.
+        template: file name of the Jinja template.
+        sections: of the page. The page holds its script, which also draws the 3-D view, only where they have figures.
+        values: of the template's variables; text that is not Markup is escaped.
     """
     charts = page_charts([figure for section in sections for figure in section.figures])
     script = _script() if charts else None
@@ -119,7 +121,7 @@ def render(template: str, *, sections: Sequence[Section] = (), **values: Any) ->
 
 
 def write_page(page: str, path: Path) -> None:
-    """Write a page, whole or not at all."""
+    """Write a page as a file. If that fails, no part of the file is left."""
     with new_file(path) as temporary:
         temporary.write_text(page, encoding="utf-8", errors="xmlcharrefreplace")
 
@@ -129,20 +131,20 @@ def _asset(name: str) -> str:
 
 
 def _script() -> str:
-    """three.js and Vega, then the page's own files in one scope of their own."""
+    """Return the script of a page: three.js and Vega, then this package's own files in one scope."""
     libraries = [_asset(f"vendor/{name}.min.js") for name in ("three", "vega")]
     files = [_asset(f"view/{name}.js") for name in _SCRIPTS]
     return f'{"".join(libraries)}\n(() => {{\n"use strict";\n{"".join(files)}}})();\n'
 
 
 def _policy_source(script: str) -> str:
-    """What Content-Security-Policy calls an inline script by."""
+    """Return the name by which a Content-Security-Policy allows an inline script: its SHA-256 hash."""
     digest = hashlib.sha256(script.encode("utf-8")).digest()
     return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
 
 
 def light(color: str) -> Markup:
-    """A traffic light, for a table's cell."""
+    """Return a traffic light as HTML, for a cell of a table."""
     macros: Any = _environment().get_template("macros.html").module
     return Markup(macros.light(color))
 

@@ -1,4 +1,4 @@
-"""A plan as one self-contained page, in the report's style: how well the map will be known, what to change."""
+"""A plan as one self-contained page in the style of the report: expected accuracy, and what to change."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from rangesfm.report.tables import Table
 from rangesfm.report.text import count, duration, fixed, percent, rough
 from rangesfm.trust.testing import MistakeTest
 
-# From well known to hardly, each as visible on a light page as on a dark one.
+# From the smallest to the largest stddev; each colour is as visible on a light page as on a dark one.
 _COLORS = ("#2f7ebc", "#2a9d8f", "#6f9a2b", "#c98b12", "#d4512b")
 _OPEN_COLOR = "#a3123a"
-# Of the largest stddev: less has one colour.
+# Fraction of the largest stddev below which all stddevs have the same colour.
 _LEAST_SHOWN = 0.1
 _AREA_OPACITY, _AREA_WIDTH_PX = 70, 160
 _MAX_NUM_MISTAKES = 12
 
 
 def write_plan(plan: SurveyPlan, folder: Path) -> list[Path]:
-    """Write ``plan.json`` and ``plan.html`` there."""
+    """Write ``plan.json`` and ``plan.html`` into a folder and return their paths."""
     make_output_folder(folder)
     numbers, page = folder / "plan.json", folder / "plan.html"
     write_text(json.dumps(plan.as_json(), indent=2) + "\n", numbers)
@@ -40,7 +40,7 @@ def write_plan(plan: SurveyPlan, folder: Path) -> list[Path]:
 
 
 def render_plan(plan: SurveyPlan) -> str:
-    """The page, which fetches nothing."""
+    """Return the HTML text of the page of a plan."""
     title = f"{len(plan.anchors_m)} anchors, {count(len(plan.keyframe_stddevs_m))} keyframes"
     advice = [
         _advice("What would gain most for the scale", plan.advice_for_scale),
@@ -78,15 +78,15 @@ def _tiles(plan: SurveyPlan) -> list[tuple[str, str, str]]:
 
 
 def accuracy_views(plan: SurveyPlan) -> Figure:
-    """The path in plan and in elevation, coloured by how well it will be known, as is what lies around it."""
+    """Return plan and elevation of the path; path and surroundings are coloured by their expected stddev."""
     centers = plan.expected.planned.trajectory.centers
     edges = _edges(plan.expected.stddevs_at(plan.expected.planned.places_m))
-    # Plan and elevation are of the site, z up, whatever frame the result will be in.
+    # A plan is drawn in the site frame, z up, even where the result will be in another frame.
     views = tuple(_view(plan, view, centers, edges) for view in views_of(centers, "site"))
     whose = "in the site" if plan.place is not None else "against the first camera"
     caption = (
-        f"How well places will be known {whose} (1 stddev of the three coordinates together): of the keyframes along "
-        "the path, and of what the photos show around it, at the path's mean height and depth."
+        f"Expected uncertainty of places {whose} (one stddev of the three coordinates together): of the keyframes "
+        "along the path, and of points around it that the photos show, at the path's mean height and depth."
     )
     return Figure("accuracy", caption, views, layout="views")
 
@@ -107,7 +107,7 @@ def _view(plan: SurveyPlan, view: View, centers: Array, edges: Array) -> Panel:
 
 
 def _area(plan: SurveyPlan, view: View, middle: Array, edges: Array, limits: Limits) -> Pixels:
-    """(h, w, 4): the colour of a place that a photo shows, by how well it will be known."""
+    """Return an RGBA picture (h, w, 4) of the surroundings, coloured by the expected stddev of points there."""
     (x_low, x_high), (y_low, y_high), size = limits
     width, height = _AREA_WIDTH_PX, max(round(_AREA_WIDTH_PX * size[1] / size[0]), 1)
     across, down = np.meshgrid(np.linspace(x_low, x_high, width), np.linspace(y_high, y_low, height))
@@ -122,11 +122,11 @@ def _area(plan: SurveyPlan, view: View, middle: Array, edges: Array, limits: Lim
 
 
 def _edges(stddevs_m: Array) -> Array:
-    """Ends of bands of about equal ratios, in two digits; the last one is infinite where something is open."""
+    """Return upper ends of bands of stddevs, metres with two digits, at about equal ratios; the last is infinite."""
     known = stddevs_m[np.isfinite(stddevs_m) & (stddevs_m > 0)]
     if len(known) == 0:
         return np.array([np.inf])
-    # The first camera is known exactly where its frame is that of the result.
+    # In the frame of the first camera, stddevs near that camera are almost 0; bands of equal ratio cannot begin there.
     least = max(known.min(), _LEAST_SHOWN * known.max())
     inner = np.geomspace(least, known.max(), len(_COLORS) + 1)[1:-1]
     edges = np.unique([float(f"{edge:.2g}") for edge in inner])
@@ -146,7 +146,7 @@ def _color(band: int, num: int) -> str:
 
 
 def _stretches(line: Array, inside: Mask) -> Array:
-    """The path where it is inside, with the step that leads out of it."""
+    """Return the path (n, 2) with NaN outside the mask; the step that leads out of the mask is kept."""
     kept = inside | np.append(False, inside[:-1])
     return np.where(kept[:, None], line, np.nan)
 
@@ -156,7 +156,7 @@ def _advice(caption: str, ranked: Sequence[Advice]) -> Table:
         [f"{k}. {each.words}", percent(each.scale_stddev), rough(each.place_stddev_m, "m")]
         for k, each in enumerate(ranked, 1)
     ]
-    columns = ["one change", "scale then ±", "that keyframe then"]
+    columns = ["one change", "scale then ±", "that keyframe then ±"]
     if ranked and np.isnan(ranked[0].place_stddev_m):  # in the first camera's frame
         rows, columns = [row[:2] for row in rows], columns[:2]
     return Table(caption, columns, rows, kind="settings")
@@ -186,5 +186,5 @@ def _mistakes(mistakes: Sequence[MistakeTest]) -> Table:
         for each in mistakes[:_MAX_NUM_MISTAKES]
     ]
     header = ["mistake", "found from", "", "would change the scale by", "places by"]
-    note = "Of each mistake that may be made the smallest that will be found, and the most that one of that size does."
+    note = "For each possible mistake: the smallest size that will be found, and how much that size changes at most."
     return Table("Mistakes just too small to be found", header, rows, note)

@@ -1,4 +1,4 @@
-"""A figure as data: the same for the page, its CSV file and a picture for a paper."""
+"""Figures as data, from which the charts of the page, their CSV files and picture files are made."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ Range = tuple[float, float]
 Limits = tuple[Range, Range, tuple[float, float]]
 
 VIEW_SIZE = (400.0, 350.0)
-"""Of a plan or an elevation, at most."""
+"""Largest width and height of a plan or an elevation, pixels."""
 
 WIDE_SIZE = (990.0, 250.0)
-"""Of a panel as wide as the page."""
+"""Width and height of a panel as wide as the page, pixels."""
 
 _ROOM_AROUND = 0.06
 
 
 class Series(NamedTuple):
-    """Points that belong together.
+    """Points of a figure that belong together.
 
     Attributes:
-        name: as the legend and the CSV file have it.
+        name: in the legend and in the CSV file.
         color: name of a colour of the page's style, or "#rrggbb".
-        points: (n, 2); NaN breaks a line.
-        kind: "dots", "line", "dashed", or "filled" (a line with the area from there to zero).
-        is_data: whether the CSV file and the pointer know it; not a mere summary of another series.
+        points: (n, 2) x and y; NaN breaks a line.
+        kind: "dots", "line", "dashed", or "filled" (a line with the area between it and zero).
+        is_data: whether the CSV file has it and the pointer shows its values; false for the summary of another series.
     """
 
     name: str
@@ -43,13 +43,15 @@ class Series(NamedTuple):
 
 
 class Mark(NamedTuple):
-    """One labelled place: a "triangle" or a "disc".
+    """One marked place in a panel.
 
     Attributes:
         name: of its kind, for the legend.
         color: name of a colour of the page's style.
-        label: beside it; "" for none.
-        title: what it says when pointed at, and what the CSV file calls it.
+        shape: "triangle" or "disc".
+        x, y: in the units of the axes.
+        label: text beside it; "" for none.
+        title: text that the pointer shows, and name in the CSV file.
     """
 
     name: str
@@ -63,20 +65,22 @@ class Mark(NamedTuple):
 
 @dataclass(frozen=True)
 class Panel:
-    """One coordinate system.
+    """One coordinate system of a figure.
 
     Attributes:
-        title: above it; "" for none.
-        description: for those who cannot see it.
+        title: text above it; "" for none.
+        description: text for readers who cannot see it.
         labels: of the x and the y axis.
-        x_range, y_range: of the axes; None takes that of the data.
+        series: data drawn in it.
+        marks: marked places in it.
+        x_range, y_range: of the axes; None: the range of the data.
         size: width and height between the axes, in pixels.
-        keeps_shape: whether its height goes with its width, so that both axes keep one scale.
-        zero_line: whether zero is marked on the y axis.
-        line: name and x of a line over the whole height.
-        band: name and ends on the x axis of a strip over the whole height.
-        rows: height, left and right label of each row, instead of numbers on the y axis.
-        picture: (h, w, 4) red, green, blue, opacity, behind the series and all over the panel; top row first.
+        keeps_shape: whether its height follows its width, so that both axes keep the same scale.
+        zero_line: whether a line marks zero on the y axis.
+        line: name and x of a vertical line over the whole height.
+        band: name and both ends on the x axis of a vertical strip over the whole height.
+        rows: y, left label and right label of each row; they replace the numbers on the y axis.
+        picture: (h, w, 4) red, green, blue, opacity, behind the series and over the whole panel; top row first.
     """
 
     title: str
@@ -96,7 +100,7 @@ class Panel:
 
     @property
     def limits(self) -> tuple[Range, Range]:
-        """Ranges of both axes, where none are given those of the data, with room above and below."""
+        """Return the ranges of both axes: as given, or those of the data, with some room above and below."""
         marks = np.array([[mark.x, mark.y] for mark in self.marks], dtype=np.float64).reshape(-1, 2)
         points = np.concatenate([marks, *(series.points for series in self.series)])
         x_range = self.x_range or _limits(points[:, 0])
@@ -109,10 +113,11 @@ class Figure:
     """Panels with one caption and one legend.
 
     Attributes:
-        name: of its files.
-        caption: what there is to see.
+        name: of its files, without ending.
+        caption: text that says what is shown.
+        panels: one or several.
         layout: "single", "views" (two side by side) or "panels" (many).
-        table: which of the page's own tables is its data, where that is too much to hold twice;
+        table: name of the data on the page that the CSV file is made of, where they are too many to be stored twice;
             None: the series themselves.
     """
 
@@ -124,12 +129,15 @@ class Figure:
 
     @property
     def is_wide(self) -> bool:
-        """Whether it stands on its own instead of beside another."""
+        """Return whether the figure takes the whole width of the page."""
         return self.layout != "single" or self.panels[0].size[0] >= WIDE_SIZE[0]
 
     @property
     def entries(self) -> dict[str, tuple[str, str]]:
-        """The legend: colour and shape (a kind of Series, a shape of Mark, "upright" or "strip") of each text."""
+        """Return the legend: each text with its colour and shape.
+
+        The shape is the kind of a Series, the shape of a Mark, "upright" for a vertical line or "strip" for a band.
+        """
         given = [(one.name, one.color, one.kind) for panel in self.panels for one in panel.series if len(one.points)]
         for panel in self.panels:
             given += [(mark.name, mark.color, mark.shape) for mark in panel.marks]
@@ -148,17 +156,18 @@ def figure_of(
     table: str | None = None,
     **of_panel: Any,
 ) -> Figure:
-    """A figure of one panel without a title; ``of_panel`` is what else a Panel has."""
+    """Return a figure with one panel without a title; ``of_panel`` are further attributes of the Panel."""
     return Figure(name, caption, (Panel("", description, labels, tuple(series), **of_panel),), table=table)
 
 
 @dataclass(frozen=True)
 class View:
-    """A look at the world along one of its axes.
+    """A view of the world along one of its axes.
 
     Attributes:
-        axes: the horizontal and the vertical one on the page.
-        sign: of the vertical one there.
+        name: "Plan" or "Elevation".
+        axes: numbers of the world's axes that are horizontal and vertical on the page.
+        sign: -1 where the vertical axis of the world points down on the page, else 1.
     """
 
     name: str
@@ -166,11 +175,11 @@ class View:
     sign: float = 1.0
 
     def seen(self, points: Array) -> Array:
-        """(n, 2) places on the page of (n, 3) points."""
+        """Return the places on the page, (n, 2), of points (n, 3)."""
         return np.asarray(points[:, self.axes] * np.array([1.0, self.sign]))
 
     def anchors(self, anchors_m: Mapping[str, npt.ArrayLike]) -> tuple[Array, tuple[Mark, ...]]:
-        """(n, 2) places of anchors, (3,) by id, and their marks."""
+        """Return the places on the page, (n, 2), of anchors whose positions (3,) are given by id, and their marks."""
         places = self.seen(np.array(list(anchors_m.values()), dtype=np.float64).reshape(-1, 3))
         marks = [
             Mark("anchor", "anchor", "triangle", x, y, anchor_id, f"anchor {anchor_id}")
@@ -179,7 +188,15 @@ class View:
         return places, tuple(marks)
 
     def panel(self, what: str, unit: str, series: Iterable[Series], limits: Limits, **others: Any) -> Panel:
-        """What ``equal_view`` says of the limits, and what else a Panel has."""
+        """Return the panel of this view.
+
+        Args:
+            what: words for what is shown, for the description.
+            unit: of the axis labels, with a space before it.
+            series: data, already projected by ``seen``.
+            limits: from ``equal_view``.
+            others: further attributes of the Panel.
+        """
         x, y = (f"{'xyz'[axis]}{unit}" for axis in self.axes)
         others |= dict(zip(("x_range", "y_range", "size"), limits)) | {"keeps_shape": True}
         labels = (x, f"−{y}" if self.sign < 0 else y)
@@ -187,7 +204,7 @@ class View:
 
 
 def views_of(centers: Array, frame: str) -> tuple[View, View]:
-    """Plan and elevation of a path; the latter with its longer horizontal direction."""
+    """Return plan and elevation of a path (n, 3); the elevation shows the longer horizontal direction."""
     extents = np.ptp(centers, axis=0)
     if frame == "site":
         return View("Plan", (0, 1)), View("Elevation", (0 if extents[0] >= extents[1] else 1, 2))
@@ -196,7 +213,7 @@ def views_of(centers: Array, frame: str) -> tuple[View, View]:
 
 
 def equal_view(points: Array) -> Limits:
-    """Ranges of both axes and a size that show all (n, 2) points, with a margin, at one scale in both directions."""
+    """Return x range, y range and size in pixels that show points (n, 2) with a margin, at one scale in x and y."""
     width, height = VIEW_SIZE
     center, extents = (points.min(axis=0) + points.max(axis=0)) / 2, np.ptp(points, axis=0)
     per_pixel = 1.14 * max(extents[0] / width, extents[1] / height, 1e-3 / width)
@@ -207,7 +224,7 @@ def equal_view(points: Array) -> Limits:
 
 
 def running_median(points: Array, x_range: Range, num_bins: int) -> Array:
-    """(num_bins, 2): middles of equal bins of x and the median of y in each; NaN in empty ones."""
+    """Return the middles of equal bins of x and the median of y in each, (num_bins, 2); NaN for empty bins."""
     x, y = points[np.isfinite(points).all(axis=1)].T
     edges = np.linspace(*x_range, num_bins + 1)
     index = np.clip(np.digitize(x, edges) - 1, 0, num_bins - 1)
@@ -216,25 +233,25 @@ def running_median(points: Array, x_range: Range, num_bins: int) -> Array:
 
 
 def histogram(values: Array, edges: Array) -> Array:
-    """(n, 2): the line around the bars; what lies beyond the edges is in the outermost."""
+    """Return the outline of a histogram, (n, 2); values beyond the edges count in the outermost bars."""
     heights = np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0].astype(float)
     return np.column_stack([np.repeat(edges, 2), np.concatenate([[0.0], np.repeat(heights, 2), [0.0]])])
 
 
 def time_axis(times_s: Array) -> tuple[Array, str]:
-    """(n,) seconds since the first and what the axis is called; numbers where no range has a time."""
+    """Return the values (n,) and the label of a time axis: seconds since the first, or numbers without any times."""
     if not np.isfinite(times_s).any():
         return np.arange(len(times_s), dtype=np.float64), "range number"
     return times_s - np.nanmin(times_s), "time s"
 
 
 def every_nth(num: int, most: int) -> int:
-    """Every how many-th of so many is drawn, where no more than most are to be."""
+    """Return the stride that keeps at most ``most`` of ``num`` items, 1 or more."""
     return max(1, -(-num // most))
 
 
 def from_zero(series: Iterable[Series]) -> Range:
-    """A y axis from zero to a little above the highest point."""
+    """Return the range of a y axis from zero to a little above the highest point."""
     return 0.0, 1.08 * max(float(one.points[:, 1].max()) for one in series)
 
 
@@ -245,7 +262,7 @@ def _limits(values: Array, share_around: float = 0.0) -> Range:
 
 
 def _widened(limits: Range) -> Range:
-    """The limits, or some room around a single value."""
+    """Return the limits, or limits with some room around where they are a single value."""
     low, high = limits
     if abs(high - low) > 1e-9 * max(1.0, abs(low), abs(high)):
         return low, high

@@ -1,4 +1,4 @@
-"""The 3-D view: what stands where, in metres from an origin near it, and what the page says around it."""
+"""Data of the 3-D view: positions in metres relative to a nearby origin, and texts of the page around the view."""
 
 from __future__ import annotations
 
@@ -28,30 +28,34 @@ from rangesfm.vision.photos import UNREADABLE, opened_image
 MAX_NUM_POINTS = 500_000
 MAX_NUM_RANGES = 20_000
 NUM_STEPS = 65535
-"""Positions of points are whole steps of the largest side of their box."""
+"""Number of steps into which the largest side of the points' box is divided; positions are stored as whole steps."""
 
 MAX_NUM_THUMBNAILS, MAX_THUMBNAIL_BYTES = 160, 600_000
-"""The latter of all of them, as they stand in the page."""
+"""Largest number of thumbnails, and of bytes of all thumbnails together as they are stored in the page."""
 
-# Of a photo that is no JPEG, which takes three bytes for each: more is not worth a thumbnail.
+# A photo in another format than JPEG is decoded at full size, with three bytes a pixel. Larger ones get no thumbnail.
 _MAX_DECODED_PIXELS = 100_000_000
 _WIDTHS_PX, _QUALITY = (256, 208, 160, 128), 60
 _FAR_QUANTILE = 0.005
 _SEEN_QUANTILE = 0.05
 _FRUSTUM_SHAPE = (0.6, 0.4)
 _RADIUS_OF_95_PERCENT = 2.80
-"""Of a three-dimensional normal distribution, in stddevs."""
+"""Radius, in stddevs, of the sphere that holds 95 % of a three-dimensional normal distribution.
+
+It is the root of the 0.95 quantile of the chi-square distribution with three degrees of freedom, 7.81.
+"""
 
 
 @dataclass(frozen=True)
 class ScenePath:
-    """One path of cameras.
+    """One path of cameras in the scene.
 
     Attributes:
-        id, name: of its layer, and as the reader sees it.
-        color: of the page's style.
-        trajectory: in the scene's frame, metres.
-        has_orientations: whether frusta can be drawn.
+        id: of its layer.
+        name: shown to the reader.
+        color: name of a colour of the page's style.
+        trajectory: in the frame of the scene, metres.
+        has_orientations: whether camera orientations are known, so that frusta can be drawn.
     """
 
     id: str
@@ -63,14 +67,14 @@ class ScenePath:
 
 @dataclass(frozen=True)
 class Scene:
-    """What the view shows, in one metric frame.
+    """Everything that the 3-D view shows, in one metric frame.
 
     Attributes:
-        frame: "site" (z up) or any other (a camera's: y down).
-        paths: the last is the result, on which cameras are chosen.
-        points_m, points_rgb: (m, 3) of the map.
-        anchors: by id; those with a position are where the ranges end.
-        content: whose ranges and photos are shown too; None: only the map.
+        frame: "site" (z up), or any other name for the frame of a camera (y down).
+        paths: of cameras. The last one is the result; the reader chooses cameras on it.
+        points_m, points_rgb: (m, 3) positions and colours of the map's points.
+        anchors: by id. Ranges are drawn to those that have a position.
+        content: result whose ranges and photos are shown, too; None: only the map is shown.
     """
 
     frame: str
@@ -86,7 +90,7 @@ class Scene:
 
 
 def scene_of(content: Content) -> Scene | None:
-    """What the view shows of a result; None without a model."""
+    """Return the scene of a result, or None where the result has no model."""
     if not content.final:
         return None
     paths = []
@@ -104,7 +108,10 @@ def scene_of(content: Content) -> Scene | None:
 
 
 def view_of(scene: Scene) -> dict[str, Any]:
-    """The view on the page: what its script draws, its layers (id, name, colour and shape of the swatch) and a note."""
+    """Return the data of the view on the page.
+
+    They are what the script draws, the layers (id, name, colour and shape of the swatch), and a note for the reader.
+    """
     origin_m = _origin_m(scene)
     box, content, photos = _box(scene, origin_m), scene.content, scene.result.image_names
     cameras, scale = (None, None) if content is None else (content.cameras, content.summary.scale)
@@ -118,12 +125,12 @@ def view_of(scene: Scene) -> dict[str, Any]:
     stride = 1 if content is None or content.ranges is None else every_nth(len(content.ranges.status), MAX_NUM_RANGES)
     note = (
         "Drag to turn, wheel or pinch to zoom, right drag or two fingers to move; click a camera for its photo.",
-        f"{count(num_left_out)} points far away or beyond the view's limit are not drawn." if num_left_out else "",
-        f"One in {stride} ranges is drawn and listed; ranges.csv holds all." if stride > 1 else "",
-        f"{count(len(pictures))} of {count(len(photos))} photos have a picture: the page stays small."
+        f"{count(num_left_out)} points are not drawn, because they are far away or too many." if num_left_out else "",
+        f"One in {stride} ranges is drawn and listed; ranges.csv has all." if stride > 1 else "",
+        f"To keep the page small, only {count(len(pictures))} of {count(len(photos))} photos have a picture here."
         if 0 < len(pictures) < len(photos)
         else "",
-        "Ellipsoids around the anchors hold 95 %, at their true size." if anchors else "",
+        "Ellipsoids around the anchors are their 95 % regions, at true size." if anchors else "",
     )
     return {
         "up": [0, 0, 1] if scene.frame == "site" else [0, -1, 0],
@@ -173,7 +180,10 @@ def _points(scene: Scene, origin_m: Array) -> dict[str, Any] | None:
 
 
 def _chosen_points(scene: Scene) -> npt.NDArray[np.int64]:
-    """Points to draw, in random order. A few strays far away would coarsen the steps of all others."""
+    """Return the indices of the points to draw, in random order.
+
+    Points far away from all others are left out: they would make the box, and with it the steps of all points, coarse.
+    """
     points = scene.points_m
     if len(points) == 0:
         return np.zeros(0, dtype=np.int64)
@@ -186,13 +196,13 @@ def _chosen_points(scene: Scene) -> npt.NDArray[np.int64]:
 
 
 def _around(scene: Scene) -> Array:
-    """All positions beside the map's points."""
+    """Return the positions of cameras and anchors, (n, 3)."""
     anchors = [[anchor.position_m] for anchor in scene.anchors.values() if anchor.position_m is not None]
     return np.concatenate([*(path.trajectory.centers for path in scene.paths), *anchors])
 
 
 def _seen_m(scene: Scene) -> tuple[Array, Array, float]:
-    """Corners and radius of what is to be seen at first."""
+    """Return both corners (3,) and the radius in metres of the box that the view shows at first."""
     seen = [_around(scene)]
     if len(scene.points_m):
         seen.append(np.quantile(scene.points_m, [_SEEN_QUANTILE, 1 - _SEEN_QUANTILE], axis=0))
@@ -202,10 +212,10 @@ def _seen_m(scene: Scene) -> tuple[Array, Array, float]:
 
 
 def _origin_m(scene: Scene) -> Array:
-    """What the view's positions are relative to, near the middle of what is to be seen.
+    """Return the origin (3,) of the positions in the view, near the middle of what the view shows at first.
 
-    A graphics card computes with 32 bits: in the coordinates of a national grid, 5400000 m from their origin, that is
-    half a metre. It is a round place, so that the grid's lines are at round coordinates.
+    A graphics card computes with 32 bits, which resolve only half a metre in a national grid 5400000 m from its origin.
+    The coordinates of the origin are round numbers, so that the lines of the grid are at round coordinates.
     """
     low, high, radius = _seen_m(scene)
     step = 10.0 ** math.floor(math.log10(radius))
@@ -214,7 +224,7 @@ def _origin_m(scene: Scene) -> Array:
 
 
 def _box(scene: Scene, origin_m: Array) -> dict[str, Any]:
-    """Corners and radius of what is to be seen at first, and the height of the ground."""
+    """Return corners and radius of the box that the view shows at first, and the height of the ground."""
     low, high, radius = _seen_m(scene)
     low, high = low - origin_m, high - origin_m
     ground = float(low[2]) if scene.frame == "site" else float(high[1])
@@ -222,7 +232,7 @@ def _box(scene: Scene, origin_m: Array) -> dict[str, Any]:
 
 
 def _frustum_size(path: Trajectory, radius: float) -> float:
-    """About the distance to the next camera, but neither dust nor a wall."""
+    """Return the size of a frustum, metres: about the distance between cameras, but neither too small nor too large."""
     steps = np.linalg.norm(np.diff(path.centers, axis=0), axis=1)
     typical = float(np.median(steps)) if len(steps) else radius
     return float(np.clip(0.7 * typical, 0.012 * radius, 0.05 * radius))
@@ -250,7 +260,7 @@ def _ranges(content: Content, path: Trajectory) -> dict[str, Any] | None:
     anchor_ids, anchor = np.unique(np.array(ranges.anchor_id, dtype=str), return_inverse=True)
     present = set(ranges.status)
     known = [status.label for status in RangeStatus if status.label in present]
-    statuses = [*known, *sorted(present.difference(known))]  # the used first
+    statuses = [*known, *sorted(present.difference(known))]  # ranges that are used come first
     status = np.array([statuses.index(label) for label in ranges.status])
     residuals_m = ranges.residuals_by_model_m
     final = next(reversed(residuals_m))
@@ -281,15 +291,16 @@ def _ranges(content: Content, path: Trajectory) -> dict[str, Any] | None:
 
 
 def _residual_limit(residuals: Array) -> float:
-    """The residual that has the full colour: all but a twentieth of the used are below."""
+    """Return the residual in metres that is drawn in full colour: 95 % of the used ranges have smaller ones."""
     known = np.abs(residuals[np.isfinite(residuals)])
     return max(float(np.quantile(known, 0.95)), 1e-3) if len(known) else 1.0
 
 
 def pack(values: npt.ArrayLike, kind: str) -> dict[str, str]:
-    """An array as the page's script reads it, row by row.
+    """Return an array, row by row, as base64 in the form that the script of the page reads.
 
     Args:
+        values: numbers of any shape.
         kind: "uint8", "uint16", "int32" or "float32".
     """
     array = np.ascontiguousarray(values, dtype=np.dtype(kind).newbyteorder("<"))
@@ -297,11 +308,11 @@ def pack(values: npt.ArrayLike, kind: str) -> dict[str, str]:
 
 
 def thumbnails(folder: Path | None, image_names: Sequence[str]) -> dict[str, str]:
-    """JPEGs as data URIs by photo, evenly over the path; photos that cannot be read are left out.
+    """Return thumbnails as JPEG data URIs by photo name, of photos evenly spaced along the path.
 
-    So are those that a name or a link would fetch from outside the folder: the page is handed on.
-
-    All are made as wide as fits into MAX_THUMBNAIL_BYTES; if even the smallest do not fit, there are fewer.
+    Photos that cannot be read are left out. So are photos that a name or a link would take from outside the folder,
+    because the page is given to others. All thumbnails have the largest width with which they fit into
+    ``MAX_THUMBNAIL_BYTES``; if they do not fit even with the smallest width, there are fewer.
     """
     if folder is None or not folder.is_dir():
         return {}
@@ -324,7 +335,7 @@ def _small_copy(path: Path) -> Image.Image | None:
     width = _WIDTHS_PX[0]
     try:
         with opened_image(path) as photo:
-            photo.draft("RGB", (2 * width, 2 * width))  # a JPEG is decoded no larger than needed
+            photo.draft("RGB", (2 * width, 2 * width))  # a JPEG is then decoded at about this size only
             if photo.width * photo.height > _MAX_DECODED_PIXELS:
                 return None
             return ImageOps.contain(photo.convert("RGB"), (width, width))
@@ -333,7 +344,7 @@ def _small_copy(path: Path) -> Image.Image | None:
 
 
 def data_uri(picture: Image.Image, kind: str, **options: Any) -> str:
-    """A picture that stands in the page itself; kind: "PNG" or "JPEG"."""
+    """Return a picture as a data URI, which a page can hold itself; kind: "PNG" or "JPEG"."""
     file = io.BytesIO()
     picture.save(file, kind, optimize=True, **options)
     return f"data:image/{kind.lower()};base64,{base64.b64encode(file.getvalue()).decode('ascii')}"

@@ -1,4 +1,4 @@
-"""The report's tables, each from Content."""
+"""Tables of the report, each made from Content."""
 
 from __future__ import annotations
 
@@ -24,34 +24,36 @@ _REFINEMENT = {
     "kept": "refined map kept",
     "why_not_kept": "why not kept",
     "iterations": "iterations",
-    "keyframe_graph_steps": "steps along the path before",
-    "bend_m": "bent by, m",
-    "bending_factor": "bent before by photos, times what their residuals let expect",
+    "keyframe_graph_steps": "iterations of the keyframe graph before",
+    "bend_m": "RMS bend taken out, m",
+    "bending_factor": "bend before, over that expected from the photos' residuals",
     "initial_cost": "cost before",
     "final_cost": "cost after",
     "reprojection_rms_px": "reprojection RMS, px",
     "pixel_stddev": "stddev of an observation, px",
-    "correlation_inflation": "stddevs widened for errors that last, times",
+    "correlation_inflation": "factor on stddevs, for errors that last",
     "seconds": "time, s",
     "converged": "converged",
     "message": "solver's message",
     "scale_value": "scale after, m per unit",
-    "relative_scale_stddev": "its stddev, relative",
+    "relative_scale_stddev": "relative stddev of the scale",
     "tag_in_cam_m": "lever arm, m",
-    "time_offset_change_s": "clock offset changed by, s",
+    "time_offset_change_s": "change of the time offset, s",
     "short_range_error_m": "error of short ranges, m",
 }
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table as the page has it, which leaves it out if it has no rows.
+    """A table of the page. The page leaves it out if it has no rows.
 
     Attributes:
-        header: of the columns; empty for none.
-        rows: cells, the first of each the row's name; whatever is not Markup is escaped.
-        kind: name of a style of its own.
-        is_narrow: whether it stands beside others that are.
+        caption: heading of the table.
+        header: names of the columns; empty for a table without a header.
+        rows: cells of each row, the first of which names the row. Text that is not Markup is escaped.
+        note: text below the table.
+        kind: class of the table's own CSS style; None: that of all tables.
+        is_narrow: whether it can stand beside other narrow tables.
     """
 
     caption: str
@@ -63,14 +65,14 @@ class Table:
 
 
 def range_statuses(content: Content) -> Table:
-    """What became of the log's ranges."""
+    """Return the table of how many ranges of the log have each status."""
     statuses = Counter([] if content.ranges is None else content.ranges.status)
     rows = [[name, count(num), fixed(100.0 * num / statuses.total(), 1, "%")] for name, num in statuses.most_common()]
     return Table("What became of the ranges", ["status", "ranges", "share"], rows)
 
 
 def ranges_per_anchor(content: Content) -> Table:
-    """Numbers and residuals of each anchor's ranges, before and after the refinement."""
+    """Return the table of each anchor's ranges: how many, and their residuals before and after the refinement."""
     ranges, rows = content.ranges, []
     for anchor_id in [] if ranges is None else in_natural_order(ranges.anchor_id):
         assert ranges is not None
@@ -87,16 +89,17 @@ def ranges_per_anchor(content: Content) -> Table:
 
 
 def mistakes(content: Content) -> Table:
-    """Of each mistake that may have been made, whether it was found; a bar that is half full is at the threshold.
+    """Return the table of the tests of mistakes: which were made and found, and what the others may do.
 
-    Of a kind that was not found, as with each of the anchors, the likeliest stands for all.
+    A bar that is half full is at the threshold of the test. Where several mistakes of one kind were not found, such as
+    one for each anchor, the table has only the one with the most evidence.
     """
     tests, rows = content.summary.tests, []
     numbers = {
         "stddev": "stddev",
         "smallest_detectable": "smallest found",
-        "effect_on_scale": "of the scale",
-        "effect_on_place_m": "of places m",
+        "effect_on_scale": "effect on scale",
+        "effect_on_place_m": "on places m",
     }
     likeliest: set[str] = set()
     for i, test in enumerate(tests):
@@ -107,35 +110,35 @@ def mistakes(content: Content) -> Table:
         filled = min(test.statistic / (2 * test.threshold), 1.0) if test.threshold else 0.0
         bar = Markup('<meter min="0" max="1" high="0.5" optimum="0" value="{:.3f}"></meter>').format(filled)
         unfound = "would not be found" if test.smallest_detectable is None else "not found"
-        others = f" ({num_others} others like it: less evidence)" if num_others else ""
+        others = f" ({num_others} others of this kind have less evidence)" if num_others else ""
         cells = _cells(f"tests.{i}", test, dict.fromkeys(numbers, partial(fixed, decimals=4)))
-        unit = "share" if test.unit == "1" else test.unit
+        unit = "fraction" if test.unit == "1" else test.unit
         verdict = "found" if test.rejected else unfound
         rows.append([mistake(test.name, test.subject), f"{test.words}{others}", bar, verdict, unit, *cells])
     return Table(
         "Mistakes that may have been made",
         ["mistake", "if it was made", "evidence", "", "unit", *numbers.values()],
         rows,
-        f"A bar more than half full is beyond chance{_from_stddevs(tests)}. What is not found may still be there, "
-        "smaller than the smallest that is found; the last two columns say what that may do, to the scale as a share "
-        "of it. All tests are in result.json.",
+        f"A bar more than half full is more than chance explains{_from_stddevs(tests)}. A mistake that is not found "
+        "may still be there, if it is smaller than the smallest one found. The last two columns say how much it may "
+        "then change the scale (as a fraction of it) and places in the map. All tests are in result.json.",
         kind="mistakes",
     )
 
 
 def _from_stddevs(tests: Sequence[MistakeEntry]) -> str:
-    """Where a single number is beyond chance, as so many were looked for."""
+    """Return a remark that says from how many stddevs on a mistake with a single number counts as found."""
     least = min((test.threshold for test in tests if test.stddev and test.threshold), default=None)
     if least is None:
         return ""
     return (
-        f", for a single number {math.sqrt(least):.1f} of its stddevs: among as many as are looked for here, one of "
-        "three comes up without any mistake"
+        f" (a mistake with a single number is found from {math.sqrt(least):.1f} of its stddevs on: so many mistakes "
+        "are tested that one of three stddevs comes up by chance)"
     )
 
 
 def comparison(content: Content) -> Table:
-    """The paper's table."""
+    """Return the table of the comparison with the reference, which is the table of the 2018 paper."""
     columns = dict.fromkeys(("rmse_m", "rmse_se3_m", "rmse_sim3_m"), partial(fixed, decimals=4))
     columns["scale_error_percent"] = partial(signed, decimals=3)
     rows = [[row.name, *_cells(f"comparison.{i}", row, columns)] for i, row in enumerate(content.summary.comparison)]
@@ -143,12 +146,13 @@ def comparison(content: Content) -> Table:
         "Keyframe centres against the reference",
         ["trajectory", "RMSE m", "after SE(3) m", "after Sim(3) m", "scale error %"],
         rows,
-        "The first RMSE is without any alignment: a metric frame must speak for itself.",
+        "The first RMSE is computed without any alignment. The others are computed after the best rigid motion, SE(3), "
+        "and after the best similarity, Sim(3), which also removes an error of the scale.",
     )
 
 
 def two_candidates(content: Content) -> Table:
-    """Mean and standard deviation of the paper's two branches."""
+    """Return the table of the paper's two branches of scale candidates, with mean and standard deviation."""
     given, rows = content.summary.scale.two_candidate, []
     for name in () if given is None else ("alpha0", "alpha1"):
         cells = _cells(f"scale.two_candidate.{name}", getattr(given, name), {"mean": plain, "std": plain})
@@ -157,17 +161,17 @@ def two_candidates(content: Content) -> Table:
         "The paper's two candidates",
         ["branch", "mean", "stddev", ""],
         rows,
-        "Each range has two possible scales; the paper takes the mean of the branch with the smaller standard "
-        "deviation. Shown for comparison: other methods do not use it.",
+        "Each range has two possible scales, alpha0 and alpha1. The 2018 paper takes the mean of the branch with the "
+        "smaller standard deviation. This is shown for comparison; other methods do not use it.",
     )
 
 
 def anchors(content: Content) -> Table:
-    """Where the anchors are, with what is not certain about it."""
+    """Return the table of the anchors: positions, their standard deviations, and range biases."""
     given = content.summary.anchors
     rows = [_anchor(anchor_id, given[anchor_id]) for anchor_id in in_natural_order(given)]
     header = ["anchor", "x m", "y m", "z m", "stddev m", "Δx m", "Δy m", "Δz m", "range bias m", "mirror image at m"]
-    note = "Δ: estimated minus surveyed position, where it was surveyed. A stddev of 0: held there."
+    note = "Δ: estimated minus surveyed position, for surveyed anchors. A stddev of 0: the position was held fixed."
     return Table("Anchors in the map's frame", header, rows, note)
 
 
@@ -186,7 +190,7 @@ def _anchor(anchor_id: str, anchor: AnchorEntry) -> list[str]:
 
 
 def distances(content: Content) -> Table:
-    """Taped distances, those that held the scale and those that check it."""
+    """Return the table of taped distances: those that helped to fix the scale (control) and those that check it."""
     columns = dict.fromkeys(("measured_m", "stddev_m", "estimated_m"), partial(fixed, decimals=4))
     columns["residual_m"] = partial(signed, decimals=4)
     rows = [
@@ -198,7 +202,7 @@ def distances(content: Content) -> Table:
 
 
 def intrinsics(content: Content) -> Table:
-    """The cameras before and, if there was one, after the refinement."""
+    """Return the table of the cameras' intrinsics before the refinement and, if there was one, after it."""
     header = ["camera", "parameter", "scaled", "refined", "change"]
     num_columns = 3 if content.refined is None else 5
     rows = [
@@ -210,7 +214,7 @@ def intrinsics(content: Content) -> Table:
 
 
 def inputs(content: Content) -> Table:
-    """The files that the result was made from."""
+    """Return the table of the files from which the result was made."""
     rows = [
         [entry.path, *_cells(f"inputs.{i}", entry, {"bytes": count}), entry.sha256, entry.hashed]
         for i, entry in enumerate(content.summary.inputs)
@@ -219,7 +223,7 @@ def inputs(content: Content) -> Table:
 
 
 def stages(content: Content) -> Table:
-    """Where the time went."""
+    """Return the table of the time that each stage took."""
     known = {name: s for name, s in content.summary.seconds.items() if s is not None and name != "total"}
     longest = max(known.values(), default=0.0) or 1.0
     bar = Markup('<i class="bar" style="width:{:.1f}%"></i>')
@@ -228,7 +232,7 @@ def stages(content: Content) -> Table:
 
 
 def refinement(content: Content) -> Table:
-    """What the solver did."""
+    """Return the table of what the refinement did."""
     refine = content.summary.refine
     values = {} if refine is None else refine.to_json()
     rows = [
@@ -240,15 +244,15 @@ def refinement(content: Content) -> Table:
 
 
 def error_budget(content: Content) -> Table:
-    """What the scale's interval is made of, largest part first."""
+    """Return the table of the components of the scale's standard deviation, the largest first."""
     parts = content.summary.scale.relative_stddev.components
     words = component_words(parts)
     rows = [[words[name], f"{100 * stddev:.2f}"] for name, stddev in sorted(parts.items(), key=lambda part: -part[1])]
-    return Table("What the scale's stddev is made of", ["errors", "stddev %"], rows, is_narrow=True)
+    return Table("Components of the scale's stddev", ["errors", "stddev %"], rows, is_narrow=True)
 
 
 def sensitivity(content: Content) -> Table:
-    """By how much the scale would change."""
+    """Return the table of how much the scale would change, in percent, if ranges or lever arm were longer."""
     given = content.summary.scale.sensitivity
     percents = {
         "1 cm, all ranges": given.common_bias_per_cm,
@@ -258,34 +262,34 @@ def sensitivity(content: Content) -> Table:
         **{f"1 cm, lever arm {way}": value for way, value in zip(_WAYS, given.lever_arm_per_cm)},
     }
     rows = [[what, signed(percent, 3)] for what, percent in percents.items() if content.summary.has_ranges]
-    title = "By how much the scale would change if it were longer by"
-    return Table(title, ["what is longer than it was taken to be", "scale %"], rows, is_narrow=True)
+    title = "Change of the scale if a length were longer than assumed"
+    return Table(title, ["longer by", "scale %"], rows, is_narrow=True)
 
 
 def scale_by_kind(content: Content) -> Table:
-    """The scale by ranges alone and by measured lengths alone."""
+    """Return the table of the scale from ranges alone and from measured lengths alone."""
     columns = dict.fromkeys(("value", "stddev"), plain)
     rows = [
         [f"{kind} alone", *_cells(f"scale.by_kind.{kind}", entry, columns)]
         for kind, entry in content.summary.scale.by_kind.items()
     ]
-    return Table("The scale by what was measured", ["by", "metres per unit", "stddev"], rows, is_narrow=True)
+    return Table("The scale from each kind of measurement", ["from", "metres per unit", "stddev"], rows, is_narrow=True)
 
 
 def versions(content: Content) -> Table:
-    """Of the software."""
+    """Return the table of the versions of the software."""
     return Table("Versions", [], [*map(list, content.summary.versions.items())], is_narrow=True)
 
 
 def settings(content: Content) -> Table:
-    """The survey as the run had it, in the words of its keys."""
+    """Return the table of the settings of the run, with the meaning of each key."""
     given = content.summary.settings.to_json()
     known = [item for item in KEYS if (given.get(item.table) or {}).get(item.name) not in (None, [], {})]
     rows = [[item.meaning, plain(given[item.table][item.name]), f"[{item.table}] {item.name}"] for item in known]
-    return Table("Settings", ["what it is", "value", "key of the survey file"], rows, kind="settings")
+    return Table("Settings", ["meaning", "value", "key of the survey file"], rows, kind="settings")
 
 
 def _cells(key: str, entry: object, columns: _Columns) -> list[str]:
-    """Numbers of an entry of ``result.json``, by their names in it."""
+    """Return cells with numbers of an entry of ``result.json``; ``columns`` has a formatter for each by its name."""
     given = {name: getattr(entry, name) for name in columns}
     return [keyed(f"{key}.{name}", value, columns[name](value)) for name, value in given.items()]

@@ -1,4 +1,4 @@
-"""Numbers as a reader likes them."""
+"""Numbers and texts in the form in which the report shows them."""
 
 from __future__ import annotations
 
@@ -19,64 +19,64 @@ def _known(value: float | None) -> float | None:
 
 
 def fixed(value: float | None, decimals: int, unit: str = "", *, nothing: str = NOTHING) -> str:
-    """With so many decimals and a unit; ``nothing`` for what is not known."""
+    """Return a number with a fixed number of decimals and a unit, or ``nothing`` where it is unknown or not finite."""
     number = _known(value)
     if number is None:
         return nothing
-    text = f"{round(number, decimals) + 0.0:.{decimals}f}"  # no minus before what rounds to zero
+    text = f"{round(number, decimals) + 0.0:.{decimals}f}"  # adding 0.0 turns minus zero into zero
     return text.replace("-", "−") + (f"\u00a0{unit}" if unit else "")
 
 
 def signed(value: float | None, decimals: int, unit: str = "") -> str:
-    """As ``fixed``, with a sign before positive numbers too."""
+    """Return a number as ``fixed`` does, with a plus sign before positive numbers."""
     number = _known(value)
     return ("+" if number is not None and number > 0 else "") + fixed(value, decimals, unit)
 
 
 def count(value: float | None) -> str:
-    """A whole number with thin spaces between thousands."""
+    """Return a whole number with thin spaces between thousands."""
     number = _known(value)
     return NOTHING if number is None else f"{round(number):,}".replace(",", "\u202f")
 
 
 def rough(value: float | None, unit: str) -> str:
-    """In two digits with a unit; "open" for what nothing determines."""
+    """Return a number with two digits and its unit, or "open" where nothing determines it."""
     number = _known(value)
     return "open" if number is None else f"{number:.2g}\u00a0{unit}"
 
 
 def percent(share: float) -> str:
-    """A share in two digits."""
+    """Return a fraction as a percentage with two digits."""
     return rough(100 * share, "%")
 
 
 def mistake(name: str, subject: str) -> str:
-    """In a few words, for a row of a table or of a figure."""
+    """Return a short name of a mistake, for a row of a table or of a figure."""
     of_anchor = name.removeprefix("anchor's ").removeprefix("anchor ")
     return f"anchor {subject}: {of_anchor}" if of_anchor != name else f"{name} {subject}".strip()
 
 
 def decimals_for(stddev: float | None, *, default: int) -> int:
-    """Decimals that show two digits of the stddev."""
+    """Return the number of decimals that shows two digits of a standard deviation."""
     if stddev is None or stddev <= 0:
         return default
     return min(max(1 - math.floor(math.log10(stddev)), 0), 12)
 
 
 def duration(seconds: float | None) -> str:
-    """As hours, minutes and seconds, no finer than needed."""
+    """Return a duration as text ("5 min 03 s") with spaces at which the browser breaks no line."""
     number = _known(seconds)
     return NOTHING if number is None else progress.duration(number).replace(" ", "\u00a0")
 
 
 def sentence(text: str) -> str:
-    """A message as a sentence of its own: it begins with a capital and ends with a full stop."""
+    """Return a message as a sentence: it begins with a capital letter and ends with a full stop."""
     whole = text[:1].upper() + text[1:]
     return whole if whole.endswith((".", "!", "?")) else f"{whole}."
 
 
 def plain(value: Any) -> str:
-    """Any JSON value on one line."""
+    """Return any JSON value as text on one line."""
     if value is None:
         return NOTHING
     if isinstance(value, bool):
@@ -91,9 +91,9 @@ def plain(value: Any) -> str:
 
 
 def keyed(key: str, value: Any, text: str) -> str:
-    """A number of ``result.json`` as the reader sees it, marked with its key (joined by dots) and its full value.
+    """Return the text of a number of ``result.json``, marked in HTML with its key (joined by dots) and its full value.
 
-    What is no number stands as it is.
+    The text of any other value is returned unmarked.
     """
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return text
@@ -101,7 +101,11 @@ def keyed(key: str, value: Any, text: str) -> str:
 
 
 def said_once(texts: Iterable[str], others: Sequence[str] = ()) -> list[str]:
-    """Texts without those that the others say already, or that begin as one before with the same measure."""
+    """Return the texts without repetitions.
+
+    A text is left out if the others contain it, or if an earlier one begins with the same words up to the first comma,
+    semicolon, colon or bracket: that is the same measure with other numbers.
+    """
     said, measures = " ".join(others), set[str]()
     kept = []
     for text in texts:

@@ -145,7 +145,7 @@ def test_two_clicks_measure_a_distance_with_its_interval(opened: Browser) -> Non
         opened.click_at(*place_of(opened, f"rangesfmView.scene.anchors[{i}].position"))
     distance = float(np.linalg.norm(np.subtract(anchors[0], anchors[5])))
     said = re.fullmatch(
-        r"anchor 1 to anchor 6: ([\d.]+) m \(95 % by the scale alone: ([\d.]+) to ([\d.]+) m\)",
+        r"anchor 1 to anchor 6: ([\d.]+) m \(95 % interval, from the scale alone: ([\d.]+) to ([\d.]+) m\)",
         text_of(opened, ".measured"),
     )
     assert said is not None

@@ -1,4 +1,4 @@
-// Anchors with their names, their error ellipsoids, and mirror images.
+// Anchors with their names, error ellipsoids and mirror images.
 
 function makeAnchors(anchors, size) {
   const group = new THREE.Group();

@@ -1,22 +1,23 @@
-// Cameras as frusta along their path.
+// Cameras, drawn as frusta along their path.
 
 const FRUSTUM_EDGES = [0, 1, 0, 2, 0, 3, 0, 4, 1, 2, 2, 3, 3, 4, 4, 1];
 const FRUSTUM_SIDES = [0, 1, 2, 0, 2, 3, 0, 3, 4, 0, 4, 1];
 
-/** A place in the frame of a path's i-th camera, carried into the world; center: where the camera is then. */
+/** Returns a place given in the frame of the i-th camera of a path in the world; center: position of that camera. */
 function fromCamera(path, i, place, center = row3(path.centers, i)) {
   const rotation = path.rotations.subarray(9 * i, 9 * i + 9);
   return center.map((value, axis) => row3(rotation, axis).reduce((sum, part, j) => sum + part * place[j], value));
 }
 
-/** Corners of a frustum, metres, in turn: the camera's centre is 0, then the image from its top left, clockwise. */
+/** Returns corners of a frustum in metres, in the order of turn: 0 is the camera's centre, 1 to 4 are the image corners,
+ * clockwise from the top left. */
 function frustum(path, i, size, [w, h], turn) {
   const inCamera = [[0, 0, 0], [-w, -h, 1], [w, -h, 1], [w, h, 1], [-w, h, 1]];
   const corners = inCamera.map((corner) => fromCamera(path, i, corner.map((value) => size * value)));
   return turn.map((corner) => corners[corner]);
 }
 
-/** All cameras of a path and the line through them, in the colour of the theme's name; later paths over earlier. */
+/** Returns all cameras of a path and the line through them. Paths with a larger order are drawn over the others. */
 function makePath(path, size, shape, order) {
   const group = new THREE.Group();
   const add = (Kind, positions) => group.add(themed(Kind, positions, new THREE.LineBasicMaterial(), path.color));
@@ -28,7 +29,7 @@ function makePath(path, size, shape, order) {
   return group;
 }
 
-/** The one camera that the reader looks at: larger, and filled. */
+/** The camera that the reader has chosen, drawn larger and filled. */
 class ChosenCamera {
   constructor(size, shape) {
     Object.assign(this, { size: 1.6 * size, shape, group: new THREE.Group() });

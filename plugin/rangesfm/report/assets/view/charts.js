@@ -1,4 +1,4 @@
-// The figures: Vega-Lite draws them in the page's colours, as wide as there is room.
+// The figures, drawn by Vega-Lite in the colours of the page, as wide as there is room.
 
 const POINTER_PX = 24;
 
@@ -10,7 +10,7 @@ class Chart {
     node.style.height = `${this.#size()[1] + top + bottom}px`;
   }
 
-  /** Draws it, once: thousands of points take their time. */
+  /** Draws the chart unless it is drawn already, because thousands of points take time. */
   draw() {
     if (this.view !== null) return;
     const datasets = Object.fromEntries(this.series.map((one, i) => [`series${i}`, rowsOf(one)]));
@@ -24,7 +24,7 @@ class Chart {
     new ResizeObserver(() => this.#fit()).observe(this.node);
   }
 
-  /** {name, x, y} of all data, as the CSV file has them. */
+  /** Yields {name, x, y} of all data, as the CSV file has them. */
   *rows() {
     for (const one of this.series) {
       if (one.is_data) for (const { x, y } of rowsOf(one)) if (isFinite(x + y)) yield { name: one.name, x, y };
@@ -32,7 +32,7 @@ class Chart {
     yield* this.marks;
   }
 
-  /** Rounded to so many digits, and more where the axis shows values much closer together than they are far from 0. */
+  /** Rounds a value to numDigits digits, and to more where the axis is short and far from 0. */
   number(value, axis, numDigits) {
     const [low, high] = this.spec.encoding[axis].scale.domain;
     const share = Math.max(Math.abs(low), Math.abs(high)) / (high - low);
@@ -49,7 +49,7 @@ class Chart {
     this.view.width(width).height(height).run();
   }
 
-  /** What is nearest to the pointer tells its values. */
+  /** Shows the values of the data nearest to the pointer. */
   #point({ clientX, clientY }) {
     const box = this.node.getBoundingClientRect();
     const { left, top } = this.spec.padding;
@@ -72,12 +72,12 @@ class Chart {
   }
 }
 
-/** Rows of x and y of a flat array of both in turn, which are relative to an origin. */
+/** Returns rows {x, y} from a flat array of x and y in turn, relative to an origin. */
 function rowsOf({ points, origin }) {
   return Array.from({ length: points.length / 2 }, (_, i) => ({ x: origin[0] + points[2 * i], y: origin[1] + points[2 * i + 1] }));
 }
 
-/** All figures of the page, by name: a list of charts each, which are drawn when they come near or go to paper. */
+/** Returns the charts of each figure by its name. They are drawn when they come near the window, or for printing. */
 function makeFigures(figures) {
   const chartOf = new Map();
   const drawSeen = (entries) => entries.forEach((entry) => entry.isIntersecting && chartOf.get(entry.target).draw());

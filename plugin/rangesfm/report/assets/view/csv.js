@@ -1,4 +1,4 @@
-// Data of the page as CSV files, made when asked for.
+// Data of the page as CSV files, made when the reader asks for them.
 
 function csvText(rows) {
   const quoted = (text) => (/[",\n\r]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
@@ -6,7 +6,7 @@ function csvText(rows) {
   return `${[Object.keys(rows[0]), ...rows.map(Object.values)].map((row) => row.map(cell).join(",")).join("\n")}\n`;
 }
 
-/** A text with an apostrophe before it where a spreadsheet would take it for a formula, as in the result's tables. */
+/** Puts an apostrophe before a text that a spreadsheet would take for a formula, as the tables of the result do. */
 function asText(text) {
   return /^'*\s*[=+\-@\uff1d\uff0b\uff0d\uff20]/.test(text) && isNaN(text) ? `'${text}` : text;
 }
@@ -24,7 +24,7 @@ function rangeRows(ranges, others) {
   }));
 }
 
-/** Rows of the tables that figures name. */
+/** Functions that make the rows of the tables that figures name. */
 const TABLES = {
   ranges: ({ ranges }) =>
     rangeRows(ranges, (i) => ({
@@ -46,7 +46,7 @@ const TABLES = {
     }),
 };
 
-/** Rows of what a figure's charts draw. */
+/** Returns rows of what the charts of a figure draw. */
 function rowsOfCharts(charts) {
   const [x, y] = charts[0].labels.map((label) => (label || "row").replace("−", "minus ").split(/\s+/).join("_"));
   return charts.flatMap((chart) => {
@@ -55,7 +55,7 @@ function rowsOfCharts(charts) {
   });
 }
 
-/** A figure's button gives the table it names, or else what its charts draw. */
+/** Makes each CSV button save the table that its figure names, or else what the charts of the figure draw. */
 function attachDownloads(scene, figures) {
   for (const button of document.querySelectorAll("button[data-figure]")) {
     button.addEventListener("click", () => {

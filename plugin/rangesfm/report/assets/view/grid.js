@@ -1,8 +1,8 @@
-// A grid in metres on the ground, and the scale bar over the view.
+// A metric grid on the ground, and the scale bar over the view.
 
 const NUM_GRID_CELLS = 12;
 
-/** The round length (1, 2 or 5 times a power of ten) nearest below. */
+/** Returns the largest round length (1, 2 or 5 times a power of ten) that is not above a length. */
 function roundLength(length) {
   const power = 10 ** Math.floor(Math.log10(length));
   return [5, 2, 1].map((factor) => factor * power).find((round) => round <= length * 1.0001);
@@ -12,7 +12,7 @@ function lengthText(length) {
   return length < 0.01 ? `${+(1000 * length).toPrecision(2)} mm` : length < 1 ? `${+(100 * length).toPrecision(2)} cm` : `${+length.toPrecision(6)} m`;
 }
 
-/** Returns the grid and the width of its cells. */
+/** Returns the grid and the width of its cells in metres. */
 function makeGrid(box, up) {
   const cell = roundLength((2.4 * box.radius) / NUM_GRID_CELLS);
   const numCells = 2 * Math.ceil((1.2 * box.radius) / cell);
@@ -22,11 +22,11 @@ function makeGrid(box, up) {
   const vertical = up.findIndex((value) => value !== 0);
   const middle = box.low.map((value, axis) => cell * Math.round((value + box.high[axis]) / 2 / cell));
   grid.position.set(...middle.with(vertical, box.ground));
-  if (vertical === 2) grid.rotateX(Math.PI / 2); // it is made with y up
+  if (vertical === 2) grid.rotateX(Math.PI / 2); // three.js makes it with y up
   return { grid, cell };
 }
 
-/** Keeps a bar of round length up to date. */
+/** Keeps the scale bar at a round length as the view changes. */
 function attachScaleBar(stage, bar) {
   stage.addEventListener("frame", () => {
     const perPixel = stage.metresPerPixel();

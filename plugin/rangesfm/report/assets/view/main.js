@@ -1,4 +1,4 @@
-// The view, put together from the page's data and its controls.
+// The 3-D view, made from the data of the page and connected to its controls.
 
 class View {
   constructor(root, scene) {
@@ -14,7 +14,7 @@ class View {
     this.look("oblique");
   }
 
-  /** Choose a camera of the final path: its frustum, its photo and its ranges. */
+  /** Shows frustum, photo and ranges of a camera of the final path. */
   choose(i) {
     if (this.slider === null) return;
     this.chosen = i;
@@ -58,7 +58,7 @@ class View {
     this.stage.lookFrom(directions[name]);
   }
 
-  /** Position of the i-th point of the map, metres from the scene's origin. */
+  /** Returns the position of the i-th point of the map, metres from the origin of the scene. */
   pointAt(i) {
     return pointPosition(this.scene.points, i);
   }
@@ -102,9 +102,9 @@ class View {
     on("click", "[data-look]", (button) => this.look(button.dataset.look));
     on("change", "[name=status], [name=all-photos]", () => this.showRanges());
     on("input", "[name=photo]", (slider) => this.choose(Number(slider.value)));
-    // On paper, a picture stands for the view.
+    // A printed page has a picture in place of the view.
     addEventListener("beforeprint", () => {
-      this.stage.draw(); // what is drawn can be read only at once
+      this.stage.draw(); // the canvas can be read only directly after it is drawn
       this.root.querySelector(".printed").src = this.canvas.toDataURL("image/png");
     });
     this.slider = this.root.querySelector("[name=photo]");
@@ -114,7 +114,7 @@ class View {
   }
 }
 
-// The page is there to read before its figures and the view are: setting up WebGL may take longer than all the rest.
+// The text of the page is shown before figures and view are made, because starting WebGL may take longer than the rest.
 const start = () => {
   const scene = readBlock("scene");
   if (scene?.ranges) scene.ranges.residual = scene.ranges[scene.ranges.final];

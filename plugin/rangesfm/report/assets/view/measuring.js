@@ -1,7 +1,7 @@
-// The distance between two clicked positions, with what the scale leaves uncertain of it.
+// The distance between two clicked positions, with the interval that follows from the scale.
 
 class Measuring {
-  /** interval: the scale's interval relative to its value, [low, high], or null. */
+  /** interval: 95 % interval of the scale relative to its value, [low, high], or null. */
   constructor(stage, output, interval) {
     Object.assign(this, { stage, output, interval });
     this.line = themed(THREE.Line, [], new THREE.LineBasicMaterial({ depthTest: false }), "chosen");
@@ -19,7 +19,7 @@ class Measuring {
     this.stage.requestFrame();
   }
 
-  /** One end; the third begins anew. */
+  /** Adds an end of the distance; a third end begins a new distance. */
   add(name, position) {
     if (this.ends.length === 2) this.clear();
     this.ends.push({ name, position });
@@ -34,7 +34,7 @@ class Measuring {
     this.label.position.set(...a.position.map((value, axis) => (value + b.position[axis]) / 2));
     this.label.element.textContent = `${distance.toFixed(3)} m`;
     const [low, high] = (this.interval ?? []).map((share) => (share * distance).toFixed(3));
-    const interval = low && ` (95 % by the scale alone: ${low} to ${high} m)`;
+    const interval = low && ` (95 % interval, from the scale alone: ${low} to ${high} m)`;
     this.output.textContent = `${a.name} to ${b.name}: ${distance.toFixed(3)} m${interval ?? ""}`;
     this.stage.requestFrame();
   }

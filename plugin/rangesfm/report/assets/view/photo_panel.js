@@ -1,4 +1,4 @@
-// What is known of one photo: its thumbnail, its place, and its ranges.
+// The panel of the chosen photo: thumbnail, position and ranges.
 
 const MAX_NUM_ROWS = 200;
 
@@ -7,7 +7,7 @@ class PhotoPanel {
     Object.assign(this, { panel, scene, image: panel.querySelector("img") });
   }
 
-  /** numbers: of the ranges nearest to the photo. */
+  /** numbers: those of the ranges nearest to the photo. */
   show(path, i, numbers) {
     const name = path.names[i];
     const thumbnail = this.scene.thumbnails[name];
@@ -30,7 +30,7 @@ class PhotoPanel {
     return `Photo ${i + 1} of ${path.names.length}${time}; x, y, z = ${at.join(", ")} m${this.#moved(path, i)}`;
   }
 
-  /** How far the refinement moved this camera. */
+  /** Returns a text that says how far the refinement moved this camera. */
   #moved(path, i) {
     const before = this.scene.paths.filter((other) => other.rotations !== null).at(-2);
     const j = before?.names.indexOf(path.names[i]) ?? -1;

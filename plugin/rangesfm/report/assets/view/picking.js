@@ -1,10 +1,10 @@
-// What is under the reader's finger.
+// Finding what the reader clicked on.
 
 const REACH_PX = 14;
 const SAME_SPOT_PX = 5;
 const MAX_DRAG_PX = 5;
 
-/** Calls back with the pixel of each click or tap that was no drag. */
+/** Calls a function with the pixel of each click or tap that is not a drag. */
 function onClick(canvas, callback) {
   let start = null;
   canvas.addEventListener("pointerdown", (event) => (start = event.isPrimary ? event : null));
@@ -15,7 +15,7 @@ function onClick(canvas, callback) {
   });
 }
 
-/** The nearest of many positions to a pixel; of several on the same spot, the one in front. */
+/** Returns the position nearest to a pixel, of several on the same spot the one in front; null if none is near. */
 function nearestTo(stage, pixel, num, positionOf) {
   let best = null;
   for (let index = 0; index < num; index++) {

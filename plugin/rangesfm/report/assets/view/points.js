@@ -1,4 +1,4 @@
-// The map's points. They come in random order, so that the first so many are an even sample of all.
+// The map's points. They come in random order, so that the first n of them are an even sample.
 
 const LEAST_SHARE_WHILE_MOVING = 0.1;
 const MANY_POINTS = 30000;
@@ -21,7 +21,8 @@ function makePoints(stage, { steps, colors, origin, extent, num }) {
   return points;
 }
 
-/** Position of the i-th point, metres from the scene's origin: whole steps of the largest side of their box. */
+/** Returns the position of the i-th point, metres from the origin of the scene. It is stored as whole steps, of which
+ * the largest side of the points' box has 65535. */
 function pointPosition({ steps, origin, extent }, i) {
   return row3(steps, i).map((value, axis) => origin[axis] + (extent / 65535) * value);
 }

@@ -1,8 +1,8 @@
-// Ranges as lines from the radio at the camera to its anchor, coloured by residual.
+// Ranges, drawn as lines from the tag at the camera to the anchor and coloured by residual.
 
 const RESIDUAL_COLORS = ["residual-negative", "residual-zero", "residual-positive"];
 
-/** The radio's antenna when a range was taken: on the line between the two keyframes. */
+/** Returns the position of the tag when a range was taken, interpolated between two keyframes. */
 function tagPosition(path, ranges, i) {
   const [before, after, weight] = [ranges.before[i], ranges.after[i], ranges.weight[i] / 255];
   const end = row3(path.centers, after);
@@ -26,7 +26,7 @@ class RangeLines {
     onTheme(() => this.#paint());
   }
 
-  /** Show the ranges of some statuses, and of one camera only unless it is null. */
+  /** Shows the ranges of some statuses: those of one camera, or all where camera is null. */
   show(statuses, camera) {
     const wanted = camera === null ? [...this.hasLine.keys()] : this.ofCamera(camera);
     const chosen = wanted.filter((i) => this.hasLine[i] && statuses.has(this.ranges.status[i]));
@@ -34,12 +34,12 @@ class RangeLines {
     this.numShown = chosen.length;
   }
 
-  /** Numbers of the ranges taken nearest to a camera, in time order. */
+  /** Returns the numbers of the ranges taken nearest to a camera, in order of time. */
   ofCamera(camera) {
     return [...this.ranges.camera.keys()].filter((i) => this.ranges.camera[i] === camera);
   }
 
-  /** From the middle colour to an end's as the residual grows to the limit, fast at first. */
+  /** Colours each line by its residual: from the middle colour at 0 to an end colour at the limit, fast at first. */
   #paint() {
     const [negative, zero, positive] = RESIDUAL_COLORS.map((name) => new THREE.Color(themeColor(name)));
     const colors = this.geometry.getAttribute("color");

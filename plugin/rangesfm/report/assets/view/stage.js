@@ -1,4 +1,4 @@
-// The stage: renderers, camera and controls. It draws when something changed, and only then.
+// The stage: renderers, camera and controls. It draws only when something has changed.
 
 const SLOW_FRAME_MS = 45;
 const MAX_PIXEL_RATIO = 2;
@@ -6,7 +6,7 @@ const FIELD_OF_VIEW_DEG = 45;
 const SLOPE = Math.tan((FIELD_OF_VIEW_DEG * Math.PI) / 360);
 const MARGIN = 1.08;
 
-/** Its events: "frame" (drawn), "slow" (frames take long while moving), "rest" (moving has ended). */
+/** Dispatches the events "frame" (drawn), "slow" (frames take long while moving) and "rest" (moving has ended). */
 class Stage extends EventTarget {
   /** Returns null where the browser has no WebGL. */
   static on(canvas, labels, up, box) {
@@ -16,7 +16,7 @@ class Stage extends EventTarget {
 
   constructor(canvas, labels, context, up, box) {
     super();
-    THREE.ColorManagement.enabled = false; // colours go to the screen as the photos have them
+    THREE.ColorManagement.enabled = false; // the screen shows the colours of the photos unchanged
     Object.assign(this, { canvas, box, scene: new THREE.Scene(), lastFrame: null, isRequested: false });
     this.center = new THREE.Vector3(...box.low).add(new THREE.Vector3(...box.high)).divideScalar(2);
     this.renderer = new THREE.WebGLRenderer({ canvas, context, antialias: true });
@@ -67,7 +67,7 @@ class Stage extends EventTarget {
     this.lastFrame += duration;
   }
 
-  /** Look at the middle of the scene from a direction, as near as shows all corners of its box. */
+  /** Looks at the middle of the scene from a direction, at the smallest distance that shows all corners of its box. */
   lookFrom(direction) {
     const towards = new THREE.Vector3(...direction).normalize();
     const right = this.camera.up.clone().cross(towards).normalize();
@@ -85,13 +85,13 @@ class Stage extends EventTarget {
     this.requestFrame();
   }
 
-  /** Where on the canvas a position in metres is: pixels from its left and top, and depth, more than 1 behind it. */
+  /** Returns the pixel of a position in metres (from left and top) and its depth, above 1 behind the camera. */
   pixelOf(position) {
     const { x, y, z } = new THREE.Vector3(...position).project(this.camera);
     return [((x + 1) / 2) * this.canvas.clientWidth, ((1 - y) / 2) * this.canvas.clientHeight, z];
   }
 
-  /** Metres on the screen of one pixel, at the point looked at. */
+  /** Returns how many metres one pixel is, at the distance of the point looked at. */
   metresPerPixel() {
     return (2 * SLOPE * this.camera.position.distanceTo(this.controls.target)) / this.canvas.clientHeight;
   }
@@ -103,7 +103,7 @@ class Stage extends EventTarget {
   }
 }
 
-/** Lines or a mesh in a colour of the theme, always drawn: what of them is in view changes. */
+/** Returns lines or a mesh in a colour of the theme. They are never culled, because their positions may change. */
 function themed(Kind, positions, material, color) {
   onTheme(() => material.color.set(themeColor(color)));
   const made = new Kind(lineGeometry(positions), material);
@@ -115,13 +115,13 @@ function lineGeometry(positions) {
   return new THREE.BufferGeometry().setAttribute("position", new THREE.Float32BufferAttribute(positions.flat(), 3));
 }
 
-/** Gives lines or a mesh other places. */
+/** Gives lines or a mesh other positions. */
 function moveTo(object, positions) {
   object.geometry.dispose();
   object.geometry = lineGeometry(positions);
 }
 
-/** A text over the view, right of a place in it. */
+/** Returns a text over the view, right of a place in it. */
 function makeLabel(kind, text) {
   const element = Object.assign(document.createElement("span"), { className: `label ${kind}`, textContent: text });
   return Object.assign(new THREE.CSS2DObject(element), { center: new THREE.Vector2(0, 0.5) });
