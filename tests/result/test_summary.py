@@ -111,7 +111,7 @@ def test_lines_for_people_tell_what_is_known() -> None:
         "scale: 1.5 m per SfM unit, 95 % interval unknown to unknown",
         "verdict: good: the scale is known to 2 % (95 % interval)",
         "the scale is sensitive: -0.60 % per cm of bias in short ranges",
-        "refined after 23 iterations; the photos alone had bent the map by 0.01 m (rms), back by the ranges",
+        "refined after 23 iterations; the ranges took a bend of 0.01 m (rms) out of the map",
         "ranges: 7 of 9 used, rms 0.051 m, median unknown m",
         "map: 40 photos, 900 points, frame site",
         *("", "a  b", "c  d", ""),

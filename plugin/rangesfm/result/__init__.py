@@ -1,1 +1,1 @@
-"""The result folder: what is in it, how it is written and read."""
+"""The result folder: what it contains, and how it is written and read."""

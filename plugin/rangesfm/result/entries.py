@@ -1,4 +1,4 @@
-"""The entries of ``result.json``: their keys, and how they follow from what a run found."""
+"""Entries of ``result.json``: their keys, and how they are made from what a run found."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Quaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_un
 
 
 class SimilarityEntry(Record):
-    """``x -> scale * R x + translation_m``, with R as a unit quaternion, the real part last."""
+    """A similarity, ``x -> scale * R x + translation_m``, with R as a unit quaternion whose real part is last."""
 
     scale: Number
     rotation_xyzw: Quaternion
@@ -54,7 +54,7 @@ class SimilarityEntry(Record):
 
 
 class TwoCandidateEntry(Record):
-    """The paper's table; see TwoCandidate."""
+    """Both branches of the paper's two-candidate estimate; see TwoCandidate."""
 
     alpha0: Branch
     alpha1: Branch
@@ -63,14 +63,18 @@ class TwoCandidateEntry(Record):
 
 
 class ScaleByKindEntry(Record):
-    """The scale by "ranges" alone or by "lengths" alone, and its stddev; null where they do not determine it."""
+    """The scale by one kind of measurement alone, "ranges" or "lengths", in metres per unit of the unscaled model.
+
+    Attributes:
+        stddev: null where it is not determined.
+    """
 
     value: Number
     stddev: NumberOrNull
 
 
 class ScaleEntry(Record):
-    """The scale and how far to trust it, metres per unit of the unscaled model; see ScaleEstimate."""
+    """The scale in metres per unit of the unscaled model, and how reliable it is; see ScaleEstimate."""
 
     value: Number
     stddev_formal: NumberOrNull
@@ -81,7 +85,7 @@ class ScaleEntry(Record):
         default_factory=dict,
         validation_alias=AliasChoices("error_stddevs", AliasPath("errors", "learned", "stddev_of_component")),
     )
-    """Of the components of the ranges' errors by name, as learnt: metres (slope: share of the distance)."""
+    """Learnt standard deviations of the components of the range errors: metres (slope: fraction of the distance)."""
     method: Text
     verdict: Literal["good", "doubtful"]
     reasons: tuple[Text, ...]
@@ -98,18 +102,18 @@ class ScaleEntry(Record):
 
     @property
     def larger_stddev(self) -> float | None:
-        """Formal or empirical, as far as they are known: formal ones are far too small on real logs."""
+        """Return the larger of the formal and the empirical stddev; None if both are unknown."""
         known = (stddev for stddev in (self.stddev_formal, self.stddev_empirical) if stddev is not None)
         return max(known, default=None)
 
     @property
     def relative_stddev_empirical(self) -> float | None:
-        """Of every length in the metric models, by the scale alone; None if not known."""
+        """Return the relative stddev that the scale gives every length in the metric models; None if unknown."""
         return self.stddev_empirical / self.value if self.stddev_empirical is not None and self.value else None
 
 
 class ModelScaleEntry(Record):
-    """The scale of one of several models by its own ranges; without values where they do not determine it."""
+    """The scale of one of several models, from its own ranges; its numbers are null where they do not determine it."""
 
     value: NumberOrNull
     stddev_empirical: NumberOrNull
@@ -119,7 +123,7 @@ class ModelScaleEntry(Record):
 
 
 class ModelEntry(Record):
-    """One of several models: its own scale, and its place in the joined map."""
+    """One of several models that were to be joined: its own scale, and its place in the joined map."""
 
     name: Text
     num_images: Count
@@ -150,7 +154,7 @@ class MapEntry(Record):
 
 
 class AnchorEntry(Record):
-    """An anchor in the metric models' world; see AnchorEstimate. Null: not known, or there is none."""
+    """An anchor in the world of the metric models; see AnchorEstimate. What is unknown or does not exist is null."""
 
     position_m: VectorOrNull
     stddev_m: NumberOrNull = Field(validation_alias=AliasChoices("stddev_m", "position_stddev_m"))
@@ -160,7 +164,10 @@ class AnchorEntry(Record):
 
 
 class TimeOffsetEntry(Record):
-    """Image time = range time + ``value_s``; null where the log names photos. The rest if it was estimated."""
+    """The time offset between the clocks: image time = range time + ``value_s``.
+
+    It is null where the log names photos. All keys after ``estimated`` but the note are null unless it was estimated.
+    """
 
     value_s: NumberOrNull
     stddev_s: NumberOrNull
@@ -181,7 +188,7 @@ class TimeOffsetEntry(Record):
 
 
 class ResidualEntry(Record):
-    """Ranges between tag and anchor, and the residuals of those used by the final model."""
+    """Numbers of ranges between tag and anchor, and residuals in the final model of those that are used."""
 
     num: Count
     num_used: Count
@@ -191,7 +198,7 @@ class ResidualEntry(Record):
 
 
 class RangesEntry(ResidualEntry):
-    """All ranges; those between two anchors or two tags are only counted."""
+    """All ranges, together and by anchor. Ranges between two anchors or two tags are only counted."""
 
     num_anchor_anchor: Count
     num_tag_tag: Count
@@ -217,7 +224,7 @@ class RangesEntry(ResidualEntry):
 
 
 class CheckEntry(Record):
-    """Ranges that no estimate has seen, and their residuals by the final model."""
+    """Ranges that were held out of all estimates, and their residuals in the final model."""
 
     num: Count
     rms_m: NumberOrNull
@@ -225,7 +232,7 @@ class CheckEntry(Record):
 
 
 class CheckRangesEntry(CheckEntry):
-    """All of them, and by anchor."""
+    """All held-out ranges, together and by anchor."""
 
     per_anchor: dict[Text, CheckEntry]
 
@@ -242,14 +249,14 @@ class CheckRangesEntry(CheckEntry):
 
 
 def _by_anchor(found: MetricResult, chosen: Mask) -> Iterator[tuple[str, Mask]]:
-    """Which of the chosen ranges are to each anchor."""
+    """Yield the id of each anchor and the mask (n,) of the chosen ranges to it."""
     log = found.observations.log
     for k, anchor_id in enumerate(log.anchor_ids):
         yield anchor_id, chosen & (log.anchor_index == k)
 
 
 def rms(values: Array) -> float:
-    """Root of the mean square; NaN of none, as ``median``."""
+    """Return the root mean square of values, or NaN where there are none."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else np.nan
 
 
@@ -258,7 +265,7 @@ def median(values: Array) -> float:
 
 
 class PlaceEntry(Record):
-    """Where the map is in the site's frame, and how far to trust that; see Place."""
+    """How well the place of the map in the site frame is known; see Place."""
 
     verdict: Literal["good", "doubtful"]
     reasons: tuple[Text, ...]
@@ -271,9 +278,10 @@ class RefineEntry(Record):
     """What the refinement did; see RefineSummary. What was not estimated is null.
 
     Attributes:
-        kept: whether the final map is the refined one; else it is the scaled one.
-        why_not_kept: what the refined one could not be.
-        bending_factor: by how much more than the photos' residuals let expect the map was bent before.
+        kept: whether the final map is the refined one. Otherwise it is the scaled one.
+        why_not_kept: reasons why the refined map cannot be right; empty where it is kept.
+        bending_factor: bend of the map before the refinement, divided by the bend that the residuals of the photos let
+            expect.
     """
 
     kept: Flag
@@ -319,7 +327,7 @@ class RefineEntry(Record):
 
 
 class MistakeEntry(Record):
-    """A mistake that may have been made, and what the ranges say of it; see MistakeTest."""
+    """A mistake that may have been made, and what the ranges say about it; see MistakeTest."""
 
     name: Text
     subject: Text
@@ -337,17 +345,17 @@ class MistakeEntry(Record):
 
 
 class ComparisonRow(Record):
-    """One path against the reference: a row of the paper's table.
+    """Comparison of one path with the reference: a row of the table in the 2018 paper.
 
     Attributes:
-        name: what the path is.
-        num_keyframes: keyframes whose reference position is known; the numbers are over these.
-        rmse_m: of keyframe centres, without any alignment; None where the path's
-            frame is not the reference's and cannot be tied to it.
-        rmse_se3_m: after the best rigid motion; None below three keyframes.
-        rmse_sim3_m: after the best similarity; None below three keyframes.
-        scale_error_percent: scale of the path relative to the reference, minus one:
-            positive when the map is too large; None below three keyframes or without motion.
+        name: of the path.
+        num_keyframes: number of keyframes with a known reference position; all errors are over these.
+        rmse_m: of keyframe centres, without any alignment; null where the path is in another frame than the reference
+            and cannot be brought into it.
+        rmse_se3_m: after the best rigid motion; null below three keyframes.
+        rmse_sim3_m: after the best similarity; null below three keyframes.
+        scale_error_percent: scale of the path relative to the reference, minus one: positive where the map is too
+            large; null below three keyframes or without motion.
     """
 
     name: Text
@@ -359,7 +367,7 @@ class ComparisonRow(Record):
 
 
 class GeoreferenceEntry(Record):
-    """Where the metric models' world lies on the Earth; see Georeference."""
+    """Place of the metric models' world on the Earth; see Georeference."""
 
     lat_deg: Number
     lon_deg: Number
@@ -372,7 +380,7 @@ class GeoreferenceEntry(Record):
 
 
 class _Table(Record):
-    """A table of a survey; named are the keys that are read again."""
+    """A table of a survey file as recorded. Classes name only the keys that are read again."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -402,7 +410,7 @@ class TagSettings(_Table):
 
 
 class Settings(_Table):
-    """The survey as the run had it, by tables and keys."""
+    """The settings of the survey as the run had them, by table and key."""
 
     images: ImageSettings
     ranges: RangesSettings
@@ -411,7 +419,7 @@ class Settings(_Table):
 
 
 class InputEntry(Record):
-    """An input with its SHA-256, so that a result can be checked later; see ``input_hashes``."""
+    """An input with its SHA-256 hash, by which it can be recognised later; see ``input_hashes``."""
 
     path: Text
     sha256: Text

@@ -1,4 +1,4 @@
-"""The result folder: what a run leaves there, what the next one takes away first, and how it is read back."""
+"""The result folder: what a run writes into it, what the next run removes, and how it is read back."""
 
 from __future__ import annotations
 
@@ -30,21 +30,26 @@ _Table = TypeVar("_Table", bound=TableFile)
 
 REPORT_NAME = "report.html"
 PHOTOS_NAMES = ("photos", "photos_2")
-"""Folders of photos taken out of a video or a bag; an earlier result's stay in one while a new one's are made."""
+"""Folders of photos taken from a video or a bag. There are two, because the photos of an earlier result stay in one of
+them while those of a new result are made."""
 REFERENCE_NAME = "reference.csv"
 MODEL_NAMES = ("sparse_scaled", "sparse_metric")
 RESULT_FILES = (ResultSummary.NAME, REPORT_NAME, REFERENCE_NAME, *(table.NAME for table in TABLES))
 RESULT_NAMES = (*RESULT_FILES, *MODEL_NAMES)
-"""What a result consists of; the first says that it is whole."""
+"""Names of all files and folders of a result. The first one is written last: where it is there, the result is whole."""
 
 
 def result_names(survey: Survey) -> set[str]:
-    """Names in the output folder that a result of this survey takes, with the formats that are asked for."""
+    """Return the names that a result of this survey takes in the output folder, export formats included."""
     return set(RESULT_NAMES).union(*(EXPORTED_NAMES[name] for name in survey.export.formats))
 
 
 def refuse_to_overwrite(survey: Survey) -> None:
-    """Raise InputError for an input that stands where a result will be written, or that results would stand among."""
+    """Check that the results will overwrite no input, and will not be written among the files of an input folder.
+
+    Raises:
+        InputError: they would; it names the input.
+    """
     folder = survey.output.path.resolve()
     maps = survey.images.model is None
     places = {folder / name for name in result_names(survey)}
@@ -54,31 +59,32 @@ def refuse_to_overwrite(survey: Survey) -> None:
         if not places.isdisjoint((path, *path.parents)):
             raise InputError("the results would overwrite this input, expected another output path", item.path)
         if path.is_dir() and path == folder:
-            raise InputError("the results would stand among this input, expected another output path", item.path)
+            raise InputError("the results would be written into this input, expected another output path", item.path)
 
 
 def places_for_photos(folder: Path) -> tuple[Path, Path]:
-    """Return two folders for photos of a video, first the one that is free: the result that is there has the other."""
+    """Return two folders for photos of a video, the free one first; an existing result may use the other one."""
     first, second = (folder / name for name in PHOTOS_NAMES)
     try:
         used = ResultSummary.read(folder / ResultSummary.NAME).settings.images.path
-    except (InputError, OSError):  # there is none
+    except (InputError, OSError):  # there is no earlier result
         return first, second
     return (second, first) if used is not None and path_of(used).name == first.name else (first, second)
 
 
 @contextmanager
 def new_result(folder: Path, images_path: Path | None = None) -> Iterator[Path]:
-    """Yield a folder to write a whole result into; on success it takes the place of the earlier result, all at once.
+    """Yield a temporary folder for a whole result; on success its content replaces the earlier result at once.
 
-    Whoever is killed inside it, or finds no room, leaves the earlier result as it was.
+    If the process is killed inside the block, or the disk is full, the earlier result stays as it was.
 
     Args:
-        images_path: folder of the photos. If it is one of those that are taken out of a video, the other one, of an
-            earlier result, goes with that.
+        folder: the result folder.
+        images_path: folder of the photos. If it is one of ``PHOTOS_NAMES``, the other one belongs to the earlier result
+            and is removed with it.
 
     Raises:
-        InputError: a file in the place of one of a result's is not this tool's own.
+        InputError: a file that the result would replace was not written by this tool.
     """
     with sole_writer(folder) as output:
         places = [output.path / name for name in RESULT_NAMES]
@@ -102,13 +108,23 @@ def write_models_and_tables(
     images_path: Path | None = None,
     georeference: Georeference | None = None,
 ) -> InputError | None:
-    """Write a result's models, its tables and the formats that were asked for into a new folder.
+    """Write the models, the tables and the export formats of a result into a new folder.
 
     Args:
-        database_path: where the database of the photos' features will be.
+        found: the result.
+        export: options that name the formats. Formats that this result cannot have (points or covariances without any)
+            are left out.
+        folder: to write into.
+        database_path: final place of the database with the features of the photos.
+        images_path: folder of the photos; None where it is not known.
+        georeference: of the result's frame; None without one.
 
     Returns:
-        What is to be said of formats that cannot be written, which spoil nothing else.
+        The error of a format that cannot be written, for a warning; None if all were written. Models and tables are
+        complete in either case.
+
+    Raises:
+        RangesfmError: something else failed, such as a full disk.
     """
     write_model(found.scaled, folder / "sparse_scaled" / "0")
     if found.refined is not None:
@@ -136,7 +152,7 @@ def write_models_and_tables(
     try:
         export_map(map_, folder, export.changed(formats=formats))
     except InputError as error:
-        if error.exit_status != BAD_INPUT:  # a full disk, of which the rest has no more
+        if error.exit_status != BAD_INPUT:  # a full disk, on which the rest of the result cannot be written either
             raise
         return error
     return None
@@ -144,11 +160,11 @@ def write_models_and_tables(
 
 @dataclass(frozen=True)
 class ResultFolder:
-    """A run's output folder, read back for comparison, export, report and joining.
+    """The output folder of a run, read back for comparison, export, report and joining.
 
     Attributes:
         path: of the folder.
-        summary: ``result.json``.
+        summary: content of ``result.json``.
         timestamps_s: time of each photo by name; None where the photos have no times.
     """
 
@@ -158,7 +174,7 @@ class ResultFolder:
 
     @property
     def anchor_positions_m(self) -> dict[str, Array]:
-        """(3,) position by anchor id, in the metric models' world; anchors without one are left out."""
+        """Return the positions (3,) of anchors by id, in the world of the metric models; unknown ones are left out."""
         return {
             anchor_id: np.array(anchor.position_m)
             for anchor_id, anchor in self.summary.anchors.items()
@@ -167,46 +183,46 @@ class ResultFolder:
 
     @property
     def images_path(self) -> Path | None:
-        """Folder of the run's photos; None if it had none, or had them outside of the folder around the result."""
+        """Return the folder of the run's photos; None without one, or if it is not in the folder around the result."""
         recorded = self.summary.settings.images.path
         return None if recorded is None else photos_beside(self.path, recorded)
 
     @property
     def anchors_path(self) -> Path | None:
-        """File of the run's anchors; None if it had none."""
+        """Return the file of the run's anchors; None if it had none."""
         recorded = self.summary.settings.anchors.path
         return None if recorded is None else path_in(self.path, recorded)
 
     def lever_arms_m(self, tag_ids: Sequence[str]) -> Array:
-        """(n, 3) antenna in the camera's frame of each tag of a list; of one the settings do not name, the common."""
+        """Return the lever arm of each tag, (n, 3) metres in the camera frame: its own, else the common one."""
         settings = self.summary.settings.tag
         arms = [settings.lever_arms_m.get(tag_id, settings.tag_in_cam_m) for tag_id in tag_ids]
         return np.array(arms, dtype=np.float64).reshape(-1, 3)
 
     def read(self, table: type[_Table]) -> _Table | None:
-        """One of TABLES; None if it is not there."""
+        """Read one of ``TABLES``; None if its file is not there."""
         return table.read(self.path)
 
     def read_reference(self) -> Reference | None:
-        """The reference at the photos, in the metric models' world; None if it is not there."""
+        """Read the reference positions of the photos, in the world of the metric models; None if there are none."""
         path = self.path / REFERENCE_NAME
         return read_reference(path) if path.is_file() else None
 
     def read_model(self, stage: str) -> pycolmap.Reconstruction | None:
-        """The model ``stage``/0 ("sparse", "sparse_scaled" or "sparse_metric"); None if it is not there."""
+        """Read the model ``stage``/0 ("sparse", "sparse_scaled" or "sparse_metric"); None if it is not there."""
         path = self.path / stage / "0"
         return read_model(path) if path.is_dir() else None
 
     def read_metric_model(self) -> pycolmap.Reconstruction | None:
-        """The best one: refined, else scaled; None if neither is there."""
+        """Read the refined model, else the scaled one; None if neither is there."""
         return self.read_model("sparse_metric") or self.read_model("sparse_scaled")
 
 
 def read_result_folder(path: Path) -> ResultFolder:
-    """Read what is small; models and other tables are read when asked for.
+    """Read the summary and the photo times of a result folder; models and other tables are read on demand.
 
     Raises:
-        InputError: the folder is missing, has no ``result.json``, or that is not what a run writes.
+        InputError: the folder is missing, has no ``result.json``, or that file was not written by a run.
     """
     result_path = path / ResultSummary.NAME
     if not result_path.is_file():

@@ -1,4 +1,4 @@
-"""MetricResult: all that the stages after the reconstruction found, in memory; what is written follows from it."""
+"""Everything that the stages after the reconstruction found, in memory; the files of a result are made from it."""
 
 from __future__ import annotations
 
@@ -28,11 +28,16 @@ from rangesfm.trust.linearized import RangesOnMap
 from rangesfm.trust.verdict import TrustVerdict
 
 USED = (RangeStatus.USED, RangeStatus.DOWN_WEIGHTED)
-"""Of ranges with a say in the final model, however small."""
+"""Statuses of ranges that are used in the final model, with full or reduced weight."""
 
 
 class Rivals(NamedTuple):
-    """Other offsets of the clocks: doubts in words, and the relative stddev of the scale by the choice among them."""
+    """Other likely time offsets between the clocks.
+
+    Attributes:
+        doubts: sentences for the user.
+        stddev: relative standard deviation of the scale that comes from the choice among them.
+    """
 
     doubts: tuple[str, ...]
     stddev: float
@@ -40,27 +45,28 @@ class Rivals(NamedTuple):
 
 @dataclass(frozen=True)
 class MetricResult:
-    """A scaled and perhaps refined map with its ranges.
+    """A scaled and perhaps refined map with its ranges. The log has n ranges.
 
     Attributes:
         trajectory: keyframes of the unscaled model.
-        time_offset: as estimated; None where it was given or is not needed.
-        time_offset_s: as used; None where the log names photos.
+        time_offset: estimate of the time offset; None where it was given or is not needed.
+        time_offset_s: time offset used, image time minus range time; None where the log names photos.
         estimate: of the scale.
         scaled: the model after rescaling.
-        predicted_scaled_m: (n,) ranges by that model; NaN without a place.
-        scaled_weights: (n,) robust weights by it.
-        refined: the model after refinement; None without.
-        refinement: its summary; None without.
-        why_broken: what the refined model cannot be; empty if nothing speaks against it. Where it is broken, the scaled
-            one is the result.
-        place: of the map in the site's frame; None where the frame is the first camera's, or nobody judged it yet.
-        models: that were to be joined to what is one model here; empty where there was only one.
-        trust: what the tests of mistakes say of the final map.
-        tape: the measured lengths, those that cannot belong to the map as left out; None: there are none.
-        rivals: of the clocks' offset; None: there are none.
-        on_map: the ranges on the scaled map; None where that is only the start of a refinement, or there are none.
-        refined_with_ranges: the refined map as ranges lie on it; None without.
+        predicted_scaled_m: (n,) ranges predicted by the scaled model; NaN for ranges without a place on the path.
+        scaled_weights: (n,) robust weights by the scaled model.
+        refined: the model after the refinement; None without one.
+        refinement: summary of the refinement; None without one.
+        why_broken: reasons why the refined model cannot be right; empty if there are none. If there are any, the scaled
+            model is the result.
+        place: how well the place of the map in the site frame is known; None where the frame is that of the first
+            camera, or where it has not been judged yet.
+        models: all models that were to be joined to this one; empty where there was only one.
+        trust: result of the tests of mistakes on the final map.
+        tape: the measured lengths, with those left out that cannot be in the map; None without any.
+        rivals: other likely time offsets; None without any.
+        on_map: the ranges on the scaled map; None where that map is only the start of a refinement, or without ranges.
+        refined_with_ranges: the refined map with the ranges on it; None without one.
     """
 
     trajectory: Trajectory
@@ -83,17 +89,17 @@ class MetricResult:
 
     @property
     def final(self) -> pycolmap.Reconstruction:
-        """The best metric model there is."""
+        """Return the refined model, or the scaled one where there is no refined one or it is broken."""
         return self.scaled if self.refined is None or self.why_broken else self.refined
 
     @property
     def kept_refinement(self) -> RefineSummary | None:
-        """That of the final model; None where it is the scaled one."""
+        """Return the summary of the refinement; None where the final model is the scaled one."""
         return None if self.why_broken else self.refinement
 
     @property
     def _stage(self) -> ScaleEstimate | RefineSummary:
-        """The one that the final model comes from."""
+        """Return what the final model comes from: the kept refinement, or the estimate of the scale."""
         return self.kept_refinement or self.estimate
 
     @property
@@ -102,32 +108,32 @@ class MetricResult:
 
     @property
     def observations(self) -> RangeObservations:
-        """With the final status of each range."""
+        """Return the ranges with their final status."""
         return self._stage.observations
 
     @property
     def predicted_m(self) -> Array:
-        """(n,) ranges by the final model."""
+        """Return the ranges predicted by the final model, (n,) metres."""
         return self.predicted_scaled_m if self.kept_refinement is None else self.kept_refinement.predicted_m
 
     @property
     def weights(self) -> Array:
-        """(n,) robust weights by the final model."""
+        """Return the robust weights of the ranges by the final model, (n,) in [0, 1]."""
         return self.scaled_weights if self.kept_refinement is None else self.kept_refinement.weights
 
     @property
     def range_stddev_m(self) -> Array:
-        """(n,) noise of each range as weighted last; NaN without a place."""
+        """Return the last noise stddev of each range, (n,) metres; NaN for ranges without a place on the path."""
         return self._stage.errors.stddev_m
 
     @property
     def residuals_m(self) -> Array:
-        """(n,) predicted minus measured, by the final model."""
+        """Return predicted minus measured ranges by the final model, (n,) metres."""
         return self.predicted_m - self.observations.log.range_m
 
     @property
     def center_covariance_m2(self) -> dict[str, Array]:
-        """(3, 3) of each keyframe's projection centre, by its photo; empty where it was not found."""
+        """Return the covariance (3, 3) of each keyframe's projection centre by photo; empty if it is not known."""
         found = None if self.kept_refinement is None else self.kept_refinement.covariance
         if found is None:
             return {}
@@ -136,12 +142,12 @@ class MetricResult:
 
     @cached_property
     def diagnostics(self) -> ScaleDiagnostics:
-        """How the scale came about."""
+        """Return the scale candidates of the ranges and how many ranges agree with each scale."""
         return scale_diagnostics(self.estimate, self.trajectory)
 
     @property
     def refined_scale(self) -> float | None:
-        """Metres per SfM unit after refinement, by where most keyframe centres went."""
+        """Return metres per SfM unit after the refinement, from how most keyframe centres moved; None without one."""
         if self.refined is None:
             return None
         if self.refined_with_ranges is not None:
@@ -151,7 +157,7 @@ class MetricResult:
         ).scale
 
     def moved(self, offset_m: Array) -> MetricResult:
-        """The same in a world whose coordinates are larger by ``offset_m`` (3,)."""
+        """Return the same result in a world whose coordinates are larger by ``offset_m`` (3,)."""
         if not offset_m.any():
             return self
         shift = Similarity(1.0, np.eye(3), offset_m)
@@ -172,7 +178,7 @@ class MetricResult:
         )
 
     def doubted(self, reasons: Sequence[str], advice: Sequence[str] = ()) -> MetricResult:
-        """The same with further reasons to doubt it, if there are any, and what to do about them."""
+        """Return the result as doubtful for further reasons, with advice on them; unchanged if there are no reasons."""
         if not reasons:
             return self
         estimate = self.estimate

@@ -1,4 +1,4 @@
-"""The path of a model in a result folder, by the times that the run left beside it."""
+"""The path of a model in a result folder, with the photo times that the run wrote beside it."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from rangesfm.result.tables import PhotoTimes
 
 
 def path_of_model(model: pycolmap.Reconstruction, result: ResultFolder) -> Trajectory:
-    """Return the path of one of a result's models.
+    """Return the camera's path in a model of a result.
 
     Raises:
-        InputError: the result has times of photos, and none is of a photo of the model.
+        InputError: the result has photo times, but none for a photo of the model.
     """
     path = trajectory_from_reconstruction(model, result.timestamps_s)
     if not len(path) and model.num_reg_images():

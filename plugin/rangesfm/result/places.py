@@ -1,7 +1,7 @@
-"""Where a result says that its inputs are, and where they are looked for when it is read again.
+"""Paths of the inputs, as a result records them and as they are found when it is read again.
 
-A result is handed on, with its report: paths in it say no more of the machine that made it than is needed. And it may
-come from a stranger: it does not say where this machine's photos are looked for.
+Results are given to others. So the recorded paths say no more than needed about the machine that made a result, and a
+result of a stranger must not decide which photos of the reader's machine go into a page.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from rangesfm.survey.settings import KEYS, Survey
 def recorded_path(path: Path, folder: Path) -> str:
     """Return a path as a result in ``folder`` records it.
 
-    That is relative to the folder, with slashes, as long as both are in some folder below the file system's root; else
-    the whole path.
+    It is relative to the folder, with slashes, if both are in a common folder below the root of the file system;
+    otherwise it is the absolute path.
     """
     here, there = os.path.abspath(folder), os.path.abspath(path)
     try:
         common = os.path.commonpath([here, there])
-    except ValueError:  # on two drives of Windows
+    except ValueError:  # they are on different drives of Windows
         return there
     return there if common == os.path.dirname(common) else Path(os.path.relpath(there, here)).as_posix()
 
 
 def path_in(folder: Path, recorded: str) -> Path:
-    """Return the path that a result in ``folder`` records; earlier versions recorded whole paths."""
+    """Return the absolute path for a recorded path of a result in ``folder``; old results recorded absolute paths."""
     return Path(os.path.abspath(folder / path_of(recorded)))
 
 
 def recorded_settings(survey: Survey) -> dict[str, Any]:
-    """Return a survey's tables and keys as its result records them."""
+    """Return the tables and keys of a survey, with paths as its result records them."""
     tables = survey.to_dict()
     for key in KEYS:
         if key.role is not None and tables[key.table][key.name] is not None:
@@ -43,15 +43,16 @@ def recorded_settings(survey: Survey) -> dict[str, Any]:
 
 
 def recorded_inputs(entries: list[dict[str, Any]], survey: Survey) -> list[dict[str, Any]]:
-    """Return the entries of ``input_hashes`` as a survey's result records them."""
+    """Return the entries of ``input_hashes``, with paths as the result of the survey records them."""
     return [{**entry, "path": recorded_path(path_of(entry["path"]), survey.output.path)} for entry in entries]
 
 
 def photos_beside(folder: Path, recorded: str) -> Path | None:
-    """Return the folder of photos that a result records, if it is in the result's folder or in the one around that.
+    """Return the recorded folder of photos if it is in the result folder or in the folder around it, else None.
 
-    Elsewhere it is None: a stranger's result could name a folder of the reader's, whose photos would be in the page
-    that the reader hands on. Nor does the home folder, or the root of the file system, count as a survey's own.
+    A result of a stranger could name any folder of the reader, whose photos would then be in a page that the reader
+    gives to others. For the same reason, the folder around the result does not count if it is the home folder or the
+    root of the file system.
     """
     path, around = path_in(folder, recorded), folder.resolve().parent
     own = folder if around in (Path(around.anchor), _home()) else around
@@ -59,17 +60,17 @@ def photos_beside(folder: Path, recorded: str) -> Path | None:
 
 
 def is_within(path: Path, folder: Path) -> bool:
-    """Whether a path leads into a folder, whatever links there are on the way."""
+    """Return whether a path leads into a folder after all links are followed."""
     try:
         end = path.resolve()
-        # Before Python 3.13 links in a circle are an error; from then on what is left of them is still a link.
+        # Links in a circle raise an error before Python 3.13; from then on the resolved path is still a link.
         return not end.is_symlink() and end.is_relative_to(folder.resolve())
-    except (OSError, RuntimeError, ValueError):  # or no name that a file can have
+    except (OSError, RuntimeError, ValueError):  # ValueError: no file can have this name
         return False
 
 
 def _home() -> Path | None:
     try:
         return Path.home().resolve()
-    except RuntimeError:  # this user has none
+    except RuntimeError:  # this user has no home folder
         return None

@@ -1,8 +1,8 @@
-"""``result.json``, and what it says in words.
+"""The content of ``result.json``, and its summary in words for the end of a run.
 
     python -m rangesfm.result.summary > examples/result.schema.json
 
-prints its JSON schema.
+writes its JSON schema.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from rangesfm.result import entries
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.scale.estimate import ScaleSensitivity
 
-# Percents of the scale for a centimetre that the summary mentions.
+# Change of the scale, in percent per centimetre of an error, above which the summary mentions it.
 _NOTABLE_PERCENT = 0.5
 
 
 class ResultSummary(Record):
-    """``result.json``: what a run found, what it was made from and how it was made.
+    """Content of ``result.json``: what a run found, from which inputs, and how.
 
     Attributes:
-        metric_from_sfm: world of ``sparse/0`` to world of ``sparse_scaled/0``.
-        frame: the world of the metric models.
+        place: null where the frame is that of the first camera.
+        metric_from_sfm: similarity from the world of ``sparse/0`` to the world of ``sparse_scaled/0``.
+        frame: of the metric models.
         anchors: by id.
-        place: null where the frame is the first camera's.
         refine: null without a refinement.
-        models: that were to be joined to what is one model here; empty where there was only one.
-        tests: of mistakes that may have been made, those that were found first.
-        distances: that were taped, or are known between a rig's cameras.
-        comparison: only there where a reference was given.
-        georeference: null if the anchors did not say.
+        models: all models that were to be joined to this one; empty where there was only one.
+        tests: of mistakes that may have been made; those that were found come first.
+        distances: lengths that were taped, or are known between cameras of a rig.
+        comparison: empty without a reference.
+        georeference: null if the anchors do not give one.
         versions: of the software, by name.
-        seconds: by stage, and in all ("total").
+        seconds: by stage, and in total ("total").
     """
 
     NAME: ClassVar = "result.json"
@@ -66,12 +66,17 @@ class ResultSummary(Record):
 
     @property
     def has_ranges(self) -> bool:
-        """Whether a radio took part; else the scale is that of measured lengths alone."""
+        """Return whether ranges were used; otherwise the scale comes from measured lengths alone."""
         return self.scale.method != "lengths"
 
     @classmethod
     def of(cls, found: MetricResult, **others: Any) -> ResultSummary:
-        """Of what the stages found, and of ``others``: entries from ``distances`` on, which do not follow from that."""
+        """Return the summary of a result.
+
+        Args:
+            found: what the stages found.
+            others: entries that do not follow from it, from ``distances`` on.
+        """
         estimate = found.estimate
         return cls(
             scale=entries.ScaleEntry.model_validate(estimate),
@@ -90,14 +95,19 @@ class ResultSummary(Record):
         )
 
     def lines(self, folder: Path, table: str | None) -> Iterator[str]:
-        """What a user wants to know at the end of a run, with the comparison's table, if there is one."""
+        """Yield the lines that the user sees at the end of a run.
+
+        Args:
+            folder: of the result.
+            table: of the comparison with a reference, as text; None without one.
+        """
         scale, ranges, offset = self.scale, self.ranges, self.time_offset
         low, high = scale.interval_95 or (None, None)
         interval = f"{_text(low, '.6g')} to {_text(high, '.6g')}"
         yield f"scale: {scale.value:.6g} m per SfM unit, 95 % interval {interval}"
         yield f"verdict: {scale.verdict}: {'; '.join(scale.reasons)}"
         if self.place is not None:
-            # What speaks against both has just been said.
+            # Reasons that hold for both verdicts were given with that on the scale.
             reasons = [reason for reason in self.place.reasons if reason not in scale.reasons]
             yield f"place: {self.place.verdict}{': ' if reasons else ''}{'; '.join(reasons)}"
         for advice in scale.advice:
@@ -111,8 +121,8 @@ class ResultSummary(Record):
             yield f"ranges: {ranges.num_used} of {ranges.num} used{residuals}"
         if self.distances:
             held = [abs(row.residual_m) for row in self.distances if row.kind == CONTROL and row.residual_m is not None]
-            worst = f", the map differs from them by {max(held):.3f} m at most" if held else ""
-            yield f"measured lengths: {len(held)} of {len(self.distances)} held the scale{worst}"
+            worst = f"; the map differs from these by {max(held):.3f} m at most" if held else ""
+            yield f"measured lengths: {len(held)} of {len(self.distances)} used for the scale{worst}"
         if offset.estimated:
             value, stddev = _text(offset.value_s, "+.3f"), _text(offset.stddev_s, ".3f")
             yield f"time offset: image time = range time {value} s, +- {stddev} s"
@@ -124,15 +134,15 @@ class ResultSummary(Record):
 
 
 def _refined(refine: entries.RefineEntry) -> str:
-    """What the refinement did; that photos bend a map is nobody's mistake."""
+    """Return the line that says what the refinement did."""
     if not refine.kept:
         return "the refinement broke the map: the result is the scaled map"
-    bent_back = f"; the photos alone had bent the map by {refine.bend_m:.2g} m (rms), back by the ranges"
+    bent_back = f"; the ranges took a bend of {refine.bend_m:.2g} m (rms) out of the map"
     return f"refined after {refine.iterations} iterations{bent_back if refine.bend_m else ''}"
 
 
 def _notable(sensitivity: ScaleSensitivity) -> Iterator[str]:
-    """What to measure to the centimetre: where one is worth much of the scale."""
+    """Yield a line that names the errors of which one centimetre changes the scale much, if there are any."""
     values = {
         "of bias in short ranges": sensitivity.short_range_per_cm,
         "of bias in all ranges": sensitivity.common_bias_per_cm,
@@ -148,7 +158,7 @@ def _text(value: float | None, spec: str) -> str:
 
 
 def schema() -> str:
-    """JSON schema of ``result.json``."""
+    """Return the JSON schema of ``result.json``."""
     return json.dumps(ResultSummary.model_json_schema(mode="serialization"), indent=1) + "\n"
 
 

@@ -1,4 +1,4 @@
-"""The tables of the result folder: CSV files, each a class whose fields are the columns."""
+"""Tables of the result folder: CSV files, each described by a class whose fields are the columns."""
 
 from __future__ import annotations
 
@@ -23,10 +23,12 @@ USED_LABELS = [status.label for status in USED]
 
 
 class Column(NamedTuple):
-    """How a column is written, and whether its cells may be empty (of numbers: NaN).
+    """Format of a column.
 
     Attributes:
-        format_spec: as ".6g"; of text "s"; empty: so that the numbers are read as they were.
+        format_spec: format of the cells, such as ".6g", or "s" for text. Empty: as many digits as needed to read back
+            the same numbers.
+        may_be_empty: whether cells may be empty; an empty cell is read as NaN or an empty text.
     """
 
     format_spec: str
@@ -44,23 +46,23 @@ _Covariance = Annotated[Array, Column(".9g")]
 
 @dataclass(frozen=True)
 class TableFile(ABC):
-    """n rows; each field is a column (``Texts``, ``Numbers``, ...), in the order and by the names of the file."""
+    """A table with n rows. Each field is a column (``Texts``, ``Numbers``, ...), with its name and in its order."""
 
     NAME: ClassVar[str]
 
     @classmethod
     @abstractmethod
     def of(cls: type[_Kind], found: MetricResult) -> _Kind | None:
-        """What a run found, for this file; None: the run does not leave it."""
+        """Return the table of what a run found; None where the run does not write this file."""
 
     @classmethod
     def columns(cls) -> dict[str, Column]:
-        """By name, in their order."""
+        """Return the columns by name, in their order."""
         hints = get_type_hints(cls, include_extras=True)
         return {field.name: hints[field.name].__metadata__[0] for field in fields(cls)}
 
     def write(self, folder: Path) -> None:
-        """Write the file into a folder, whole or not at all."""
+        """Write the file into a folder. If that fails, no part of the file is left."""
         columns = self.columns()
         cells = [_cells(getattr(self, name), column.format_spec) for name, column in columns.items()]
         write_table(folder / self.NAME, list(columns), zip(*cells, strict=True))
@@ -70,7 +72,7 @@ class TableFile(ABC):
         """Read the file of a folder; None if it is not there.
 
         Raises:
-            InputError: it is not what a run writes; with the line.
+            InputError: the file was not written by a run; the text names the line.
         """
         path, columns = folder / cls.NAME, cls.columns()
         if not path.is_file():
@@ -94,20 +96,23 @@ def _values(table: Table, name: str, column: Column) -> Any:
 
 @dataclass(frozen=True)
 class RangesAsUsed(TableFile):
-    """n ranges, in the order of the log; a peer of its kind stands in a range's other column.
+    """Content of ``ranges.csv``: all n ranges of the log, in its order.
+
+    A range between two anchors or two tags has one id in the column of anchors and the other in that of tags. "Place"
+    means the place on the camera's path.
 
     Attributes:
-        timestamp_s: (n,) on the radio's clock, NaN where the log gives photos instead.
-        image_name: n names, empty where the log gives times.
+        timestamp_s: (n,) on the radio's clock; NaN where the log names photos instead.
+        image_name: n names; empty where the log has times.
         anchor_id, tag_id: n ids.
-        range_m: (n,) measured.
-        range_stddev_m: (n,) noise as weighted last; NaN without a place.
+        range_m: (n,) measured ranges.
+        range_stddev_m: (n,) last noise stddev of each range; NaN without a place.
         keyframe_before, keyframe_after: n photos between which each range was taken; empty without a place.
-        weight: (n,) of the later one, in [0, 1]; NaN without a place.
-        predicted_scaled_m, predicted_refined_m: (n,) with the scaled and with the refined model; NaN where not
-            applicable.
-        residual_m: (n,) predicted with the final model minus measured.
-        robust_weight: (n,) in [0, 1] by that residual; NaN for ranges that have no say.
+        weight: (n,) interpolation weight of ``keyframe_after``, in [0, 1]; NaN without a place.
+        predicted_scaled_m, predicted_refined_m: (n,) ranges predicted by the scaled and by the refined model; NaN
+            without a place or without that model.
+        residual_m: (n,) range predicted by the final model, minus measured range.
+        robust_weight: (n,) weight by that residual, in [0, 1]; NaN for ranges that the estimate does not consider.
         status: n labels of RangeStatus.
     """
 
@@ -155,7 +160,15 @@ class RangesAsUsed(TableFile):
         )
 
     def places_on(self, image_names: Sequence[str]) -> tuple[Indices, Indices, Mask]:
-        """(n,) which of a path's keyframes are before and after each range, -1 for none; and whether it has a place."""
+        """Return where each range is on a path.
+
+        Args:
+            image_names: of the keyframes of the path.
+
+        Returns:
+            (n,) number of the keyframe before each range, -1 for none; (n,) the same after it; (n,) whether the range
+            has a place on the path.
+        """
         index_of = {name: i for i, name in enumerate(image_names)}
         before, after = (
             np.array([index_of.get(name, -1) for name in names], dtype=np.int64)
@@ -165,20 +178,20 @@ class RangesAsUsed(TableFile):
 
     @property
     def residuals_by_model_m(self) -> dict[str, Array]:
-        """(n,) predicted minus measured, with the "scaled" model and, if there is one, with the "refined"."""
+        """Return predicted minus measured ranges, (n,) metres, by model: "scaled" and, if there is one, "refined"."""
         refined = self.predicted_refined_m - self.range_m
         both = {"scaled": self.predicted_scaled_m - self.range_m, "refined": refined}
         return both if np.isfinite(refined).any() else {"scaled": both["scaled"]}
 
     @property
     def is_used(self) -> Mask:
-        """(n,) ranges with a say in the final model, however small."""
+        """Return the mask (n,) of ranges that are used in the final model, with full or reduced weight."""
         return np.isin(np.array(self.status, dtype=str), USED_LABELS)
 
 
 @dataclass(frozen=True)
 class PhotoTimes(TableFile):
-    """``images.csv``: when each photo was taken, on the camera's clock; none where the photos have no times."""
+    """Content of ``images.csv``: time of each photo on the camera's clock. There is none for photos without times."""
 
     NAME: ClassVar = "images.csv"
     image_name: Texts
@@ -196,7 +209,7 @@ class PhotoTimes(TableFile):
 
 @dataclass(frozen=True)
 class CenterCovariances(TableFile):
-    """``pose_covariance.csv``: covariance of each keyframe's projection centre, m^2, in the result's frame."""
+    """Content of ``pose_covariance.csv``: covariance of each keyframe's projection centre, m^2, in the final frame."""
 
     NAME: ClassVar = "pose_covariance.csv"
     image_name: Texts
@@ -217,7 +230,7 @@ class CenterCovariances(TableFile):
 
     @property
     def by_photo_m2(self) -> dict[str, Array]:
-        """(3, 3) by the name of the photo."""
+        """Return the covariances (3, 3) by name of the photo."""
         xx, xy, xz = self.cov_xx_m2, self.cov_xy_m2, self.cov_xz_m2
         yy, yz, zz = self.cov_yy_m2, self.cov_yz_m2, self.cov_zz_m2
         matrices = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).transpose(2, 0, 1)
@@ -226,7 +239,7 @@ class CenterCovariances(TableFile):
 
 @dataclass(frozen=True)
 class TagCorners(TableFile):
-    """``markers.csv``: where corners of printed tags were found in photos, in pixels; to be a survey's markers."""
+    """Content of ``markers.csv``: pixels at which corners of printed tags were found; it can be a survey's markers."""
 
     NAME: ClassVar = "markers.csv"
     marker: Texts
@@ -247,7 +260,7 @@ class TagCorners(TableFile):
 
 @dataclass(frozen=True)
 class ScaleCandidates(TableFile):
-    """``scale_candidates.csv``: the paper's two candidates of each range that has them, metres per SfM unit."""
+    """Content of ``scale_candidates.csv``: the paper's two candidates of each range, metres per SfM unit."""
 
     NAME: ClassVar = "scale_candidates.csv"
     timestamp_s: NumbersOrEmpty
@@ -267,7 +280,7 @@ class ScaleCandidates(TableFile):
 
 @dataclass(frozen=True)
 class ScaleConsensus(TableFile):
-    """``scale_consensus.csv``: how many ranges agree with each scale, metres per SfM unit."""
+    """Content of ``scale_consensus.csv``: number of ranges that agree with each scale, metres per SfM unit."""
 
     NAME: ClassVar = "scale_consensus.csv"
     scale: Rounded
@@ -282,7 +295,7 @@ class ScaleConsensus(TableFile):
 
 @dataclass(frozen=True)
 class TimeOffsetCurve(TableFile):
-    """``time_offset_curve.csv``: what offsets of the clocks cost, metres, where one was searched for (CostCurve)."""
+    """Content of ``time_offset_curve.csv``: cost in metres of each time offset that was tried; see CostCurve."""
 
     NAME: ClassVar = "time_offset_curve.csv"
     time_offset_s: Numbers
