@@ -140,8 +140,8 @@ def refusal(own_survey: WalkedSurvey, monkeypatch: pytest.MonkeyPatch, capfd: py
             set_line("anchors.csv", 3, "A2,1,,3"),
             r"/anchors.csv:3: y_m is empty, expected all three coordinates or none",
         ),
-        (set_line("anchors.csv", 3, "A1,1,2,3"), r"/anchors.csv:3: anchor A1 stands in line 2 already"),
-        (set_line("images.csv", 4, "frame_00001.jpg,7"), r"/images.csv:4: frame_00001.jpg stands in line 2 already"),
+        (set_line("anchors.csv", 3, "A1,1,2,3"), r"/anchors.csv:3: anchor A1 is in line 2 already"),
+        (set_line("images.csv", 4, "frame_00001.jpg,7"), r"/images.csv:4: frame_00001.jpg is in line 2 already"),
         (set_line("images.csv", 4, "frame_00003.jpg,x"), r"/images.csv:4: timestamp_s is 'x', expected seconds"),
         (
             write("images.csv", "image_name,timestamp_s\nother.jpg,1\n"),
@@ -367,9 +367,9 @@ class TestPhotos:
     @pytest.mark.parametrize(
         ("line", "text", "said"),
         [
-            (3, "0.png,111", r"/photos.csv:3: 0.png stands in line 2 already, expected one row per photo"),
+            (3, "0.png,111", r"/photos.csv:3: 0.png is in line 2 already, expected one row per photo"),
             (3, "1.jpg,111", r"/photos.csv:3: image_name is '1.jpg', expected the name of a photo in the folder"),
-            (3, "1.png,110", r"/photos.csv:3: 1.png has the time of 0.png in line 2, expected another"),
+            (3, "1.png,110", r"/photos.csv:3: 1.png has the same time as 0.png in line 2, expected another"),
         ],
     )
     def test_whose_times_are_wrong(

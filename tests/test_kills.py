@@ -65,7 +65,7 @@ def test_killed_in_step_after_step_it_ends_as_if_nothing_had_been(
     for moment in (IN_MATCHING, IN_MAPPING, BEFORE_THE_RESULT):
         said.append(killed(moment, *flags, cwd=folder))
         assert not (output / "result.json").exists()
-    assert "mapping: goes on from " in said[2]
+    assert "mapping: continues from " in said[2]
     said.append(rangesfm_command("run", *flags, cwd=folder).stderr)
     for step, first_without in (("features", 1), ("matching", 2), ("mapping", 3)):
         is_done = [f"{step}: taken over from an earlier run" in text for text in said]

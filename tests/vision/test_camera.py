@@ -83,7 +83,7 @@ def test_of_several_tables_each_is_of_the_photos_in_its_folder_or_of_its_pattern
     ("pattern", "message"),
     [
         ("*1.jpg", r"\[\[camera\]\] images 'a' and '\*1.jpg' both match the photo a/1.jpg, expected one"),
-        ("c/", r"\[\[camera\]\] images is 'c/', expected some photo's name, as a/0.jpg"),
+        ("c/", r"\[\[camera\]\] images is 'c/', expected a pattern that fits some photo's name, such as a/0.jpg"),
     ],
 )
 def test_a_photo_of_two_tables_or_a_table_of_no_photo_is_one_line(photos: Photos, pattern: str, message: str) -> None:
@@ -126,7 +126,7 @@ def test_photos_of_other_sizes_and_turned_ones_take_their_place_on_the_path(
     (model,) = summary.models
     assert len(model.cameras) == 3
     assert listener.messages == [
-        f"the camera's parameters are of photos of another shape than {room.names[4]}: COLMAP guesses its camera"
+        f"the camera's parameters belong to photos of another shape than {room.names[4]}: COLMAP guesses its camera"
         " (1 of 3 cameras)"
     ]
     image_of = {image.name: image for image in model.images.values()}

@@ -52,7 +52,7 @@ def test_a_gpu_is_used_where_there_is_one_and_it_is_wanted(
 
 
 @pytest.mark.parametrize(
-    ("num", "why"), [(0, "pycolmap finds no GPU"), (None, "built without CUDA, pycolmap-cuda12 with it")]
+    ("num", "why"), [(0, "pycolmap finds no GPU"), (None, "built without CUDA; install pycolmap-cuda12")]
 )
 def test_a_gpu_that_is_asked_for_and_not_there_is_refused_before_anything_is_computed(
     num: int | None, why: str, monkeypatch: pytest.MonkeyPatch

@@ -59,7 +59,7 @@ def test_its_features_matches_and_cameras_are_used_and_it_stays_as_it_is(
         tuple(room.camera.params or ())[1:]
     ]
     assert sha256_of(given) == before
-    assert listener.messages == ["of given.db are taken features of 6 photos and matches of 15 pairs"]
+    assert listener.messages == ["features of 6 photos and matches of 15 pairs are taken from given.db"]
     reconstructed(room, given, listener)
     assert [text for text in listener.messages if "earlier run" in text] == [
         f"{step}: taken over from an earlier run" for step in ("features", "matching", "mapping")
@@ -86,7 +86,7 @@ def test_of_hloc_without_descriptors_and_two_view_geometries_the_matches_are_ver
     assert reconstructed(room, given, listener).num_registered == len(room.names)
     with pycolmap.Database.open(given) as database:
         database.clear_matches()
-    with pytest.raises(InputError, match=r"given.db: has neither matches nor a descriptor of photo000.png"):
+    with pytest.raises(InputError, match=r"given.db: has neither matches nor descriptors to match photo000.png by"):
         reconstructed(room, given, listener)
 
 
@@ -98,8 +98,8 @@ def test_photos_that_only_one_side_has_are_told_in_one_line(room: Room, given: P
     summary = reconstructed(room, given, listener)
     assert summary.num_registered == len(room.names) - 1
     assert listener.messages == [
-        "of given.db are taken features of 5 photos and matches of 10 pairs; 1 photos are not in it and are left out,"
-        " the first is photo002.png; 1 of its photos are no keyframes, the first is elsewhere/photo.png"
+        "features of 5 photos and matches of 10 pairs are taken from given.db; 1 photos are not in it and are left out,"
+        " the first is photo002.png; 1 of its photos are not keyframes, the first is elsewhere/photo.png"
     ]
 
 
@@ -108,14 +108,14 @@ def test_one_that_is_none_or_of_other_photos_is_refused(room: Room, given: Path,
         camera = database.read_camera(1)
         camera.width = 300
         database.update_camera(camera)
-    with pytest.raises(InputError, match=r"photo000.png is of 300 x 192 pixels there, expected 256 x 192 as its file"):
+    with pytest.raises(InputError, match=r"photo000.png has 300 x 192 pixels here, expected 256 x 192 like its file"):
         reconstructed(room, given, listener)
     with pycolmap.Database.open(given) as database:
         database.clear_keypoints()
     with pytest.raises(InputError, match=r"given.db: has features of 0 of 6 photos, expected at least 2"):
         reconstructed(room, given, listener)
     given.write_text("no database")
-    with pytest.raises(InputError, match=r"given.db: is no database of COLMAP's"):
+    with pytest.raises(InputError, match=r"given.db: is not a database of COLMAP's"):
         reconstructed(room, given, listener)
 
 
@@ -127,17 +127,26 @@ def _not_a_number(rows: sqlite3.Connection) -> None:
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
-        ("UPDATE keypoints SET data = substr(data, 1, 40) WHERE image_id = 1", "a row is not .* and 40 differ"),
-        ("UPDATE descriptors SET data = substr(data, 1, 40) WHERE image_id = 1", "a row is not .* and 40 differ"),
-        ("UPDATE matches SET data = substr(data, 1, 8)", "a row is not as COLMAP writes it"),
-        ("UPDATE two_view_geometries SET F = substr(F, 1, 8) WHERE rows > 0", "a row is not as COLMAP writes it"),
-        ("UPDATE keypoints SET cols = 1000000 WHERE image_id = 1", "a row is not as COLMAP writes it"),
-        ("UPDATE keypoints SET rows = -5 WHERE image_id = 1", "a row is not as COLMAP writes it"),
-        ("UPDATE descriptors SET rows = rows - 1, data = substr(data, 129)", "not as many descriptors as features"),
-        (_not_a_number, "a feature of photo000.png has no finite place"),
-        ("UPDATE matches SET rows = 1, data = x'FFFF0000FFFF0000'", "match in features that are not there"),
-        ("UPDATE cameras SET model = 77", "a row is not as COLMAP writes it"),
-        ("UPDATE cameras SET params = x''", "a row is not as COLMAP writes it"),
+        (
+            "UPDATE keypoints SET data = substr(data, 1, 40) WHERE image_id = 1",
+            "COLMAP cannot read a row .* and 40 differ",
+        ),
+        (
+            "UPDATE descriptors SET data = substr(data, 1, 40) WHERE image_id = 1",
+            "COLMAP cannot read a row .* and 40 differ",
+        ),
+        ("UPDATE matches SET data = substr(data, 1, 8)", "COLMAP cannot read a row of it"),
+        ("UPDATE two_view_geometries SET F = substr(F, 1, 8) WHERE rows > 0", "COLMAP cannot read a row of it"),
+        ("UPDATE keypoints SET cols = 1000000 WHERE image_id = 1", "COLMAP cannot read a row of it"),
+        ("UPDATE keypoints SET rows = -5 WHERE image_id = 1", "COLMAP cannot read a row of it"),
+        (
+            "UPDATE descriptors SET rows = rows - 1, data = substr(data, 129)",
+            "another number of descriptors than of features",
+        ),
+        (_not_a_number, "a feature of photo000.png has no finite position"),
+        ("UPDATE matches SET rows = 1, data = x'FFFF0000FFFF0000'", "a match of .* is of a feature that is not there"),
+        ("UPDATE cameras SET model = 77", "COLMAP cannot read a row of it"),
+        ("UPDATE cameras SET params = x''", "COLMAP cannot read a row of it"),
         ("UPDATE cameras SET width = 0", "the camera of photo000.png has impossible parameters"),
     ],
 )
@@ -154,5 +163,5 @@ def test_a_damaged_row_is_one_line(
 @pytest.mark.parametrize("num_bytes", [0, 100, 5000, 40_000])
 def test_a_database_that_is_cut_off_is_one_line(num_bytes: int, room: Room, given: Path, listener: Listener) -> None:
     given.write_bytes(given.read_bytes()[:num_bytes])
-    with pytest.raises(InputError, match=r"given\.db: (is no database of COLMAP's|has features of 0 of 6 photos)"):
+    with pytest.raises(InputError, match=r"given\.db: (is not a database of COLMAP's|has features of 0 of 6 photos)"):
         reconstructed(room, given, listener)

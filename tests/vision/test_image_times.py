@@ -108,8 +108,11 @@ class TestCsv:
             ("image_name,timestamp_s\na.jpg,\n", "images.csv:2: timestamp_s is empty, expected seconds"),
             ("image_name,timestamp_s\n,1\n", "images.csv:2: image_name is empty"),
             ("image_name,timestamp_s\na.jpg,1.4e18\n", "images.csv:2: timestamp_s is 1.4e18, expected seconds"),
-            ("image_name,timestamp_s\na.jpg,1\na.jpg,2\n", "images.csv:3: a.jpg stands in line 2 already"),
-            ("image_name,timestamp_s\na.jpg,1\nb.jpg,1.0\n", "images.csv:3: b.jpg has the time of a.jpg in line 2"),
+            ("image_name,timestamp_s\na.jpg,1\na.jpg,2\n", "images.csv:3: a.jpg is in line 2 already"),
+            (
+                "image_name,timestamp_s\na.jpg,1\nb.jpg,1.0\n",
+                "images.csv:3: b.jpg has the same time as a.jpg in line 2",
+            ),
         ],
     )
     def test_names_the_line_of_what_is_wrong(self, tmp_path: Path, text: str, message: str) -> None:
@@ -126,7 +129,7 @@ class TestCsv:
         path = write_csv(tmp_path, "image_name,timestamp_s\na.jpg,1.5\nz.jpg,2.5\nb.jpg,3.5\n")
         times = read_image_times_csv(path, ["a.jpg", "b.jpg"])
         assert (times.image_names, times.timestamps_s.tolist()) == (("a.jpg", "b.jpg"), [1.5, 3.5])
-        assert times.notes == ("1 of the 3 names in images.csv are of no photo in the folder",)
+        assert times.notes == ("1 of the 3 names in images.csv belong to no photo in the folder",)
 
 
 class TestExif:

@@ -53,7 +53,7 @@ def test_all_conditions_hold_together() -> None:
         ({"min_interval_s": -1.0}, "min_interval_s is -1.0, expected a number of seconds from 0 to"),
         ({"min_interval_s": math.nan}, "min_interval_s is nan"),
         ({"max_num_keyframes": 2}, "max_num_keyframes is 2, expected a whole number from 3 to"),
-        ({"every_nth": 5}, "2 of 10 photos chosen as keyframes, expected at least 3"),
+        ({"every_nth": 5}, "2 of 10 photos are chosen as keyframes, expected at least 3"),
     ],
 )
 def test_refuses_options_that_leave_nothing_to_reconstruct(options: dict[str, float], message: str) -> None:

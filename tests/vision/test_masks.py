@@ -61,18 +61,18 @@ def test_no_feature_is_where_a_mask_is_black_and_other_masks_give_others(room: R
 def test_a_missing_mask_or_one_of_another_size_is_one_line(room: Room, masks: Path) -> None:
     first, second = (masks / f"{name}.png" for name in room.names[:NUM_PHOTOS])
     Image.new("L", (128, 96)).save(first)
-    with pytest.raises(InputError, match=r"photo000.png.png: is of 128 x 96 pixels, expected 256 x 192 as the photo"):
+    with pytest.raises(InputError, match=r"photo000.png.png: has 128 x 96 pixels, expected 256 x 192 like the photo"):
         leftmost_features(room, masks)
     first.write_text("no image")
     with pytest.raises(InputError, match=r"photo000.png.png: cannot be read as an image, expected 256 x 192"):
         leftmost_features(room, masks)
     second.unlink()
     with pytest.raises(
-        InputError, match=r"1 of 2 photos have no mask there, .* photo001.png: expected photo001.png.png"
+        InputError, match=r"1 of 2 photos have no mask in this folder, .* photo001.png: expected photo001.png.png"
     ):
         leftmost_features(room, masks)
     shutil.rmtree(masks)
-    with pytest.raises(InputError, match=r"masks: no such folder, expected one of masks"):
+    with pytest.raises(InputError, match=r"masks: no such folder, expected a folder of masks"):
         leftmost_features(room, masks)
     assert not masks.with_name("out").exists()
 

@@ -120,7 +120,7 @@ class TestCamera:
         [
             (
                 CameraOptions(model="PINHOL", params=(1.0,)),
-                "model is 'PINHOL', expected one of COLMAP's, the nearest is 'PINHOLE'",
+                "model is 'PINHOL', expected a COLMAP camera model; the nearest is 'PINHOLE'",
             ),
             (
                 CameraOptions(model="PINHOLE", params=(300.0, 160.0, 120.0)),

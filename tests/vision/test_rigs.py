@@ -111,7 +111,7 @@ def test_rigs_of_a_given_database_are_told_to_have_no_say(simulated: Simulated, 
             read_rigs(simulated.config(tmp_path / "rig_config.json", known)).apply(path)
         with opened(path, photos, tmp_path) as given:
             assert given is not None
-            assert ("its rigs are not: what [images] rig_config says of them counts" in given.note) == bool(known)
+            assert ("its rigs are ignored: rigs are taken from [images] rig_config" in given.note) == bool(known)
 
 
 @pytest.mark.parametrize(
@@ -179,7 +179,7 @@ def test_photos_of_one_frame_share_the_time_of_the_first_of_them_that_has_one(
     assert times.image_names == ("other.png", *NAMES[::NUM_CAMERAS])
     assert times.timestamps_s.tolist() == [-1, *range(NUM_FRAMES)]
     (tmp_path / "times.csv").write_text(f"image_name,timestamp_s\n{NAMES[0]},1\n{NAMES[1]},1\nother.png,1\n")
-    with pytest.raises(InputError, match=rf"4: other.png has the time of {NAMES[0]} in line 2"):
+    with pytest.raises(InputError, match=rf"4: other.png has the same time as {NAMES[0]} in line 2"):
         read_image_times_csv(tmp_path / "times.csv", tuple(frames), frames)
 
 
@@ -188,9 +188,9 @@ def test_photos_of_one_frame_share_the_time_of_the_first_of_them_that_has_one(
     [
         ({"cam_from_rig_rotation": [1, 0, 0]}, "cam_from_rig_rotation of 'camera000003_' has 3 numbers, expected 4"),
         ({"cam_from_rig_rotation": [2, 0, 0, 0]}, "is .2, 0, 0, 0., expected w, x, y, z of length 1"),
-        ({"ref_sensor": True}, "is no rig configuration of COLMAP's .*only have one reference sensor"),
+        ({"ref_sensor": True}, "is not a rig configuration of COLMAP's .*only have one reference sensor"),
         ({"image_prefix": "right/"}, "no photo's name begins with image_prefix 'right/'"),
-        ({"image_prefix": "camera00000"}, "is of 'camera000001_' and of 'camera00000', expected one image_prefix"),
+        ({"image_prefix": "camera00000"}, "belongs to 'camera000001_' and 'camera00000', expected one image_prefix"),
     ],
 )
 def test_what_is_no_rig_is_one_line(simulated: Simulated, tmp_path: Path, others: dict[str, Any], message: str) -> None:

@@ -105,7 +105,7 @@ def test_goes_on_from_the_photos_it_had_and_ends_as_if_nothing_had_been(
     num_photos = pycolmap.Reconstruction(snapshot).num_reg_images()
     assert num_photos > num_snapshots
     assert_as_undisturbed(mapping.run(listener), undisturbed)
-    assert f"mapping: goes on from {num_photos} photos of an earlier run" in listener.messages
+    assert f"mapping: continues from {num_photos} photos of an earlier run" in listener.messages
     assert listener.updates["mapping"][-1] == (NUM_PHOTOS, NUM_PHOTOS)
     assert names_in(mapping.output) == ["database.db", "mapper.log", "reconstruct.json", "sparse"]
 

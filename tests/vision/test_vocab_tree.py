@@ -78,7 +78,7 @@ def test_those_that_look_alike_are_matched(room: Room, database: Path, tree: Pat
 def test_a_file_that_is_no_tree_is_one_line(room: Room, database: Path, tmp_path: Path) -> None:
     (tmp_path / "tree.bin").write_text("no tree")
     pairing = pairing_options(MapperOptions(matching="vocabtree", vocab_tree_path=tmp_path / "tree.bin"), 6)
-    with pytest.raises(InputError, match=r"tree.bin: is no vocabulary tree"):
+    with pytest.raises(InputError, match=r"tree.bin: is not a vocabulary tree"):
         pairs_to_match(database, usable_photos(room.folder, room.names), pairing)
 
 

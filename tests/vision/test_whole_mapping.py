@@ -53,7 +53,7 @@ def test_holds_every_photo_at_its_place_says_so_and_comes_again(
         for mapper in (asked, asked.changed(pipeline=other), asked)
     ]
     assert [list(summary.seconds) for summary in summaries] == [["mapping"]] * 3
-    assert "mapping: this mapper does not say how far it is, and an interrupted one begins anew" in listener.messages
+    assert "mapping: this mapper shows no progress, and starts anew after an interruption" in listener.messages
     centers = [np.array([_center(summary.models[0], name) for name in room.names]) for summary in summaries]
     world_from_sfm = pycolmap.estimate_sim3d(centers[0], room.centers)
     assert world_from_sfm is not None

@@ -96,7 +96,7 @@ def test_masks_a_database_and_options_of_colmap_are_looked_at(folder: Path) -> N
     assert masked.faults == []
     (folder / "masks" / f"{names[3]}.png").unlink()
     (missing,) = check_survey(survey_of(folder, mapper__mask_path=folder / "masks")).faults
-    assert f"1 of {len(names)} photos have no mask there, the first is {names[3]}" in str(missing)
+    assert f"1 of {len(names)} photos have no mask in this folder, the first is {names[3]}" in str(missing)
     with pycolmap.Database.open(folder / "empty.db"):
         pass
     (poor,) = check_survey(survey_of(folder, mapper__database_path=folder / "empty.db")).faults

@@ -22,23 +22,23 @@ def run_in_background(
     count: Callable[[], int],
     num_total: int | None,
 ) -> Result:
-    """Run ``work`` in a thread, and meanwhile say how far it is.
+    """Run ``work`` in a thread and report its progress meanwhile.
 
-    Python hears Ctrl-C in the main thread only, and only between its own instructions: a call into
-    COLMAP there would put it off for minutes. Whatever interrupts the waiting cancels the work, and
-    goes on once the work has ended.
+    Python notices Ctrl-C in the main thread only, and only between its own instructions, so that a call into COLMAP in
+    the main thread would delay it for minutes. An exception that interrupts the waiting cancels the work, and is raised
+    once the work has ended.
 
     Args:
-        work: hands the token on to COLMAP. Where its calls do not release Python's lock, the waiting hears of Ctrl-C
-            and says how far the work is whenever they call back.
-        count: how many of ``num_total`` (None: unknown) items are done.
+        work: passes the token on to COLMAP. If its calls do not release Python's global lock, Ctrl-C and progress are
+            handled only when they call back.
+        count: returns how many of ``num_total`` items (None: unknown) are done.
 
     Raises:
         ReconstructionError: COLMAP raised an error of its own.
     """
     token = pycolmap.CancellationToken()
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="colmap") as executor:
-        # A Ctrl-C that comes while the thread starts loses track of it: there must be nothing in it yet.
+        # After a Ctrl-C while the thread starts, nothing would wait for it. So it starts with a task that does nothing.
         executor.submit(int).result()
         try:
             future = executor.submit(work, token)
@@ -47,7 +47,7 @@ def run_in_background(
         except BaseException as error:
             token.cancel()
             if isinstance(error, KeyboardInterrupt):
-                progress.message("interrupted: COLMAP finishes the photos at hand")
+                progress.message("interrupted: COLMAP finishes its current photos")
             raise
     try:
         result = future.result()

@@ -1,4 +1,4 @@
-"""The cameras of the photos: which photos share one, and what the user knows of it, or COLMAP's guess."""
+"""Cameras of the photos: which photos share a camera, with the user's calibration or COLMAP's guess for each."""
 
 from __future__ import annotations
 
@@ -16,33 +16,38 @@ from rangesfm.options import CameraOptions
 from rangesfm.vision.photos import Photos, exif_tags
 from rangesfm.vision.rigs import NO_RIGS, Rigs
 
-_TELLING_TAGS = (0x010F, 0x0110, 0xA431, 0x920A)  # make, model, serial number, focal length
+# EXIF tags that tell one camera from another: make, model, serial number, focal length.
+_TELLING_TAGS = (0x010F, 0x0110, 0xA431, 0x920A)
 _MODELS = {name: model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
 
 
 def check_camera(options: CameraOptions) -> None:
-    """Refuse what is no camera of COLMAP's.
+    """Check that the options describe cameras that COLMAP has.
 
     Raises:
-        InputError: an unknown model, parameters without a model, too few or too many or impossible ones; a pattern of
-            photos where there is nothing but this one table.
+        InputError: an unknown model; parameters without a model; too few, too many or impossible parameters; a pattern
+            of photo names where there is only one [camera] table.
     """
     if options.images is not None and not options.others:
-        raise InputError(f"[camera] images is '{options.images}', expected none but in several [[camera]] tables")
+        raise InputError(
+            f"[camera] images is '{options.images}', expected this key only with several [[camera]] tables"
+        )
     for table in options.tables:
         _check_table(table)
 
 
 def _check_table(options: CameraOptions) -> None:
     if options.params is None and options.focal_length_stddev_px is not None:
-        raise InputError("[camera] has focal_length_stddev_px but no params, expected those that it is of")
+        raise InputError("[camera] has focal_length_stddev_px but no params, expected params with a focal length")
     if options.model is None:
         if options.params is not None:
-            raise InputError("[camera] has params but no model, expected COLMAP's camera model that they belong to")
+            raise InputError("[camera] has params but no model, expected the COLMAP camera model they belong to")
         return
     if options.model not in _MODELS:
         nearest = nearest_known(options.model, _MODELS)
-        raise InputError(f"[camera] model is '{options.model}', expected one of COLMAP's, the nearest is '{nearest}'")
+        raise InputError(
+            f"[camera] model is '{options.model}', expected a COLMAP camera model; the nearest is '{nearest}'"
+        )
     if options.params is None:
         return
     expected = pycolmap.Camera.create_from_model_name(1, options.model, 1.0, 1, 1)
@@ -58,11 +63,12 @@ def _check_table(options: CameraOptions) -> None:
 
 @dataclass(frozen=True)
 class PhotoCameras:
-    """The cameras of n photos.
+    """Cameras of n photos.
 
     Attributes:
-        cameras: without ids. of_photo: n places among them.
-        guessed: one of the photos of each camera that the given parameters are not of, if any are given.
+        cameras: the cameras, without ids.
+        of_photo: n indices into ``cameras``, the camera of each photo.
+        guessed: where parameters are given, one photo of each camera that they do not fit.
     """
 
     cameras: tuple[pycolmap.Camera, ...]
@@ -71,7 +77,7 @@ class PhotoCameras:
 
     @property
     def inputs(self) -> list[Any]:
-        """Plain values that tell them from others."""
+        """Plain values that are equal only for equal cameras; they go into a fingerprint."""
         cameras = [
             [camera.model_name, camera.params.tolist(), camera.width, camera.height, camera.has_prior_focal_length]
             for camera in self.cameras
@@ -80,16 +86,17 @@ class PhotoCameras:
 
 
 def cameras_of_photos(options: CameraOptions, photos: Photos, rigs: Rigs = NO_RIGS) -> PhotoCameras:
-    """Which camera took each photo; photos of one camera are of one size.
+    """Find the camera that took each photo; all photos of one camera have the same size.
 
     Args:
-        options: as checked by ``check_camera``. Where they leave a camera open, COLMAP takes it from the EXIF data of
-            its first photo.
-        rigs: whose cameras are one each, whatever the options say.
+        options: as checked by ``check_camera``. Where they give no parameters, COLMAP guesses the camera from the EXIF
+            data of its first photo.
+        rigs: each camera of a rig is one camera, whatever the options say.
 
     Raises:
-        InputError: photos of two sizes of one camera of a rig, parameters that belong to photos of another size, a
-            table whose pattern is of no photo. OptionError: a photo that belongs to two tables.
+        InputError: a camera of a rig has photos of two sizes, the parameters belong to photos of another size, or no
+            photo fits the pattern of a table.
+        OptionError: a photo belongs to two tables.
     """
     table_of = {name: options.of_photo(name) for name in photos.names}
     cameras: list[pycolmap.Camera] = []
@@ -98,7 +105,10 @@ def cameras_of_photos(options: CameraOptions, photos: Photos, rigs: Rigs = NO_RI
     for table in options.tables:
         own = photos.of([name for name in photos.names if table_of[name] is table])
         if not own.names and table.images is not None:
-            raise InputError(f"[[camera]] images is '{table.images}', expected some photo's name, as {photos.names[0]}")
+            raise InputError(
+                f"[[camera]] images is '{table.images}', expected a pattern that fits some photo's name, such as"
+                f" {photos.names[0]}"
+            )
         if not own.names:
             continue
         found = _of_one_table(table, own, rigs)
@@ -128,13 +138,13 @@ def _of_one_table(options: CameraOptions, photos: Photos, rigs: Rigs) -> PhotoCa
 
 
 def _keys(mode: str, photos: Photos, rigs: Rigs) -> list[Any]:
-    """The same for photos of one camera."""
+    """Return a key for each photo; photos with equal keys share a camera."""
     sizes: dict[str | None, tuple[int, int]] = {}
     in_rigs = [rigs.camera_of(name) for name in photos.names]
     for name, size, camera in zip(photos.names, photos.sizes, in_rigs, strict=True):
         if camera is not None and (first := sizes.setdefault(camera, size)) != size:
             message = (
-                f"{name} is of {size[0]} x {size[1]} pixels, expected {first[0]} x {first[1]} as others of '{camera}'"
+                f"{name} has {size[0]} x {size[1]} pixels, expected {first[0]} x {first[1]} like others of '{camera}'"
             )
             raise InputError(message, rigs.path)
     key_of: Callable[[str], Any] = {
@@ -150,7 +160,7 @@ def _keys(mode: str, photos: Photos, rigs: Rigs) -> list[Any]:
 
 
 def _maker(path: Path) -> tuple[str, ...]:
-    """What EXIF tells one camera from another by, and one focal length from another; empty without EXIF."""
+    """Return the EXIF values that tell cameras and focal lengths apart; empty without EXIF."""
     tags = exif_tags(path)
     return tuple(str(tags[tag]).strip("\0 ") for tag in _TELLING_TAGS if tag in tags)
 

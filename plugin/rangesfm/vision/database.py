@@ -1,8 +1,8 @@
 """COLMAP's database of one survey: photos, features and matches.
 
-Always through pycolmap, also to look at it while COLMAP writes: Python's sqlite3 is another copy of
-SQLite, and when one copy closes a file, the system drops the locks that the other one in the same
-process holds on it. The database is broken within seconds.
+It is always opened through pycolmap, even to look at it while COLMAP writes. Python's sqlite3 is another copy of
+SQLite. When one copy closes a file, the system drops the locks that the other copy in the same process holds on it,
+and the database is damaged within seconds.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import pycolmap
 def create_database(
     path: Path, image_names: Sequence[str], cameras: Sequence[pycolmap.Camera], of_photo: Sequence[int]
 ) -> None:
-    """A new database with these photos, in the place of an old one; each camera is a rig of its own.
+    """Create a database with these photos in the place of an old one; each camera is a rig of its own.
 
-    COLMAP would enter photos as its threads come to them; entered here they have the same ids
-    1, 2, ... in every run, and the same seed gives the same model.
+    COLMAP itself would add the photos in the order in which its threads come to them. Here they get the ids 1, 2, ...
+    in the order of ``image_names``, so that the same seed gives the same model in every run.
 
     Args:
-        of_photo: place of each photo's camera in ``cameras``.
+        of_photo: index of each photo's camera in ``cameras``.
     """
     remove_database(path)
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
@@ -43,9 +43,10 @@ def create_database(
 
 
 def write_positions(path: Path, positions: Iterable[tuple[float, float, float] | None]) -> None:
-    """Where each photo was taken, by the order of their ids: latitude, longitude (degrees, WGS 84) and altitude (m).
+    """Write the position of each photo, in the order of their ids, as COLMAP does for photos that it adds itself.
 
-    COLMAP would write down those of photos that it enters itself.
+    Args:
+        positions: latitude and longitude in degrees (WGS 84) and altitude in metres, or None for a photo without one.
     """
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
         for image_id, position in enumerate(positions, 1):
@@ -58,14 +59,14 @@ def write_positions(path: Path, positions: Iterable[tuple[float, float, float] |
 
 
 def remove_database(path: Path) -> None:
-    """Remove the file and those that SQLite keeps beside it."""
+    """Remove the database file and the files that SQLite keeps beside it."""
     for suffix in ("", "-wal", "-shm"):
         path.with_name(path.name + suffix).unlink(missing_ok=True)
 
 
 @contextmanager
 def copying(source_path: Path, path: Path) -> Iterator[tuple[pycolmap.Database, pycolmap.Database]]:
-    """A database and another one, to which something is to be written; of an error nothing is."""
+    """Open a source and a target database; an error inside the block undoes all that was written to the target."""
     with (
         pycolmap.Database.open(source_path) as source,
         pycolmap.Database.open(path) as target,
@@ -75,7 +76,11 @@ def copying(source_path: Path, path: Path) -> Iterator[tuple[pycolmap.Database, 
 
 
 def copy_features(source: pycolmap.Database, target: pycolmap.Database, new_ids: Mapping[int, int]) -> None:
-    """Features of photos, by their ids in the source those in the target."""
+    """Copy the features of photos.
+
+    Args:
+        new_ids: by each photo's id in the source, its id in the target.
+    """
     for old, new in new_ids.items():
         target.write_keypoints(new, source.read_keypoints(old))
         if source.exists_descriptors(old):
@@ -83,7 +88,7 @@ def copy_features(source: pycolmap.Database, target: pycolmap.Database, new_ids:
 
 
 def copy_photos(source_path: Path, path: Path, image_ids: Sequence[int]) -> None:
-    """A new database for matching some of another one's photos, which keep their ids and are called by them."""
+    """Copy some photos with their features into a new database, where each photo keeps its id and is named by it."""
     with copying(source_path, path) as (source, target):
         for camera in source.read_all_cameras():
             target.write_camera(camera, use_camera_id=True)
@@ -99,14 +104,14 @@ def copy_photos(source_path: Path, path: Path, image_ids: Sequence[int]) -> None
 
 
 def copy_matches(source_path: Path, path: Path, pairs: Iterable[tuple[tuple[int, int], tuple[int, int]]]) -> None:
-    """Matches of pairs of photos into another database, as far as there are any.
+    """Copy the matches of those pairs of photos that COLMAP has matched into another database.
 
     Args:
-        pairs: ids in the source, smaller first, and those of the same photos in the target, likewise.
+        pairs: for each pair, the two ids in the source and the two ids in the target, smaller id first.
     """
     with copying(source_path, path) as (source, target):
         for old, new in pairs:
-            if source.exists_two_view_geometry(*old):  # COLMAP has been through them, whether or not they match
+            if source.exists_two_view_geometry(*old):  # COLMAP writes one for each pair it has tried, matching or not
                 target.write_matches(*new, source.read_matches(*old))
                 target.write_two_view_geometry(*new, source.read_two_view_geometry(*old))
 
@@ -119,7 +124,7 @@ def clear_matches(path: Path) -> None:
 
 @contextmanager
 def named_by_place(path: Path, image_names: Sequence[str]) -> Iterator[None]:
-    """Inside the block the photos are called by their place in ``image_names``, the order of their ids.
+    """Name the photos by their index in ``image_names`` (the order of their ids) inside the block.
 
     COLMAP's sequential matching takes the order of names for the order in time.
     """
@@ -131,7 +136,7 @@ def named_by_place(path: Path, image_names: Sequence[str]) -> Iterator[None]:
 
 
 def name_photos(path: Path, image_names: Sequence[str]) -> None:
-    """By the order of their ids."""
+    """Rename the photos; ``image_names`` is in the order of their ids."""
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
         for image in database.read_all_images():
             image.name = image_names[image.image_id - 1]
@@ -139,10 +144,10 @@ def name_photos(path: Path, image_names: Sequence[str]) -> None:
 
 
 def num_photos_with_features(database: pycolmap.Database) -> int:
-    """How many photos COLMAP has been through, whether or not it found anything in them."""
+    """Return the number of photos that COLMAP has searched for features, whether or not it found any."""
     return sum(database.exists_keypoints(image_id) for image_id in range(1, database.num_images() + 1))
 
 
 def num_matching_pairs(database: pycolmap.Database) -> int:
-    """How many pairs of photos have matches that fit one geometry of two views."""
+    """Return the number of pairs of photos whose matches fit one two-view geometry."""
     return len(database.read_two_view_geometry_num_inliers()[0])

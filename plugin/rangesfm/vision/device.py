@@ -1,4 +1,4 @@
-"""What computes features and matches: the processor, or a GPU."""
+"""Device that computes features and matches: the processor or a GPU."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rangesfm.options import MapperOptions
 
 
 def uses_gpu(mapper: MapperOptions) -> bool:
-    """Whether COLMAP is to work on a GPU. Told to with none there, it would fail in the middle of its work.
+    """Whether COLMAP is to work on a GPU; without one it would fail in the middle of its work.
 
     Raises:
         OptionError: a GPU is asked for, and there is none.
@@ -20,17 +20,21 @@ def uses_gpu(mapper: MapperOptions) -> bool:
     num = num_gpus()
     if mapper.device == "cuda" and not num:
         others = " or ".join(OTHER_BUILDS["pycolmap"])
-        why = "pycolmap finds no GPU" if num == 0 else f"pycolmap as installed is built without CUDA, {others} with it"
+        why = "pycolmap finds no GPU" if num == 0 else f"this pycolmap is built without CUDA; install {others}"
         raise OptionError(f"[mapper] device is 'cuda', expected 'auto' or 'cpu': {why}", "mapper", "device")
     return bool(num)
 
 
 def device_of(options: pycolmap.FeatureExtractionOptions | pycolmap.FeatureMatchingOptions) -> pycolmap.Device:
-    """The device that goes with options. By itself COLMAP takes any with CUDA for a GPU, whatever its options say."""
+    """Return the device that the options ask for; by default COLMAP uses a GPU if there is one, whatever they say."""
     return pycolmap.Device.cuda if options.use_gpu else pycolmap.Device.cpu
 
 
 def refuse_missing_gpu(use_gpu: bool, table: str) -> None:
-    """OptionError where COLMAP's own key asks a build with CUDA for a GPU that is not there."""
+    """Refuse COLMAP's own key ``use_gpu`` where there is no GPU.
+
+    Raises:
+        OptionError: the key is true, and pycolmap, built with CUDA, finds no GPU.
+    """
     if use_gpu and num_gpus() == 0:
         raise OptionError(f"[{table}] use_gpu is true, expected false: pycolmap finds no GPU", table, "use_gpu")

@@ -1,4 +1,4 @@
-"""Step 1: photos into COLMAP's database, and features out of them."""
+"""Step 1: features of the photos in COLMAP's database."""
 
 from __future__ import annotations
 
@@ -19,11 +19,17 @@ from rangesfm.vision.device import refuse_missing_gpu, uses_gpu
 from rangesfm.vision.own_process import MODULE, FeatureExtraction
 from rangesfm.vision.photos import MIN_NUM_PHOTOS, Photos
 
-_MIN_NUM_FEATURES = 50  # COLMAP starts from pairs with 100 matches and adds photos that see 30 known points
+# A photo with fewer features is reported as poor. COLMAP starts from pairs with 100 matches and adds photos that see
+# 30 known points.
+_MIN_NUM_FEATURES = 50
 
 
 def feature_options(mapper: MapperOptions) -> pycolmap.FeatureExtractionOptions:
-    """Raises InputError for keys or values that are not COLMAP's, or for a GPU that is not there."""
+    """Return COLMAP's options for feature extraction.
+
+    Raises:
+        InputError: a key or value that COLMAP does not have, or no GPU where one is asked for.
+    """
     options = pycolmap.FeatureExtractionOptions(num_threads=mapper.num_threads, use_gpu=uses_gpu(mapper))
     apply_options(options, mapper.features, "mapper.features")
     refuse_learned(options.type.name, "mapper.features")
@@ -32,13 +38,17 @@ def feature_options(mapper: MapperOptions) -> pycolmap.FeatureExtractionOptions:
 
 
 def refuse_learned(name: str, table: str) -> None:
-    """OptionError for learned features, or a learned way to match them, where pycolmap has no networks."""
+    """Refuse learned features and learned matching where pycolmap is built without them.
+
+    Raises:
+        OptionError: ``name``, the key ``type`` of the table, is a learned method and pycolmap cannot run it.
+    """
     if not name.startswith("SIFT") or name.endswith("LIGHTGLUE"):
         known = pycolmap.FeatureExtractionOptions().todict()
         if "aliked" not in known:
             raise OptionError(
-                f"[{table}] type is '{name}', expected SIFT: pycolmap {pycolmap.__version__} as installed is built"
-                " without ONNX, which runs networks; features of other programs come by database_path",
+                f"[{table}] type is '{name}', expected SIFT: the installed pycolmap {pycolmap.__version__} is built"
+                " without ONNX, which runs networks; use database_path for features of other programs",
                 table,
                 "type",
             )
@@ -52,13 +62,14 @@ def extract_features(
     progress: Progress,
     mask_path: Path | None = None,
 ) -> None:
-    """Find features in the photos of the database that have none yet, where their masks are not black.
+    """Find features in the photos of the database that have none yet, except where their masks are black.
 
     Args:
-        log: what COLMAP says is appended to it.
+        log: COLMAP's messages are appended to this file.
+        mask_path: folder of the masks.
 
     Raises:
-        ReconstructionError: hardly any photo has features, or COLMAP failed.
+        ReconstructionError: fewer than two photos have enough features, or COLMAP failed.
     """
     with pycolmap.Database.open(database_path) as database:
 
@@ -79,8 +90,8 @@ def extract_features(
     num_rich = len(photos.names) - len(poor)
     if num_rich < MIN_NUM_PHOTOS:
         raise ReconstructionError(
-            f"{num_rich} of {len(photos.names)} photos have {_MIN_NUM_FEATURES} features or more, the first without"
-            f" is {poor[0]}: are they sharp, exposed well, and not of blank walls?"
+            f"{num_rich} of {len(photos.names)} photos have {_MIN_NUM_FEATURES} features or more, the first with fewer"
+            f" is {poor[0]}: are the photos sharp, well exposed, and not of blank walls?"
         )
     if poor:
         progress.message(

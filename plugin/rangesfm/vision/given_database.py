@@ -1,4 +1,4 @@
-"""A database that the user has, of COLMAP's or hloc's: what there is of a survey's photos, and what is still to do."""
+"""A database that the user provides, from COLMAP or hloc: its features and matches of a survey's photos."""
 
 from __future__ import annotations
 
@@ -24,15 +24,16 @@ from rangesfm.vision.photos import MIN_NUM_PHOTOS, Photos
 
 @dataclass(frozen=True)
 class GivenDatabase:
-    """A copy of it, which pycolmap may bring up to date.
+    """A copy of the user's database; pycolmap may update the copy to its own version.
 
     Attributes:
-        source: the user's file. path: of the copy.
-        sha256: of the user's file.
-        photos: those of the survey that it has features of.
-        ids: their ids in it, in the order of the photos.
-        num_pairs: pairs of these photos that it has matches of.
-        note: what of it is used, and what of the survey and of it the other lacks.
+        source: the user's file.
+        path: the copy.
+        sha256: hash of the user's file.
+        photos: the photos of the survey for which the database has features.
+        ids: their ids in the database, in the order of ``photos``.
+        num_pairs: number of pairs of these photos with matches.
+        note: message that says which parts are used, and which photos are missing on either side.
     """
 
     source: Path
@@ -45,11 +46,15 @@ class GivenDatabase:
 
     @property
     def inputs(self) -> list[Any]:
-        """Plain values that tell its features and matches of these photos from others."""
+        """Plain values that differ whenever the features and matches of these photos do."""
         return [self.sha256, self.photos.names]
 
     def cameras(self) -> PhotoCameras:
-        """As it has them; InputError for one of another size than its photos."""
+        """Return the cameras of the database.
+
+        Raises:
+            InputError: a camera has another size than one of its photos.
+        """
         with pycolmap.Database.open(self.path) as database:
             of_photo = [database.read_image(id_).camera_id for id_ in self.ids]
             ids = sorted(set(of_photo))
@@ -58,13 +63,13 @@ class GivenDatabase:
         for name, size, place in zip(self.photos.names, self.photos.sizes, places, strict=True):
             if (found := (cameras[place].width, cameras[place].height)) != size:
                 raise InputError(
-                    f"{name} is of {found[0]} x {found[1]} pixels there, expected {size[0]} x {size[1]} as its file",
+                    f"{name} has {found[0]} x {found[1]} pixels here, expected {size[0]} x {size[1]} like its file",
                     self.source,
                 )
         return PhotoCameras(cameras, places)
 
     def copy_to(self, path: Path) -> None:
-        """Features and matches of the photos, into a database in which their ids are 1, 2, ..."""
+        """Copy the photos' features and matches into a database where the photos have the ids 1, 2, ..."""
         new = {id_: new_id for new_id, id_ in enumerate(self.ids, 1)}
         with copying(self.path, path) as (source, target):
             copy_features(source, target, new)
@@ -77,17 +82,18 @@ class GivenDatabase:
 
 @contextmanager
 def opened(path: Path | None, photos: Photos, folder: Path) -> Iterator[GivenDatabase | None]:
-    """The database, if one is given, while its copy is in ``folder``.
+    """Copy the database, if one is given, into ``folder`` for the duration of the block.
 
     Raises:
-        InputError: it is none, or has features of fewer than two of the photos, or nothing to match them by.
+        InputError: it is not a database of COLMAP's, has features of fewer than two of the photos, or has neither
+            matches nor descriptors.
     """
     if path is None:
         yield None
         return
     with scratch_folder(folder / "given_database") as scratch:
         copy = Path(shutil.copyfile(path, scratch / "database.db"))
-        if (log := path.with_name(path.name + "-wal")).is_file():  # what SQLite has not yet written into the file
+        if (log := path.with_name(path.name + "-wal")).is_file():  # changes that SQLite has not yet put into the file
             shutil.copyfile(log, copy.with_name(copy.name + "-wal"))
         yield _read(path, copy, photos)
 
@@ -97,7 +103,7 @@ def _read(source: Path, path: Path, photos: Photos) -> GivenDatabase:
         with colmap_log(path.with_name("open.log")):
             database = pycolmap.Database.open(path)
     except RuntimeError:
-        raise InputError("is no database of COLMAP's", source) from None
+        raise InputError("is not a database of COLMAP's", source) from None
     with database, _damage_named(source):
         of_name = {image.name: image.image_id for image in database.read_all_images()}
         ids = {
@@ -105,8 +111,8 @@ def _read(source: Path, path: Path, photos: Photos) -> GivenDatabase:
         }
         if len(ids) < MIN_NUM_PHOTOS:
             raise InputError(
-                f"has features of {len(ids)} of {len(photos.names)} photos, expected at least {MIN_NUM_PHOTOS}, by"
-                f" their names relative to the folder as {photos.names[0]}",
+                f"has features of {len(ids)} of {len(photos.names)} photos, expected at least {MIN_NUM_PHOTOS}, with"
+                f" their names relative to the folder, such as {photos.names[0]}",
                 source,
             )
         _require_sound(database, source, ids)
@@ -114,33 +120,36 @@ def _read(source: Path, path: Path, photos: Photos) -> GivenDatabase:
         has_rigs = any(rig.non_ref_sensors for rig in database.read_all_rigs())
         bare = next((name for name, id_ in ids.items() if not database.exists_descriptors(id_)), None)
     if not num_pairs and bare is not None:
-        raise InputError(f"has neither matches nor a descriptor of {bare} to match it by, expected either", source)
-    note = f"of {source.name} are taken features of {len(ids)} photos and matches of {num_pairs} pairs"
+        raise InputError(f"has neither matches nor descriptors to match {bare} by, expected one of them", source)
+    note = f"features of {len(ids)} photos and matches of {num_pairs} pairs are taken from {source.name}"
     if lacking := [name for name in photos.names if name not in ids]:
         note += f"; {len(lacking)} photos are not in it and are left out, the first is {lacking[0]}"
     if others := sorted(of_name.keys() - set(photos.names)):
-        note += f"; {len(others)} of its photos are no keyframes, the first is {others[0]}"
+        note += f"; {len(others)} of its photos are not keyframes, the first is {others[0]}"
     if has_rigs:
-        note += "; its rigs are not: what [images] rig_config says of them counts"
+        note += "; its rigs are ignored: rigs are taken from [images] rig_config"
     return GivenDatabase(source, path, sha256_of(source), photos.of(ids), tuple(ids.values()), num_pairs, note)
 
 
 @contextmanager
 def _damage_named(source: Path) -> Iterator[None]:
-    """Say of which file COLMAP cannot read a row, instead of in which line of its own code it noticed."""
+    """Turn COLMAP's errors on rows that it cannot read into an InputError that names the file."""
     try:
         yield
     except (RuntimeError, ValueError, LookupError, MemoryError) as error:
         sizes = re.search(r"\((\d+) vs\. (\d+)\)", str(error))
         why = f" (sizes of {sizes[1]} and {sizes[2]} differ)" if sizes else ""
-        raise InputError(f"is damaged: a row is not as COLMAP writes it{why}", source) from error
+        raise InputError(f"is damaged: COLMAP cannot read a row of it{why}", source) from error
 
 
 def _require_sound(database: pycolmap.Database, source: Path, ids: Mapping[str, int]) -> None:
-    """Read all of these photos, by name, that COLMAP would read, and check what it would not.
+    """Read all data of these photos that COLMAP would read, and check what COLMAP does not check.
+
+    Args:
+        ids: id of each photo by its name.
 
     Raises:
-        InputError: cameras or features that cannot be, or matches of features that are not there.
+        InputError: a camera or feature has impossible values, or a match refers to a feature that does not exist.
     """
     num_features = {}
     for name, id_ in ids.items():
@@ -149,10 +158,10 @@ def _require_sound(database: pycolmap.Database, source: Path, ids: Mapping[str, 
             raise InputError(f"is damaged: the camera of {name} has impossible parameters", source)
         keypoints = database.read_keypoints(id_)
         if not np.isfinite(keypoints).all():
-            raise InputError(f"is damaged: a feature of {name} has no finite place", source)
+            raise InputError(f"is damaged: a feature of {name} has no finite position", source)
         num_features[id_] = len(keypoints)
         if database.exists_descriptors(id_) and len(database.read_descriptors(id_).data) != len(keypoints):
-            raise InputError(f"is damaged: {name} has not as many descriptors as features", source)
+            raise InputError(f"is damaged: {name} has another number of descriptors than of features", source)
     names = {id_: name for name, id_ in ids.items()}
     for first, second in _pairs(database, num_features):
         matches = [database.read_matches(first, second)]
@@ -161,11 +170,11 @@ def _require_sound(database: pycolmap.Database, source: Path, ids: Mapping[str, 
         limits = num_features[first], num_features[second]
         if any(len(pairs) and (np.max(pairs, axis=0) >= limits).any() for pairs in matches):
             raise InputError(
-                f"is damaged: {names[first]} and {names[second]} match in features that are not there", source
+                f"is damaged: a match of {names[first]} and {names[second]} is of a feature that is not there", source
             )
 
 
 def _pairs(database: pycolmap.Database, known: Mapping[int, Any]) -> Sequence[tuple[int, int]]:
-    """Those with matches, of photos that are known by their ids."""
+    """Return the pairs with matches in which both photos are among ``known``, by their ids."""
     pairs = (pycolmap.pair_id_to_image_pair(pair_id) for pair_id in database.read_num_matches()[0])
     return [(first, second) for first, second in pairs if first in known and second in known]

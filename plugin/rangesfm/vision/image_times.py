@@ -1,4 +1,4 @@
-"""When each photo was taken: from a CSV file, from EXIF, or from file names that are times."""
+"""Times of the photos: from a CSV file, from EXIF, or from file names that are times."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ IMAGE_EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 _COLUMNS = ("image_name", "timestamp_s")
 _ALIASES = {"filename": "image_name", "timestamp": "timestamp_s"}
 _FINEST_RESOLUTION_S = 1e-3
-_MAX_TIMESTAMP_S = 1e11  # the year 5138: larger numbers are in another unit
+_MAX_TIMESTAMP_S = 1e11  # the year 5138; a larger number must be in another unit
 _DATE_TIME_ORIGINAL, _SUB_SEC_TIME_ORIGINAL, _OFFSET_TIME_ORIGINAL = 0x9003, 0x9291, 0x9011
-# 2001 to 2096 since 1970. The same in ms, us or ns is never taken for another unit, and neither a
-# frame number nor a date written as digits (20260131...) is taken for any of them.
+# The years 2001 to 2096 in seconds since 1970. With this interval a time in ms, us or ns is never taken for a time in
+# another unit, and neither a frame number nor a date written as digits (20260131...) is taken for a time.
 _EPOCH_S = (1e9, 4e9)
 _UNITS_PER_SECOND = (1, 10**3, 10**6, 10**9)
-_MIN_DECIMALS = 3  # with fewer, a number like scan_1.2 is more likely a version than seconds
+_MIN_DECIMALS = 3  # a number with fewer decimals, as in scan_1.2, is more likely a version than seconds
 
 
 class _Stamp(NamedTuple):
@@ -48,8 +48,8 @@ class ImageTimes:
         timestamps_s: (n,) seconds on the camera's clock, strictly increasing.
         resolution_s: the finest step of that clock as written down, at least 0.001.
         source: "csv", "exif" or "file_names".
-        num_left_out: photos that have no time, or the same as another.
-        notes: what a user should know about these times, a line each.
+        num_left_out: photos that have no time, or the same time as another photo.
+        notes: one-line remarks on these times for the user.
     """
 
     image_names: tuple[str, ...]
@@ -63,21 +63,21 @@ class ImageTimes:
         return len(self.image_names)
 
     def of(self, names: Sequence[str]) -> ImageTimes:
-        """The same of some of the photos."""
+        """Return the times of the photos with these names."""
         rows = np.flatnonzero(np.isin(self.image_names, names))
         kept = tuple(self.image_names[row] for row in rows)
         return replace(self, image_names=kept, timestamps_s=self.timestamps_s[rows])
 
     def by_name(self) -> dict[str, float]:
-        """The time of each photo, seconds."""
+        """Return the time of each photo in seconds, by name."""
         return dict(zip(self.image_names, self.timestamps_s.tolist(), strict=True))
 
 
 def list_images(folder: str | Path) -> tuple[str, ...]:
-    """Names of all photos in a folder and its subfolders, links to such among them, sorted; hidden ones are none.
+    """Return the sorted names of all photos in a folder and its subfolders, including linked ones but not hidden ones.
 
     Raises:
-        InputError: there is no such folder, or no photo in it, or one whose name no table could hold.
+        InputError: the folder does not exist or has no photo, or a photo's name cannot be written into a table.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -92,7 +92,7 @@ def list_images(folder: str | Path) -> tuple[str, ...]:
         raise InputError(f"no photos ({' '.join(e[1:] for e in IMAGE_EXTENSIONS)}) in this folder", folder)
     for name in names:
         if not is_plain_name(name):
-            raise InputError(f"the photo '{name}' has a name that is no printable UTF-8 text: rename it", folder)
+            raise InputError(f"the name of the photo '{name}' is not printable UTF-8 text: rename it", folder)
     return tuple(sorted(names))
 
 
@@ -102,13 +102,13 @@ def find_image_times(
     csv_path: str | Path | None = None,
     frames: Mapping[str, Sequence[str]] | None = None,
 ) -> ImageTimes:
-    """Times of the photos ``names`` of ``folder``: the CSV file if given, else EXIF, else the names.
+    """Find the times of the photos ``names`` in ``folder``, from the CSV file if given, else from EXIF or the names.
 
     Args:
-        frames: as of ``read_image_times_csv``, by ``names``.
+        frames: as for ``read_image_times_csv``.
 
     Raises:
-        InputError: none of them gives times, or the CSV file is not right.
+        InputError: none of these gives times, or the CSV file is not valid.
     """
     if csv_path is not None:
         return read_image_times_csv(csv_path, names, frames)
@@ -124,7 +124,7 @@ def find_image_times(
 
 
 def is_image_times_file(head: str) -> bool:
-    """Whether a file that begins like this tells when photos were taken."""
+    """Whether a file with this beginning is a table of image times."""
     return has_columns(head, _COLUMNS, _ALIASES)
 
 
@@ -135,13 +135,13 @@ def read_image_times_csv(
 
     Args:
         path: the CSV file; other columns are ignored.
-        names: the photos that there are; None: those of the file are not checked.
-        frames: photos taken at once, by the one among ``names`` that stands for them, itself among them; theirs is the
-            time of the first of them that has one.
+        names: the existing photos; None: the names in the file are not checked.
+        frames: groups of photos taken at once, each by the name of the photo among ``names`` that stands for it and
+            belongs to it. A group gets the time of its first photo that has one.
 
     Raises:
-        InputError: with the line: a column missing, a cell that is no time in seconds, a photo
-            that does not exist where one of ``names`` has no time, a photo or a time that stands there twice.
+        InputError: with the line: a column is missing, a cell is not a time in seconds, a photo does not exist while
+            one of ``names`` has no time, or a photo or a time appears twice.
     """
     table = read_table(path, _COLUMNS, aliases=_ALIASES, separator=None)
     if not len(table):
@@ -157,7 +157,8 @@ def read_image_times_csv(
         known = {*names, *frame_of}
         unknown = [row for row, name in enumerate(image_names) if name not in known]
         timed = set(image_names)
-        # More names than photos are of photos that were taken away; with a photo left over, one is misspelt.
+        # If every photo has a time, the unknown names belong to photos that were removed. If one has none, an unknown
+        # name is probably misspelt.
         if unknown and not all({name, *frames.get(name, ())} & timed for name in names):
             raise table.error(unknown[0], "image_name", f"the name of a photo in the folder, like '{names[0]}'")
     texts = table.text("timestamp_s")
@@ -172,15 +173,15 @@ def read_image_times_csv(
     ordered = _in_time_order(stamps, names or tuple(stamps), "csv")
     if not unknown:
         return ordered
-    note = f"{len(unknown)} of the {len(image_names)} names in {table.path.name} are of no photo in the folder"
+    note = f"{len(unknown)} of the {len(image_names)} names in {table.path.name} belong to no photo in the folder"
     return replace(ordered, notes=(note, *ordered.notes))
 
 
 def times_from_exif(folder: str | Path, names: Sequence[str]) -> ImageTimes:
-    """Times from EXIF DateTimeOriginal, its fraction SubSecTimeOriginal and its zone OffsetTimeOriginal.
+    """Read times from EXIF DateTimeOriginal, its fraction SubSecTimeOriginal and its zone OffsetTimeOriginal.
 
-    Seconds since 1970 in UTC. Cameras that do not say their zone are taken to run on UTC, which
-    shifts all times alike.
+    The times are seconds since 1970 in UTC. Photos without a zone take the zone of a photo that has one. If none has,
+    UTC is assumed, which shifts all times alike.
 
     Raises:
         InputError: at most half of the photos have a time.
@@ -193,11 +194,10 @@ def times_from_exif(folder: str | Path, names: Sequence[str]) -> ImageTimes:
 
 
 def times_from_file_names(names: Sequence[str]) -> ImageTimes:
-    """Times from names that end in a time: ``1403715273262142976.png``, ``cam0/1305032180.405639.jpg``.
+    """Read times from names that end in a time: ``1403715273262142976.png``, ``cam0/1305032180.405639.jpg``.
 
-    A whole number is a time if, in s, ms, us or ns since 1970, it lies between 2001 and 2096;
-    smaller ones are frame numbers, which say nothing about time. A number with three or more
-    decimals is in seconds, since whenever.
+    A whole number is a time if, in s, ms, us or ns since 1970, it lies between 2001 and 2096. Smaller numbers are taken
+    for frame numbers, which do not give a time. A number with three or more decimals is in seconds from any origin.
 
     Raises:
         InputError: at most half of the names are times.
@@ -207,7 +207,7 @@ def times_from_file_names(names: Sequence[str]) -> ImageTimes:
 
 
 def _in_time_order(stamps: Mapping[str, _Stamp], names: Sequence[str], source: str) -> ImageTimes:
-    """Sort by time; of photos with the same time only the first by name can be kept."""
+    """Sort the photos by time; of photos with the same time, keep the first by name."""
     ordered = sorted(stamps, key=lambda name: (stamps[name].time_s, name))
     kept = [n for i, n in enumerate(ordered) if i == 0 or stamps[n].time_s > stamps[ordered[i - 1]].time_s]
     resolution_s = max(min(stamp.resolution_s for stamp in stamps.values()), _FINEST_RESOLUTION_S)
@@ -238,11 +238,11 @@ def _refuse_repetitions(
     row_of_time: dict[float, int] = {}
     for row, (name, time) in enumerate(zip(image_names, times, strict=True)):
         if (first := row_of_name.setdefault(name, row)) != row:
-            message = f"{name} stands in line {table.line[first]} already, expected one row per photo"
+            message = f"{name} is in line {table.line[first]} already, expected one row per photo"
             raise InputError(message, table.path, int(table.line[row]))
         first = row_of_time.setdefault(time, row)
         if first != row and frame_of.get(name, name) != frame_of.get(image_names[first], image_names[first]):
-            message = f"{name} has the time of {image_names[first]} in line {table.line[first]}, expected another"
+            message = f"{name} has the same time as {image_names[first]} in line {table.line[first]}, expected another"
             raise InputError(message, table.path, int(table.line[row]))
 
 
@@ -253,26 +253,26 @@ def _of_most(
         first = next(name for name in names if name not in stamps)
         raise InputError(
             f"{len(names) - len(stamps)} of {len(names)} photos have no {what}, the first is {first}; "
-            "expected a CSV file image_name,timestamp_s then",
+            "expected a CSV file image_name,timestamp_s",
             folder,
         )
     return _in_time_order(stamps, names, source)
 
 
 def _resolution(text: str) -> float:
-    """The step of a decimal number as written."""
+    """Return the value of one unit in the last decimal place of a number as written."""
     return float(10.0 ** -len(text.partition(".")[2]))
 
 
 def _read_exif(path: Path) -> dict[int, str]:
-    """Text tags; none if the file has none or is no image."""
+    """Return the EXIF tags that hold text, by number; empty if the file has none or is not an image."""
     return {tag: value.strip("\0 ") for tag, value in exif_tags(path).items() if isinstance(value, str)}
 
 
 def _exif_stamp(exif: Mapping[int, str], default_offset: timedelta) -> _Stamp | None:
     try:
         local = datetime.strptime(exif.get(_DATE_TIME_ORIGINAL, ""), "%Y:%m:%d %H:%M:%S")
-    except ValueError:  # also the zeros and blanks of a camera whose clock was never set
+    except ValueError:  # a camera whose clock was never set writes zeros or blanks
         return None
     offset = _utc_offset(exif)
     seconds = (local.replace(tzinfo=timezone.utc) - (default_offset if offset is None else offset)).timestamp()

@@ -1,4 +1,4 @@
-"""The choice of keyframes: enough photos for a model, few enough to wait for it."""
+"""Choice of keyframes: enough photos for a model, but not so many that it takes too long."""
 
 from __future__ import annotations
 
@@ -16,13 +16,16 @@ MIN_NUM_KEYFRAMES = 3
 
 
 def select_keyframes(photos: ImageTimes | Sequence[str], options: KeyframeOptions) -> tuple[str, ...]:
-    """Names of the keyframes in time order; of photos without times, their names alone, in the order given.
+    """Return the names of the keyframes in time order, or in the given order for photos without times.
 
-    First every n-th photo, of those the ones far enough apart in time, and of those evenly as many
-    as are allowed; the first photo always is a keyframe.
+    Every n-th photo is taken. Of these, those at least ``min_interval_s`` apart are kept. If these are more than
+    ``max_num_keyframes``, so many are taken, evenly spaced. The first photo is always a keyframe.
+
+    Args:
+        photos: photos with times, or names alone.
 
     Raises:
-        InputError: fewer than three keyframes left, or a least time between photos that have no times.
+        InputError: fewer than three keyframes are left, or a least interval is set for photos without times.
     """
     names = photos.image_names if isinstance(photos, ImageTimes) else tuple(photos)
     kept = np.arange(0, len(names), options.every_nth)
@@ -34,7 +37,7 @@ def select_keyframes(photos: ImageTimes | Sequence[str], options: KeyframeOption
         kept = kept[np.linspace(0, len(kept) - 1, options.max_num_keyframes).round().astype(int)]
     if len(kept) < MIN_NUM_KEYFRAMES:
         raise InputError(
-            f"{len(kept)} of {len(names)} photos chosen as keyframes, expected at least {MIN_NUM_KEYFRAMES}"
+            f"{len(kept)} of {len(names)} photos are chosen as keyframes, expected at least {MIN_NUM_KEYFRAMES}"
             f" (every_nth {options.every_nth}, min_interval_s {options.min_interval_s:g})"
         )
     return tuple(names[index] for index in kept)

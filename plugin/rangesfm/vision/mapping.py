@@ -1,4 +1,4 @@
-"""Step 3: COLMAP's mappers, and their models on disk."""
+"""Step 3: mapping by COLMAP's mappers, and their models on disk."""
 
 from __future__ import annotations
 
@@ -34,11 +34,12 @@ PipelineOptions = pycolmap.IncrementalPipelineOptions | WholePipelineOptions
 
 @dataclass(frozen=True)
 class MappingOptions:
-    """How photos become models.
+    """Options of the mapping.
 
     Attributes:
-        growing: of the mapper. whole: of one more adjustment of each model, with intrinsics that were held till then;
-            None: none were.
+        growing: options of the mapper.
+        whole: options of a last adjustment of each model, which frees intrinsics that the mapper held fixed; None where
+            it held none.
     """
 
     growing: PipelineOptions
@@ -46,10 +47,10 @@ class MappingOptions:
 
 
 def pipeline_options(camera: CameraOptions, mapper: MapperOptions, seed: int) -> PipelineOptions:
-    """Of the mapper that is wanted.
+    """Return the options of the chosen mapper.
 
     Raises:
-        InputError: keys or values that are not COLMAP's, or that are the incremental mapper's alone.
+        InputError: a key or value that COLMAP does not have, or that only the incremental mapper has.
     """
     if mapper.ranges_in_mapping and mapper.method != "incremental":
         message = f"[mapper] ranges_in_mapping is true, expected false beside method '{mapper.method}'"
@@ -62,8 +63,8 @@ def pipeline_options(camera: CameraOptions, mapper: MapperOptions, seed: int) ->
         if any(table.intrinsics_in_mapping == "kept" for table in camera.tables):
             adjustment.refine_focal_length = adjustment.refine_extra_params = False
     elif mapper.method == "hierarchical":
-        # Each cluster is mapped by one thread: with several the search for an initial pair is a race. COLMAP 4.2 hands
-        # this number on to the clusters, whatever their own options say.
+        # Each cluster is mapped by one thread, because with several the search for an initial pair is a race. COLMAP
+        # 4.2 passes this number on to the clusters, whatever their own options say.
         options = pycolmap.HierarchicalPipelineOptions(num_threads=1, num_workers=mapper.num_cores)
         _set_seed(options.incremental_options, seed)
     else:
@@ -80,10 +81,10 @@ def _set_seed(options: pycolmap.IncrementalPipelineOptions, seed: int) -> None:
 def mapping_options(
     camera: CameraOptions, mapper: MapperOptions, rigs: Rigs, seed: int, database_path: Path
 ) -> MappingOptions:
-    """Have the mapping hold the intrinsics that are known, and the rigs of whose cameras all places are configured.
+    """Return mapping options that hold known intrinsics fixed, and rigs whose camera poses are all configured.
 
-    The global mapper keeps the intrinsics of all cameras, or of none; and it begins with the rigs that are known and
-    refines them: with rigs held, COLMAP 4.2's global positioning ends in a map without sense, of perfect matches too.
+    The global mapper holds the intrinsics of all cameras or of none. It starts from the known rigs and refines them,
+    because with rigs held fixed COLMAP 4.2's global positioning gives a senseless map, even from perfect matches.
     """
     growing = pipeline_options(camera, mapper, seed)
     if isinstance(growing, pycolmap.GlobalPipelineOptions):
@@ -103,7 +104,7 @@ def mapping_options(
     options.constant_cameras |= refined_last
     if options.constant_cameras >= set(cameras):
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
-        # Registering a photo by its matches alone asks for nothing else.
+        # Registration of a photo by its matches alone looks at these two options, not at constant_cameras.
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
     return MappingOptions(growing, whole if refined_last else None)
 
@@ -111,12 +112,12 @@ def mapping_options(
 def _held_cameras(
     camera: CameraOptions, camera_of_photo: Sequence[tuple[str, pycolmap.Camera]]
 ) -> tuple[set[int], set[int]]:
-    """Ids of cameras that are held throughout, and of those that are held while the map grows."""
+    """Return the ids of cameras that are held fixed throughout, and of those held fixed while the map grows."""
     as_given = cameras_as_given(camera, camera_of_photo)
     held: dict[str, set[int]] = {"kept": set(), "refined last": set(), "refined": set()}
     for name, found in camera_of_photo:
         table = camera.of_photo(name)
-        # What COLMAP guesses for photos of another shape than the calibrated ones is no calibration.
+        # For photos of another shape than the calibrated ones COLMAP guesses the camera, and a guess is not held fixed.
         if found.camera_id in as_given or table.params is None:
             held[table.intrinsics_in_mapping].add(found.camera_id)
     return held["kept"], held["refined last"]
@@ -125,9 +126,9 @@ def _held_cameras(
 def map_photos(
     space: Workspace, photos: Photos, options: MappingOptions, adjustment: GlobalAdjustment | None = None
 ) -> None:
-    """Write all models of the database, the one with the most photos first.
+    """Map the photos of the database and write all models, the one with the most photos first.
 
-    The incremental mapper goes on from the newest snapshot there is, and has its own there until it is done.
+    The incremental mapper continues from the newest snapshot, if there is one, and writes snapshots until it is done.
 
     Raises:
         ReconstructionError: there is not a single model, or COLMAP failed.
@@ -144,8 +145,8 @@ def map_photos(
         with pycolmap.Database.open(space.database) as database:
             num_matching = num_matching_pairs(database)
         raise ReconstructionError(
-            f"no model from {len(photos.names)} photos, of which {num_matching} pairs match: photos from"
-            " more places sideways to the view, or known camera parameters, may help"
+            f"no model from {len(photos.names)} photos, of which {num_matching} pairs match: photos taken from more"
+            " places, shifted sideways to the view, or known camera parameters may help"
         )
     with new_folder(space.models) as temporary:
         for index, model in enumerate(sorted(models, key=lambda model: -model.num_reg_images())):
@@ -160,13 +161,13 @@ def _map_incrementally(
     options: pycolmap.IncrementalPipelineOptions,
     adjustment: GlobalAdjustment | None,
 ) -> list[pycolmap.Reconstruction]:
-    """All models that COLMAP's incremental mapper makes; there may be none."""
+    """Return all models that COLMAP's incremental mapper makes; there may be none."""
     begun = newest_snapshot(space.snapshots)
     num_begun = 0
     if begun is not None:
         num_begun = pycolmap.Reconstruction(begun).num_reg_images()
-        space.progress.message(f"mapping: goes on from {num_begun} photos of an earlier run")
-    num_registered: list[int] = []  # by model; a photo may be in more than one
+        space.progress.message(f"mapping: continues from {num_begun} photos of an earlier run")
+    num_registered: list[int] = []  # photos of each model; a photo may be in more than one
     with scratch_folder(space.output / "mapping") as folder:
         snapshots = Snapshots(space.snapshots, folder)
 
@@ -196,10 +197,10 @@ def _map_incrementally(
 
 
 def _map_at_once(space: Workspace, image_path: Path, options: WholePipelineOptions) -> list[pycolmap.Reconstruction]:
-    """The same of the mappers that take all photos at once; what COLMAP says is appended to the log."""
-    space.progress.message("mapping: this mapper does not say how far it is, and an interrupted one begins anew")
+    """Return all models of a mapper that takes all photos at once, and append COLMAP's messages to the log."""
+    space.progress.message("mapping: this mapper shows no progress, and starts anew after an interruption")
     with scratch_folder(space.output / "mapping") as folder:
-        # A copy: they note there what they find of pairs of photos.
+        # The mapper works on a copy of the database, because it writes what it finds about pairs into it.
         work = WholeMapping(Path(shutil.copyfile(space.database, folder / "database.db")), image_path, options)
         try:
             with closing(run_children(MODULE, [work], 1, lambda _: None)) as ended:
@@ -210,6 +211,6 @@ def _map_at_once(space: Workspace, image_path: Path, options: WholePipelineOptio
 
 
 def read_models(models_path: Path) -> tuple[pycolmap.Reconstruction, ...]:
-    """The models that ``map_photos`` wrote, in their order."""
+    """Read the models that ``map_photos`` wrote, in their order."""
     folders = [folder for folder in models_path.iterdir() if folder.name.isdecimal()]
     return tuple(read_model(folder) for folder in sorted(folders, key=lambda folder: int(folder.name)))

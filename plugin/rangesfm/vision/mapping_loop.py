@@ -1,10 +1,10 @@
-"""COLMAP's incremental mapping, the same in every run, and with a global bundle adjustment of one's own if wanted.
+"""COLMAP's incremental mapping with the same result in every run, optionally with another global bundle adjustment.
 
-pycolmap.incremental_mapping searches for an initial pair in several threads. Now and then one of them finds a pair that
-comes late in the order, and ends the search of another for an earlier one; so the search is left to one thread here.
+pycolmap.incremental_mapping searches for the initial pair in several threads. Sometimes a thread finds a pair that
+comes late in the order, and this ends another thread's search for an earlier pair. Here a single thread searches.
 
-With an adjustment of one's own, the order of things is that of COLMAP's IncrementalPipeline, whose parts do all the
-work but the global adjustment: with COLMAP's own there, the models are the same.
+With another adjustment, the steps follow COLMAP's IncrementalPipeline, whose parts do everything except the global
+adjustment. If that adjustment is COLMAP's own, the models are the same as COLMAP's.
 """
 
 from __future__ import annotations
@@ -26,21 +26,22 @@ class GlobalAdjustment(Protocol):
 
     @property
     def inputs(self) -> Any:
-        """Plain values; others whenever it would adjust otherwise."""
+        """Plain values that differ whenever the adjustment would give another result."""
 
     def adjust(self, model: pycolmap.Reconstruction) -> bool:
-        """Adjust all of a model, in place; False leaves it, as it was, to COLMAP."""
+        """Adjust a whole model in place; return False to leave the unchanged model to COLMAP's adjustment."""
 
 
-# As in COLMAP: an initial pair that cannot be continued is given up after so many photos.
+# Photos that are tried in vain before a model below the minimal size is given up, as in COLMAP's IncrementalPipeline.
 _MAX_NUM_INITIAL_TRIALS = 30
+# Rounds of lower demands on the initial pair, as in COLMAP.
 _NUM_RELAXATIONS = 2
-# Relative, of the cost: Ceres' own.
+# The last adjustment ends when the cost decreases by less than this fraction, which is Ceres' default.
 _WHOLE_FUNCTION_TOLERANCE = 1e-6
 
 
 class _StoppedError(Exception):
-    """Goes through COLMAP's mapping, whose parts hear of a cancellation and of the time only so."""
+    """Raised in a callback to stop COLMAP's mapping, whose parts watch neither a cancellation nor the time."""
 
 
 def incremental_mapping(
@@ -54,15 +55,16 @@ def incremental_mapping(
     next_image_callback: Callable[[pycolmap.Reconstruction], None] = lambda model: None,
     cancellation_token: pycolmap.CancellationToken | None = None,
 ) -> list[pycolmap.Reconstruction]:
-    """All models, in the order in which they were begun.
+    """Run the incremental mapping and return all models, in the order in which they were begun.
 
-    Python's lock is held but for the callbacks: COLMAP's parts do not release it.
+    COLMAP's parts do not release Python's global lock, so that other threads run only during the callbacks.
 
     Args:
         adjustment: takes the place of COLMAP's global bundle adjustment.
-        input_path: a model to go on from.
-        next_image_callback: given the model that the photo was added to.
-        cancellation_token: ends the mapping with the photo at hand, as the time does that the options allow.
+        input_path: folder of a model to continue.
+        initial_image_pair_callback: called when a model has its initial pair, or is continued.
+        next_image_callback: called for each further photo, with the model that the photo was added to.
+        cancellation_token: ends the mapping after the current photo, as does ``options.max_runtime_seconds``.
     """
     options.image_path = image_path
     manager = pycolmap.ReconstructionManager()
@@ -95,9 +97,10 @@ def adjust_whole(
     options: pycolmap.IncrementalPipelineOptions,
     adjustment: GlobalAdjustment | None = None,
 ) -> None:
-    """Adjust all of a model of this database once more, in place, as the mapping does at its end, but to the end.
+    """Adjust a whole model of this database once more, in place, as the mapping does at its end, until it converges.
 
-    COLMAP stops at a slope that is steep for a focal length which few photos tell: it would stay 10 % off among six.
+    COLMAP's gradient tolerance stops an adjustment too early where few photos determine the focal length: with six
+    photos it would stay 10 % off.
     """
     with pycolmap.Database.open(database_path) as database:
         pipeline = pycolmap.IncrementalPipeline(options, database, pycolmap.ReconstructionManager())
@@ -113,7 +116,7 @@ def adjust_whole(
 
 
 def _map_with_relaxed_demands(pipeline: pycolmap.IncrementalPipeline, adjustment: GlobalAdjustment | None) -> None:
-    """Map until nothing is left to register, with lower and lower demands on the initial pair."""
+    """Map until nothing is left to register, lowering the demands on the initial pair step by step."""
     mapper = pycolmap.IncrementalMapper(pipeline.database_cache)
     goes_on = pipeline.reconstruction_manager.size() > 0
     for options in _relaxed(pipeline.options.get_mapper(), mapper):
@@ -134,7 +137,7 @@ def _map_with_relaxed_demands(pipeline: pycolmap.IncrementalPipeline, adjustment
 def _relaxed(
     options: pycolmap.IncrementalMapperOptions, mapper: pycolmap.IncrementalMapper
 ) -> Iterator[pycolmap.IncrementalMapperOptions]:
-    options.num_threads = 1  # for nothing but the search for an initial pair
+    options.num_threads = 1  # COLMAP uses these threads only in the search for an initial pair
     yield options
     for _ in range(_NUM_RELAXATIONS):
         options.init_min_num_inliers //= 2
@@ -147,7 +150,7 @@ def _relaxed(
 
 @dataclass(frozen=True)
 class _MappingLoop:
-    """One run of the mapper over a database, with the present demands on an initial pair (``mapper_options``)."""
+    """One run of the mapper over a database, with one set of demands on an initial pair (``mapper_options``)."""
 
     pipeline: pycolmap.IncrementalPipeline
     mapper: pycolmap.IncrementalMapper
@@ -155,10 +158,10 @@ class _MappingLoop:
     adjustment: GlobalAdjustment | None
 
     def map_models(self, goes_on: bool) -> bool:
-        """Model after model, each from another initial pair; whether that was all that is wanted.
+        """Build models, each from another initial pair; return False if lower demands might give further models.
 
         Args:
-            goes_on: with the model that is there, at first.
+            goes_on: continue the existing model first.
         """
         options, manager = self.pipeline.options, self.pipeline.reconstruction_manager
         for trial in range(options.init_num_trials):
@@ -168,7 +171,7 @@ class _MappingLoop:
             num_images, is_another = model.num_reg_images(), options.multiple_models and manager.size() > 1
             is_kept = status == pycolmap.IncrementalPipelineStatus.SUCCESS and num_images > 0
             is_kept = is_kept and not (is_another and num_images < options.min_model_size)
-            # Before the mapper forgets those of a model that is not kept: it has tried them.
+            # Counted now, because the mapper is about to forget the photos of a discarded model. They have been tried.
             num_tried = self.mapper.num_total_reg_images()
             if is_kept:
                 model.update_point_3d_errors()
@@ -186,7 +189,7 @@ class _MappingLoop:
         return False
 
     def _map_model(self, model: pycolmap.Reconstruction) -> pycolmap.IncrementalPipelineStatus:
-        """An initial pair, and photo after photo from there."""
+        """Build one model: find an initial pair unless the model has photos, then add photo after photo."""
         options, mapper = self.pipeline.options, self.mapper
         mapper.begin_reconstruction(model)
         if not model.num_reg_frames():
@@ -199,7 +202,7 @@ class _MappingLoop:
         while mapper.num_shared_reg_images() < options.max_model_overlap:
             image_id = self._register_next(model)
             if image_id is None:
-                # Once more after an adjustment, which may bring photos into reach.
+                # A global adjustment may make further photos registrable, so it is followed by one more attempt.
                 if has_failed:
                     break
                 self.adjust_all(model)
@@ -220,7 +223,7 @@ class _MappingLoop:
         return pycolmap.IncrementalPipelineStatus.SUCCESS
 
     def _register_next(self, model: pycolmap.Reconstruction) -> int | None:
-        """The photo that was registered, by its points or else by its matches; None: none could be."""
+        """Register a photo by its points, or else by its matches; return its id, or None if no photo could be."""
         options, mapper = self.pipeline.options, self.mapper
         only, fallback = options.structure_less_registration_only, options.structure_less_registration_fallback
         for structure_less in (True,) if only else (False, True) if fallback else (False,):
@@ -248,7 +251,7 @@ class _MappingLoop:
     def adjust_all(
         self, model: pycolmap.Reconstruction, bundle_adjustment: pycolmap.BundleAdjustmentOptions | None = None
     ) -> None:
-        """Adjust the whole model, and its tracks to it, until they change no more."""
+        """Adjust the whole model and update its tracks in turns, until the tracks hardly change."""
         bundle_adjustment = bundle_adjustment or self.pipeline.options.get_global_bundle_adjustment()
         options, mapper = self.pipeline.options, self.mapper
         triangulation = options.get_triangulation()

@@ -1,4 +1,4 @@
-"""Step 2: which features of two photos show the same thing."""
+"""Step 2: matching of features between photos."""
 
 from __future__ import annotations
 
@@ -28,13 +28,14 @@ from rangesfm.vision.own_process import MODULE, MatchingShare
 from rangesfm.vision.pairs import NamedPairs, Pairing, pairing_options, pairs_to_match
 from rangesfm.vision.photos import Photos
 
-_MIN_NUM_PAIRS = 100  # for less, a second process does not pay
-_MAX_NUM_PAIRS = 2000  # of one share, whose database is one of at most some hundred photos
-# A tile's pairs are of few photos for one share, a small one's for COLMAP's memory.
+_MIN_NUM_PAIRS = 100  # with fewer pairs, a second process is not worth its start
+_MAX_NUM_PAIRS = 2000  # pairs of one share; its database then holds some hundred photos at most
+# Pairs are sorted by tiles of the matrix of all pairs, in photos a side. Tiles keep the photos of one share few; the
+# small tiles inside them keep the photos in COLMAP's memory few.
 _TILE_SIZE, _SMALL_TILE_SIZE = 64, 8
-# pycolmap's wheels carry an OpenBLAS without locks. Of two threads that match at once, one now and then
-# computes in the other's memory: some pair keeps 50 of its 1100 matches, in every run another one.
-# Processes have memories of their own. [mapper.matcher] num_threads overrides this. On a GPU no BLAS is used.
+# pycolmap's wheels carry an OpenBLAS without locks. When two threads match at once, one sometimes computes in the
+# other's memory: some pair then keeps 50 of its 1100 matches, a different pair in every run. Processes do not share
+# memory, so each matches in one thread. [mapper.matcher] num_threads overrides this. A GPU uses no BLAS.
 _NUM_CPU_THREADS = 1
 
 
@@ -43,9 +44,11 @@ class MatchingOptions:
     """COLMAP's options for the chosen way of matching.
 
     Attributes:
-        pairing: says which pairs.
-        verifier: of matches that are given.
-        num_processes: that match at once.
+        pairing: which pairs are matched.
+        matcher: options of the matching itself.
+        verification: options of the geometric verification of matches.
+        verifier: options of the verification where the matches are given.
+        num_processes: processes that match at the same time.
     """
 
     pairing: Pairing | NamedPairs
@@ -60,21 +63,25 @@ class MatchingOptions:
 
     @property
     def is_by_place(self) -> bool:
-        """Whether a pair is one before anything is known of the photos but their order and their names."""
+        """Whether the pairs depend on the order and names of the photos alone, not on their content or position."""
         if isinstance(self.pairing, (pycolmap.SpatialPairingOptions, pycolmap.VocabTreePairingOptions)):
             return False
         return not (isinstance(self.pairing, pycolmap.SequentialPairingOptions) and self.pairing.loop_detection)
 
     @property
     def pairing_inputs(self) -> list[Any]:
-        """Plain values that tell these pairs from others of the same photos."""
+        """Plain values that differ whenever other pairs of the same photos would be matched."""
         if isinstance(self.pairing, tuple):
             return list(self.pairing)
         return [type(self.pairing).__name__, str(self.pairing.todict())]
 
 
 def matching_options(mapper: MapperOptions, num_photos: int, seed: int) -> MatchingOptions:
-    """Raises InputError for keys or values that are not COLMAP's, or for a GPU that is not there."""
+    """Return the options for matching.
+
+    Raises:
+        InputError: a key or value that COLMAP does not have, or no GPU where one is asked for.
+    """
     on_gpu = uses_gpu(mapper)
     num_threads = mapper.num_threads if on_gpu else _NUM_CPU_THREADS
     options = MatchingOptions(
@@ -84,7 +91,7 @@ def matching_options(mapper: MapperOptions, num_photos: int, seed: int) -> Match
         verifier=pycolmap.GeometricVerifierOptions(num_threads=mapper.num_threads),
         num_processes=1 if on_gpu else mapper.num_cores,
     )
-    # Within COLMAP's own: what it asks of two views is not what its RANSAC asks by itself.
+    # Set in COLMAP's own options, because their RANSAC defaults differ from those of a fresh RANSACOptions.
     options.verification.ransac.random_seed = seed
     apply_options(options.matcher, mapper.matcher, "mapper.matcher")
     refuse_learned(options.matcher.type.name, "mapper.matcher")
@@ -95,10 +102,10 @@ def matching_options(mapper: MapperOptions, num_photos: int, seed: int) -> Match
 def match_features(
     database_path: Path, photos: Photos, options: MatchingOptions, log: Path, progress: Progress
 ) -> None:
-    """Match the pairs of photos that have not been matched yet; with the same result whatever the number of processes.
+    """Match the pairs of photos that have not been matched yet; the number of processes does not change the result.
 
     Args:
-        log: what COLMAP says is appended to it.
+        log: COLMAP's messages are appended to this file.
 
     Raises:
         ReconstructionError: no two photos match.
@@ -120,7 +127,11 @@ def match_features(
 
 
 def verify_matches(database_path: Path, photos: Photos, options: MatchingOptions, progress: Progress) -> None:
-    """Look which matches fit one geometry of two views, unless that is done; ReconstructionError if none do."""
+    """Verify the matches by two-view geometry, unless that is done.
+
+    Raises:
+        ReconstructionError: no two photos match.
+    """
     with pycolmap.Database.open(database_path) as database:
         num_pairs = database.num_matched_image_pairs()
         if database.num_verified_image_pairs() < num_pairs:
@@ -143,8 +154,8 @@ def _require_matches(database_path: Path, photos: Photos) -> None:
         num_matching = num_matching_pairs(database)
     if num_matching == 0:
         raise ReconstructionError(
-            f"no two of {len(photos.names)} photos match: neighbours should share at least half of what they show;"
-            " more photos, or more of them as keyframes, may help"
+            f"no two of {len(photos.names)} photos match: neighbouring photos should overlap by at least half;"
+            " more photos or more keyframes may help"
         )
 
 
@@ -170,14 +181,14 @@ def _match_shares(
         with closing(run_children(MODULE, prepared(), num_at_once, update)) as ended:
             for _ in ended:
                 take_first()
-    finally:  # interrupted: what there is saves the next run doing it
+    finally:  # after an interruption, keep the matches found so far for the next run
         while begun:
-            with suppress(RuntimeError):  # a database that was only being made
+            with suppress(RuntimeError):  # the database of a share was not complete yet
                 take_first()
 
 
 def _shared_out(pairs: Sequence[tuple[int, int]], num_processes: int) -> Iterator[list[tuple[int, int]]]:
-    """Shares for processes that work at the same time: of the same size, and of few photos."""
+    """Split the pairs into shares of equal size and of few photos each, for processes that work at the same time."""
     tiles = sorted(pairs, key=lambda pair: [id_ // size for size in (_TILE_SIZE, _SMALL_TILE_SIZE, 1) for id_ in pair])
     num_at_once = max(1, min(num_processes, len(pairs) // _MIN_NUM_PAIRS))
     for start in range(0, len(tiles), num_at_once * _MAX_NUM_PAIRS):

@@ -1,8 +1,9 @@
-"""What COLMAP does in a process of its own: features, a share of the matching, and the mappers that take all photos.
+"""Work that COLMAP does in a process of its own: features, a share of the matching, and mappers that take all photos.
 
-A library that writes to a full disk from a thread of its own ends the whole process: here it ends one that is watched.
+When the disk is full, a library that writes from its own thread ends the whole process. Here that is a child process,
+whose end is noticed.
 
-Run as a module by ``rangesfm.processes.supervision`` it does one such piece of work.
+``rangesfm.processes.supervision`` runs this file as a module to do one piece of work.
 """
 
 from __future__ import annotations
@@ -23,13 +24,14 @@ from rangesfm.vision.device import device_of
 
 MODULE = "rangesfm.vision.own_process"
 WholePipelineOptions = pycolmap.GlobalPipelineOptions | pycolmap.HierarchicalPipelineOptions
-# Features that COLMAP keeps in memory, each of some 700 bytes with its index; what it forgets it indexes anew.
+# Largest number of features that COLMAP keeps in memory, each with its index some 700 bytes. Features that it drops are
+# read and indexed again when needed.
 _MAX_NUM_FEATURES = 400_000
 
 
 @dataclass(frozen=True)
 class FeatureExtraction:
-    """Photos of a database that are to have features, where their masks, if there are any, are not black."""
+    """Feature extraction for photos of a database, except where their masks, if there are any, are black."""
 
     database: Path
     image_path: Path
@@ -39,7 +41,7 @@ class FeatureExtraction:
     log: Path
 
     def run(self, _: Progress) -> int:
-        """Returns how many photos there were; whoever looks into the database sees how many are done."""
+        """Extract the features and return the number of photos; progress is read from the database instead."""
         reader = pycolmap.ImageReaderOptions()
         if self.mask_path is not None:
             reader.mask_path = self.mask_path
@@ -57,7 +59,7 @@ class FeatureExtraction:
 
 @dataclass(frozen=True)
 class MatchingShare:
-    """Pairs of photos by their ids, smaller first, and all that it takes to match them in a folder of their own."""
+    """A share of the matching: pairs of photo ids, smaller first, matched in a folder of their own."""
 
     folder: Path
     pairs: Sequence[tuple[int, int]]
@@ -70,20 +72,20 @@ class MatchingShare:
 
     @property
     def log(self) -> Path:
-        """What COLMAP said."""
+        """File with COLMAP's messages."""
         return self.folder / "mapper.log"
 
     def prepare(self, source: Path) -> None:
-        """Take over the features of its photos; there each photo is called by its id."""
+        """Copy the features of its photos into a database of its own, where each photo is named by its id."""
         copy_photos(source, self.database, sorted({id_ for pair in self.pairs for id_ in pair}))
         (self.folder / "pairs.txt").write_text("".join(f"{first} {second}\n" for first, second in self.pairs))
 
     def run(self, progress: Progress) -> int:
-        """Returns how many pairs have been compared."""
+        """Match the pairs and return their number."""
         pairing = pycolmap.ImportedPairingOptions()
         pairing.match_list_path = self.folder / "pairs.txt"
         with colmap_log(self.log), pycolmap.Database.open(self.database) as database:
-            # Pairs after which COLMAP writes down what it has found; it keeps as many photos in memory.
+            # Number of pairs after which COLMAP writes its matches; it also keeps this many photos in memory.
             pairing.block_size = max(1, _MAX_NUM_FEATURES * database.num_images() // (1 + database.num_descriptors()))
             run_in_background(
                 lambda token: pycolmap.match_image_pairs(
@@ -101,13 +103,16 @@ class MatchingShare:
         return len(self.pairs)
 
     def hand_over(self, target: Path) -> None:
-        """What it has found, also of pairs that do not match."""
+        """Copy the results into the target database, also of pairs that do not match."""
         copy_matches(self.database, target, ((pair, pair) for pair in self.pairs))
 
 
 @dataclass(frozen=True)
 class WholeMapping:
-    """A mapping that neither says how far it is nor hears of a Ctrl-C; it writes the models beside the database."""
+    """A mapping that takes all photos at once; it reports no progress and writes the models beside the database.
+
+    It does not notice a cancellation, so that Ctrl-C ends its process.
+    """
 
     database: Path
     image_path: Path
@@ -115,11 +120,11 @@ class WholeMapping:
 
     @property
     def log(self) -> Path:
-        """What COLMAP said."""
+        """File with COLMAP's messages."""
         return self.database.with_name("mapper.log")
 
     def run(self, _: Progress) -> int:
-        """Returns how many models there are."""
+        """Run the mapping and return the number of models."""
         where = self.database, self.image_path, self.database.parent
         with colmap_log(self.log):
             if isinstance(self.options, pycolmap.GlobalPipelineOptions):
@@ -128,7 +133,7 @@ class WholeMapping:
 
 
 def _run(work: FeatureExtraction | MatchingShare | WholeMapping, parent: MessagesToParent) -> int:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # at once: what is written down is whole
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C may end the process at once: files written so far are intact
     return work.run(parent)
 
 

@@ -1,4 +1,4 @@
-"""Which pairs of photos are matched: by COLMAP's generators of pairs, or as a list says."""
+"""Choice of the pairs of photos to match: by COLMAP's pair generators, or from a list."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rangesfm.options import MapperOptions
 from rangesfm.vision.database import named_by_place
 from rangesfm.vision.photos import Photos
 
-_MAX_NUM_EXHAUSTIVE = 60  # 1770 pairs; beyond, the pairs outgrow the photos
+_MAX_NUM_EXHAUSTIVE = 60  # photos, which make 1770 pairs; with more photos the number of pairs grows too large
 
 Pairing = (
     pycolmap.ExhaustivePairingOptions
@@ -27,10 +27,10 @@ NamedPairs = tuple[tuple[str, str], ...]
 
 
 def pairing_options(mapper: MapperOptions, num_photos: int) -> Pairing | NamedPairs:
-    """COLMAP's options, whose type says which way it is, or the pairs by name.
+    """Return COLMAP's options for pairing, whose type is the way of pairing, or the pairs of a list by name.
 
     Raises:
-        InputError: keys or values that are not COLMAP's, or a list that is none.
+        InputError: a key or value that COLMAP does not have, or a file that is not a list of pairs.
     """
     if mapper.pairs is not None:
         return read_pairs(mapper.pairs)
@@ -51,10 +51,10 @@ def pairing_options(mapper: MapperOptions, num_photos: int) -> Pairing | NamedPa
 
 
 def read_pairs(path: Path) -> NamedPairs:
-    """Two names of photos a line, with a tab between them, or a blank where neither has one; ``#`` begins a comment.
+    """Read a list of pairs: two photo names a line, separated by a tab or by blanks; ``#`` begins a comment.
 
     Raises:
-        InputError: with the line that does not hold two names, or a file that cannot be read.
+        InputError: a line does not hold two different names (the error gives the line), or the file cannot be read.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -66,16 +66,18 @@ def read_pairs(path: Path) -> NamedPairs:
             continue
         names = [name.strip() for name in line.split("\t")] if "\t" in line else line.split()
         if len(names) != 2 or names[0] == names[1]:
-            raise InputError(f"'{line}', expected the names of two photos with a tab between them", path, number)
+            raise InputError(f"'{line}', expected the names of two photos separated by a tab", path, number)
         pairs.append((names[0], names[1]))
     return tuple(pairs)
 
 
 def pairs_to_match(database_path: Path, photos: Photos, pairing: Pairing | NamedPairs) -> list[tuple[int, int]]:
-    """Ids of all pairs to be compared, smaller first; where the photos' looks or places decide, features are needed.
+    """Return the ids of all pairs to be matched, sorted, smaller id first.
+
+    Pairing by similarity needs the features in the database, and pairing by position the photos' positions.
 
     Raises:
-        ReconstructionError: a list of pairs that names no two of the photos.
+        ReconstructionError: the list of pairs contains no pair of these photos.
     """
     if isinstance(pairing, tuple):
         return _pairs_of_names(photos.names, pairing)
@@ -95,8 +97,10 @@ def pairs_to_match(database_path: Path, photos: Photos, pairing: Pairing | Named
             if not isinstance(pairing, pycolmap.VocabTreePairingOptions):
                 raise
             reason = " ".join(str(error).split())
-            raise InputError(f"is no vocabulary tree for these features ({reason})", pairing.vocab_tree_path) from None
-    # The most alike to a photo is itself.
+            raise InputError(
+                f"is not a vocabulary tree for these features ({reason})", pairing.vocab_tree_path
+            ) from None
+    # Pairing by similarity also pairs each photo with itself, its most similar photo. These pairs are left out.
     return sorted({(min(pair), max(pair)) for pair in pairs if pair[0] != pair[1]})
 
 
@@ -105,6 +109,6 @@ def _pairs_of_names(names: Sequence[str], pairs: NamedPairs) -> list[tuple[int, 
     known = [(ids[first], ids[second]) for first, second in pairs if first in ids and second in ids]
     if not known:
         raise ReconstructionError(
-            f"none of {len(pairs)} pairs is of two keyframes, expected names relative to the folder as {names[0]}"
+            f"none of {len(pairs)} pairs names two keyframes, expected names relative to the folder, such as {names[0]}"
         )
     return sorted({(min(pair), max(pair)) for pair in known})

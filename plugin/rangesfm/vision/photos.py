@@ -1,4 +1,4 @@
-"""The files of photos: which can be read, what cameras write into them beside the pixels, and their masks."""
+"""Photo files: which of them can be read, their EXIF data, and their masks."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from rangesfm.files.contents import sha256_of, state_and_sha256
 
 MIN_NUM_PHOTOS = 2
 MAX_PIXELS = 1_000_000_000
-"""Of a photo that is used: COLMAP needs three bytes for each, and a small file may claim any number of them."""
+"""Largest number of pixels of a photo; COLMAP needs three bytes for each, and a small file may claim any number."""
 UNREADABLE = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
-"""What Pillow's readers raise."""
+"""Errors that Pillow's readers raise."""
 _pillow_limit = threading.Lock()
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 _LATITUDE, _LONGITUDE, _ALTITUDE = 2, 4, 6
@@ -28,13 +28,13 @@ _LATITUDE_REF, _LONGITUDE_REF, _ALTITUDE_REF = 1, 3, 5
 
 @dataclass(frozen=True)
 class Photos:
-    """Photos, of whatever size.
+    """Photos of one folder, of any sizes.
 
     Attributes:
-        folder: of all of them.
+        folder: the folder.
         names: n names, relative to the folder, in the order given.
-        sizes: n times width and height, pixels, as stored: EXIF does not turn them, as COLMAP does not.
-        left_out: photos that cannot be used, and why.
+        sizes: n pairs of width and height in pixels, as stored; EXIF orientation is ignored, as in COLMAP.
+        left_out: for each photo that cannot be used, by name, the reason.
     """
 
     folder: Path
@@ -43,16 +43,16 @@ class Photos:
     left_out: dict[str, str]
 
     def of(self, names: Collection[str]) -> Photos:
-        """Some of them."""
+        """Return the photos with these names."""
         wanted = set(names)
         kept = [(name, size) for name, size in zip(self.names, self.sizes, strict=True) if name in wanted]
         return replace(self, names=tuple(name for name, _ in kept), sizes=tuple(size for _, size in kept))
 
     def contents(self, known: Mapping[str, Any]) -> dict[str, tuple[tuple[int, int, int], str]]:
-        """State and SHA-256 of each file, by name in the order given: what tells these photos from others.
+        """Return the state and SHA-256 of each file, by name in the order given.
 
         Args:
-            known: what an earlier call returned, perhaps by way of JSON; a file is not read again
+            known: the result of an earlier call, which may have been stored as JSON. A file is not read again
                 while its size and its times of change are the same.
         """
         return {name: state_and_sha256(self.folder / name, known.get(name)) for name in self.names}
@@ -60,10 +60,12 @@ class Photos:
 
 @contextmanager
 def opened_image(path: Path) -> Iterator[Image.Image]:
-    """Open an image of whatever size, of which Pillow refuses those above 179 megapixels; no pixel is read by that.
+    """Open an image of up to MAX_PIXELS pixels, although Pillow refuses images above 179 megapixels.
+
+    No pixel is read yet.
 
     Raises:
-        One of UNREADABLE: it is no image, or no regular file, of which some never end, or has more than MAX_PIXELS.
+        One of UNREADABLE: it is not an image or not a regular file (reading some others never ends), or is too large.
     """
     if not path.is_file():
         raise FileNotFoundError("there is no such file")
@@ -82,7 +84,11 @@ def opened_image(path: Path) -> Iterator[Image.Image]:
 
 
 def usable_photos(folder: Path, names: Sequence[str]) -> Photos:
-    """Those that can be read; ReconstructionError for fewer than two of them."""
+    """Return the photos that can be read.
+
+    Raises:
+        ReconstructionError: fewer than two photos can be read.
+    """
     usable, left_out = dict[str, tuple[int, int]](), dict[str, str]()
     for name in names:
         try:
@@ -101,7 +107,7 @@ def usable_photos(folder: Path, names: Sequence[str]) -> Photos:
 
 
 def image_size(path: Path) -> tuple[int, int] | None:
-    """Width and height, pixels; None of what is no image."""
+    """Return width and height in pixels, or None if the file is not an image."""
     try:
         with opened_image(path) as image:
             return int(image.width), int(image.height)
@@ -110,7 +116,7 @@ def image_size(path: Path) -> tuple[int, int] | None:
 
 
 def exif_tags(path: Path) -> dict[int, Any]:
-    """Tags of the photo and of its exposure, by number; none if the file has none or is no image."""
+    """Return the EXIF tags of the photo and its exposure, by number; empty if the file has none or is not an image."""
     try:
         with opened_image(path) as image:
             exif = image.getexif()
@@ -120,7 +126,10 @@ def exif_tags(path: Path) -> dict[int, Any]:
 
 
 def exif_position(path: Path) -> tuple[float, float, float] | None:
-    """Latitude and longitude in degrees (WGS 84) and altitude in metres, 0 where it says none; None without a place."""
+    """Return the EXIF position: latitude and longitude in degrees (WGS 84), and altitude in metres, 0 if not given.
+
+    None if the photo has no usable position.
+    """
     try:
         with opened_image(path) as image:
             tags = image.getexif().get_ifd(_GPS_IFD)
@@ -140,31 +149,31 @@ def _degrees(parts: Any, is_negative: bool) -> float:
 
 
 def contents_of_masks(folder: Path | None, photos: Photos) -> dict[str, str]:
-    """SHA-256 of each photo's mask; none without a folder of them.
+    """Return the SHA-256 of each photo's mask, by the photo's name; empty without a folder of masks.
 
     Raises:
-        InputError: a photo has none, which COLMAP would leave without features, or one of another size, which COLMAP
-            would take for one of the photo's size.
+        InputError: a photo has no mask, so that COLMAP would find no features in it, or has a mask of another size,
+            which COLMAP would use as if it had the photo's size.
     """
     if folder is None:
         return {}
     if not folder.is_dir():
-        raise InputError("no such folder, expected one of masks ([mapper] mask_path)", folder)
+        raise InputError("no such folder, expected a folder of masks ([mapper] mask_path)", folder)
     masks = {name: _mask(folder, name) for name in photos.names}
     if missing := [name for name, mask in masks.items() if not mask.is_file()]:
         raise InputError(
-            f"{len(missing)} of {len(masks)} photos have no mask there, the first is {missing[0]}: expected"
+            f"{len(missing)} of {len(masks)} photos have no mask in this folder, the first is {missing[0]}: expected"
             f" {missing[0]}.png",
             folder,
         )
     for name, size in zip(photos.names, photos.sizes, strict=True):
         if (found := image_size(masks[name])) != size:
-            what = "cannot be read as an image" if found is None else f"is of {found[0]} x {found[1]} pixels"
-            raise InputError(f"{what}, expected {size[0]} x {size[1]} as the photo {name}", masks[name])
+            what = "cannot be read as an image" if found is None else f"has {found[0]} x {found[1]} pixels"
+            raise InputError(f"{what}, expected {size[0]} x {size[1]} like the photo {name}", masks[name])
     return {name: sha256_of(mask) for name, mask in masks.items()}
 
 
 def _mask(folder: Path, name: str) -> Path:
-    """As COLMAP looks for it: that of a.png may also be called a.png."""
+    """Return the mask's path by COLMAP's rule: the mask of a.png is a.png.png, or else a.png."""
     mask = folder / f"{name}.png"
     return folder / name if not mask.is_file() and name.lower().endswith(".png") else mask

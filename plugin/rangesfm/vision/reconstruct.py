@@ -1,4 +1,4 @@
-"""Photos to an unscaled COLMAP model: features, matching, mapping."""
+"""Reconstruction of an unscaled COLMAP model from photos: features, matching, mapping."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from rangesfm.vision.unpublished import UnpublishedReconstruction
 
 @dataclass(frozen=True)
 class ReconstructionSummary:
-    """What became of the photos.
+    """Outcome of a reconstruction.
 
     Attributes:
         models: the separate models, the one with the most photos first.
         num_keyframes: photos asked for.
         num_registered: photos in the first model.
-        seconds: by step ("features", "matching", "mapping"); one that was taken over has none.
+        seconds: duration of each step ("features", "matching", "mapping"), without those taken over from earlier runs.
         log_path: COLMAP's own log.
     """
 
@@ -63,30 +63,31 @@ def reconstruct(
     """Reconstruct photos.
 
     Writes ``database.db``, the models ``sparse/0`` (the largest), ``sparse/1``, ..., ``mapper.log``
-    and ``reconstruct.json`` to ``output_path``, once all of them are complete. Steps that an earlier run into the same
-    folder did with the same photos (by their content) and options are taken over, and so are the features and matches
-    that an interrupted one had found, and its newest snapshot of the mapping. Where only some photos are other ones, so
-    are the features of those that are the same, and the matches of pairs of them.
+    and ``reconstruct.json`` to ``output_path``, once all of them are complete.
+
+    Steps that an earlier run into the same folder did with the same photos (by their content) and options are taken
+    over. Of an interrupted run, the features and matches found so far and the newest snapshot of the mapping are taken
+    over. Where only some of the photos have changed, the features of the others and the matches between them are.
 
     Args:
         image_path: folder of the photos.
-        image_names: the keyframes, relative to it, in time order.
+        image_names: the keyframes, relative to that folder, in time order.
         output_path: made if it does not exist.
-        camera: which photos share one, and what is known of it.
-        rigs: that cameras are on.
-        seed: the same one gives the same models.
+        camera: which photos share a camera, and what is known of the cameras.
+        rigs: the rigs that cameras are mounted on.
+        seed: the same seed gives the same models.
         restart: take nothing over.
         adjustment: takes the place of COLMAP's global bundle adjustment while the map grows, photo by photo.
-        superseded: names of what was made from the earlier models, in the output folder; it goes with them.
+        superseded: names in the output folder of files made from the earlier models; they are removed with them.
         deferred: leave the earlier reconstruction in its place until a result is published (``OutputFolder.defer``).
 
     Raises:
-        InputError: options that COLMAP does not take, a folder that cannot be written to, or files in the places of
-            the results that this tool did not write.
+        InputError: COLMAP does not accept an option, a folder cannot be written to, or files that this tool did not
+            write are in the places of the results.
         ReconstructionError: the photos cannot be read, or do not give a model.
         KeyboardInterrupt: as soon as COLMAP has stopped.
     """
-    pipeline_options(camera, mapper, seed)  # what COLMAP does not take is refused before anything is computed
+    pipeline_options(camera, mapper, seed)  # so that bad options are refused before anything is computed
     progress = progress or SilentProgress()
     with (
         sole_writer(Path(output_path)) as output,
@@ -120,7 +121,11 @@ def _map(
     seed: int,
     adjustment: GlobalAdjustment | None,
 ) -> None:
-    """Write the models of the matches, whose fingerprint is given, into the workspace."""
+    """Map the photos in the workspace's database into models.
+
+    Args:
+        of_matches: fingerprint of the matches.
+    """
     intrinsics = [table.intrinsics_in_mapping for table in camera.tables]
     of_adjustment = [] if adjustment is None else [adjustment.inputs]
     inputs = fingerprint(of_matches, mapper.method, mapper.pipeline, *intrinsics, *of_adjustment)
@@ -146,12 +151,13 @@ def _map(
 
 
 def _place_cameras(space: Workspace, photos: Photos, rigs: Rigs, options: MappingOptions) -> None:
-    """Map the photos as if there were no rigs, and enter in the database where their cameras sit in that model.
+    """Map the photos without rigs, and write the rigs' poses found in that model into the database.
 
-    Places that are known say what its unit is, so that all go together.
+    Camera poses that the configuration does give set the scale of that model, so that all poses have one unit.
 
     Raises:
-        ReconstructionError: there is no model, or a camera of a rig is not in it together with its reference camera.
+        ReconstructionError: there is no model, or no photo of some rig camera is in it together with one of its
+            reference camera, taken at the same time.
     """
     with scratch_folder(space.output / "rigs") as folder:
         without_rigs = Workspace(folder, space.progress, log=space.log)
@@ -162,12 +168,12 @@ def _place_cameras(space: Workspace, photos: Photos, rigs: Rigs, options: Mappin
         model = read_models(without_rigs.models)[0]
     rigs.rescale(model)
     why_not = (
-        "without the rig no photos of its cameras that were taken at once come into one model: say in"
-        f" {rigs.path} where they sit (cam_from_rig)"
+        "mapped without the rig, no photos that its cameras took at once are in one model: add the cameras' poses"
+        f" (cam_from_rig) to {rigs.path}"
     )
     try:
         rigs.apply(space.database, model)
-    except InputError as error:  # there are frames of which it has no other camera's photo
+    except InputError as error:  # in no frame does the model have the photo of another camera
         raise ReconstructionError(why_not) from error
     with pycolmap.Database.open(space.database) as database:
         if any(pose is None for rig in database.read_all_rigs() for pose in rig.non_ref_sensors.values()):
@@ -183,9 +189,10 @@ def match_photos(
     seed: int,
     space: Workspace,
 ) -> tuple[Photos, str]:
-    """Features and matches of photos, returned by their ids 1, 2, ..., with the matches' fingerprint.
+    """Write features and matches of the photos into the workspace's database.
 
-    Arguments and errors as of ``reconstruct``.
+    Returns the photos used, whose ids in the database are 1, 2, ..., and the fingerprint of the matches. Arguments and
+    errors are those of ``reconstruct``.
     """
     check_camera(camera)
     for_features = feature_options(mapper)
@@ -207,8 +214,8 @@ def match_photos(
             cameras = given.cameras() if is_open else cameras_of_photos(camera, photos, rigs)
         if cameras.guessed:
             space.progress.message(
-                f"the camera's parameters are of photos of another shape than {cameras.guessed[0]}: COLMAP guesses its"
-                f" camera ({len(cameras.guessed)} of {len(cameras.cameras)} cameras)"
+                f"the camera's parameters belong to photos of another shape than {cameras.guessed[0]}: COLMAP guesses"
+                f" its camera ({len(cameras.guessed)} of {len(cameras.cameras)} cameras)"
             )
         renewed = RenewedDatabase(space, photos, cameras, rigs, given, mapper, masks, for_features, for_matching)
         with space.logged():

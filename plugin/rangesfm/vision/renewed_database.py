@@ -1,4 +1,4 @@
-"""Steps 1 and 2 in COLMAP's database, begun anew where photos or options are other ones: what holds of it stays."""
+"""Steps 1 and 2 in COLMAP's database; when photos or options change, the parts that are still valid are kept."""
 
 from __future__ import annotations
 
@@ -36,14 +36,15 @@ _NOTE = "database"
 
 @dataclass(frozen=True)
 class RenewedDatabase:
-    """The database of a reconstruction, with a note in the record of its steps of what it was made from.
+    """The database of a reconstruction, with a note in the record of its steps that says what it was made from.
 
-    Killed at any moment, it leaves a note that is true or none; without one nothing of the database is used.
+    If the process is killed at any moment, the note is either true or missing. Without a note nothing of the database
+    is used.
 
     Attributes:
         photos: in the order of their ids.
-        given: the user's database, whose features take the place of all that an earlier run has found.
-        masks: SHA-256 of each photo's, by name.
+        given: the user's database, whose features replace all that an earlier run has found.
+        masks: SHA-256 of each photo's mask, by the photo's name.
     """
 
     space: Workspace
@@ -65,9 +66,9 @@ class RenewedDatabase:
 
     @cached_property
     def feature_inputs(self) -> str:
-        """Fingerprint of what features depend on beside the photo itself."""
+        """Fingerprint of what features depend on besides the photo itself."""
         sources = [self.mapper.features, *([self.masks] if self.masks else [])]
-        on_gpu = ["GPU"] if self.features.use_gpu else []  # which finds other features, and matches them otherwise
+        on_gpu = ["GPU"] if self.features.use_gpu else []  # a GPU finds other features and other matches
         return fingerprint(pycolmap.__version__, *(sources if self.given is None else self.given.inputs), *on_gpu)
 
     @property
@@ -76,12 +77,12 @@ class RenewedDatabase:
 
     @cached_property
     def match_inputs(self) -> str:
-        """Likewise, of matches beside the two photos."""
+        """Fingerprint of what matches depend on besides the two photos."""
         how = [self.matching.pairing_inputs, self.mapper.matcher, self.matching.seed]
         return fingerprint(self.feature_inputs, self.cameras.inputs, *([] if self.has_matches else how))
 
     def fill(self) -> str:
-        """Find features and matches, as far as no earlier run has; returns the fingerprint of all they depend on."""
+        """Find the features and matches that no earlier run has found; return the fingerprint of all they depend on."""
         database, photos, steps = self.space.database, self.photos, self.space.steps
         contents = list(self.contents.items())
         inputs = fingerprint(self.feature_inputs, self.cameras.inputs, contents, *self.rigs.inputs)
@@ -93,25 +94,26 @@ class RenewedDatabase:
         return inputs
 
     def _begin(self) -> None:
-        """Put a new database in the place of the earlier one, with what that has of the same photos."""
+        """Replace the earlier database by a new one, with the earlier features and matches of unchanged photos."""
         space = self.space
         space.remove_old_models()
         space.log.unlink(missing_ok=True)
         earlier = space.steps.notes.get(_NOTE, {})
-        space.steps.note(_NOTE, {})  # until there is a new one nothing is taken over from the database
+        space.steps.note(_NOTE, {})  # until the new note is written, nothing is taken over from the database
         with new_file(space.database) as fresh:
             self._create(fresh)
             if self.given is not None:
                 self.given.copy_to(fresh)
             elif num_taken := self._take_over(earlier, fresh):
                 space.progress.message(f"features: those of {num_taken} photos are taken over from an earlier run")
-            remove_database(space.database)  # also what SQLite keeps beside it, which would be taken for the new one's
+            # SQLite would take files that it kept beside the old database for parts of the new one.
+            remove_database(space.database)
         self._write_note()
 
     def _begin_matching(self) -> None:
         """Forget the matches, unless they were made with the same options."""
         self.space.remove_old_models()
-        # In the place of those under which a process that was killed may have been matching.
+        # A process that was killed may have left the photos under the temporary names that sequential matching needs.
         name_photos(self.space.database, self.photos.names)
         if self.space.steps.notes.get(_NOTE, {}).get("matches") != self.match_inputs:
             clear_matches(self.space.database)
@@ -130,7 +132,7 @@ class RenewedDatabase:
         write_positions(path, (exif_position(self.photos.folder / name) for name in self.photos.names))
 
     def _take_over(self, earlier: Mapping[str, Any], fresh: Path) -> int:
-        """Returns of how many photos there were features."""
+        """Copy features and matches of unchanged photos; return the number of photos with features."""
         ids, path = self._earlier_ids(earlier), self.space.database
         if not ids or not path.exists():
             return 0
@@ -145,15 +147,15 @@ class RenewedDatabase:
                 }
                 copy_features(source, target, {old_id: new_id for new_id, old_id in taken.items()})
             of_pairs = (((taken.get(first, 0), taken.get(second, 0)), (first, second)) for first, second in pairs)
-            # Not of photos that stood in the other order: COLMAP does not match two as it would the other way round.
+            # A pair whose photos were in the other order is left out: COLMAP's matches depend on the order of the two.
             copy_matches(path, fresh, ((old, pair) for old, pair in of_pairs if 0 < old[0] < old[1]))
             return len(taken)
-        except RuntimeError:  # somebody has damaged the earlier one
+        except RuntimeError:  # the earlier database is damaged
             self._create(fresh)
             return 0
 
     def _earlier_ids(self, earlier: Mapping[str, Any]) -> dict[int, int]:
-        """Id in the earlier database of each photo that has not changed, by its new one."""
+        """Return the id in the earlier database of each photo that has not changed, by its new id."""
         if earlier.get("features") != self.feature_inputs:
             return {}
         photos = earlier.get("photos")

@@ -1,4 +1,4 @@
-"""Rigs of cameras by COLMAP's rig configuration: which photos were taken at once, and where the cameras sit."""
+"""Rigs of cameras from COLMAP's rig configuration: photos taken at once, and the cameras' poses in their rig."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ import pycolmap
 from rangesfm.distances.tape import CONTROL, TapedDistance
 from rangesfm.errors import InputError
 
-# Cameras that are nearer to each other share a centre, as those of a panorama do: no length.
+# Cameras nearer to each other than this share a centre, like those of a panorama, and give no length.
 _MIN_BASELINE_M = 1e-4
+# Largest difference of a quaternion's length from 1.
 _MAX_OFF_UNIT = 1e-3
-# Places are written to a hundredth of a millimetre or finer: what differs by less was not measured twice.
+# Positions are written to a hundredth of a millimetre or finer, so that a smaller difference is no second measurement.
 _SAME_PLACE_M = 1e-5
 
 
 @dataclass(frozen=True)
 class Rigs:
-    """Rigs as configured; none without a configuration.
+    """Rigs as configured; empty without a configuration.
 
     Attributes:
-        configs: COLMAP's, in the order of the file; their lengths are in metres.
-        path: of the file.
+        configs: COLMAP's rig configurations in the order of the file, with lengths in metres.
+        path: the configuration file.
     """
 
     configs: tuple[pycolmap.RigConfig, ...] = ()
@@ -40,36 +41,38 @@ class Rigs:
 
     @property
     def inputs(self) -> list[Any]:
-        """Plain values that tell them from others; none for no rigs."""
+        """Plain values that differ for other rigs; empty without rigs."""
         return [str(config.todict()) for config in self.configs]
 
     @property
     def are_known(self) -> list[bool]:
-        """Of each rig, whether the configuration says where all of its cameras sit."""
+        """For each rig, whether the configuration gives the poses of all its cameras."""
         return [all(c.ref_sensor or c.cam_from_rig is not None for c in config.cameras) for config in self.configs]
 
     @property
     def are_metric(self) -> bool:
-        """Whether the configuration says of any two cameras how far apart they are."""
+        """Whether the configuration gives the distance between any two cameras."""
         return any(_baseline_m(camera) for _, camera in self._cameras)
 
     def camera_of(self, name: str) -> str | None:
-        """What a photo's name begins with, by which its camera is known; None outside the rigs.
+        """Return the image prefix of the camera that took a photo, or None if the photo belongs to no rig.
 
         Raises:
-            InputError: the names of two cameras' photos begin so.
+            InputError: the photo's name begins with the prefixes of two cameras.
         """
         found = [camera.image_prefix for _, camera in self._cameras if name.startswith(camera.image_prefix)]
         if len(found) > 1:
-            message = f"the photo {name} is of '{found[0]}' and of '{found[1]}', expected one image_prefix"
+            message = f"the photo {name} belongs to '{found[0]}' and '{found[1]}', expected one image_prefix"
             raise InputError(message, self.path)
         return found[0] if found else None
 
     def frames(self, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
-        """Photos that were taken at once, by the one that stands for them: the reference camera's, else the first.
+        """Group the photos that were taken at once.
+
+        Each group goes by its photo from the reference camera, or by its first photo if there is none.
 
         Raises:
-            InputError: a camera without photos, or a photo of two cameras.
+            InputError: a camera has no photos, or a photo belongs to two cameras.
         """
         prefixes = {name: self.camera_of(name) for name in names}
         for _, camera in self._cameras:
@@ -87,13 +90,13 @@ class Rigs:
         return {frame[0]: tuple(frame) for frame in ordered}
 
     def apply(self, database_path: Path, model: pycolmap.Reconstruction | None = None) -> None:
-        """Put the rigs into a database in which each camera of theirs is one.
+        """Write the rigs into a database in which each of their cameras is one camera.
 
         Args:
-            model: of the photos without rigs, by which cameras are placed of which the configuration says nothing.
+            model: a model of the photos without rigs, which gives the camera poses that the configuration lacks.
 
         Raises:
-            InputError: COLMAP cannot make rigs of these photos, for want of some or of others in the model.
+            InputError: COLMAP cannot form the rigs, because photos are missing in the database or in the model.
         """
         if not self.configs:
             return
@@ -105,16 +108,22 @@ class Rigs:
                 raise InputError(f"does not go with the photos ({reason})", self.path) from None
 
     def ids_of_known(self, database_path: Path) -> set[int]:
-        """Ids in a database of the rigs whose cameras' places are all known: COLMAP enters rigs by their order."""
+        """Return the ids of the rigs in a database whose camera poses are all known.
+
+        COLMAP gives ids to rigs in the order of the configuration.
+        """
         with pycolmap.Database.open(database_path) as database:
             ids = sorted(rig.rig_id for rig in database.read_all_rigs())
         return {rig_id for rig_id, is_known in zip(ids, self.are_known, strict=False) if is_known}
 
     def baselines(self, model: pycolmap.Reconstruction, stddev_m: float) -> tuple[TapedDistance, ...]:
-        """Return the known distances of the rigs' cameras from their reference cameras, as if taped between two photos.
+        """Return the known distances of cameras from their reference cameras, as measured lengths between two photos.
 
-        A camera that sits in the same place in several rigs, as where one rig came back on another day or several were
-        built alike, was measured once. All of these lengths share that one error, so they are one length.
+        A camera with the same position in several rigs gives one length. Such rigs are one rig used on several days, or
+        were built to one plan. The position was measured once, and all rigs share its error.
+
+        Args:
+            stddev_m: standard deviation of each length, metres.
         """
         measured: list[pycolmap.RigConfigCamera] = []
         taped = []
@@ -126,7 +135,7 @@ class Rigs:
         return tuple(taped)
 
     def rescale(self, model: pycolmap.Reconstruction) -> None:
-        """Bring a model made without the rigs to the scale of the cameras whose places are known, if there are any."""
+        """Scale a model made without the rigs, in place, to the known distances between cameras, if there are any."""
         ratios = [
             _baseline_m(camera) / length
             for camera, pairs in self._baselines_in(model)
@@ -139,7 +148,7 @@ class Rigs:
     def _baselines_in(
         self, model: pycolmap.Reconstruction
     ) -> Iterator[tuple[pycolmap.RigConfigCamera, Iterator[tuple[str, str]]]]:
-        """Yield each camera whose distance from its rig's first is known, and the photos that are so far apart."""
+        """Yield each camera at a known distance from its reference camera, with the pairs of photos of the two."""
         for config in self.configs:
             reference = next(camera.image_prefix for camera in config.cameras if camera.ref_sensor)
             for camera in config.cameras:
@@ -151,10 +160,10 @@ NO_RIGS = Rigs()
 
 
 def read_rigs(path: Path | None) -> Rigs:
-    """COLMAP's ``rig_config.json``; no rigs without a path.
+    """Read COLMAP's ``rig_config.json``; without a path there are no rigs.
 
     Raises:
-        InputError: it is none, or places a camera by no rotation.
+        InputError: the file is not a rig configuration, or a camera's pose is not valid.
     """
     if path is None:
         return NO_RIGS
@@ -163,10 +172,10 @@ def read_rigs(path: Path | None) -> Rigs:
         places = [camera for rig in json.loads(path.read_text(encoding="utf-8")) for camera in rig["cameras"]]
     except (RuntimeError, ValueError, LookupError, TypeError) as error:
         reason = " ".join(str(error).split()).removesuffix(".")
-        raise InputError(f"is no rig configuration of COLMAP's ({reason})", path) from None
+        raise InputError(f"is not a rig configuration of COLMAP's ({reason})", path) from None
     if not configs:
         raise InputError("holds no rig, expected COLMAP's rig configuration", path)
-    for camera in places:  # COLMAP takes what is not there for whatever there was
+    for camera in places:  # COLMAP does not check the number of values, and has arbitrary ones where some are missing
         for key, num in (("cam_from_rig_rotation", 4), ("cam_from_rig_translation", 3)):
             if len(found := camera.get(key, [0.0] * num)) != num:
                 raise InputError(f"{key} of '{camera['image_prefix']}' has {len(found)} numbers, expected {num}", path)
@@ -178,19 +187,23 @@ def read_rigs(path: Path | None) -> Rigs:
 
 
 def _baseline_m(camera: pycolmap.RigConfigCamera) -> float:
-    """0 where it is not known, or none."""
+    """Return the distance of a camera from its reference camera in metres; 0 if unknown or negligible."""
     length_m = 0.0 if camera.cam_from_rig is None else float(np.linalg.norm(camera.cam_from_rig.translation))
     return length_m if length_m >= _MIN_BASELINE_M else 0.0
 
 
 def _is_placed_alike(camera: pycolmap.RigConfigCamera, other: pycolmap.RigConfigCamera) -> bool:
-    """Whether two cameras have the same centre in their rigs, to the digits that a file is written with."""
+    """Whether two cameras have the same centre in their rigs, to the precision of a configuration file."""
     centers = [known.cam_from_rig.inverse().translation for known in (camera, other) if known.cam_from_rig is not None]
     return len(centers) == 2 and bool(np.allclose(centers[0], centers[1], rtol=0, atol=_SAME_PLACE_M))
 
 
 def _pairs(model: pycolmap.Reconstruction, reference: str, other: str) -> Iterator[tuple[str, str]]:
-    """Photos of two cameras that were taken at once and are in a model."""
+    """Yield the pairs of photos in a model that two cameras took at once.
+
+    Args:
+        reference, other: image prefixes of the cameras.
+    """
     names = sorted(image.name for image in model.images.values() if image.has_pose)
     there = set(names)
     for name in names:

@@ -1,4 +1,4 @@
-"""Snapshots of a mapping: an interrupted one goes on from the newest."""
+"""Snapshots of a mapping; an interrupted mapping continues from the newest one."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from rangesfm.geometry.trajectory import pose_of
 
 
 class Snapshots:
-    """Keeps the newest snapshot of the first model of a mapping that goes on from exactly where it is.
+    """Keeper of the newest snapshot of a mapping's first model.
 
-    COLMAP refines all of the model each time that it has grown by a tenth, and counts from there. A mapping that goes
-    on from a model counts anew, so that only a model just refined gives what an undisturbed mapping does.
+    A mapping that continues from a snapshot gives the same result as an undisturbed one. COLMAP refines the whole model
+    each time it has grown by a tenth, counted from the last such refinement. A continued mapping starts counting at its
+    first model, so that snapshots are taken only just after a refinement.
 
-    Further models are begun when the first is done; there are no snapshots of them.
+    Further models are begun when the first is done, and have no snapshots.
 
     Args:
-        path: folder of the newest snapshot, made when there is one.
-        scratch: folder beside it, where one is written.
+        path: folder of the newest snapshot, made with the first snapshot.
+        scratch: folder on the same disk, where a snapshot is written before it is moved to ``path``.
     """
 
     def __init__(self, path: Path, scratch: Path):
@@ -33,19 +34,19 @@ class Snapshots:
         self._poses: dict[int, bytes] = {}
 
     def add_photo(self, model: pycolmap.Reconstruction) -> None:
-        """To be called when COLMAP has added a photo to the first model."""
+        """Take a snapshot if one is due; to be called when COLMAP has added a photo to the first model."""
         if self._is_just_refined(model):
             _keep(write_snapshot(model, self._scratch), self._path)
 
     def _is_just_refined(self, model: pycolmap.Reconstruction) -> bool:
-        """All cameras have moved since the last photo; the photos next to a new one alone move otherwise."""
+        """Whether all poses have changed since the last photo; without a refinement only those near a new photo do."""
         poses = {id_: pose_of(model.frame(id_)).params.tobytes() for id_ in model.reg_frame_ids()}
         before, self._poses = self._poses, poses
         return bool(before) and all(poses[id_] != pose for id_, pose in before.items() if id_ in poses)
 
 
 def write_snapshot(model: pycolmap.Reconstruction, path: Path) -> Path:
-    """Into a folder of its own, called by the time in milliseconds as COLMAP does."""
+    """Write a model into a new folder in ``path``, named by the time in milliseconds as COLMAP does; return it."""
     folder = path / f"{time.time_ns() // 1_000_000:013d}"
     folder.mkdir()
     model.write_binary(folder)
@@ -53,7 +54,7 @@ def write_snapshot(model: pycolmap.Reconstruction, path: Path) -> Path:
 
 
 def newest_snapshot(path: Path) -> Path | None:
-    """The model to go on from; None if there is none that is whole."""
+    """Return the folder of the newest complete snapshot, or None if there is none."""
     for folder in sorted(path.iterdir(), reverse=True) if path.is_dir() else ():
         try:
             read_model(folder)
@@ -64,7 +65,7 @@ def newest_snapshot(path: Path) -> Path | None:
 
 
 def _keep(model: Path, path: Path) -> None:
-    """Move a whole model into the folder of snapshots, in the place of older ones."""
+    """Move a complete model into the folder of snapshots, and remove the older ones."""
     path.mkdir(exist_ok=True)
     older = list(path.iterdir())
     os.replace(model, path / model.name)

@@ -1,4 +1,4 @@
-"""Steps that are done once, and their folder: what an earlier run into the same one did need not be done again."""
+"""Steps of a reconstruction and their folder; steps that an earlier run into the folder completed are not repeated."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from rangesfm.progress import Progress
 
 DATABASE_NAME, MODELS_NAME, LOG_NAME, RECORD_NAME = "database.db", "sparse", "mapper.log", "reconstruct.json"
 RECONSTRUCTION_NAMES = (DATABASE_NAME, MODELS_NAME, LOG_NAME, RECORD_NAME)
-"""What a reconstruction consists of."""
+"""Files and folders of a complete reconstruction."""
 SNAPSHOTS_NAME = "mapping_snapshot"
 
 
 def fingerprint(*inputs: Any) -> str:
-    """The same text for the same inputs (plain values, in any nesting)."""
+    """Return a hash of the inputs (plain values, in any nesting); equal inputs have equal hashes."""
     return hashlib.sha256(json.dumps(inputs, sort_keys=True, default=str).encode()).hexdigest()
 
 
@@ -31,8 +31,8 @@ class Steps:
     """A series of steps, each of which needs the one before; their state is kept in a JSON file.
 
     Attributes:
-        notes: what else is kept there, plain values by name; see ``note``.
-        seconds: how long each step took that was done here, by name.
+        notes: other plain values kept in that file, by name; see ``note``.
+        seconds: duration of each step that was done in this run, by name.
     """
 
     def __init__(
@@ -42,13 +42,14 @@ class Steps:
         earlier: Steps | None = None,
         begin: Callable[[Mapping[str, str]], None] = lambda passed: None,
     ):
-        """Read the record.
+        """Read the record of earlier runs.
 
         Args:
-            earlier: the same steps with their results in another folder, complete: what was done there with the same
-                inputs need not be done here.
-            begin: called before the first step that has to be done here, with the inputs of those before it, by name.
-                The record is read again after it.
+            record_path: the JSON file.
+            earlier: the same steps, complete, with their results in another folder. A step that was done there with the
+                same inputs is not done here.
+            begin: called before the first step that has to be done here, with the inputs of the steps before it, by
+                name. The record is read again afterwards.
         """
         self._path = record_path
         self._progress = progress
@@ -72,9 +73,10 @@ class Steps:
 
         Args:
             inputs: fingerprint of all that the step depends on.
-            prepare: clears the ground; skipped where ``work`` was interrupted on the same inputs.
-            work: goes on from whatever it left when it was interrupted.
-            unfinished: where it leaves that, if not in ``output``.
+            output: file or folder that the step makes.
+            prepare: removes old results; skipped where ``work`` was interrupted on the same inputs.
+            work: does the step, continuing from what an interruption left.
+            unfinished: where an interruption leaves its results, if not in ``output``.
         """
         if self._earlier is not None:
             if self._earlier._has(name, inputs, output.relative_to(self._path.parent)):
@@ -99,17 +101,17 @@ class Steps:
 
     @property
     def has_begun(self) -> bool:
-        """Whether results are in this folder, and not in that of the earlier steps."""
+        """Whether the results are in this folder, not in that of the earlier steps."""
         return self._earlier is None
 
     def begin(self) -> None:
-        """Do all from here on in this folder, on top of what the earlier steps have done."""
+        """Do all further steps in this folder, building on what the earlier steps have done."""
         self._begin(self._passed)
         self._earlier = None
         self._read_record()
 
     def has_done(self, steps: Mapping[str, str]) -> bool:
-        """Whether the record says of all these steps, by name, that they were done with these inputs."""
+        """Whether all these steps are recorded as done with these inputs, given by the steps' names."""
         states = [(self._record.get(name, {}), inputs) for name, inputs in steps.items()]
         return all(state.get("done") is True and state.get("inputs") == inputs for state, inputs in states)
 
@@ -121,14 +123,14 @@ class Steps:
         self._record, self.notes = _read(source, "steps"), _read(source, "notes")
 
     def forget(self, first: str) -> None:
-        """Nothing is known any more of this step and of those after it."""
+        """Remove this step and those after it from the record."""
         names = list(self._record)
         for name in names[names.index(first) :] if first in names else ():
             del self._record[name]
         self._write()
 
     def note(self, name: str, value: dict[str, Any]) -> None:
-        """Keep something for the next run, whatever becomes of the steps."""
+        """Keep a value for the next run, independently of the state of the steps."""
         self.notes[name] = value
         if self._earlier is None:
             self._write()
@@ -142,13 +144,13 @@ class Steps:
 
 
 class Workspace:
-    """Folder in which a reconstruction is made, and what an earlier run has done there.
+    """Folder in which a reconstruction is made, with the record of what earlier runs have done there.
 
     Args:
-        folder: where that is.
-        earlier: the steps of a complete reconstruction in another folder, to go on from.
+        folder: the folder.
+        earlier: the steps of a complete reconstruction in another folder, to continue from.
         begin: see ``Steps``.
-        log: of COLMAP's own words; None: in this folder.
+        log: file for COLMAP's messages; None: one in this folder.
     """
 
     def __init__(
@@ -169,20 +171,21 @@ class Workspace:
         self.steps = Steps(folder / RECORD_NAME, progress, earlier, begin)
 
     def remove_old_models(self) -> None:
-        """Remove the models that were made here, and those in the making."""
+        """Remove the models in this folder, complete and unfinished ones."""
         for folder in (self.models, self.snapshots):
             shutil.rmtree(folder, ignore_errors=True)
 
     @contextmanager
     def logged(self) -> Iterator[None]:
-        """Have COLMAP's own words in the log, and say in a failure where they are."""
+        """Write COLMAP's messages to the log inside the block, and name the log in the error of a failure."""
         with colmap_log(self.log):
             try:
                 yield
             except ReconstructionError as error:
                 raise ReconstructionError(f"{error} (COLMAP's log: {self.log})") from error
             except RuntimeError as error:
-                # What pycolmap raises where the database cannot be read or written says nothing of the disk.
+                # Where the database cannot be read or written, the message of pycolmap's error does not mention the
+                # disk.
                 raise ReconstructionError(
                     f"COLMAP stopped: {error}; is there room on the disk, and for files of that size?"
                     f" (COLMAP's log: {self.log})"
@@ -194,4 +197,4 @@ def _read(path: Path, part: str) -> dict[str, dict[str, Any]]:
         entries = json.loads(path.read_text(encoding="utf-8"))[part]
         return {str(name): dict(entry) for name, entry in entries.items()}
     except (OSError, ValueError, AttributeError, TypeError, LookupError, RecursionError):
-        return {}  # none yet, or not ours: nothing is known
+        return {}  # there is no record yet, or the file is not one of ours

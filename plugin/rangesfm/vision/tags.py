@@ -1,4 +1,4 @@
-"""Printed tags (ArUco, AprilTag) in photos: found by OpenCV, each corner a marker."""
+"""Printed tags (ArUco, AprilTag) found in photos by OpenCV; each corner becomes a marker."""
 
 from __future__ import annotations
 
@@ -17,23 +17,25 @@ from rangesfm.errors import InputError
 from rangesfm.progress import Progress
 from rangesfm.vision.photos import UNREADABLE, opened_image
 
-# To OpenCV the centre of the first pixel is (0, 0), to COLMAP (0.5, 0.5).
+# The centre of the first pixel is (0, 0) in OpenCV and (0.5, 0.5) in COLMAP.
 _CENTRE_PX = 0.5
 _NUM_CORNERS = 4
-# A black square looks smaller in a photo than it is: its rim is half light, and photos show half light as much more.
-# Corners are sought in the light itself, by the usual curve of 8-bit photos; what another curve leaves at a side:
+# A black square looks smaller in a photo than it is: the pixels at its rim receive half the light, and the gamma curve
+# of a photo shows them brighter than half. Corners are therefore sought in linear light, by the usual gamma of 8-bit
+# photos. The second number is the error of a side, in pixels, that remains where a camera has another curve.
 _GAMMA, _LEFT_AT_SIDE_PX = 2.2, 0.2
-# Of a module of the tag, in which to seek its corner; and in pixels.
+# Half-width of the window in which a corner is refined: as a fraction of a module of the tag, and its limits in pixels.
 _WINDOW, _MIN_WINDOW_PX, _MAX_WINDOW_PX = 0.75, 2, 10
 
 
 @dataclass(frozen=True)
 class FoundTags:
-    """The tags of some photos.
+    """Tags found in photos.
 
     Attributes:
-        markers: ``tag7.0`` to ``tag7.3``, the corners of tag 7 from its upper left one on as it is read, clockwise.
-        num_photos: in which there is any.
+        markers: corners by name. ``tag7.0`` to ``tag7.3`` are those of tag 7, clockwise from the upper left corner of
+            the tag held upright.
+        num_photos: number of photos in which a tag was found.
     """
 
     markers: dict[str, Marker]
@@ -41,21 +43,23 @@ class FoundTags:
 
     @property
     def tags(self) -> list[str]:
-        """Their names, without corners."""
+        """Names of the tags, without corners."""
         return list(dict.fromkeys(name.partition(".")[0] for name in self.markers))
 
     @property
     def side_px(self) -> float:
-        """Typical length of a side."""
+        """Median length of a side in the photos, in pixels."""
         ends = [[self.markers[f"{tag}.{k}"].pixels for tag in self.tags] for k in (0, 1)]
         start, end = (np.concatenate(of) for of in ends)
         return float(np.median(np.linalg.norm(end - start, axis=1)))
 
     def sides(self, side_m: float, stddev_m: float) -> tuple[TapedDistance, ...]:
-        """The four sides of each, as if they had been taped.
+        """Return the four sides of each tag as measured lengths.
 
         Args:
-            stddev_m: of all printed sides together; what all that are seen may be off comes on top.
+            side_m: length of a side, metres.
+            stddev_m: standard deviation of the error that all printed sides share, metres. The error that all corners
+                found in photos share is added to it.
         """
         if not self.markers:
             return ()
@@ -70,9 +74,9 @@ class FoundTags:
 
 
 def find_tags(folder: Path, image_names: Sequence[str], dictionary: str, progress: Progress) -> FoundTags:
-    """Look for the tags of a dictionary, as its pixels are stored, in each photo.
+    """Find the tags of an OpenCV dictionary in each photo, in pixels as stored.
 
-    One that is in a photo twice has no place there.
+    A tag that appears twice in a photo is left out of that photo.
 
     Raises:
         InputError: OpenCV is not installed, or a photo cannot be read.
@@ -105,7 +109,7 @@ def find_tags(folder: Path, image_names: Sequence[str], dictionary: str, progres
 
 
 def _refined(cv2: Any, pixels: npt.NDArray[np.uint8], quad: Array, num_modules: int) -> Array:
-    """(4, 2) corners in the light that fell on the pixels."""
+    """Return the corners of a tag (4, 2), refined in linear light, in OpenCV's pixel coordinates."""
     module_px = float(np.linalg.norm(quad[0] - quad[1])) / num_modules
     window = int(np.clip(_WINDOW * module_px, _MIN_WINDOW_PX, _MAX_WINDOW_PX))
     low, high = quad.min(axis=0) - 2 * _MAX_WINDOW_PX, quad.max(axis=0) + 2 * _MAX_WINDOW_PX

@@ -1,4 +1,4 @@
-"""A reconstruction in the making; the one in the output folder stays until the new one is complete."""
+"""A reconstruction in progress; the earlier one stays in the output folder until the new one is complete."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rangesfm.vision.steps import (
 )
 
 _NAME = "reconstruction"
-# What SQLite keeps beside a database that a program has open.
+# Files that SQLite keeps beside a database that a program has open.
 _OF_OPEN_DATABASE = (f"{DATABASE_NAME}-wal", f"{DATABASE_NAME}-shm")
 
 
@@ -32,7 +32,7 @@ class UnpublishedReconstruction:
     """
 
     def __init__(self, output: OutputFolder, progress: Progress, *, restart: bool):
-        """Look at what there is; nothing of the complete reconstruction is touched.
+        """Open the workspace; the complete reconstruction in the output folder is not changed.
 
         Raises:
             InputError: files that this tool did not write are in the places of the new ones.
@@ -52,11 +52,11 @@ class UnpublishedReconstruction:
 
     @property
     def models_path(self) -> Path:
-        """Folder of the models, once they are there."""
+        """Folder of the models, once they exist."""
         return (self._folder if self.space.steps.has_begun else self._output.path) / self.space.models.name
 
     def files(self) -> dict[Path, Path]:
-        """Return what is to be published: for each place in the output folder what comes there."""
+        """Return the files and folders to publish: for each path in the output folder, the one that goes there."""
         if not self.space.steps.has_begun:
             return {}
         found = {self._output.path / name: self._folder / name for name in RECONSTRUCTION_NAMES}
@@ -71,11 +71,11 @@ class UnpublishedReconstruction:
             self.discard()
 
     def discard(self) -> None:
-        """Remove the workspace: all of it is published, or none of it was needed."""
+        """Remove the workspace, when all of it is published or none of it was needed."""
         remove(self._folder)
 
     def _begin(self, passed: Mapping[str, str]) -> None:
-        """Go on from what an interrupted run has left here, if it fits; else from the complete reconstruction."""
+        """Continue from what an interrupted run has left here if it fits, else copy the complete reconstruction."""
         self._require_own()
         if (self._folder / RECORD_NAME).is_file() and Steps(self._folder / RECORD_NAME, self._progress).has_done(
             passed
@@ -83,7 +83,7 @@ class UnpublishedReconstruction:
             return
         for name in (*RECONSTRUCTION_NAMES, *_OF_OPEN_DATABASE, SNAPSHOTS_NAME):
             remove(self._folder / name)
-        # The record comes last: without it nothing of the rest is used.
+        # The record is copied last, because without it the other files are not used.
         for name in (DATABASE_NAME, LOG_NAME, RECORD_NAME):
             if (self._output.path / name).is_file():
                 shutil.copyfile(self._output.path / name, self._folder / name)

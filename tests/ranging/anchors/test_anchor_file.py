@@ -64,7 +64,7 @@ def test_unnamed_column_of_ids_and_plain_coordinate_names_are_understood(tmp_pat
         ("2,1,abc,3,,,", "y_m is 'abc'"),
         ("2,1,nan,3,,,", "y_m is nan"),
         (",1,2,3,,,", "anchor_id is empty"),
-        ("1,1,2,3,,,", "anchor 1 stands in line 2 already"),
+        ("1,1,2,3,,,", "anchor 1 is in line 2 already"),
         ("2,1,2,3,-0.1,,", "position_stddev_m is -0.1"),
         ("2,1,2,3,,,-1", "range_bias_stddev_m is -1"),
         ("2,1,2,3", "has 4 cells, the header row has 7"),

@@ -78,7 +78,7 @@ def read_anchors(path: str | Path) -> tuple[Anchor, ...]:
     anchor_ids = table.text("anchor_id")
     if again := repeated(anchor_ids):
         row, first = again
-        message = f"anchor {anchor_ids[row]} stands in line {table.line[first]} already, expected each once"
+        message = f"anchor {anchor_ids[row]} is in line {table.line[first]} already, expected each once"
         raise InputError(message, path, int(table.line[row]))
     positions = _positions(table)
     expected = "a number of metres that is not negative, or nothing"
