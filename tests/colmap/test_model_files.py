@@ -120,16 +120,16 @@ class TestContent:
     @pytest.mark.parametrize(
         ("name", "field", "value", "said"),
         [
-            ("cameras.bin", "param", math.nan, "the parameters of camera 1 are not those of a camera"),
-            ("cameras.bin", "param", 1e308, "the parameters of camera 1 are not those of a camera"),
-            ("cameras.bin", "param", 0.0, "the parameters of camera 1 are not those of a camera"),
+            ("cameras.bin", "param", math.nan, "camera 1 has impossible parameters"),
+            ("cameras.bin", "param", 1e308, "camera 1 has impossible parameters"),
+            ("cameras.bin", "param", 0.0, "camera 1 has impossible parameters"),
             ("cameras.bin", "width", 2**63, f"camera 1 has photos of {2**63} x 768 pixels"),
             ("cameras.bin", "height", 0, "camera 1 has photos of 1024 x 0 pixels"),
             ("frames.bin", "tx", 1e300, r"the pose of \S+\.png is not finite"),
             ("frames.bin", "qw", 3.0, r"the pose of \S+\.png has a quaternion of length 3\.\d+, expected 1"),
-            ("images.bin", "name", b"", "image 1 has no name of printable text"),
-            ("images.bin", "name", b"\xff.jpg", "image 1 has no name of printable text"),
-            ("images.bin", "name", b"two\nlines.jpg", "image 1 has no name of printable text"),
+            ("images.bin", "name", b"", "the name of image 1 is not printable text"),
+            ("images.bin", "name", b"\xff.jpg", "the name of image 1 is not printable text"),
+            ("images.bin", "name", b"two\nlines.jpg", "the name of image 1 is not printable text"),
             ("images.bin", "y", 1e308, "a feature has no finite pixel coordinates"),
             ("points3D.bin", "x", math.inf, r"points3D.bin: point \d+ is at \(inf, .*\), expected finite coordinates"),
         ],
@@ -158,20 +158,26 @@ class TestContent:
             del file.groups[0][num_left:]
             file.records[0][-1].value = len(file.groups[0])
 
-        assert "the tracks are not those of the features in images.bin" in refused("points3D.bin", change)
+        assert "the tracks of the points do not agree with the features in images.bin" in refused(
+            "points3D.bin", change
+        )
 
     def test_whose_points_are_gone_is_refused(self, refused: Callable[..., str]) -> None:
         def change(file: ModelFile) -> None:
             del file.records[3], file.groups[3]
             file.count -= 1
 
-        assert "the tracks are not those of the features in images.bin" in refused("points3D.bin", change)
+        assert "the tracks of the points do not agree with the features in images.bin" in refused(
+            "points3D.bin", change
+        )
 
     def test_that_sees_a_point_twice_at_one_feature_is_refused(self, refused: Callable[..., str]) -> None:
         def change(file: ModelFile) -> None:
             file.groups[0][1] = file.groups[0][0]
 
-        assert "the tracks are not those of the features in images.bin" in refused("points3D.bin", change)
+        assert "the tracks of the points do not agree with the features in images.bin" in refused(
+            "points3D.bin", change
+        )
 
     def test_whose_image_is_gone_is_refused(self, rigs: Path, tmp_path: Path) -> None:
         model = read_model(rigs)
@@ -181,7 +187,9 @@ class TestContent:
         del images.records[3], images.groups[3]
         images.count -= 1
         (tmp_path / "images.bin").write_bytes(images.pack())
-        with pytest.raises(InputError, match=r"frame \d+ has a pose and no image, or one that is not there"):
+        with pytest.raises(
+            InputError, match=r"frame \d+ has a pose but no image, or names an image that does not exist"
+        ):
             read_model(tmp_path)
 
     def test_without_tracks_and_features_is_read(self, rigs: Path, tmp_path: Path) -> None:
@@ -198,7 +206,7 @@ class TestContent:
         read_model(rigs).write_text(tmp_path)
         text = (tmp_path / "points3D.txt").read_text().splitlines(keepends=True)
         (tmp_path / "points3D.txt").write_text("".join(text[:-1]))
-        with pytest.raises(InputError, match="the tracks are not those of the features"):
+        with pytest.raises(InputError, match="the tracks of the points do not agree with the features"):
             read_model(tmp_path)
 
     def test_with_quaternions_of_few_digits_has_rotations_all_the_same(self, rigs: Path, tmp_path: Path) -> None:

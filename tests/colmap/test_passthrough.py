@@ -50,7 +50,7 @@ def test_reaches_options_inside_options_inside_options() -> None:
         ({"ba_global_frames_ratio": "2"}, "[m] ba_global_frames_ratio is '2', expected a number"),
         ({"ba_local_backend": "GTSAM"}, "[m] ba_local_backend is 'GTSAM', expected one of CERES, CASPAR"),
         ({"ba_local_backend": []}, "[m] ba_local_backend is [], expected one of CERES, CASPAR"),
-        ({"constant_cameras": ["a"]}, "[m] constant_cameras is ['a'], expected a list that COLMAP takes"),
+        ({"constant_cameras": ["a"]}, "[m] constant_cameras is ['a'], expected a list that COLMAP accepts"),
         ({"min_num_matches": 10**12}, "[m] min_num_matches is 1000000000000, expected a whole number that COLMAP"),
         ({"mapper": 3}, "[m] mapper is 3, expected a table"),
         ({"min_num_matches": -5}, "[m] COLMAP refuses a value, expected min_num_matches > 0 (-5 vs. 0)"),

@@ -1,4 +1,4 @@
-"""Cameras that somebody calibrated: as OpenCV, Kalibr and ROS describe them, and for photos of several sizes."""
+"""Calibrated cameras: conversion from OpenCV, Kalibr and ROS, and scaling to photos of several sizes."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 Size = tuple[int, int]
 
-# To OpenCV, and so to Kalibr and ROS, the centre of the first pixel is (0, 0); to COLMAP it is (0.5, 0.5).
+# The centre of the first pixel is (0, 0) in OpenCV, Kalibr and ROS, and (0.5, 0.5) in COLMAP.
 _CORNER_PX = 0.5
-# COLMAP's model and how many parameters it has beside fx, fy, cx, cy.
+# COLMAP's model for each distortion model, and its number of parameters after fx, fy, cx, cy.
 _MODELS = {
     "none": ("PINHOLE", 0),
     "radtan": ("OPENCV", 4),
@@ -31,25 +31,33 @@ _MODELS = {
 def colmap_camera(
     distortion: str, pinhole: Iterable[float], coefficients: Iterable[float], path: Path
 ) -> tuple[str, tuple[float, ...]]:
-    """COLMAP's name of the model and its parameters; InputError, with the path, if COLMAP has no such model.
+    """Return COLMAP's name of a camera model, and its parameters.
 
     Args:
-        distortion: the model's name in Kalibr or ROS.
-        pinhole: fx, fy, cx, cy in pixels.
+        distortion: the distortion model's name in Kalibr or ROS.
+        pinhole: fx, fy, cx, cy in pixels, in OpenCV's convention.
+        coefficients: of the distortion.
+        path: the file that they are from, for messages.
+
+    Raises:
+        InputError: COLMAP has no such model.
     """
     if distortion not in _MODELS:
         raise InputError(f"distortion_model is '{distortion}', expected one of {', '.join(_MODELS)}", path)
     model, num = _MODELS[distortion]
     given = [*map(float, coefficients)]
-    if model == "OPENCV" and any(given[num:]):  # a third radial coefficient
+    if model == "OPENCV" and any(given[num:]):  # there is a third radial coefficient
         model, num = "FULL_OPENCV", 8
     fx, fy, cx, cy = map(float, pinhole)
     return model, (fx, fy, cx + _CORNER_PX, cy + _CORNER_PX, *[*given, *[0.0] * num][:num])
 
 
 def calibrated_cameras(model: str, params: Sequence[float], sizes: Iterable[Size]) -> dict[Size, pycolmap.Camera]:
-    """The given camera for each size (pixels) of photos that it can have: the most common, and the same rescaled."""
-    import pycolmap  # slow to load, and of no use to who only looks for cameras in files
+    """Return the given camera for each photo size (width and height in pixels) that it fits.
+
+    The parameters belong to the most common size. Sizes of the same shape get a rescaled camera, other sizes none.
+    """
+    import pycolmap  # imported here because it is slow to load, and is not needed for reading calibration files
 
     counted = Counter(sizes)
     own, _ = max(counted.items(), key=lambda item: (item[1], item[0]))
@@ -58,7 +66,7 @@ def calibrated_cameras(model: str, params: Sequence[float], sizes: Iterable[Size
     given.has_prior_focal_length = True
     cameras = {}
     for width, height in counted:
-        if abs(width * own[1] - height * own[0]) <= max(own):  # the same shape, but for a rounded pixel
+        if abs(width * own[1] - height * own[0]) <= max(own):  # the same shape, up to a rounded pixel
             cameras[width, height] = pycolmap.Camera(given.todict())
             cameras[width, height].rescale(width, height)
     return cameras
@@ -67,13 +75,13 @@ def calibrated_cameras(model: str, params: Sequence[float], sizes: Iterable[Size
 def cameras_as_given(
     options: CameraOptions, camera_of_photo: Iterable[tuple[str, pycolmap.Camera]]
 ) -> dict[int, tuple[CameraOptions, pycolmap.Camera]]:
-    """By id, those whose parameters are known: the table that they are in, and the camera with just these.
+    """Return, by camera id, each camera whose parameters the user gave: its table and the camera with those parameters.
 
     Args:
         camera_of_photo: each photo's name and camera.
     """
     found: dict[int, tuple[CameraOptions, pycolmap.Camera]] = {}
-    sizes: dict[int, list[Size]] = {}  # of each table's photos
+    sizes: dict[int, list[Size]] = {}  # sizes of each table's photos, by the table's identity
     for name, camera in camera_of_photo:
         table, _ = found.setdefault(camera.camera_id, (options.of_photo(name), camera))
         sizes.setdefault(id(table), []).append((camera.width, camera.height))

@@ -1,4 +1,4 @@
-"""COLMAP's own log into a file, the terminal left alone."""
+"""Redirection of COLMAP's log from the terminal into a file."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ _FLAGS_INTO_FILE = {"alsologtostderr": False, "logtostderr": False, "stderrthres
 def colmap_log(path: Path) -> Iterator[None]:
     """Append what COLMAP logs inside the block to ``path``.
 
-    COLMAP logs through glog: one destination per process, so blocks neither nest nor run at the
-    same time in two threads. glog adds a time and a number to the name of its file, hence the
-    folder. The flags are as before afterwards; glog's default files in the system's temporary
-    folder, which COLMAP makes unasked, are off from then on.
+    COLMAP logs through glog, which has one destination per process. Blocks must therefore not nest, nor run at the same
+    time in two threads. glog adds a time and a number to the name of its file, so that it gets a temporary folder.
+    Afterwards the flags are restored. glog's default files in the system's temporary folder stay off.
     """
     logging = pycolmap.logging
     levels = logging.Level.__members__.values()
@@ -40,7 +39,7 @@ def colmap_log(path: Path) -> Iterator[None]:
 
 
 def append_log(part: Path, path: Path) -> None:
-    """Append what a process has left in a log of its own, if it has, to ``path``."""
+    """Append the log of another process to ``path``, if that log exists."""
     with suppress(FileNotFoundError), path.open("ab") as log:
         log.write(part.read_bytes())
 

@@ -1,4 +1,4 @@
-"""COLMAP models off the disk, read with care."""
+"""Reading of COLMAP models, with the checks that COLMAP itself does not make."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rangesfm.files.atomic import is_plain_name
 from rangesfm.files.tables import read_text
 
 MAX_COORDINATE = 1e12
-"""Of points and poses, in any unit: twice across the solar system in metres. Squares of it are still exact enough."""
+"""Largest accepted coordinate of points and poses, in any unit; its square is still exact enough as a double."""
 
 NUM_CAMERA_PARAMS = {
     int(model): len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params)
@@ -33,23 +33,25 @@ _FEATURE = np.dtype([("xy", "<f8", 2), ("point_id", "<u8")])
 _ELEMENT = np.dtype([("image_id", "<u4"), ("feature", "<u4")])
 _POINT = np.dtype([("point_id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")])
 _NEEDED = ("cameras", "images", "points3D")
-# On a line of images.txt: id, quaternion, translation, camera.
+# Columns before the photo's name on a line of images.txt: id, quaternion (4), translation (3), camera.
 _NUM_BEFORE_NAME = 9
 _EXPECTED = "expected cameras, images and points3D files that COLMAP wrote"
-# Text files round quaternions, and some programs write a few digits only.
+# Largest difference of a quaternion's length from 1 that is corrected. Text files round quaternions, and some programs
+# write only a few digits.
 _MAX_QUATERNION_ERROR = 1e-2
+# Up to this difference a quaternion is left as it is.
 _UNIT_LENGTH_ERROR = 1e-9
 _MAX_IMAGE_SIZE = 1_000_000
 
 
 @dataclass(frozen=True)
 class Records:
-    """n records of a file, each a head and as many groups of fields of one length as it announces.
+    """n records of a binary file, each a head and then groups of fields; all groups of a file have one length.
 
     Attributes:
         path: the file.
         data: its content.
-        start, groups_start, end: n places in ``data``.
+        start, groups_start, end: n byte offsets in ``data``, where each record, its groups and its end are.
     """
 
     path: Path
@@ -59,26 +61,26 @@ class Records:
     end: list[int]
 
     def heads(self, dtype: np.dtype[np.void]) -> npt.NDArray[np.void]:
-        """(n,) the beginning of each record."""
+        """Return the beginning of each record (n,), decoded as ``dtype``."""
         size = dtype.itemsize
         return np.frombuffer(b"".join([self.data[place : place + size] for place in self.start]), dtype)
 
     def groups(self, dtype: np.dtype[np.void]) -> npt.NDArray[np.void]:
-        """The groups of all records, one after the other."""
+        """Return the groups of all records, one after the other, decoded as ``dtype``."""
         joined = b"".join([self.data[start:end] for start, end in zip(self.groups_start, self.end, strict=True)])
         return np.frombuffer(joined, dtype)
 
     def num_groups(self, dtype: np.dtype[np.void]) -> npt.NDArray[np.int64]:
-        """(n,) of each record."""
+        """Return the number of groups of each record (n,)."""
         return (np.array(self.end, np.int64) - np.array(self.groups_start, np.int64)) // dtype.itemsize
 
 
 def read_records(path: Path) -> Records:
-    """The records of one of MODEL_FILES.
+    """Read the records of one of MODEL_FILES.
 
     Raises:
-        InputError: the file ends before the records that it announces. COLMAP goes on reading then, and may take
-            any count for granted: it runs for minutes and fills the memory.
+        InputError: the file ends before the number of records that it announces. COLMAP would go on reading, and with
+            a damaged count run for minutes and fill the memory.
     """
     try:
         cursor = _Cursor(path.read_bytes())
@@ -92,10 +94,10 @@ def read_records(path: Path) -> Records:
 
 
 def check_map(images: Records, points: Records) -> None:
-    """Check what is many in a model, its points and their features, which COLMAP in part takes for granted.
+    """Check the points of a model and their features, which COLMAP does not check completely.
 
     Raises:
-        InputError: a coordinate is no usable number, or the two files do not agree on where the points are seen.
+        InputError: a coordinate is not finite or too large, or the two files disagree on where the points are seen.
     """
     heads, features = points.heads(_POINT), images.groups(_FEATURE)
     usable = np.all(np.abs(heads["xyz"]) <= MAX_COORDINATE, axis=1)
@@ -106,7 +108,7 @@ def check_map(images: Records, points: Records) -> None:
     if not np.all(np.abs(features["xy"]) <= MAX_COORDINATE):
         raise InputError("a feature has no finite pixel coordinates", images.path)
     if len(np.unique(heads["point_id"])) < len(heads):
-        raise InputError("two points have one id", points.path)
+        raise InputError("two points have the same id", points.path)
     num_features = images.num_groups(_FEATURE)
     image_id = np.repeat(images.heads(np.dtype([("image_id", "<u4")]))["image_id"], num_features)
     index = np.arange(len(features)) - np.repeat(np.cumsum(num_features) - num_features, num_features)
@@ -117,33 +119,33 @@ def check_map(images: Records, points: Records) -> None:
         elements["image_id"], elements["feature"], np.repeat(heads["point_id"], points.num_groups(_ELEMENT))
     )
     if not np.array_equal(said_by_features, said_by_tracks):
-        raise InputError("the tracks are not those of the features in images.bin", points.path)
+        raise InputError("the tracks of the points do not agree with the features in images.bin", points.path)
 
 
 def _sorted_by_place(
     image_id: npt.NDArray[np.uint32], feature: npt.NDArray[np.integer], point_id: npt.NDArray[np.uint64]
 ) -> npt.NDArray[np.uint64]:
-    """(n, 2) each feature's place in the model, and its point."""
+    """Return, for each feature in order, a number for its photo and index, and the id of its point (n, 2)."""
     place = image_id.astype(np.uint64) << np.uint64(32) | feature.astype(np.uint64)
     order = np.lexsort((point_id, place))
     return np.column_stack([place[order], point_id[order]])
 
 
 class _Cursor:
-    """Steps through the records of a binary file, and fails beyond its end."""
+    """Position in a binary file; moving beyond the end raises struct.error."""
 
     def __init__(self, data: bytes):
         self.data = data
         self.place = 0
 
     def number(self, code: str) -> int:
-        """The next integer, little-endian, by its struct code."""
+        """Read the next little-endian integer, given its struct code."""
         (value,) = struct.unpack_from(f"<{code}", self.data, self.place)
         self.place += struct.calcsize(f"<{code}")
         return int(value)
 
     def skip(self, num_bytes: int) -> int:
-        """Skip so many bytes; where they begin."""
+        """Skip this many bytes and return the offset where they begin."""
         start, self.place = self.place, self.place + num_bytes
         if self.place > len(self.data):
             raise struct.error
@@ -167,18 +169,21 @@ def _walk_rig(cursor: _Cursor) -> int:
 
 
 def _walk_groups(cursor: _Cursor, num_before: int, code: str, size: int) -> int:
-    """Over what is before the groups, in bytes, and the groups, whose number has this code."""
+    """Step over a head of ``num_before`` bytes, the number of groups with this struct code, and the groups.
+
+    Returns the offset where the groups begin. Each group has ``size`` bytes.
+    """
     cursor.skip(num_before)
     return cursor.skip(cursor.number(code) * size)
 
 
 def _walk_image(cursor: _Cursor) -> int:
-    """With a name, which a zero byte ends."""
+    """Step over an image, whose head ends in a name terminated by a zero byte."""
     end = cursor.data.find(b"\0", cursor.place + 64)
     return _walk_groups(cursor, end + 1 - cursor.place if end >= 0 else len(cursor.data), "Q", _FEATURE.itemsize)
 
 
-# Each steps over a record and tells where the groups begin with which it ends.
+# Functions that step over one record and return the offset where its groups begin.
 _WALKS: dict[str, Callable[[_Cursor], int]] = {
     "cameras.bin": _walk_camera,
     "rigs.bin": _walk_rig,
@@ -187,15 +192,15 @@ _WALKS: dict[str, Callable[[_Cursor], int]] = {
     "points3D.bin": partial(_walk_groups, num_before=43, code="Q", size=_ELEMENT.itemsize),
 }
 MODEL_FILES = tuple(_WALKS)
-"""COLMAP's binary files, each a count and so many records."""
+"""Names of COLMAP's binary model files; each file is a count followed by that many records."""
 
 
 def read_model(path: Path) -> pycolmap.Reconstruction:
-    """A COLMAP model, binary or text.
+    """Read a COLMAP model, binary or text.
 
     Raises:
-        InputError: there is none, or its files are damaged: COLMAP takes much of them for granted, and what it does
-            with the rest later, in its own code, is not for a user to meet.
+        InputError: there is no model, or its files are damaged. COLMAP does not check much of them itself, and would
+            fail later with an error in its own code.
     """
     _require_whole(path)
     records = {name: read_records(path / name) for name in MODEL_FILES if (path / name).is_file()}
@@ -214,7 +219,10 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
 
 
 def _require_whole(path: Path) -> None:
-    """Refuse what COLMAP would not find, or find and read wrongly: it takes binary files before text."""
+    """Refuse a model with missing files, or in text form with names that COLMAP would read wrongly.
+
+    Of binary and text files in one folder the more complete set counts, and the binary set if both are as complete.
+    """
     here = {ending: [name for name in _NEEDED if (path / f"{name}{ending}").is_file()] for ending in (".bin", ".txt")}
     ending = max(here, key=lambda ending: len(here[ending]))
     missing = [name + ending for name in _NEEDED if name not in here[ending]]
@@ -235,15 +243,19 @@ def _check_names_of_text(path: Path) -> None:
             continue
         name = words[-1].strip()
         if len(words) > _NUM_BEFORE_NAME and len(name.split()) > 1:
-            what = f"the photo's name {name!r} holds blanks, at which COLMAP ends it in text files"
+            what = f"the photo's name {name!r} holds blanks, and COLMAP reads names in text files up to a blank only"
             raise InputError(
                 f"{what}: convert the model to binary where it was made, or rename the photos", path, number
             )
-        next(lines, None)  # its features
+        next(lines, None)  # the line after it lists the features
 
 
 def write_binary_model(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write a model's files into a folder; OSError if one ends too soon, as on a full disk: COLMAP does not look."""
+    """Write a model's files into a folder.
+
+    Raises:
+        OSError: a file is incomplete, as on a full disk, which COLMAP does not notice.
+    """
     model.write_binary(folder)
     try:
         for name in MODEL_FILES:
@@ -260,7 +272,7 @@ def _check_names(model: pycolmap.Reconstruction, path: Path) -> None:
         except UnicodeDecodeError:
             name = ""
         if not is_plain_name(name):
-            raise InputError(f"image {image_id} has no name of printable text", path)
+            raise InputError(f"the name of image {image_id} is not printable text", path)
         names[name] += 1
     repeated = next((name for name, num in names.items() if num > 1), None)
     if repeated is not None:
@@ -273,11 +285,11 @@ def _check_cameras(model: pycolmap.Reconstruction, path: Path) -> None:
             raise InputError(f"camera {camera_id} has photos of {camera.width} x {camera.height} pixels", path)
         params, focal_lengths = camera.params, camera.params[camera.focal_length_idxs()]
         if not (np.all(np.abs(params) <= MAX_COORDINATE) and np.all(focal_lengths > 0)):
-            raise InputError(f"the parameters of camera {camera_id} are not those of a camera", path)
+            raise InputError(f"camera {camera_id} has impossible parameters", path)
 
 
 def _check_poses(model: pycolmap.Reconstruction, path: Path) -> None:
-    """Check all poses, and make the quaternions of unit length, which everything later takes them for."""
+    """Check all poses, and normalize their quaternions, because all later code assumes unit length."""
     for rig_id, rig in model.rigs.items():
         for sensor_id, sensor_from_rig in rig.non_ref_sensors.items():
             if sensor_from_rig is not None:
@@ -287,7 +299,7 @@ def _check_poses(model: pycolmap.Reconstruction, path: Path) -> None:
         frame = model.frame(frame_id)
         image_ids = [data_id.id for data_id in frame.image_ids]
         if not image_ids or not all(map(model.exists_image, image_ids)):
-            raise InputError(f"frame {frame_id} has a pose and no image, or one that is not there", path)
+            raise InputError(f"frame {frame_id} has a pose but no image, or names an image that does not exist", path)
         what = f"the pose of {min(model.image(image_id).name for image_id in image_ids)}"
         frame.rig_from_world = _checked(frame.rig_from_world, what, path)
 

@@ -1,4 +1,4 @@
-"""Which points the photos of a model see, and where."""
+"""Points that the photos of a model see, and their image coordinates."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from rangesfm.arrays import Array, Indices
 
 
 def seen_in(image: pycolmap.Image) -> tuple[Indices, Array]:
-    """(n,) ids of the 3-D points that a photo sees, and (n, 2) where, in pixels."""
+    """Return the ids (n,) of the 3-D points that a photo sees, and their image coordinates (n, 2) in pixels."""
     seen = [(point.point3D_id, point.x(), point.y()) for point in image.get_observation_points2D()]
     columns = np.array(seen, dtype=np.float64).reshape(-1, 3)
     return columns[:, 0].astype(np.int64), columns[:, 1:]
 
 
 def overlaps_in(model: pycolmap.Reconstruction) -> csr_array:
-    """(n, n) number of points that two of the n photos of a model have in common."""
+    """Return the sparse matrix (n, n) of the numbers of points that pairs of the n registered photos both see."""
     photos = [
         [point.point3D_id for point in model.image(image_id).get_observation_points2D()]
         for image_id in model.reg_image_ids()

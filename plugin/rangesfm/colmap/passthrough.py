@@ -1,4 +1,4 @@
-"""Keys of a survey file straight into pycolmap's option objects, checked one by one."""
+"""Transfer of survey file keys into pycolmap's option objects, each key checked."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def apply_options(options: Any, values: Mapping[str, Any], table: str) -> None:
 
     Args:
         options: any pycolmap ``*Options`` object; changed in place.
-        values: by COLMAP's own names; an object inside takes a table, an enumeration the name of a member.
-        table: what the user calls this table, for messages (for example ``"mapper.pipeline"``).
+        values: values by COLMAP's own names. A nested object takes a table, an enumeration the name of a member.
+        table: the user's name for this table, for messages (for example ``"mapper.pipeline"``).
 
     Raises:
-        OptionError: an unknown key (names the nearest known one), a value of another type, or
-            values that COLMAP itself refuses (with its reason).
+        OptionError: a key is unknown (the message names the nearest known one), a value has another type, or COLMAP
+            itself refuses a value (the message gives its reason).
     """
     _assign(options, values, table)
     if values and hasattr(type(options), "check"):
@@ -46,18 +46,18 @@ def _assign(options: Any, values: Mapping[str, Any], table: str) -> None:
             nearest = nearest_known(key, known)
             message = f"unknown key '{printable(key)}' in [{table}]; the nearest known one is '{nearest}'"
             raise OptionError(message, table, key)
-        # On the type: asking a pycolmap object for an attribute that it lacks writes to its log.
+        # The type is asked, because asking a pycolmap object for an attribute that it lacks writes to COLMAP's log.
         if hasattr(type(known[key]), "todict"):
             if not isinstance(value, Mapping):
                 raise _wrong_value(table, key, value, "a table")
-            # The attribute is the object inside; todict made a copy.
+            # Values are set on the attribute itself, because todict returned a copy.
             _assign(getattr(options, key), value, f"{table}.{key}")
         else:
             _assign_value(options, key, value, type(known[key]), table)
 
 
 def _assign_value(options: Any, key: str, value: Any, kind: Any, table: str) -> None:
-    """Set one attribute; stricter than pybind11, which takes True for 1 and 1 for True."""
+    """Set one attribute, with stricter types than pybind11, which accepts True for 1 and 1 for True."""
     if hasattr(kind, "__members__"):
         if not isinstance(value, str) or value not in kind.__members__:
             raise _wrong_value(table, key, value, "one of " + ", ".join(kind.__members__))
@@ -69,12 +69,12 @@ def _assign_value(options: Any, key: str, value: Any, kind: Any, table: str) -> 
         raise _wrong_value(table, key, value, expected)
     try:
         setattr(options, key, kind(value))
-    except TypeError:  # the items of a list, or a number too large
-        raise _wrong_value(table, key, value, f"{expected} that COLMAP takes") from None
+    except TypeError:  # an item of a list has another type, or a number is too large
+        raise _wrong_value(table, key, value, f"{expected} that COLMAP accepts") from None
 
 
 def _check(options: Any, table: str) -> None:
-    """Let COLMAP look at its values; the reason of a refusal it only logs."""
+    """Let COLMAP check its values, and take the reason of a refusal from its log, the only place it is in."""
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "check.log"
         with colmap_log(log):

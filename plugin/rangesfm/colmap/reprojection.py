@@ -1,4 +1,4 @@
-"""How far a model's points lie from where its photos show them."""
+"""Reprojection errors of a model, and the test whether model, photos and cameras belong together."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.colmap.observations import seen_in
 
-# COLMAP itself keeps no observation that is farther off (IncrementalPipelineOptions.filter_max_reproj_error).
+# COLMAP keeps no observation with a larger error, in pixels (IncrementalPipelineOptions.filter_max_reproj_error).
 _MAX_ERROR_PX = 4.0
-# Of the longer side of a photo: features of large photos are coarser.
+# The same limit for large photos, as a fraction of the longer side, because features of large photos are less precise.
 _MAX_ERROR_SHARE = 0.005
 MISMATCHED = "check that model, photos and the camera's parameters belong together"
 
 
 @dataclass(frozen=True)
 class PointErrors:
-    """Of n points.
+    """Reprojection errors of n points.
 
     Attributes:
-        error_px: (n,) mean over the photos that see a point; huge where it lies behind one of them.
-        points: (n, 3) in the model's world.
-        max_median_px: more than that, in the middle, no model of these photos has.
+        error_px: (n,) mean over the photos that see a point, in pixels; huge where it lies behind one of them.
+        points: (n, 3) positions in the model's world.
+        max_median_px: largest median error that a model of these photos can have, in pixels.
     """
 
     error_px: Array
@@ -33,16 +33,21 @@ class PointErrors:
 
     @property
     def median_px(self) -> float:
-        """NaN without points."""
+        """Median of the points' errors in pixels; NaN without points."""
         return float(np.median(self.error_px)) if len(self.error_px) else float("nan")
 
     @property
     def fit(self) -> bool:
-        """Whether the points are of these photos and cameras at all; nothing speaks against no points."""
+        """Whether the points can belong to these photos and cameras; true without points."""
         return not self.median_px > self.max_median_px
 
     def apart(self, whose: str, photos: str = "the photos") -> str:
-        """In words, how far points lie that do not fit."""
+        """Return a message that says how far off the points are.
+
+        Args:
+            whose: name of the model.
+            photos: words for the photos.
+        """
         return (
             f"{whose}'s points lie {self.median_px:.3g} px (median) from where {photos} show them, expected below "
             f"{self.max_median_px:.3g} px"
@@ -50,7 +55,7 @@ class PointErrors:
 
 
 def point_errors(model: pycolmap.Reconstruction) -> PointErrors:
-    """Of a model's points, in the order of their ids."""
+    """Compute the reprojection errors of a model's points, in the order of their ids."""
     measured = pycolmap.Reconstruction(model)
     measured.update_point_3d_errors()
     points = [point for _, point in sorted(measured.points3D.items())]
@@ -63,7 +68,10 @@ def point_errors(model: pycolmap.Reconstruction) -> PointErrors:
 
 
 def photo_errors_px(model: pycolmap.Reconstruction) -> dict[str, float]:
-    """Median reprojection error of each registered photo that sees points, by name; infinite where most lie behind."""
+    """Return the median reprojection error in pixels of each registered photo that sees points, by name.
+
+    It is infinite if most of its points lie behind the photo.
+    """
     medians = {}
     xyz = {point_id: point.xyz for point_id, point in model.points3D.items()}
     for image_id in sorted(model.reg_image_ids()):

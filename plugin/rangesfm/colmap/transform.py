@@ -1,4 +1,4 @@
-"""Models carried into another world, put together there, or given what became of a copy."""
+"""Changes of whole models: transformation into another world, joining, removal of photos, update from a copy."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from rangesfm.geometry.trajectory import pose_of
 
 
 def rescale(reconstruction: pycolmap.Reconstruction, metric_from_sfm: Similarity) -> pycolmap.Reconstruction:
-    """A copy of the model in the metric world; poses and points move, the original stays.
+    """Return a copy of the model in the metric world, with transformed poses and points.
 
-    In a rig the distances between its cameras scale along, as COLMAP has them in model units.
+    The distances between the cameras of a rig scale along, because COLMAP stores them in model units.
     """
     metric = pycolmap.Reconstruction(reconstruction)
     transform(metric, metric_from_sfm)
@@ -24,13 +24,13 @@ def rescale(reconstruction: pycolmap.Reconstruction, metric_from_sfm: Similarity
 
 
 def transform(reconstruction: pycolmap.Reconstruction, new_from_old: Similarity) -> None:
-    """As ``rescale``, in place: a solver that works on the model's arrays sees it."""
+    """Transform a model in place, so that a solver that works on the model's arrays sees the change."""
     rotation = pycolmap.Rotation3d(new_from_old.rotation)
     reconstruction.transform(pycolmap.Sim3d(new_from_old.scale, rotation, new_from_old.translation))
 
 
 def take_over(reconstruction: pycolmap.Reconstruction, adjusted: pycolmap.Reconstruction) -> None:
-    """Give a model, in place, the poses, points and intrinsics of a copy of it that was adjusted."""
+    """Copy poses, points and intrinsics from an adjusted copy of a model into the model, in place."""
     for frame_id in reconstruction.reg_frame_ids():
         pose_of(reconstruction.frame(frame_id)).params[:] = pose_of(adjusted.frame(frame_id)).params
     for point_id, point in reconstruction.points3D.items():
@@ -40,13 +40,13 @@ def take_over(reconstruction: pycolmap.Reconstruction, adjusted: pycolmap.Recons
 
 
 def joined_model(models: Sequence[pycolmap.Reconstruction]) -> pycolmap.Reconstruction:
-    """One model of the registered photos and the points of all.
+    """Return one model with the registered photos and the points of several models.
 
-    Ids of photos, frames, rigs and cameras are kept where they are free, so that those of models from one database stay
-    the database's. A rig that is the same in two models, with all its cameras, is one. Points are numbered anew.
+    Ids of photos, frames, rigs and cameras are kept where they are free, so that models from one database keep that
+    database's ids. A rig that is equal in two models, with all its cameras, becomes one rig. Points get new ids.
 
     Args:
-        models: in one world and unit. A photo is in one of them only.
+        models: models in one world and unit. Each photo is in one of them only.
     """
     joined = pycolmap.Reconstruction()
     for model in models:
@@ -56,7 +56,7 @@ def joined_model(models: Sequence[pycolmap.Reconstruction]) -> pycolmap.Reconstr
 
 
 def without_photos(model: pycolmap.Reconstruction, image_names: Collection[str]) -> pycolmap.Reconstruction:
-    """A copy of a model without the frames of some photos; the model itself if it has none of them."""
+    """Return a copy of a model without the frames of these photos, or the model itself if it has none of them."""
     unwanted = {image.frame_id for image in model.images.values() if image.has_pose and image.name in image_names}
     if not unwanted:
         return model
@@ -68,7 +68,7 @@ def without_photos(model: pycolmap.Reconstruction, image_names: Collection[str])
 
 @dataclass(frozen=True)
 class _Addition:
-    """A model on its way into the joined one."""
+    """A model that is being added to the joined one."""
 
     joined: pycolmap.Reconstruction
     model: pycolmap.Reconstruction
@@ -86,7 +86,7 @@ class _Addition:
             self.joined.add_point3D(point.xyz, pycolmap.Track(track), point.color)
 
     def _add_rigs(self) -> tuple[dict[int, int], dict[int, int]]:
-        """New ids of rigs and of cameras, by those in the model."""
+        """Add rigs and cameras; return their new ids, by their ids in the model."""
         same = {
             rig_id
             for rig_id in self.model.rigs
@@ -122,7 +122,7 @@ class _Addition:
 
 
 def _free_ids(wanted: Iterable[int], taken: Iterable[int]) -> dict[int, int]:
-    """The ids themselves where no other has them, new ones beyond all else."""
+    """Return a new id for each wanted id: the same id if it is free, else one above all ids in use."""
     wanted, taken = sorted(wanted), set(taken)
     next_id = max([*wanted, *taken], default=0) + 1
     ids: dict[int, int] = {}
@@ -138,7 +138,7 @@ def _camera_ids(rig: pycolmap.Rig) -> list[int]:
 
 
 def _description(model: pycolmap.Reconstruction, rig_id: int) -> Any:
-    """Plain values that are the same for the same rig."""
+    """Return plain values that are equal for equal rigs."""
     rig = model.rig(rig_id)
     others = {
         sensor.id: None if pose is None else pose.matrix().tolist() for sensor, pose in rig.non_ref_sensors.items()
