@@ -60,7 +60,7 @@ class TestNewFile:
         for text in ("first", "second"):
             write_text(text, tmp_path / "a.csv")
         (tmp_path / "a.csv").write_text("mine")
-        with pytest.raises(InputError, match=r"a\.csv: is not a file that rangesfm wrote as it is now"):
+        with pytest.raises(InputError, match=r"a\.csv: is not a file that rangesfm wrote, or has changed since"):
             write_text("third", tmp_path / "a.csv")
         assert (tmp_path / "a.csv").read_text() == "mine"
 
@@ -109,7 +109,7 @@ class TestNewFile:
 
     def test_leaves_what_is_in_the_place_of_its_own_folder(self, tmp_path: Path) -> None:
         (tmp_path / PRIVATE_NAME).write_text("mine")
-        with pytest.raises(InputError, match="expected a folder of rangesfm's own or nothing"):
+        with pytest.raises(InputError, match="expected rangesfm's own folder or nothing here"):
             write_text("new", tmp_path / "a.csv")
         assert (tmp_path / PRIVATE_NAME).read_text() == "mine"
 

@@ -124,7 +124,7 @@ def test_missing_column_names_what_was_found_and_expected(tmp_path: Path) -> Non
 
 
 def test_column_that_stands_twice_is_refused(tmp_path: Path) -> None:
-    assert "2 columns are a" in str(refusal(write(tmp_path, "a,b,a\n1,2,3\n")))
+    assert "2 columns are named a" in str(refusal(write(tmp_path, "a,b,a\n1,2,3\n")))
 
 
 def test_table_without_header_row_is_refused(tmp_path: Path) -> None:

@@ -375,7 +375,7 @@ class TestOtherPhotos:
         data = (output / "database.db").read_bytes()
         changed = data[:4096] + bytes(len(data) - 4096)
         (output / "database.db").write_bytes(changed)
-        with pytest.raises(InputError, match=r"database\.db: is not a file that rangesfm wrote as it is now"):
+        with pytest.raises(InputError, match=r"database\.db: is not a file that rangesfm wrote, or has changed since"):
             reconstruct(room.folder, room.names[:4], output, camera=room.camera, mapper=MAPPER)
         assert (output / "database.db").read_bytes() == changed
 

@@ -1,1 +1,1 @@
-"""Safe reading and writing: tables, JSON, outputs that appear whole, one writer a folder."""
+"""Safe reading and writing of files: tables, JSON, outputs that appear only when complete, one writer per folder."""

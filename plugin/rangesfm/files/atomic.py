@@ -1,4 +1,4 @@
-"""Outputs appear whole or not at all, and never in the place of what somebody else made."""
+"""Outputs that appear complete or not at all, and never replace files that this tool did not write."""
 
 from __future__ import annotations
 
@@ -25,17 +25,18 @@ __all__ = [
     "write_text",
 ]
 
-_NOT_IN_NAMES = ("Cc", "Cs", "Zl", "Zp")  # control characters, bytes that are no text, ends of lines and paragraphs
+# Unicode categories: control characters, bytes that are not text, line separators and paragraph separators.
+_NOT_IN_NAMES = ("Cc", "Cs", "Zl", "Zp")
 
 
 def stays_inside(name: str) -> bool:
-    """Whether a name from a file, taken relative to a folder, cannot lead out of it."""
+    """Whether a name from a file, taken relative to a folder, stays inside that folder."""
     path = Path(name)
     return not path.is_absolute() and ".." not in path.parts
 
 
 def path_of(text: str) -> Path:
-    """The path that text from a file stands for, also under a locale that cannot spell it: then it is UTF-8."""
+    """Return the path that text from a file names; where the locale cannot encode the text, UTF-8 is used."""
     try:
         os.fsencode(text)
     except UnicodeEncodeError:
@@ -44,12 +45,16 @@ def path_of(text: str) -> Path:
 
 
 def is_plain_name(name: str) -> bool:
-    """Whether a photo's name can stand in tables and files: some UTF-8 text on one line."""
+    """Whether a photo's name can be written into tables and files: UTF-8 text on one line, not empty."""
     return bool(name) and not any(unicodedata.category(character) in _NOT_IN_NAMES for character in name)
 
 
 def require_apart(inputs: Iterable[Path], output: Path) -> None:
-    """Raise InputError if ``output`` is one of the files or folders that are read, or lies inside one."""
+    """Check that the output path is neither one of the inputs nor inside one.
+
+    Raises:
+        InputError: it is.
+    """
     target = output.resolve()
     for path in inputs:
         if path.resolve() in (target, *target.parents):
@@ -61,7 +66,7 @@ def new_file(path: Path) -> Iterator[Path]:
     """Yield a temporary file to write to; on success it takes the place of ``path``.
 
     Raises:
-        InputError: there is a file or folder that this tool did not write; it stays as it is.
+        InputError: at ``path`` is a folder, or a file that this tool did not write; it stays as it is.
     """
     if is_private(path):
         with _temporary(path.with_name(f".{path.stem}.part{path.suffix}")) as temporary:
@@ -75,28 +80,28 @@ def new_file(path: Path) -> Iterator[Path]:
         output.require_own([target])
         if target.is_dir():
             raise InputError("is a folder, expected a file", path)
-        our_names: set[str | None] = {None}  # of which an error says nothing to the user
+        our_names: set[str | None] = {None}  # file names in errors that mean nothing to the user
         try:
-            # With the same ending, by which libraries tell the format.
+            # The temporary file has the same ending, because libraries tell the format by it.
             part = output.part(path.name)
             our_names.add(str(part))
             with _temporary(part) as temporary:
                 yield temporary
                 output.publish({target: temporary})
-        except OSError as error:  # of a full disk, which may say nothing of the file
+        except OSError as error:  # the error of a full disk may not name the file
             error.filename = str(path) if error.filename in our_names else error.filename
             raise
 
 
 def write_text(text: str, path: Path) -> None:
-    """Write a file of UTF-8, whole or not at all; of a path that is none, the bytes become escapes."""
+    """Write a UTF-8 file, complete or not at all; bytes of paths that are not UTF-8 become escapes."""
     with new_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 @contextmanager
 def scratch_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary folder, named after ``path`` and on the same file system, that is gone afterwards."""
+    """Yield a temporary folder, named after ``path`` and on the same file system, and remove it afterwards."""
     if is_private(path):
         with _temporary(path.with_name(f".{path.name}.part")) as folder:
             folder.mkdir(parents=True)
@@ -112,7 +117,7 @@ def new_folder(path: Path) -> Iterator[Path]:
     """Yield a temporary folder to write to; on success it takes the place of the folder ``path``.
 
     Raises:
-        InputError: there is something in the earlier folder that this tool did not write; all of it stays as it is.
+        InputError: the earlier folder holds something that this tool did not write; all of it stays as it is.
     """
     if is_private(path):
         with scratch_folder(path) as folder:
@@ -129,12 +134,12 @@ def new_folder(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _temporary(path: Path) -> Iterator[Path]:
-    """Have nothing at a path before the block and after it, whatever interrupts it and when."""
+    """Remove whatever is at a path before the block and after it, also if the block is interrupted."""
     try:
         try:
-            remove(path)  # left by a process that was killed
+            remove(path)  # a process that was killed may have left something
             yield path
         finally:
             remove(path)
-    finally:  # again: a Ctrl-C may have ended the first
+    finally:  # once more, because a Ctrl-C may have interrupted the first removal
         remove(path)

@@ -25,13 +25,17 @@ def is_bag_folder(path: Path) -> bool:
 
 
 def is_bag(path: Path) -> bool:
-    """Whether it is called as a file of a bag, or is the folder of one."""
+    """Whether a path has a file name ending of a bag, or is the folder of a ROS 2 bag."""
     return path.suffix.lower() in (".bag", *_ROS2) or is_bag_folder(path)
 
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[AnyReader]:
-    """Yield the bag; whatever goes wrong with it, also inside the block, or without rosbags, becomes an InputError."""
+    """Open a bag for the duration of the block.
+
+    Raises:
+        InputError: the bag cannot be read, also inside the block, or the package rosbags is missing.
+    """
     if not path.exists():
         raise InputError("no such file", path)
     _check_database(path)
@@ -43,34 +47,34 @@ def open_bag(path: Path) -> Iterator[AnyReader]:
             "reading a ROS bag needs the package rosbags: python -m pip install 'rangesfm[ros]'", path
         ) from None
     try:
-        # ROS 2 bags of before 2023 do not say what their messages are made of.
+        # ROS 2 bags from before 2023 do not contain the definitions of their messages.
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as bag:
             yield bag
     except InputError:
         raise
-    except Exception as error:  # whatever a broken bag makes its parsers do
+    except Exception as error:  # a broken bag makes the parsers raise errors of all kinds
         text = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"cannot be read as a ROS bag ({text})", path) from error
 
 
 def messages_of(bag: AnyReader, connections: Sequence[Connection]) -> Iterator[tuple[str, Any, float]]:
-    """Type, content and time of arrival in seconds of each message, in their order."""
+    """Yield the type, content and time of arrival (in seconds) of each message, in their order."""
     for connection, received_ns, data in bag.messages(connections):
         yield connection.msgtype, bag.deserialize(data, connection.msgtype), received_ns * 1e-9
 
 
 def stamp_s(message: Any) -> float:
-    """The time in the header of a message; 0 if nobody set it."""
+    """Return the time in a message's header in seconds; 0 if it was not set."""
     return float(message.header.stamp.sec + message.header.stamp.nanosec * 1e-9)
 
 
 def type_name(message_type: str) -> str:
-    """The last part, without the package that defines it."""
+    """Return the name of a message type without its package."""
     return message_type.rpartition("/")[2]
 
 
 def _check_database(path: Path) -> None:
-    """Refuse SQLite databases that are no ROS 2 bag; there are many of other kinds, COLMAP's among them."""
+    """Refuse SQLite databases that are not ROS 2 bags, COLMAP's for example."""
     if not path.is_file():
         return
     with path.open("rb") as file:
@@ -84,4 +88,4 @@ def _check_database(path: Path) -> None:
     if not tables >= _BAG_TABLES:
         found = ", ".join(sorted(tables)[:3]) or "none"
         expected = " and ".join(sorted(_BAG_TABLES))
-        raise InputError(f"an SQLite database that is no ROS 2 bag: it has tables {found}, expected {expected}", path)
+        raise InputError(f"is an SQLite database but no ROS 2 bag: it has tables {found}, expected {expected}", path)

@@ -1,4 +1,4 @@
-"""Files known by their content."""
+"""Hashes of files, which tell whether their content has changed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ CHUNK_BYTES = 1 << 20
 
 
 def sha256_of(path: Path) -> str:
-    """SHA-256 of a file's content, in hexadecimal."""
+    """Return the SHA-256 of a file's content, in hexadecimal."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while chunk := file.read(CHUNK_BYTES):
@@ -19,14 +19,14 @@ def sha256_of(path: Path) -> str:
 
 
 def state_and_sha256(path: Path, known: Any = None) -> tuple[tuple[int, int, int], str]:
-    """Size and times of change of a file, and its SHA-256.
+    """Return a file's state (size and two times of change), and its SHA-256.
 
     Args:
-        known: what an earlier call returned, perhaps by way of JSON: the file is not read again while its state is
-            the same.
+        known: the result of an earlier call, which may have been stored as JSON. The file is not read again while its
+            state is the same.
     """
     found = path.stat()
-    # The second time is the file system's own: it also moves when a program sets the first one back.
+    # The second time is set by the file system itself, so that it also changes when a program sets the first one back.
     state = (found.st_size, found.st_mtime_ns, found.st_ctime_ns)
     if isinstance(known, (list, tuple)) and len(known) == 2 and known[0] in (state, [*state]):
         return state, str(known[1])

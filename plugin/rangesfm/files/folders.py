@@ -1,4 +1,4 @@
-"""All folders inside folders, behind links too: photos of one survey may lie on several disks."""
+"""Listing of all folders inside folders, following links, because photos of one survey may lie on several disks."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 LEFT_BY_RUNS = frozenset({"result.json", "reconstruct.json", "photos.json"})
-"""Names of files by which such folders are known."""
+"""Names of files that mark a folder as the result of an earlier run."""
 
 
 def walk(*folders: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
-    """Each folder once, with the names of its folders (the caller may take out some) and of its files, sorted.
+    """Yield each folder once, with the sorted names of its subfolders and of its files.
 
-    What is hidden is left out, and so are folders that earlier runs left, but for ``folders`` themselves.
+    The caller may remove subfolders from their list to skip them. Hidden files and folders are left out, and so are
+    result folders of earlier runs, unless they are among ``folders``.
     """
     seen: set[str] = set()
     for folder in folders:

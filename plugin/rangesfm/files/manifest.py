@@ -1,4 +1,4 @@
-"""A record of the files that this tool wrote into a folder, by which it knows them from everybody else's."""
+"""Record of the files that this tool wrote into a folder, which tells them from all other files."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from rangesfm.files.contents import CHUNK_BYTES
 _NAME = "manifest.json"
 _VERSION = 1
 _SQLITE_MAGIC = b"SQLite format 3\x00"
-# SQLite counts in its header how often the file was opened for writing: COLMAP does so to look at a database.
-# https://www.sqlite.org/fileformat2.html, sections 1.3.7 and 1.3.18
+# Byte ranges of counters in SQLite's header. They change whenever the file is opened for writing, which COLMAP does
+# even to look at a database. Source: https://www.sqlite.org/fileformat2.html, sections 1.3.7 and 1.3.18.
 _SQLITE_COUNTERS = ((24, 28), (92, 96))
 
 _State = tuple[int, int, int]
@@ -26,10 +26,11 @@ _State = tuple[int, int, int]
 class Manifest:
     """The files of one folder that this tool wrote, with the content that it gave them.
 
-    A file is this tool's as long as it is a regular file with that content; whoever changes one makes it their own.
+    A file counts as this tool's own as long as it is a regular file with that content. A file that somebody has changed
+    no longer does.
 
     Attributes:
-        token: a random word that the names of unfinished files carry, so that nobody else's can have it.
+        token: a random word in the names of unfinished files, so that no other file can have such a name.
         moves: renames that were begun and not finished: source in the private folder, target in the folder.
     """
 
@@ -37,7 +38,7 @@ class Manifest:
         """Read the record of ``folder`` from its private folder; empty if there is none.
 
         Raises:
-            InputError: there is something in its place that is no such record.
+            InputError: the file in its place is not such a record.
         """
         self._folder = folder
         self._path = private / _NAME
@@ -45,7 +46,7 @@ class Manifest:
         self.moves: list[tuple[str, str]] = []
         self._hashes: dict[str, list[str]] = {}
         self._states: dict[str, _State] = {}
-        # Size, time and hash of what was expected last: a rename leaves the first two as they are.
+        # Size, time of change and hash of the file last announced by ``expect``; a rename keeps size and time.
         self._expected: dict[str, tuple[tuple[int, int], str]] = {}
         if os.path.lexists(self._path):
             self._read()
@@ -55,17 +56,19 @@ class Manifest:
         return not self._hashes and not self.moves
 
     def foreign_file(self, path: Path) -> Path | None:
-        """Return a file at ``path``, or inside it, that this tool did not write as it is now; None if there is none."""
+        """Return a file at ``path`` or inside it that is not this tool's own, or None if there is none."""
         for file in _files_in(path):
             if not self._is_own(file):
                 return file
         return None
 
     def expect(self, files: Iterable[tuple[Path, Path]]) -> None:
-        """Count the content of ``source`` as this tool's own at ``target``, beside what is own there already.
+        """Count the content of each source as this tool's own at its target, in addition to what is own there already.
+
+        The record must be saved before the source is renamed to the target.
 
         Args:
-            files: pairs (source, target) of files or folders. To be saved before the one is renamed to the other.
+            files: pairs (source, target) of files or folders.
         """
         for source, target in files:
             for file in _files_in(source):
@@ -75,7 +78,7 @@ class Manifest:
                 self._expected[name] = state[:2], found
 
     def settle(self, targets: Iterable[Path]) -> None:
-        """Count nothing as this tool's own at or inside these targets but what is there now."""
+        """Count only the present content of these targets as this tool's own, and no longer any earlier content."""
         for target in targets:
             present = {self._name_of(file): file for file in _files_in(target)}
             name = self._name_of(target)
@@ -92,7 +95,7 @@ class Manifest:
                     self._states[other] = state
 
     def save(self) -> None:
-        """Write the record, whole or not at all."""
+        """Write the record, complete or not at all."""
         files = {
             name: {"sha256": hashes, "state": self._states.get(name)} for name, hashes in sorted(self._hashes.items())
         }
@@ -121,7 +124,7 @@ class Manifest:
                     self._states[name] = size, modified, changed
         except (OSError, ValueError, TypeError, AttributeError, LookupError, RecursionError) as error:
             raise InputError(
-                "is not a record of this version of rangesfm of what it wrote: move it away, or give another output"
+                "is not a record of written files by this version of rangesfm: move it away, or give another output"
                 " path",
                 self._path,
             ) from error
@@ -143,7 +146,7 @@ class Manifest:
 
 
 def content_hash(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal; of an SQLite database without the counters of who has opened it."""
+    """Return the SHA-256 of a file, in hexadecimal; the counters in the header of an SQLite database are ignored."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
         head = bytearray(file.read(CHUNK_BYTES))
@@ -157,7 +160,7 @@ def content_hash(path: Path) -> str:
 
 
 def _files_in(path: Path) -> Iterator[Path]:
-    """The path itself unless it is a folder, whose files then; a link counts as a file, wherever it leads."""
+    """Yield the path if it is a file or a link, or all files and links inside it if it is a folder."""
     if not os.path.lexists(path):
         return
     if path.is_symlink() or not path.is_dir():

@@ -1,6 +1,6 @@
-"""A folder that one process at a time writes to, and in which nothing is lost that this tool did not write.
+"""Output folder that one process at a time writes to, and where files that this tool did not write are never lost.
 
-What is being made, the lock and the record of what was written stand in one hidden folder inside it.
+A hidden folder inside it holds unfinished files, the lock, and the record of what was written.
 """
 
 from __future__ import annotations
@@ -30,10 +30,11 @@ PRIVATE_NAME = ".rangesfm"
 DEFAULT_OUTPUT = "out"
 LOCK_NAME = f"{PRIVATE_NAME}/lock"
 _PARTS_NAME = "parts"
-# For a holder that ends, and removes the file, between two tries; and for one that writes a single file.
+# Time to wait for the lock. The short wait covers a holder that is just ending, the long one a holder that writes a
+# single file.
 _MAX_WAIT_S = 0.2
 _MAX_WAIT_FOR_ONE_FILE_S = 10.0
-_NOT_OURS = "is not a file that rangesfm wrote as it is now: move it away, or give another output path"
+_NOT_OURS = "is not a file that rangesfm wrote, or has changed since: move it away, or give another output path"
 _NUM_TRIES = 5
 _LOCK_BEGIN = '{"pid": '
 _numbers = itertools.count()
@@ -56,18 +57,18 @@ class OutputFolder:
         self._finish_moves()
 
     def part(self, name: str) -> Path:
-        """Return a path for something in the making, which is nobody else's and on the same file system."""
+        """Return a unique path for an unfinished file or folder, on the same file system."""
         folder = self.private / _PARTS_NAME
         if not folder.exists():
-            self._manifest.save()  # by whose token the next process knows what this one has left
+            self._manifest.save()  # the next process knows leftovers of this one by the manifest's token
             folder.mkdir()
         return folder / f"{self._manifest.token}-{os.getpid()}-{next(_numbers)}-{name}"
 
     def require_own(self, targets: Iterable[Path]) -> None:
-        """Check that all there is at these paths, or inside them, was written by this tool and is unchanged.
+        """Check that everything at these paths, or inside them, was written by this tool and is unchanged.
 
         Raises:
-            InputError: names the first file that was not, or a link on the way to it.
+            InputError: something was not, or a parent folder is a link; the message names it.
         """
         for target in targets:
             for parent in target.parents:
@@ -78,30 +79,30 @@ class OutputFolder:
             try:
                 foreign = self._manifest.foreign_file(target)
             except OSError as error:
-                raise InputError(f"cannot be read ({error.strerror}), and so not be replaced", target) from error
+                raise InputError(f"cannot be read ({error.strerror}) and is therefore not replaced", target) from error
             if foreign is not None:
                 raise InputError(_NOT_OURS, foreign)
 
     def is_own(self, path: Path) -> bool:
-        """Whether there is a file at this path that this tool wrote as it is now."""
+        """Whether the file at this path was written by this tool and is unchanged."""
         return os.path.lexists(path) and self._manifest.foreign_file(path) is None
 
     def defer(self, new: Mapping[Path, Path]) -> None:
-        """Have the next ``publish`` that replaces a whole result put these in their places, too."""
+        """Add files and folders, by their places, to the next ``publish`` that replaces a whole result."""
         self._deferred.update(new)
 
     def publish(self, new: Mapping[Path, Path], removed: Sequence[Path] = (), *, last: Path | None = None) -> None:
-        """Put files and folders in the places of earlier ones, all of them or, where that fails, none.
+        """Move files and folders into the places of earlier ones: all of them, or none if that fails.
 
-        A process that is killed in between has it finished by the next one that writes to the folder.
+        If the process is killed in between, the next one that writes to the folder finishes the moves.
 
         Args:
-            new: for each place what comes there, from the private folder.
-            removed: places where nothing is to be left.
-            last: a file whose presence says that the others are whole: it goes first and comes last.
+            new: for each place the file or folder that goes there, from the private folder.
+            removed: places to clear.
+            last: a file whose presence says that the others are complete. It is removed first and placed last.
 
         Raises:
-            InputError: what is in one of the places is not this tool's own.
+            InputError: something in one of the places is not this tool's own.
         """
         if last is not None:
             new, self._deferred = {**self._deferred, **new}, {}
@@ -134,7 +135,7 @@ class OutputFolder:
         self._settle([target for _, target in moves])
 
     def close(self) -> None:
-        """Remove what is in the making, and the private folder if it keeps nothing."""
+        """Remove unfinished files, and the record if it is empty and nothing else is in the private folder."""
         self._clear_parts()
         with suppress(OSError):
             (self.private / _PARTS_NAME).rmdir()
@@ -147,7 +148,7 @@ class OutputFolder:
         self._manifest.save()
 
     def _finish_moves(self) -> None:
-        """Finish what a killed process had begun to put in its place; everything that it needs is there."""
+        """Finish the moves that a killed process had begun; all that they need is still there."""
         moves = [
             (self._inside(self.private, source) if source else None, self._inside(self.path, target))
             for source, target in self._manifest.moves
@@ -157,7 +158,7 @@ class OutputFolder:
         self.require_own(target for _, target in moves)
         new = {target: source for source, target in moves if source is not None}
         for target, source in new.items():
-            if os.path.lexists(source):  # else it is in its place already
+            if os.path.lexists(source):  # if not, it has been moved already
                 if os.path.lexists(target):
                     os.rename(target, self.part(target.name))
                 target.parent.mkdir(parents=True, exist_ok=True)
@@ -178,7 +179,7 @@ class OutputFolder:
         return path.relative_to(folder).as_posix()
 
     def _clear_parts(self) -> None:
-        """Remove what no living process is making; what is still to be put in its place stays."""
+        """Remove unfinished files whose process has ended, except those that a begun move still needs."""
         folder = self.private / _PARTS_NAME
         kept = {Path(source).parts[1] for source, _ in self._manifest.moves if source.startswith(f"{_PARTS_NAME}/")}
         for path in sorted(folder.iterdir()) if folder.is_dir() and not folder.is_symlink() else ():
@@ -189,16 +190,15 @@ class OutputFolder:
 
 
 _held: ContextVar[Mapping[Path, OutputFolder]] = ContextVar("held", default=MappingProxyType({}))
-"""Folders that this thread holds: what it calls meanwhile may ask for them again."""
+"""Output folders that this thread holds; code that it calls meanwhile gets the same object again."""
 
 
 @contextmanager
 def sole_writer(folder: Path, *, max_wait_s: float = _MAX_WAIT_S) -> Iterator[OutputFolder]:
-    """Keep other runs out of ``folder`` inside the block; clear away what killed ones left half-made there.
+    """Keep other runs out of ``folder`` inside the block, and remove unfinished files that killed runs left there.
 
-    The folder is made if need be, and is gone again if nothing was written to it. The lock is the
-    kernel's, so a killed process leaves none behind; where the file system knows no locks there is
-    none at all.
+    The folder is made if necessary, and removed again if nothing was written to it. The lock is the kernel's, so that
+    a killed process leaves none behind. Where the file system has no locks, other runs are not kept out.
 
     Raises:
         InputError: another process (or thread) writes there, or the folder cannot be written to.
@@ -224,15 +224,15 @@ def sole_writer(folder: Path, *, max_wait_s: float = _MAX_WAIT_S) -> Iterator[Ou
             _held.reset(token)
             held.close()
     finally:
-        with suppress(OSError):  # Windows removes no open file
-            (key / LOCK_NAME).unlink()  # before it is let go, or it might already be another's
+        with suppress(OSError):  # Windows does not remove an open file
+            (key / LOCK_NAME).unlink()  # before the release, after which the file may be another process's lock
         lock.release()
         _remove_empty([private, *made])
 
 
 @contextmanager
 def writer_of(path: Path) -> Iterator[OutputFolder]:
-    """Give the folder that is held and that ``path`` is in; its own folder, held as long as the block, if none is."""
+    """Yield the innermost held folder around ``path``, or else hold the parent folder of ``path`` inside the block."""
     path = absolute(path)
     around = [held for folder, held in _held.get().items() if path.is_relative_to(folder)]
     if around:
@@ -243,7 +243,7 @@ def writer_of(path: Path) -> Iterator[OutputFolder]:
 
 
 def absolute(path: Path) -> Path:
-    """Return the path without links on the way to it; a link at its end stays one."""
+    """Return the absolute path with links in its parent folders resolved; a link at the path itself stays one."""
     return path.parent.resolve() / path.name
 
 
@@ -253,7 +253,7 @@ def is_private(path: Path) -> bool:
 
 
 def free_output(folder: Path) -> Path:
-    """Choose an output folder inside ``folder``: ``out``, unless somebody else keeps something there."""
+    """Choose an output folder inside ``folder``: ``out``, unless it holds files that this tool did not write."""
     first = folder / DEFAULT_OUTPUT
     is_free = (
         not os.path.lexists(first) or (first / PRIVATE_NAME).is_dir() or (first.is_dir() and not os.listdir(first))
@@ -262,11 +262,15 @@ def free_output(folder: Path) -> Path:
 
 
 def make_output_folder(path: Path) -> None:
-    """Make ``path`` and check that it can be written to; raise InputError if not."""
+    """Make the folder ``path`` and check that it can be written to.
+
+    Raises:
+        InputError: it cannot be made or written to, or is no place for an output folder.
+    """
     if path.resolve() == Path(path.resolve().anchor):
         raise InputError("is the root of the file system, expected a folder for the results", path)
     if PRIVATE_NAME in path.resolve().parts and not is_private(path.resolve()):
-        raise InputError(f"lies in a folder {PRIVATE_NAME}, where rangesfm keeps what is its own", path)
+        raise InputError(f"lies in a folder {PRIVATE_NAME}, which is reserved for rangesfm's own files", path)
     try:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
@@ -276,7 +280,7 @@ def make_output_folder(path: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """Remove a file, a link or a whole folder, as far as it can be."""
+    """Remove a file, a link or a whole folder; whatever cannot be removed stays without an error."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -286,47 +290,47 @@ def remove(path: Path) -> None:
 
 def _remove_empty(folders: Iterable[Path]) -> None:
     for path in folders:
-        with suppress(OSError):  # not empty
+        with suppress(OSError):  # the folder is not empty
             path.rmdir()
 
 
 def _rename(source: Path, target: Path, done: list[tuple[Path, Path]]) -> None:
-    done.append((source, target))  # before it: an interruption may come right after it
+    done.append((source, target))  # noted first, because an interruption may come right after the rename
     os.rename(source, target)
 
 
 def _lock(folder: Path, private: Path, max_wait_s: float) -> BaseFileLock:
-    """The lock of a folder, held unless the file system knows none."""
+    """Acquire and return the lock of a folder; it is not held where the file system has no locks."""
     from filelock import FileLock, Timeout
 
     try:
         private.mkdir(exist_ok=True)
     except OSError as error:
-        raise InputError("is there, expected a folder of rangesfm's own or nothing", private) from error
+        raise InputError("exists, expected rangesfm's own folder or nothing here", private) from error
     if private.is_symlink():
-        raise InputError("is a link, expected a folder of rangesfm's own or nothing", private)
+        raise InputError("is a link, expected rangesfm's own folder or nothing here", private)
     path = private / "lock"
     if os.path.lexists(path) and not _is_lock(path):
-        raise InputError("is there and no lock of rangesfm's: move it away, or give another output path", path)
+        raise InputError("is not a lock file of rangesfm's: move it away, or give another output path", path)
     lock = FileLock(path)
     for _ in range(_NUM_TRIES):
         try:
             lock.acquire(timeout=max_wait_s, poll_interval=_MAX_WAIT_S / 4)
         except Timeout:
             raise InputError(f"{_holder(path)}: wait for it to end, or give another output path", folder) from None
-        except FileNotFoundError:  # a holder that ended has just removed the private folder
+        except FileNotFoundError:  # another process has just ended and removed the private folder
             private.mkdir(parents=True, exist_ok=True)
             continue
-        except OSError:  # the file system knows no locks; the file still says who writes there
+        except OSError:  # the file system has no locks; the lock file still says who writes to the folder
             pass
         break
-    with suppress(OSError):  # on Windows nobody can write there now: then others are not told whose it is
+    with suppress(OSError):  # on Windows a locked file cannot be written, and others are not told who holds the lock
         path.write_text(_own_name(), encoding="utf-8")
     return lock
 
 
 def _is_lock(path: Path) -> bool:
-    """Whether a file is a lock: empty, as it is when it has just been made, or beginning as the name of a holder."""
+    """Whether a file is a lock of this tool: empty, as when just made, or beginning like the entry of a holder."""
     try:
         if path.is_symlink() or not path.is_file():
             return False
@@ -345,21 +349,21 @@ def _own_name() -> str:
 
 
 def _holder(lock: Path) -> str:
-    """Who writes to the folder, by what the lock file says."""
+    """Return a message that says who writes to the folder, as the lock file has it."""
     try:
         holder = json.loads(lock.read_text(encoding="utf-8", errors="replace"))
         host = "" if holder["host"] == socket.gethostname() else f" on {holder['host']}"
         who, since = f"process {holder['pid']}{host} ({holder['command']})", holder["since"]
         return f"{who} has been writing to this folder since {since}"
-    except (OSError, ValueError, TypeError, KeyError, RecursionError):  # it has only just begun
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):  # the holder has not written its entry yet
         return "another process is writing to this folder"
 
 
 def _is_another_process(pid: int) -> bool:
-    """Whether another process has this number: our own leftovers are those of one before us that had it."""
+    """Whether another living process has this number; leftovers with our own number are an earlier process's."""
     import psutil
 
-    try:  # one that has ended stays until its parent asks for it
+    try:  # a process that has ended remains listed until its parent asks for its exit status
         return pid != os.getpid() and psutil.Process(pid).status() not in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
     except psutil.AccessDenied:
         return True

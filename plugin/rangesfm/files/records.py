@@ -1,4 +1,4 @@
-"""JSON, read strictly and written so; records are JSON whose keys stand once, as the fields of a pydantic model."""
+"""Strict reading and writing of JSON, and records: JSON objects whose keys are the fields of a pydantic model."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rangesfm.files.tables import read_text
 
 _Kind = TypeVar("_Kind", bound="Record")
 _MAX_SHOWN = 60
-# Errors of pydantic whose own words are about Python.
+# What was expected, for types of pydantic errors whose own message speaks of Python types.
 _EXPECTED = {
     "dict_type": "a JSON object",
     "model_type": "a JSON object",
@@ -27,9 +27,12 @@ _EXPECTED = {
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file, or InputError, with the line where there is one.
+    """Read a JSON file.
 
-    NaN and infinity, which some programs write and JSON does not know, become None.
+    NaN and infinity, which are not JSON but which some programs write, become None.
+
+    Raises:
+        InputError: the file cannot be read or is not JSON; the error gives the line if it is known.
     """
     try:
         return json.loads(
@@ -39,20 +42,20 @@ def read_json(path: Path) -> Any:
         raise InputError(f"not JSON: {error.msg}", path, error.lineno) from None
     except RecursionError:
         raise InputError("not JSON that can be read: nested too deeply", path) from None
-    except ValueError as error:  # numbers that Python refuses
+    except ValueError as error:  # a number that Python refuses
         raise InputError(f"not JSON: {error}", path) from None
 
 
 def write_json(value: Any, path: Path) -> None:
-    """Write plain values.
+    """Write plain values as a JSON file.
 
-    Of paths that are no UTF-8, what is none becomes JSON's own escapes, by which they are read as they were.
+    Bytes of paths that are not UTF-8 become JSON escapes, so that reading gives the same path again.
     """
     write_text(json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n", path)
 
 
 def _integer(text: str) -> int:
-    _finite(text)  # whoever calculates with it takes a float
+    _finite(text)  # an integer must be finite as a float, because it is calculated with as a float
     return int(text)
 
 
@@ -64,7 +67,7 @@ def _finite(text: str) -> float:
 
 
 def _plain(value: Any) -> Any:
-    """What numpy holds as Python has it; None for numbers that are not finite, as JSON has no others."""
+    """Return a numpy value as a plain Python value, and None for a float that is not finite and so is not JSON."""
     value = value.tolist() if hasattr(value, "tolist") else value
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
@@ -80,38 +83,42 @@ def _whole(value: Any) -> Any:
     return None if isinstance(value, (list, tuple)) and None in map(_plain, value) else value
 
 
-Text = InstanceOf[str]  # not ``str``, which refuses paths that are no UTF-8
+Text = InstanceOf[str]  # pydantic's own ``str`` refuses paths that are not UTF-8
 Flag = Annotated[bool, Strict(), BeforeValidator(_plain)]
 Count = Annotated[int, Strict(), BeforeValidator(_plain)]
 Number = Annotated[float, Strict(), BeforeValidator(_plain)]
 NumberOrNull = Annotated[Annotated[float, Strict()] | None, BeforeValidator(_plain)]
-"""Null where the number is not known, or not finite."""
+"""Number that is null in JSON where it is not known or not finite."""
 Vector = Annotated[tuple[Number, Number, Number], BeforeValidator(_plain)]
 VectorOrNull = Annotated[tuple[Number, Number, Number] | None, BeforeValidator(_whole)]
 IntervalOrNull = Annotated[tuple[Number, Number] | None, BeforeValidator(_whole)]
 
 
 class Record(BaseModel):
-    """A JSON object, made from keywords or from any value with attributes of these names.
+    """A JSON object, made from keywords or from any object with attributes of these names.
 
-    Keys that it does not know, of a later version perhaps, are passed over in reading. A field with a default is left
-    out of the JSON where nothing was said of it.
+    Reading ignores unknown keys, which a later version may have written. A field with a default is left out of the JSON
+    if it was not set.
     """
 
     model_config = ConfigDict(frozen=True, from_attributes=True)
 
     def to_json(self) -> dict[str, Any]:
-        """What ``json.loads`` makes of the file, in the order of the fields."""
+        """Return the plain values that are written as JSON, in the order of the fields."""
         values: dict[str, Any] = _as_json(self.model_dump(by_alias=True, exclude_unset=True))
         return values
 
     def write(self, path: Path) -> None:
-        """Write the file, whole or not at all."""
+        """Write the file, complete or not at all."""
         write_json(self.to_json(), path)
 
     @classmethod
     def read(cls: type[_Kind], path: Path) -> _Kind:
-        """Read the file; InputError, with the key, if it is not what ``write`` leaves."""
+        """Read a file that ``write`` wrote.
+
+        Raises:
+            InputError: the file is not such a record; the message names the key.
+        """
         content = read_json(path)
         if not isinstance(content, dict):
             raise InputError("expected a JSON object", path, 1)

@@ -1,11 +1,11 @@
-"""Tables in text: the one place that reads CSV and its relatives, and writes it; and tables as commands print them.
+"""Tables in text: reading and writing of CSV and similar files, and the layout of tables that commands print.
 
-A file's table has a header row; ``#`` comments and blank lines may stand anywhere; a byte order mark, any line ending
-and quoted cells are understood. Whatever is wrong is an InputError with its line.
+A table in a file has a header row. ``#`` comments and blank lines may be anywhere. A byte order mark, any line ending
+and quoted cells are understood. Every error is an InputError with the line.
 
-What is written is read back as it was. A first cell that begins with ``#`` is quoted, or its row would be a comment.
-Text that a spreadsheet would take for a formula, and compute, is written with an apostrophe before it; the apostrophe
-is how spreadsheets themselves mark text, and reading takes it off.
+A written table is read back unchanged. A first cell that begins with ``#`` is quoted, because its row would otherwise
+be a comment. Text that a spreadsheet would compute as a formula gets an apostrophe in front. Spreadsheets mark text in
+the same way, and reading removes the apostrophe.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ from rangesfm.files.atomic import new_file
 _HEAD_BYTES = 1 << 16
 _GZIP_MARK = b"\x1f\x8b"
 _UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
-# What a formula begins with, also in the wide letters of East Asian keyboards; an apostrophe may mark it as text.
+# Beginning of a formula, also in the full-width characters of East Asian keyboards, after any apostrophes.
 _FORMULA = re.compile(r"'*\s*[=+\-@\uff1d\uff0b\uff0d\uff20]")
 _MAY_BEGIN_FORMULA = frozenset("'=+-@\uff1d\uff0b\uff0d\uff20 \u3000\xa0\t")
-_UNPACKED = (".gz", ".bz2", ".xz")  # by numpy, whatever such a file holds
+_UNPACKED = (".gz", ".bz2", ".xz")  # numpy unpacks files with these endings, even if they are not packed
 
 
 @dataclass(frozen=True)
 class Categories:
-    """n texts of which few differ.
+    """n texts with few different values.
 
     Attributes:
-        names: the different ones, in order of first appearance.
-        index: (n,) which of them each is.
+        names: the different texts, in order of first appearance.
+        index: (n,) index of each text in ``names``.
     """
 
     names: tuple[str, ...]
@@ -56,7 +56,7 @@ class Categories:
         return cls(tuple(index_of), np.fromiter(map(index_of.__getitem__, texts), np.int64, len(texts)))
 
     def subset(self, rows: npt.NDArray[np.bool_]) -> Categories:
-        """Some of the texts; names without any are forgotten."""
+        """Return the texts of the rows that are true in ``rows`` (n,), without the names that they do not use."""
         if rows.all():
             return self
         chosen = self.index[rows]
@@ -69,14 +69,14 @@ class Categories:
 
 @dataclass(frozen=True)
 class Table:
-    """The asked-for columns of a file, n rows.
+    """The requested columns of a file, n rows.
 
     Attributes:
         path: the file.
         columns: all names of the header row, in order.
         line: (n,) 1-based line of each row.
-        cells: of each asked-for column that the file has; a column that was read as numbers has these instead.
-        reread: gives this table with all cells as text; None where they are.
+        cells: for each requested column that the file has, its cells as text, or as numbers if it was read so.
+        reread: returns this table with all cells as text; None if they are.
     """
 
     path: Path
@@ -89,7 +89,7 @@ class Table:
         return len(self.line)
 
     def where(self, chosen: Sequence[bool]) -> Table:
-        """Some of the rows, of a table of texts."""
+        """Return the table with the rows that are true in ``chosen``; all cells must be text."""
         if all(chosen):
             return self
         cells = {name: [*compress(texts, chosen)] for name, texts in self.cells.items()}
@@ -99,7 +99,7 @@ class Table:
         return column in self.cells
 
     def text(self, column: str, *, empty: str | None = None) -> list[str]:
-        """The cells without surrounding blanks; ``empty`` stands for empty ones, which are refused if it is None."""
+        """Return the cells without surrounding blanks; ``empty`` replaces empty cells, and None refuses them."""
         texts = [_without_mark(cell.strip()) for cell in self._raw(column)]
         if "" in texts:
             if empty is None:
@@ -108,12 +108,12 @@ class Table:
         return texts
 
     def begins_with_number(self, column: str) -> bool:
-        """Whether the first cell is one, or there is none."""
+        """Whether the first cell of the column is a number, or there is no cell."""
         cells = self.cells[column]
         return not isinstance(cells, list) or not cells or _number(cells[0]) is not None
 
     def categories(self, column: str, *, empty: str | None = None) -> Categories:
-        """The cells as ``text`` has them, told apart: fast where they are few."""
+        """Return the cells like ``text``, but as categories, which is fast where few texts differ."""
         raw = Categories.of(self._raw(column))
         names = [_without_mark(name.strip()) for name in raw.names]
         if "" in names and empty is None:
@@ -131,13 +131,17 @@ class Table:
         least: float = -np.inf,
         above: float = -np.inf,
     ) -> npt.NDArray[np.float64]:
-        """The cells as finite numbers, (n,).
+        """Return the cells as finite numbers (n,).
 
         Args:
-            empty: stands for empty cells, which are refused if it is None, and for a column that is not there.
-            missing: what an empty cell may look like, in small letters.
-            expected: what the message calls a good cell.
-            least, above: numbers less than one, and those not above the other, are refused.
+            empty: value of empty cells and of a missing column; if it is None, empty cells are refused.
+            missing: texts of a cell that counts as empty, in small letters.
+            expected: description of a valid cell, for messages.
+            least: smaller numbers are refused.
+            above: numbers that are not greater than this are refused.
+
+        Raises:
+            InputError: a cell is not valid; the error gives the line.
         """
         if column not in self and empty is not None:
             return np.full(len(self), empty)
@@ -153,13 +157,13 @@ class Table:
         return values
 
     def error(self, row: int, column: str, expected: str) -> InputError:
-        """The error that says what stands in ``column`` of the 0-based ``row`` instead of ``expected``."""
+        """Return the error that says what is in ``column`` of the 0-based ``row``, and what was expected."""
         cell = self._raw(column)[row].strip()
         found = "empty" if not cell else cell if _number(cell) is not None else f"'{printable(cell)}'"
         return InputError(f"{column} is {found}, expected {expected}", self.path, int(self.line[row]))
 
     def refuse(self, wrong: npt.NDArray[np.bool_], column: str, expected: str) -> None:
-        """The error of the first row that is (n,) ``wrong``, if any is."""
+        """Raise the error of the first row that is true in ``wrong`` (n,), if there is one."""
         if wrong.any():
             raise self.error(int(np.argmax(wrong)), column, expected)
 
@@ -180,14 +184,15 @@ def read_table(
     aliases: Mapping[str, str] | None = None,
     separator: str | None = ",",
 ) -> Table:
-    """Read the named columns of a file; others are ignored.
+    """Read the named columns of a file; other columns are ignored.
 
     Args:
         required: columns that the file must have.
         optional: columns that it may have.
-        text: those of them that are not numbers. Any column can be had as either; this way it is fast.
-        aliases: other names by which a file may call them, ``{name in the file: name}``.
-        separator: one character; a blank means any run of blanks; None: told from the header row.
+        text: the columns that are not numbers. Any column can later be read as text or as numbers; this only makes
+            reading fast.
+        aliases: other names of columns in the file, ``{name in the file: name}``.
+        separator: one character; a blank means any run of blanks; None: found from the header row.
 
     Raises:
         InputError: the file is missing, empty or not text, lacks a column, or has a row with too
@@ -211,7 +216,7 @@ def read_table(
     reread = partial(_table_of_texts, path, names, wanted, header_line, body, separator)
     rows = None
     if body and not body.isspace() and separator != " " and not any(character in body for character in '"#'):
-        # Of the columns that nobody asked for only their number matters.
+        # Cells of columns that are not requested are read as one character, because only their number matters.
         types = ["U1" if name not in wanted else "O" if name in text else "f8" for name in names]
         rows = _plain_rows(path, header_line, types, separator)
     if rows is None or len(rows) != body.count("\n") + (not body.endswith("\n")):
@@ -221,20 +226,20 @@ def read_table(
 
 
 def _plain_rows(path: Path, num_skipped: int, types: list[str], separator: str) -> npt.NDArray[np.void] | None:
-    """All rows, fast: fields f0, f1 ... of the given types; None if any cell is of another, or too much or missing."""
+    """Read all rows fast, with fields f0, f1, ... of the given types; None if any row does not fit."""
     if path.suffix in _UNPACKED:
         return None
     try:
         fields = [(f"f{k}", type) for k, type in enumerate(types)]
         return np.loadtxt(path, fields, None, separator, skiprows=num_skipped, ndmin=1, encoding="utf-8-sig")
-    except ValueError:  # the reader of all tables knows what to say
+    except ValueError:  # the general reader then reads the file, and finds the right message
         return None
 
 
 def _table_of_texts(
     path: Path, names: list[str], wanted: Mapping[str, int], header_line: int, body: str, separator: str
 ) -> Table:
-    """Whatever the rows hold: quoted cells, comments, blank lines."""
+    """Read all rows as text, with quoted cells, comments and blank lines."""
     lines: list[int] = []
     cells: dict[str, list[str]] = {name: [] for name in wanted}
     for line, row in enumerate(body.split("\n"), header_line + 1):
@@ -251,7 +256,7 @@ def _table_of_texts(
 
 
 def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Write a CSV file, whole or not at all."""
+    """Write a CSV file, complete or not at all."""
     with new_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         plain = csv.writer(file, lineterminator="\n")
         quoted = csv.writer(file, lineterminator="\n", quoting=csv.QUOTE_ALL)
@@ -261,17 +266,21 @@ def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]
 
 
 def _marked(cell: str) -> str:
-    """A cell as it is written: with an apostrophe if it would be taken for a formula."""
+    """Return a cell as it is written: with an apostrophe in front if a spreadsheet would take it for a formula."""
     return f"'{cell}" if _FORMULA.match(cell) and _number(cell) is None else cell
 
 
 def _without_mark(cell: str) -> str:
-    """What a written cell holds."""
+    """Return the content of a written cell, without the apostrophe that marks it as text."""
     return cell[1:] if cell[:1] == "'" and _FORMULA.match(cell) else cell
 
 
 def write_user_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """As ``write_table``, to a path that the user gave: InputError if it cannot be written."""
+    """Write a CSV file to a path that the user gave.
+
+    Raises:
+        InputError: it cannot be written.
+    """
     try:
         write_table(path, header, rows)
     except OSError as error:
@@ -279,16 +288,16 @@ def write_user_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[
 
 
 def repeated(keys: Iterable[Hashable]) -> tuple[int, int] | None:
-    """Where the first key stands that has been there before, and where that was; None if all differ."""
+    """Return the index of the first key that repeats an earlier one, and that one's index; None if all differ."""
     first: dict[Hashable, int] = {}
     return next(((k, first[key]) for k, key in enumerate(keys) if first.setdefault(key, k) != k), None)
 
 
 def read_text(path: str | Path, *, errors: str = "strict") -> str:
-    """A whole UTF-8 file (or UTF-16 with its mark) with ``\\n`` line endings and without a byte order mark.
+    """Read a whole UTF-8 file (or UTF-16 with its byte order mark), with ``\\n`` line endings and without the mark.
 
     Args:
-        errors: "strict": bytes that are not text are an InputError; "replace": they are replaced.
+        errors: "strict": bytes that are not text raise an InputError; "replace": they are replaced.
     """
     data = _read_bytes(path)
     try:
@@ -300,13 +309,13 @@ def read_text(path: str | Path, *, errors: str = "strict") -> str:
 
 
 def read_head(path: str | Path) -> str:
-    """The first part of a file, as ``read_text`` would give it; bytes that are not text are replaced."""
+    """Read the first part of a file like ``read_text``; bytes that are not text are replaced."""
     data = _read_bytes(path, _HEAD_BYTES)
     return data.decode(_encoding(data), errors="replace").replace("\r\n", "\n").replace("\r", "\n")
 
 
 def header_names(text: str, separator: str | None = None) -> list[str]:
-    """The cells of the first line that is neither blank nor a comment, as far as it is a row of cells at all."""
+    """Return the cells of the first line that is neither blank nor a comment; empty if it is not a row of cells."""
     row = next(filter(_has_content, text.split("\n")), "")
     try:
         return [cell.strip() for cell in _split_row(row, separator or guess_separator(row))]
@@ -315,12 +324,12 @@ def header_names(text: str, separator: str | None = None) -> list[str]:
 
 
 def has_columns(text: str, required: Collection[str], aliases: Mapping[str, str] | None = None) -> bool:
-    """Whether the header row of a file that begins like this names some columns, as ``read_table`` understands it."""
+    """Whether the header row in the beginning of a file names the required columns, as ``read_table`` reads it."""
     return {*required} <= {(aliases or {}).get(name, name) for name in header_names(text)}
 
 
 def guess_separator(row: str) -> str:
-    """The most frequent of comma, semicolon and tab in a row; a blank if there is none of them."""
+    """Return the most frequent of comma, semicolon and tab in a row, or a blank if it has none of them."""
     separator = max(",;\t", key=row.count)
     return separator if separator in row else " "
 
@@ -328,9 +337,9 @@ def guess_separator(row: str) -> str:
 def _read_bytes(path: str | Path, num: int = -1) -> bytes:
     try:
         status = os.stat(path)
-        if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):  # may never end, or never begin
-            raise InputError("is no regular file", path)
-        if stat.S_ISREG(status.st_mode) and status.st_size == 0:  # as the kernel's own, of which some never end
+        if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):  # reading a device or pipe may never end
+            raise InputError("is not a regular file", path)
+        if stat.S_ISREG(status.st_mode) and status.st_size == 0:  # like the kernel's own files, some of which never end
             return b""
         with open(path, "rb") as file:
             packed = file.read(len(_GZIP_MARK)) == _GZIP_MARK
@@ -343,7 +352,7 @@ def _read_bytes(path: str | Path, num: int = -1) -> bytes:
         raise InputError("no such file", path) from None
     except IsADirectoryError:
         raise InputError("is a folder, expected a file", path) from None
-    except (OSError, ValueError, EOFError, zlib.error) as error:  # ValueError: a name that no file can have
+    except (OSError, ValueError, EOFError, zlib.error) as error:  # ValueError comes with a name that no file can have
         raise InputError(f"cannot be read ({getattr(error, 'strerror', None) or error})", path) from None
 
 
@@ -356,7 +365,7 @@ def _has_content(line: str) -> bool:
 
 
 def _split_header(text: str) -> tuple[str, int, str]:
-    """The first row with content (empty if there is none), its 1-based line, and all that comes after."""
+    """Return the first row with content (empty if there is none), its 1-based line, and all text after it."""
     start, line = 0, 1
     while start < len(text):
         end = text.find("\n", start)
@@ -384,7 +393,7 @@ def _check_names(names: list[str], required: Sequence[str], optional: Sequence[s
             raise InputError(f"no column {name}; found {found}; expected {expected}", path, line)
     for name in (*required, *optional):
         if names.count(name) > 1:
-            raise InputError(f"{names.count(name)} columns are {name}, expected one", path, line)
+            raise InputError(f"{names.count(name)} columns are named {name}, expected one", path, line)
 
 
 def _expected(required: Sequence[str], optional: Sequence[str]) -> str:
@@ -392,7 +401,7 @@ def _expected(required: Sequence[str], optional: Sequence[str]) -> str:
 
 
 def _number(cell: str) -> float | None:
-    """float(), without Python's own ``1_000``; None if it is no number."""
+    """Return a cell as a float, or None if it is not a number; Python's own notation ``1_000`` is not one."""
     try:
         return None if "_" in cell else float(cell)
     except ValueError:
@@ -404,11 +413,11 @@ def _listed(names: Iterable[str]) -> str:
 
 
 def align_rows(rows: Iterable[Sequence[str]], *, num_left: int = 1) -> str:
-    """One line a row; columns as wide as their longest cell on a terminal, whatever alphabet it is written in.
+    """Format rows as lines of text with aligned columns, by the width of characters on a terminal.
 
     Args:
-        rows: all of equal length; cells stand there as they are, whatever looks like markup.
-        num_left: so many columns begin at their left edge, the others end at their right.
+        rows: rows of equal length; text that looks like markup is shown as it is.
+        num_left: number of left-aligned columns; the others are right-aligned.
     """
     from rich.console import Console
     from rich.table import Table
@@ -420,5 +429,5 @@ def align_rows(rows: Iterable[Sequence[str]], *, num_left: int = 1) -> str:
             table.add_column(justify="left" if len(table.columns) < num_left else "right", no_wrap=True)
         table.add_row(*map(Text, row))
     lines = io.StringIO()
-    Console(file=lines, width=1 << 20).print(table)  # nothing is cut
+    Console(file=lines, width=1 << 20).print(table)  # wide enough that nothing is cut
     return "\n".join(line.rstrip() for line in lines.getvalue()[:-1].split("\n"))
