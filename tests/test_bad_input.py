@@ -154,7 +154,7 @@ def refusal(own_survey: WalkedSurvey, monkeypatch: pytest.MonkeyPatch, capfd: py
         ),
         (
             write("reference.csv", "timestamp_s,x_m,y_m,z_m\n1,1,2,3\n2,1,2,3\n"),
-            r"/reference.csv: none of the keyframes is at a known position: known are times from 1.000 to 2.000 s",
+            r"/reference.csv: none of the keyframes is at a known position: positions are known from 1.000 to 2.000 s",
         ),
         (add_tags, r"/uwb.csv: the log has several tags \(T0, T1\): give each its lever arm"),
         (change_model(lose_a_pose), r"/sparse/0: the pose of frame_00003.jpg is not finite"),

@@ -166,7 +166,10 @@ class TestRefusal:
         ("flags", "said"),
         [
             (("--positions", "none.csv"), "none.csv: no such file"),
-            (("--time_offset", "1000"), "uwb.csv: none of the ranges is at a known position: known are times from "),
+            (
+                ("--time_offset", "1000"),
+                "uwb.csv: none of the ranges is at a known position: positions are known from ",
+            ),
             (("--time_offset", "nan"), "'nan' is not a time in seconds, expected at most 1e+10 of them"),
             (("--max_interpolation_gap_s", "1e300"), "'1e300' is not a time in seconds"),
             (("--tag_in_cam", "0.1,0,0"), "a lever arm needs the rotations"),

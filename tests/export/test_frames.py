@@ -142,7 +142,7 @@ def test_anchors_in_a_national_grid_keep_their_millimetres_and_true_lengths() ->
 def test_an_unknown_system_and_swapped_coordinates_are_refused() -> None:
     with pytest.raises(InputError, match="unknown coordinate system 'EPSG:99999999'"):
         georeference_at(np.zeros((1, 3)), "EPSG:99999999")
-    with pytest.raises(InputError, match="lie outside of where EPSG:32632 holds"):
+    with pytest.raises(InputError, match="lie outside the area in which EPSG:32632 is valid"):
         georeference_at(np.array([[1e30, 5.2e6, 0.0]]), "EPSG:32632")
 
 

@@ -57,11 +57,11 @@ def test_is_found_by_name() -> None:
     [
         (log_of("p1"), Reference(PATH_M, timestamps_s=TIMES_S), "ranges are by name and the positions by time"),
         (log_at([0.0]), Reference(PATH_M[:1], image_names=("p1",)), "ranges are by time and the positions by name"),
-        (log_of("a"), Reference(PATH_M[:1], image_names=("b",)), "of photo 'b', the first of the ranges of 'a'"),
+        (log_of("a"), Reference(PATH_M[:1], image_names=("b",)), "of photo 'b', the first of the ranges of photo 'a'"),
         (
             log_at([7.0, 9.0]),
             Reference(PATH_M, timestamps_s=TIMES_S),
-            "known are times from 0.000 to 2.400 s, .* the ranges are from 7.000 to 9.000 s",
+            "positions are known from 0.000 to 2.400 s, .* the ranges are from 7.000 to 9.000 s",
         ),
     ],
     ids=["by name", "by time", "other names", "other times"],

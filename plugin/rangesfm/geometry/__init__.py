@@ -1,1 +1,1 @@
-"""Similarities, paths, which way is up, and where on the Earth."""
+"""Geometry: similarities, camera paths, gravity, and georeferences."""

@@ -1,8 +1,9 @@
-"""Georeference: a local frame of metres (x east, y north, z up) at a place on the Earth.
+"""Georeference: a local frame in metres (x east, y north, z up) at a place on the Earth.
 
-Everything inside works in the local frame, where numbers are small and a metre is a metre; projected coordinates, which
-stretch it, and large ones exist only in files. Transformations are PROJ's, through pyproj (the extra ``geo``), without
-network: a vertical datum that needs a grid is not known, and heights are taken as ellipsoidal ones of their system.
+All computations use the local frame, where coordinates are small and distances are true. Projected coordinates, which
+are large and distort distances, appear in files only. The transformations are PROJ's, through pyproj (the extra
+``geo``), without network access. Vertical datums that need a grid are therefore not available, and heights are taken
+as ellipsoidal heights of their system.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 GEOGRAPHIC = "EPSG:4979"
 """WGS 84: longitude and latitude in degrees, ellipsoidal height in metres; always in this order here."""
 
-# Around the area for which a coordinate system was made.
+# Points may lie this far outside the area for which a coordinate system was made.
 _MARGIN_DEG = 1.0
 
 _ENU = (
@@ -35,12 +36,12 @@ _ENU = (
 
 @dataclass(frozen=True)
 class Georeference:
-    """Where a metric map lies on the Earth.
+    """Place of a metric map on the Earth.
 
     Attributes:
-        lat_deg, lon_deg, height_m: WGS 84, the origin of the local frame.
-        crs: coordinate system in which files give coordinates, as "EPSG:2056".
-        enu_from_world: rigid, from the map's world to the local frame.
+        lat_deg, lon_deg, height_m: origin of the local frame, WGS 84.
+        crs: coordinate system of coordinates in files, such as "EPSG:2056".
+        enu_from_world: rigid transformation from the map's world to the local frame.
     """
 
     lat_deg: float
@@ -50,11 +51,11 @@ class Georeference:
     enu_from_world: Similarity = IDENTITY
 
     def geographic(self, points: Array) -> Array:
-        """(n, 3) longitude, latitude (degrees) and height of points in the map's world."""
+        """Return longitude, latitude (degrees) and height (metres) of points in the map's world, both (n, 3)."""
         return _apply(self._enu_from_geographic, self.enu_from_world.apply(points), inverse=True)
 
     def projected(self, points: Array) -> Array:
-        """(n, 3) coordinates in ``crs`` (east or longitude first) of points in the map's world."""
+        """Return the coordinates in ``crs`` (east or longitude first) of points in the map's world, both (n, 3)."""
         return _apply(_geographic_from(self.crs), self.geographic(points), inverse=True)
 
     @cached_property
@@ -65,14 +66,17 @@ class Georeference:
 
 
 def georeference_at(coordinates: Array, crs: str) -> tuple[Georeference, Array]:
-    """The local frame around the middle of points (n, 3) in ``crs``, and the points in it, in metres.
+    """Return a local frame at the mean of some points, and the points (n, 3) in that frame, in metres.
 
-    They are east or longitude first, then height; NaN rows stay NaN. InputError if the system is not known, or does not
-    hold where they are.
+    Args:
+        coordinates: (n, 3) points in ``crs``: east or longitude, north or latitude, height. NaN rows stay NaN.
+
+    Raises:
+        InputError: the coordinate system is unknown, or is not valid at these points.
     """
     geographic = _apply(_geographic_from(crs), coordinates)
     if not _holds_at(crs, geographic[np.isfinite(coordinates).all(axis=1)]):
-        raise InputError(f"coordinates lie outside of where {crs} holds: are they east, north, height?")
+        raise InputError(f"coordinates lie outside the area in which {crs} is valid: are they east, north, height?")
     lon_deg, lat_deg, height_m = np.nanmean(geographic, axis=0).tolist()
     georeference = Georeference(lat_deg, lon_deg, height_m, crs)
     return georeference, _apply(georeference._enu_from_geographic, geographic)
@@ -87,13 +91,18 @@ def georeference_of_anchor(
     heading_deg: float,
     crs: str = GEOGRAPHIC,
 ) -> Georeference:
-    """The local frame of a map of which one anchor's place on the Earth and one direction's heading are known.
+    """Return the georeference of a map from the place of one anchor on the Earth and the heading of one direction.
 
     Args:
-        place: latitude and longitude in degrees, ellipsoidal height in metres (WGS 84), the frame's origin.
-        up_in_world: (3,) against gravity.
-        forward_in_world: (3,) a direction; InputError if it is vertical.
-        heading_deg: its azimuth, from north through east.
+        anchor_in_world_m: (3,) position of the anchor in the map's world, metres.
+        place: its latitude and longitude in degrees, and ellipsoidal height in metres (WGS 84); origin of the frame.
+        up_in_world: (3,) direction opposite to gravity.
+        forward_in_world: (3,) direction whose heading is known.
+        heading_deg: azimuth of that direction, from north through east.
+        crs: coordinate system of coordinates in files.
+
+    Raises:
+        InputError: the direction is vertical.
     """
     up = up_in_world / np.linalg.norm(up_in_world)
     level = forward_in_world - (forward_in_world @ up) * up
@@ -112,17 +121,21 @@ def georeference_of_anchor(
 
 
 def check_crs(crs: str) -> None:
-    """Raise InputError unless PROJ knows this coordinate system."""
+    """Check that PROJ knows this coordinate system, and raise InputError if not."""
     _geographic_from(crs)
 
 
 def is_geographic(crs: str) -> bool:
-    """Whether the system counts in degrees."""
+    """Whether the coordinates of this system are longitude and latitude in degrees."""
     return bool(_pyproj().CRS.from_user_input(crs).is_geographic)
 
 
 def _holds_at(crs: str, geographic: Array) -> bool:
-    """Whether (n, 3) places lie where the system is meant to be used; formulas give some place for any nonsense."""
+    """Whether points (n, 3) lie in the system's area of use; the formulas give some result for wrong input, too.
+
+    Args:
+        geographic: longitude and latitude in degrees, and height.
+    """
     if not np.isfinite(geographic).all():
         return False
     area = _pyproj().CRS.from_user_input(crs).area_of_use
@@ -130,7 +143,7 @@ def _holds_at(crs: str, geographic: Array) -> bool:
         return True
     lon, lat = geographic[:, 0], geographic[:, 1]
     west, east = lon >= area.west - _MARGIN_DEG, lon <= area.east + _MARGIN_DEG
-    within_lon = west | east if area.west > area.east else west & east  # across the date line
+    within_lon = west | east if area.west > area.east else west & east  # an area may cross the date line
     return bool(np.all(within_lon & (lat >= area.south - _MARGIN_DEG) & (lat <= area.north + _MARGIN_DEG)))
 
 
@@ -139,7 +152,9 @@ def _geographic_from(crs: str) -> Transformer:
     try:
         system = pyproj.CRS.from_user_input(crs)
     except pyproj.exceptions.CRSError:
-        raise InputError(f"unknown coordinate system {crs!r}, expected one of PROJ's, as EPSG:2056") from None
+        raise InputError(
+            f"unknown coordinate system {crs!r}, expected one that PROJ knows, such as EPSG:2056"
+        ) from None
     if len(system.axis_info) < 3 and not system.is_compound:
         system = system.to_3d()
     transformer: Transformer = pyproj.Transformer.from_crs(system, GEOGRAPHIC, always_xy=True)
@@ -148,7 +163,7 @@ def _geographic_from(crs: str) -> Transformer:
 
 def _apply(transformer: Any, points: Array, *, inverse: bool = False) -> Array:
     direction = "INVERSE" if inverse else "FORWARD"
-    # As lists: an array of one number some versions of pyproj take for the number, which numpy warns of.
+    # Lists are passed, because some versions of pyproj take an array of one number for a number, and numpy warns.
     columns = np.asarray(points, dtype=np.float64).T.tolist()
     return np.column_stack(transformer.transform(*columns, direction=direction))
 

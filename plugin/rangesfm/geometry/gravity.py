@@ -1,4 +1,4 @@
-"""Which way is up: a user's word on the first camera, as a prior on how the map stands in the site frame."""
+"""Gravity: the up direction in the first camera, given by the user, as a prior on the map's tilt in the site frame."""
 
 from __future__ import annotations
 
@@ -11,41 +11,41 @@ from rangesfm.arrays import Array
 from rangesfm.geometry.rotations import cross_matrices
 
 UP_IN_SITE = np.array([0.0, 0.0, 1.0])
-# A camera that somebody held level, or a phone's accelerometer.
+# Standard deviation of the given direction: that of a camera held level by hand, or of a phone's accelerometer.
 _STDDEV_DEG = 3.0
 
 
 @dataclass(frozen=True)
 class Gravity:
-    """The upward direction, which is +z in the site frame.
+    """Prior on the up direction, which is +z in the site frame.
 
     Attributes:
         up_in_first_camera: (3,) unit vector.
-        stddev_rad: of its direction.
+        stddev_rad: standard deviation of its direction, radians.
     """
 
     up_in_first_camera: Array
     stddev_rad: float
 
     def residuals(self, rotation: Array) -> Array:
-        """(3,) in stddevs, for the rotation of site_from_first_camera (3, 3)."""
+        """Return the residuals (3,) in standard deviations, given the rotation (3, 3) of site_from_first_camera."""
         off: Array = (rotation @ self.up_in_first_camera - UP_IN_SITE) / self.stddev_rad
         return off
 
     def jacobian(self, rotation: Array, left: Array) -> Array:
-        """(3, 3) of the residuals by a rotation vector; ``left`` is its left Jacobian."""
+        """Return the derivatives (3, 3) of the residuals by a rotation vector whose left Jacobian is ``left``."""
         slope: Array = -cross_matrices(rotation @ self.up_in_first_camera) @ left / self.stddev_rad
         return slope
 
     def level_rotations(self, num: int) -> Rotation:
-        """All headings, evenly, of a map that stands upright."""
+        """Return ``num`` rotations of an upright map, with evenly spaced headings."""
         upright, _ = Rotation.align_vectors(UP_IN_SITE[None], self.up_in_first_camera[None])
         headings = Rotation.from_euler("z", np.linspace(0.0, 2 * np.pi, num, endpoint=False)[:, None])
         return headings * upright
 
 
 def gravity_of(up_in_first_camera: tuple[float, float, float] | None) -> Gravity | None:
-    """The prior of what a user says; None if nothing."""
+    """Return the prior for a direction that the user gave, or None without one."""
     if up_in_first_camera is None:
         return None
     up = np.array(up_in_first_camera, dtype=np.float64)

@@ -1,14 +1,14 @@
-"""Motion between keyframes by a Gaussian process: white noise on acceleration, its power learnt from the keyframes.
+"""Motion between keyframes as a Gaussian process with white noise on acceleration, learnt from the keyframes.
 
 Source: Anderson and Barfoot, "Full STEAM ahead: exactly sparse Gaussian process regression for batch continuous-time
-trajectory estimation on SE(3)" (IROS 2015), with the prior "white noise on acceleration". Of scalar coordinates its
+trajectory estimation on SE(3)" (IROS 2015), with the prior "white noise on acceleration". For scalar coordinates its
 posterior mean is the cubic smoothing spline (Wahba, 1978), in the banded form of Reinsch (1967).
 
-The second divided differences z of the keyframes have the covariance ``power * R + noise**2 * Q'Q``: R from the white
-acceleration, Q'Q from errors of the keyframes that are independent of each other. Both are learnt by the likelihood of
-z, which no straight and even motion changes. Errors of the keyframes are only told from motion where keyframes are
-close in time; elsewhere the keyframes count as exact. A keyframe far out of place says no more of the power than
-one that is just in place: all others are as certain as before.
+The changes of velocity z at the keyframes have the covariance ``power * R + noise**2 * Q'Q``. R comes from the white
+acceleration, and Q'Q from independent errors of the keyframes' positions. Both factors are learnt by maximum likelihood
+of z, which is unchanged by adding a motion at constant velocity. Errors of keyframes can be told from motion only where
+keyframes are close in time. Elsewhere the keyframes count as exact. The influence of a keyframe far out of place on the
+power is bounded, so that it does not make all other keyframes' motion uncertain.
 """
 
 from __future__ import annotations
@@ -20,28 +20,30 @@ from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded, solve_b
 
 from rangesfm.arrays import Array, Indices, Mask
 
-# Within so many seconds a camera hardly accelerates: two keyframes closer than this bound the keyframes' own errors.
+# Within this time, in seconds, a camera hardly accelerates. Two keyframes that are closer in time give an upper bound
+# on the keyframes' own errors.
 _CLOSE_S = 0.25
-# Ratios noise**2 / power that are tried, in cubes of the median gap between keyframes, beside 0. At the smallest the
-# keyframes count as exact, at the largest the whole path is one straight and even motion.
+# Ratios noise**2 / power that are tried besides 0, in units of the cubed median gap between keyframes. At the smallest
+# the keyframes count as exact, at the largest the whole path is one motion at constant velocity.
 _RATIOS = np.geomspace(1e-6, 1e9, 61)
-# In stddevs: a change of velocity counts as no larger than this (Huber's proposal 2, for scale).
+# Changes of velocity are limited to this many standard deviations in the estimate of the power (Huber's proposal 2).
 _MOST_STDDEVS = 3.0
 _NUM_SCALE_ROUNDS = 60
 
 
 @dataclass(frozen=True)
 class MotionPrior:
-    """What d coordinates of n keyframes say of the motion between them.
+    """Motion between n keyframes, as learnt from d coordinates of them.
 
     Attributes:
-        times_s: (n,) strictly increasing.
-        is_bridged: (n - 1,) gaps across which the motion goes on; the others part the path.
-        power: of the white acceleration in each coordinate, unit^2 / s^3.
-        noise_stddev: of each coordinate of a keyframe, beside the motion.
-        bends: (n, d) posterior mean of the acceleration at the keyframes; at the ends of each part as it goes on there.
-        bend_covariance: (3, n) diagonal and the next two of the covariance of (n,) bends, over ``power``, as if the
-            acceleration was piecewise linear; 0 at the ends of each part.
+        times_s: (n,) times of the keyframes, strictly increasing.
+        is_bridged: (n - 1,) gaps across which the motion is continuous; the other gaps split the path into parts.
+        power: power of the white acceleration in each coordinate, unit^2 / s^3.
+        noise_stddev: standard deviation of the error of a keyframe in each coordinate, in the coordinates' unit.
+        bends: (n, d) posterior mean of the acceleration at the keyframes, unit / s^2; at the ends of each part 0, or
+            continued from the next keyframe where the keyframes count as exact.
+        bend_covariance: (3, n) main diagonal and next two diagonals of the covariance of the bends of one coordinate,
+            divided by ``power``, for piecewise linear acceleration; 0 at the ends of each part.
     """
 
     times_s: Array
@@ -52,14 +54,15 @@ class MotionPrior:
     bend_covariance: Array
 
     def beyond_chord(self, before: Indices, weight: Array) -> tuple[Array, Array]:
-        """What the motion has beyond the straight line between two keyframes, and how far that can be trusted.
+        """Return the offset of the motion from the straight line between two keyframes, with its uncertainty.
 
         Args:
-            before: (m,) the keyframe before; its gap is bridged. weight: (m,) share of the gap that has passed.
+            before: (m,) index of the keyframe before each time; the gap after it must be bridged.
+            weight: (m,) fraction of the gap that has passed.
 
         Returns:
-            (m, d) what is to be added to the straight line between the keyframes as they are, and (m,) the stddev of
-            each coordinate of the sum, with the errors of the keyframes.
+            (m, d) offset to add to the straight line between the keyframes, and (m,) standard deviation of each
+            coordinate of the sum, including the errors of the keyframes.
         """
         gap_s = self.times_s[before + 1] - self.times_s[before]
         early = gap_s**2 / 6 * ((1 - weight) ** 3 - (1 - weight))
@@ -73,9 +76,12 @@ class MotionPrior:
         return offsets, np.sqrt(np.maximum(variance, 0.0))
 
     def _bent_by_ends(self, before: Indices, weight: Array, early: Array, late: Array) -> Array:
-        """(m,) covariance of the offset and of the line's own error, both by errors of the two keyframes around."""
+        """Return the covariance (m,) of the offset and the straight line's error, over ``noise_stddev**2``.
+
+        Both depend on the errors of the two keyframes around each time.
+        """
         second = _second_differences(self.times_s, self.is_bridged)
-        # Of the second differences at the keyframes from the one before to the next but one.
+        # Covariances of the line's error with the second differences at the four keyframes from ``before - 1`` on.
         by_line = np.zeros((4, len(before)))
         for row, k in enumerate(range(-1, 3)):
             at = np.clip(before + k, 0, len(self.times_s) - 1)
@@ -94,11 +100,12 @@ class MotionPrior:
 
 
 def learn_motion(times_s: Array, values: Array, is_bridged: Mask) -> MotionPrior:
-    """Learn the power of the acceleration and the noise of the keyframes, and what they say of the motion.
+    """Learn the power of the acceleration and the noise of the keyframes, and with them the motion.
 
     Args:
-        times_s: (n,) strictly increasing. values: (n, d) coordinates of the keyframes.
-        is_bridged: (n - 1,) gaps across which the motion goes on.
+        times_s: (n,) times of the keyframes, strictly increasing.
+        values: (n, d) coordinates of the keyframes.
+        is_bridged: (n - 1,) gaps across which the motion is continuous.
     """
     second = _second_differences(times_s, is_bridged)
     is_inner = second[1] != 0
@@ -126,9 +133,9 @@ def learn_motion(times_s: Array, values: Array, is_bridged: Mask) -> MotionPrior
 
 
 def _second_differences(times_s: Array, is_bridged: Mask) -> Array:
-    """(3, n) factors of the keyframe before, of a keyframe and of the next one in the change of velocity at it.
+    """Return the coefficients (3, n) of the previous, this and the next keyframe in each change of velocity.
 
-    0 at the ends of each part of the path.
+    They are 0 at the ends of each part of the path.
     """
     rates = 1 / np.diff(times_s)
     to_last, to_next = np.append(0.0, rates), np.append(rates, 0.0)
@@ -137,7 +144,7 @@ def _second_differences(times_s: Array, is_bridged: Mask) -> Array:
 
 
 def _of_motion(times_s: Array, is_inner: Mask) -> Array:
-    """(3, n) diagonal and the next two of R; 1 on the diagonal at the ends of each part."""
+    """Return the main diagonal and the next two diagonals (3, n) of R; at the ends of each part the diagonal is 1."""
     gaps_s = np.diff(times_s)
     banded = np.zeros((3, len(times_s)))
     banded[0] = np.where(is_inner, (np.append(0.0, gaps_s) + np.append(gaps_s, 0.0)) / 3, 1.0)
@@ -146,7 +153,7 @@ def _of_motion(times_s: Array, is_inner: Mask) -> Array:
 
 
 def _of_noise(second: Array) -> Array:
-    """(3, n) diagonal and the next two of Q'Q."""
+    """Return the main diagonal and the next two diagonals (3, n) of Q'Q."""
     before, at, after = second
     banded = np.zeros_like(second)
     banded[0] = np.sum(second**2, axis=0)
@@ -156,20 +163,26 @@ def _of_noise(second: Array) -> Array:
 
 
 def _most_noise(times_s: Array, values: Array, is_bridged: Mask) -> float:
-    """The largest variance of a keyframe's coordinate that keyframes close in time allow; 0 where there are none."""
+    """Return the largest error variance of a keyframe's coordinate that keyframes close in time allow, else 0.
+
+    If all of the difference between two such keyframes is noise, its mean square is twice the variance. The result is
+    the median of the squares, which is 0.45 to 1 times their mean.
+    """
     is_close = is_bridged & (np.diff(times_s) <= _CLOSE_S)
     squares = np.mean(np.diff(values, axis=0)[is_close] ** 2, axis=1)
-    # Half of the mean, if all of it was noise; the median of squares is 0.45 to 1 of the mean.
     return float(np.median(squares)) if is_close.any() else 0.0
 
 
 def _fit(covariance: Array, differences: Array, is_inner: Mask) -> tuple[float, float, Array, Array] | None:
-    """Return how unlikely the second differences are, the likeliest power, bends and the banded Cholesky factor.
-
-    The first is -2 times the logarithm of the likelihood for each coordinate, up to a constant.
+    """Fit the power by maximum likelihood, given the covariance of the second differences up to the power.
 
     Args:
-        covariance: (3, n) of the second differences, over the power. None where rounding leaves it indefinite.
+        covariance: (3, n) main diagonal and next two diagonals of that covariance.
+        differences: (n, d) second differences.
+
+    Returns:
+        -2 times the log-likelihood of each coordinate up to a constant, the power, the bends (n, d), and the banded
+        Cholesky factor; None if rounding makes the covariance indefinite, or the power is 0.
     """
     try:
         factor = np.asarray(cholesky_banded(covariance, lower=True, check_finite=False), dtype=np.float64)
@@ -185,11 +198,11 @@ def _fit(covariance: Array, differences: Array, is_inner: Mask) -> tuple[float, 
 
 
 def _going_on(by_motion: Array, gaps_s: Array, is_bridged: Mask, differences: Array, bends: Array) -> Array:
-    """Return bends (n, d) that do not end before the path does.
+    """Return bends (n, d) that continue to the ends of each part of the path.
 
-    White noise knows no acceleration at an end, where the camera may well be turning as evenly as before. It is taken
-    to go on there as far as it does from one keyframe to the next elsewhere in the same part: the regression of each
-    on its neighbour, which is 0 or less if the acceleration is white.
+    With white noise the expected acceleration at an end is 0, although the camera may turn there as steadily as before.
+    Here the acceleration at an end is a fraction of that at the neighbouring keyframe. The fraction is the regression
+    coefficient of each bend on its neighbour in the same part, which is 0 or less if the acceleration is white.
     """
     is_inner = np.append(False, is_bridged) & np.append(is_bridged, False)
     both = is_inner[:-1] & is_inner[1:]
@@ -210,7 +223,7 @@ def _going_on(by_motion: Array, gaps_s: Array, is_bridged: Mask, differences: Ar
 
 
 def _mean_square(squares: Array) -> float:
-    """Return the mean of squares (m,), each counting as no larger than a multiple of it."""
+    """Return the mean of squares (m,), each limited to ``_MOST_STDDEVS**2`` times that mean."""
     mean = float(np.mean(squares))
     for _ in range(_NUM_SCALE_ROUNDS):
         before, mean = mean, float(np.mean(np.minimum(squares, _MOST_STDDEVS**2 * mean)))
@@ -220,7 +233,10 @@ def _mean_square(squares: Array) -> float:
 
 
 def _inverse_near_diagonal(factor: Array) -> Array:
-    """(3, n) diagonal and the next two of the inverse, from a banded Cholesky factor (Takahashi et al., 1973)."""
+    """Return the main diagonal and the next two diagonals (3, n) of an inverse, from the banded Cholesky factor.
+
+    Source: Takahashi et al. (1973).
+    """
     diagonal = factor[0]
     one, two = (factor[1] / diagonal).tolist(), (factor[2] / diagonal).tolist()
     own = (1 / diagonal**2).tolist()
@@ -228,7 +244,7 @@ def _inverse_near_diagonal(factor: Array) -> Array:
     inverse = [[0.0] * (num + 2) for _ in range(3)]
     on, next_to, beyond = inverse
     for j in range(num - 1, -1, -1):
-        # Rows below the matrix have a factor of 0.
+        # The coefficients for rows below the matrix are 0.
         next_to[j] = -one[j] * on[j + 1] - two[j] * next_to[j + 1]
         beyond[j] = -one[j] * next_to[j + 1] - two[j] * on[j + 2]
         on[j] = own[j] - one[j] * next_to[j] - two[j] * beyond[j]

@@ -1,4 +1,4 @@
-"""Reference: where the camera really was, for comparison."""
+"""Reference: known camera poses for comparison."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
 QUATERNION_TOLERANCE = 1e-2
 MAX_TIME_DIFFERENCE_S = 0.01
-"""A sample this close in time is taken as it is: half a centimetre at walking pace."""
+"""A sample this close in time is used without interpolation; at 1 m/s it is off by a centimetre at most."""
 
 
 @dataclass(frozen=True)
 class Reference:
-    """n known camera poses, by photo or by time.
+    """n known camera poses, by photo or by time; exactly one of names and times is given.
 
     Attributes:
         positions_m: (n, 3) projection centres in the reference's frame, metres.
-        image_names: n photos; or None.
-        timestamps_s: (n,) on the camera's clock, strictly increasing; or None. Exactly one of the two is given.
-        world_from_cam: (n, 3, 3) rotations of the camera frame as COLMAP has it (x right, y down, z forward); or None.
+        image_names: names of the n photos, or None.
+        timestamps_s: (n,) times on the camera's clock, strictly increasing, or None.
+        world_from_cam: (n, 3, 3) rotations of COLMAP's camera frame (x right, y down, z forward), or None.
     """
 
     positions_m: Array
@@ -57,7 +57,11 @@ class Reference:
         return len(self.positions_m)
 
     def positions_at(self, trajectory: Trajectory, max_gap_s: float = 0.05) -> tuple[Array, Array | None]:
-        """``poses`` of the keyframes; InputError if the reference is by time and the trajectory has no times."""
+        """Return the reference poses of a trajectory's keyframes; see ``poses``.
+
+        Raises:
+            InputError: the reference is by time and the trajectory has no times.
+        """
         if self.image_names is None and trajectory.timestamps_s is None:
             raise InputError("the reference is by time, but the photos have no times (images.csv)")
         return self.poses(trajectory.image_names, trajectory.timestamps_s, max_gap_s)
@@ -65,14 +69,19 @@ class Reference:
     def poses(
         self, image_names: Sequence[str] | None, times_s: Array | None, max_gap_s: float
     ) -> tuple[Array, Array | None]:
-        """Reference poses of n photos, or at (n,) times: whichever the reference has.
+        """Return the reference poses of n photos, or at n times if the reference is by time.
 
-        By photo: those of the same name. By time: interpolated linearly (rotations on the
-        shortest arc) between two samples at most ``max_gap_s`` apart; in longer gaps and at
-        the ends, the nearest sample if it is within MAX_TIME_DIFFERENCE_S.
+        Poses by photo are found by name. Poses by time are interpolated linearly (rotations on the shortest arc)
+        between two samples at most ``max_gap_s`` apart. In longer gaps and at the ends, the nearest sample is taken if
+        it is within MAX_TIME_DIFFERENCE_S.
+
+        Args:
+            image_names: n photos; needed if the reference is by photo.
+            times_s: (n,) times on the camera's clock; needed if the reference is by time.
 
         Returns:
-            (n, 3) positions, NaN where unknown, and (n, 3, 3) rotations likewise; None if the reference has none.
+            (n, 3) positions in metres and (n, 3, 3) rotations, NaN where unknown; rotations are None if the reference
+            has none.
         """
         if self.image_names is not None:
             assert image_names is not None
@@ -103,23 +112,26 @@ class Reference:
     def why_nothing_is_known(
         self, of: str, image_names: Sequence[str] | None, times_s: Array | None, max_gap_s: float = 0.05
     ) -> str:
-        """One line for the user of whose keyframes or ranges (``of``, with their photos and times) none is at a known
-        position."""
+        """Return a one-line message that explains why no keyframe or range is at a known position.
+
+        Args:
+            of: "keyframes" or "ranges", with their ``image_names`` and ``times_s``.
+        """
         why = f"none of the {of} is at a known position: "
         if len(self) == 0 or not len(image_names or ()) + len([] if times_s is None else times_s):
-            return f"{why}there are {len(self)} of these, or no {of}"
+            return f"{why}there are {len(self)} known positions, or no {of}"
         if self.image_names is not None:
             assert image_names is not None
             known, first = printable(self.image_names[0]), printable(image_names[0])
-            return f"{why}the first that is known is of photo '{known}', the first of the {of} of '{first}'"
+            return f"{why}the first known position is of photo '{known}', the first of the {of} of photo '{first}'"
         assert self.timestamps_s is not None
         assert times_s is not None
         spacing = np.diff(self.timestamps_s)
         return (
-            f"{why}known are times from {self.timestamps_s[0]:.3f} to {self.timestamps_s[-1]:.3f} s"
+            f"{why}positions are known from {self.timestamps_s[0]:.3f} to {self.timestamps_s[-1]:.3f} s"
             + (f", {np.median(spacing):.3f} s apart" if len(spacing) else "")
-            + f", the {of} are from {times_s.min():.3f} to {times_s.max():.3f} s; between known times at most "
-            f"{max_gap_s:g} s apart they are interpolated"
+            + f", the {of} are from {times_s.min():.3f} to {times_s.max():.3f} s; positions are interpolated between "
+            f"known times at most {max_gap_s:g} s apart"
         )
 
     def _at_index(self, index: npt.NDArray[np.int64]) -> tuple[Array, Array | None]:
@@ -128,7 +140,7 @@ class Reference:
 
 
 def is_reference_file(head: str) -> bool:
-    """Whether a file that begins like this is a reference: positions by photo or time, or a TUM trajectory."""
+    """Whether a file with this beginning is a reference: positions by photo or time, or a TUM trajectory."""
     names = header_names(head)
     if _are_numbers(names):
         return abs(float(np.linalg.norm([float(name) for name in names[-4:]])) - 1.0) <= QUATERNION_TOLERANCE
@@ -138,12 +150,12 @@ def is_reference_file(head: str) -> bool:
 def read_reference(path: str | Path) -> Reference:
     """Read ``reference.csv`` or a TUM trajectory.
 
-    The CSV has a header row: ``image_name`` or ``timestamp_s``, then ``x_m,y_m,z_m`` and
-    perhaps ``qx,qy,qz,qw`` (world from camera). A TUM file has no header row:
-    ``timestamp tx ty tz qx qy qz qw``, separated by blanks.
+    The CSV file has a header row: ``image_name`` or ``timestamp_s``, then ``x_m,y_m,z_m`` and optionally
+    ``qx,qy,qz,qw`` (world from camera). A TUM file has no header row, and lines of ``timestamp tx ty tz qx qy qz qw``,
+    separated by blanks.
 
     Raises:
-        InputError: with the line, for whatever is wrong.
+        InputError: the file is not valid; the error gives the line if it is known.
     """
     path = Path(path)
     names = header_names(read_head(path))
@@ -157,7 +169,7 @@ def read_reference(path: str | Path) -> Reference:
 
 
 def write_reference(reference: Reference, path: Path) -> Path:
-    """Write a ``reference.csv`` that ``read_reference`` reads."""
+    """Write a ``reference.csv`` that ``read_reference`` reads, and return its path."""
     columns = [np.asarray(reference.positions_m)]
     names: tuple[str, ...] = POSITION_COLUMNS
     if reference.world_from_cam is not None:
@@ -198,7 +210,7 @@ def _from_table(table: Table, key: str) -> Reference:
     positions = np.column_stack([table.numbers(column) for column in POSITION_COLUMNS])
     rotations = _rotations(table)
     if again := repeated(table.text(key) if key == "image_name" else table.numbers(key).tolist()):
-        raise table.error(again[0], key, "one not said before")
+        raise table.error(again[0], key, "each one once")
     if key == "image_name":
         return Reference(positions, image_names=tuple(table.text(key)), world_from_cam=rotations)
     times = table.numbers(key)
@@ -227,7 +239,7 @@ def _rotations(table: Table) -> Array | None:
 
 
 def _rows(values: Array, index: npt.NDArray[np.int64]) -> Array:
-    """Rows of ``values``; NaN where the index is -1."""
+    """Return rows of ``values`` by index, and NaN for an index of -1."""
     rows = np.full((len(index), *values.shape[1:]), np.nan)
     rows[index >= 0] = values[index[index >= 0]]
     return rows

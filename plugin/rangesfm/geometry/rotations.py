@@ -1,4 +1,4 @@
-"""Small turns, as rotation vectors."""
+"""Derivatives of rotations by rotation vectors."""
 
 from __future__ import annotations
 
@@ -9,14 +9,17 @@ from rangesfm.arrays import Array
 
 
 def cross_matrices(vectors: Array) -> Array:
-    """(..., 3, 3): v x, as matrices."""
+    """Return the matrices (..., 3, 3) of the cross product with vectors v (..., 3), so that matrix @ a = v x a."""
     x, y, z = np.moveaxis(vectors, -1, 0)
     zero = np.zeros_like(x)
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*vectors.shape, 3)
 
 
 def left_jacobian(rotation: Rotation) -> Array:
-    """d Exp(w) = [J dw]x Exp(w). Solà et al., "A micro Lie theory for state estimation in robotics", eq. 145."""
+    """Return the left Jacobian J (3, 3) of a rotation Exp(w): d Exp(w) = [J dw]x Exp(w).
+
+    Source: Solà et al., "A micro Lie theory for state estimation in robotics", eq. 145.
+    """
     vector = rotation.as_rotvec()
     angle, cross = float(np.linalg.norm(vector)), cross_matrices(vector)
     if angle < 1e-4:

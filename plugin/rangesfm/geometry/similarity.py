@@ -1,4 +1,4 @@
-"""Similarities between point sets, and the shape of a path."""
+"""Similarity transformations between point sets, and the shape of a path."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from rangesfm.geometry.rotations import cross_matrices
 
 @dataclass(frozen=True)
 class Similarity:
-    """``x_new = scale * rotation @ x_old + translation``; named new_from_old where it is used."""
+    """Similarity ``x_new = scale * rotation @ x_old + translation``; variables of this type are named new_from_old."""
 
     scale: float
     rotation: Array
     translation: Array
 
     def __matmul__(self, inner: Similarity) -> Similarity:
-        """``(a_from_b @ b_from_c)`` is ``a_from_c``."""
+        """Compose two transformations: ``a_from_b @ b_from_c`` is ``a_from_c``."""
         return Similarity(self.scale * inner.scale, self.rotation @ inner.rotation, self.apply(inner.translation))
 
     def apply(self, points: Array) -> Array:
@@ -33,50 +33,51 @@ class Similarity:
 
 
 def overflow_raised() -> np.errstate:
-    """Within it, numbers that run over, and infinite ones that cancel, raise FloatingPointError."""
+    """Return a context in which overflow, division by zero and invalid operations raise FloatingPointError."""
     return np.errstate(over="raise", invalid="raise", divide="raise")
 
 
 IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 
-# Of coordinates, or of their unit where they are smaller: what some operations on numbers of sixteen digits may leave.
+# Rounding error that some operations in double precision may leave, as a fraction of the coordinates or, where they are
+# smaller, of their unit.
 _ROUNDING = 1e-12
-# Of the extent of a path: nearer to the origin is only a camera that stands there, however far from its own origin the
-# world was in which the path was computed.
+# A camera counts as being at the origin up to this fraction of the path's extent. Rounding stays below it even if the
+# world in which the path was computed was far from its own origin.
 _AT_ORIGIN = 1e-6
-# In medians of what all points are off, and how often they are looked at anew.
+# Points farther off than this multiple of the median distance are left out of an alignment, in this many rounds.
 _FAR_OFF = 5.0
 _NUM_TRIMMINGS = 5
-# Of a unit vector, which has one coordinate that is larger: far enough from 0 for its sign to be no accident.
+# Every unit vector has a coordinate above this size, which is far enough from 0 for its sign to be stable.
 _OF_SOME_SIZE = 0.3
 
 
 def rounding_of(coordinates: Array) -> float:
-    """A length that may be nothing but the rounding of (n, 3) coordinates: what is decided by a length needs more."""
+    """Return the largest length that may be mere rounding of coordinates (n, 3), in their unit."""
     return _ROUNDING * (1.0 + float(np.abs(coordinates).max(initial=0.0)))
 
 
 def are_apart(points: Array) -> bool:
-    """Whether (n, 3) points are more than one place, computed again and again."""
+    """Whether points (n, 3) differ by more than rounding, so that they are not all one place."""
     return bool(np.ptp(points, axis=0).max() > rounding_of(points))
 
 
 def off_origin(centers: Array) -> Mask:
-    """(n,) which cameras of a path are elsewhere than at its origin, where no scale moves them."""
+    """Return which cameras of a path are not at the origin (n,), where a change of scale would not move them."""
     distance = np.linalg.norm(centers, axis=1)
     is_off: Mask = distance > max(_AT_ORIGIN * float(distance.max(initial=0.0)), rounding_of(centers))
     return is_off
 
 
 def align_points(source: Array, target: Array, *, with_scale: bool = True) -> Similarity:
-    """The similarity (or rigid motion) target_from_source with least squared error.
+    """Return the similarity (or rigid motion) target_from_source with the least squared error.
 
-    Umeyama, "Least-squares estimation of transformation parameters between two point
-    patterns", PAMI 1991. A reflection is never returned.
+    Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991.
+    A reflection is never returned.
 
     Args:
         source, target: (n, 3) corresponding points, n >= 3 for a unique answer.
-        with_scale: False keeps the scale at 1, as do points that are all in one place.
+        with_scale: False keeps the scale at 1. The scale is also 1 if all source points are in one place.
     """
     w = np.ones(len(source)) / len(source)
     mean_source, mean_target = w @ source, w @ target
@@ -91,9 +92,11 @@ def align_points(source: Array, target: Array, *, with_scale: bool = True) -> Si
 
 
 def align_most(source: Array, target: Array, start: Similarity) -> Similarity:
-    """``align_points`` without the points that lie elsewhere than most: a few that moved on their own have no say.
+    """Align points like ``align_points``, without those that do not follow the majority.
 
-    ``start``: about how most of the points lie to each other.
+    Args:
+        source, target: (n, 3) corresponding points.
+        start: approximate target_from_source of most of the points.
     """
     found = start
     for _ in range(_NUM_TRIMMINGS):
@@ -104,13 +107,19 @@ def align_most(source: Array, target: Array, start: Similarity) -> Similarity:
 
 
 def similarity_motions(from_middle: Array) -> Array:
-    """(n, 3, 7) how points (n, 3) move with the logarithm of the scale, a turn (rad) and a shift about the origin."""
+    """Return the derivatives (n, 3, 7) of points (n, 3) by a similarity about the origin.
+
+    The 7 columns are the logarithm of the scale, a rotation vector (radians) and a translation.
+    """
     shifts = np.tile(np.eye(3), (len(from_middle), 1, 1))
     return np.concatenate([from_middle[:, :, None], -cross_matrices(from_middle), shifts], axis=2)
 
 
 def similarity_between(source: Array, target: Array) -> Similarity | None:
-    """As ``align_points``; None where it has no scale: one of them is a single place, or they have nothing alike."""
+    """Return ``align_points(source, target)``, or None if the scale is undetermined.
+
+    That is so if the points of one set are all in one place, or the two sets have nothing in common.
+    """
     if not (are_apart(source) and are_apart(target)):
         return None
     found = align_points(source, target)
@@ -119,18 +128,18 @@ def similarity_between(source: Array, target: Array) -> Similarity | None:
 
 
 def rmse(differences: Array) -> float:
-    """Root of the mean squared length of (n, 3) differences; NaN for none."""
+    """Return the root mean square length of differences (n, 3); NaN if there are none."""
     return float(np.sqrt(np.mean(np.sum(differences**2, axis=1)))) if len(differences) else float("nan")
 
 
 @dataclass(frozen=True)
 class PathShape:
-    """Principal extents of a set of points.
+    """Principal axes and extents of a set of points.
 
     Attributes:
-        centroid: (..., 3).
-        axes: (..., 3, 3), columns are the principal directions, longest first; ``oriented``.
-        stddevs: (..., 3) along them, in the unit of the points.
+        centroid: (..., 3) mean of the points.
+        axes: (..., 3, 3) whose columns are the principal directions, longest first, with signs by ``oriented``.
+        stddevs: (..., 3) standard deviations along them, in the unit of the points.
     """
 
     centroid: Array
@@ -139,7 +148,7 @@ class PathShape:
 
 
 def path_shape(points: Array) -> PathShape:
-    """Principal directions of (..., n, 3) points."""
+    """Compute the principal axes and extents of points (..., n, 3)."""
     centroid, num = points.mean(axis=-2), points.shape[-2]
     _, singular_values, vt = np.linalg.svd(points - centroid[..., None, :], full_matrices=num < 3)
     stddevs = np.zeros_like(centroid)
@@ -148,23 +157,27 @@ def path_shape(points: Array) -> PathShape:
 
 
 def oriented(axes: Array) -> Array:
-    """Columns (..., 3, k), each turned so that its last coordinate of some size is positive: no decomposition tells."""
+    """Fix the signs of unit vectors, the columns of (..., 3, k), which a decomposition leaves open.
+
+    The last coordinate that is clearly not 0 becomes positive.
+    """
     last = 2 - np.argmax(np.abs(axes[..., ::-1, :]) > _OF_SOME_SIZE, axis=-2, keepdims=True)
     turned: Array = axes * np.sign(np.take_along_axis(axes, last, axis=-2))
     return turned
 
 
-# Extents of a path across itself, in lengths, that ranges with noise of about a decimetre hardly see.
+# Up to these extents across a path, as fractions of the extent along it, the path counts as straight or flat. Ranges
+# with noise of about a decimetre hardly see less.
 NEARLY_STRAIGHT = 0.03
 NEARLY_FLAT = 0.05
-# Stddev of the distance from the fitted centre, in radii, and the largest radius in lengths of the path: a short arc
-# lies near many circles and is none.
+# A path counts as round up to this RMS difference of the distance from the fitted centre, in radii, and up to this
+# radius, in units of the path's extent. A short arc lies near many circles, and does not count as round.
 _ROUND = 0.02
 _MAX_RADIUS = 2.0
 
 
 def path_kind(points: Array) -> str:
-    """The symmetries of (n, 3) points, n >= 1, that ranges cannot see past.
+    """Return the symmetry of points (n, 3), n >= 1, which leaves positions found from ranges ambiguous.
 
     It is "straight", "circular" (and flat), "flat", "spherical" or "general".
     """
@@ -181,7 +194,7 @@ def path_kind(points: Array) -> str:
 
 
 def round_middle(points: Array) -> tuple[Array, float]:
-    """Centre (3,) and radius of the sphere nearest to (n, 3) points; of flat ones, of the circle in their plane."""
+    """Return the centre (3,) and radius of the sphere that fits points (n, 3), or of the circle if they are flat."""
     shape = path_shape(points)
     local = (points - shape.centroid) @ shape.axes
     seen = shape.stddevs > 0.02 * shape.stddevs[0]

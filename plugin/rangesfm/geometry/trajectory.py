@@ -1,4 +1,4 @@
-"""Trajectory: the camera's path through one model's world."""
+"""Trajectory: the camera's path in the world of one model."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     import pycolmap
 
 ROUNDING_S = 1e-6
-"""Of a difference of two times that are seconds since 1970."""
+"""Rounding error of the difference of two times in seconds since 1970."""
 
 
 @dataclass(frozen=True)
 class Trajectory:
     """Poses of the registered keyframes (COLMAP frames), sorted by time where times are known.
 
-    A rig's pose is that of its reference camera, so ``cam`` means the rig frame.
+    The pose of a rig is that of its reference camera, so that ``cam`` means the rig frame.
 
     Attributes:
         frame_ids: (n,) int, COLMAP's frame ids.
@@ -29,7 +29,7 @@ class Trajectory:
         timestamps_s: (n,) seconds on the camera's clock, strictly increasing; None if unknown.
         centers: (n, 3) projection centres in the world, in the world's unit.
         world_from_cam: (n, 3, 3) rotations.
-        time_resolution_s: step to which each of the times was rounded or cut; 0: they are exact.
+        time_resolution_s: step to which the times were rounded or truncated; 0 if they are exact.
     """
 
     frame_ids: Indices
@@ -43,18 +43,18 @@ class Trajectory:
         return len(self.image_names)
 
     def transformed(self, scale: float, rotation: Array, translation: Array) -> Trajectory:
-        """The same path in the world ``x_new = scale * rotation @ x + translation``."""
+        """Return the path in the world ``x_new = scale * rotation @ x + translation``."""
         centers = scale * self.centers @ rotation.T + translation
         return replace(self, centers=centers, world_from_cam=rotation @ self.world_from_cam)
 
     def as_in(self, model: pycolmap.Reconstruction) -> Trajectory:
-        """The same keyframes as another model has them."""
+        """Return the path of the same keyframes in another model."""
         times = self.timestamps_s
         by_name = None if times is None else dict(zip(self.image_names, times.tolist(), strict=True))
         return trajectory_from_reconstruction(model, by_name)
 
     def timed(self, timestamps_s: Mapping[str, float]) -> Trajectory:
-        """The keyframes whose photo has a time by its name, in the order of these times."""
+        """Return the keyframes whose photo has a time, in the order of these times, given by the photos' names."""
         known = [row for row, name in enumerate(self.image_names) if name in timestamps_s]
         rows = sorted(known, key=lambda row: timestamps_s[self.image_names[row]])
         names = tuple(self.image_names[row] for row in rows)
@@ -62,18 +62,17 @@ class Trajectory:
         return Trajectory(self.frame_ids[rows], names, times, self.centers[rows], self.world_from_cam[rows])
 
     def resized(self, factor: float, frame: str) -> Trajectory:
-        """The path with another scale, otherwise placed as it is.
+        """Return the path scaled by a factor around a fixed point.
 
-        What stays in place: in the first camera's frame the first keyframe, which defines it
-        (the paper); in a site frame the middle of the path, which is what ranges to surveyed
-        anchors hold on to whatever the scale.
+        In the frame "first_camera" the fixed point is the first keyframe, which defines that frame. In a site frame it
+        is the mean of the path, because ranges to surveyed anchors determine that point whatever the scale.
         """
         fixed_point = self.centers[0] if frame == "first_camera" else self.centers.mean(axis=0)
         return self.transformed(factor, np.eye(3), (1.0 - factor) * fixed_point)
 
 
 def in_first_camera(trajectory: Trajectory, unit: float = 1.0) -> Trajectory:
-    """A path as seen from its first pose, in a unit of so many of its own."""
+    """Return a path in the frame of its first pose, in a new unit that is ``unit`` times its own."""
     turn = trajectory.world_from_cam[0].T
     return trajectory.transformed(1 / unit, turn, -turn @ trajectory.centers[0] / unit)
 
@@ -84,13 +83,13 @@ def trajectory_from_reconstruction(
     *,
     time_resolution_s: float = 0.0,
 ) -> Trajectory:
-    """Read the path off a model.
+    """Return the path of a model's registered frames.
 
     Args:
         reconstruction: a COLMAP model with registered frames.
         timestamps_s: camera-clock time of each photo by name; frames whose photo has
             no time are left out. None: the path has no times and is ordered by name.
-        time_resolution_s: step to which each of the times was rounded or cut.
+        time_resolution_s: step to which the times were rounded or truncated.
     """
     rows = []
     for frame_id in reconstruction.reg_frame_ids():
@@ -115,9 +114,9 @@ def trajectory_from_reconstruction(
 
 
 def joined_trajectory(parts: Sequence[Trajectory]) -> tuple[Trajectory, list[Indices]]:
-    """One path of several parts in one world, and for each part where its keyframes are in it.
+    """Join several parts in one world into one path; also return, for each part, the indices of its keyframes in it.
 
-    All parts have times, or none; the order is that of ``trajectory_from_reconstruction``.
+    Either all parts have times or none. The order is that of ``trajectory_from_reconstruction``.
     """
     names = np.array([name for part in parts for name in part.image_names], dtype=object)
     times = [part.timestamps_s for part in parts if part.timestamps_s is not None]
@@ -137,12 +136,12 @@ def joined_trajectory(parts: Sequence[Trajectory]) -> tuple[Trajectory, list[Ind
 
 
 def is_one_after_the_other(path: Trajectory) -> bool:
-    """Whether no two keyframes are of one time: those of a map that was joined from several cameras' may be."""
+    """Whether no two keyframes have the same time; in a map joined from several cameras' maps they may."""
     return path.timestamps_s is None or bool(np.all(np.diff(path.timestamps_s) > 0))
 
 
 def pose_of(frame: pycolmap.Frame) -> pycolmap.Rigid3d:
-    """rig_from_world of a registered frame: a view, so that what is written to its params moves the frame."""
+    """Return rig_from_world of a registered frame as a view, so that writing to its ``params`` moves the frame."""
     pose = frame.rig_from_world
     if pose is None:
         raise ValueError(f"frame {frame.frame_id} has no pose")
@@ -150,7 +149,7 @@ def pose_of(frame: pycolmap.Frame) -> pycolmap.Rigid3d:
 
 
 def photos_by_frame(reconstruction: pycolmap.Reconstruction) -> dict[str, tuple[str, ...]]:
-    """Names of the photos of each frame, by the one that stands for them in a trajectory."""
+    """Return the names of each frame's photos, by the photo that stands for the frame in a trajectory."""
     return {
         _reference_image_name(reconstruction, frame): tuple(
             reconstruction.image(data_id.id).name for data_id in frame.image_ids
@@ -160,7 +159,7 @@ def photos_by_frame(reconstruction: pycolmap.Reconstruction) -> dict[str, tuple[
 
 
 def _reference_image_name(reconstruction: pycolmap.Reconstruction, frame: pycolmap.Frame) -> str:
-    """The photo of the rig's reference camera; of a frame that lacks it, the first by name."""
+    """Return the name of the frame's photo from the reference camera, or of its first photo by name if it has none."""
     images = [reconstruction.image(data_id.id) for data_id in frame.image_ids]
     reference = [image for image in images if image.is_ref_in_frame()]
     return str(min(image.name for image in reference or images))

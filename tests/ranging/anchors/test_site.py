@@ -40,7 +40,7 @@ def test_near_anchors_and_those_of_other_frames_stay(frame: str) -> None:
     [
         ("first_camera", [1.0, 2.0, 3.0], "the frame is 'first_camera'"),
         ("site", None, "no anchor has a position"),
-        ("site", [1.2e6, 2.6e6, 0.0], "lie outside of where EPSG:2056 holds"),
+        ("site", [1.2e6, 2.6e6, 0.0], "lie outside the area in which EPSG:2056 is valid"),
     ],
 )
 def test_a_coordinate_system_needs_positions_on_the_earth(frame: str, position: list[float] | None, said: str) -> None:
