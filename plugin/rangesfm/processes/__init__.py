@@ -1,1 +1,1 @@
-"""Processes of our own, watched from their start to their end, and threads."""
+"""Supervised child processes, and threads."""

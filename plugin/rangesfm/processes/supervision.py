@@ -1,8 +1,8 @@
-"""A process of our own, watched from its start to its end: what it says, what memory it takes, and why it ended.
+"""Supervision of a child process from its start to its end: its messages, its memory, and why it ended.
 
-It runs a module as ``python -m MODULE PARENT`` would, but imports nothing from the working folder. It reads one pickled
-object and writes one JSON object a line: ``{"stage": name}``, ``{"num_done": n, "num_total": m}``, and last either
-``{"done": ...}`` or ``{"failed": ...}``.
+The process runs a module like ``python -m MODULE PARENT``, but imports nothing from the working folder. It reads one
+pickled object, and writes JSON objects, one a line: ``{"stage": name}``, ``{"num_done": n, "num_total": m}``, and last
+either ``{"done": ...}`` or ``{"failed": ...}``.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ from rangesfm.errors import ReconstructionError, failure_of
 _PR_SET_PDEATHSIG = 1
 _UPDATE_INTERVAL_S = 0.5
 _POLL_INTERVAL_S = 0.2
-_MAX_STOP_S = 20.0  # until a process that was interrupted is killed
+_MAX_STOP_S = 20.0  # an interrupted process that has not ended by then is killed
 _MAX_LINE = 200
-# Python puts the working folder first on the path, as "". A survey that somebody sent may hold a numpy.py, which would
-# be imported and so run. `python -P` would leave it out, but is only known from Python 3.11 on.
+# Python puts the working folder first on the path, as "". A survey from somebody else may hold a numpy.py, which would
+# be imported and so run. `python -P` would leave the folder out, but exists only since Python 3.11.
 _RUN_MODULE = (
     "import sys; sys.path[:1] == [''] and sys.path.pop(0); "
     "import runpy; runpy.run_module(sys.argv.pop(1), run_name='__main__', alter_sys=True)"
 )
-_STACK_TRACE = ("***", "@", "PC:")  # as glog begins its lines
+_STACK_TRACE = ("***", "@", "PC:")  # beginnings of the lines of a stack trace by glog
 
 
 class MessagesToParent:
-    """The progress of the work, one message a line; not every one of the many updates."""
+    """Progress of the work as messages, one a line; only some of the many updates are sent."""
 
     def __init__(self, stream: TextIO):
         self._stream = stream
@@ -61,7 +61,7 @@ class MessagesToParent:
             self.send({"num_done": num_done, "num_total": num_total})
 
     def message(self, text: str) -> None:
-        """Warnings are in what the work leaves."""
+        """Send nothing, because warnings are part of the results."""
 
     def send(self, message: dict[str, Any]) -> None:
         self._stream.write(json.dumps(message) + "\n")
@@ -69,11 +69,11 @@ class MessagesToParent:
 
 
 def work_for_parent(work: Callable[[Any, MessagesToParent], Any]) -> None:
-    """Do what a process is there for: ``work``, called with what the process is given.
+    """Do the work of a child process: call ``work`` with the object that the parent sends.
 
-    What that returns (plain values), or the error that it raises, is the process's last message.
+    The last message is the result of ``work`` (plain values), or the error that it raised.
     """
-    # It may have been started where Ctrl-C is ignored, and by a command that waits for SIGTERM in its own way.
+    # The parent may ignore Ctrl-C or block SIGTERM, and a child process inherits both.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     if sys.platform != "win32":
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
@@ -87,31 +87,31 @@ def work_for_parent(work: Callable[[Any, MessagesToParent], Any]) -> None:
 
 
 def _own_stdout() -> TextIO:
-    """The parent's end of stdout; whatever else is printed goes to stderr."""
+    """Return the stream to the parent, and send everything else that is printed to stderr."""
     stream = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     return stream
 
 
 def _end_with(parent: int) -> None:
-    """Be killed as soon as the parent is, however it ends: the folder written to must be free for the next one."""
+    """Have this process killed when its parent ends in any way, so that the output folder is free for the next run."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:
             os.kill(os.getpid(), signal.SIGKILL)
-    else:  # the parent's end of stdin closes with it
+    else:  # stdin closes when the parent ends
         threading.Thread(target=lambda: (sys.stdin.buffer.read(), os._exit(1)), daemon=True).start()
 
 
 @dataclass(frozen=True)
 class Ended:
-    """How it ended.
+    """How a child process ended.
 
     Attributes:
         last: the last message it sent; None if it sent none.
         signal: the signal that killed it, if one did.
-        needed_bytes: more memory than it might have, for which it was killed; None: it was not.
-        stopped: it was interrupted, as was wanted.
+        needed_bytes: the memory it took, if it was killed for exceeding its limit, else None.
+        stopped: whether it was interrupted on request.
         errors: the last line it wrote to stderr.
     """
 
@@ -123,13 +123,13 @@ class Ended:
 
     @property
     def how(self) -> str:
-        """In words, of one that did not say it itself."""
+        """A message about the end of a process that did not send one itself."""
         how = "its process ended too soon" if self.signal is None else f"its process was ended ({self.signal.name})"
         return f"{how}: {self.errors}" if self.errors else how
 
 
 def child_command(module: str) -> list[str]:
-    """The command that runs a module which works for its parent (``work_for_parent``)."""
+    """Return the command that runs a module which calls ``work_for_parent``."""
     return [sys.executable, "-c", _RUN_MODULE, module, str(os.getpid())]
 
 
@@ -142,12 +142,15 @@ def supervise(
     memory_limit_bytes: int | None,
     is_stopped: Callable[[], bool],
 ) -> Ended:
-    """Run a process that reads ``given`` and writes JSON objects, one a line.
+    """Run a process that reads ``given`` and writes JSON objects, one a line; return how it ended.
 
     Args:
+        command: the process's command line.
+        given: bytes for its standard input.
         listen: called with each message.
-        memory_limit_bytes: it is killed if it takes more; None: there is no limit.
-        is_stopped: asked several times a second; once it says so, the process is interrupted.
+        environment: its environment variables.
+        memory_limit_bytes: the process is killed if it takes more; None: there is no limit.
+        is_stopped: called several times a second; once it returns True, the process is interrupted.
     """
     with tempfile.TemporaryFile() as errors:
         process = subprocess.Popen(
@@ -156,13 +159,13 @@ def supervise(
             stdout=subprocess.PIPE,
             stderr=errors,
             env=environment,
-            start_new_session=True,  # a Ctrl-C in the terminal is not for it
+            start_new_session=True,  # so that a Ctrl-C in the terminal does not reach it
         )
         try:
             watched = _Watched(process, memory_limit_bytes, is_stopped)
             last = _talk(watched, given, listen)
         finally:
-            process.kill()  # no harm if it has ended
+            process.kill()  # has no effect if it has ended
             process.wait()
         died_of = signal.Signals(-process.returncode) if process.returncode < 0 else None
         return Ended(last, died_of, watched.needed_bytes, watched.stopped_at is not None, _last_line(errors))
@@ -171,14 +174,17 @@ def supervise(
 def run_children(
     module: str, given: Iterable[object], num_at_once: int, update: Callable[[int], None]
 ) -> Generator[None, None, None]:
-    """Have pieces of work done, each by a process; yields once for each that is done, in their order.
+    """Have each piece of work done by a process; yield once for each finished piece, in their order.
 
     Leaving the iteration (``contextlib.closing``) interrupts the processes, and waits for their end.
 
     Args:
-        module: what they run, by ``work_for_parent``; it ends with the number of items that it has done.
-        given: what each process is given. Not taken from before there is need of it: no more than one waits.
-        update: called several times a second with the number of items that all of them have done.
+        module: the module that a process runs; it calls ``work_for_parent``, with the number of finished items as the
+            result.
+        given: the object that each process is given. Objects are taken one at a time, when they are needed; at most one
+            waits for a process.
+        num_at_once: number of processes at the same time.
+        update: called several times a second with the number of items that all processes have finished.
 
     Raises:
         ReconstructionError: a process failed; the others were interrupted.
@@ -234,7 +240,7 @@ def run_children(
 
 @dataclass
 class _Watched:
-    """A process that is interrupted or killed where that is due."""
+    """A process that is interrupted on request, and killed if it takes too much memory or does not stop."""
 
     process: subprocess.Popen[bytes]
     memory_limit_bytes: int | None
@@ -244,7 +250,7 @@ class _Watched:
 
     def look(self) -> None:
         if self.memory_limit_bytes is not None and self.needed_bytes is None:
-            with suppress(psutil.Error):  # it has ended
+            with suppress(psutil.Error):  # the process has ended
                 used = psutil.Process(self.process.pid).memory_info().rss
                 if used > self.memory_limit_bytes:
                     self.needed_bytes = used
@@ -257,7 +263,7 @@ class _Watched:
 
 
 def _talk(watched: _Watched, given: bytes, listen: Callable[[dict[str, Any]], None]) -> dict[str, Any] | None:
-    """Hand over and listen until the process closes its stdout; returns its last message."""
+    """Send the input and listen until the process closes its stdout; return its last message."""
     process = watched.process
     assert process.stdin is not None
     assert process.stdout is not None
@@ -265,7 +271,7 @@ def _talk(watched: _Watched, given: bytes, listen: Callable[[dict[str, Any]], No
     threading.Thread(target=_read_lines, args=(process.stdout, lines), daemon=True).start()
     last = None
     try:
-        with suppress(BrokenPipeError):  # it died; what it said before counts
+        with suppress(BrokenPipeError):  # the process died; its messages so far still count
             process.stdin.write(given)
             process.stdin.flush()
         while True:
@@ -277,7 +283,7 @@ def _talk(watched: _Watched, given: bytes, listen: Callable[[dict[str, Any]], No
                 listen(last)
     finally:
         with suppress(BrokenPipeError):
-            process.stdin.close()  # not sooner: that it is open says that we live
+            process.stdin.close()  # only now, because an open stdin tells the process that its parent is alive
     process.wait()
     return last
 
@@ -285,7 +291,7 @@ def _talk(watched: _Watched, given: bytes, listen: Callable[[dict[str, Any]], No
 def _read_lines(stream: IO[bytes], lines: queue.SimpleQueue[bytes | None]) -> None:
     with stream:
         for line in stream:
-            if line.endswith(b"\n"):  # one without was being written when the process was killed
+            if line.endswith(b"\n"):  # a line without it is incomplete, because the process was killed
                 lines.put(line)
     lines.put(None)
 

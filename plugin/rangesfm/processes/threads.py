@@ -1,4 +1,4 @@
-"""Independent parts of a computation side by side, and how many threads compute at all."""
+"""Threads: their number, and independent parts of a computation in parallel."""
 
 from __future__ import annotations
 
@@ -21,23 +21,25 @@ _First = TypeVar("_First")
 _Second = TypeVar("_Second")
 _Arguments = ParamSpec("_Arguments")
 
-# Bounds that hold in this process now.
+# Bounds on the number of threads that are in force in this process.
 _bounds: list[int] = []
 
-# OpenMP takes one number for each level of parallel loops within others; there are no such loops here.
+# OpenMP allows one number for each level of nested parallel loops. There are no nested ones here, so the first counts.
 _NUMBER = r"\s*0*([1-9][0-9]{0,8})\s*(,.*)?"
 _VARIABLE = "OMP_NUM_THREADS"
 
 
 def num_threads() -> int:
-    """One for each core, or fewer where ``OMP_NUM_THREADS`` or ``at_most`` says so."""
+    """Return the number of threads: one for each core, or fewer by ``OMP_NUM_THREADS`` or ``at_most``."""
     found = re.fullmatch(_NUMBER, os.environ.get(_VARIABLE, ""))
     asked = [] if found is None else [int(found[1])]
     return min([os.cpu_count() or 1, *asked, *_bounds])
 
 
 def settle_num_threads() -> None:
-    """Check ``OMP_NUM_THREADS`` before libraries read it: they print what they do not like, or try 100000 threads.
+    """Check ``OMP_NUM_THREADS`` before libraries read it, and limit it to the number of threads used here.
+
+    With an invalid value libraries print warnings, and with a huge one they try to start so many threads.
 
     Raises:
         InputError: it is neither a number nor empty.
@@ -55,7 +57,7 @@ def settle_num_threads() -> None:
 
 @contextmanager
 def at_most(num: int) -> Iterator[None]:
-    """Have no more threads side by side inside the block; less than 1 for no bound."""
+    """Limit the number of parallel threads inside the block; a number below 1 means no limit."""
     bound = num if num > 0 else os.cpu_count() or 1
     _bounds.append(bound)
     try:
@@ -65,9 +67,10 @@ def at_most(num: int) -> Iterator[None]:
 
 
 def with_one_blas_thread(function: Callable[_Arguments, _Done]) -> Callable[_Arguments, _Done]:
-    """Have numpy and scipy multiply matrices in one thread while a function computes.
+    """Decorate a function so that numpy and scipy use one BLAS thread while it runs.
 
-    The matrices here are small: more threads make them slower, ten times so on two cores, and more beside other work.
+    The matrices here are small. More threads make them slower, by a factor of ten on two cores, and by more beside
+    other work.
     """
 
     @functools.wraps(function)
@@ -80,23 +83,24 @@ def with_one_blas_thread(function: Callable[_Arguments, _Done]) -> Callable[_Arg
 
 @functools.cache
 def _blas() -> ThreadpoolController:
-    import scipy.linalg  # noqa: F401 (its BLAS is another than numpy's, and is found only where it is loaded)
+    import scipy.linalg  # noqa: F401 (SciPy has a BLAS of its own, which is found only once it is loaded)
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController().select(user_api="blas")
 
 
 def side_by_side(function: Callable[[_Part], _Done], parts: Iterable[_Part]) -> list[_Done]:
-    """Of each part what the function makes of it, in their order: the same, however many threads there are.
+    """Apply a function to each part in parallel threads, and return the results in their order.
 
-    Worth it for numpy and scipy, which let other threads go on while they compute.
+    The results do not depend on the number of threads. It is faster for functions that compute in numpy and scipy,
+    which release Python's global lock.
     """
     with ThreadPoolExecutor(num_threads()) as pool:
         return list(pool.map(function, parts))
 
 
 def both(first: Callable[[], _First], second: Callable[[], _Second]) -> tuple[_First, _Second]:
-    """What two computations give that do not need each other; where both fail, what the first raises is raised."""
+    """Run two independent computations in parallel and return both results; if both fail, raise the first's error."""
     if num_threads() == 1:
         return first(), second()
     with ThreadPoolExecutor(1) as pool:
