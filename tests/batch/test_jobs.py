@@ -34,20 +34,18 @@ def test_two_surveys_that_write_to_one_folder_are_refused(output: str, tmp_path:
     with pytest.raises(InputError) as caught:
         read_jobs([first, second], {}, tmp_path / "batch")
     folder = tmp_path / "surveys" / "out_of_a"
-    assert str(caught.value) == (
-        f"{second}: writes to {folder}, and so does {first}: expected an [output] path of its own"
-    )
+    assert str(caught.value) == (f"{second}: writes to {folder}, as {first} does: expected another [output] path")
 
 
 def test_one_survey_named_twice_is_refused(tmp_path: Path) -> None:
     path = write_survey(tmp_path / "a.toml", None)
-    with pytest.raises(InputError, match="and so does"):
+    with pytest.raises(InputError, match=r"as .* does: expected another"):
         read_jobs([path, tmp_path / "." / "a.toml"], {}, tmp_path / "batch")
 
 
 def test_a_survey_must_not_write_where_the_table_goes(tmp_path: Path) -> None:
     path = write_survey(tmp_path / "a.toml", "batch")
-    with pytest.raises(InputError, match="and so does the table of the batch"):
+    with pytest.raises(InputError, match="as the table of the batch does"):
         read_jobs([path], {}, tmp_path / "batch")
 
 

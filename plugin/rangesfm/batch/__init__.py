@@ -1,1 +1,1 @@
-"""Many surveys at once on Dask: which there are, what each may use, who works on them, what became of them."""
+"""Many surveys at once on Dask: their list, the resources of each, the workers, and the results."""

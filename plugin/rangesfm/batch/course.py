@@ -1,4 +1,4 @@
-"""How far each survey of a batch is and what it found, and the whole of it."""
+"""State of a batch: the progress and the results of each survey, and of all."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rangesfm.result.summary import ResultSummary
 
 
 class Status(str, Enum):
-    """What became of a survey."""
+    """Status of a survey in a batch."""
 
     WAITING = "waiting"
     RUNNING = "running"
@@ -31,19 +31,20 @@ class Status(str, Enum):
 
 @dataclass(frozen=True)
 class SurveyRow:
-    """One row: of what a survey found, what ``result.json`` says of it.
+    """One row of the batch's table; the results are taken from ``result.json``.
 
     Attributes:
-        survey: its file.
-        reason: of a failure, or what the verdict names; one line.
-        exit_status: that ``rangesfm run`` would have had; None while it is not over.
-        num_attempts: how often a worker began it; more than 1 where one was killed.
-        seconds: from the beginning of the last attempt to the end.
-        host: where that was.
-        output_path: folder of its results; empty if its file cannot be read.
-        scale, scale_stddev: metres per SfM unit; the larger of the formal and the empirical stddev.
-        num_photos: in the model.
-        rmse_m: of the final map's keyframe centres without alignment, where there is a reference.
+        survey: the survey file.
+        reason: why the survey failed, or the reasons of its verdict; one line.
+        exit_status: exit status that ``rangesfm run`` would have; None while the survey is not over.
+        num_attempts: number of times a worker began the survey; more than 1 where a process was killed.
+        seconds: duration of the last attempt.
+        host: machine of the last attempt.
+        output_path: folder of the results; empty if the survey file cannot be read.
+        scale: metres per unit of the unscaled model.
+        scale_stddev: the larger of its formal and its empirical standard deviation.
+        num_photos: number of photos in the model.
+        rmse_m: RMSE of the final map's keyframe centres without alignment, where there is a reference.
     """
 
     survey: str
@@ -67,12 +68,12 @@ class SurveyRow:
     num_warnings: int | None = None
 
     def cells(self) -> dict[str, Any]:
-        """By column; plain values."""
+        """Return the plain values of the row, by column."""
         return asdict(self) | {"status": self.status.value}
 
 
 def figures_of(summary: ResultSummary) -> dict[str, Any]:
-    """Of a SurveyRow, those that come from ``result.json``."""
+    """Return the fields of a SurveyRow that come from ``result.json``."""
     scale, ranges = summary.scale, summary.ranges
     return {
         "verdict": scale.verdict,
@@ -90,15 +91,15 @@ def figures_of(summary: ResultSummary) -> dict[str, Any]:
 
 
 def exit_status_of(rows: Iterable[SurveyRow]) -> int:
-    """0 if all surveys are done, otherwise the largest of their statuses; what broke off has that of a failed run."""
+    """Return 0 if all surveys are done, else the largest of their exit statuses; an internal error counts as failed."""
     return max((FAILED if row.exit_status == INTERNAL_ERROR else row.exit_status or 0 for row in rows), default=0)
 
 
 def format_rows(rows: Sequence[SurveyRow]) -> str:
-    """The rows as aligned plain text, and below them why surveys are not done."""
+    """Format the rows as aligned plain text, followed by the reasons of surveys that are not done."""
     header = ("survey", "result", "scale", "photos", "ranges used", "range RMS m", "RMSE m", "seconds")
     table = align_rows([header, *map(_texts, rows)])
-    # Errors about the file itself name it already.
+    # An error about the survey file itself already begins with the file's name.
     reasons = [
         row.reason if row.reason.startswith(f"{row.survey}:") else f"{row.survey}: {row.reason}"
         for row in rows
@@ -122,12 +123,13 @@ def _texts(row: SurveyRow) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class SurveyState:
-    """A survey's row as far as it is known, and what it is doing.
+    """Present state of a survey.
 
     Attributes:
-        stage: it is in.
-        num_done, num_total: of the stage's items, where it counts them.
-        began_s: its last attempt, on the course's clock.
+        row: its row as far as it is known.
+        stage: the stage that it is in.
+        num_done, num_total: finished and all items of the stage, where the stage counts them.
+        began_s: start of the last attempt on the course's clock, seconds.
     """
 
     row: SurveyRow
@@ -138,20 +140,20 @@ class SurveyState:
 
 
 class BatchListener(Protocol):
-    """Receives the course of a batch."""
+    """Receiver of the progress of a batch."""
 
     def show(self, course: Course) -> None:
-        """Called on every change, and several times a second."""
+        """Show the state; called on every change, and several times a second."""
 
     def message(self, text: str) -> None:
-        """One line that the user should read."""
+        """Show a line that the user should read."""
 
 
 class Course:
-    """All surveys of a batch; it changes as the workers tell.
+    """State of all surveys of a batch, updated by the workers' messages.
 
     Attributes:
-        num_at_once: surveys at once, as far as it is known.
+        num_at_once: number of surveys that run at once, as far as it is known.
     """
 
     def __init__(self, jobs: Sequence[Job], *, clock: Callable[[], float] = time.monotonic):
@@ -174,14 +176,14 @@ class Course:
 
     @property
     def seconds(self) -> float:
-        """Since the beginning."""
+        """Seconds since the beginning of the batch."""
         return self._clock() - self._start_s
 
     def num(self, status: Status) -> int:
         return sum(row.status is status for row in self.rows)
 
     def seconds_left(self) -> float | None:
-        """Until all are over, if the others take as long as those that are done; None before one is."""
+        """Return the expected seconds until the end, from the mean duration of finished surveys; None before one is."""
         taken = [row.seconds for row in self.rows if row.status is Status.DONE and row.seconds is not None]
         if not taken:
             return None
@@ -191,11 +193,15 @@ class Course:
         return max(work / self.num_at_once, max(running, default=0.0))
 
     def seconds_running(self, state: SurveyState) -> float:
-        """Since the last attempt began; 0 where none is going on."""
+        """Return the seconds since the last attempt began, or 0 if the survey is not running."""
         return 0.0 if state.began_s is None else self._clock() - state.began_s
 
     def tell(self, index: int, message: dict[str, Any]) -> None:
-        """A message of a survey's worker, or of its process."""
+        """Take in a message of a survey's worker or process.
+
+        Args:
+            index: of the survey.
+        """
         state = self._states[index]
         if state.row.status.is_final:
             return
@@ -209,18 +215,19 @@ class Course:
             self._states[index] = replace(state, num_done=message["num_done"], num_total=message["num_total"])
 
     def end_all(self, status: Status, reason: str, exit_status: int | None = None) -> None:
-        """Whatever is not over ends so."""
+        """End all surveys that are not over with this status."""
         for index, row in enumerate(self.rows):
             if not row.status.is_final:
                 self.end(index, status, reason, exit_status)
 
     def end(self, index: int, status: Status, reason: str, exit_status: int | None, **figures: Any) -> None:
-        """A survey is over.
+        """End a survey.
 
         Args:
-            reason: why it failed, or of a verdict that is not good; one line.
-            exit_status: that ``rangesfm run`` has then.
-            figures: what it found (``figures_of``).
+            index: of the survey.
+            reason: why it failed, or why its verdict is not good; one line.
+            exit_status: exit status that ``rangesfm run`` would have.
+            figures: its results (``figures_of``).
         """
         state = self._states[index]
         seconds = None if state.began_s is None else self.seconds_running(state)

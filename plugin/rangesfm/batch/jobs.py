@@ -1,4 +1,4 @@
-"""What a batch is asked for: its surveys, read before anything starts, and what each may use of a machine."""
+"""Input of a batch: its surveys, which are read before anything starts, and the resources that each may use."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from rangesfm.errors import Failure, InputError, failure_of, one_line
 from rangesfm.survey.settings import Survey, read_survey
 
-_USUAL_BYTES = 2 * 10**9  # what a reconstruction of some hundred photos stays below
+_USUAL_BYTES = 2 * 10**9  # a reconstruction of some hundred photos needs less memory than this
 
 
 @dataclass(frozen=True)
@@ -17,9 +17,9 @@ class Job:
     """One survey of a batch.
 
     Attributes:
-        name: its file, as the user wrote it; on one line, without what cannot be printed.
-        survey: None if the file cannot be used.
-        failure: then why not.
+        name: its file as the user wrote it, on one line, without characters that cannot be printed.
+        survey: its settings; None if the file cannot be used.
+        failure: why the file cannot be used; None if it can.
     """
 
     name: str
@@ -31,14 +31,14 @@ def read_jobs(paths: Sequence[str | Path], overrides: Mapping[str, object], outp
     """Read the survey files of a batch.
 
     Args:
-        overrides: values by dotted key in place of those of every file; see ``read_survey``.
-        output_path: where the batch's own table goes.
+        overrides: values by dotted key that replace those in every file; see ``read_survey``.
+        output_path: folder of the batch's own table.
 
     Returns:
-        A job for each file, also for those that cannot be used.
+        A job for each file, also for files that cannot be used.
 
     Raises:
-        InputError: two of them write to the same folder, or one to the batch's own.
+        InputError: two surveys write to the same folder, or one writes to the batch's own.
     """
     jobs = tuple(_read_job(path, overrides) for path in paths)
     writes_to = {output_path.resolve(): "the table of the batch"}
@@ -48,7 +48,7 @@ def read_jobs(paths: Sequence[str | Path], overrides: Mapping[str, object], outp
         folder = job.survey.output.path.resolve()
         if folder in writes_to:
             raise InputError(
-                f"writes to {folder}, and so does {writes_to[folder]}: expected an [output] path of its own", job.name
+                f"writes to {folder}, as {writes_to[folder]} does: expected another [output] path", job.name
             )
         writes_to[folder] = job.name
     return jobs
@@ -63,14 +63,14 @@ def _read_job(path: str | Path, overrides: Mapping[str, object]) -> Job:
 
 @dataclass(frozen=True)
 class BatchOptions:
-    """How a batch is run.
+    """Options of a batch.
 
     Attributes:
-        scheduler: address of a Dask scheduler; None: workers of this machine.
-        num_workers: surveys at once on this machine; None: as many as it has cores and memory for.
-        num_threads: of each survey; None: its worker's share of the cores.
-        memory_limit_bytes: of each survey; None: its worker's share of the memory.
-        restart: do anew what earlier runs have done.
+        scheduler: address of a Dask scheduler; None: workers on this machine.
+        num_workers: number of surveys at once on this machine; None: as many as its cores and memory allow.
+        num_threads: threads of each survey; None: its worker's share of the cores.
+        memory_limit_bytes: memory of each survey; None: its worker's share of the memory.
+        restart: repeat what earlier runs have done.
     """
 
     scheduler: str | None = None
@@ -82,10 +82,12 @@ class BatchOptions:
 
 @dataclass(frozen=True)
 class Share:
-    """What one survey may use; None: what there is on its worker's machine, over the surveys it does at once.
+    """Resources that one survey may use.
 
     Attributes:
-        num_at_once: surveys at once by host, as far as it is known beforehand.
+        num_threads: threads; None: the cores of its machine, divided by the surveys that run there at once.
+        memory_limit_bytes: memory; None: the memory of its machine, divided likewise.
+        num_at_once: number of surveys at once on each host, as far as it is known beforehand.
     """
 
     num_threads: int | None = None
@@ -93,7 +95,13 @@ class Share:
     num_at_once: Mapping[str, int] = field(default_factory=dict)
 
     def on(self, host: str, num_slots: int, num_cores: int, memory_bytes: int) -> tuple[int, int]:
-        """Number of threads and of bytes for a survey on a machine, of which the asking worker has ``num_slots``."""
+        """Return the numbers of threads and of bytes of memory for one survey on a machine.
+
+        Args:
+            host: name of the machine.
+            num_slots: number of surveys at once of the worker that asks.
+            num_cores, memory_bytes: of the machine.
+        """
         num = max(num_slots, self.num_at_once.get(host, 0))
         return self.num_threads or max(1, num_cores // num), self.memory_limit_bytes or memory_bytes // num
 
@@ -101,7 +109,7 @@ class Share:
 def share_this_machine(
     options: BatchOptions, num_surveys: int, num_cores: int, memory_bytes: int
 ) -> tuple[int, Share, str | None]:
-    """How many workers, what each survey may use, and what is to be said about it.
+    """Return the number of workers, the resources of each survey, and a remark for the user or None.
 
     Raises:
         InputError: more threads are asked for than there are cores.

@@ -1,4 +1,4 @@
-"""A batch as one self-contained page, in the report's style."""
+"""Page of a batch: one self-contained HTML file in the report's style."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ _HEADER = (
     "time",
 )
 _NOTE = (
-    "Scale: metres per unit of the unscaled model, with the larger of its standard deviations. RMSE: of the keyframe "
-    "centres against a reference, without any alignment. Attempts: more than one where a worker was killed."
+    "Scale: metres per unit of the unscaled model, with the larger of its two standard deviations. RMSE: error of the "
+    "keyframe centres against a reference, without any alignment. Attempts: more than one where a worker was killed."
 )
 
 
 def render(course: Course, folder: Path) -> str:
-    """The page; it loads itself anew while the batch runs.
+    """Return the page as HTML; while the batch runs the page reloads itself.
 
     Args:
-        folder: where the page will be, from which its links start.
+        folder: folder of the page, to which its links are relative.
     """
     heading = f"{len(course.rows)} surveys"
     return page.render(
@@ -47,7 +47,7 @@ def render(course: Course, folder: Path) -> str:
         heading=heading,
         reload=None if course.is_over else RELOAD_S,
         tiles=_tiles(course),
-        table=Table("What each found", _HEADER, [_row(row, folder) for row in course.rows], _NOTE),
+        table=Table("Results", _HEADER, [_row(row, folder) for row in course.rows], _NOTE),
         reasons=[(_light(row), row) for row in course.rows if row.reason],
     )
 
@@ -57,9 +57,9 @@ def _tiles(course: Course) -> list[tuple[str, str, str]]:
     num_left = len(course.rows) - course.num(Status.DONE) - course.num(Status.FAILED)
     return [
         ("Done", count(course.num(Status.DONE)), f"of {count(len(course.rows))}"),
-        ("Failed", count(course.num(Status.FAILED)), "see below why"),
-        ("Not done", count(num_left), "or not yet"),
-        ("Time taken", duration(course.seconds), f"of all surveys {duration(seconds)}"),
+        ("Failed", count(course.num(Status.FAILED)), "reasons below"),
+        ("Not done", count(num_left), "waiting, running or interrupted"),
+        ("Time taken", duration(course.seconds), f"sum of all surveys {duration(seconds)}"),
     ]
 
 
@@ -82,7 +82,7 @@ def _row(row: SurveyRow, folder: Path) -> list[str]:
 
 
 def _name(row: SurveyRow, folder: Path) -> str:
-    """With a link to the survey's report, where it has one."""
+    """Return the survey's name, with a link to its report if there is one."""
     report = Path(row.output_path) / REPORT_NAME
     if row.status is not Status.DONE or not report.is_file():
         return row.survey

@@ -1,4 +1,4 @@
-"""Many surveys, each run by a Dask worker: one that fails does not stop the others."""
+"""Run of many surveys, each by a Dask worker; a survey that fails does not stop the others."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from rangesfm.files.records import write_json
 from rangesfm.files.tables import write_table
 
 _POLL_INTERVAL_S = 0.2
-_NUM_RETRIES = 2  # of a survey whose process was killed; Dask itself counts the workers that were
-_MAX_STOP_S = 30.0  # more than a worker gives a survey
+_NUM_RETRIES = 2  # for a survey whose process was killed; Dask itself counts attempts whose worker was killed
+_MAX_STOP_S = 30.0  # longer than a worker waits for an interrupted survey
 TABLE_NAME, JSON_NAME, PAGE_NAME = "batch.csv", "batch.json", "batch.html"
 
 
 def write_results(course: Course, folder: Path) -> None:
-    """Write ``batch.csv``, ``batch.json`` and ``batch.html``; while the batch runs the page loads itself anew."""
+    """Write ``batch.csv``, ``batch.json`` and ``batch.html``; while the batch runs the page reloads itself."""
     rows = course.rows
     cells = [["" if value is None else str(value) for value in row.cells().values()] for row in rows]
     write_table(folder / TABLE_NAME, list(SurveyRow("").cells()), cells)
@@ -45,16 +45,16 @@ def write_results(course: Course, folder: Path) -> None:
 
 
 def run_batch(jobs: Sequence[Job], options: BatchOptions, output_path: Path, listener: BatchListener) -> Course:
-    """Run all surveys; write ``batch.csv``, ``batch.json`` and ``batch.html``, anew whenever one has ended.
+    """Run all surveys; rewrite ``batch.csv``, ``batch.json`` and ``batch.html`` whenever one has ended.
 
     Args:
-        jobs: from ``read_jobs``; those that cannot be used are in the table too.
+        jobs: from ``read_jobs``; those that cannot be used are in the table, too.
         output_path: folder of the table.
 
     Raises:
         InputError: no scheduler answers, the folder cannot be written to, or more threads are asked for than there
             are cores.
-        KeyboardInterrupt: once the workers have stopped; the table says how far each survey came.
+        KeyboardInterrupt: once the workers have stopped; the table then says how far each survey came.
     """
     course = Course(jobs)
     with sole_writer(output_path):
@@ -72,7 +72,7 @@ def _workers(options: BatchOptions, jobs: Sequence[Job], listener: BatchListener
         with workers.workers_of(options.scheduler) as client:
             at_once = workers.num_at_once(client)
             if not at_once:
-                listener.message(f"{options.scheduler} has no workers yet: the surveys wait for some")
+                listener.message(f"{options.scheduler} has no workers yet: the surveys wait for them")
             yield client, Share(options.num_threads, options.memory_limit_bytes, at_once)
         return
     num_surveys = sum(job.survey is not None for job in jobs)
@@ -84,7 +84,7 @@ def _workers(options: BatchOptions, jobs: Sequence[Job], listener: BatchListener
 
 
 class _Crew:
-    """The workers of a batch, given its surveys, and listened to."""
+    """The workers of a batch: gives them its surveys and takes in their messages."""
 
     def __init__(self, client: Client, course: Course, output_path: Path, listener: BatchListener, share: Share):
         self._client = client
@@ -97,7 +97,7 @@ class _Crew:
         self._task_of: dict[Future, workers.SurveyTask] = {}
 
     def run(self, jobs: Sequence[Job], restart: bool) -> None:
-        """Until all surveys are over."""
+        """Run the surveys until all are over."""
         try:
             write_results(self._course, self._output_path)
             self._client.subscribe_topic(self._batch, self._inbox.put)
@@ -121,7 +121,7 @@ class _Crew:
         future.add_done_callback(self._inbox.put)
 
     def _look(self) -> None:
-        """Take in what has come, or wait a moment for it, and pass it on."""
+        """Process the messages that have arrived, after a short wait for the first."""
         items = _all_of(self._inbox)
         if self._client.status != "running":
             self._course.end_all(Status.FAILED, "the connection to the scheduler was lost", FAILED)
@@ -130,7 +130,7 @@ class _Crew:
             self._course.num_at_once = max(1, sum(self._client.nthreads().values()))
         ended = [item for item in items if not isinstance(item, tuple)]
         for item in items:
-            if isinstance(item, tuple):  # when, and what
+            if isinstance(item, tuple):  # a message: its time and its content
                 self._course.tell(item[1]["index"], item[1])
             else:
                 self._take_end(item)
@@ -147,19 +147,19 @@ class _Crew:
             self._course.end(task.index, Status.DONE, ending["reason"], 0, **ending["figures"])
 
     def _stop(self) -> None:
-        """Have the workers interrupt what they are at, and wait for it; then nothing is half-written."""
+        """Have the workers interrupt their surveys, and wait for them, so that nothing is left half-written."""
         futures = list(self._task_of)
         try:
             self._client.run(workers.stop_batch, self._batch, on_error="ignore")
             with self._client.as_current():
                 wait(futures, timeout=_MAX_STOP_S)
             self._client.cancel(futures)
-        except (OSError, RuntimeError):  # they are gone, or do not answer (TimeoutError): then they are ended
+        except (OSError, RuntimeError):  # the workers are gone, or do not answer (TimeoutError)
             pass
 
 
 def _all_of(inbox: queue.SimpleQueue[Any]) -> list[Any]:
-    """What is in it; waits a moment for the first."""
+    """Return all items in the inbox, after a short wait for the first."""
     items = []
     wait_s = _POLL_INTERVAL_S
     while True:
@@ -171,14 +171,14 @@ def _all_of(inbox: queue.SimpleQueue[Any]) -> list[Any]:
 
 
 def _ending(future: Future) -> Any:
-    """What ``run_on_worker`` returned, or why it did not."""
-    if future.cancelled():  # as it is where the scheduler has ended
+    """Return the result of ``run_on_worker``, or a Failure that says why there is none."""
+    if future.cancelled():  # also when the scheduler has ended
         return Failure("the scheduler gave it up", FAILED)
     error = future.exception(timeout=_MAX_STOP_S)
     if error is None:
         return future.result(timeout=_MAX_STOP_S)
     if isinstance(error, KilledWorker):
-        return Failure("the worker that had it was lost, and so were those that tried it again", FAILED)
+        return Failure("its worker was lost, and so were the workers that tried it again", FAILED)
     if isinstance(error, workers.KilledError):
-        return Failure(f"{error}; so it was each time it was tried", FAILED)
+        return Failure(f"{error}; this happened at every attempt", FAILED)
     return Failure(" ".join(f"its worker failed: {type(error).__name__}: {error}".split()), FAILED)

@@ -1,7 +1,7 @@
-"""One survey in a process of its own: what this module does, run by ``rangesfm.processes.supervision``.
+"""One survey of a batch in a process of its own, run as a module by ``rangesfm.processes.supervision``.
 
-A worker starts it, so that a crash of the survey leaves the worker whole, what the survey needs of memory is known, and
-it can be interrupted. It is given a (survey, restart), and ends with the survey's figures.
+A worker starts it. A crash of the survey then does not affect the worker, the survey's memory is known, and the survey
+can be interrupted. The process is given a tuple (survey, restart), and its result is the survey's figures.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from rangesfm.survey.settings import Survey
 
 def _run(given: tuple[Survey, bool], worker: MessagesToParent) -> dict[str, Any]:
     survey, restart = given
-    sys.argv = ["rangesfm", "batch", str(survey.source.path)]  # by which others know who writes to its folder
+    # The lock of the output folder names this command to other processes.
+    sys.argv = ["rangesfm", "batch", str(survey.source.path)]
     from rangesfm.batch.course import figures_of
     from rangesfm.workflows.run import metric_map_of
 

@@ -1,4 +1,4 @@
-"""Dask: its workers, of this machine or of a scheduler that is there, and what one of them does for a survey."""
+"""Dask workers, on this machine or of an existing scheduler, and the run of one survey on a worker."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from rangesfm.survey.settings import Survey
 
 _CONNECT_S = 10
 _IN_PROCESS = "inproc://"
-# Nothing is served beside the work itself.
+# Dask's web pages and profiling are switched off.
 _CONFIG = {
     "distributed.scheduler.http.routes": [],
     "distributed.worker.http.routes": [],
@@ -36,14 +36,14 @@ _CONFIG = {
     "distributed.comm.timeouts.connect": f"{_CONNECT_S}s",
 }
 _SILENT = logging.CRITICAL + 1
-# By the system for want of memory, or by somebody from outside: then it is worth another try.
+# Signals by which the system, when memory is short, or a user kills a process. Such a survey is tried again.
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
-# Batches whose surveys this worker is to leave alone.
+# Batches whose surveys this worker must not run any more.
 _stopped: set[str] = set()
 
 
 class _NoServer:
-    """A scheduler or worker that serves no pages: the server of Dask's would open a port even without any."""
+    """Mixin for a scheduler or worker without Dask's web server, which would open a port even if it has no pages."""
 
     def start_http_server(self, *arguments: Any, **options: Any) -> None:
         """Start nothing."""
@@ -59,10 +59,10 @@ class _Worker(_NoServer, Worker):  # type: ignore[misc] # Dask has no type hints
 
 @contextmanager
 def local_workers(num: int) -> Iterator[Client]:
-    """Workers in this process, each for one survey at a time.
+    """Start workers in this process, each for one survey at a time.
 
-    They need no processes of their own, as every survey has one, and they open no port: Dask runs whatever code is
-    sent to a port of its, so that any other user of this machine could have it run as this one.
+    They need no processes of their own, because every survey has one. They open no port, because Dask runs any code
+    that is sent to its port, so that another user of the machine could run code as this user.
     """
     with (
         dask.config.set(_CONFIG),
@@ -79,18 +79,18 @@ def local_workers(num: int) -> Iterator[Client]:
 
 
 def _worker_options(scratch: str) -> dict[str, Any]:
-    # Dask need not watch the memory: each survey is watched by name.
+    # Dask does not watch the memory, because each survey's process is watched.
     return {"protocol": _IN_PROCESS, "nthreads": 1, "memory_limit": 0, "local_directory": scratch}
 
 
 @contextmanager
 def workers_of(scheduler: str) -> Iterator[Client]:
-    """The workers of a scheduler, by its address.
+    """Connect to the workers of a scheduler, by its address.
 
-    Certificates for an address that begins with tls:// are those of Dask's own configuration.
+    For an address that begins with tls://, certificates are taken from Dask's own configuration.
 
     Raises:
-        InputError: it does not answer, or there are no certificates that it asks for.
+        InputError: the scheduler does not answer, or certificates are missing.
     """
     with dask.config.set(_CONFIG), _silence():
         try:
@@ -99,25 +99,27 @@ def workers_of(scheduler: str) -> Iterator[Client]:
             client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
         except (OSError, ValueError, ImportError, RuntimeError) as error:
             reason = " ".join(str(error).split())
-            raise InputError(f"no Dask scheduler answers at '{scheduler}', as tcp://head:8786: {reason}") from None
+            raise InputError(
+                f"no Dask scheduler answers at '{scheduler}' (expected an address like tcp://head:8786): {reason}"
+            ) from None
         with client:
             yield client
 
 
 def _require_certificates(scheduler: str) -> None:
-    """Raise ValueError if an address and Dask's configuration do not agree on certificates; its client would hang."""
+    """Raise ValueError if an address and Dask's configuration disagree on encryption; Dask's client would hang."""
     security = Security()
     if scheduler.startswith("tls://"):
         if security.get_connection_args("client")["ssl_context"] is None:
             expected = "distributed.comm.tls.ca-file, client.cert and client.key"
             raise ValueError(f"tls:// needs certificates, expected {expected} in Dask's configuration")
     elif security.require_encryption:
-        raise ValueError("Dask's configuration says require-encryption, expected an address as tls://head:8786")
+        raise ValueError("Dask's configuration says require-encryption, expected an address like tls://head:8786")
 
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Nobody but the batch itself speaks to the user: Dask logs each worker that is lost, with a traceback."""
+    """Switch off logging inside the block, because Dask logs a traceback for each worker that is lost."""
     before = logging.root.manager.disable
     logging.disable(logging.CRITICAL)
     try:
@@ -127,14 +129,14 @@ def _silence() -> Iterator[None]:
 
 
 def num_at_once(client: Client) -> Mapping[str, int]:
-    """How many tasks each host does at once, by the workers that are there now.
+    """Return the number of tasks that each host runs at once, by the workers present now.
 
     Raises:
-        InputError: they do not know this package.
+        InputError: the workers cannot import this package.
     """
     try:
         slots = client.run(_slots).values()
-    except Exception as error:  # whatever went wrong there, it is raised here
+    except Exception as error:  # any error on a worker is raised here
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise InputError(f"the workers of the scheduler cannot run surveys ({reason})") from None
     num = Counter[str]()
@@ -149,10 +151,14 @@ def _slots(dask_worker: Any) -> tuple[str, int]:
 
 @dataclass(frozen=True)
 class SurveyTask:
-    """What a worker is given.
+    """A survey for a worker.
 
     Attributes:
-        batch: the batch's own name, under which the worker tells how far it is.
+        batch: name of the batch, which is the topic of the worker's messages.
+        index: of the survey in the batch.
+        survey: its settings.
+        share: the resources that it may use.
+        restart: repeat what earlier runs have done.
     """
 
     batch: str
@@ -163,11 +169,11 @@ class SurveyTask:
 
 
 class KilledError(Exception):
-    """The survey's process was killed from outside; its text is one line for the user."""
+    """The survey's process was killed from outside; the text is one line for the user."""
 
 
 def stop_batch(batch: str) -> None:
-    """Interrupt the surveys of a batch, and begin no more of them on this worker."""
+    """Interrupt the surveys of a batch on this worker, and begin no more of them."""
     _stopped.add(batch)
 
 
@@ -175,10 +181,10 @@ def run_on_worker(task: SurveyTask) -> Any:
     """Run a survey in a process of its own.
 
     Returns:
-        The Failure, or what the process ended with: ``{"figures": ..., "reason": ...}``.
+        A Failure, or the result of the process: ``{"figures": ..., "reason": ...}``.
 
     Raises:
-        KilledError: the process was killed from outside, so that another attempt may well go through.
+        KilledError: the process was killed from outside, so that another attempt may succeed.
     """
     worker, host = get_worker(), socket.gethostname()
 
@@ -188,10 +194,10 @@ def run_on_worker(task: SurveyTask) -> Any:
     if task.batch in _stopped:
         return Failure("interrupted", INTERRUPTED)
     tell({"began_on": host})
-    # The limit of all of a worker's tasks, if it has one, as clusters' workers do.
+    # A worker of a cluster may have a memory limit for all its tasks.
     memory_bytes = getattr(worker.memory_manager, "memory_limit", None) or MEMORY_LIMIT
     num_threads, memory_limit_bytes = task.share.on(host, worker.state.nthreads, CPU_COUNT, memory_bytes)
-    own = task.survey.mapper.num_threads  # no more, though the file may ask for fewer
+    own = task.survey.mapper.num_threads  # the survey file may ask for fewer threads, but not for more
     survey = task.survey.changed({"mapper.num_threads": num_threads if own < 1 else min(own, num_threads)})
     ended = supervise(
         child_command("rangesfm.batch.survey_process"),
@@ -211,12 +217,12 @@ def run_on_worker(task: SurveyTask) -> Any:
 def _why_it_did_not_end(ended: Ended, memory_limit_bytes: int) -> Failure:
     if ended.needed_bytes is not None:
         needed, limit = (f"{num / 1e6:.0f} MB" for num in (ended.needed_bytes, memory_limit_bytes))
-        why = f"needs more memory than its share: {needed}, and {limit} is what it may take"
-        return Failure(f"{why}; give it more by --memory_limit, or fewer --num_workers", FAILED)
+        why = f"needs more memory than its share: it took {needed}, and its limit is {limit}"
+        return Failure(f"{why}; set a larger --memory_limit or fewer --num_workers", FAILED)
     if ended.stopped:
         return Failure("interrupted", INTERRUPTED)
     if ended.signal in _FROM_OUTSIDE:
         raise KilledError(
-            f"its process was killed ({ended.signal.name}): by somebody, or by the system for want of memory"
+            f"its process was killed ({ended.signal.name}) by a user, or by the system because memory was short"
         )
     return Failure(ended.how, FAILED)
