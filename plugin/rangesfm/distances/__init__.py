@@ -1,1 +1,1 @@
-"""Measured lengths, by tape or by radio, to hold the scale (control) or to try it (check)."""
+"""Measured lengths, by tape or by radio, that fix the scale (control) or test it (check)."""

@@ -1,4 +1,4 @@
-"""Distances in a model: where the ends of taped ones are, and those between anchors, by radio or by survey."""
+"""Measured lengths in a model: the ends of taped lengths, and lengths between anchors by radio or by survey."""
 
 from __future__ import annotations
 
@@ -18,28 +18,30 @@ from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.noise import shared_stddev
 from rangesfm.ranging.log import RangeKind, RangeLog
 
-# Marks of one point further from it than this share of the photo's size are of different points.
+# Largest distance of a mark from its reprojected marker, as a fraction of the photo's longer side. A mark farther off
+# belongs to another point.
 _MAX_REPROJECTION = 0.02
+# Smallest angle between the rays to a marker.
 _MIN_TRIANGULATION_ANGLE_DEG = 0.5
-# Stddev of a median over that of a mean.
+# Standard deviation of the median of normally distributed values over that of their mean: sqrt(pi / 2).
 _MEDIAN_OVER_MEAN = 1.2533
-# So that it can be divided by.
+# Smallest standard deviation of a length between anchors, because lengths are weighted by its inverse.
 _MIN_STDDEV_M = 1e-3
 
 
 @dataclass(frozen=True)
 class LocatedDistances:
-    """k taped distances, their ends found in one model: two of its points, or two anchors.
+    """k measured lengths whose ends were found in one model: two of its points, or two anchors.
 
     Attributes:
-        model_length: (k,) between points, in the model's unit; NaN between anchors.
-        anchor_pair: (k, 2) int, the two anchors; -1 between points.
-        distance_m, stddev_m: (k,) as measured.
-        is_check: (k,) bool, those that have no say.
-        ends: (k, 2, 3) the points, in the model's unit; NaN where nobody said.
-        mark_stddev: (k,) what marks in photos do to the model's length, in its unit.
-        is_printed: (k,) bool, sides of tags, which were printed alike: what one is too long, all are.
-        is_everywhere: (k,) bool, in the map all along, so that it is no matter how that bends.
+        model_length: (k,) length between two points in the model's unit; NaN between anchors.
+        anchor_pair: (k, 2) int, indices of the two anchors; -1 between points.
+        distance_m, stddev_m: (k,) measured length and its standard deviation.
+        is_check: (k,) bool, lengths that do not take part in the estimate.
+        ends: (k, 2, 3) the two points in the model's world and unit; NaN if unknown.
+        mark_stddev: (k,) standard deviation of the model's length due to errors of marks in photos, in its unit.
+        is_printed: (k,) bool, sides of printed tags, which share one error of their size.
+        is_everywhere: (k,) bool, lengths that occur all along the map, so that its bending does not matter.
     """
 
     model_length: Array
@@ -61,7 +63,7 @@ class LocatedDistances:
         model_length: Array | None = None,
         anchor_pair: Indices | None = None,
     ) -> LocatedDistances:
-        """All control, between points that are anywhere, or between anchors."""
+        """Make control lengths, between anchors or between points whose positions are unknown."""
         k = len(distance_m)
         length = np.full(k, np.nan) if model_length is None else model_length
         pair = np.full((k, 2), -1, dtype=np.int64) if anchor_pair is None else anchor_pair
@@ -70,25 +72,30 @@ class LocatedDistances:
 
     @property
     def is_between_points(self) -> Mask:
-        """(k,)"""
+        """Lengths between points of the model, not anchors, (k,)."""
         return np.asarray(self.anchor_pair[:, 0] < 0)
 
     def __len__(self) -> int:
         return len(self.distance_m)
 
     def subset(self, rows: Mask) -> LocatedDistances:
-        """Some of them."""
+        """Return the lengths that are true in ``rows`` (k,)."""
         return LocatedDistances(*(column[rows] for column in self._columns()))
 
     def joined(self, others: LocatedDistances) -> LocatedDistances:
-        """These, then others."""
+        """Return these lengths followed by others."""
         return LocatedDistances(*map(np.concatenate, zip(self._columns(), others._columns(), strict=True)))
 
     def _columns(self) -> tuple[npt.NDArray[Any], ...]:
         return tuple(getattr(self, field.name) for field in fields(self))
 
     def lengths_m(self, scale: float, anchors_m: Array) -> Array:
-        """(k,) as a map has them, with the model's scale and the anchors (m, 3); NaN where an anchor has no place."""
+        """Return the lengths in a map (k,), in metres; NaN where an anchor has no position.
+
+        Args:
+            scale: scale of the model.
+            anchors_m: (m, 3) positions of the anchors.
+        """
         lengths = scale * self.model_length
         between_anchors = ~self.is_between_points
         first, second = anchors_m[self.anchor_pair[between_anchors].T]
@@ -97,12 +104,13 @@ class LocatedDistances:
 
 
 def locate_distances(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Sequence[str]) -> LocatedDistances:
-    """Find each end: a photo of that name (its projection centre), else a marker, else an anchor.
+    """Find the ends of measured lengths in a model.
+
+    An end is the photo of that name (its projection centre), else the marker, else the anchor.
 
     Raises:
-        InputError: with the line, for an end that is none of these, a photo that is not in the model, a
-            distance from an anchor to what is none, and marks that are too few, seen from one direction only, or not
-            of one point.
+        InputError: an end is none of these, a photo is not in the model, only one of the two ends is an anchor, or the
+            marks of a marker are too few, seen from one direction only, or not of one point. The error gives the line.
     """
     images, markers = images_by_name(model), triangulate_markers(tape, model)
     points = {name: image.projection_center() for name, image in images.items()} | markers
@@ -134,7 +142,7 @@ def locate_distances(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Seq
 
 
 def distances_within(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Sequence[str]) -> Tape:
-    """Those of the distances that one of several models can hold: both ends in its photos, or anchors."""
+    """Return the tape with only the lengths whose two ends are both in this model, or are both anchors."""
     images = images_by_name(model)
     marked = {
         name for name, marker in tape.markers.items() if sum(photo in images for photo in marker.image_names) >= 2
@@ -148,22 +156,22 @@ def _what_is_wrong(taped: TapedDistance, points: dict[str, Array], anchor_ids: S
     for name in taped.ends:
         if name not in points and name not in anchor_ids:
             return f"an end is {name!r}, expected a photo that is in the model, a marker or an anchor of the log"
-    return f"from {taped.ends[0]!r} to {taped.ends[1]!r}: expected two anchors, or two ends of which none is an anchor"
+    return f"from {taped.ends[0]!r} to {taped.ends[1]!r}: expected two anchors, or two ends that are not anchors"
 
 
 def images_by_name(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Image]:
-    """Those that have a pose."""
+    """Return the model's photos with a pose, by name."""
     return {image.name: image for image in model.images.values() if image.has_pose}
 
 
 def triangulate_markers(tape: Tape, model: pycolmap.Reconstruction) -> dict[str, Array]:
-    """(3,) place of each marker that is the end of a distance; InputError as ``locate_distances`` has it."""
+    """Return the position (3,) of each marker that is an end of a length, by name; errors like ``locate_distances``."""
     images, ends = images_by_name(model), {name for taped in tape.distances for name in taped.ends}
     return {name: _triangulate(name, marker, images, tape) for name, marker in tape.markers.items() if name in ends}
 
 
 def _triangulate(name: str, marker: Marker, images: dict[str, pycolmap.Image], tape: Tape) -> Array:
-    """The marker's place, from the photos that are in the model."""
+    """Return the position of a marker (3,) in the model's world, from the photos that are in the model."""
 
     def wrong(what: str, k: int = 0) -> InputError:
         return InputError(f"marker {name!r} {what}", tape.markers_path, marker.lines[k])
@@ -177,7 +185,7 @@ def _triangulate(name: str, marker: Marker, images: dict[str, pycolmap.Image], t
         raise wrong("has a mark outside its photo")
     rays = np.array([[*np.ravel(at), 1.0] for at in in_cam if at is not None])
     rays /= np.linalg.norm(rays, axis=1)[:, None]
-    # From the first camera: far from its origin a linear triangulation loses half its digits.
+    # Relative to the first camera, because linear triangulation far from the origin loses half of its digits.
     origin = views[0].projection_center()
     relative = pycolmap.triangulate_multi_view_point([_cam_from_world_at(origin, view) for view in views], rays)
     point = None if relative is None else np.ravel(relative) + origin
@@ -187,12 +195,12 @@ def _triangulate(name: str, marker: Marker, images: dict[str, pycolmap.Image], t
         camera, seen_at = _camera(view), view.project_point(point)
         off_px = np.inf if seen_at is None else float(np.linalg.norm(seen_at - marker.pixels[k]))
         if off_px > _MAX_REPROJECTION * max(camera.width, camera.height):
-            raise wrong(f"is {off_px:.0f} px from where the other photos put it: is it the same point?", k)
+            raise wrong(f"is {off_px:.0f} px from its position by the other photos: is it the same point?", k)
     return point
 
 
 def _mark_covariance(marker: Marker, point: Array, images: dict[str, pycolmap.Image]) -> Array:
-    """(3, 3) of a marker's place, by how well it is marked in each photo."""
+    """Return the covariance (3, 3) of a marker's position due to the errors of its marks, in the model's unit."""
     information = np.zeros((3, 3))
     for view in (images[name] for name in marker.image_names if name in images):
         step = 1e-4 * float(np.linalg.norm(point - view.projection_center()))
@@ -205,7 +213,10 @@ def _mark_covariance(marker: Marker, point: Array, images: dict[str, pycolmap.Im
 
 
 def locatable(tape: Tape, model: pycolmap.Reconstruction) -> Tape:
-    """Without the tags of which a corner has no place in the model; what somebody marked is his to correct."""
+    """Return the tape without tags that have a corner which cannot be triangulated.
+
+    Markers set by hand are kept, so that the user is told what is wrong with them.
+    """
     images, lost = images_by_name(model), set[str]()
     for name, marker in tape.found_markers.items():
         try:
@@ -217,7 +228,7 @@ def locatable(tape: Tape, model: pycolmap.Reconstruction) -> Tape:
 
 
 def _cam_from_world_at(origin: Array, image: pycolmap.Image) -> Array:
-    """(3, 4) for a world whose origin is at ``origin``."""
+    """Return cam_from_world (3, 4) for a world whose origin is moved to ``origin``."""
     pose = image.cam_from_world().matrix()
     pose[:, 3] += pose[:, :3] @ origin
     return pose
@@ -239,15 +250,15 @@ def _widest_angle_deg(point: Array, views: Sequence[pycolmap.Image]) -> float:
 def distances_by_radio(
     log: RangeLog, noise_m: float, bias_m: Array, bias_stddev_m: Array, common_bias_stddev_m: float
 ) -> LocatedDistances:
-    """One distance for each pair of anchors that ranged: the median of their ranges, in either direction.
+    """Return one length for each pair of anchors that ranged: the median of their ranges in both directions.
 
-    A pair's ranges all err by the same delays and reflections: many of them are hardly better than one. A bias is
-    an anchor's with the tag; two radios of one kind read by the mean of theirs too long.
+    All ranges of a pair share the error from the same delays and reflections, so that many are hardly better than one.
+    A bias belongs to an anchor's ranges with the tag. Ranges between two anchors get the mean of their two biases.
 
     Args:
-        noise_m: stddev of a range of which the log says none.
-        bias_m, bias_stddev_m: (num_anchors,) what each anchor's ranges read too long, as far as that is known.
-        common_bias_stddev_m: of what all ranges between anchors read too long.
+        noise_m: standard deviation of a range for which the log gives none.
+        bias_m, bias_stddev_m: (num_anchors,) known bias of each anchor's ranges, and its standard deviation.
+        common_bias_stddev_m: standard deviation of the bias that all ranges between anchors share.
     """
     ranges = log.peer_ranges(RangeKind.ANCHOR_ANCHOR)
     range_m, given = log.range_m[ranges.rows], log.range_stddev_m[ranges.rows]
@@ -266,7 +277,7 @@ def distances_by_radio(
 
 
 def surveyed_distances(anchors: Sequence[Anchor]) -> tuple[TapedDistance, ...]:
-    """One for each pair of anchors with given positions, as if it had been taped."""
+    """Return the length between each pair of anchors with given positions, like a taped length."""
     return tuple(
         TapedDistance(
             (first.anchor_id, second.anchor_id),

@@ -1,4 +1,4 @@
-"""Taped distances: their files, the marks in photos between which they were taken, and their table against the map."""
+"""Measured lengths: their file, the marks of their ends in photos, and their comparison with the map."""
 
 from __future__ import annotations
 
@@ -16,33 +16,34 @@ from rangesfm.files.records import Number, NumberOrNull, Record, Text
 from rangesfm.files.tables import Table, read_table, repeated
 
 CONTROL, CHECK = "control", "check"
-# Of one that cannot belong to the map.
+# Kind of a length that contradicts the map and was rejected.
 LEFT_OUT = "left out"
-# What a steel tape and a steady hand are good for.
+# Standard deviation of a length measured with care by a steel tape.
 DEFAULT_STDDEV_M = 0.01
 DISTANCE_COLUMNS = ("from", "to", "distance_m")
 _PIXELS = ("x_px", "y_px")
 MARKER_COLUMNS = ("marker", "image_name", *_PIXELS)
+# Standard deviation of a coordinate of a mark set by hand.
 _CLICKED_STDDEV_PX = 1.0
 FOUND_STDDEV_PX = 0.3
-"""Of a corner that a library found."""
+"""Standard deviation of a coordinate of a tag's corner that was found by OpenCV."""
 
-# Of stddevs; one honest distance in three hundred is further off.
+# A length disagrees with the map beyond this number of standard deviations, which chance exceeds in one of 370 cases.
 _DISAGREES = 3.0
 
 
 @dataclass(frozen=True)
 class TapedDistance:
-    """A measured length between two ends, each a photo (its camera), a marker or an anchor.
+    """A measured length between two ends, each a photo (its camera's centre), a marker or an anchor.
 
     Attributes:
         ends: names of the two ends.
-        distance_m: measured.
-        stddev_m: of the measurement.
-        kind: "control" (it holds the scale) or "check" (it is compared with the result).
-        line: in the file.
-        is_printed: whether it is the side of a tag that was found in photos.
-        is_everywhere: whether the map has it all along, as that between the cameras of a rig.
+        distance_m: measured length.
+        stddev_m: standard deviation of the measurement.
+        kind: "control" (it takes part in the scale), "check" (it is compared with the result) or "left out".
+        line: line in the file; 0 if it is from no file.
+        is_printed: whether it is the side of a printed tag found in photos.
+        is_everywhere: whether it occurs all along the map, like the distance between cameras of a rig.
     """
 
     ends: tuple[str, str]
@@ -56,13 +57,13 @@ class TapedDistance:
 
 @dataclass(frozen=True)
 class Marker:
-    """A point of the scene, marked in k photos by hand, or found in them.
+    """A point of the scene, marked by hand or found in k photos.
 
     Attributes:
-        image_names: k names.
+        image_names: names of the k photos.
         pixels: (k, 2) x and y in COLMAP's convention: the centre of the first pixel is (0.5, 0.5).
-        lines: (k,) in the file.
-        stddev_px: of each coordinate.
+        lines: (k,) lines in the file; 0 if it was found.
+        stddev_px: standard deviation of each coordinate.
     """
 
     image_names: tuple[str, ...]
@@ -73,12 +74,12 @@ class Marker:
 
 @dataclass(frozen=True)
 class Tape:
-    """All that was taped.
+    """Measured lengths and markers.
 
     Attributes:
-        distances: in the order of the file.
-        markers: by name.
-        distances_path, markers_path: where they were read from, for messages.
+        distances: the lengths in the order of the file.
+        markers: the markers by name.
+        distances_path, markers_path: the files they were read from, for messages.
     """
 
     distances: tuple[TapedDistance, ...] = ()
@@ -87,20 +88,20 @@ class Tape:
     markers_path: Path | None = None
 
     def control(self) -> Tape:
-        """The distances that are to be kept to."""
+        """Return the tape with its control lengths only."""
         return replace(self, distances=tuple(taped for taped in self.distances if taped.kind == CONTROL))
 
     @property
     def found_markers(self) -> dict[str, Marker]:
-        """Those that nobody marked by hand."""
+        """Markers that were found in photos, not set by hand."""
         return {name: marker for name, marker in self.markers.items() if marker.stddev_px == FOUND_STDDEV_PX}
 
     def with_more(self, distances: tuple[TapedDistance, ...], markers: Mapping[str, Marker] | None = None) -> Tape:
-        """With others, and with marks found in photos; names that somebody gave to marks of his own stay his."""
+        """Return the tape with more lengths and markers; its own markers are kept where a new one has an equal name."""
         return replace(self, distances=self.distances + distances, markers={**(markers or {}), **self.markers})
 
     def without(self, rows: Collection[int]) -> Tape:
-        """With some of the distances, by their numbers, as left out."""
+        """Return the tape with the lengths of these indices marked as left out."""
         distances = (replace(taped, kind=LEFT_OUT) if k in rows else taped for k, taped in enumerate(self.distances))
         return replace(self, distances=tuple(distances))
 
@@ -108,10 +109,10 @@ class Tape:
 def read_tape(distances_path: str | Path, markers_path: str | Path | None = None) -> Tape:
     """Read ``from,to,distance_m[,stddev_m,kind]`` and ``marker,image_name,x_px,y_px``.
 
-    Without a kind a distance is control, without a stddev it is good to a centimetre.
+    A length without a kind is a control length. Without a standard deviation it gets DEFAULT_STDDEV_M.
 
     Raises:
-        InputError: with the line, for what is not as described.
+        InputError: a file is not valid; the error gives the line.
     """
     distances = _distances(read_table(distances_path, DISTANCE_COLUMNS, ["stddev_m", "kind"]))
     markers = {} if markers_path is None else _markers(read_table(markers_path, MARKER_COLUMNS))
@@ -145,13 +146,13 @@ def _markers(table: Table) -> dict[str, Marker]:
     for name, rows in rows_of.items():
         seen_in = tuple(image_names[row] for row in rows)
         if again := repeated(seen_in):
-            raise table.error(rows[again[0]], "image_name", "a photo in which this marker has no place yet")
+            raise table.error(rows[again[0]], "image_name", "each photo once for this marker")
         markers[name] = Marker(seen_in, pixels[rows], tuple(table.line[rows].tolist()))
     return markers
 
 
 class DistanceRow(Record):
-    """One taped distance, metres: by tape, in the map, and what the map has too much."""
+    """One measured length in metres: measured, in the map, and the difference map minus measurement."""
 
     from_: Text = Field(validation_alias=AliasChoices("from", "from_"), serialization_alias="from")
     to: Text
@@ -163,7 +164,7 @@ class DistanceRow(Record):
 
 
 def distance_rows(tape: Tape, lengths_m: Array) -> list[DistanceRow]:
-    """One entry for each distance of the tape, in its order, with (k,) lengths in the map."""
+    """Return a row for each length of the tape, in its order, given the lengths in the map (k,)."""
     return [
         DistanceRow(
             from_=taped.ends[0],
@@ -179,10 +180,13 @@ def distance_rows(tape: Tape, lengths_m: Array) -> list[DistanceRow]:
 
 
 def disagreements(rows: Iterable[DistanceRow], relative_scale_stddev: float, bending: float = 0.0) -> Iterator[str]:
-    """What to tell of distances that the map misses by more than tape, scale and bending explain.
+    """Yield a line for each length that differs from the map by more than tape, scale and bending explain.
 
-    A control distance has held the scale already, so that the scale's error does not excuse it. ``bending``: relative
-    stddev by which the scale varies from place to place.
+    For a control length the uncertainty of the scale is not counted, because it has taken part in the scale.
+
+    Args:
+        relative_scale_stddev: relative standard deviation of the scale.
+        bending: relative standard deviation by which the scale varies from place to place.
     """
     for row in rows:
         of_scale = relative_scale_stddev if row.kind == CHECK else 0.0
