@@ -1,1 +1,1 @@
-"""The demo's survey: photos that ship with the package, and a simulated radio."""
+"""The demo survey: photos that ship with the package, and a simulated radio."""

@@ -1,4 +1,4 @@
-"""A radio's log along a path with known truth: noise, bias, obstructed and lost ranges, another clock."""
+"""Simulated range log along a known path, with noise, biases, obstructed and lost ranges, and a clock of its own."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from rangesfm.arrays import Array
 from rangesfm.ranging.log import RangeLog
 
-# A radio cannot measure less than this; the log's ranges are positive.
+# Shortest range that a radio measures; ranges in a log are positive.
 _MIN_RANGE_M = 0.01
 
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Pose as a function of time on the camera's clock.
+    """Camera pose as a function of time on the camera's clock.
 
     Attributes:
         start_s, end_s: first and last time at which it is defined.
@@ -34,12 +34,12 @@ class CameraPath:
 
     @classmethod
     def through(cls, times_s: Array, centers_m: Array, world_from_cam: Array) -> CameraPath:
-        """The smooth path through n poses.
+        """Return a smooth path through n poses.
 
         Args:
-            times_s: (n,) strictly increasing, n >= 2.
-            centers_m: (n, 3).
-            world_from_cam: (n, 3, 3).
+            times_s: (n,) times, strictly increasing, n >= 2.
+            centers_m: (n, 3) projection centres, metres.
+            world_from_cam: (n, 3, 3) rotations.
         """
         rotations = Rotation.from_matrix(world_from_cam)
         return cls(
@@ -47,24 +47,24 @@ class CameraPath:
         )
 
     def centers(self, times_s: Array) -> Array:
-        """(n, 3) projection centres in the world, metres."""
+        """Return the projection centres (n, 3) in the world at n times, metres."""
         return np.asarray(self.position(times_s))
 
     def world_from_cam(self, times_s: Array) -> Array:
-        """(n, 3, 3) rotations."""
+        """Return the rotations world_from_cam (n, 3, 3) at n times."""
         return np.asarray(self.rotation(times_s).as_matrix())
 
 
 @dataclass(frozen=True)
 class Radio:
-    """How the radio measures.
+    """Error model of a simulated radio.
 
     Attributes:
-        rate_hz: ranges to each anchor in a second; the anchors take turns.
-        range_stddev_m: Gaussian noise.
-        range_bias_m: what an anchor's ranges read too long, by its id; 0 where not given.
+        rate_hz: ranges to each anchor per second; the anchors take turns.
+        range_stddev_m: standard deviation of the Gaussian noise.
+        range_bias_m: bias of the ranges to each anchor, by anchor id (positive: too long); 0 where not given.
         obstructed_share: share of ranges without line of sight.
-        obstructed_mean_m: mean of the exponential distribution of what these read too long.
+        obstructed_mean_m: mean of their additional error, which is positive and exponentially distributed.
         lost_share: share of ranges that never arrive.
         time_offset_s: image time = range time + offset.
         resolution_m: ranges are multiples of it; 0: not rounded.
@@ -82,13 +82,13 @@ class Radio:
 
 @dataclass(frozen=True)
 class SimulatedRanges:
-    """n ranges and the truth about them, in the order of the log.
+    """n simulated ranges with their true values, in the order of the log.
 
     Attributes:
-        log: as the radio gives it.
-        image_time_s: (n,) when each was taken, on the camera's clock.
+        log: the log that the radio gives.
+        image_time_s: (n,) time of each range on the camera's clock.
         distance_m: (n,) true distance between the antennas.
-        is_obstructed: (n,) whether it had no line of sight.
+        is_obstructed: (n,) whether a range had no line of sight.
     """
 
     log: RangeLog
@@ -104,12 +104,12 @@ def simulate_ranges(
     radio: Radio,
     seed: int = 0,
 ) -> SimulatedRanges:
-    """Ranges at the radio's rate all along a path.
+    """Simulate ranges at the radio's rate along a whole path.
 
     Args:
-        anchors_m: (3,) position in the world by id.
-        tag_in_cam_m: (3,) lever arm.
-        seed: of noise, obstruction and loss.
+        anchors_m: position (3,) of each anchor in the world, by id, metres.
+        tag_in_cam_m: (3,) lever arm of the tag in the camera frame, metres.
+        seed: seed of noise, obstruction and loss.
     """
     num_rounds = int((path.end_s - path.start_s) * radio.rate_hz)
     turn = np.arange(num_rounds * len(anchors_m))
@@ -126,12 +126,14 @@ def measure_ranges(
     radio: Radio,
     seed: int,
 ) -> SimulatedRanges:
-    """What the radio makes of n distances; its rate is not used.
+    """Simulate the radio's measurement of n distances; the radio's rate is not used.
 
     Args:
-        times_s: (n,) on the camera's clock.
-        tags_m: (n, 3) the moving antenna in the world.
-        anchor_index: (n,) which of ``anchors_m`` each is to.
+        times_s: (n,) times on the camera's clock.
+        tags_m: (n, 3) positions of the moving antenna in the world, metres.
+        anchor_index: (n,) index of each distance's anchor in ``anchors_m``.
+        anchors_m: position (3,) of each anchor in the world, by id, metres.
+        seed: seed of noise, obstruction and loss.
     """
     rng = np.random.default_rng(seed)
     ids = np.array(list(anchors_m))

@@ -1,8 +1,8 @@
-"""A whole survey to try the pipeline on: photos of a yard, a radio's log, surveyed anchors, the truth, the survey file.
+"""A complete survey to try the pipeline on: photos of a yard, a range log, surveyed anchors, the truth, a survey file.
 
-The photos ship with the package, and so does the way of their camera, along which the radio is simulated: ``path.csv``
-has its pose at each photo and at three moments before the first and after the last. It is in the site frame: metres,
-x east, y north, z up, origin on the ground in the south-west corner of the yard.
+The photos ship with the package. The camera's path, along which the radio is simulated, is in ``path.csv``: its poses
+at each photo, and at three times before the first and after the last photo. The path is in the site frame, in metres:
+x east, y north, z up, with the origin on the ground in the south-west corner of the yard.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ ANCHOR_STDDEV_M = 0.01
 TAG_IN_CAM_M = (0.03, -0.12, -0.05)
 TIME_OFFSET_S = 2.35
 
-# The radio is on before the first photo and after the last: rows of ``path.csv``, a second each.
+# The radio is on before the first photo and after the last, for this number of rows of ``path.csv``, one a second.
 NUM_ROWS_AROUND = 3
 _RADIO = Radio(
     rate_hz=8.0,
@@ -58,15 +58,15 @@ _EXPECTED = "expected a new or an empty folder, or one that holds the same demo"
 
 @dataclass(frozen=True)
 class DemoSurvey:
-    """Where the survey is, and the truth about it.
+    """The demo survey, with its true poses and ranges.
 
     Attributes:
         folder: holds ``survey.toml``, ``images``, ``uwb.csv``, ``anchors.csv`` and ``reference.csv``.
         image_names: n photos in time order.
-        timestamps_s: (n,) camera clock, seconds since 1970.
-        centers_m: (n, 3) projection centres in the site frame.
-        world_from_cam: (n, 3, 3).
-        ranges: the log, on the radio's clock, and its truth.
+        timestamps_s: (n,) times on the camera's clock, seconds since 1970.
+        centers_m: (n, 3) projection centres in the site frame, metres.
+        world_from_cam: (n, 3, 3) rotations.
+        ranges: the log, on the radio's clock, with its true values.
     """
 
     folder: Path
@@ -82,14 +82,13 @@ class DemoSurvey:
 
 
 def make_demo_survey(folder: Path, *, num_photos: int = 40, seed: int = 0) -> DemoSurvey:
-    """Write what somebody brought home who walked through the yard with a camera and a radio.
-
-    A folder that already holds this very survey is left as it is.
+    """Write the demo survey into a folder; a folder that already holds the same survey is left as it is.
 
     Args:
-        folder: where to write; new or empty.
-        num_photos: the first so many of those that ship, about one a second; all 40 go around the yard once.
-        seed: of the radio's errors and of those of the surveyed anchors.
+        folder: a new or empty folder.
+        num_photos: number of photos, from the first on. They are about one second apart, and all 40 go around the yard
+            once.
+        seed: seed of the errors of the radio and of the surveyed anchors.
 
     Raises:
         InputError: the folder holds something else or cannot be written to.
@@ -101,7 +100,7 @@ def make_demo_survey(folder: Path, *, num_photos: int = 40, seed: int = 0) -> De
     if folder.exists() and not folder.is_dir():
         raise InputError(_EXPECTED, folder)
     with sole_writer(folder) as output:
-        # What a demo left that was killed while it was made is complete in parts, and all its own.
+        # A demo that was killed leaves some of its files, each of them complete and recorded as this tool's own.
         others = [path for path in output.path.iterdir() if path.name != PRIVATE_NAME]
         if survey.survey_path.exists() or not all(output.is_own(path) for path in others):
             raise InputError(_EXPECTED, folder)
@@ -111,13 +110,13 @@ def make_demo_survey(folder: Path, *, num_photos: int = 40, seed: int = 0) -> De
         write_ranges_csv(survey.ranges.log, folder / "uwb.csv")
         write_text(_anchor_file(seed), folder / "anchors.csv")
         write_reference(Reference(survey.centers_m, image_names=survey.image_names), folder / "reference.csv")
-        # Last: where it is, all is.
+        # The survey file is written last, so that its presence shows that the survey is complete.
         write_text(text, survey.survey_path)
     return survey
 
 
 def _plan(folder: Path, num_photos: int, seed: int) -> DemoSurvey:
-    """Everything about the survey but the photos themselves."""
+    """Return the survey with its true values; nothing is written."""
     with PATH_FILE.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))[: num_photos + 2 * NUM_ROWS_AROUND]
     columns = ("timestamp_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
@@ -145,7 +144,7 @@ def _is_there(survey: DemoSurvey, text: str) -> bool:
 
 
 def _anchor_file(seed: int) -> str:
-    """The anchors as somebody surveyed them."""
+    """Return the text of the anchor file, with positions that have the errors of a survey."""
     rng = np.random.default_rng([seed, 1])
     lines = ["anchor_id,x_m,y_m,z_m,position_stddev_m"]
     for name, position in ANCHORS_M.items():
@@ -160,7 +159,7 @@ def _survey_file(num_photos: int, seed: int) -> str:
 # Paths are relative to this file.
 
 [images]
-path = "images"                 # when each was taken stands in its EXIF data
+path = "images"                 # the times of the photos are in their EXIF data
 
 [camera]
 model = "{CAMERA_MODEL}"         # f, cx, cy, k; leave the table out if the camera is not calibrated
@@ -168,20 +167,20 @@ params = [{_listed(CAMERA_PARAMS)}]
 
 [ranges]
 path = "uwb.csv"                # timestamp_s,anchor_id,range_m
-time_offset = "auto"            # the radio's clock is not the camera's: image time = range time + offset
+time_offset = "auto"            # radio and camera have different clocks: image time = range time + offset
 
 [anchors]
 path = "anchors.csv"            # surveyed in the yard: x east, y north, z up
 frame = "site"
 
 [tag]
-tag_in_cam_m = [{_listed(TAG_IN_CAM_M)}]   # antenna: x right, y down, z forward
+tag_in_cam_m = [{_listed(TAG_IN_CAM_M)}]   # lever arm of the antenna: x right, y down, z forward
 
 [mapper.features.sift]
-max_num_features = 2000         # plenty here, and matching stays quick
+max_num_features = 2000         # enough for these photos, and keeps matching fast
 
 [report]
-reference = "reference.csv"     # the truth, only to compare with
+reference = "reference.csv"     # the true positions, used for comparison only
 
 [output]
 path = "out"

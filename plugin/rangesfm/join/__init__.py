@@ -1,1 +1,1 @@
-"""Models without a common photo, joined through the anchors that they hear."""
+"""Joining of models that have no common photo, through ranges to the same anchors."""

@@ -1,4 +1,4 @@
-"""Models without a common photo, joined through the anchors that they hear: one model, one path, one set of ranges."""
+"""Joining of models without common photos, through ranges to the same anchors, into one model, path and range set."""
 
 from __future__ import annotations
 
@@ -24,13 +24,14 @@ from rangesfm.survey.settings import Survey
 
 @dataclass(frozen=True)
 class ModelVerdict:
-    """One of the models that were to be joined.
+    """Outcome for one of the models that were to be joined.
 
     Attributes:
-        name: for people, as "sparse/0".
-        num_images: photos in it.
-        estimate: of its scale by its own ranges; None if they do not determine it.
-        joined_from_sfm: its unscaled world to that of the joined unscaled model; None if it is left out.
+        name: name for the user, such as "sparse/0".
+        num_images: number of its photos.
+        estimate: estimate of its scale by its own ranges; None if they do not determine it.
+        joined_from_sfm: transformation from its unscaled world to that of the joined unscaled model; None if the model
+            is left out.
         reason: why it is left out; empty if it is not.
     """
 
@@ -43,13 +44,13 @@ class ModelVerdict:
 
 @dataclass(frozen=True)
 class PathOfModel:
-    """A model, its path and the ranges on it.
+    """A model with its path and the ranges on that path.
 
     Attributes:
-        name: for people, as "sparse/0".
-        sfm: unscaled.
-        trajectory: of its photos that have a time.
-        observations: on it, of the log that all models share.
+        name: name for the user, such as "sparse/0".
+        sfm: the unscaled model.
+        trajectory: path of its photos that have a time.
+        observations: ranges on that path, from the log that all models share.
     """
 
     name: str
@@ -61,7 +62,7 @@ class PathOfModel:
 def estimate_scale(
     survey: Survey, inputs: RangingInputs, path: PathOfModel, bending: MapBending | None = None
 ) -> ScaleEstimate:
-    """``initialize_scale`` by a survey's options, with the lengths of its inputs."""
+    """Estimate the scale of a model by ``initialize_scale``, with the options and measured lengths of a survey."""
     distances = None
     if inputs.tape is not None:
         distances = locate_distances(inputs.tape, path.sfm, path.observations.log.anchor_ids)
@@ -80,7 +81,13 @@ def estimate_scale(
 
 @dataclass(frozen=True)
 class JoinedModels:
-    """The models that could be joined, as one in the world and the unit of the first, and the verdicts on all."""
+    """Result of joining.
+
+    Attributes:
+        path: the joined model, in the world and unit of the first model.
+        verdicts: the outcome for each model.
+        notes: lines for the user.
+    """
 
     path: PathOfModel
     verdicts: tuple[ModelVerdict, ...]
@@ -88,13 +95,13 @@ class JoinedModels:
 
 
 def join_models(parts: Sequence[PathOfModel], survey: Survey, inputs: RangingInputs) -> JoinedModels:
-    """Scale each model on its own, and lay them into one world by all their ranges with one set of anchors.
+    """Scale each model on its own, then place all in one world by all their ranges, with one set of anchors.
 
     Args:
-        parts: to the first one the others are joined. No photo is in two of them.
+        parts: models without common photos. The others are joined to the first one.
 
     Raises:
-        GeometryError: not even the scale of the first one is determined.
+        GeometryError: the scale of the first model is not determined.
     """
     exclusive = each_on_one_path([part.observations for part in parts])
     parts = [replace(part, observations=of) for part, of in zip(parts, exclusive, strict=True)]
@@ -103,8 +110,8 @@ def join_models(parts: Sequence[PathOfModel], survey: Survey, inputs: RangingInp
     placements = place_models(list(scaled.values()))
     reasons |= {k: reason for k, reason in zip(scaled, placements.reasons, strict=True) if reason}
     if first in reasons and inputs.anchor_frame == "first_camera":
-        why = f"the anchors are given in the frame of the first photo, and {parts[first].name}, which has it, "
-        reasons = {k: reasons.get(k, f"{why}has no place") for k in range(1, len(parts))}
+        why = f"the anchors are given in the frame of the first photo, and {parts[first].name}, which has that photo, "
+        reasons = {k: reasons.get(k, f"{why}cannot be placed") for k in range(1, len(parts))}
     first_from_sfm = dict(zip(scaled, placements.first_from_sfm, strict=True))
     placed = {k: motion for k, motion in first_from_sfm.items() if motion is not None and k not in reasons}
     verdicts = (
@@ -122,7 +129,7 @@ def join_models(parts: Sequence[PathOfModel], survey: Survey, inputs: RangingInp
 
 
 def _first_in_time(parts: Sequence[PathOfModel]) -> int:
-    """Which of them has the first photo; without times, the first by name."""
+    """Return the index of the model with the earliest photo, or without times the first photo by name."""
     starts = [
         (0.0 if path.timestamps_s is None else float(path.timestamps_s[0]), path.image_names[0])
         for path in (part.trajectory for part in parts)
@@ -133,7 +140,11 @@ def _first_in_time(parts: Sequence[PathOfModel]) -> int:
 def _scaled_alone(
     parts: Sequence[PathOfModel], survey: Survey, inputs: RangingInputs, first: int
 ) -> tuple[dict[int, ScaledModel], dict[int, str]]:
-    """The models whose scale their own ranges determine, and why those of others do not."""
+    """Return the models whose scale their own ranges determine, and for the other models the reason.
+
+    Both are by the models' indices in ``parts``. The first model must be among the scaled ones, else a GeometryError
+    is raised.
+    """
     scaled: dict[int, ScaledModel] = {}
     reasons: dict[int, str] = {}
     for k, part in enumerate(parts):
@@ -147,7 +158,10 @@ def _scaled_alone(
 
 
 def _alone(part: PathOfModel, survey: Survey, inputs: RangingInputs, *, has_first_camera: bool) -> ScaledModel:
-    """A model by its own ranges. For one without the first camera, anchors given in its frame are those of a site."""
+    """Scale a model by its own ranges.
+
+    For a model without the first photo, anchors in that photo's frame are like anchors in a site frame.
+    """
     frame, tape = inputs.anchor_frame, inputs.tape
     if not has_first_camera:
         frame = "site" if frame == "first_camera" else frame
@@ -162,7 +176,7 @@ def _alone(part: PathOfModel, survey: Survey, inputs: RangingInputs, *, has_firs
 
 
 def _assembled(parts: Sequence[PathOfModel], first_from_sfm: Sequence[Similarity]) -> PathOfModel:
-    """All of them in the world of the first."""
+    """Return all models and paths as one, in the world of the first."""
     if len(parts) == 1:
         return parts[0]
     moved = [
