@@ -1,10 +1,11 @@
-"""What has changed between two surveys of one site.
+"""Show what has changed between two surveys of one site.
 
-    python compare_two_surveys.py RESULT_FOLDER_BEFORE RESULT_FOLDER_AFTER [CHANGES.ply]
+python compare_two_surveys.py RESULT_FOLDER_BEFORE RESULT_FOLDER_AFTER [CHANGES.ply]
 
-Both must be in the site frame of the same anchors, so that no alignment is needed, or allowed to hide anything. Prints
-how far the points of the second map are from the nearest of the first, next to what the two scales leave open, and
-writes the points that are further than that (red) with the others (grey).
+Both results must be in the site frame of the same anchors: they are compared as they are, because an alignment could
+hide a change. Prints the distances from the points of the second map to the nearest points of the first, next to the
+uncertainty of the two scales. Writes the points that lie further away than that uncertainty in red, and all others in
+grey.
 """
 
 from __future__ import annotations

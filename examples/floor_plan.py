@@ -1,10 +1,10 @@
-"""A floor plan with dimensions from a metric map (needs matplotlib).
+"""Draw a floor plan with dimensions from a metric map (needs matplotlib).
 
-    python floor_plan.py RESULT_FOLDER PLAN.png [LOWEST_M HIGHEST_M]
+python floor_plan.py RESULT_FOLDER PLAN.png [LOWEST_M HIGHEST_M]
 
-Shows the map's points between two heights, seen from above, the camera's path and the anchors, and the extent of it
-all in metres with the uncertainty of the scale. Without heights the middle half of the points is taken, which leaves
-out most of floor and ceiling.
+Shows, from above, the map's points between two heights, the camera's path, the anchors, and the overall length and
+width in metres with the uncertainty of the scale. Without heights, the middle half of the points by height is drawn,
+which leaves out most of the floor and the ceiling.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def main() -> None:
     model = result.read_metric_model()
     if model is None:
         sys.exit(f"{folder}: no metric model")
-    # A site frame has z up by custom; any other map is made level by what its cameras hold for up.
+    # In a site frame z points up by convention. Any other map is levelled by the orientation of its cameras.
     options = ExportOptions(frame="result" if result.summary.frame == "site" else "level")
     map_ = in_frame(MetricMap(model, result.timestamps_s, result.anchor_positions_m), options)
     points = np.array([point.xyz for point in map_.reconstruction.points3D.values()])
@@ -60,7 +60,7 @@ def main() -> None:
 
 
 def draw_dimension(axes: Axes, corner: Array, interval: tuple[float, float], axis: int, relative_stddev: float) -> None:
-    """An arrow below (or left of) everything, and its length."""
+    """Draw a dimension arrow with its length below the map, or left of it."""
     start, end = corner - 0.4, corner - 0.4
     start[axis], end[axis] = interval
     axes.annotate("", (end[0], end[1]), (start[0], start[1]), arrowprops={"arrowstyle": "<->"})

@@ -1,10 +1,10 @@
-"""Metric input for 3D Gaussian splatting: undistorted photos and a model in metres, z up.
+"""Prepare metric input for 3D Gaussian splatting: undistorted photos and a model in metres, z up.
 
-    python gaussian_splatting.py RESULT_FOLDER OUTPUT_FOLDER [PHOTOS_FOLDER]
+python gaussian_splatting.py RESULT_FOLDER OUTPUT_FOLDER [PHOTOS_FOLDER]
 
 Give OUTPUT_FOLDER/undistorted to any trainer that takes COLMAP data (images/ and sparse/0); what it learns is then in
-metres. Trainers that recentre and rescale scenes must be told not to: nerfstudio and gsplat by
-``--auto-scale-poses False --center-method none``, and so on.
+metres. Some trainers recentre and rescale scenes unless they are told not to: for nerfstudio and gsplat, pass
+``--auto-scale-poses False --center-method none``.
 """
 
 from __future__ import annotations

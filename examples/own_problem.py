@@ -1,8 +1,8 @@
-"""Add range residuals to a bundle adjustment of your own: the cost functions alone.
+"""Add range residuals to a bundle adjustment of your own, using only the cost functions.
 
     python examples/own_problem.py sparse/0
 
-Every photo gets one made-up range to an anchor at (1, 2, 0); put your own in their place.
+Every photo gets one made-up range to an anchor at (1, 2, 0). Replace these by your own ranges.
 """
 
 import sys
@@ -19,7 +19,7 @@ tag_in_cam_m = np.zeros(3)
 config = pycolmap.BundleAdjustmentConfig()
 for image_id in reconstruction.reg_image_ids():
     config.add_image(image_id)
-# COLMAP's usual gauge fixes the scale, and with it would cancel the ranges.
+# COLMAP's usual gauge fixes the scale, so that the ranges could not change it.
 config.fix_gauge(pycolmap.BundleAdjustmentGauge.UNSPECIFIED)
 adjuster = pycolmap.create_default_ceres_bundle_adjuster(
     pycolmap.BundleAdjustmentOptions(print_summary=False), config, reconstruction

@@ -1,8 +1,8 @@
-"""Take an existing COLMAP model to metres with a UWB log and anchors whose positions nobody knows.
+"""Scale an existing COLMAP model to metres with a UWB log and anchors at unknown positions.
 
     python examples/scale_existing_model.py sparse/0 images.csv uwb.csv metric/0
 
-The log is canonical CSV (timestamp_s,anchor_id,range_m), images.csv has image_name,timestamp_s on the same clock.
+The log is canonical CSV (timestamp_s,anchor_id,range_m). images.csv has image_name,timestamp_s on the same clock.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""A whole batch: surveys in processes of this machine, some of which are killed in mid-work, and on a scheduler."""
+"""Whole batches: surveys in processes of this machine, some of which are killed while they work, and on a scheduler."""
 
 from __future__ import annotations
 
@@ -49,13 +49,13 @@ method = "hierarchical"
 def surveys(photo_run: PhotoRun, tmp_path: Path) -> Path:
     """Two surveys, the first of which is mapped already.
 
-    The second is to be mapped otherwise, and wants to know more of the scale than there is to know.
+    The second needs another mapping, and asks for a scale more certain than its data allow.
     """
     for name in NAMES:
         folder = shutil.copytree(photo_run.survey.folder, tmp_path / name)
         (folder / "out" / "result.json").unlink()
         log = (folder / "uwb.csv").read_text().splitlines(keepends=True)
-        (folder / "uwb.csv").write_text("".join([log[0], *log[1::3]]))  # quicker
+        (folder / "uwb.csv").write_text("".join([log[0], *log[1::3]]))  # a third of the ranges, to be quicker
         text = (folder / "survey.toml").read_text().replace('time_offset = "auto"', "time_offset = 2.35")
         text = text.replace("[report]", "[report]\nenabled = false")
         scale = "max_relative_stddev = 1e-6" if name == "east" else ""
@@ -69,7 +69,7 @@ def surveys(photo_run: PhotoRun, tmp_path: Path) -> Path:
 @contextmanager
 def batch(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
     command = [sys.executable, "-m", "rangesfm", "batch", *arguments]
-    # A session of its own, as from a terminal, whose Ctrl-C goes to all processes of the group.
+    # A session of its own, as a terminal has one, so that Ctrl-C goes to all processes of the group.
     process = subprocess.Popen(
         command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
@@ -81,14 +81,15 @@ def batch(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def survey_process(folder: Path, batch: subprocess.Popen[str]) -> psutil.Process:
-    """That of the first survey which writes to its folder, held still in mid-work."""
+    """Suspend the process of the first survey that writes to its folder, and return it."""
     while batch.poll() is None:
         for name in NAMES:
             try:
                 found = psutil.Process(json.loads((folder / name / "out" / LOCK_NAME).read_text())["pid"])
                 found.suspend()
                 return found
-            except (OSError, ValueError, psutil.Error):  # there is none, it is being written, or it is over
+            # no such process, a lock file half-written, or the process has ended
+            except (OSError, ValueError, psutil.Error):
                 pass
         time.sleep(0.02)
     pytest.fail(f"it has ended\n{batch.communicate()}")
@@ -100,12 +101,12 @@ def rows_of(folder: Path) -> dict[str, dict[str, str]]:
 
 
 def left_over(folder: Path) -> list[Path]:
-    """What is in the making, hidden in whatever folder."""
+    """List unfinished files and folders, which have hidden names, wherever they are."""
     return [path for path in folder.rglob(".*") if path.name != PRIVATE_NAME] + [*folder.rglob("parts/*")]
 
 
 def ports_of(process: psutil.Process) -> list[object]:
-    """Where it and its children can be spoken to."""
+    """List the sockets on which this process and its children listen."""
     of_all = [process, *process.children(recursive=True)]
     return [socket.laddr for one in of_all for socket in one.net_connections() if socket.status == psutil.CONN_LISTEN]
 
@@ -114,7 +115,8 @@ def test_all_surveys_end_though_one_is_killed_and_others_fail_and_nothing_is_ope
     surveys: Path, photo_run: PhotoRun
 ) -> None:
     files = [f"{name}/survey.toml" for name in NAMES]
-    sprung = set_traps(surveys)  # what every process of the batch would find in its working folder
+    # modules that every process of the batch would import from its working folder if it looked there
+    sprung = set_traps(surveys)
     with batch(surveys, "broken.toml", *files, "--num_workers", "2") as process:
         survey = survey_process(surveys, process)
         assert ports_of(psutil.Process(process.pid)) == []
@@ -222,7 +224,7 @@ def test_what_cannot_be_is_refused(
 
 @contextmanager
 def scheduler(scratch: Path, protocol: str, security: Security) -> Iterator[str]:
-    """The address of one with a worker, both in this process."""
+    """Start a Dask scheduler with one worker, both in this process, and yield its address."""
     with LocalCluster(
         n_workers=1,
         threads_per_worker=1,
@@ -268,7 +270,7 @@ def test_a_scheduler_with_certificates_speaks_only_to_who_has_one_of_them(tmp_pa
 
 
 def as_configured(security: Security, folder: Path) -> dict[str, str]:
-    """Dask's configuration of a client that has certificates, as files."""
+    """Dask's configuration of a client, with its certificates written to files."""
     for name in ("tls_ca_file", "tls_client_cert", "tls_client_key"):
         (folder / name).write_text(getattr(security, name))
     of_client = {f"distributed.comm.tls.client.{name}": str(folder / f"tls_client_{name}") for name in ("cert", "key")}

@@ -1,4 +1,4 @@
-"""How far a batch is, by what its workers tell."""
+"""The progress of a batch, from what its workers report."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_an_attempt_begins_anew_where_a_worker_was_killed(course: Course, clock:
     course.end(0, Status.DONE, "", 0, verdict="good")
     row = course.rows[0]
     assert (row.status, row.num_attempts, row.host, row.seconds) == (Status.DONE, 2, "two", 8)
-    course.tell(0, {"began_on": "late"})  # from a worker that was thought lost
+    course.tell(0, {"began_on": "late"})  # from a worker that was thought to be lost
     assert course.rows[0] == row
 
 
@@ -47,7 +47,8 @@ def test_time_left_is_that_of_those_that_are_done(course: Course, clock: Clock) 
     assert course.seconds_left() is None
     course.end(0, Status.DONE, "", 0)
     course.tell(2, {"began_on": "here"})
-    assert course.seconds_left() == pytest.approx((30 + 0 + 30) / 2)  # d waits, b is due, c has begun
+    # d waits, b should have ended by now, c has just begun
+    assert course.seconds_left() == pytest.approx((30 + 0 + 30) / 2)
     clock.now_s += 20
     assert course.seconds_left() == pytest.approx((30 + 0 + 10) / 2)
 

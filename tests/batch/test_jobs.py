@@ -1,4 +1,4 @@
-"""Which surveys a batch has, which it refuses before anything starts, and what each may use of a machine."""
+"""Which surveys a batch has, which of them it refuses before anything starts, and each one's share of the machine."""
 
 from __future__ import annotations
 
@@ -70,8 +70,8 @@ def test_names_of_files_may_hold_what_no_table_could(tmp_path: Path) -> None:
     ("options", "num_surveys", "num_cores", "memory_gb", "expected"),
     [
         (BatchOptions(), 16, 8, 64, (8, 1, 8)),
-        (BatchOptions(), 3, 8, 64, (3, 2, 21)),  # never more workers than surveys: the cores are theirs
-        (BatchOptions(), 16, 8, 8, (4, 2, 2)),  # memory for four
+        (BatchOptions(), 3, 8, 64, (3, 2, 21)),  # never more workers than surveys: the cores go to those
+        (BatchOptions(), 16, 8, 8, (4, 2, 2)),  # there is memory for four workers
         (BatchOptions(), 16, 8, 1, (1, 8, 1)),
         (BatchOptions(num_workers=2), 16, 8, 64, (2, 4, 32)),
         (BatchOptions(num_threads=4), 16, 8, 64, (2, 4, 32)),

@@ -1,4 +1,4 @@
-"""The table of a batch, in its three shapes."""
+"""The table of a batch, in its three formats."""
 
 from __future__ import annotations
 

@@ -1,11 +1,12 @@
-"""How long a million ranges take to find their places among a thousand keyframes.
+"""Measure how long it takes to place a million ranges on a path of a thousand keyframes.
 
     python -m tests.benchmarks.association [NUM_RANGES [NUM_KEYFRAMES]]
 
-The keyframes are a walk at 2 Hz; the ranges to eight anchors are spread over it, in order of time or in no order.
-Beside it stands what anything of the kind must do to the same data at least: sort the times and interpolate three
-coordinates linearly (numpy.argsort and numpy.interp). Times are the processor's, so that other work beside does not
-count; run it with OMP_NUM_THREADS=1. The last column is the largest distance of a place found from the true path.
+The keyframes are a walk at 2 Hz. The ranges to eight anchors are spread over it, either in order of time or shuffled.
+For comparison, the same data are processed by the least work that any such method needs: sorting the times and
+interpolating three coordinates linearly (numpy.argsort and numpy.interp). Times are processor times, so that other
+programs do not count; run it with OMP_NUM_THREADS=1. The last column is the largest distance of a found place from the
+true path.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
-"""How long many demo surveys take on several workers, beside one after another.
+"""Compare how long many demo surveys take on several workers and one after another.
 
 python -m tests.benchmarks.batch [--num_surveys 16] [--num_photos 40] [--small] [--num_workers 2] [--kill]
 
-Makes the surveys, runs each with ``rangesfm run`` one after another (all cores), then all with ``rangesfm batch`` from
-nothing, and prints the seconds of both (by the clock and of the processors), their ratio, the cores, and the machine's
-load before each. With ``--kill`` one worker is killed in mid-work, and the rows of the table are counted.
+Makes the surveys, runs each with ``rangesfm run`` one after another (all cores), then all of them with ``rangesfm
+batch`` from scratch. Prints the seconds of both (wall clock and processor time), their ratio, the number of cores, and
+the machine's load before each. With ``--kill`` one worker is killed while it works, and the rows of the table are
+counted.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from tests.simulated.small_demo import make_small_demo
 
 from rangesfm.demo.survey import TIME_OFFSET_S, make_demo_survey
 
-_FLAGS = ("--ranges_time_offset", str(TIME_OFFSET_S))  # short surveys leave it open
+_FLAGS = ("--ranges_time_offset", str(TIME_OFFSET_S))  # short surveys do not determine it
 
 
 def make_surveys(folder: Path, arguments: argparse.Namespace) -> list[Path]:
@@ -38,7 +39,7 @@ def make_surveys(folder: Path, arguments: argparse.Namespace) -> list[Path]:
 
 
 def seconds_of(folder: Path, *arguments: str, kill_after_s: float | None = None) -> float:
-    """Wall-clock time of a command, of which one worker may be killed meanwhile."""
+    """Return the wall-clock time of a command, and kill one of its workers meanwhile if asked."""
     begin = time.monotonic()
     process = subprocess.Popen(
         [sys.executable, "-m", "rangesfm", *arguments], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE
@@ -52,14 +53,14 @@ def seconds_of(folder: Path, *arguments: str, kill_after_s: float | None = None)
 
 
 def kill_a_worker(pid: int) -> None:
-    """One that has a survey: a child of the command with a child of its own."""
+    """Kill a worker that has a survey: a child of the command with a child of its own."""
     workers = [child for child in psutil.Process(pid).children() if child.children()]
     print(f"killing worker {workers[0].pid}", flush=True)
     workers[0].kill()
 
 
 def processor_seconds() -> float:
-    """Of all processes that have been waited for."""
+    """Return the processor time of all child processes that have ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 

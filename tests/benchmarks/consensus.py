@@ -1,4 +1,4 @@
-"""How long exact consensus over the scale takes for a million ranges, beside sorting as many numbers.
+"""Measure how long exact consensus over the scale takes for a million ranges, beside sorting as many numbers.
 
 python -m tests.benchmarks.consensus [NUM_RANGES]
 """
@@ -18,7 +18,7 @@ _SCALE = 2.0
 
 
 def range_problem(num: int) -> RangeProblem:
-    """Four anchors, noise of 0.1 m, every third range too long."""
+    """Ranges to four anchors with noise of 0.1 m, three in ten of them too long."""
     rng = np.random.default_rng(0)
     centers = rng.normal(size=(num, 3)) * [2.0, 2.0, 0.4]
     levers = 0.1 * rng.normal(size=(num, 3))

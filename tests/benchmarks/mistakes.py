@@ -1,9 +1,10 @@
-"""What the tests of mistakes cost beside the refinement: a hall with six surveyed anchors, and its model.
+"""Measure what the tests of mistakes cost beside the refinement, in a hall with six surveyed anchors.
 
     python -m tests.benchmarks.mistakes [--num_keyframes 600] [--num_ranges 60000]
 
-Processor time of both in one run: of a clean survey, of one with an anchor's coordinate typed wrong by a metre, and of
-one whose ranges to an anchor are half a metre longer from half of the time on. Nothing fails on a time.
+Prints the processor time of both for three surveys: a clean one, one with an anchor's coordinate typed wrong by a
+metre, and one whose ranges to an anchor are half a metre too long in the second half of the time. There is no limit on
+the times.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ HALL = SITES[0]
 
 
 def timed(work: Callable[..., Any], seconds: list[float]) -> Callable[..., Any]:
-    """The same work, with its processor time noted."""
+    """Wrap a function so that its processor time is appended to ``seconds``."""
 
     def run(*arguments: Any, **others: Any) -> Any:
         begin = time.process_time()
@@ -50,7 +51,7 @@ def timed(work: Callable[..., Any], seconds: list[float]) -> Callable[..., Any]:
 
 
 def write_survey(folder: Path, num_keyframes: int, num_ranges: int) -> tuple[Survey, RangeLog]:
-    """The model, the photos' times and the anchors; the survey, and the log that is to be written yet."""
+    """Write the model, the photos' times and the anchors; return the survey, and the log that is yet to be written."""
     end_s = PHOTO_INTERVAL_S * num_keyframes
     path = loop_path(end_s, center_m=(10, 7, 1.7), semi_axes_m=(7, 4.5), height_amplitude_m=0.4, num_turns=5)
     times = np.linspace(0.0, end_s - PHOTO_INTERVAL_S, num_keyframes)

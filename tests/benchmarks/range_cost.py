@@ -1,11 +1,11 @@
-"""What ranges cost in COLMAP's bundle adjustment: processor time of a solver iteration with them, against without.
+"""Measure what ranges add to COLMAP's bundle adjustment: the processor time of an iteration with and without them.
 
     python -m tests.benchmarks.range_cost [--num_rounds 9]
 
-600 keyframes in sequence with 200 observations each, one thread. Every round solves each variant twice, with few and
-with more iterations from the same perturbed start; the difference is what iterations cost, without the set-up. Rounds
-go through all variants in turn, so that whatever else the machine does falls on all alike; the medians over the rounds
-are printed. At one range a keyframe the ratio should be at most 1.05. Nothing fails on a time.
+600 keyframes in sequence with 200 observations each, one thread. Every round solves each variant twice from the same
+perturbed start, with few and with more iterations; the difference is the cost of the iterations, without the set-up.
+Each round goes through all variants, so that other load on the machine affects all alike. The medians over the rounds
+are printed. At one range per keyframe the ratio should be at most 1.05. There is no limit on the times.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ KEYFRAME_INTERVAL_S = 0.5
 RANGE_STDDEV_M = 0.1
 TAG_IN_CAM_M = (0.05, -0.12, -0.03)
 ANCHORS_M = {"A1": (50.0, 12.0, 3.0), "A2": (110.0, -15.0, 1.0), "A3": (180.0, 14.0, 0.5), "A4": (250.0, -12.0, 4.0)}
-# From the start chosen here all steps of these succeed, so that each iteration does the same work.
+# From this start every one of these steps succeeds, so that each iteration does the same work.
 FEW_ITERATIONS, MORE_ITERATIONS = 1, 6
 
 
 @dataclass(frozen=True)
 class Variant:
-    """Ranges to add: none if ``num_per_keyframe`` is 0."""
+    """Number of ranges to add per keyframe (0: none), and whether anchors are free."""
 
     num_per_keyframe: int
     anchors_are_free: bool
@@ -66,7 +66,7 @@ VARIANTS = (Variant(0, False), Variant(1, False), Variant(1, True), Variant(10, 
 
 @dataclass(frozen=True)
 class Solve:
-    """One solve: its processor time, and what the solver says about it."""
+    """One solve: its processor time, and what the solver reports about it."""
 
     seconds: float
     num_unsuccessful_steps: int
@@ -74,7 +74,7 @@ class Solve:
 
 
 class TimedAdjuster:
-    """A bundle adjuster that does a given number of iterations, and whose solve is timed."""
+    """A bundle adjuster that does a given number of iterations and takes the time of its solve."""
 
     def __init__(self, adjuster: pycolmap.CeresBundleAdjuster, num_iterations: int, solves: list[Solve]):
         self._adjuster = adjuster
@@ -98,7 +98,7 @@ class TimedAdjuster:
 
 @contextmanager
 def timed_solves(num_iterations: int) -> Iterator[list[Solve]]:
-    """Every bundle adjuster made inside the block is a timed one."""
+    """Make every bundle adjuster that is created inside the block a timed one."""
     make = pycolmap.create_default_ceres_bundle_adjuster
     solves: list[Solve] = []
 
@@ -148,7 +148,7 @@ def perturb(reconstruction: pycolmap.Reconstruction) -> None:
 
 
 def ranges_of(variant: Variant, path: CameraPath, model: SyntheticModel, trajectory: Trajectory) -> RangeObservations:
-    """The first of each keyframe's ranges is taken with its photo, the others before the next one."""
+    """Simulate ranges: the first of each keyframe is taken with its photo, the others before the next photo."""
     rate = max(variant.num_per_keyframe, 1) / KEYFRAME_INTERVAL_S / len(ANCHORS_M)
     simulated = simulate_ranges(path, ANCHORS_M, TAG_IN_CAM_M, Radio(rate_hz=rate, range_stddev_m=RANGE_STDDEV_M))
     wanted = ANCHORS_M if variant.num_per_keyframe else ()

@@ -1,4 +1,4 @@
-"""How long a log of a million lines takes to read, beside numpy and pandas.
+"""Measure how long a log of a million lines takes to read, beside numpy and pandas.
 
 python -m tests.benchmarks.read_log [NUM_LINES]
 """
@@ -21,7 +21,7 @@ _NUM_REPETITIONS = 5
 
 
 def write_log(path: Path, num: int) -> None:
-    """Eight anchors at 1 kHz, times since 1970 in microseconds, ranges in millimetres."""
+    """Write a log of eight anchors at 1 kHz, with times since 1970 in microseconds and ranges in millimetres."""
     random = np.random.default_rng(1)
     times = (1.7e9 + np.arange(num) * 1e-3 + random.uniform(0, 1e-3, num)).tolist()
     ranges = random.uniform(1, 50, num).tolist()
@@ -41,7 +41,7 @@ def best_of(read: Callable[[], object]) -> float:
 
 
 def contenders(path: Path) -> dict[str, Callable[[], object]]:
-    """What reads the same file; pandas only where it is installed."""
+    """Readers of the same file, by name; pandas only where it is installed."""
     readers: dict[str, Callable[[], object]] = {
         "rangesfm.read_ranges": lambda: read_ranges(path),
         "numpy.loadtxt, all numbers": lambda: np.loadtxt(path, delimiter=",", skiprows=1),

@@ -1,18 +1,18 @@
-"""Photos to a model, stage by stage, beside the same calls of pycolmap with all its threads.
+"""Measure the stages from photos to a model, beside the same calls of pycolmap with all its threads.
 
 python -m tests.benchmarks.reconstruction PHOTOS[:EVERY_NTH] ... [--num_threads 2] [--num_rounds 3] [--seed 0]
     [--camera_model OPENCV --camera_params 377,432,...]
 
-as ``DATA/room_env1/images:3 DATA/fountain/images plugin/rangesfm/demo/photos``. Of each folder, the photos in the order
-of their names, matched sequentially. Rounds of both take turns; printed are medians of the seconds by the clock and by
-all processors together (user and system, processes that were started included; less disturbed by whatever else the
-machine does), their ratios within each round (median, smallest and largest), and the machine's load. "all" is the whole
-call, from reading the photos to reading the models.
+PHOTOS are folders, for example ``DATA/room_env1/images:3 DATA/fountain/images plugin/rangesfm/demo/photos``. The photos
+of a folder are taken in the order of their names and matched sequentially. Each round measures both programs. Printed
+are the medians of the wall-clock seconds and of the processor seconds (user and system, child processes included; other
+load on the machine disturbs these less), their ratios within each round (median, smallest and largest), and the
+machine's load. "all" is the whole call, from reading the photos to reading the models.
 
-Last, matching alone by one process that is kept on one core, by one that is not, by ``--num_threads`` of them and by
-twice as many, on the same features; how many cores each keeps busy; and whether the matches are the same, row for row.
-A process matches in one thread and verifies in another, so that on two cores it is not much slower than two processes;
-how processes scale is told by the one on one core.
+The last table is about matching alone, on the same features: by one process bound to one core, by one that is not, by
+``--num_threads`` processes and by twice as many. It gives how many cores each keeps busy, and whether the matches are
+the same, row for row. A process matches in one thread and verifies in another, so on two cores it is not much slower
+than two processes. Compare with the process bound to one core to see how matching scales.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ STAGES = ("features", "matching", "mapping")
 
 @dataclass(frozen=True)
 class Effort:
-    """Seconds by the clock and by all processors together."""
+    """Seconds of wall-clock time and of processor time."""
 
     clock_s: float
     processor_s: float
@@ -72,7 +72,7 @@ def effort_of(work: Callable[[], object]) -> Effort:
 
 
 class StageEfforts(SilentProgress):
-    """Takes the time whenever a stage begins."""
+    """Record the time whenever a stage begins."""
 
     def __init__(self) -> None:
         self.marks: list[Effort] = []
@@ -85,7 +85,7 @@ class StageEfforts(SilentProgress):
 def by_pycolmap(
     photos: Path, names: Sequence[str], output: Path, camera: CameraOptions, num: int, seed: int
 ) -> list[Effort]:
-    """Its own calls, with the seed and the camera given."""
+    """Run pycolmap's own calls, with the given seed and camera."""
     database = output / "database.db"
     reader = pycolmap.ImageReaderOptions()
     if camera.model is not None and camera.params is not None:
@@ -121,12 +121,12 @@ def by_rangesfm(
     mapper = MapperOptions(matching="sequential", num_threads=num)
     stages, begin = StageEfforts(), Effort.so_far()
     reconstruct(photos, names, output, camera=camera, mapper=mapper, seed=seed, progress=stages)
-    marks = [begin, *stages.marks[1:], Effort.so_far()]  # what comes before the features is counted as theirs
+    marks = [begin, *stages.marks[1:], Effort.so_far()]  # what comes before the features counts as part of them
     return [*(end - start for start, end in pairwise(marks)), marks[-1] - begin]
 
 
 def match_anew(photos: Path, names: Sequence[str], database: Path, num_processes: int, seed: int) -> Effort:
-    """Of matching alone."""
+    """Match the photos anew, and return the effort of matching alone."""
     clear_matches(database)
     options = matching_options(MapperOptions(matching="sequential", num_threads=num_processes), len(names), seed)
     usable, log = usable_photos(photos, names), database.with_name("mapper.log")
@@ -136,7 +136,7 @@ def match_anew(photos: Path, names: Sequence[str], database: Path, num_processes
 
 @contextmanager
 def on_cores(num: int) -> Iterator[None]:
-    """Keep this thread, and the processes that it starts, on so many cores."""
+    """Restrict this thread, and the processes that it starts, to this number of cores."""
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, sorted(cores)[:num])
     try:

@@ -1,26 +1,28 @@
-"""Solvers of one and the same problem, side by side: time, memory and error of bundle adjustment with ranges.
+"""Compare solvers of the same bundle adjustment with ranges: time, memory and error.
 
     python -m tests.benchmarks.solvers [--num_keyframes 50 200 600 2000] [--num_ranges 1 10 100] [--num_rounds 3]
         [--solvers cpp free between]
 
-(GTSAM: ``pip install '.[benchmark]'``; left out where it is missing.) Keyframes in sequence with 200 observations
-each, features in at most 8 photos, stddev 0.5 px; ranges (stddev 0.1 m) from each keyframe to four anchors, Cauchy's
-loss on every one; first pose held, start perturbed. Who takes part:
+The problem: keyframes in sequence with 200 observations each, features in at most 8 photos, stddev 0.5 px; ranges
+(stddev 0.1 m) from each keyframe to four anchors, each with a Cauchy loss; the first pose is held and the start is
+perturbed. The solvers:
 
     none      pycolmap's bundle adjustment without ranges, with its own trust region
     cpp       rangesfm's costs, the ranges of a keyframe to an anchor in one residual block
     free      the same with unknown anchors
     between   the same ranges spread between the keyframes, each acting on two poses
-    python    the residual of `cpp` as a Python cost function, one a range
-    gtsam     projection and range factors, Levenberg-Marquardt with its defaults
+    python    the residual of `cpp` as a Python cost function, one per range
+    gtsam     projection and range factors, Levenberg-Marquardt with its defaults (``pip install '.[benchmark]'``;
+              left out where it is not installed)
     scipy     least_squares with the sparsity of the Jacobian; up to 50 keyframes, one observation in five
 
-Each case is a process of its own, one thread, in turn with the others and as often as there are rounds; times are
-processor time, medians. An iteration is the difference between six and one, from the same start, tried three times, and
-again until 3 s have gone. The total is from the model in memory to the solution: problem built and solved. Ceres takes
-its direct solver for all, as the refinement does; pycolmap by itself takes the iterative one beyond 1000 photos, which
-is slower here. Memory is the peak of the process beyond what the imports took: model, problem and solver. The RMSE is
-of the keyframe centres, without alignment. Nothing fails on a time.
+Each case runs in a process of its own with one thread. The solvers take turns in each round. Times are medians of
+processor time. The time of an iteration is that of six iterations minus that of one, from the same start, divided by
+the difference; this is tried three times, and again until 3 s have passed. The total is the time from the model in
+memory to the solution: building the problem and solving it. Ceres uses its direct solver for all, as the refinement
+does; pycolmap by itself takes the iterative one beyond 1000 photos, which is slower here. Memory is the peak of the
+process beyond what the imports took: model, problem and solver. The RMSE is of the keyframe centres, without alignment.
+There is no limit on the times.
 """
 
 from __future__ import annotations
@@ -64,13 +66,13 @@ MIN_TRIALS, MIN_SECONDS = 3, 3.0
 TOLERANCE = 1e-8
 SOLVERS = ("none", "cpp", "free", "between", "python", "gtsam", "scipy")
 MAX_SCIPY_KEYFRAMES, SCIPY_THINNING = 50, 5
-# A Python cost function takes some 20 microseconds: more would measure patience.
+# A Python cost function takes some 20 microseconds: more ranges would take too long.
 MAX_PYTHON_RANGES = 60_000
 
 
 @dataclass(frozen=True)
 class Case:
-    """What one process does."""
+    """The solver and the size of the problem, for one process."""
 
     solver: str
     num_keyframes: int
@@ -79,7 +81,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What it measured; times in seconds."""
+    """What one process measured; times in seconds."""
 
     iteration: float
     build: float
@@ -92,7 +94,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Ranges:
-    """n ranges of stddev ``RANGE_STDDEV_M``, at keyframes or between each and the next."""
+    """Ranges of stddev ``RANGE_STDDEV_M``, at keyframes or between each and the next."""
 
     keyframe: npt.NDArray[np.int64]
     weight: Array
@@ -152,7 +154,7 @@ def perturb(reconstruction: pycolmap.Reconstruction, rng: np.random.Generator) -
 
 
 def write_survey(survey: Survey, folder: Path) -> None:
-    """As a COLMAP model and as arrays, so that each solver starts from what it likes best."""
+    """Write a survey as a COLMAP model and as arrays, so that each solver starts from the form that suits it best."""
     (folder / "model").mkdir()
     survey.reconstruction.write(folder / "model")
     images = survey.reconstruction.images
@@ -181,7 +183,8 @@ def ranges_in(arrays: Any, kind: str) -> Ranges:
     return Ranges(*(arrays[f"{kind}_{name}"] for name in Ranges.__dataclass_fields__))
 
 
-# One solve: number of iterations at most -> iterations, build and solve seconds, final cost and centres.
+# A solver: maps the largest number of iterations to the iterations done, build seconds, solve seconds, final cost and
+# centres.
 Solve = Callable[[int], tuple[int, float, float, float, Array]]
 
 
@@ -189,7 +192,8 @@ def ceres_solver(case: Case, folder: Path, arrays: Any) -> Solve:
     ceres.check_compatibility()
 
     def solve(max_num_iterations: int) -> tuple[int, float, float, float, Array]:
-        reconstruction = pycolmap.Reconstruction(folder / "model")  # not a copy of one: memory is measured
+        # read from disk rather than copied, because memory is measured
+        reconstruction = pycolmap.Reconstruction(folder / "model")
         start = time.process_time()
         adjuster = bundle_adjuster(reconstruction, case, max_num_iterations)
         blocks = add_ranges(adjuster, reconstruction, case, arrays)
@@ -218,7 +222,8 @@ def bundle_adjuster(
     if case.solver != "none":
         solver.initial_trust_region_radius = 1e10
     options.ceres.solver_options = solver
-    # Direct for all, as in the refinement: COLMAP's iterative one, from 1000 photos on, creeps along a path.
+    # The direct solver for all, as in the refinement: the iterative one, which COLMAP takes from 1000 photos on,
+    # converges slowly along a path.
     options.ceres.max_num_images_direct_sparse_cpu_solver = max(1000, reconstruction.num_reg_images())
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in reconstruction.reg_image_ids():
@@ -453,7 +458,7 @@ def measure(case: Case, folder: Path) -> Outcome:
 
 
 def iteration_seconds(solve: Solve) -> float:
-    """Median of as many trials as it takes to know a short time."""
+    """Return the median time of an iteration, repeating short trials until the time is known well enough."""
     trials: list[float] = []
     start = time.process_time()
     while len(trials) < MIN_TRIALS or time.process_time() - start < MIN_SECONDS:

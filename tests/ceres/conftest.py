@@ -1,4 +1,4 @@
-"""A small bundle adjustment to put residuals into."""
+"""A small bundle adjustment to which tests add residuals."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def reconstruction() -> pycolmap.Reconstruction:
 
 @pytest.fixture
 def adjuster_of() -> AdjusterOf:
-    """Makes a bundle adjuster over all images, with fixed intrinsics and one thread."""
+    """Return a function that makes a bundle adjuster over all images, with fixed intrinsics and one thread."""
     return _adjuster_of
 
 
@@ -53,7 +53,7 @@ PoseBlock: TypeAlias = Callable[[pycolmap.Reconstruction, int], npt.NDArray[np.f
 
 @pytest.fixture
 def pose_block() -> PoseBlock:
-    """A frame's pose as the solver has it."""
+    """Return a function that gives a frame's pose in the array that the solver changes."""
     return _pose_block
 
 
@@ -66,7 +66,7 @@ def _pose_block(reconstruction: pycolmap.Reconstruction, frame_id: int) -> npt.N
 
 @pytest.fixture
 def unchecked() -> Iterator[None]:
-    """Nothing has been checked yet in this process, and will not have been."""
+    """Forget the result of the compatibility check before and after the test."""
     check_compatibility.cache_clear()
     yield
     check_compatibility.cache_clear()

@@ -1,4 +1,4 @@
-"""What type checkers read of the compiled part: ``python -m tests.ceres.stub`` makes it from the docstrings anew."""
+"""The type stub of the compiled part: ``python -m tests.ceres.stub`` makes it anew from the docstrings."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import tempfile
 from pathlib import Path
 
 STUB = Path(__file__).parents[2] / "plugin" / "rangesfm" / "_cpp.pyi"
-# With pyceres there first, what the functions return goes by its name.
+# pyceres is imported first, so that the stub names its classes as return types.
 _GENERATE = "import sys, pyceres, pybind11_stubgen; pybind11_stubgen.main(['rangesfm._cpp', '-o', sys.argv[1]])"
 
 
 def compiled_part_stub() -> str:
-    """The stub, without the docstrings and values that the compiled part has itself."""
+    """Return the stub, without the docstrings and values that the compiled part has itself."""
     with tempfile.TemporaryDirectory() as folder:
         subprocess.run([sys.executable, "-c", _GENERATE, folder], check=True)
         stub = ast.parse((Path(folder) / "rangesfm" / "_cpp.pyi").read_text(encoding="utf-8"))

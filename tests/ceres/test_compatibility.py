@@ -1,4 +1,4 @@
-"""Whether what is installed fits together."""
+"""The check that the installed packages fit together."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_the_gate_opens_for_what_is_installed() -> None:
 
 @pytest.mark.usefixtures("unchecked")
 def test_the_gate_stays_shut_where_types_are_not_shared(monkeypatch: pytest.MonkeyPatch) -> None:
-    # What pybind11 does with a type that its internals do not know.
+    # pybind11 raises this for a type that it does not know.
     def unknown_type(**_: object) -> pyceres.CostFunction:
         raise TypeError("Unable to convert function return value to a Python type! The signature was\n\t...")
 
@@ -49,7 +49,7 @@ def test_the_gate_stays_shut_where_a_known_cost_comes_out_wrong(monkeypatch: pyt
 
 
 def test_the_compiled_part_needs_no_library_that_pycolmap_does_not_need_too() -> None:
-    """Ceres is linked in, and never the system's: else two of them would meet."""
+    """Ceres is linked in statically: a second Ceres library of the system would conflict with pycolmap's."""
     readelf = subprocess.run(["readelf", "-dW", _cpp.__file__], capture_output=True, text=True, check=True)
     needed = set(re.findall(r"NEEDED.*\[(.+?)\.so", readelf.stdout))
     assert needed <= {"libstdc++", "libm", "libgcc_s", "libc", "ld-linux-x86-64", "ld-linux-aarch64"}

@@ -1,4 +1,4 @@
-"""The compiled cost functions, each for itself."""
+"""The compiled cost functions, one at a time."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ def random_pose(rng: np.random.Generator, extent: float) -> Array:
 
 
 def moved(block: Array, step: Array) -> Array:
-    """A block after a step in its tangent space; of a pose as COLMAP's manifold has it (Eigen's quaternions).
+    """Return a block after a step in its tangent space.
 
-    Ceres turns by twice the step's length, from the left.
+    Poses move as on COLMAP's manifold (Eigen's quaternions): Ceres turns by twice the step's length, from the left.
     """
     if block.size != 7:
         return block + step
@@ -56,7 +56,7 @@ def tangent_jacobian(function: Callable[[Array], Array], block: Array, step_size
 
 
 def tangent_basis(block: Array) -> Array:
-    """(block.size, tangent size): how a block moves with a step in its tangent space, at no step."""
+    """(block.size, tangent size) derivative of a block by a step in its tangent space, at step zero."""
     if block.size != 7:
         return np.eye(block.size)
     x, y, z, w = block[:4]
@@ -178,8 +178,9 @@ def test_jacobian_in_pycolmaps_problem_is_the_finite_difference_on_its_manifold(
 
 
 def test_residual_is_the_hand_computed_one() -> None:
-    # The camera at (1, 2.5, 0), turned by 90 degrees about z, the tag half a metre along its x axis: at (1, 2, 0),
-    # 5 m from the anchor. Read 0.25 m too long, that is 2.5 stddevs of 0.1 m more than the 5 m measured.
+    # The camera is at (1, 2.5, 0), turned by 90 degrees about z; the tag is half a metre along its x axis, at (1, 2,
+    # 0), 5 m from the anchor. The bias of 0.25 m adds to the predicted range: that is 2.5 stddevs of 0.1 m more than
+    # the 5 m measured.
     cost = range_cost(range_m=5.0, tag_in_cam_m=[0.5, 0.0, 0.0], stddev_m=0.1)
     pose = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5), 2.5, -1.0, 0.0])
     residuals, _ = cost.evaluate(pose, np.array([4.0, 6.0, 0.0]), np.array([0.25]))

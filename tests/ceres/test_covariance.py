@@ -125,7 +125,7 @@ def joint(
 
 
 def covariance_of_all(problem: Any, blocks: Sequence[Array]) -> Array:
-    """The inverse of the whole normal equations."""
+    """Return the inverse of the whole normal equations."""
     jacobian = tangent_jacobian(problem, blocks).toarray()
     covariance: Array = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-14, hermitian=True)
     return covariance
@@ -182,7 +182,7 @@ def test_residuals_that_err_together_count_as_their_covariance_says() -> None:
     num = survey.problem.num_residuals()
     rows = np.arange(num - len(survey.biases) - num_ranges, num - len(survey.biases))
     rng = np.random.default_rng(0)
-    # Each on its own with a variance of 1.7, and three errors that they share.
+    # Each range has an error of its own with a variance of 1.7, and there are three errors that all share.
     by_error = np.hstack([np.eye(num_ranges), rng.standard_normal((num_ranges, 3))])
     of_errors = np.diag(np.concatenate([np.full(num_ranges, 1.7), np.ones(3)]))
     errors = ResidualErrors(rows, csr_array(by_error), of_errors)
@@ -224,7 +224,7 @@ def test_motions_of_the_map_that_nothing_holds_are_counted(num_anchors: int, num
 
 
 def test_a_free_map_errs_least_under_inner_constraints() -> None:
-    """The pseudo-inverse of what is left of the normal equations without the points."""
+    """The covariance is the pseudo-inverse of the normal equations reduced by the points."""
     survey = joint(model(), num_anchors=1)
     found = joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases[:1])
     jacobian = tangent_jacobian(survey.problem, variable(survey)).toarray()
@@ -243,7 +243,7 @@ def test_it_agrees_with_colmaps_own_where_there_are_no_ranges() -> None:
     adjuster = bundle_adjuster(reconstruction, hold_first=True)
     frames = sorted(reconstruction.reg_frame_ids())
     other = pose_of(reconstruction.frame(frames[4])).params
-    adjuster.problem.set_parameter_block_constant(other)  # the scale
+    adjuster.problem.set_parameter_block_constant(other)  # this pose and the first, which is held, fix the scale
     found = joint_covariance(adjuster.problem, reconstruction)
     options = pycolmap.BACovarianceOptions(damping=0.0)
     theirs = pycolmap.estimate_ba_covariance_from_problem(options, reconstruction, adjuster.problem)
@@ -296,7 +296,7 @@ def test_an_anchor_that_its_ranges_do_not_determine_is_named() -> None:
 
 
 def test_surveys_err_as_the_covariance_says() -> None:
-    """Monte Carlo: the errors of solved surveys, squared and in variances, average 1."""
+    """Monte Carlo: the normalized squared errors of solved surveys average 1."""
     rng = np.random.default_rng(7)
     times = np.arange(NUM_FRAMES, dtype=np.float64)
     truth = orbit_path(1.4 * NUM_FRAMES).centers(times)
@@ -317,7 +317,8 @@ def test_surveys_err_as_the_covariance_says() -> None:
         scales.append((np.sum(errors * middle) / np.sum(middle**2) / found.relative_scale_stddev) ** 2)
         similarity = np.linalg.lstsq(motions, errors.ravel(), rcond=None)[0]
         maps.append(similarity @ np.linalg.solve(found.similarity, similarity) / 7)
-    # 60 runs: about 180 degrees of freedom of each center and anchor, 60 of the scale, 420 of scale, turn and shift.
+    # 60 runs give about 180 degrees of freedom for each centre and anchor, 60 for the scale, and 420 for scale,
+    # rotation and translation.
     assert np.mean(centers) == pytest.approx(1.0, abs=0.2)
     assert np.mean(anchors) == pytest.approx(1.0, abs=0.2)
     assert np.mean(scales) == pytest.approx(1.0, abs=0.4)
@@ -325,7 +326,7 @@ def test_surveys_err_as_the_covariance_says() -> None:
 
 
 def test_a_motion_that_only_rounding_keeps_from_moving_nothing_is_none() -> None:
-    """A turn moves no anchor at the origin, if this is all that can move."""
+    """A turn about the origin does not move an anchor there, even if rounding puts it 1e-17 m away."""
     counts = []
     for at in (np.zeros(3), np.array([1e-17, 2e-17, -1e-17])):
         survey = joint(model(), num_anchors=0)
@@ -340,7 +341,7 @@ def test_a_motion_that_only_rounding_keeps_from_moving_nothing_is_none() -> None
 
 
 def photos_alone(*, hold_first: bool = False) -> tuple[pycolmap.Reconstruction, pycolmap.CeresBundleAdjuster]:
-    """Where the photos have it."""
+    """Return the model adjusted to its photos alone, without ranges, and its adjuster."""
     reconstruction = model()
     adjuster = bundle_adjuster(reconstruction, hold_first=hold_first)
     adjuster.solve()
@@ -348,8 +349,10 @@ def photos_alone(*, hold_first: bool = False) -> tuple[pycolmap.Reconstruction, 
 
 
 def ratios(reconstruction: pycolmap.Reconstruction) -> tuple[Array, Array]:
-    """Logarithms of how much farther the second and the last frame are from the middle one than the first is, and
-    their derivative by the centres: where the map is and how large does not matter to them.
+    """Return two logarithms of ratios of distances, and their derivative by the centres.
+
+    The distances are those of the second and of the last frame from the middle one, over that of the first frame. They
+    do not depend on the map's position, orientation or scale.
     """
     frames = sorted(reconstruction.reg_frame_ids())
     centers = np.array([pose_of(reconstruction.frame(i)).inverse().translation for i in frames])
@@ -400,7 +403,9 @@ def test_photos_say_how_far_a_map_was_moved_from_where_they_have_it() -> None:
 
 
 def test_priors_may_err_otherwise_than_the_residuals_of_photos() -> None:
-    """With priors as good as the covariance's unit has them, or all other residuals worse."""
+    """If priors err less than their stddevs say, the centres are more certain; if they err as they say, nothing
+    changes.
+    """
     survey = joint(model())
     rows = np.zeros(0, dtype=np.int64)
     nothing = csr_array((0, 1))

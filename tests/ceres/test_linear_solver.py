@@ -35,13 +35,13 @@ def walk(num: int, num_observations: int) -> SyntheticModel:
 
 
 def overlaps_of(pairs: npt.NDArray[np.int64], num: int) -> csr_array:
-    """(n, n) of (k, 2) pairs of photos, each pair once."""
+    """Return the (n, n) overlaps given by (k, 2) pairs of photos, each pair once."""
     ones = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(num, num))
     return csr_array(ones + ones.T)
 
 
 def each_with_the_next(num: int, num_next: int, seed: int | None = None) -> csr_array:
-    """Overlaps along a path, of which the photos may come in any order."""
+    """Return the overlaps along a path; with a seed, the photos are numbered in random order."""
     first = np.repeat(np.arange(num), num_next)
     second = first + np.tile(np.arange(1, num_next + 1), num)
     pairs = np.stack([first, second], axis=1)[second < num]

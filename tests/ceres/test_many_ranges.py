@@ -1,4 +1,4 @@
-"""A whole log of ranges in a bundle adjustment: the same as one by one, in fewer blocks."""
+"""A whole log of ranges in a bundle adjustment: the same as adding them one by one, in fewer blocks."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ LOSS_SCALE = 2.0
 
 @pytest.fixture
 def ranges() -> PlacedRanges:
-    """At and between the keyframes, in no order."""
+    """Ranges at and between the keyframes, in random order."""
     rng = np.random.default_rng(0)
     before = rng.integers(NUM_POSES - 1, size=NUM_RANGES)
     after = before + rng.integers(2, size=NUM_RANGES)
@@ -88,7 +88,7 @@ def cost_of(adjuster: pycolmap.CeresBundleAdjuster) -> float:
 
 
 def initial_cost(adjuster: pycolmap.CeresBundleAdjuster) -> float:
-    """As the solver finds it."""
+    """Return the cost of the start as the solver reports it."""
     adjuster.options.ceres.solver_options.max_num_iterations = 0
     summary = adjuster.solve()
     assert isinstance(summary, pycolmap.CeresBundleAdjustmentSummary)
@@ -96,7 +96,7 @@ def initial_cost(adjuster: pycolmap.CeresBundleAdjuster) -> float:
 
 
 def gradient_norm(adjuster: pycolmap.CeresBundleAdjuster) -> float:
-    """Of the whole problem, so that it depends on every residual and Jacobian."""
+    """Return the gradient's norm of the whole problem, which depends on every residual and Jacobian."""
     jacobian = adjuster.problem.evaluate_jacobian()
     rows = np.repeat(np.arange(jacobian.num_rows), np.diff(jacobian.rows))
     residuals = np.asarray(adjuster.problem.evaluate_residuals())
@@ -113,7 +113,8 @@ def test_cost_and_gradient_are_those_of_the_ranges_one_by_one(
     add_one_by_one(one_by_one, ranges, blocks, pyceres.CauchyLoss(LOSS_SCALE))
     add_ranges(together, ranges, blocks, loss_scale=LOSS_SCALE)
     assert gradient_norm(together) == pytest.approx(gradient_norm(one_by_one), rel=1e-9)
-    # With one of Ceres' losses, half the squares of what the problem calls residuals are not the cost.
+    # The solver's initial cost is used because with one of Ceres' losses the cost is not half the sum of the squared
+    # residuals.
     assert cost_of(together) == pytest.approx(initial_cost(one_by_one), rel=1e-9)
     assert 0 < together.problem.num_residual_blocks() - before < NUM_RANGES / 2
 
@@ -196,7 +197,7 @@ def test_no_ranges_are_no_blocks(
 def test_the_tag_hangs_on_the_rig_frame_whichever_cameras_the_rig_has(
     adjuster_of: AdjusterOf, pose_block: PoseBlock
 ) -> None:
-    """Three cameras in a rig, and the scale 4 % off: ranges from the rig frame put it right."""
+    """With three cameras in a rig and the scale 4 % off, ranges from the rig frame put the scale right."""
     pycolmap.set_random_seed(0)
     options = pycolmap.SyntheticDatasetOptions(
         num_rigs=1, num_cameras_per_rig=3, num_frames_per_rig=8, num_points3D=80, track_length=8
@@ -236,6 +237,6 @@ def test_the_tag_hangs_on_the_rig_frame_whichever_cameras_the_rig_has(
 
 
 def sensor_poses(reconstruction: pycolmap.Reconstruction) -> list[pycolmap.Rigid3d]:
-    """Of the cameras in their rig, but for the reference camera, which is the rig frame."""
+    """Return the poses of the cameras in their rig, without the reference camera, which is the rig frame."""
     (rig,) = reconstruction.rigs.values()
     return [rig.sensor_from_rig(sensor) for sensor in rig.non_ref_sensors]

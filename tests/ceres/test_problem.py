@@ -56,7 +56,7 @@ def test_blocks_that_the_solver_cannot_work_on_in_place_are_refused(
 def test_a_block_given_twice_is_refused(
     reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf, pose_block: PoseBlock
 ) -> None:
-    # Ceres would end the process.
+    # Given the same block twice, Ceres would abort the process.
     adjuster, pose = adjuster_of(reconstruction), pose_block(reconstruction, 1)
     cost = distance_cost(distance_m=1.0, stddev_m=0.1, a_in_cam_m=[0, 0, 0], b_in_cam_m=[1, 0, 0])
     with pytest.raises(ValueError, match="given twice"):
@@ -88,7 +88,7 @@ def test_a_normal_prior_is_off_by_its_stddevs(reconstruction: pycolmap.Reconstru
 def test_a_normal_prior_that_means_nothing_is_refused(
     reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf, mean: list[float], stddev: float | list[float]
 ) -> None:
-    # Ceres would end the process.
+    # Given such a prior, Ceres would abort the process.
     with pytest.raises(ValueError, match=r"prior of|broadcast"):
         add_normal_prior(adjuster_of(reconstruction), np.zeros(2), mean, stddev)
 
@@ -161,7 +161,7 @@ def test_a_pose_that_the_adjuster_holds_stays_where_it_is(
 def test_a_pose_that_the_adjuster_holds_is_no_part_of_its_problem_until_a_range_makes_it_one(
     reconstruction: pycolmap.Reconstruction, hold: bool, adjuster_of: AdjusterOf, pose_block: PoseBlock
 ) -> None:
-    """What ``add_residual_block`` is there for, shown on the bare problem; it tells if pycolmap mends it."""
+    """This is why ``add_residual_block`` exists, shown on the bare problem; the test fails if pycolmap changes it."""
     pose = pose_block(reconstruction, 1)
     before = pose.copy()
     adjuster = adjuster_of(reconstruction, constant_frame_id=1)
@@ -211,7 +211,9 @@ def test_what_is_kept_from_elimination_ends_at_the_same_place(
 def adjuster_with_free_anchor(
     reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf, pose_block: PoseBlock
 ) -> tuple[pycolmap.CeresBundleAdjuster, Array, Array]:
-    """Ranges without error from every frame to an anchor that is thought to be elsewhere, and its bias."""
+    """Return an adjuster with exact ranges from every frame to an anchor that starts elsewhere; the anchor and its
+    bias.
+    """
     adjuster, anchor, bias = adjuster_of(reconstruction), ANCHOR_IN_WORLD_M + START_ERROR_M, np.zeros(1)
     for frame_id in reconstruction.reg_frame_ids():
         pose = pose_block(reconstruction, frame_id)
@@ -280,7 +282,7 @@ LIFETIMES = """
 
 @pytest.mark.parametrize("first", ["pycolmap", "pyceres"])
 def test_references_may_be_dropped_in_any_order(first: str) -> None:
-    # In a process of its own: what went wrong here would end this one.
+    # In a process of its own, because a failure here would abort the process.
     imports = "import pycolmap, pyceres" if first == "pycolmap" else "import pyceres, pycolmap"
     script = textwrap.dedent(LIFETIMES).format(imports=imports)
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=600)

@@ -1,4 +1,4 @@
-"""Solving with a say in when it is enough."""
+"""Solving with a callback that decides when to stop."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_it_ends_as_soon_as_it_is_enough_with_the_parameters_of_that_step(
 
     summary = solve(adjuster_of(reconstruction), is_enough)
     assert summary.termination_type.name == "USER_SUCCESS"
-    assert summary.num_successful_steps == 2  # Ceres counts the start
+    assert summary.num_successful_steps == 2  # Ceres counts the start as one
     assert not np.array_equal(seen[-1], before)
     np.testing.assert_array_equal(seen[-1], point.xyz)
 

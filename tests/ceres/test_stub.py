@@ -1,4 +1,4 @@
-"""What type checkers read of the compiled part is what it says of itself."""
+"""The type stub of the compiled part agrees with the compiled part."""
 
 from __future__ import annotations
 
