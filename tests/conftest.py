@@ -1,4 +1,4 @@
-"""What the tests of whole commands share: the command itself, and a survey without photos to try it on."""
+"""Fixtures that the tests of whole commands share: the command itself, and a survey without photos."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import io
 import json
 import os
 
-# As the command line does; numpy reads it when it is imported.
+# The command line sets this too. numpy reads it when it is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import shutil
@@ -42,7 +42,7 @@ TIME_OFFSET_S = 2.0
 ANCHORS_M = {"A1": (-6.0, -5.0, 0.5), "A2": (6.0, -5.0, 2.5), "A3": (6.0, 5.0, 0.7), "A4": (-6.0, 5.0, 2.2)}
 
 
-# A shell's background jobs ignore Ctrl-C, and so would every command that a test starts from there.
+# Background jobs of a shell ignore Ctrl-C, and the commands that tests start from there would ignore it too.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
@@ -51,14 +51,17 @@ def pytest_report_header() -> str:
 
 
 def blas_kernels() -> list[str]:
-    """Those that numpy and scipy compute with, each with its own: as the processor or OPENBLAS_CORETYPE says."""
+    """Return the names of the BLAS kernels in use, chosen by the processor or by OPENBLAS_CORETYPE.
+
+    numpy and scipy each have their own.
+    """
     import scipy.linalg  # noqa: F401 (loads scipy's)
     from threadpoolctl import threadpool_info
 
     return [str(library.get("architecture")) for library in threadpool_info() if library["user_api"] == "blas"]
 
 
-# Of a quarter of a minute and more each.
+# Test files that take a quarter of a minute or more.
 LONG_FILES = (
     *("test_style.py", "test_kernels.py", "test_commands.py", "test_batch.py", "test_initialize.py"),
     *("test_trilateration.py", "test_run.py", "test_ranges_in_mapping.py", "test_kills.py", "test_bad_input.py"),
@@ -68,7 +71,7 @@ LONG_FILES = (
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest files first: of two processes, one would work on the last of them alone at the end."""
+    """Start the longest files first; otherwise one of two processes would work alone on the last of them."""
     place = {name: number for number, name in enumerate(LONG_FILES)}
     items.sort(key=lambda item: place.get(item.path.name, len(place)))
 
@@ -81,11 +84,11 @@ class WalkedSurvey:
     ``anchors_first_camera.csv`` and ``reference.csv`` (site frame).
 
     Attributes:
-        folder: of all of it.
-        site_from_sfm: the truth.
-        centers_m: (n, 3) in the site frame, by photo in time order.
+        folder: the folder that holds these files.
+        site_from_sfm: the true similarity.
+        centers_m: (n, 3) true centres in the site frame, by photo in time order.
         image_names: n names.
-        flags: what a command needs to read it all but the anchors, from inside the folder.
+        flags: arguments with which a command, run inside the folder, reads everything but the anchors.
     """
 
     folder: Path
@@ -102,7 +105,7 @@ class WalkedSurvey:
 
 @pytest.fixture(scope="session")
 def rangesfm_process() -> Command:
-    """Run ``rangesfm`` with some arguments in a folder, as a process of its own."""
+    """Return a function that runs ``rangesfm`` in a folder as a process of its own."""
 
     def run(*arguments: str | Path, cwd: Path, status: int | None = 0) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "rangesfm", *map(str, arguments)]
@@ -113,7 +116,10 @@ def rangesfm_process() -> Command:
 
 @pytest.fixture(scope="session")
 def rangesfm_command() -> Command:
-    """The same in this process, where what takes half of a command's time has been imported already."""
+    """Return a function that runs ``rangesfm`` in this process.
+
+    This saves the imports, which take half of a command's time.
+    """
 
     def run(*arguments: str | Path, cwd: Path, status: int | None = 0) -> subprocess.CompletedProcess[str]:
         with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as out:
@@ -132,7 +138,7 @@ def _checked(done: subprocess.CompletedProcess[str], status: int | None) -> subp
 
 @pytest.fixture(scope="session")
 def walked_survey(tmp_path_factory: pytest.TempPathFactory) -> WalkedSurvey:
-    """40 photos at one a second along a loop, and 20 ranges a second to four anchors. Not to be written to."""
+    """A walk of 40 photos, one a second, and 20 ranges a second to four anchors. Tests must not write to it."""
     folder = tmp_path_factory.mktemp("walked_survey")
     path = loop_path(42.0, start_s=99.0, seed=3)
     times: Array = np.arange(100, 140, dtype=np.float64)
@@ -171,10 +177,10 @@ class PhotoRun:
     """A small survey with photographs, and the first run on it.
 
     Attributes:
-        survey: its folder is where the command ran.
-        flags: of that command, but for the output path.
-        output_path: what it left.
-        stdout, stderr: what it printed.
+        survey: the command ran in its folder.
+        flags: those of that command, except the output path.
+        output_path: the output folder of the run.
+        stdout, stderr: what the command printed.
     """
 
     survey: DemoSurvey
@@ -186,8 +192,8 @@ class PhotoRun:
 
 @pytest.fixture(scope="session")
 def photo_run(rangesfm_process: Command, tmp_path_factory: pytest.TempPathFactory) -> PhotoRun:
-    """14 small photos of the demo's yard, run once. Not to be written to."""
-    # With more threads COLMAP starts from the first pair that will do, whichever thread comes first.
+    """A run on 14 small photos of the demo's yard. Tests must not write to it."""
+    # One thread: with more, COLMAP starts from whichever suitable pair is found first.
     flags = ("survey.toml", "--ranges_time_offset", str(DEMO_TIME_OFFSET_S), "--num_threads", "1")
     with _shared_folder(tmp_path_factory, "photo_run") as folder:
         survey = make_small_demo(folder / "yard")
@@ -201,12 +207,12 @@ def photo_run(rangesfm_process: Command, tmp_path_factory: pytest.TempPathFactor
 
 @contextmanager
 def _shared_folder(factory: pytest.TempPathFactory, name: str) -> Iterator[Path]:
-    """A folder that all processes of one test run share, and that one at a time may write to, inside the block."""
+    """Lock and yield a folder that all processes of one test run share."""
     base = factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
     folder.mkdir(exist_ok=True)
     with (folder / "lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # the system lets go of it, however the block ends
+        fcntl.flock(lock, fcntl.LOCK_EX)  # the system releases the lock, however the block ends
         yield folder
 
 

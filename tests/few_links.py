@@ -1,4 +1,4 @@
-"""A model that hardly hangs together at one place of its path."""
+"""Make a model that is only weakly connected at one place of its path."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import pycolmap
 
 
 def leave_few_links(model: pycolmap.Reconstruction, last_image_id: int, num_links: int) -> None:
-    """Delete all but so many of the points that are seen up to that photo and beyond; ids are in the order of time."""
+    """Delete all but ``num_links`` of the points that are seen both up to that photo and after it.
+
+    Image ids are in the order of time.
+    """
     links = []
     for point_id, point in sorted(model.points3D.items()):
         seen = [element.image_id for element in point.track.elements]

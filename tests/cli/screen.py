@@ -1,4 +1,4 @@
-"""A terminal that keeps what is written to it, and what somebody who looks at it sees; a clock that is set by hand."""
+"""A simulated terminal that shows what a viewer would see, and a clock that tests set by hand."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ class Clock:
 
 
 class Terminal(io.StringIO):
-    """Knows the control sequences of progress, and fails on any other."""
+    """A terminal that understands the control sequences of the progress display, and fails on any other."""
 
     def isatty(self) -> bool:
         return True
 
     def lines(self) -> list[str]:
-        """What stands there now; blank lines at the end left out."""
+        """Return the lines that are visible now, without blank lines at the end."""
         rows, row, column = [""], 0, 0
         for part in re.findall(r"\033\[[?\d]*[A-Za-z]|[\r\n]|[^\033\r\n]+", self.getvalue()):
             if part == "\r":

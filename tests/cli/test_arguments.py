@@ -1,4 +1,4 @@
-"""Arguments in either spelling reach the commands; wrong ones are named with the nearest right one."""
+"""Arguments in either spelling reach the commands; for a wrong one, the nearest right one is suggested."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a user sees of a batch while it goes on."""
+"""What a user sees while a batch runs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def course(clock: Clock) -> Course:
 
 
 def go_on(course: Course, shown: BatchTerminal, clock: Clock) -> None:
-    """One is done and the other refused, shown at each step."""
+    """Advance a batch in which one survey is done and the other is refused, and show each step."""
     shown.show(course)
     for index in (0, 1):
         course.tell(index, {"began_on": "here"})

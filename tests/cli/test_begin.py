@@ -1,4 +1,4 @@
-"""A first survey: written, checked and run from a folder as it is."""
+"""A first survey: written, checked and run from an unprepared folder."""
 
 from __future__ import annotations
 

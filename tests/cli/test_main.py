@@ -1,4 +1,4 @@
-"""The command as users meet it: help, results, and one line for whatever goes wrong."""
+"""The command as users meet it: help, results, and one line for each error."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_help_of_each_command_shows_an_example(command: str, capsys: pytest.Capt
     [(["refine", "--help"], ["numpy", "scipy", "pycolmap"]), (["--help"], ["numpy", "pydantic", "pycolmap"])],
 )
 def test_help_is_quick_and_needs_none_of_the_heavy_packages(argv: list[str], heavy: list[str]) -> None:
-    """What survey keys are made of is only imported by the command that needs it."""
+    """The definitions of the survey keys are imported only by the command that needs them."""
     code = f"import sys; from rangesfm.cli import main; main({argv}); sys.exit(bool(set({heavy}) & set(sys.modules)))"
     assert run(sys.executable, "-c", code).returncode == 0
 

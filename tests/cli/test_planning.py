@@ -1,4 +1,4 @@
-"""``rangesfm plan`` prints what a survey will know, or why it is no plan."""
+"""``rangesfm plan`` prints what a survey will determine, or why the file is not a plan."""
 
 from __future__ import annotations
 

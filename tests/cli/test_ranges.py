@@ -1,4 +1,4 @@
-"""``rangesfm ranges`` says what is in a log, draws it and writes it in the canonical form."""
+"""``rangesfm ranges`` summarizes a log, plots it and writes it in the canonical format."""
 
 from __future__ import annotations
 

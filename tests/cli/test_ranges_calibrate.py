@@ -1,4 +1,4 @@
-"""``rangesfm ranges calibrate`` writes the curve that the other commands take."""
+"""``rangesfm ranges calibrate`` writes the error curve that the other commands read."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ANCHORS = {"a": (0.0, 0.0, 2.0), "b": (6.0, 0.0, 0.3), "c": (6.0, 5.0, 2.0), "d"
 
 @pytest.fixture
 def survey(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """2000 ranges that read 0.1 m long everywhere, with positions by time."""
+    """Write 2000 ranges that are 0.1 m too long on average, and positions by time."""
     monkeypatch.chdir(tmp_path)
     times = np.arange(500) / 10
     tags = np.array([3.0, 2.5, 1.2]) + np.array([2.8, 2.3, 0.8]) * np.sin(times[:, None] * [0.31, 0.47, 0.83])

@@ -17,7 +17,7 @@ from rangesfm.survey.settings import Survey
 
 @dataclass
 class Calls:
-    """Stands in for the pipeline: what was asked of it."""
+    """A stand-in for the pipeline that records the calls made to it."""
 
     made: list[tuple[str, Survey, dict[str, Any]]] = field(default_factory=list)
 

@@ -1,4 +1,4 @@
-"""``rangesfm trilaterate`` places anchors, and what it writes is what other commands read."""
+"""``rangesfm trilaterate`` locates anchors, and the other commands can read the file it writes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TIME_OFFSET_S = 3.0
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A flight with ``uwb.csv``, and its positions as ``flight.csv`` (camera), ``tag.csv`` and ``flat.csv`` (tag)."""
+    """Write a flight: ``uwb.csv``, and its positions as ``flight.csv`` (camera) and ``tag.csv`` (tag)."""
     path = loop_path(40.0, height_amplitude_m=1.5, seed=3)
     radio = Radio(rate_hz=4.0, range_stddev_m=0.03, obstructed_share=0.1, time_offset_s=TIME_OFFSET_S)
     write_ranges_csv(simulate_ranges(path, ANCHORS_M, TAG_IN_CAM_M, radio, seed=5).log, tmp_path / "uwb.csv")
@@ -50,7 +50,7 @@ def positions_in(path: Path) -> dict[str, Array | None]:
 
 
 def write_flat(folder: Path) -> None:
-    """Ranges taken at named places in a plane: ``places.csv`` and ``uwb_places.csv``."""
+    """Write ranges taken at named places in a plane: ``places.csv`` and ``uwb_places.csv``."""
     places = np.array([(x, y, 1.0) for x in (-3.0, 0.0, 3.0) for y in (-2.0, 0.0, 2.0, 4.0)])
     names = [f"p{k}" for k in range(len(places))]
     write_reference(Reference(places, image_names=tuple(names)), folder / "places.csv")
@@ -74,7 +74,7 @@ def test_anchors_are_found_and_written(
         assert anchor.position_m is not None
         off_m = float(np.linalg.norm(anchor.position_m - ANCHORS_M[anchor.anchor_id]))
         assert off_m < min(2 * anchor.position_stddev_m, 0.1)
-        assert 0 < anchor.position_stddev_m < 0.2  # what radios get wrong by direction may hide in the place
+        assert 0 < anchor.position_stddev_m < 0.2  # range errors that depend on direction may bias the position
         assert anchor.range_bias_stddev_m is not None
         assert f"\n{anchor.anchor_id}    " in text
     assert "written to anchors.csv" in text

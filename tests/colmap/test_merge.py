@@ -1,4 +1,4 @@
-"""Separate models become one: every photo, point, camera and rig once, and where it was."""
+"""Merging separate models keeps every photo, point, camera and rig once, and in its place."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_models_with_the_same_ids_keep_all_photos_points_and_cameras(num_cameras
     model = rigs_of_cameras(2, num_cameras)
     for image in model.images.values():
         assert image.num_points3D > 0
-    # Of another size its rigs are others, where they have more than one camera.
+    # A model of another scale has other rigs, if these have more than one camera.
     larger = rescale(model, TWICE_AS_LARGE)
     joined = joined_model([model, larger])
     assert joined.is_valid()

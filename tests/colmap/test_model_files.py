@@ -1,4 +1,4 @@
-"""COLMAP models are read as they are, and damaged ones refused before they do harm."""
+"""COLMAP models are read unchanged, and damaged ones are refused before they do harm."""
 
 from __future__ import annotations
 
@@ -98,11 +98,11 @@ def test_pose_that_is_not_finite_is_named(walked_survey: WalkedSurvey, tmp_path:
 
 
 class TestContent:
-    """What COLMAP would take, and stumble over later: one thing wrong at a time."""
+    """Contents that COLMAP would accept and fail on later; each test spoils one thing."""
 
     @pytest.fixture
     def refused(self, rigs: Path, tmp_path: Path) -> Callable[..., str]:
-        """Change a file, and tell what the refusal says of it."""
+        """Return a function that changes a file and returns the message of the refusal."""
 
         def read(name: str, change: Callable[[ModelFile], object]) -> str:
             folder = shutil.copytree(rigs, tmp_path / "model")

@@ -1,4 +1,4 @@
-"""Which points the photos of a model see, and where."""
+"""Which points the photos of a model see, and at which pixels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A model is carried into the metric world, and the one it came from stays."""
+"""A model is transformed to the metric world, and the original stays as it is."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Models of the same photos against the first: what a known similarity, a moved camera and ranges show as."""
+"""Models of the same photos compared with the first: a known similarity, a moved camera, and range residuals."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ TAG_IN_CAM_M = (0.03, -0.12, -0.05)
 
 @pytest.fixture(scope="module")
 def models(walked_survey: WalkedSurvey, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
-    """A model; the same half as large, turned and shifted; and one with its eleventh camera a unit aside."""
+    """A model; a copy half as large, rotated and translated; and a copy with its eleventh camera moved by one unit."""
     folder = tmp_path_factory.mktemp("models")
     paths = [folder / name for name in ("first", "similar", "moved")]
     for path in paths:
@@ -50,7 +50,7 @@ def models(walked_survey: WalkedSurvey, tmp_path_factory: pytest.TempPathFactory
 
 
 def survey_of(files: Path, others: Mapping[str, object] | None = None) -> Survey:
-    """Of the walked survey's files, with other keys beside them."""
+    """A survey of the walked survey's files, with additional keys."""
     keys = {
         "images.times": files / "images.csv",
         "ranges.path": files / "uwb.csv",
@@ -63,7 +63,7 @@ def survey_of(files: Path, others: Mapping[str, object] | None = None) -> Survey
 
 @pytest.fixture(scope="module")
 def result(walked_survey: WalkedSurvey, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same model scaled with its ranges."""
+    """The result folder of the same model, scaled with its ranges."""
     files = walked_survey.folder
     output_path = tmp_path_factory.mktemp("result") / "out"
     survey = survey_of(files, {"anchors.frame": "site", "output.path": output_path, "report.enabled": False})
@@ -107,7 +107,7 @@ def test_ranges_tell_the_metric_model_from_the_unscaled(result: Path, models: tu
     metric, unscaled, _ = compared(result, models[0], models[1]).rows
     assert metric.range_rms_m is not None
     assert unscaled.range_rms_m is not None
-    assert metric.range_rms_m[0] < 0.1  # the radio's 0.05 m, and the path between photos
+    assert metric.range_rms_m[0] < 0.1  # the radio's 0.05 m, and the interpolation between photos
     assert unscaled.range_rms_m[0] > 3 * metric.range_rms_m[0]
     assert unscaled.range_rms_m[1] == pytest.approx(metric.range_rms_m[0], rel=1e-6)
 
@@ -130,7 +130,7 @@ def test_a_log_is_held_against_models_that_no_run_has_made(
     (first, similar, moved) = compare_many(named, ranges).rows
     rms = [row.range_rms_m for row in (first, similar, moved) if row.range_rms_m is not None]
     assert len(rms) == 3
-    assert rms[0][1] < 0.1  # the radio's 0.05 m, and the path between photos
+    assert rms[0][1] < 0.1  # the radio's 0.05 m, and the interpolation between photos
     assert rms[0][0] > 3 * rms[0][1]
     assert rms[1][1] == pytest.approx(rms[0][1], rel=1e-6)
     assert rms[2][1] > 1.2 * rms[0][1]  # one camera in forty is wrong

@@ -1,4 +1,4 @@
-"""Comparison: what the paper's table says of known errors, and what two models differ by."""
+"""Comparison with a reference: the paper's table for known errors, and the differences between two models."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def make_path(centers: Array, rotations: Array | None = None) -> Trajectory:
 
 
 def walk(num: int = 30, seed: int = 0) -> tuple[Array, Array]:
-    """Centres and rotations of a wandering camera."""
+    """Centres and rotations of a camera on a random walk."""
     rng = np.random.default_rng(seed)
     return np.cumsum(rng.normal(size=(num, 3)), axis=0), Rotation.random(num, random_state=seed).as_matrix()
 
@@ -56,7 +56,7 @@ def reference_of(path: Trajectory, *, has_rotations: bool = True) -> Reference:
 
 
 def in_first_camera(path: Trajectory) -> Trajectory:
-    """The path as seen from its first camera."""
+    """Return the path in the frame of its first camera."""
     rotation = path.world_from_cam[0].T
     return path.transformed(1.0, rotation, -rotation @ path.centers[0])
 
@@ -252,7 +252,7 @@ def test_models_of_different_photos_are_not_compared() -> None:
 
 
 def write_folder(folder: Path, model: pycolmap.Reconstruction, *, is_refined: bool = True) -> Path:
-    """A result whose refinement did nothing but shrink the map by a tenth."""
+    """Write a result whose refinement only shrank the map by a tenth."""
     scaled = pycolmap.Reconstruction(model)
     scaled.transform(pycolmap.Sim3d(1.1, pycolmap.Rotation3d(), np.zeros(3)))
     for name, part in (("sparse_scaled", scaled), ("sparse_metric", model)):

@@ -1,4 +1,4 @@
-"""A simulated radio measures the distance between the antennas, with the faults it is told to have."""
+"""A simulated radio measures the distance between the antennas, with the errors it is given."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The demo's survey is complete, says when its photos were taken, and comes with the truth."""
+"""The demo's survey is complete, gives the times of its photos, and comes with the truth."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def test_all_forty_photos_ship_and_a_short_survey_has_the_first_of_them(made: De
 
 @pytest.fixture
 def no_photos(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Copying a photo is interrupted."""
+    """Let copying a photo raise KeyboardInterrupt."""
 
     def fail(*_: object) -> None:
         raise KeyboardInterrupt

@@ -1,4 +1,4 @@
-"""Ranges between anchors as distances: one for each pair, as good as the radios' common error lets it be."""
+"""Ranges between anchors as distances: one per pair, with the uncertainty of the radios' common error."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rangesfm.ranging.log import RangeLog
 
 
 def log_of(rows: list[tuple[str, str, float]], stddev_m: float | None = None) -> RangeLog:
-    """Ranges between tag T and anchors, or between two anchors."""
+    """A log of ranges between tag T and anchors, or between two anchors."""
     log = RangeLog.from_arrays(
         [anchor for _, anchor, _ in rows],
         [range_m for *_, range_m in rows],

@@ -1,4 +1,4 @@
-"""Ends of taped distances in a model, and the table of them."""
+"""Locating the ends of taped distances in a model, and the table of them."""
 
 from __future__ import annotations
 

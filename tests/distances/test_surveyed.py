@@ -1,4 +1,4 @@
-"""Distances between surveyed anchors: what of a survey holds in any frame."""
+"""Distances between surveyed anchors, which hold in any frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Models that COLMAP makes up, and what exports of them are read back by."""
+"""Synthetic models made by COLMAP, and readers for exports of them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PLY_CODES = {"double": "<f8", "float": "<f4", "uchar": "u1"}
 
 
 def synthesized(num_photos: int, num_points: int, seed: int, **others: Any) -> pycolmap.Reconstruction:
-    """Photos of one camera, or of ``num_rigs``; the other options too are those of COLMAP."""
+    """Synthesize a model with photos of one camera, or of ``num_rigs``; other options are passed to COLMAP."""
     pycolmap.set_random_seed(seed)
     options = pycolmap.SyntheticDatasetOptions()
     given = {"num_rigs": 1, "num_frames_per_rig": num_photos, "num_points3D": num_points, **others}
@@ -29,7 +29,7 @@ def centers_of(model: pycolmap.Reconstruction) -> dict[str, Array]:
 
 
 def read_ply(path: Path) -> npt.NDArray[np.void]:
-    """The vertices of a binary PLY file, by its header alone."""
+    """Read the vertices of a binary PLY file as its header describes them."""
     head, _, body = path.read_bytes().partition(b"end_header\n")
     lines = [line.split() for line in head.decode("ascii").splitlines()]
     assert lines[:2] == [["ply"], ["format", "binary_little_endian", "1.0"]]

@@ -1,4 +1,4 @@
-"""Files made from the unscaled model, carried into the metric world."""
+"""Files made from the unscaled model are transformed to the metric world."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_cameras_of_nerfstudio_go_where_an_export_of_the_metric_model_puts_them(
 ) -> None:
     options = ExportOptions(formats=("nerfstudio",))
     (path,) = export_map(MetricMap(sfm), tmp_path / "sfm", options)
-    # As nerfstudio's own converter does: another world, and a note of it.
+    # nerfstudio's own converter does the same: it turns the world and records the transform in the file.
     content = json.loads(path.read_text())
     applied = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
     content["applied_transform"] = applied[:3].tolist()

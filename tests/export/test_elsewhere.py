@@ -1,4 +1,4 @@
-"""Exports to other reconstruction programs: read back by their rules, they hold the same cameras and points."""
+"""Exports to other reconstruction programs: read by their rules, they hold the same cameras and points."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_distances_between_cameras_agree_between_all_formats(shift: Array, tmp_p
             assert found == pytest.approx(true, rel=1e-6)
 
 
-# Formats that hold no cameras, or need photos or a place on the Earth.
+# Formats that hold no cameras, or that need photos or a place on the Earth.
 NEED_MORE = {
     *COVARIANCE_FORMATS,
     "undistorted",
@@ -149,7 +149,7 @@ def of_two_cameras(first: str, second: str) -> pycolmap.Reconstruction:
 def test_nerfstudio_is_told_of_every_camera(tmp_path: Path) -> None:
     content = load(export(of_two_cameras("OPENCV_FISHEYE", "OPENCV_FISHEYE"), "nerfstudio", tmp_path))
     assert content["camera_model"] == "OPENCV_FISHEYE"
-    # What stands at the top would hold for all.
+    # Intrinsics at the top level would apply to all frames.
     assert not {"fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "p1", "p2"} & content.keys()
     assert sorted(frame["fl_x"] for frame in content["frames"]) == [500.0] * 6 + [700.0] * 6
     assert not any("camera_model" in frame for frame in content["frames"])
@@ -162,7 +162,7 @@ def test_nerfstudio_has_no_place_for_fisheyes_beside_others(tmp_path: Path) -> N
 
 
 def opencv_projection(frame: dict[str, Any], xyz: Array) -> Array:
-    """By the formulas in OpenCV's documentation of its two camera models."""
+    """Project a point with the formulas of OpenCV's documentation of its two camera models."""
     x, y = xyz[:2] / xyz[2]
     r2 = x * x + y * y
     k1, k2, k3, k4 = (frame.get(name, 0.0) for name in ("k1", "k2", "k3", "k4"))
@@ -232,7 +232,7 @@ def triangulated(model: pycolmap.Reconstruction, marks: list[dict[str, Any]], ca
     ]
     bearings = np.array([[*ray, 1.0] for ray in rays if ray is not None])
     poses = [image.cam_from_world().matrix() for image in images if image is not None]
-    for pose in poses:  # around a near origin, as a linear triangulation needs it
+    for pose in poses:  # move the origin near the cameras: the linear triangulation needs that
         pose[:, 3] += pose[:, :3] @ NEAR
     point = pycolmap.triangulate_multi_view_point(poses, bearings / np.linalg.norm(bearings, axis=1)[:, None])
     assert point is not None

@@ -1,4 +1,4 @@
-"""Exports: what is written is read back by other readers and says the same."""
+"""Exports, read back by other readers, have the same content."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def model() -> pycolmap.Reconstruction:
 
 
 def times_of(model: pycolmap.Reconstruction) -> dict[str, float]:
-    """A second apart, later names earlier."""
+    """Times one second apart, in reverse order of the names."""
     names = sorted((image.name for image in model.images.values()), reverse=True)
     return {name: 1.7e9 + i for i, name in enumerate(names)}
 

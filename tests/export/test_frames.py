@@ -36,7 +36,7 @@ ANCHORS = {"A1": np.array([3.0, -4.0, 2.0]), "Tür": np.array([-5.0, 1.0, 0.5])}
 
 @pytest.fixture(scope="module")
 def map_() -> MetricMap:
-    """A walk in a metric world with z up, camera upright."""
+    """A walk in a metric world with z up, with the camera upright."""
     path = loop_path(20.0, start_s=0.0, seed=1)
     times = np.arange(20, dtype=np.float64)
     made = synthetic_model(times, path.centers(times), path.world_from_cam(times), pixel_stddev=0.0, seed=2)
@@ -45,7 +45,7 @@ def map_() -> MetricMap:
 
 
 def turned(map_: MetricMap, rotation_vector: list[float]) -> MetricMap:
-    """The same map in a world that lies askew."""
+    """Return the same map in a world that is tilted."""
     rotation = Rotation.from_rotvec(rotation_vector).as_matrix()
     askew = Similarity(1.0, rotation, np.array([1.0, 2.0, 3.0]))
     anchors = {name: askew.apply(at) for name, at in (map_.anchors_m or {}).items()}
@@ -104,7 +104,7 @@ def test_a_map_without_a_place_cannot_leave_for_the_earth(map_: MetricMap, tmp_p
 
 
 def enu_by_hand(geographic: Array) -> Array:
-    """East, north, up of longitude, latitude, height by the textbook: geocentric, then turned."""
+    """Convert longitude, latitude and height to east, north and up by the textbook: geocentric, then rotated."""
     to_cartesian = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
     xyz = np.column_stack(to_cartesian.transform(*geographic.T))
     origin = np.array(to_cartesian.transform(LON_DEG, LAT_DEG, HEIGHT_M))
@@ -135,7 +135,8 @@ def test_anchors_in_a_national_grid_keep_their_millimetres_and_true_lengths() ->
     np.testing.assert_allclose(georeference.projected(local[:2]), grid[:2], atol=1e-4)
     geod = pyproj.Geod(ellps="WGS84")
     lon, lat, _ = georeference.geographic(local[:2]).T
-    true_m = geod.inv(lon[0], lat[0], lon[1], lat[1])[2] * (1 + 480 / 6.38e6)  # above the ellipsoid, lengths grow
+    # lengths grow with the height above the ellipsoid
+    true_m = geod.inv(lon[0], lat[0], lon[1], lat[1])[2] * (1 + 480 / 6.38e6)
     assert np.hypot(*(local[0] - local[1])[:2]) == pytest.approx(true_m, abs=2e-3)
 
 
@@ -220,7 +221,7 @@ def test_geopackage_is_a_database_of_points_in_the_maps_system(on_earth: MetricM
     assert system == 32632
     places = places_of(on_earth)
     assert [name for name, _ in rows] == list(places)
-    # A GeoPackage point ends with its well-known binary, and that with three doubles.
+    # A GeoPackage point ends with its well-known binary, which ends with three doubles.
     read = np.array([struct.unpack("<3d", blob[-24:]) for _, blob in rows])
     assert on_earth.georeference is not None
     expected = replace(on_earth.georeference, crs="EPSG:32632").projected(np.array(list(places.values())))
@@ -235,7 +236,7 @@ def test_the_map_itself_is_not_touched(on_earth: MetricMap, tmp_path: Path) -> N
 
 
 def test_photos_that_do_not_lean_to_either_side_of_a_flat_path_do_not_say_which_is_up(map_: MetricMap) -> None:
-    """Photos straight down: rounding would turn the map upside down now and then."""
+    """For photos straight down, rounding would decide which side of the path is up."""
     down = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     path = map_.trajectory
     headings = Rotation.from_rotvec(np.arange(len(path))[:, None] * [0.0, 0.0, 0.3]).as_matrix()

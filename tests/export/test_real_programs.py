@@ -1,8 +1,9 @@
-"""Exports, opened by the programs they are for: as many photos and points, and the same distances.
+"""Exports opened by the programs they are for: they show as many photos and points, and the same distances.
 
-COLMAP 3.8 is Debian's (``apt-get install colmap``), evo is GPL and no dependency: where one is not installed, its tests
-are left out. pyopf opens its format in test_elsewhere, laspy and pyogrio theirs in test_frames; nerfstudio and OpenSfM,
-which do not install beside other packages, are read there by the rules of their loaders.
+COLMAP 3.8 comes from Debian (``apt-get install colmap``); evo is GPL and no dependency. The tests of a program that is
+not installed are skipped. pyopf opens its format in test_elsewhere, laspy and pyogrio theirs in test_frames. nerfstudio
+and OpenSfM cannot be installed beside other packages, so test_elsewhere reads their formats by the rules of their
+loaders.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ Array = npt.NDArray[np.float64]
 
 NUM_PHOTOS, NUM_POINTS = 7, 80
 METRIC_FROM_SFM = Similarity(3.28, Rotation.from_rotvec([0.1, -0.7, 2.5]).as_matrix(), np.array([1 / 3, -20.0, 5.0]))
-# Until a program that will have none of its project has said so.
+# A program that rejects its project has said so within this time.
 OPENS_WITHIN_S = 5.0
 
 needs_colmap = pytest.mark.skipif(shutil.which("colmap") is None, reason="COLMAP's program is not installed")
@@ -74,7 +75,7 @@ def run(program: str, *arguments: str | Path, home: Path | None = None) -> str:
 
 
 def centers_of(model: pycolmap.Reconstruction) -> Array:
-    """(n, 3) in order of the names."""
+    """Return the (n, 3) centres in the order of the names."""
     images = sorted(model.images.values(), key=lambda image: image.name)
     return np.array([image.projection_center() for image in images])
 
@@ -89,7 +90,7 @@ def test_colmap_counts_photos_and_points(map_: MetricMap, name: str, tmp_path: P
 
 
 def version_of_colmap() -> str:
-    """As the transform's file is named: the line of eight numbers came with 3.9."""
+    """Return the version as in the name of the transform's file; the line of eight numbers came with COLMAP 3.9."""
     found = re.search(r"COLMAP (\d+)\.(\d+)", run("colmap", "help"))
     assert found is not None
     return "3.8" if (int(found[1]), int(found[2])) < (3, 9) else "4"

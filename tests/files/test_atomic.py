@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all."""
+"""Files and folders appear whole or not at all."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 
 def interrupting_once(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function, its first call ended by Ctrl-C."""
+    """Wrap a function so that its first call is interrupted by Ctrl-C."""
     is_first = True
 
     def called(*arguments: Any, **options: Any) -> None:
@@ -219,7 +219,7 @@ class TestNewFolder:
 
 
 class TestPublishing:
-    """Several files and folders in one step, ``result.json`` first to go and last to come."""
+    """Publishing several files and folders in one step: ``result.json`` goes first and comes last."""
 
     NAMES = ("model", "result.json", "table.csv")
 

@@ -1,4 +1,4 @@
-"""JSON is read, or refused in one line."""
+"""JSON files are read, or refused in one line."""
 
 from __future__ import annotations
 

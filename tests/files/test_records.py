@@ -1,4 +1,4 @@
-"""Records: JSON by typed models, plain whatever the numbers."""
+"""Records: JSON by typed models, with plain values for all numbers."""
 
 from __future__ import annotations
 

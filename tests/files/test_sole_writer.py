@@ -1,4 +1,4 @@
-"""One run at a time into a folder, seen from other processes, and what killed ones leave."""
+"""Only one run at a time writes to a folder: seen from other processes, and after killed ones."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ with sole_writer(Path(sys.argv[1])):
 
 @pytest.fixture
 def hold() -> Iterator[Callable[[Path], subprocess.Popen[str]]]:
-    """Start a process that holds a folder until it reads a line."""
+    """Return a function that starts a process which holds a folder until it reads a line."""
     started: list[subprocess.Popen[str]] = []
 
     def start(folder: Path) -> subprocess.Popen[str]:

@@ -1,4 +1,4 @@
-"""Tables are read whole or refused with the line that is wrong."""
+"""Tables are read whole, or refused with the number of the wrong line."""
 
 from __future__ import annotations
 
@@ -201,13 +201,16 @@ def test_comments_of_the_user_are_comments_and_quoted_cells_are_cells(tmp_path: 
 
 
 class TestFastWay:
-    """Plain tables are read all at once; a comment, which is nothing to a table, leads around that."""
+    """The fast way to read plain tables gives the same as the general way.
+
+    A comment has no meaning in a table, but makes the reader take the general way.
+    """
 
     NUMBERS = (st.floats() | st.integers() | st.decimals(-1e7, 1e7, places=6)).map(str)
     CELLS = NUMBERS | st.text("019.-+eE_ nainfx\u0661\u00e9\t\x0b\x85\0", max_size=5)
 
     def said(self, table: Callable[[], Table]) -> list[object]:
-        """All that can be had of columns a (numbers) and b (text), or the errors."""
+        """Return everything that can be read of columns a (numbers) and b (text), or the errors."""
         asked: list[Callable[[Table], object]] = [
             lambda table: table.numbers("a").tobytes(),
             lambda table: table.numbers("a", empty=7.0).tobytes(),

@@ -1,4 +1,4 @@
-"""Tables stand in columns, whatever their cells hold."""
+"""Printed tables are aligned in columns, whatever their cells hold."""
 
 from __future__ import annotations
 

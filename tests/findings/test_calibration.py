@@ -1,4 +1,4 @@
-"""Calibrations of other programs are COLMAP's cameras, with its convention of pixels."""
+"""Calibrations of other programs become COLMAP's cameras, with its pixel convention."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each file is known by what it holds, whatever it is called."""
+"""Each file is recognized by its content, whatever its name."""
 
 from __future__ import annotations
 

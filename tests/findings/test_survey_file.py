@@ -1,4 +1,4 @@
-"""A survey file that is written is read back as what it was made of."""
+"""A survey file that was written reads back as the same survey."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Of each kind one file is taken, and where nothing tells which, the user is asked."""
+"""One file of each kind is taken; where it is not clear which, the user is asked."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_a_whole_folder_is_a_survey(tmp_path: Path) -> None:
 
 
 def test_the_usual_name_is_meant_and_the_others_are_told(tmp_path: Path) -> None:
-    tmp_path = tmp_path / "photos" / "monday"  # what stands above the folder has no say
+    tmp_path = tmp_path / "photos" / "monday"  # names of the folders above do not matter
     write_photos(tmp_path / "images" / "left", 2)
     write_photos(tmp_path / "images" / "right", 2)
     write_photos(tmp_path / "images_small", 2)

@@ -23,7 +23,7 @@ _EXTREMES: dict[str, tuple[float | bytes, ...]] = {
 
 @dataclass
 class Field:
-    """A number by its struct code, or a text that a zero byte ends; ``name`` says what it means."""
+    """A number by its struct code, or a text that ends with a zero byte; ``name`` says what it means."""
 
     name: str
     code: str
@@ -37,12 +37,12 @@ class Field:
 
 @dataclass
 class ModelFile:
-    """``count`` and the records that it announces; each ends in groups of fields, its track or its features.
+    """A model file: ``count`` records; each ends with groups of fields, which are its track or its features.
 
     Attributes:
-        count: as written, whether true or not.
-        records: of each its own fields.
-        groups: of each record as many groups as ``num_groups``, its last own field, announces.
+        count: the number of records as written, which may be wrong.
+        records: the fields of each record, without its groups.
+        groups: the groups of each record; the record's last field says how many there are.
     """
 
     count: int
@@ -59,7 +59,7 @@ class ModelFile:
 
 
 def parse(name: str, data: bytes) -> ModelFile:
-    """One of the files of an undamaged model."""
+    """Parse one of the files of an undamaged model."""
     cursor = _Cursor(data)
     count = int(cursor.take("count", "Q").value)
     records, groups = [], []
@@ -71,7 +71,7 @@ def parse(name: str, data: bytes) -> ModelFile:
 
 
 def spoil(file: ModelFile, rng: random.Random) -> str:
-    """One change in place; what it was, in words."""
+    """Make one change in place, and return its description."""
     return rng.choice(_SPOILERS)(file, rng)
 
 
@@ -152,7 +152,7 @@ def _set_extreme(file: ModelFile, rng: random.Random) -> str:
 
 
 def _shift(file: ModelFile, rng: random.Random) -> str:
-    """A number that is only a little wrong."""
+    """Change a number by a little."""
     field = rng.choice(_any_fields(file, rng))
     if isinstance(field.value, bytes):
         field.value = field.value[:-1]
@@ -164,7 +164,7 @@ def _shift(file: ModelFile, rng: random.Random) -> str:
 
 
 def _copy_from_another(file: ModelFile, rng: random.Random) -> str:
-    """An id that is another's: twice there, or leading elsewhere."""
+    """Copy an id from another record, so that it occurs twice or refers to something else."""
     fields, others = _any_fields(file, rng), _any_fields(file, rng)
     same = [(field, other) for field in fields for other in others if field.name == other.name]
     if not same:

@@ -1,9 +1,9 @@
-"""Damaged COLMAP models: each is refused, or good for whatever is done with a model; prints a table.
+"""Damaged COLMAP models: each must be refused, or be usable for everything that is done with models; prints a table.
 
     python -m tests.fuzz.models --num 10000 --output_path /tmp/fuzz_models
 
-Each is read and used in a child process, so that one that takes the process down is seen and the rest goes on. What
-is found is in the output folder: the model, and what became of it. ``--first N --num 1`` repeats one of them.
+Each model is read and used in a child process, so that a crash is noticed and the campaign continues. Models that did
+harm are kept in the output folder. ``--first N --num 1`` repeats model N.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _TAG_IN_CAM_M = (0.03, -0.12, -0.05)
 
 
 def make_survey(folder: Path) -> None:
-    """A model of ten photos along a loop, binary and as text, with ranges to four anchors."""
+    """Write a model of ten photos along a loop, binary and as text, with ranges to four anchors."""
     from tests.simulated.model import synthetic_model
     from tests.simulated.path import loop_path
 
@@ -65,7 +65,7 @@ def make_survey(folder: Path) -> None:
 
 
 def damage(survey: Path, number: int, model_path: Path) -> str:
-    """Write the model of that number; what is wrong with it, in words."""
+    """Write the damaged model of that number, and return a description of the damage."""
     rng = random.Random(number)
     is_text = number % _TEXT_EVERY == 0
     shutil.rmtree(model_path, ignore_errors=True)
@@ -92,13 +92,13 @@ def _spoil_file(path: Path, data: bytes, rng: random.Random) -> str:
         file = parse(path.name, data)
         change = spoil(file, rng)
         path.write_bytes(file.pack())
-    except Exception:  # spoilt before, so that it is no file of records any more
+    except Exception:  # an earlier change has left a file that does not parse
         return "left"
     return change
 
 
 def use(survey: Path, number: int, model_path: Path) -> str:
-    """What became of it: "refused" or "accepted"; anything else that is wrong escapes."""
+    """Read and use a model; return "refused" or "accepted". Any other outcome raises an exception."""
     from rangesfm.colmap.model_files import read_model
     from rangesfm.errors import InputError
 
@@ -142,7 +142,7 @@ def _do_what_is_done_with_models(model: object, model_path: Path) -> None:
 
 
 def _refine(survey: Path, model_path: Path) -> int:
-    """Status of the whole command; an internal error is 1."""
+    """Return the exit status of the whole command, which must not be an internal error."""
     from rangesfm.cli import main as rangesfm
 
     files = ("--ranges", "uwb.csv", "--anchors", "anchors.csv", "--images", "images.csv", "--output_path", "out")
@@ -156,10 +156,10 @@ def _refine(survey: Path, model_path: Path) -> int:
 
 
 def _serve(pipe: Connection, survey: Path, model_path: Path) -> None:
-    """Use one model after the other; the last message before this process dies tells which one did it."""
+    """Use one model after the other. If this process dies, the parent knows which model it was working on."""
     warnings.simplefilter("error")
     os.environ["RANGESFM_DEBUG"] = "1"
-    silent = os.open(os.devnull, os.O_WRONLY)  # COLMAP's own log
+    silent = os.open(os.devnull, os.O_WRONLY)  # silences COLMAP's own log
     os.dup2(silent, sys.stderr.fileno())
     while True:
         number = pipe.recv()
@@ -175,7 +175,7 @@ def _serve(pipe: Connection, survey: Path, model_path: Path) -> None:
 
 
 class _Worker:
-    """A child process, started anew when one has died."""
+    """A child process that is started anew when it has died."""
 
     def __init__(self, survey: Path, model_path: Path):
         self._arguments = (survey, model_path)
@@ -189,7 +189,10 @@ class _Worker:
         end.close()
 
     def outcome(self, number: int) -> tuple[str, str]:
-        """Of one model, and the traceback of a failure; "crashed" and "hung" are the process's own."""
+        """Return what became of one model, with the traceback of a failure.
+
+        "crashed" and "hung" are outcomes of the process itself.
+        """
         self._pipe.send(number)
         try:
             if self._pipe.poll(TIMEOUT_S):
@@ -206,7 +209,7 @@ class _Worker:
 
 
 def run(first: int, num: int, output_path: Path) -> Counter[str]:
-    """Use ``num`` damaged models and count what became of them; keep those that did harm."""
+    """Use ``num`` damaged models and count the outcomes; keep the models that did harm."""
     outcomes: Counter[str] = Counter()
     with tempfile.TemporaryDirectory(prefix="fuzz_models_") as temporary:
         survey, model_path = Path(temporary), Path(temporary) / "model"

@@ -1,4 +1,4 @@
-"""Damage to files, by a seed: bytes, and the cells and lines of text."""
+"""Seeded damage to files: to bytes, and to the cells and lines of text."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable
 
 _CELL_ENDS = re.compile(rb"[,;\t \n=:()\[\]\"']")
-# What numbers, names and structure are mistaken for, cut off at or run over by.
+# Cells that break parsers of numbers, names and structure, or exceed their limits.
 _CELLS = (
     *(
         b"",
@@ -63,7 +63,7 @@ _MAX_REPEATS = 40
 
 
 def mutated(data: bytes, rng: random.Random, max_size: int) -> bytes:
-    """``data`` with one to four changes, no longer than ``max_size``."""
+    """Return ``data`` with one to four changes, no longer than ``max_size``."""
     for _ in range(rng.choice((1, 1, 2, 4))):
         data = rng.choice(_CHANGES)(data, rng)[:max_size]
     return data

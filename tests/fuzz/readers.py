@@ -1,11 +1,11 @@
-"""Coverage-guided fuzzing of all readers of files, by atheris; prints a table of what was tried and found.
+"""Coverage-guided fuzzing of all readers of files with atheris; prints a table of what was tried and found.
 
     python -m pip install atheris
     python -m tests.fuzz.readers --runs 40000 --output_path /tmp/fuzz
 
-With 40 000 runs for each of the targets (``tests/fuzz/targets.py``) it takes about an hour on one core. What is
-found is in the output folder: for each different failure the input and the traceback. A run that takes more than 3 s of
-the processor, or 48 MB more than all before it, is a failure too; one that hangs for 300 s is killed.
+With 40 000 runs for each of the targets (``tests/fuzz/targets.py``) it takes about an hour on one core. The output
+folder holds the input and the traceback of each different failure. A run that takes more than 3 s of processor time, or
+48 MB more than all before it, is a failure too; one that hangs for 300 s is killed.
 """
 
 from __future__ import annotations
@@ -30,12 +30,13 @@ PLUGIN = Path(__file__).parents[2] / "plugin"
 MAX_LENGTH = 4096
 TIMEOUT_S = 300
 MAX_PROCESSOR_TIME_S = 3.0
-_MEMORY_BYTES = 48 << 20  # what one run may take beyond all before it: chance, and modules loaded late
+# what one run may take beyond all before it: room for chance, and for modules that are imported late
+_MEMORY_BYTES = 48 << 20
 _SAVE_EVERY = 250
 
 
 class BoundError(Exception):
-    """One small input took a lot of memory or time."""
+    """A small input took a lot of memory or time."""
 
 
 class Campaign:
@@ -51,7 +52,7 @@ class Campaign:
         self._found: set[str] = set()
 
     def run(self, data: bytes) -> None:
-        """One input; a failure is written down, and the campaign goes on."""
+        """Try one input; a failure is written to a file, and the campaign continues."""
         self._counts["runs"] += 1
         before, start_s = peak_bytes(), time.process_time()
         try:
@@ -79,13 +80,13 @@ class Campaign:
 
 
 def fuzz_one(name: str, runs: int, seed: int, output_path: Path) -> None:
-    """Does not return: libFuzzer ends the process."""
+    """Fuzz one target. Does not return: libFuzzer ends the process."""
     import atheris
 
-    # atheris instruments nothing that an editable installation's own finder loads.
+    # The finder of an editable installation would load rangesfm without atheris's instrumentation.
     sys.meta_path = [finder for finder in sys.meta_path if isinstance(finder, type)]
     sys.path.insert(0, str(PLUGIN))
-    warnings.simplefilter("error")  # a user would see them among the messages
+    warnings.simplefilter("error")  # a user would see warnings among the messages
     with atheris.instrument_imports(include=["rangesfm"]):
         campaign = Campaign(name, output_path)
 

@@ -1,4 +1,4 @@
-"""What is fuzzed: the readers of all files that a user brings, and what must hold of whatever they accept."""
+"""Targets of the fuzzing: the readers of all files that a user brings, and checks of whatever they accept."""
 
 from __future__ import annotations
 
@@ -28,24 +28,24 @@ from rangesfm.survey.settings import Survey, read_survey
 from rangesfm.vision.image_times import ImageTimes, read_image_times_csv
 
 CORPUS = Path(__file__).parent / "corpus"
-_WHOLE_CHECK_EVERY = 8  # by chance: it takes longer than all else
+_WHOLE_CHECK_EVERY = 8  # only some inputs, chosen by a checksum, because this check takes the longest
 REFUSALS = (InputError, GeometryError)
 
 
 class SilentAcceptanceError(Exception):
-    """A reader took what it should have refused, or gave back what is not as its type promises."""
+    """A reader accepted what it should have refused, or returned something that its type does not allow."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """A reader.
+    """A reader to fuzz.
 
     Attributes:
         name: of the target, and of its folder of seeds.
-        file_name: what the file is called; endings may matter.
-        read: the file, refused by one of REFUSALS.
+        file_name: the name of the file to read; its ending may matter.
+        read: reads the file, or refuses it with one of REFUSALS.
         check: raises SilentAcceptanceError for what should not have been accepted.
-        companions: files beside it that stay as they are: what they are called, and where in the corpus they are.
+        companions: further files beside it, which stay as they are: their names, and their paths in the corpus.
     """
 
     name: str
@@ -58,7 +58,7 @@ class Target:
         return sorted((CORPUS / self.name).iterdir())
 
     def run(self, data: bytes, folder: Path) -> bool:
-        """Whether the file is accepted; whatever escapes from here is a finding."""
+        """Return whether the file is accepted; any other exception is a finding."""
         path = folder / self.file_name
         path.write_bytes(data)
         for name, seed in self.companions:
@@ -78,7 +78,7 @@ def _expect(holds: object, what: str) -> None:
 
 
 def _check_log(log: RangeLog) -> None:
-    """A log is what its type promises; some are summed up, and written and read again without loss."""
+    """Check what the type of a log promises; some logs are also summed up, written and read again without loss."""
     _expect(len(log) > 0, "a log without ranges")
     _expect(np.all(np.isfinite(log.range_m)) and np.all(log.range_m > 0), "ranges that are finite and positive")
     _expect(log.timestamp_s is None or np.all(np.isfinite(log.timestamp_s)), "times that are finite")
@@ -136,7 +136,7 @@ def _check_survey(survey: Survey) -> None:
 
 
 def _read_whole_result(path: Path) -> ResultFolder:
-    """Everything that pages and exports ask for."""
+    """Read everything that pages and exports ask for."""
     result = read_result_folder(path.parent)
     summary = result.summary
     summary.metric_from_sfm.similarity, summary.scale.relative_stddev_empirical, summary.scale.larger_stddev  # noqa: B018
@@ -149,7 +149,7 @@ def _read_whole_result(path: Path) -> ResultFolder:
 
 
 def _carry(path: Path) -> Path:
-    """Into another world, and back from there: what is written can be read again."""
+    """Transform a file to another world and back, so that what is written is read again."""
     similarity = Similarity(2.0, np.eye(3), np.array([1.0, 2.0, 3.0]))
     with tempfile.TemporaryDirectory() as folder:
         (written,) = apply_to([path], similarity, Path(folder))

@@ -1,4 +1,4 @@
-"""A few seconds of fuzzing with fixed seeds; the long runs are in README.md beside this file."""
+"""A few seconds of fuzzing with fixed seeds; README.md beside this file describes the long runs."""
 
 from __future__ import annotations
 
