@@ -1,4 +1,4 @@
-"""Installations other than the one at hand."""
+"""Simulate other installations than the present one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rangesfm.installed_versions import installed_version
 
 
 def with_installed(monkeypatch: pytest.MonkeyPatch, **versions: str | None) -> None:
-    """Have these packages installed in these versions (None: not there), an underscore for a hyphen."""
+    """Simulate packages in these versions (None: not installed); write an underscore for a hyphen."""
     known = {name.replace("_", "-"): version for name, version in versions.items()}
     monkeypatch.setattr(
         installed_versions, "installed_version", lambda name: known[name] if name in known else installed_version(name)
@@ -18,7 +18,7 @@ def with_installed(monkeypatch: pytest.MonkeyPatch, **versions: str | None) -> N
 
 
 def with_gpus(monkeypatch: pytest.MonkeyPatch, num: int | None) -> None:
-    """Have a pycolmap that finds so many GPUs; None: one that is built without CUDA."""
+    """Simulate a pycolmap that finds this number of GPUs (None: built without CUDA)."""
     if num is None:
         monkeypatch.delattr(pycolmap, "get_num_cuda_devices", raising=False)
     else:

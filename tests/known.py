@@ -1,4 +1,4 @@
-"""What a test knows to be there."""
+"""Unwrap optional results that a test expects to be there."""
 
 from __future__ import annotations
 
@@ -8,6 +8,6 @@ _T = TypeVar("_T")
 
 
 def known(value: _T | None) -> _T:
-    """The value, which a result may leave open and this one must not."""
+    """Return a value that may be None in general, but not in this test."""
     assert value is not None
     return value

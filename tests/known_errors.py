@@ -1,4 +1,4 @@
-"""Errors of ranges as if a scale stage had found them."""
+"""Range errors with known values, in the form in which the scale stage finds them."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def known_errors(
     inflation: float = 1.0,
     common_bias_stddev_m: float = RangeModelOptions().common_bias_stddev_m,
 ) -> RangeErrors:
-    """Of all ranges of the log.
+    """Return errors of all ranges of the log that have a place.
 
     Args:
-        stddev_m: of every range, or (n,) of each: all of it, also what short ranges share.
+        stddev_m: of every range, or (n,) of each, including the part that short ranges share.
         is_estimated: whether the refinement is to estimate the noise anew.
     """
     rows, num = observations.placed_rows, len(observations.log)

@@ -1,4 +1,4 @@
-"""Similarities and the shape of paths."""
+"""Similarities, and the shape of paths."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_rmse_is_that_of_lengths_and_of_nothing_not_a_number() -> None:
 
 
 def test_path_shape_tells_how_long_wide_and_high_a_path_is(rng: np.random.Generator) -> None:
-    # Corners of a box: the extents are half its edges.
+    # For the corners of a box, the stddevs are half its edges.
     corners = np.array([(x, y, z) for x in (-3.0, 3.0) for y in (-2.0, 2.0) for z in (-1.0, 1.0)])
     rotation = random_similarity(rng, 1.0).rotation
     shape = path_shape(corners @ rotation.T + 5.0)
@@ -154,7 +154,7 @@ def test_few_points_are_of_some_kind(num_points: int) -> None:
 
 
 ONE_PLACE = np.tile([0.1, -7.3, 1.6], (7, 1))
-"""Whose mean is none of them."""
+"""Seven times the same point; rounding makes their mean differ from it."""
 
 
 def test_points_that_only_rounding_parts_are_one_place(rng: np.random.Generator) -> None:

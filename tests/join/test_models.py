@@ -1,4 +1,4 @@
-"""Models without a common photo, joined through anchors, as the truth has them; and what does not hold them."""
+"""Models without a common photo are joined through anchors as the truth has them, or left out if they cannot be."""
 
 from __future__ import annotations
 
@@ -45,12 +45,13 @@ HALF = NUM_PHOTOS // 2
 
 @dataclass(frozen=True)
 class Halves:
-    """One walk, mapped in two halves that know nothing of each other.
+    """One walk, mapped in two halves that have no photo or point in common.
 
     Attributes:
-        parts: each in a world and a unit of its own.
-        log: ranges of both.
-        centers_m: (n, 3) and first_camera: world_from_cam of the first, the truth.
+        parts: the paths of the halves, each in a world and a unit of its own.
+        log: ranges of both halves.
+        centers_m: (n, 3) true centres.
+        first_camera: (3, 3) true world_from_cam of the first photo.
     """
 
     parts: tuple[PathOfModel, ...]
@@ -59,7 +60,7 @@ class Halves:
     first_camera: Array
 
     def with_ranges(self, wanted: npt.NDArray[np.bool_]) -> Halves:
-        """The same where the other ranges never arrived."""
+        """Return the same halves with these ranges only."""
         log = self.log.subset(wanted)
         parts = (replace(p, observations=associate(log, p.trajectory, TAG_IN_CAM_M)) for p in self.parts)
         return replace(self, log=log, parts=tuple(parts))
@@ -74,12 +75,12 @@ class Halves:
         return join_models(self.parts, Survey().changed({"scale.max_relative_stddev": 0.2}), inputs)
 
     def off_m(self, centers: Array, *, with_scale: bool = True) -> float:
-        """How far a photo is from the truth, at most, after the best similarity (or rigid motion) of all."""
+        """Return the largest distance of a photo from the truth after the best similarity (or rigid motion) of all."""
         aligned = align_points(centers, self.centers_m, with_scale=with_scale).apply(centers)
         return float(np.linalg.norm(aligned - self.centers_m, axis=1).max())
 
     def write(self, folder: Path) -> Survey:
-        """The log and the times of the photos, and a survey that needs nothing more than photos or a model."""
+        """Write the log and the times of the photos; return a survey that only lacks photos or a model."""
         write_ranges_csv(self.log, folder / "uwb.csv")
         rows = ["image_name,timestamp_s\n"]
         for path in (part.trajectory for part in self.parts):
@@ -103,7 +104,7 @@ class Halves:
 
 
 def walk() -> Halves:
-    """Up and down along a loop, ranges to four anchors at each photo."""
+    """Simulate a loop with large changes of height, and ranges to four anchors at each photo."""
     level = loop_path(NUM_PHOTOS + 2.0, start_s=99.0, seed=3)
     knots = np.linspace(99.0, 101.0 + NUM_PHOTOS, NUM_PHOTOS + 3)
     centers = level.centers(knots) + np.outer(0.8 * np.sin(0.9 * knots), [0, 0, 1])
@@ -128,14 +129,14 @@ def exact() -> Halves:
 
 
 def of_half(halves: Halves, number: int) -> npt.NDArray[np.bool_]:
-    """(n,) ranges taken in it."""
+    """(n,) whether each range was taken in this half."""
     assert halves.log.timestamp_s is not None
     in_second: npt.NDArray[np.bool_] = halves.log.timestamp_s >= 99.5 + HALF
     return in_second if number == 1 else ~in_second
 
 
 def test_halves_of_a_walk_are_where_they_were_if_the_anchors_are_known(exact: Halves) -> None:
-    """In the frame of the first photo, which for the second half is a site's."""
+    """The anchors are given in the frame of the first photo; the second half treats it as a site frame."""
     joined = exact.join("first_camera")
     assert exact.off_m(joined.path.trajectory.centers) < 1e-6
     assert [verdict.joined_from_sfm is not None for verdict in joined.verdicts] == [True, True]
@@ -203,7 +204,7 @@ def test_a_run_joins_what_the_mapper_left_in_pieces(
 
 @pytest.fixture(scope="module")
 def finished(exact: Halves, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Both halves as surveys of their own."""
+    """Scale each half as a survey of its own, and return the folder."""
     folder = tmp_path_factory.mktemp("surveys")
     for part, day in zip(exact.parts, ("monday", "tuesday"), strict=True):
         (folder / day).mkdir()

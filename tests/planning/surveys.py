@@ -1,4 +1,4 @@
-"""Plans of surveys, and such surveys as they may turn out."""
+"""Plans of surveys, and simulated outcomes of them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ COPLANAR_M = ((6.0, 6.0, 1.6), (-6.0, 6.0, 1.6), (6.0, -6.0, 1.6), (-6.0, -6.0, 
 
 
 def loop(duration_s: float = 60.0, num_keyframes: int = 120, height_amplitude_m: float = 0.35) -> Trajectory:
-    """A walk round the middle, at 1.6 m."""
+    """A walk around the middle, at a height of 1.6 m."""
     path = loop_path(duration_s, unsteadiness_m=0.02, height_amplitude_m=height_amplitude_m, seed=3)
     times = np.linspace(0.0, duration_s, num_keyframes)
     names = tuple(f"{number:04d}.jpg" for number in range(num_keyframes))
@@ -34,13 +34,13 @@ def loop(duration_s: float = 60.0, num_keyframes: int = 120, height_amplitude_m:
 def planned(
     anchors_m: Sequence[Place], frame: str, trajectory: Trajectory | None = None, **others: Any
 ) -> PlannedSurvey:
-    """With a radio that ranges five times a second."""
+    """A plan with a radio that ranges five times a second."""
     anchors = tuple(Anchor(f"A{number}", np.array(place)) for number, place in enumerate(anchors_m))
     return PlannedSurvey(trajectory or loop(), anchors, frame, **{"rate_hz": 5.0, **others})
 
 
 def turned_out(expected: Expected, seed: int) -> RangeObservations:
-    """Its ranges with errors drawn from what was expected of them."""
+    """Simulate an outcome of a plan: its ranges with errors drawn from the expected ones."""
     rng = np.random.default_rng(seed)
     learned, log = expected.learned, expected.observations.log
     white = learned.names.index("white")

@@ -1,4 +1,4 @@
-"""What a plan expects is what runs of such surveys state."""
+"""What a plan expects agrees with what runs of such surveys state."""
 
 from __future__ import annotations
 
@@ -107,6 +107,6 @@ def test_what_is_known_of_the_radio_counts() -> None:
 
 def test_a_taped_length_makes_the_scale_no_better_than_itself_and_the_bending_of_the_map() -> None:
     taped = expect(planned(FIVE_ANCHORS_M, "site", taped=((5.0, 0.005),)))
-    # 5 mm of 5 m, and the map's bending between its ends.
+    # 5 mm in 5 m, and the bending of the map between the ends.
     assert 0.5 * BENDING < taped.uncertainty.components["given"] < 1.5 * BENDING
     assert 0.5 * BENDING < taped.uncertainty.empirical < 1.5 * BENDING

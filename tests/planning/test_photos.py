@@ -1,4 +1,4 @@
-"""What photos know of a planned path makes its map stiff, and its keyframes certain, as far as it goes."""
+"""The photos of a planned path limit how far its map can bend, and make its keyframes as certain as they allow."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_every_point_is_in_the_picture_of_the_photos_that_find_it() -> None:
     half_width = np.tan(np.deg2rad(OPEN.field_of_view_deg / 2))
     assert np.abs(rays.ray[:, 0]).max() < half_width
     assert np.bincount(rays.point).min() >= 2
-    # As many as wanted in nearly every photo.
+    # Nearly every photo has as many points as asked for.
     assert np.median(np.bincount(rays.frame, minlength=60)) == OPEN.num_points
     in_a_row = np.diff(rays.frame)[np.diff(rays.point) == 0]
     assert set(in_a_row.tolist()) == {1}

@@ -36,7 +36,7 @@ def test_places_on_walls_lie_on_them_at_both_heights() -> None:
 
 
 def test_placed_anchors_stand_in_the_box_and_know_more_than_a_bad_choice() -> None:
-    # In one corner, at one height.
+    # All in one corner, at one height.
     crowded = [(-7.0, -6.0, 0.3), (-7.0, -2.0, 0.3), (-2.333, -6.0, 0.3)]
     before = planned(crowded, "site", loop(30.0, 60), allowed_m=places_in_box(LOW, HIGH), is_placed=False)
     after = place_anchors(before)

@@ -1,4 +1,4 @@
-"""A plan's file is read or refused in one line that says where."""
+"""A plan's file is read, or refused in one line that says where it is wrong."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_waypoints_are_walked_at_their_speed(tmp_path: Path) -> None:
     assert plan.duration_s == pytest.approx((4 + np.hypot(2, 2)) / 0.5, abs=0.5)
     steps = np.linalg.norm(np.diff(plan.trajectory.centers, axis=0), axis=1)
     assert np.median(steps) == pytest.approx(0.25)
-    # Along x, level: the camera's z is the way, its y is down.
+    # The camera is level and looks along its way, which is x: its z axis is the way, and its y axis points down.
     np.testing.assert_allclose(plan.trajectory.world_from_cam[0] @ [0, 0, 1], [1, 0, 0], atol=1e-12)
     np.testing.assert_allclose(plan.trajectory.world_from_cam[0] @ [0, 1, 0], [0, 0, -1], atol=1e-12)
     assert np.linalg.det(plan.trajectory.world_from_cam) == pytest.approx(1.0)
@@ -49,7 +49,7 @@ def test_a_loop_stays_within_its_floor_and_its_heights(tmp_path: Path) -> None:
     low, high = path.centers.min(axis=0), path.centers.max(axis=0)
     np.testing.assert_allclose(low, [2, 4 / 3, 1.0], atol=0.1)
     np.testing.assert_allclose(high, [10, 20 / 3, 1.8], atol=0.1)
-    # Twice round.
+    # Two rounds.
     assert np.linalg.norm(np.diff(path.centers, axis=0), axis=1).sum() == pytest.approx(2 * 2 / 3 * 40, rel=0.1)
 
 

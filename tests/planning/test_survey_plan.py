@@ -1,4 +1,4 @@
-"""A plan says what will be known, what would be found, and what to change, in numbers that hold."""
+"""A plan gives the expected uncertainty, the mistakes that would be found and what to change, in numbers that hold."""
 
 from __future__ import annotations
 

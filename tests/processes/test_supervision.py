@@ -1,4 +1,4 @@
-"""Processes that speak, grow, crash and do not want to end."""
+"""Child processes that report, use too much memory, crash, or do not end when they are told to."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_a_child_imports_nothing_from_the_working_folder(
         memory_limit_bytes=None,
         is_stopped=lambda: False,
     )
-    assert ended.last is not None, ended.how  # it came as far as to say what is wrong
+    assert ended.last is not None, ended.how  # it got far enough to say what is wrong
     assert "failed" in ended.last
     assert not sprung()
 

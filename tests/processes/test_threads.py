@@ -1,4 +1,4 @@
-"""Parts side by side."""
+"""Work in parallel threads."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from rangesfm.processes.threads import (
 if TYPE_CHECKING:
     from tests.conftest import Command
 
-# What only reads, writes, rearranges or holds something, or solves for four unknowns at most.
+# Public names that only read, write, rearrange or hold something, or solve for at most four unknowns.
 COMPUTES_NOTHING = {
     *("Anchor", "GeometryError", "InputError", "PlannedSurvey", "RangeLog", "RangesfmError", "ReconstructionError"),
     *("Similarity", "SolverError", "Survey", "Trajectory", "export_model", "export_result", "find_image_times"),
@@ -131,8 +131,8 @@ def test_no_more_threads_than_are_allowed_inside_a_block_however_they_are_nested
 
 @pytest.fixture
 def two_blas_threads() -> Iterator[None]:
-    """What numpy and scipy take by themselves where there are two cores."""
-    assert scipy.linalg.norm(np.eye(2)) > 0  # loaded
+    """Let numpy and scipy use two threads, as they do by default on two cores."""
+    assert scipy.linalg.norm(np.eye(2)) > 0  # loads scipy's BLAS
     with threadpool_limits(limits=2, user_api="blas"):
         yield
 

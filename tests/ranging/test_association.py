@@ -30,7 +30,7 @@ def trajectory_of(times: Array | None, centers: Array, world_from_cam: Array | N
 
 
 def log_at(times: npt.ArrayLike, range_m: npt.ArrayLike = 5.0, anchor_ids: Sequence[str] = ("A",)) -> RangeLog:
-    """One range to each of the anchors in turn at given times."""
+    """A log of one range at each time, to the anchors in turn."""
     times = np.asarray(times, dtype=np.float64)
     ids = [anchor_ids[i % len(anchor_ids)] for i in range(len(times))]
     return RangeLog.from_arrays(ids, np.broadcast_to(range_m, times.shape), timestamp_s=times)
@@ -46,7 +46,7 @@ def straight(times: Array) -> Array:
 
 
 def curved(times: Array) -> Array:
-    """A walk in a circle of 2 m radius, at 1.2 m/s, bobbing."""
+    """A walk in a circle of 2 m radius at 1.2 m/s, going up and down."""
     return np.stack([2 * np.cos(0.6 * times), 2 * np.sin(0.6 * times), 0.1 * np.sin(1.5 * times)], axis=1)
 
 
@@ -100,7 +100,7 @@ class TestBetweenKeyframes:
     def test_a_straight_walk_seen_in_bursts_of_noisy_photos_is_known_half_way_as_well_as_stated(
         self, num_photos: int
     ) -> None:
-        """Two bursts at 15 Hz, 1.33 s apart; keyframes err by 2 cm in each coordinate."""
+        """Two bursts at 15 Hz are 1.33 s apart; keyframes have an error of 2 cm in each coordinate."""
         burst = np.arange(num_photos) / 15
         keyframe_times = np.concatenate([burst, burst[-1] + 1.33 + burst])
         half_way = np.array([burst[-1] + 1.33 / 2])
@@ -113,7 +113,7 @@ class TestBetweenKeyframes:
             stddevs.append(found.center_stddev)
         error, stated = np.sqrt(np.mean(np.square(errors))), np.sqrt(np.mean(np.square(stddevs)))
         assert 0.8 < error / stated < 1.25
-        # A straight line between the two keyframes errs by 0.02 / sqrt(2).
+        # A straight line between the two keyframes would have an error of 0.02 / sqrt(2).
         assert error < 0.035
 
     @pytest.mark.parametrize("gap_s", [0.1, 0.5])
@@ -132,7 +132,8 @@ class TestBetweenKeyframes:
         fine = np.arange(0.0, 200.0, 0.05)
         velocity = np.cumsum(0.1 * np.sqrt(0.05) * rng.standard_normal((len(fine), 3)), axis=0)
         walk = np.cumsum(0.05 * velocity, axis=0)
-        chosen = np.flatnonzero(np.isin(np.arange(len(fine)) % 40, [0, 4, 8, 12]))  # 0.2 s thrice, then 1.4 s
+        # three gaps of 0.2 s, then one of 1.4 s
+        chosen = np.flatnonzero(np.isin(np.arange(len(fine)) % 40, [0, 4, 8, 12]))
         found = associate(log_at(fine[50:-50]), trajectory_of(fine[chosen], walk[chosen]), np.zeros(3))
         gap_s = (fine[chosen][found.after] - fine[chosen][found.before]).round(3)
         error = found.centers - walk[50:-50]
@@ -142,7 +143,7 @@ class TestBetweenKeyframes:
         assert rms[1] > 5 * rms[0]
 
     def test_a_lever_arm_turns_as_well_as_stated_where_turns_begin_and_end(self) -> None:
-        """A camera that turns about its vertical axis to and fro, faster and slower at random."""
+        """The camera turns to and fro about its vertical axis, at a randomly changing rate."""
         rng = np.random.default_rng(3)
         fine = np.arange(0.0, 120.0, 0.1)
         rate = np.cumsum(0.2 * np.sqrt(0.1) * rng.standard_normal(len(fine)))
@@ -157,12 +158,12 @@ class TestBetweenKeyframes:
         at = Rotation.from_matrix(path.world_from_cam[found.before[between]])
         of_shortest = (at * part).apply(arm_m) - turned[15:-15].apply(arm_m)[between]
         assert np.mean(error[between] ** 2) < 0.7 * np.mean(of_shortest**2)
-        # The turn has one axis of three here, the arm is at right angles to it.
+        # The turn has only one axis of three, but the arm is at right angles to it.
         normalized = error[between] / found.arm_stddev_m[between, None]
         assert 0.5 < np.sqrt(np.mean(normalized**2)) < 2.0
 
     def test_stated_stddev_is_about_the_error_where_photos_are_too_rare_for_the_motion(self) -> None:
-        """A new direction about every second, and a photo in as much time or more: a spline says little."""
+        """The direction changes about every second, and photos are further apart, so that a spline predicts little."""
         rng = np.random.default_rng(1)
         knots = np.arange(0.0, 602.0, 1.0)
         walk = CubicSpline(knots, rng.normal(0, 1, (len(knots), 3)))
@@ -174,7 +175,7 @@ class TestBetweenKeyframes:
             found = associate(log_at(range_times), path, np.zeros(3), options=options)
             middle = np.abs(found.weight - 0.5) < 0.2
             error = np.sqrt(np.mean((found.centers - walk(range_times))[middle] ** 2))
-            # With a gain taken for granted (that of a smooth path) 2.7 to 6.
+            # With the gain of a smooth path, the ratio would be 2.7 to 6.
             assert 0.4 < error / np.mean(found.center_stddev[middle]) < 2.5
 
     def test_the_lever_arm_turns_with_the_camera(self) -> None:
@@ -252,10 +253,10 @@ class TestNextToAKeyframe:
 
 
 class TestCoarseTimes:
-    """A walk at 1.2 m/s; times of photos or ranges are written in steps, and say so by their stddev."""
+    """A walk at 1.2 m/s, where the times of photos or ranges are rounded and their stddev includes the rounding."""
 
     def error_in_stddevs(self, photo_step_s: float, range_step_s: float, seed: int) -> tuple[float, float]:
-        """Root mean square of each coordinate's error in stated stddevs; median stddev."""
+        """Return the root mean square error of the coordinates in stated stddevs, and the median stated stddev."""
         rng = np.random.default_rng(seed)
         photo_times = np.cumsum(rng.uniform(1.2, 1.9, 80))
         range_times = np.sort(rng.uniform(photo_times[2], photo_times[-3], 2000))
@@ -275,7 +276,7 @@ class TestCoarseTimes:
     def test_stddev_of_a_place_includes_the_rounding(self, photo_step_s: float, range_step_s: float) -> None:
         found = [self.error_in_stddevs(photo_step_s, range_step_s, seed) for seed in range(5)]
         assert 0.6 < np.mean([error for error, _ in found]) < 1.5
-        # 1.2 m/s for 0.29 s, in each of three coordinates, as a photo's or a range's time is rounded or both are.
+        # 1.2 m/s for 0.29 s, spread over three coordinates, with the times of photos, of ranges or of both rounded.
         assert 0.1 < np.mean([stddev for _, stddev in found]) < 0.4
 
     def test_exact_times_add_nothing(self) -> None:
@@ -310,7 +311,9 @@ class TestLongGaps:
         np.testing.assert_allclose(whole.centers, alone.centers, atol=1e-12)
 
     def test_a_gap_of_the_limit_is_none_whatever_the_date(self) -> None:
-        """Seconds since 1970 are 2.4e-7 s apart: photos every 2 s are now less, now more."""
+        """Double-precision seconds since 1970 have steps of 2.4e-7 s, so photos every 2 s are sometimes slightly
+        further apart.
+        """
         times = 1.7e9 + 0.1 + 2.0 * np.arange(20) + 1e-7 * np.arange(20)
         assert np.ptp(np.diff(times)) > 0
         found = associate(log_at(times[:-1] + 1.0), trajectory_of(times, straight(times - times[0])), TAG_IN_CAM_M)
@@ -324,7 +327,7 @@ class TestLongGaps:
 
 
 class TestStopAndGo:
-    """Photos every 8 s; ranges at 10 Hz for 2 s around each photo, or all the time."""
+    """Photos every 8 s; ranges at 10 Hz, for 2 s around each photo or all the time."""
 
     PHOTOS = np.linspace(0.0, 88.0, 12)
     ANCHOR = np.array([6.0, 5.0, 2.0])

@@ -10,7 +10,7 @@ from rangesfm.ranging.readers.reader import Sides, tell_roles
 
 
 def log_of(*pairs: tuple[str, str]) -> RangeLog:
-    """One range of 1, 2, .. m for each pair of tag and anchor, as a reader hands them over."""
+    """A log of ranges of 1, 2, ... m, one for each pair of tag and anchor, as a reader returns it."""
     tags, anchors = zip(*pairs)
     n = len(pairs)
     return RangeLog.from_arrays(

@@ -1,4 +1,4 @@
-"""A log in a few numbers."""
+"""The summary of a log in a few numbers."""
 
 from __future__ import annotations
 
@@ -84,11 +84,11 @@ def test_few_or_fine_ranges_are_not_suspected() -> None:
     assert find_quantization_m(np.random.default_rng(1).uniform(1, 90, 500)) is None
 
 
-# Noise from the log itself
+# Noise, estimated from the log alone
 
 
 def walk(rate_hz: float, num: int) -> tuple[Array, Array]:
-    """Times and true ranges of somebody who walks about an anchor."""
+    """Times and true ranges of somebody who walks around an anchor."""
     time = np.arange(num) / rate_hz
     return time, 5 + 2 * np.sin(0.7 * time) + np.cos(0.31 * time)
 

@@ -1,4 +1,4 @@
-"""The tag's place at each range, from a path that is known."""
+"""The tag's position at each range, from a known path."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Steps of a log's times are seen where ranges that cannot be simultaneous have the same time."""
+"""The rounding of a log's times is seen from ranges that cannot be simultaneous but have the same time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Time stamps become the range that they were made from."""
+"""Time stamps of two-way ranging become the range that they were made from."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from rangesfm.ranging.twr import (
 
 Array = npt.NDArray[np.float64]
 TENTH_OF_A_MILLIMETRE = 1e-4
-CRYSTAL = 20e-6  # no range is better than the clock it was measured with
+CRYSTAL = 20e-6  # no range is more accurate than the clock that measured it
 RANGES_M = np.linspace(0.3, 80, 2000)
 
 

@@ -1,4 +1,4 @@
-"""An anchors' file says who the anchors are and what is known of each, or is refused with its line."""
+"""An anchors' file gives the anchors and what is known of each, or is refused with the number of the wrong line."""
 
 from __future__ import annotations
 

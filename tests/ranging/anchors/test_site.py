@@ -1,4 +1,4 @@
-"""Anchors in large coordinates are worked with near their middle."""
+"""Anchors with large coordinates are computed with near their middle."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An anchor is found from ranges at known positions, with its mirror image, its error, or the reason why not."""
+"""An anchor is located from ranges at known positions, with its mirror image and error, or refused with a reason."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ KNOWN_BIAS = TrilaterationOptions(range_bias_stddev_m=0.0)
 
 
 def flight(num: int = 100) -> Array:
-    """(n, 3) a loop of 8 x 6 m that rises and falls."""
+    """(n, 3) positions on a loop of 8 x 6 m that rises and falls."""
     return loop_path(60.0, height_amplitude_m=1.5, seed=1).centers(np.linspace(0.0, 60.0, num))
 
 
 def flat(num: int = 100) -> Array:
-    """(n, 3) the same loop at a height of 1 m."""
+    """(n, 3) positions on the same loop at a constant height of 1 m."""
     return flight(num) * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
 
 
@@ -40,7 +40,7 @@ def noise(num: int, stddev: float = 0.1, seed: int = 0) -> Array:
 
 
 def squared_error(found: Trilateration, anchor: Array = ANCHOR_M) -> float:
-    """Over the covariance: 3 on average, if that is right."""
+    """Return the squared error normalized by the covariance; its mean is 3 if the covariance is right."""
     off = found.position_m - anchor
     return float(off @ np.linalg.solve(found.covariance_m2, off))
 
@@ -155,7 +155,7 @@ class TestRefusal:
 def population_errors(
     from_anchor_m: Array, anchor_index: npt.NDArray[np.int64], times: Array, rng: np.random.Generator
 ) -> Array:
-    """(n,) what a radio of the population gets wrong, with stddevs of its own."""
+    """(n,) range errors of a radio drawn from the population, with stddevs of its own."""
     alike = np.tile(np.eye(3), (len(times), 1, 1))
     alone = cells(anchor_index, 0 * anchor_index, times, from_anchor_m, alike, np.ones(len(times)), np.ones(4))
     assert len(alone) == len(times)
@@ -184,13 +184,16 @@ class TestCovariance:
                 assert placement.found is not None
                 off = placement.found.position_m - anchors[int(placement.anchor_id[1])]
                 pulls.append(off / np.sqrt(np.diag(placement.found.covariance_m2)))
-        # Of 95 %, three standard errors of twelve radios with twelve coordinates that err together.
+        # The expected share is 95 %. The limit allows three standard errors of twelve radios, each with twelve
+        # coordinates whose errors are correlated.
         assert np.mean(np.abs(pulls) < 1.96) > 0.86
         assert 0.7 < np.sqrt(np.mean(np.square(pulls))) < 1.3
 
     @pytest.mark.parametrize("draw", ["noise", "heteroscedastic", "bias"])
     def test_of_a_radio_better_than_others_is_not_too_small(self, draw: str) -> None:
-        """Nothing but noise: what else radios get wrong hides in the place, so the covariance allows for it."""
+        """The covariance is large enough even for pure noise, as it allows for other range errors that the position
+        would absorb.
+        """
         positions, squares, stddevs = flight(), [], []
         for seed in range(12):
             rng = np.random.default_rng(seed)
@@ -210,7 +213,7 @@ class TestCovariance:
 
     @pytest.mark.parametrize("timed", [True, False])
     def test_covers_errors_that_last(self, timed: bool) -> None:
-        """Twenty ranges in a row err alike, for 15 s: worth hardly more than one."""
+        """Twenty ranges in a row have the same error, for 15 s, and count for hardly more than one."""
         positions, times, squares = flight(400), np.linspace(0.0, 300.0, 400), []
         for seed in range(8):
             ranges = distances(positions) + np.repeat(noise(20, 0.1, seed), 20) + noise(400, 0.03, 99 + seed)
@@ -219,7 +222,7 @@ class TestCovariance:
         assert np.mean(squares) < chi2.ppf(1 - 5e-4, 24) / 8
 
     def test_anchors_together_say_more_of_their_radio_than_each_alone(self) -> None:
-        """One whose ranges are few is as certain as the radio is good, which the others show."""
+        """An anchor with few ranges benefits from the radio's noise, which the ranges of the other anchors show."""
         positions = flight(200)
         few = np.arange(0, 200, 20)
         anchors = np.array([(-6.0, -3.0, 0.2), (5.0, 5.0, -0.5), (-4.0, 5.0, 4.0)])
@@ -263,7 +266,7 @@ class TestKnownHeight:
 
 
 def errors_over_seeds(stddevs: Array, *, given: bool) -> list[float]:
-    """How far off anchors are, by ranges as noisy as ``stddevs`` say in another order each time."""
+    """Return the position errors over seeds, each with ``stddevs`` assigned to the ranges in another order."""
     positions, errors = flight(), []
     for seed in range(12):
         rng = np.random.default_rng(seed)
@@ -326,7 +329,7 @@ class TestErrorCurve:
 
 
 class TestRounding:
-    """What it would decide is decided otherwise, and the same on every machine."""
+    """Ambiguous cases are decided by rules that do not depend on rounding, and so the same on every machine."""
 
     @pytest.mark.parametrize("seed", range(6))
     def test_of_two_places_between_which_no_range_tells_the_upper_one_comes_first(self, seed: int) -> None:
@@ -345,7 +348,9 @@ class TestRounding:
 
     @pytest.mark.parametrize(("away_m", "seed"), [(20.0, 0), (60.0, 1), (200.0, 2)])
     def test_a_bias_that_is_known_does_not_make_a_place_about_a_line_certain(self, away_m: float, seed: int) -> None:
-        """In metres its information is 1e12, and what is left of a direction beside it is rounding."""
+        """The information of a known bias is 1e12 in metres; beside it, an undetermined direction keeps only rounding
+        errors.
+        """
         line = np.outer(np.linspace(-4.0, 4.0, 100), [1.0, 0.0, 0.0])
         ranges = distances(line, np.array([1.0, away_m, 3.0])) + noise(100, 0.02, seed)
         with pytest.raises(GeometryError, match="on a line, about which the anchor may stand anywhere"):

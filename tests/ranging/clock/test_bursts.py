@@ -1,4 +1,4 @@
-"""What a pairing of bursts of ranges with photos must show before it counts."""
+"""What a pairing of bursts of ranges with photos must show before it is used."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The offset between the camera's and the radio's clock."""
+"""The time offset between the camera's and the radio's clock."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Walk:
     rotation: Callable[[Array], Rotation]
 
     def photos(self, times_s: Array, seed: int = 0, center_stddev_m: float = 0.01) -> Trajectory:
-        """Keyframes in a world that is turned, and smaller than it should be."""
+        """Keyframes in a world that is rotated and 0.45 m per unit."""
         world = Rotation.from_rotvec([0.3, 0.2, -0.5]).as_matrix()
         noise = np.random.default_rng(seed).normal(0, center_stddev_m, (len(times_s), 3))
         return Trajectory(
@@ -53,7 +53,7 @@ class Walk:
         noise_m: float = 0.1,
         tag_in_cam_m: tuple[float, float, float] = TAG_IN_CAM_M,
     ) -> RangeLog:
-        """A range at each time (camera's clock) to one of the anchors; some read far too long."""
+        """Simulate a range at each time (camera's clock) to one of the anchors; some of them are far too long."""
         rng = np.random.default_rng([seed, 1])
         anchor = rng.integers(0, num_anchors, len(times_s))
         tag = self.center(times_s) + self.rotation(times_s).apply(tag_in_cam_m)
@@ -68,7 +68,7 @@ def no_turn(times_s: Array) -> Rotation:
 
 
 def handheld(duration_s: float, seed: int = 0) -> Walk:
-    """About in a room of 8 x 8 m, a new direction every two seconds; still before and after."""
+    """A walk in a room of about 8 x 8 m with a new direction every two seconds; still before and after it."""
     rng = np.random.default_rng([seed, 2])
     knots = 2.0 * np.arange(int(duration_s / 2) + 2)
     center = CubicSpline(knots, rng.normal(0, 1, (len(knots), 3)) * [2, 2, 0.4])
@@ -141,7 +141,7 @@ def test_lever_arm_of_half_a_metre_does_not_shift_the_offset() -> None:
 
 
 def both_tags(first: RangeLog, second: RangeLog) -> RangeLog:
-    """One log of two tags."""
+    """Merge two logs into one log with two tags."""
     ids = [log.anchor_ids[k] for log in (first, second) for k in log.anchor_index]
     return RangeLog.from_arrays(
         ids,
@@ -181,7 +181,8 @@ def test_curve_over_all_offsets_is_lowest_at_the_one_found() -> None:
     assert np.all(np.diff(curve.offsets_s) > 0)
     assert curve.offsets_s[0] < 5.0 - 15 < 5.0 + 15 < curve.offsets_s[-1]
     assert curve.offsets_s[np.argmin(curve.costs_m)] == pytest.approx(5.0, abs=0.1)
-    # At the offset the cost is the noise of the ranges (0.1 m, a fifth too long); elsewhere the motion is in it.
+    # At the true offset, the cost is the noise of the ranges (0.1 m, one in five too long); elsewhere the motion adds
+    # to it.
     assert 0.08 < curve.costs_m.min() < 0.2
     assert np.median(curve.costs_m[np.abs(curve.offsets_s - 5.0) > 5.0]) > 3 * curve.costs_m.min()
 
@@ -224,7 +225,7 @@ def test_drift_of_200_ppm_is_noticed_and_named_and_followed() -> None:
     assert found.note is not None
     assert "the clocks drift: the camera's gains +" in found.note
     assert "ppm on the radio's" in found.note
-    # The whole way the offset is known to a few milliseconds, though it changes by 0.12 s.
+    # The offset changes by 0.12 s over the log, and is known to a few milliseconds everywhere.
     np.testing.assert_allclose(found.at(times_of(log)), times - times_of(log), atol=0.015)
 
 
@@ -262,7 +263,8 @@ def test_stddev_covers_what_whole_seconds_do_to_the_offset(photos_are_rounded: b
         stddevs.append(found.stddev_s)
     assert 0.3 < np.sqrt(np.mean(np.square(errors_in_stddevs))) < 1.5
     assert np.mean(np.abs(errors_in_stddevs) < 1.96) >= 3 / 4
-    # 0.29 s a photo, 65 photos: 0.036 s at the least; ranges share a second, so that theirs averages out better.
+    # Rounding adds 0.29 s per photo, so at least 0.036 s for 65 photos. Ranges share a second, so that their rounding
+    # averages out better.
     assert np.median(stddevs) > (0.02 if photos_are_rounded else 0.003)
 
 
@@ -277,7 +279,7 @@ def test_photos_three_seconds_apart_along_a_smooth_way_are_enough() -> None:
 
 @dataclass(frozen=True)
 class StopAndGo:
-    """Stops of two seconds, six seconds apart; a burst of ranges at each and a photo in its middle."""
+    """Stops of two seconds, six seconds apart, with a burst of ranges at each and a photo in its middle."""
 
     log: RangeLog
     photos: Trajectory
@@ -334,7 +336,10 @@ def test_bursts_of_a_moving_camera_are_not_said_to_be_still() -> None:
 
 
 def test_bursts_that_suit_several_photos_leave_several_offsets() -> None:
-    """Two rounds past six stops, of which only one was photographed; half a round on, the stops are turned over."""
+    """The ranges cover two rounds past six stops, of which only the first was photographed.
+
+    After half a round, the stops are a rotated copy of themselves, which gives a third offset.
+    """
     stop_times = np.linspace(1000, 1066, 12)
     turn = np.pi / 3 * np.arange(12)
     stops = 4 * np.stack([np.cos(turn), np.sin(2 * turn), 0.5 * np.sin(turn)], axis=1)
@@ -377,7 +382,7 @@ def test_motion_that_does_not_determine_the_offset_is_refused(
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_an_offset_that_the_motion_tells_but_loosely_is_given_with_its_stddev(seed: int) -> None:
-    """A third of an even walk around an ellipse: later is nearly the same as further round."""
+    """On a third of an even walk around an ellipse, a later time looks nearly the same as a place further round."""
 
     def center(times: Array) -> Array:
         turn = 2 * np.pi * times / 33

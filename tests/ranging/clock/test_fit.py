@@ -1,4 +1,4 @@
-"""The descent to an offset of the clocks."""
+"""The descent to a time offset of the clocks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def path() -> PathSamples:
 
 
 def ranges_at(path: PathSamples, offset_s: float, noise_m: float) -> TimedRanges:
-    """Of clocks with an offset, in the middle of the walk."""
+    """Simulate ranges in the middle of the walk, for clocks with this offset."""
     rng = np.random.default_rng(1)
     times_s = np.sort(rng.uniform(40.0, 160.0, 1500))
     zero = np.zeros(len(times_s), dtype=np.int64)
@@ -39,13 +39,13 @@ def test_descents_end_soon_where_they_are_far_behind_and_go_on_where_they_are_no
     alone, behind = refine_offset(ranges, path, -20.0), refine_offset(ranges, path, -20.0, best)
     assert behind.is_hopeless_beside(best)
     assert not best.is_hopeless_beside(behind)
-    assert abs(behind.offset_s + 20.0) < abs(alone.offset_s + 20.0)  # it ended on the way
+    assert abs(behind.offset_s + 20.0) < abs(alone.offset_s + 20.0)  # it stopped on the way
     again = refine_offset(ranges, path, 0.3, behind)
     assert again.offset_s == best.offset_s
 
 
 def test_even_motion_on_a_line_tells_nothing_of_the_clocks() -> None:
-    """Another offset is another place of the anchor."""
+    """Another offset fits equally well with another place of the anchor."""
     times_s = STEP_S * np.arange(NUM_SAMPLES)
     way = times_s[:, None] * np.array([0.5, 0.2, 0.0])
     even = PathSamples(0.0, STEP_S, way, np.zeros((1, NUM_SAMPLES, 3)), np.ones(NUM_SAMPLES, dtype=bool))
@@ -53,7 +53,7 @@ def test_even_motion_on_a_line_tells_nothing_of_the_clocks() -> None:
 
 
 def test_of_two_offsets_one_is_as_much_likelier_as_the_other_is_less_likely(path: PathSamples) -> None:
-    """Each puts other ranges on the path; those that both do are compared."""
+    """Each offset puts other ranges on the path; only the ranges that both put there are compared."""
     ranges = ranges_at(path, 0.0, 0.02)
     best, rival = (fit_at_offset(ranges, path, offset_s) for offset_s in (0.0, -60.0))
     assert len(rival.losses) < len(best.losses)

@@ -1,4 +1,4 @@
-"""Which offsets of the clocks are likely."""
+"""Which time offsets of the clocks are likely."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""All offsets of the clocks at once."""
+"""The search over all time offsets of the clocks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rangesfm.ranging.clock.search import PathSamples, TimedRanges, scan_offsets
 
 @pytest.mark.parametrize("rounding", [0.0, 1e-15])
 def test_a_camera_that_stands_still_but_for_rounding_explains_no_range_at_any_offset(rounding: float) -> None:
-    """Not even one that reads as its rounding does."""
+    """No ranges fit any offset, not even ranges that vary as the rounding errors do."""
     rng = np.random.default_rng(0)
     wobble = rng.normal(size=(400, 3)).cumsum(axis=0)
     centers = np.array([1.0, 2.0, 3.0]) + rounding * wobble / np.abs(wobble).max()

@@ -1,4 +1,4 @@
-"""What ranges see of how a map is bent, against small moves of its poses."""
+"""How ranges respond to the bending of a map, compared with small moves of its poses."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ON_PATH = OnPath(BEFORE, BEFORE + 1, RNG.uniform(size=NUM_RANGES))
 
 @pytest.fixture(scope="module")
 def path() -> Trajectory:
-    """Starts at the origin, as the first camera's frame has it."""
+    """A path that starts at the origin, as in the first camera's frame."""
     along = np.linspace(0, 4, NUM_POSES)
     centers = np.column_stack([np.sin(along), 1 - np.cos(along), 0.3 * np.sin(3 * along)])
     turns = Rotation.from_rotvec(np.column_stack([0.2 * along, np.sin(along), 0.5 * along])).as_matrix()
@@ -40,7 +40,9 @@ def path() -> Trajectory:
 
 
 def placed(path: Trajectory) -> tuple[Array, Array, Array]:
-    """Centres and rotations at the ranges, and lever arms in the model's axes; as linear as the derivative has it."""
+    """Centres and rotations at the ranges, and lever arms in the model's axes, interpolated linearly like the
+    derivative.
+    """
     weight = ON_PATH.weight[:, None]
     centers = (1 - weight) * path.centers[ON_PATH.before] + weight * path.centers[ON_PATH.after]
     arms = (1 - weight) * (path.world_from_cam[ON_PATH.before] @ ARM_IN_CAM_M)
@@ -68,7 +70,7 @@ def in_cells(path: Trajectory) -> Cells:
 
 
 def slopes(path: Trajectory) -> Array:
-    """(n, 6 k), the lever arm turning as at the pose before."""
+    """(n, 6 k) derivatives of the ranges; the lever arm turns with the pose before the range."""
     _, rotations, arms = placed(path)
     found = by_poses(RangeGradient.of(from_anchors_m(path)), METRIC_FROM_MODEL, rotations, arms, ON_PATH)
     return np.asarray(found.toarray())
@@ -110,7 +112,7 @@ def test_a_map_that_grows_turns_and_moves_as_a_whole_is_not_bent(path: Trajector
 
 
 def test_cells_grow_by_each_step_of_a_walk_as_its_factors_say(path: Trajectory) -> None:
-    """Beyond what the map as a whole does, which is estimated otherwise."""
+    """Motions of the map as a whole are left out, because they are estimated otherwise."""
     of_ranges, walk = in_cells(path), WalkBending(path)
     by_range = by_poses(RangeGradient.of(from_anchors_m(path)), METRIC_FROM_MODEL, *placed(path)[1:], ON_PATH)
     factors = walk.factors(of_ranges, by_range, frame_is_free=True)

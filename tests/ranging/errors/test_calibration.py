@@ -1,4 +1,4 @@
-"""The error curve of a radio is learnt with its stddev, and taken off the ranges."""
+"""The error curve of a radio is learnt with its stddev, and subtracted from ranges."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def falling(distance_m: Array) -> Array:
 
 
 def simulated(curve: object, *, seed: int, obstructed_share: float = 0.0) -> tuple[RangeLog, Array]:
-    """5000 ranges on a random walk among the anchors; each anchor has a delay, errors last for seconds."""
+    """Simulate 5000 ranges on a random walk among the anchors; each anchor has a delay, and errors last for seconds."""
     rng = np.random.default_rng(seed)
     times = np.repeat(np.arange(1250) / 10, 4)
     phase = times[:, None] * [0.31, 0.47, 0.83] + rng.uniform(0, 6, 3)

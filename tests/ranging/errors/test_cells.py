@@ -1,4 +1,4 @@
-"""Averages of ranges, and what errors that some of them share do to these."""
+"""Averages of ranges in cells, and the covariance that shared errors give them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_uncertain_places_of_one_gap_are_one_error_for_all_of_its_ranges() -> No
         np.ones(2),
     )
     covariance = found.shared_by_places(towards, placing_m, gap)
-    # Each gap draws one vector, which moves the antenna in all of its ranges.
+    # Each gap draws one vector, which moves the antenna for all of its ranges.
     shifts = rng.standard_normal((40_000, 6, 3))
     drawn = np.array([found.mean(placing_m * np.sum(towards * shift[gap], axis=1)) for shift in shifts])
     np.testing.assert_allclose(covariance, drawn.T @ drawn / len(drawn), atol=4e-2 * covariance.max())

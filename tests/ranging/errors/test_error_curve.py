@@ -1,4 +1,4 @@
-"""An error curve is written, read and taken off ranges; beyond its ends it is less and less certain."""
+"""An error curve is written, read and subtracted from ranges; beyond its ends it gets less certain."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The noise of the ranges that fit is found although most do not."""
+"""The noise of the inliers is found although most ranges are outliers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rangesfm.ranging.errors.noise import inlier_noise
 
 
 def spoilt(num: int, share: float, side: float, seed: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """Residuals of stddev 0.1 m, of which a share is off to one side by 2 m in the mean."""
+    """Residuals of stddev 0.1 m, of which a share is off to one side by 2 m on average."""
     rng = np.random.default_rng(seed)
     wrong = rng.random(num) < share
     residuals: np.ndarray[tuple[int, ...], np.dtype[np.float64]] = 0.1 * rng.standard_normal(num)

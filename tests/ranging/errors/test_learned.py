@@ -1,4 +1,4 @@
-"""What ranges get wrong is learnt from their residuals, as far as it shows there."""
+"""The errors of ranges are learnt from their residuals, as far as these show them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NO_MAP = np.zeros((0, 1))
 
 @pytest.fixture(scope="module")
 def walked() -> Cells:
-    """Ranges to four anchors every half second on a walk among them; each is a cell."""
+    """Cells of one range each, to four anchors every half second on a walk among them."""
     rng = np.random.default_rng(0)
     time_s = np.repeat(np.arange(NUM_EPOCHS) * 0.5, NUM_ANCHORS)
     along = time_s / 50 * 2 * np.pi
@@ -56,7 +56,10 @@ def test_every_component_is_a_covariance(component, walked: Cells) -> None:  # t
 
 
 def test_unknowns_that_say_the_same_twice_change_nothing(walked: Cells) -> None:
-    """Not by rounding either, which would decide how much such a direction may explain."""
+    """Redundant columns of the design do not change the result, not even by rounding.
+
+    Otherwise rounding would decide how much such a direction may explain.
+    """
     rng = np.random.default_rng(3)
     design, prior = rng.standard_normal((len(walked), 6)), np.eye(2, 6)
     off_m = 0.1 * rng.standard_normal(len(walked)) + design @ rng.standard_normal(6)
@@ -74,7 +77,7 @@ def test_errors_ten_times_as_large_as_usual_are_seen_whatever_they_are_taken_for
     drawn = vectors @ (np.sqrt(np.maximum(values, 0)) * np.random.default_rng(1).standard_normal(len(values)))
     off_m = 10 * component.median * drawn + 0.02 * np.random.default_rng(2).standard_normal(len(values))
     learned = learn(walked, off_m)
-    # About their mean: what all ranges have in common is not seen here.
+    # Only the variance about their mean, because a common error of all ranges is not seen here.
     covariance = learned.covariance_m2
     variance = np.mean(np.diag(covariance)) - np.mean(covariance)
     assert 0.7 < np.sqrt(variance) / np.std(off_m) < 3.0
@@ -102,7 +105,7 @@ def test_what_a_survey_does_not_show_counts_with_the_mean_of_its_variance_over_r
     of_radios = slope.median * np.exp(slope.spread * np.random.default_rng(6).standard_normal(200_000))
     expected = np.sqrt(np.mean(of_radios**2))
     assert stddevs(ExpectedErrors.of(walked).usual({}))["slope"] == pytest.approx(expected, rel=0.02)
-    distance_m = walked.distance_m[walked.of_range]  # a scale that is free takes up all of it
+    distance_m = walked.distance_m[walked.of_range]  # a free scale absorbs all of it
     scaled_free = learn_errors(walked, np.zeros(len(walked)), distance_m[:, None], NO_MAP, 0.05)
     assert stddevs(scaled_free)["slope"] == pytest.approx(expected, rel=0.02)
 

@@ -1,4 +1,4 @@
-"""Stretches of time whose errors go together."""
+"""Stretches of time in which errors are correlated."""
 
 from __future__ import annotations
 

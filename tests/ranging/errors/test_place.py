@@ -1,4 +1,4 @@
-"""Ranges from one place count by what their mean is worth."""
+"""Ranges from one place count as much as their mean is worth."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_a_place_of_one_error_counts_as_one_range() -> None:
 
 
 def test_shares_make_the_mean_of_correlated_errors_better() -> None:
-    """A camera that lingers in a few places: their errors, each one of a kind, rule the plain mean."""
+    """A camera lingers in a few places: their common errors dominate the plain mean."""
     rng = np.random.default_rng(2)
     labels = np.repeat(np.arange(60), np.where(np.arange(60) < 5, 400, 5))
     plain, weighted = [], []
@@ -65,7 +65,7 @@ def test_the_formal_variance_holds_for_independent_errors() -> None:
 
 
 def test_rounding_does_not_part_a_place_on_round_coordinates() -> None:
-    """A level path at 1.6 m, in whole decimetres: every other value is a multiple of the grid."""
+    """On a level path at 1.6 m in whole decimetres, every other coordinate lies on the edge of a grid cell."""
     rng = np.random.default_rng(0)
     tags = np.column_stack([0.1 * rng.integers(-50, 50, (400, 2)), np.full(400, 1.6)])
     index = np.zeros(400, dtype=np.int64)

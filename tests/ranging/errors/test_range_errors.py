@@ -1,4 +1,4 @@
-"""Noise found from residuals."""
+"""The noise of ranges, found from their residuals."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NUM_EACH = 400
 
 
 def make_errors(stddev_m: float = 1.0, *, is_estimated: bool = True, loss: RobustLoss = GEMAN_MCCLURE) -> RangeErrors:
-    """Three anchors in turn for 400 rounds of half a second."""
+    """Errors of three anchors in turn, for 400 rounds of half a second."""
     n = 3 * NUM_EACH
     rounds = np.arange(n) // 3
     return RangeErrors(
@@ -69,7 +69,7 @@ def test_slow_errors_weigh_less_than_their_size_says() -> None:
 
 
 def test_ranges_of_one_place_that_err_alike_count_for_less() -> None:
-    """A hundred places of two ranges to each anchor, and then one place for all the rest."""
+    """A hundred places have two ranges to each anchor each; one more place has all the others."""
     num_places = 101
     rounds = np.minimum(np.arange(3 * NUM_EACH) // 3 // 2, num_places - 1)
     place = rounds + num_places * (np.arange(3 * NUM_EACH) % 3)
@@ -87,7 +87,7 @@ def test_ranges_of_one_place_that_err_alike_count_for_less() -> None:
 
 
 def test_independent_errors_keep_their_say() -> None:
-    """Chance makes some of them look alike; on average it takes little, of one place as of one stretch of time."""
+    """Independent errors look correlated by chance; on average this hardly lowers their weights."""
     rounds, anchors = np.divmod(np.arange(3 * NUM_EACH), 3)
     crowded = replace(make_errors(), place=np.unique(3 * (rounds // 5) + anchors, return_inverse=True)[1])
     says = []
@@ -100,7 +100,7 @@ def test_independent_errors_keep_their_say() -> None:
 
 
 def test_noise_stays_that_of_the_likeliest_residuals() -> None:
-    """Seven of ten ranges are long, and then a fit has gone half-way to meet them."""
+    """Seven of ten ranges are too long; a later fit that gives way to them does not change the noise."""
     rng = np.random.default_rng(3)
     is_long = rng.random(3 * NUM_EACH) < 0.7
     true = noise((0.1, 0.1, 0.1)) - is_long * rng.exponential(1.0, 3 * NUM_EACH)
@@ -114,7 +114,7 @@ def test_noise_stays_that_of_the_likeliest_residuals() -> None:
 
 
 def test_an_anchors_noise_is_that_of_its_ranges_that_fit() -> None:
-    """One anchor has most of its ranges short, the others few."""
+    """One anchor has most of its ranges off to one side, the others few."""
     rng = np.random.default_rng(4)
     is_short = rng.random(3 * NUM_EACH) < np.tile([0.7, 0.2, 0.2], NUM_EACH)
     residuals = noise((0.1, 0.1, 0.1)) + is_short * rng.exponential(5.0, 3 * NUM_EACH)
@@ -131,7 +131,9 @@ def test_a_map_that_may_bend_shows_no_more_noise_than_one_that_may_not() -> None
 
 
 def test_it_begins_with_the_noise_that_the_rigid_map_showed() -> None:
-    """Whatever short ranges share and places are uncertain by is none of it; nor do stated stddevs say anything."""
+    """The noise contains neither the shared errors of short ranges nor the uncertainty of places, and no stated
+    stddevs.
+    """
     shared, placing = np.full(3 * NUM_EACH, 0.2), np.full(3 * NUM_EACH, 0.05)
     rigid = replace(make_errors(), shared_m=shared, placing_m=placing).seen_by_rigid_map(noise((0.1, 0.1, 0.1)), 0.0)
     begun = rigid.for_bending_map(CAUCHY)
@@ -142,7 +144,7 @@ def test_it_begins_with_the_noise_that_the_rigid_map_showed() -> None:
 
 
 def test_what_drifts_away_is_noise_to_the_wide_loss_alone() -> None:
-    """Six of ten ranges are off by metres: outliers, or drift."""
+    """Six of ten ranges are off by metres, which may be outliers or drift."""
     residuals = noise((0.1, 0.1, 0.1))
     residuals[: 3 * NUM_EACH * 6 // 10] += 3.0
     wide, bounded = (
@@ -178,7 +180,7 @@ def test_a_part_spread_over_the_whole_log_is_that_part_and_the_rest_has_no_place
 
 
 def test_a_rigid_map_shows_one_noise_and_keeps_it_where_another_map_was_likelier() -> None:
-    """The likelihood counts what priors have against the map; what is stated stays as stated."""
+    """The likelihood includes the cost of priors; stated stddevs stay as stated."""
     true = noise((0.1, 0.1, 0.1))
     seen = make_errors().seen_by_rigid_map(true, prior_cost=0.0)
     np.testing.assert_allclose(seen.stddev_m, seen.noise_m)
@@ -194,7 +196,7 @@ def test_a_rigid_map_shows_one_noise_and_keeps_it_where_another_map_was_likelier
 
 
 def test_fits_and_errors_alternate_until_the_last_is_good_enough() -> None:
-    """The fit halves what it begins with by as much as the errors say, and these show what is left."""
+    """The simulated fit halves its start, and the errors grow by what the fit returns."""
     fits: list[tuple[float, float | None]] = []
 
     def fit(errors: float, before: float | None) -> float:

@@ -1,4 +1,4 @@
-"""The losses: their derivatives, their limits and what they cost where there are no outliers."""
+"""The robust losses: their derivatives, their limits and their cost in efficiency without outliers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_derivatives_are_those_of_the_loss(loss: RobustLoss) -> None:
 
 
 def curvatures(loss: RobustLoss, residuals: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Second derivative of half the loss by the residual."""
+    """Return the second derivative of half the loss by the residual."""
     _, first, second = loss.rho(residuals**2)
     return np.asarray(first + 2 * residuals**2 * second)
 
@@ -56,7 +56,7 @@ def test_only_the_bounded_one_is_bounded() -> None:
 
 @BOTH
 def test_next_to_no_residual_the_loss_is_its_square(loss: RobustLoss) -> None:
-    """Down to what is nothing beside 1."""
+    """This holds down to squares that are lost in rounding when added to 1."""
     residuals = np.geomspace(1e-12, 1e-5, 60)
     np.testing.assert_allclose(loss.rho(residuals**2)[0], residuals**2, rtol=1e-9)
     np.testing.assert_allclose(loss.slopes(residuals), 1.0, rtol=1e-9)

@@ -1,4 +1,4 @@
-"""Radio logs of all formats become the same range log, or are refused with the line that is wrong."""
+"""Radio logs of all formats become the same range log, or are refused with the number of the wrong line."""
 
 from __future__ import annotations
 
@@ -294,7 +294,7 @@ def test_text_that_is_no_table_is_refused_with_its_beginning(tmp_path: Path) -> 
     assert "distances 7.10" in str(refusal(write(tmp_path, "distances 7.10 5.24\n")))
 
 
-# Whatever the bytes
+# Any bytes
 
 
 @any_bytes_in_one_folder

@@ -1,4 +1,4 @@
-"""What radios print is read as they print it, damaged lines as far as they are whole."""
+"""The output of radios is read as they print it; of damaged lines, the intact parts are used."""
 
 from __future__ import annotations
 
@@ -295,7 +295,7 @@ def test_format_can_be_given_against_what_the_content_looks_like(tmp_path: Path)
     assert read_ranges(path, format="dwm1001_lec").range_m.tolist() == [3.44, 5.68, 7.76, 8.73]
 
 
-# Whatever the bytes
+# Any bytes
 
 prefixes = st.one_of(
     st.text("0123456789.:-T Z,[]+", max_size=24), st.floats(0, 2e9).map(lambda t: f"{t} "), st.just("1.5 ")

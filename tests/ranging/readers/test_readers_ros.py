@@ -45,7 +45,7 @@ RECEIVED_NS = 1_700_000_000_000_000_000
 
 
 def message(version: int, name: str, **fields: Any) -> Any:
-    """A message of that type; one with a header is stamped 100.25 s."""
+    """A message of that type; if it has a header, its stamp is 100.25 s."""
     types = TYPES[version].types
     if "std_msgs/Header header" in DEFINITIONS[name]:
         sequence = {"seq": 0} if version == 1 else {}

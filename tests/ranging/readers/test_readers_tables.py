@@ -1,4 +1,4 @@
-"""Tables that nobody described are understood by names and values, and said; doubts are asked with what to type."""
+"""Undescribed tables are recognized by their names and values, and reported; for unclear ones, the user is asked."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Row = tuple[float, str, float]  # time, anchor, range in metres
 
 
 def survey(step_s: float = 0.05, start_s: float = 12.0, seed: int = 3) -> list[Row]:
-    """A walk among the anchors with 5 cm of noise, one range after the other."""
+    """A walk among the anchors, with 5 cm of noise and one range at a time."""
     rng = np.random.default_rng(seed)
     rows: list[Row] = []
     for k in range(NUM_ROUNDS * len(ANCHORS)):
@@ -57,7 +57,7 @@ def write(folder: Path, content: str | bytes, name: str = "uwb.csv") -> Path:
 
 
 def clock(seconds: float) -> str:
-    """hh:mm:ss.mmm"""
+    """Format a time as hh:mm:ss.mmm."""
     return f"{int(seconds // 3600) % 24:02d}:{int(seconds // 60) % 60:02d}:{seconds % 60:06.3f}"
 
 
@@ -346,11 +346,11 @@ def test_folder_with_logs_of_several_formats_is_refused(tmp_path: Path) -> None:
         read_ranges(tmp_path)
 
 
-# What is not sure
+# Unclear tables
 
 
 def tags_side_by_side() -> str:
-    """Eight columns without names: to each of four anchors, two tags whose ranges differ by centimetres."""
+    """Eight columns without names: ranges of two tags to each of four anchors, which differ by centimetres."""
     rounds = [ROWS[k : k + 4] for k in range(0, len(ROWS), 4)]
     cells = [
         [f"{r + 0.12 * tag * (-1) ** k:.2f}" for k, (*_, r) in enumerate(one) for tag in range(2)] for one in rounds
@@ -421,7 +421,7 @@ def test_factor_graph_is_read_as_ranges_of_robots(tmp_path: Path) -> None:
     np.testing.assert_allclose(log.range_stddev_m, 0.3)
 
 
-# Whatever the bytes
+# Any bytes
 
 cells = st.one_of(
     st.text("0123456789.,-+eEna:_\"'; #\t\x00\u0663", max_size=8),
